@@ -7,7 +7,7 @@ use super::{
 };
 use perturb::proto;
 use perturb_policy::{
-    ActionKind, Inputs, Normalisers, Outcome, Player, PolicySpec, Role, initial_weights,
+    ActionKind, Inputs, Normalisers, Player, PolicySpec, Role, StepOutcome, initial_weights,
     random::{Purpose, stream},
 };
 use std::time::Instant;
@@ -73,7 +73,7 @@ fn local_player(spec: &PolicySpec, weights: &[f32]) -> Result<Player, Failure> {
 
 /// Acts and observes repeatedly, always the same observation. Returns the seconds.
 fn compute(player: &mut Player, steps: u32) -> Result<f64, Failure> {
-    let outcome = Outcome {
+    let outcome = StepOutcome {
         observations: &[0.02; BATCH * OBSERVATION],
         rewards: &[1.0; BATCH],
         terminated: &[false; BATCH],

@@ -6,7 +6,7 @@ use super::{
     median,
 };
 use perturb_faults::certificates::{Authority, CertificateFiles};
-use perturb_protocol::{Address, Connection, Patience, credentials::Credentials};
+use perturb_protocol::{Address, Connection, Timeouts, credentials::Credentials};
 
 /// Measures CartPole in batches of `batch`.
 pub(crate) async fn measure(batch: usize) -> Result<(), Failure> {
@@ -19,7 +19,7 @@ pub(crate) async fn measure(batch: usize) -> Result<(), Failure> {
         (ServerProcess::tcp(&[])?, ServerProcess::tcp(&[("--tls-cert", &cert), ("--tls-key", &key)])?);
     let mut plain_client =
         Client::on(&connect(&plain.address, Credentials::default()).await?, "CartPole", batch).await?;
-    let credentials = Credentials::knowing(&cert)?;
+    let credentials = Credentials::pinned(&cert)?;
     let mut encrypted_client = Client::on(&connect(&encrypted.address, credentials).await?, "CartPole", batch).await?;
     let (mut plain_times, mut ratios) = (Vec::new(), Vec::new());
     for _ in 0..ROUNDS {
@@ -34,5 +34,5 @@ pub(crate) async fn measure(batch: usize) -> Result<(), Failure> {
 
 async fn connect(address: &str, credentials: Credentials) -> Result<Connection, Failure> {
     let address: Address = address.parse()?;
-    Ok(Connection::open_as(&address, Patience::default(), credentials).await?)
+    Ok(Connection::open_as(&address, Timeouts::default(), credentials).await?)
 }

@@ -8,7 +8,7 @@ use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
 use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Rollout, RolloutStep};
 use perturb_policy::random::{Purpose, normal, stream};
-use perturb_policy::{ActionKind, Actor, Acts, ObservationNormaliser, PolicySpec};
+use perturb_policy::{ActionKind, Actor, ActorOutput, ObservationNormaliser, PolicySpec};
 use perturb_settings::{A2cConfig, PpoConfig};
 
 const TASKS: [(&str, usize, ActionKind); 2] =
@@ -47,7 +47,7 @@ fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
     let mut actor = Actor::new(spec, n_envs);
     actor.load_flat(policy.flat_weights()).expect("weights that fit");
     let mut rng = stream(1, Purpose::Actions);
-    let mut acts = Acts::new(spec.action, n_envs);
+    let mut acts = ActorOutput::new(spec.action, n_envs);
     let mut rollout = Rollout::new(n_steps, n_envs, spec.observation_size, spec.action.width());
     rollout.begin(actor.memory());
     for rows in observations(n_steps * n_envs * spec.observation_size).chunks(n_envs * spec.observation_size) {
@@ -77,7 +77,7 @@ fn recurrent(task: &str, observation_size: usize, action: ActionKind) {
         let mut actor = Actor::new(policy.spec(), n_envs);
         actor.load_flat(policy.flat_weights()).expect("weights that fit");
         let rows = observations(n_envs * observation_size);
-        let (mut rng, mut acts) = (stream(1, Purpose::Actions), Acts::new(action, n_envs));
+        let (mut rng, mut acts) = (stream(1, Purpose::Actions), ActorOutput::new(action, n_envs));
         time(&format!("act_rc/{task}/{n_envs}"), 300, || {
             actor.act(&rows, &mut rng, &mut acts).expect("actions");
             assert_eq!(acts.values.len(), n_envs);
@@ -103,7 +103,7 @@ fn time_a2c(id: &str, repetitions: usize, policy: &mut Policy, n_steps: usize, n
     });
 }
 
-/// One epoch.
+/// Runs one epoch.
 fn time_ppo(id: &str, repetitions: usize, policy: &mut Policy, n_steps: usize, n_envs: usize) {
     let rollout = rollout(policy, n_steps, n_envs);
     let config = PpoConfig { n_steps, n_epochs: 1, learning_rate: 1e-6, ..PpoConfig::default() };
@@ -122,7 +122,7 @@ fn main() {
             let mut actor = Actor::new(policy.spec(), n_envs);
             actor.load_flat(policy.flat_weights()).expect("weights that fit");
             let rows = observations(n_envs * observation_size);
-            let (mut rng, mut acts) = (stream(1, Purpose::Actions), Acts::new(action, n_envs));
+            let (mut rng, mut acts) = (stream(1, Purpose::Actions), ActorOutput::new(action, n_envs));
             time(&format!("act/{task}/{n_envs}"), 2000, || {
                 actor.act(&rows, &mut rng, &mut acts).expect("actions");
                 assert_eq!(acts.values.len(), n_envs);

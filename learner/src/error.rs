@@ -1,4 +1,4 @@
-//! What can go wrong in the numerical half of the learner.
+//! Errors of the numerical half of the learner.
 
 use perturb_settings::SettingError;
 
@@ -19,7 +19,7 @@ pub enum Error {
         got: usize,
         /// Steps that fit.
         expected: usize,
-        /// What was attempted.
+        /// The attempt.
         what: &'static str,
     },
     /// An episode is not in a rollout.
@@ -28,13 +28,13 @@ pub enum Error {
          {n_steps} steps of {n_envs} environments; one has at least one step"
     )]
     Episode {
-        /// Its environment, from 0.
+        /// The environment, from 0.
         environment: usize,
         /// The step after its last.
         end: usize,
-        /// Its number of steps.
+        /// The number of steps.
         length: usize,
-        /// N.
+        /// N, the number of environments.
         n_envs: usize,
         /// Steps that the rollout holds.
         n_steps: usize,

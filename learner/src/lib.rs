@@ -1,4 +1,4 @@
-//! perturb's learner: trains policies over environment servers and tests whether they still work when the physics
+//! perturb's learner: trains policies over environment servers, and tests whether they still work when the physics
 //! changes.
 #![forbid(unsafe_code)]
 

@@ -1,4 +1,4 @@
-//! Measuring what the steps of a group of cells cost.
+//! Measures the duration of the steps of a group of cells.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
@@ -9,27 +9,27 @@ use perturb_experiment::{Cell, Folder, Measurement, Speed};
 use perturb_files::interrupt::{Scratch, StopFlag};
 use perturb_files::{FileError, io};
 
-use crate::cell::{CellOrder, run_cells};
+use crate::cell::{CellJob, run_cells};
 use crate::checkpoint::{Checkpoint, CheckpointError};
 use crate::client::{Address, ClientError, Servers};
 use crate::evaluation::{TestError, TestOptions, Tester};
 use crate::training::{RunDirectory, RunDirectoryError, TrainError, train};
 
 /// A budget that no measurement uses up.
-const ENDLESS: u64 = 1 << 40;
-/// A cell that is not heard of while another is so often has failed.
-const SILENCE: u64 = 100;
-/// Test episodes: one in each of so many environments.
+const UNLIMITED_EPISODES: u64 = 1 << 40;
+/// Number of updates of another cell without one of the leader, after which the leader has failed.
+const MAX_MISSED_UPDATES: u64 = 100;
+/// Test episodes, each in an environment of its own.
 const TEST_EPISODES: u64 = 100;
 
 /// Why a group could not be measured.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum MeasureError {
-    /// There is no place for what is written meanwhile.
+    /// A temporary folder cannot be created.
     #[error(transparent)]
     File(#[from] FileError),
-    /// There is no server.
+    /// A server failed, or the connection to it.
     #[error(transparent)]
     Client(#[from] ClientError),
     /// A training ended by itself.
@@ -37,19 +37,19 @@ pub enum MeasureError {
     Ended {
         /// The cell.
         id: String,
-        /// How.
+        /// The reason.
         reason: String,
     },
-    /// A policy cannot be made.
+    /// The training failed.
     #[error(transparent)]
     Train(#[from] TrainError),
-    /// There is no place for it.
+    /// A directory cannot be trained in.
     #[error(transparent)]
     Directory(#[from] RunDirectoryError),
-    /// What was learned cannot be read.
+    /// The checkpoint cannot be read.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// What was learned cannot be tested.
+    /// The checkpoint cannot be tested.
     #[error(transparent)]
     Test(#[from] TestError),
     /// The program was asked to end.
@@ -60,8 +60,8 @@ pub enum MeasureError {
     },
 }
 
-/// Trains the cells of `group`, at least one, as a run would do them together, `jobs` times at once, for about `limit`,
-/// at least two iterations; then tests one. Forgets what was learned.
+/// Trains the cells of `group`, at least one, together as an experiment does, in `jobs` threads at once, for about `limit`
+/// and at least two iterations. Then tests one policy. Deletes the policies.
 ///
 /// # Errors
 /// [`MeasureError`]; [`MeasureError::Stopped`] soon after `stop` is raised.
@@ -108,17 +108,17 @@ fn measure_one(
     }
     let endless = |cell: &&Cell| {
         let mut cell = Cell::clone(cell);
-        cell.config.common.episodes = ENDLESS;
+        cell.config.common.episodes = UNLIMITED_EPISODES;
         cell
     };
     let cells: Vec<Cell> = group.iter().map(endless).collect();
     let folder = Folder::new(scratch);
-    let order = |cell| CellOrder { cell, folder: folder.cell(&cell.id), retry: None };
-    let orders: Vec<CellOrder<'_>> = cells.iter().map(order).collect();
+    let order = |cell| CellJob { cell, folder: folder.cell(&cell.id), retry: None };
+    let orders: Vec<CellJob<'_>> = cells.iter().map(order).collect();
     let enough = StopFlag::default();
     let mut meter = Meter::new();
     run_cells(servers, &orders, &enough, &mut |cell, event| {
-        if meter.hear(&cell.id, event) >= limit || stop.signal().is_some() {
+        if meter.on_event(&cell.id, event) >= limit || stop.signal().is_some() {
             enough.raise(1);
         }
     });
@@ -128,16 +128,17 @@ fn measure_one(
     Ok(Speed { training, testing: measure_test(servers, cell, &checkpoint, stop)? })
 }
 
-/// The time from one iteration to another of the cell that is heard of first, and all steps of all cells between: where
-/// cells take turns, between two of its iterations all others have had one.
+/// Measures the time from one iteration to another of the leader, the cell that reports first, and counts the steps of all
+/// cells between. Where cells take turns, all others have had an iteration between two of the leader's.
 struct Meter {
     start: Instant,
     timesteps: HashMap<String, u64>,
-    /// How often something was heard of each.
+    /// Number of reports of each cell.
     heard: HashMap<String, u64>,
     leader: Option<String>,
-    /// When the leader's first and last iterations were told, and how many steps had been told before.
+    /// Time of the leader's first report, and the steps of all cells that had been reported before.
     first: Option<(Duration, u64)>,
+    /// Time of the leader's last report, and the steps of all cells that had been reported before.
     last: Option<(Duration, u64)>,
     ended: Option<MeasureError>,
 }
@@ -149,18 +150,19 @@ impl Meter {
         Self { start: Instant::now(), timesteps, heard, leader: None, first: None, last: None, ended: None }
     }
 
-    /// Takes note of an event, and says for how long it has measured; zero until there is something to go by.
-    fn hear(&mut self, id: &str, event: CellEvent) -> Duration {
+    /// Counts an event. Returns for how long the meter has measured; zero before the leader's second report.
+    fn on_event(&mut self, id: &str, event: CellEvent) -> Duration {
         let now = self.start.elapsed();
         match event {
             CellEvent::Training { timesteps, .. } if timesteps > 0 => {
                 *self.heard.entry(id.to_owned()).or_default() += 1;
-                let silent = |leader: &String| self.heard[id] > self.heard.get(leader).unwrap_or(&0) + SILENCE;
+                let silent =
+                    |leader: &String| self.heard[id] > self.heard.get(leader).unwrap_or(&0) + MAX_MISSED_UPDATES;
                 if self.leader.as_ref().is_some_and(silent) {
                     (self.leader, self.first, self.last) = (None, None, None); // it has failed, and says so at the end
                 }
                 let leads = self.leader.get_or_insert_with(|| id.to_owned()) == id;
-                // Told again at the end, with nothing new.
+                // The last report is repeated at the end of the training.
                 if leads && self.timesteps.get(id).is_none_or(|&known| known < timesteps) {
                     let told = (now, self.timesteps.values().sum());
                     self.first.get_or_insert(told);
@@ -179,13 +181,13 @@ impl Meter {
         if self.first == self.last { Duration::ZERO } else { now }
     }
 
-    /// The leader, and the seconds of a step.
+    /// Returns the leader and the seconds of a step.
     fn end(self) -> Result<(String, f64), MeasureError> {
         let measured = self.leader.zip(self.first.zip(self.last));
         let seconds = measured.and_then(|(leader, ((begun, before), (ended, after)))| {
             (after > before).then(|| (leader, (ended - begun).as_secs_f64() / (after - before) as f64))
         });
-        // One that failed is no reason to know nothing, if others were measured.
+        // The failure of a cell is an error only if no other was measured.
         seconds.ok_or_else(|| {
             let nothing = || MeasureError::Ended { id: "a group".into(), reason: "it has made no step".into() };
             self.ended.unwrap_or_else(nothing)
@@ -193,7 +195,7 @@ impl Meter {
     }
 }
 
-/// The seconds of a step in tests: they go on in all environments until the last has had its episode.
+/// Seconds of a step in tests. A test steps all environments until the last has finished its episode.
 fn measure_test(servers: &Servers, cell: &Cell, checkpoint: &Checkpoint, stop: &StopFlag) -> Result<f64, MeasureError> {
     let episodes = cell.tests.episodes.min(TEST_EPISODES);
     let (seed, success) = (cell.config.common.seed, cell.tests.success.clone());
@@ -202,7 +204,7 @@ fn measure_test(servers: &Servers, cell: &Cell, checkpoint: &Checkpoint, stop: &
     let start = Instant::now();
     let records = Tester::new(servers, checkpoint, options)?.test(sets, stop, &mut |_, _| {})?;
     let seconds = start.elapsed().as_secs_f64();
-    // Each environment plays one episode, or trial, and all go on until the longest has ended.
+    // Each environment plays one episode, or trial, and all are stepped until the longest has ended.
     let mut lengths: BTreeMap<u32, u64> = BTreeMap::new();
     for episode in &records.episodes {
         *lengths.entry(episode.environment_index).or_default() += u64::from(episode.length);
@@ -223,14 +225,14 @@ mod tests {
     fn steps_count_between_two_iterations_of_the_first_cell() {
         let mut meter = Meter::new();
         for id in ["a", "b"] {
-            assert_eq!(meter.hear(id, training(0)), Duration::ZERO);
+            assert_eq!(meter.on_event(id, training(0)), Duration::ZERO);
         }
-        assert_eq!(meter.hear("a", training(5)), Duration::ZERO);
-        assert_eq!(meter.hear("b", training(80)), Duration::ZERO);
+        assert_eq!(meter.on_event("a", training(5)), Duration::ZERO);
+        assert_eq!(meter.on_event("b", training(80)), Duration::ZERO);
         meter.start -= Duration::from_secs(7);
-        assert!(meter.hear("a", training(10)) >= Duration::from_secs(7));
-        meter.hear("b", training(160));
-        meter.hear("a", training(10));
+        assert!(meter.on_event("a", training(10)) >= Duration::from_secs(7));
+        meter.on_event("b", training(160));
+        meter.on_event("a", training(10));
         let ((_, before), (_, after)) = (meter.first.unwrap(), meter.last.unwrap());
         assert_eq!((before, after), (0, 85), "an iteration of both");
         let (leader, seconds) = meter.end().unwrap();
@@ -238,22 +240,22 @@ mod tests {
     }
 
     #[test]
-    fn one_that_fails_leaves_the_measurement_to_the_others() {
+    fn failed_leader_is_replaced() {
         let mut meter = Meter::new();
-        meter.hear("a", training(5));
-        for round in 1..=SILENCE + 10 {
-            meter.hear("b", training(80 * round));
+        meter.on_event("a", training(5));
+        for round in 1..=MAX_MISSED_UPDATES + 10 {
+            meter.on_event("b", training(80 * round));
         }
-        meter.hear("a", CellEvent::Failed { reason: "NaN".into() });
+        meter.on_event("a", CellEvent::Failed { reason: "NaN".into() });
         let (leader, seconds) = meter.end().unwrap();
         assert!(leader == "b" && seconds > 0.0);
     }
 
     #[test]
-    fn what_ends_by_itself_cannot_be_measured() {
+    fn failed_group_is_an_error() {
         let mut meter = Meter::new();
-        meter.hear("a", training(5));
-        meter.hear("a", CellEvent::Failed { reason: "NaN".into() });
+        meter.on_event("a", training(5));
+        meter.on_event("a", CellEvent::Failed { reason: "NaN".into() });
         assert_eq!(meter.end().unwrap_err().to_string(), "measuring a: NaN");
         assert!(Meter::new().end().unwrap_err().to_string().contains("it has made no step"));
     }

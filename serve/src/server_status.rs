@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use perturb_protocol::{Address, Connection, Patience};
+use perturb_protocol::{Address, Connection, Timeouts};
 
 /// Time between two requests to the server.
 pub(crate) const POLL_INTERVAL: Duration = Duration::from_secs(2);
@@ -64,7 +64,7 @@ impl ServerMonitor {
 
     async fn request(&self) -> Result<ServerStatus, String> {
         let message = |error: perturb_protocol::ClientError| error.to_string();
-        let patience = Patience { reply: RESPONSE_TIMEOUT, ..Patience::default() };
+        let patience = Timeouts { reply: RESPONSE_TIMEOUT, ..Timeouts::default() };
         let connection = Connection::open_with(&self.address, patience).await.map_err(message)?;
         let start = Instant::now();
         let catalogue = connection.catalogue().await.map_err(message)?;

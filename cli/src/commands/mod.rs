@@ -38,7 +38,7 @@ use display::{AboveBar, note};
 use error::{CommandError, Result};
 use perturb_experiment::{Folder, Plan};
 use perturb_files::interrupt::end_on_signals;
-use perturb_learner::client::{ActAt, Address, PrivateServer, ServerWait, Servers};
+use perturb_learner::client::{ActorLocation, Address, PrivateServer, ServerWait, Servers};
 use tracing::Level;
 use tracing_subscriber::filter::Targets;
 use tracing_subscriber::layer::SubscriberExt;
@@ -72,7 +72,7 @@ pub fn main() -> ExitCode {
         // They would go to standard error, which is what has failed, and would end the program.
         .log_internal_errors(false);
     tracing_subscriber::registry().with(lines).with(filter).init();
-    PrivateServer::have_heard(display::say);
+    PrivateServer::set_stderr_handler(display::say);
     if matches!(cli.command, Command::Envs(_) | Command::Report(_) | Command::Curves(_) | Command::Serve(_)) {
         // These commands have nothing to finish. The others check a flag.
         // If it fails, signals end them as they end any program.
@@ -157,7 +157,7 @@ fn workers_of_each(jobs: usize, cores: usize) -> usize {
 
 /// Returns the servers for a command that trains or tests.
 fn playing_servers(args: &PlayArgs) -> Result<Servers> {
-    let act = if args.act == "client" { ActAt::Client } else { ActAt::Server };
+    let act = if args.act == "client" { ActorLocation::Client } else { ActorLocation::Server };
     Ok(reconnecting_servers(&args.server, args.wait)?.with_act(act))
 }
 

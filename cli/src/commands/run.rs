@@ -13,7 +13,7 @@ use perturb_experiment::scheduler::{CellEvent, Local, News, Order, OrderedCell, 
 use perturb_experiment::{Cell, Folder, Grouping, Plan, Taken, estimates, representatives};
 use perturb_files::interrupt::StopFlag;
 use perturb_files::require_writable;
-use perturb_learner::cell::{CellOrder, run_cells};
+use perturb_learner::cell::{CellJob, run_cells};
 use perturb_learner::client::{Address, PrivateServer, Servers};
 use perturb_learner::measure::{MeasureError, measure};
 use perturb_text::count;
@@ -87,7 +87,7 @@ fn run_worker(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<ExitCo
             Err(error) => Err(error.to_string()),
         };
         match cell {
-            Ok(cell) => orders.push(CellOrder { cell, folder: folder.cell(&cell.id), retry: *retry }),
+            Ok(cell) => orders.push(CellJob { cell, folder: folder.cell(&cell.id), retry: *retry }),
             Err(reason) => {
                 teller.tell(id, CellEvent::Refused { reason });
                 return Ok(ExitCode::SUCCESS);

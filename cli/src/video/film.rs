@@ -4,10 +4,10 @@ use std::time::{Duration, Instant};
 
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::{Checkpoint, State};
-use perturb_learner::client::{BegunEpisode, ClientError, Picture, Servers, Single, StepReply};
+use perturb_learner::client::{BegunEpisode, ClientError, Picture, RenderSession, Servers, StepReply};
 use perturb_learner::evaluation::{TestError, open_options};
 use perturb_learner::proto;
-use perturb_policy::{Ended, Player};
+use perturb_policy::{Player, SlotEnd};
 use perturb_records::success::Criterion;
 use perturb_settings::sets::TestSet;
 
@@ -151,10 +151,10 @@ struct Film<'a> {
     /// Number of episodes of the previous sets.
     before: usize,
     state: &'a State,
-    single: Single<'a>,
+    single: RenderSession<'a>,
     environment: proto::Environment,
     player: Player,
-    ended: Vec<Ended>,
+    ended: Vec<SlotEnd>,
     reply: StepReply,
     begun: BegunEpisode,
     caption: Caption,
@@ -180,7 +180,7 @@ impl<'a> Film<'a> {
         let state = &checkpoint.state;
         let open = open_options(&state.config, set, options.seed);
         let mut reply = StepReply::default();
-        let (single, begun) = Single::open(servers, &open, &mut reply.observations)?;
+        let (single, begun) = RenderSession::open(servers, &open, &mut reply.observations)?;
         checkpoint.state.check_unchanged(single.environment()).map_err(TestError::from)?;
         let environment = single.environment().clone();
         set.check(&environment).map_err(TestError::Value)?;

@@ -362,7 +362,7 @@ fn numbers_that_are_not_finite_leave_the_last_checkpoint() {
     let error = train(&servers, &config(text), &directory, 1, &StopFlag::default(), |_| {}).expect_err("NaN");
     let error = format!("{error:#}");
     assert!(error.contains("; the checkpoint after 0 episodes is kept in"), "{error}");
-    assert!(error.contains("resumed, it would come to the same numbers"), "{error}");
+    assert!(error.contains("resumed, it would fail with the same numbers"), "{error}");
     let saved = Checkpoint::load(out.path()).expect("a checkpoint");
     assert_eq!(saved.state.counters.iterations, 1, "the one that was there before");
 }

@@ -26,20 +26,20 @@ pub struct Actor {
     log_std: Vec<f32>,
     /// Continuous actions are uniform in a box, not Gaussian.
     uniform: bool,
-    /// Its networks are somebody else's.
+    /// Whether the networks were swapped for others, which do not have the weights.
     is_stale: bool,
 }
 
-/// What an architecture computes with.
+/// The networks of an architecture.
 #[derive(Clone, Debug)]
 enum Network {
     FeedForward(FeedForward),
     Recurrent(Box<Recurrent>),
 }
 
-/// What a policy did in N environments.
+/// The output of an actor in N environments.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Acts {
+pub struct ActorOutput {
     /// The kind of the actions.
     pub kind: ActionKind,
     /// `[N, A]` actions as sampled, not clipped. A discrete action is its index as f32, exact below 2²⁴, with A = 1.
@@ -50,22 +50,22 @@ pub struct Acts {
     pub values: Vec<f32>,
 }
 
-/// Where the random numbers of each environment's actions come from.
+/// The random streams from which the environments' actions are sampled.
 pub trait Streams {
     /// The stream of `environment`, one of 0 … N-1.
-    fn of(&mut self, environment: usize) -> &mut ChaCha8Rng;
+    fn stream(&mut self, environment: usize) -> &mut ChaCha8Rng;
 }
 
-/// One for all, in their order.
+/// A single stream for all environments, in their order.
 impl Streams for ChaCha8Rng {
-    fn of(&mut self, _: usize) -> &mut ChaCha8Rng {
+    fn stream(&mut self, _: usize) -> &mut ChaCha8Rng {
         self
     }
 }
 
-/// One for each.
+/// A stream for each environment.
 impl Streams for Vec<ChaCha8Rng> {
-    fn of(&mut self, environment: usize) -> &mut ChaCha8Rng {
+    fn stream(&mut self, environment: usize) -> &mut ChaCha8Rng {
         &mut self[environment]
     }
 }
@@ -84,22 +84,22 @@ impl Actor {
         Actor { spec: spec.clone(), max_batch, network, log_std, uniform: false, is_stale: false }
     }
 
-    /// From now on a continuous action is uniform in the box whose middle is the policy's mean and half of whose width is its
-    /// deviation. Discrete ones stay as they are: equal logits make them uniform.
+    /// From now on a continuous action is uniform in a box: its middle is the policy's mean, half its width the standard
+    /// deviation. Discrete actions are sampled as before: equal logits make them uniform.
     pub fn act_uniformly(&mut self) {
         self.uniform = true;
     }
 
-    /// Takes over weights, whose names and shapes must be those of [`PolicySpec::layout`]. Memories stay.
+    /// Loads weights, whose names and shapes must be those of [`PolicySpec::layout`]. The environments' memories stay.
     ///
     /// # Errors
-    /// [`Error::Arrays`] if they are not.
+    /// [`Error::Arrays`] for other names or shapes.
     pub fn load(&mut self, weights: &Weights) -> Result<()> {
         self.spec.check(weights)?;
         self.load_flat(&weights.iter().flat_map(|array| array.data.iter().copied()).collect::<Vec<f32>>())
     }
 
-    /// The same with all weights `[P]` in a row.
+    /// Loads all weights `[P]` in a row.
     ///
     /// # Errors
     /// [`Error::Length`].
@@ -115,9 +115,9 @@ impl Actor {
         Ok(())
     }
 
-    /// From now on keeps what a feed-forward policy's networks compute while it acts for `n_steps` with the same weights, for
-    /// [`Differentiator::load_from`](crate::Differentiator::load_from). No effect if these and values of one batch more are
-    /// over 64 observations.
+    /// From now on caches the activations of a feed-forward policy's networks while it acts for `n_steps` with the same weights,
+    /// for [`Differentiator::load_from`](crate::Differentiator::load_from). Has no effect if these steps and the values of one
+    /// more batch have more than 64 observations.
     pub fn keep_activations(&mut self, n_steps: usize) {
         match &mut self.network {
             Network::FeedForward(network) if self.max_batch.saturating_mul(n_steps.saturating_add(1)) <= BLOCK => {
@@ -127,8 +127,8 @@ impl Actor {
         }
     }
 
-    /// What acts for a feed-forward policy of shape `spec`, whose networks are to be exchanged for others, and log σ `[A]` of
-    /// its actions. Until weights are loaded it refuses to act.
+    /// The networks of a feed-forward policy of shape `spec`, to be swapped for others, and log σ `[A]` of its actions. The
+    /// actor refuses to act until weights are loaded.
     pub(crate) fn give_networks(&mut self, spec: &PolicySpec) -> Option<(&mut FeedForward, &[f32])> {
         match &mut self.network {
             Network::FeedForward(network) if self.spec == *spec => {
@@ -142,8 +142,8 @@ impl Actor {
     /// Samples an action for each normalised observation of `observations` `[N, O]`, in order of n; draws from `streams`
     /// once per discrete action and twice per element of a continuous one. Replaces what is in `out`.
     ///
-    /// Row n is environment n: a recurrent policy remembers the observation.
-    pub fn act(&mut self, observations: &[f32], streams: &mut impl Streams, out: &mut Acts) -> Result<()> {
+    /// Row n belongs to environment n: a recurrent policy adds the observation to that environment's memory.
+    pub fn act(&mut self, observations: &[f32], streams: &mut impl Streams, out: &mut ActorOutput) -> Result<()> {
         let n_envs = self.count(observations)?;
         let (width, outputs) = (self.spec.action.width(), self.spec.action.outputs());
         let (heads, values) = match &mut self.network {
@@ -156,7 +156,7 @@ impl Actor {
         replace_by_first_column(&mut out.values, values, n_envs);
         for n in 0..n_envs {
             let (head, action) = (&heads.row(n)[..outputs], &mut out.actions[n * width..][..width]);
-            let rng = streams.of(n);
+            let rng = streams.stream(n);
             let log_prob = match self.spec.action {
                 ActionKind::Discrete { .. } => {
                     let (choice, log_prob) = sample_categorical(head, rng);
@@ -175,8 +175,8 @@ impl Actor {
         Ok(())
     }
 
-    /// Values V of the normalised `observations` `[N, O]`; replaces what is in `out` `[N]`. Row n is environment n, whose
-    /// memory counts, but stays as it is.
+    /// Replaces `out` `[N]` by the values V of the normalised `observations` `[N, O]`. Row n belongs to environment n, whose
+    /// memory is used, but not changed.
     pub fn values(&mut self, observations: &[f32], out: &mut Vec<f32>) -> Result<()> {
         let n_envs = self.count(observations)?;
         let values = match &mut self.network {
@@ -187,8 +187,8 @@ impl Actor {
         Ok(())
     }
 
-    /// The same where row k is environment `environments[k]`: values of final observations, for which the memory is that
-    /// of the episode that ended, before [`Actor::forget`].
+    /// Replaces `out` `[K]` by the values of final `observations` `[K, O]`. Row k belongs to environment `environments[k]`,
+    /// whose memory must still be that of the episode that ended: call this before [`Actor::forget`].
     pub fn values_in(&mut self, observations: &[f32], environments: &[usize], out: &mut Vec<f32>) -> Result<()> {
         check_length("environments [K]", environments.len(), self.count(observations)?)?;
         let values = match &mut self.network {
@@ -199,14 +199,14 @@ impl Actor {
         Ok(())
     }
 
-    /// Empties the memory of `environment`, one of 0 … `max_batch`-1: its episode has ended.
+    /// Empties the memory of `environment`, one of 0 … `max_batch`-1, after the end of its episode.
     pub fn forget(&mut self, environment: usize) {
         if let Network::Recurrent(network) = &mut self.network {
             network.forget(environment);
         }
     }
 
-    /// [`max_batch`, S] what is remembered of every environment, S = [`PolicySpec::memory_size`].
+    /// [`max_batch`, S] the memory of every environment, S = [`PolicySpec::memory_size`].
     pub fn memory(&self) -> &[f32] {
         match &self.network {
             Network::FeedForward(_) => &[],
@@ -214,10 +214,10 @@ impl Actor {
         }
     }
 
-    /// Puts back what [`Actor::memory`] gave.
+    /// Restores a memory that [`Actor::memory`] returned.
     ///
     /// # Errors
-    /// [`Error::Length`] if it is not [`max_batch`, S]; nothing was changed then.
+    /// [`Error::Length`] if it is not [`max_batch`, S]; nothing is changed then.
     pub fn set_memory(&mut self, memory: &[f32]) -> Result<()> {
         check_length("memory [N, S]", memory.len(), self.memory().len())?;
         if let Network::Recurrent(network) = &mut self.network {
@@ -226,7 +226,7 @@ impl Actor {
         Ok(())
     }
 
-    /// The number of observations, of a policy that may act.
+    /// The number of observations. An error if the actor may not act.
     fn count(&self, observations: &[f32]) -> Result<usize> {
         if self.is_stale {
             return Err(Error::NoWeights);
@@ -244,10 +244,10 @@ fn replace_by_first_column(out: &mut Vec<f32>, rows: RowsFrom<'_>, n: usize) {
     out.extend((0..n).map(|n| rows.row(n)[0]));
 }
 
-impl Acts {
-    /// No actions yet, room for `n_envs`.
+impl ActorOutput {
+    /// No actions yet, with capacity for `n_envs`.
     pub fn new(kind: ActionKind, n_envs: usize) -> Self {
-        Acts {
+        ActorOutput {
             kind,
             actions: Vec::with_capacity(n_envs * kind.width()),
             log_probs: Vec::with_capacity(n_envs),
@@ -255,7 +255,7 @@ impl Acts {
         }
     }
 
-    /// Replaces `bytes` by the actions as the protocol wants them: little-endian i32 `[N]`, or f32 `[N, A]`.
+    /// Replaces `bytes` by the actions as the protocol encodes them: little-endian i32 `[N]`, or f32 `[N, A]`.
     pub fn write_bytes(&self, bytes: &mut Vec<u8>) {
         bytes.clear();
         match self.kind {

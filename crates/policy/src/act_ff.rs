@@ -7,25 +7,26 @@ use crate::kernel::{Rows, RowsFrom, run};
 use crate::perceptron::{Forward, Perceptron};
 use crate::spec::PolicySpec;
 
-/// Samples whose activations are kept at once: those of both networks stay in the processor's second cache.
+/// Samples whose activations are held at once: those of both networks fit into the processor's second-level cache.
 pub(crate) const BLOCK: usize = 64;
 
 /// Two separate perceptrons.
 #[derive(Clone, Debug)]
 pub(crate) struct Networks {
-    /// Gives logits or means.
+    /// Computes logits or means.
     pub(crate) policy: Perceptron,
-    /// Gives V(s).
+    /// Computes V(s).
     pub(crate) value: Perceptron,
 }
 
-/// What they compute of rows of observations.
+/// The activations of both networks at rows of observations.
 #[derive(Clone, Debug)]
 pub(crate) struct Activations {
     /// [rows, O].
     pub(crate) observations: Rows,
-    /// For each layer.
+    /// Outputs of the policy network's layers.
     pub(crate) policy_layers: Vec<Rows>,
+    /// Outputs of the value network's layers.
     pub(crate) value_layers: Vec<Rows>,
 }
 
@@ -35,14 +36,15 @@ pub(crate) struct FeedForward {
     observation_size: usize,
     networks: Networks,
     activations: Activations,
-    /// Rows that may be kept.
-    most_kept: usize,
-    /// Rows that are: all that was acted on since the weights came. None if that was more, or there are no weights.
-    kept: Option<usize>,
+    /// Maximal number of cached rows.
+    max_cached: usize,
+    /// Number of cached rows: all observations that were acted on since the weights were loaded. `None` if there were more, or
+    /// if there are no weights.
+    cached: Option<usize>,
 }
 
 impl Networks {
-    /// Those of a policy of `spec`, whose weights are 0.
+    /// The networks of a policy of `spec`, with weights 0.
     pub(crate) fn new(spec: &PolicySpec) -> Self {
         let network = |outputs| {
             let mut layers = spec.hidden_layers();
@@ -52,7 +54,7 @@ impl Networks {
         Networks { policy: network(spec.action.outputs()), value: network(1) }
     }
 
-    /// Takes over weights in the order of [`PolicySpec::layout`] from the front of `numbers`, which move on.
+    /// Loads weights in the order of [`PolicySpec::layout`] from the front of `numbers`, and removes them there.
     pub(crate) fn load(&mut self, numbers: &mut &[f32]) {
         self.policy.load(numbers);
         self.value.load(numbers);
@@ -60,12 +62,12 @@ impl Networks {
 }
 
 impl Activations {
-    /// Room for those of `networks`, of a policy of `spec`, in so many rows.
+    /// Buffers for the activations of `networks`, of a policy of `spec`, at this number of rows.
     pub(crate) fn new(spec: &PolicySpec, networks: &Networks, rows: usize) -> Self {
         Activations {
             observations: Rows::new(rows, spec.observation_size),
-            policy_layers: networks.policy.room(rows),
-            value_layers: networks.value.room(rows),
+            policy_layers: networks.policy.buffers(rows),
+            value_layers: networks.value.buffers(rows),
         }
     }
 }
@@ -74,55 +76,55 @@ impl FeedForward {
     pub(crate) fn new(spec: &PolicySpec, max_batch: usize) -> Self {
         let networks = Networks::new(spec);
         let activations = Activations::new(spec, &networks, max_batch);
-        FeedForward { observation_size: spec.observation_size, networks, activations, most_kept: 0, kept: None }
+        FeedForward { observation_size: spec.observation_size, networks, activations, max_cached: 0, cached: None }
     }
 
-    /// From now on keeps the activations of what is acted on, for [`FeedForward::exchange`], up to [`BLOCK`] rows with those
-    /// of values.
+    /// From now on caches the activations while acting, for [`FeedForward::exchange`]: up to [`BLOCK`] rows, those of values
+    /// included.
     pub(crate) fn keep(&mut self, spec: &PolicySpec) {
-        self.most_kept = BLOCK;
+        self.max_cached = BLOCK;
         self.activations = Activations::new(spec, &self.networks, BLOCK);
     }
 
-    /// Takes over weights, see [`Networks::load`].
+    /// Loads weights, see [`Networks::load`].
     pub(crate) fn load(&mut self, numbers: &mut &[f32]) {
         self.networks.load(numbers);
-        self.kept = Some(0);
+        self.cached = Some(0);
     }
 
-    /// Exchanges its networks for other ones, and if it has kept any, its activations for a [`BLOCK`]; says how many rows.
-    /// It must load weights before it acts again.
+    /// Swaps the networks for others and, if any rows are cached, the activations for those of a [`BLOCK`]. Returns the number
+    /// of cached rows. Weights must be loaded before acting again.
     pub(crate) fn exchange(&mut self, networks: &mut Networks, activations: &mut Activations) -> usize {
         swap(&mut self.networks, networks);
-        let kept = self.kept.take().unwrap_or(0);
-        if kept > 0 {
+        let cached = self.cached.take().unwrap_or(0);
+        if cached > 0 {
             swap(&mut self.activations, activations);
         }
-        kept
+        cached
     }
 
-    /// Rows of the policy's outputs and of the values.
+    /// Computes the rows of the policy's outputs and of the values.
     pub(crate) fn act(&mut self, observations: &[f32], n: usize) -> (RowsFrom<'_>, RowsFrom<'_>) {
         let rows = self.value_rows(observations, n);
         let (network, Activations { observations, policy_layers, value_layers }) =
             (&self.networks.policy, &mut self.activations);
         run(Forward { network, inputs: observations, rows: rows.clone(), outputs: policy_layers });
-        self.kept = self.kept.map(|_| rows.end);
+        self.cached = self.cached.map(|_| rows.end);
         let last = policy_layers.len() - 1;
         (policy_layers[last].from(rows.start), value_layers[last].from(rows.start))
     }
 
-    /// Rows of the values.
+    /// Computes the rows of the values.
     pub(crate) fn values(&mut self, observations: &[f32], n: usize) -> RowsFrom<'_> {
         let rows = self.value_rows(observations, n);
         let layers = &self.activations.value_layers;
         layers[layers.len() - 1].from(rows.start)
     }
 
-    /// Computes values; says in which rows: behind those that are kept, or, where these leave no room, in their place.
+    /// Computes values. Returns their rows: behind the cached ones or, if there is no space for them, in place of these.
     fn value_rows(&mut self, observations: &[f32], n: usize) -> Range<usize> {
-        self.kept = self.kept.filter(|kept| kept + n <= self.most_kept);
-        let first = self.kept.unwrap_or(0);
+        self.cached = self.cached.filter(|cached| cached + n <= self.max_cached);
+        let first = self.cached.unwrap_or(0);
         let rows = first..first + n;
         let (network, activations) = (&self.networks.value, &mut self.activations);
         activations.observations.copy(first, observations, self.observation_size);
@@ -140,8 +142,8 @@ mod tests {
 
     const O: usize = 3;
 
-    /// How many rows are kept after `steps` steps of `n` environments, each with values of as many observations after it.
-    fn kept(keeps: bool, n: usize, steps: usize) -> usize {
+    /// Number of cached rows after `steps` steps of `n` environments, each followed by the values of `n` observations.
+    fn cached(keeps: bool, n: usize, steps: usize) -> usize {
         let spec = PolicySpec::feed_forward(O, ActionKind::Discrete { n: 2 });
         let mut acting = FeedForward::new(&spec, n);
         if keeps {
@@ -156,22 +158,22 @@ mod tests {
         }
         let mut networks = Networks::new(&spec);
         let mut activations = Activations::new(&spec, &networks, BLOCK);
-        let kept = acting.exchange(&mut networks, &mut activations);
+        let cached = acting.exchange(&mut networks, &mut activations);
         for row in 0..BLOCK {
             let observation = activations.observations.row(row)[0];
-            assert_eq!(row < kept, observation == 1.0, "row {row} of {kept} begins with {observation}");
+            assert_eq!(row < cached, observation == 1.0, "row {row} of {cached} begins with {observation}");
         }
         assert_eq!(acting.exchange(&mut networks, &mut activations), 0, "given once");
-        kept
+        cached
     }
 
     #[test]
-    fn rows_are_kept_where_asked_for_as_long_as_there_is_room_for_all() {
+    fn rows_are_cached_as_long_as_all_fit() {
         for (n, steps, expected) in
             [(1, 5, 5), (3, 4, 12), (1, 63, 63), (1, 64, 0), (16, 3, 48), (16, 4, 0), (16, 9, 0)]
         {
-            assert_eq!(kept(true, n, steps), expected, "{n} environments, {steps} steps");
-            assert_eq!(kept(false, n, steps), 0);
+            assert_eq!(cached(true, n, steps), expected, "{n} environments, {steps} steps");
+            assert_eq!(cached(false, n, steps), 0);
         }
     }
 }

@@ -13,10 +13,10 @@ pub(crate) struct Recurrent {
     observation_size: usize,
     /// X: numbers that enter the LSTM from below.
     hidden_size: usize,
-    /// H.
+    /// H, the width of the LSTM.
     width: usize,
     hidden: Perceptron,
-    /// From x and h together, `[X + H]`, to i, f, g and o, `[4H]`.
+    /// Maps x and h together, `[X + H]`, to i, f, g and o, `[4H]`.
     gates: Layer,
     policy: Layer,
     value: Layer,
@@ -25,7 +25,7 @@ pub(crate) struct Recurrent {
     // Rows of a batch.
     /// [max_batch, O].
     observations: Rows,
-    /// For each hidden layer.
+    /// Outputs of each hidden layer.
     hidden_layers: Vec<Rows>,
     /// [max_batch, X + H].
     inputs: Rows,
@@ -48,7 +48,7 @@ impl Recurrent {
             observation_size: spec.observation_size,
             hidden_size,
             width,
-            hidden_layers: hidden.room(max_batch),
+            hidden_layers: hidden.buffers(max_batch),
             hidden,
             gates: Layer::new(hidden_size + width, 4 * width),
             policy: Layer::new(width, n_outputs),
@@ -63,7 +63,7 @@ impl Recurrent {
         }
     }
 
-    /// Takes over weights in the order of [`PolicySpec::layout`] from the front of `numbers`, which move on.
+    /// Loads weights in the order of [`PolicySpec::layout`] from the front of `numbers`, and removes them there.
     pub(crate) fn load(&mut self, numbers: &mut &[f32]) {
         self.hidden.load(numbers);
         self.gates.load_inputs(0, take(numbers, 4 * self.width * self.hidden_size));
@@ -73,7 +73,7 @@ impl Recurrent {
         self.value.load(numbers);
     }
 
-    /// One step of environments 0 … `n_envs`-1, which remember it: rows of the policy's outputs and of the values.
+    /// Computes the rows of the policy's outputs and of the values for environments 0 … `n_envs`-1, and moves their memories on.
     pub(crate) fn advance(&mut self, observations: &[f32], n_envs: usize) -> (RowsFrom<'_>, RowsFrom<'_>) {
         self.step(observations, 0..n_envs);
         for (n, memory) in self.memory.chunks_exact_mut(2 * self.width).take(n_envs).enumerate() {
@@ -82,7 +82,7 @@ impl Recurrent {
         (self.outputs.from(0), self.values.from(0))
     }
 
-    /// Rows of the values of `observations` in `environments`; memories stay.
+    /// Computes the rows of the values of `observations` in `environments`. The memories stay.
     pub(crate) fn values(
         &mut self,
         observations: &[f32],
@@ -100,7 +100,7 @@ impl Recurrent {
         &self.memory
     }
 
-    /// The same, to be overwritten.
+    /// The memories, to be overwritten.
     pub(crate) fn memory_mut(&mut self) -> &mut [f32] {
         &mut self.memory
     }

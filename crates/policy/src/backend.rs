@@ -22,7 +22,7 @@ pub fn gradient_backend(spec: &PolicySpec, threads: usize) -> Result<Box<dyn Gra
     })
 }
 
-/// The backend of recurrent policies. It gets the weights with each gradient, and keeps none.
+/// The backend of recurrent policies. Each gradient gets the weights anew, so that none are cached.
 struct RecurrentBackend(Box<dyn RecurrentDifferentiator>);
 
 impl GradientBackend for RecurrentBackend {

@@ -1,6 +1,6 @@
-//! How much is collected between two updates, and what is left of it.
+//! The amount of experience between two updates, and the part that is still to be collected.
 
-/// How much a learner collects between two updates.
+/// The amount of experience that a learner collects between two updates.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CollectUntil {
     /// T steps of each environment. Episodes continue from one rollout to the next.

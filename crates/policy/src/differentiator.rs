@@ -15,8 +15,8 @@ use crate::perceptron::{Backward, Forward};
 use crate::samples::{Samples, SequenceSamples};
 use crate::spec::PolicySpec;
 
-/// The most parts of a minibatch, and so the most threads that work on one.
-const MOST_PARTS: usize = 16;
+/// Maximal number of parts of a minibatch, and so of threads that work on one.
+const MAX_PARTS: usize = 16;
 
 /// Differentiates losses of a feed-forward policy.
 ///
@@ -32,22 +32,22 @@ pub struct Differentiator {
     parts: Vec<Part>,
     /// Whether `networks` have the weights that the next gradient is for.
     is_current: bool,
-    /// Rows of the first part that hold what the networks compute of the observations in them.
+    /// Number of rows of the first part whose activations an actor has computed.
     computed: usize,
-    /// None: the calling thread does everything.
+    /// The other threads; `None` if the calling thread does everything.
     threads: Option<ThreadPool>,
 }
 
-/// Room for a part of a minibatch.
+/// Buffers for a part of a minibatch.
 #[derive(Debug)]
 struct Part {
     block: Block,
-    /// `[P]` the derivatives of the part's losses; the first part's go to who asked.
+    /// `[P]` the derivatives of the part's losses. Empty in the first part, which writes to the caller's gradient.
     gradient: Vec<f32>,
     losses: Losses,
 }
 
-/// A block of samples on the way there and back.
+/// Buffers for the forward and backward pass of a block of samples.
 #[derive(Debug)]
 struct Block {
     activations: Activations,
@@ -66,12 +66,12 @@ impl Block {
 }
 
 impl Differentiator {
-    /// Room for the gradient of policies of shape `spec`, computed by `threads` threads, at least 1; more than 16 are not used.
+    /// A differentiator of policies of shape `spec` that computes with `threads` threads, at least 1; more than 16 are not used.
     ///
     /// # Errors
-    /// [`Error::Threads`] if the system starts no more.
+    /// [`Error::Threads`] if the threads cannot be started.
     pub fn new(spec: &PolicySpec, threads: usize) -> Result<Self> {
-        let others = threads.min(MOST_PARTS) - 1;
+        let others = threads.min(MAX_PARTS) - 1;
         let pool = || ThreadPoolBuilder::new().num_threads(others).build();
         let threads = (others > 0).then(pool).transpose();
         Ok(Differentiator {
@@ -86,7 +86,7 @@ impl Differentiator {
         })
     }
 
-    /// Takes over weights `[P]`.
+    /// Loads weights `[P]`.
     ///
     /// # Errors
     /// Another length.
@@ -104,9 +104,9 @@ impl Differentiator {
         if self.is_current { Ok(()) } else { self.load(weights) }
     }
 
-    /// Takes over the networks of an actor that has the weights, which is quicker than to load them, and says whether it
-    /// did: they must be of this shape. The actor has others then, and refuses to act until it has loaded weights
-    /// ([`Error::NoWeights`]). What [it has kept](Actor::keep_activations) need not be computed again.
+    /// Takes the networks of an actor that has the weights, which is quicker than loading them, with the activations that [it
+    /// has cached](Actor::keep_activations). Returns whether the actor has this shape; otherwise nothing happens. The actor gets
+    /// other networks, and refuses to act until it has loaded weights ([`Error::NoWeights`]).
     #[must_use]
     pub fn load_from(&mut self, actor: &mut Actor) -> bool {
         self.make_parts(1);
@@ -116,7 +116,7 @@ impl Differentiator {
         true
     }
 
-    /// Makes room for so many parts.
+    /// Adds buffers until there are `n` parts.
     fn make_parts(&mut self, n: usize) {
         while self.parts.len() < n {
             let length = if self.parts.is_empty() { 0 } else { self.n_weights };
@@ -125,7 +125,7 @@ impl Differentiator {
         }
     }
 
-    /// Whether the first part has the activations of just the samples at `indices`: whoever acted kept them.
+    /// Whether the first part has the cached activations of exactly the samples at `indices`.
     fn has_computed(&self, samples: &Samples<'_>, indices: &[u32]) -> bool {
         let size = self.spec.observation_size;
         let are_all = indices.len() == self.computed && indices.iter().enumerate().all(|(b, &i)| i as usize == b);
@@ -136,14 +136,14 @@ impl Differentiator {
             })
     }
 
-    /// The losses of the samples at `indices`, and in `gradient` `[P]` the derivatives of their total by `weights` `[P]`,
-    /// which are those that were loaded.
+    /// Writes the derivatives of the total loss of the samples at `indices` by `weights` `[P]`, which must be those that were
+    /// loaded, to `gradient` `[P]`. Returns the losses.
     ///
     /// # Errors
     /// Lengths that do not fit, or no indices.
     ///
     /// # Panics
-    /// If an index is not one of a sample, or a discrete action is not in 0 … n-1.
+    /// If an index is out of range, or a discrete action is not in 0 … n-1.
     pub fn gradient_at(
         &mut self,
         weights: &[f32],
@@ -158,11 +158,11 @@ impl Differentiator {
         if indices.is_empty() {
             return Err(Error::NoSamples);
         }
-        let n_parts = indices.len().div_ceil(BLOCK).min(MOST_PARTS);
+        let n_parts = indices.len().div_ceil(BLOCK).min(MAX_PARTS);
         self.make_parts(n_parts);
         let is_computed = self.has_computed(samples, indices);
         if !is_computed {
-            self.computed = 0; // from here on the rows are others
+            self.computed = 0; // the rows are overwritten below
         }
         let (mean, scale) = if objective.normalize_advantages { samples.mean_and_scale(indices) } else { (0.0, 1.0) };
         let Self { spec, networks, gaussian, parts, threads, .. } = self;
@@ -177,7 +177,7 @@ impl Differentiator {
         };
         let parts = &mut parts[..n.div_ceil(size)];
         match threads {
-            // To wake a thread takes about as long as a part.
+            // Waking a thread takes about as long as computing a part.
             Some(pool) if parts.len() > 2 => {
                 let share = parts.len().div_ceil(pool.current_num_threads() + 1).max(2);
                 pool.in_place_scope(|scope| {
@@ -197,7 +197,7 @@ impl Differentiator {
                 parts.iter_mut().enumerate().for_each(|(k, part)| work(k, part, gradient.take()));
             }
         }
-        // In order, whoever came first.
+        // In order of parts, whichever thread ended first.
         let mut losses = Losses::default();
         for (place, part) in parts.iter().enumerate() {
             losses += part.losses;
@@ -281,20 +281,21 @@ impl Kernel for Add<'_> {
     }
 }
 
-/// What the parts of a minibatch have in common.
+/// The inputs that all parts of a minibatch share.
 struct Shared<'a> {
     spec: &'a PolicySpec,
     networks: &'a Networks,
     gaussian: &'a Gaussian,
     weights: &'a [f32],
     samples: &'a Samples<'a>,
-    /// Whether their activations are there.
+    /// Whether the samples' activations are cached.
     is_computed: bool,
     objective: &'a Objective,
-    /// Of the advantages, and what the distance from it is multiplied with.
+    /// Mean of the advantages.
     mean: f32,
+    /// Factor for their distance from the mean.
     scale: f32,
-    /// Samples in the minibatch.
+    /// Number of samples in the minibatch.
     n: usize,
 }
 
@@ -319,7 +320,8 @@ impl Kernel for Differentiation<'_> {
 }
 
 impl Differentiation<'_> {
-    /// The samples at `indices`; with `ADD` the sums go on.
+    /// The forward pass, the losses and the backward pass of the samples at `indices`, at most [`BLOCK`]. With `ADD` the
+    /// derivatives are added to the sums.
     #[inline(always)]
     fn block<S: Simd, const ADD: bool>(&mut self, simd: S, indices: &[u32]) {
         let Block { activations, through_policy, through_value } = &mut *self.block;

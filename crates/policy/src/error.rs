@@ -1,4 +1,4 @@
-//! What can go wrong with a policy's arrays and numbers.
+//! Errors of a policy's arrays and numbers.
 
 /// A failure of a policy, a normaliser or a gradient step.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -33,9 +33,9 @@ pub enum Error {
     /// A number that must be finite is not.
     #[error("{what} became {value} at update {update}; lower the learning rate, or look for very large rewards")]
     NotFinite {
-        /// What became infinite or NaN, e.g. "the loss".
+        /// The quantity, e.g. "the loss".
         what: &'static str,
-        /// Its value: NaN, inf or -inf.
+        /// The value: NaN, inf or -inf.
         value: f64,
         /// Index of the gradient step, from 0.
         update: u64,
@@ -45,7 +45,7 @@ pub enum Error {
         "the policy's output in environment {environment} is not finite; its weights or observation hold NaN or inf"
     )]
     PolicyOutput {
-        /// Which of the N environments.
+        /// The environment, 0 … N-1.
         environment: usize,
     },
     /// A policy was to act whose networks were given away.
@@ -57,9 +57,9 @@ pub enum Error {
     /// The system starts no more threads.
     #[error("{wanted} threads cannot be started: {reason}; ask for fewer")]
     Threads {
-        /// How many were to be started.
+        /// Number of threads to start.
         wanted: usize,
-        /// What the system says.
+        /// The system's message.
         reason: String,
     },
     /// Nothing is registered that differentiates recurrent policies.
@@ -68,17 +68,17 @@ pub enum Error {
     /// The library that differentiates recurrent policies refused an operation.
     #[error("{library}: {reason}")]
     Library {
-        /// Its name.
+        /// The library's name.
         library: &'static str,
-        /// What it says.
+        /// The library's message.
         reason: String,
     },
-    /// Statistics that none can be.
+    /// Impossible statistics.
     #[error("the statistics of {name} cannot be right: {reason}")]
     Statistics {
-        /// Of what.
+        /// The normalised quantity: observations or rewards.
         name: &'static str,
-        /// What is wrong.
+        /// The reason.
         reason: String,
     },
     /// An input that must be finite is not.

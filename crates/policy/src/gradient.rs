@@ -47,7 +47,7 @@ pub trait GradientBackend {
 /// A rollout as M sequences, each of which the policy must see whole. A recurrent policy needs the steps of an environment
 /// in order: M = N. A feed-forward one takes every sample by itself: M = T·N, or those of them that are samples.
 pub enum Batch<'a> {
-    /// Of a feed-forward policy.
+    /// A batch of a feed-forward policy.
     FeedForward {
         /// The rollout.
         samples: Samples<'a>,
@@ -56,7 +56,7 @@ pub enum Batch<'a> {
         /// The distributions of the policy that acted, if they were remembered.
         acting: Option<ActingOutputs>,
     },
-    /// Of a recurrent policy.
+    /// A batch of a recurrent policy.
     Recurrent(Box<dyn RecurrentBatch>),
 }
 

@@ -1,56 +1,56 @@
-//! What a policy gets to see.
+//! The inputs of a policy.
 
-use crate::act::Acts;
+use crate::act::ActorOutput;
 use crate::error::{Result, check_length};
 use crate::spec::ActionKind;
 
-/// Makes a policy's inputs of observations: these as they are or, for RL², each with what the policy did in the step
-/// before and what came of it, (s_t, a_{t-1}, r_{t-1}, d_{t-1}), Duan et al. (2016), arXiv:1611.02779, section 2.2:
+/// Makes a policy's inputs from observations: the observations as they are or, for RL², each with the action of the previous
+/// step and its result, (s_t, a_{t-1}, r_{t-1}, d_{t-1}), Duan et al. (2016), arXiv:1611.02779, section 2.2:
 ///
 /// - s_t `[O]`: the observation, normalised;
 /// - a_{t-1}: one-hot `[n]` if actions are discrete, else as sampled `[A]`;
 /// - r_{t-1}: the reward, normalised;
-/// - d_{t-1}: 1 if it ended an episode, else 0.
+/// - d_{t-1}: 1 if the step ended an episode, else 0.
 ///
 /// The last three are 0 at the start of a trial.
 #[derive(Clone, Debug)]
 pub struct Inputs {
     observation_size: usize,
     action: ActionKind,
-    /// `[N, E]` what stands beside the observations, E = 0 if nothing does.
-    last: Vec<f32>,
-    /// E.
+    /// `[N, E]` the previous steps: action, reward and done flag. E = 0 if inputs are observations alone.
+    previous: Vec<f32>,
+    /// E, the length of a previous step.
     extra: usize,
     rows: Vec<f32>,
 }
 
 impl Inputs {
-    /// Inputs of N = `n_envs` environments at the start of a trial. `with_outcomes` adds the last action, reward and done
+    /// Inputs of N = `n_envs` environments at the start of a trial. `with_previous_step` adds the last action, reward and done
     /// flag.
-    pub fn new(observation_size: usize, action: ActionKind, n_envs: usize, with_outcomes: bool) -> Self {
-        let extra = if with_outcomes { action.outputs() + 2 } else { 0 };
-        Inputs { observation_size, action, last: vec![0.0; n_envs * extra], extra, rows: Vec::new() }
+    pub fn new(observation_size: usize, action: ActionKind, n_envs: usize, with_previous_step: bool) -> Self {
+        let extra = if with_previous_step { action.outputs() + 2 } else { 0 };
+        Inputs { observation_size, action, previous: vec![0.0; n_envs * extra], extra, rows: Vec::new() }
     }
 
-    /// O.
+    /// O, the length of an observation.
     pub fn observation_size(&self) -> usize {
         self.observation_size
     }
 
-    /// I: numbers in an input, O + E.
+    /// I = O + E, the length of an input.
     pub fn size(&self) -> usize {
         self.observation_size + self.extra
     }
 
     /// The inputs `[N, I]` of `observations` `[N, O]`.
-    pub fn of<'a>(&'a mut self, observations: &'a [f32]) -> &'a [f32] {
+    pub fn from_observations<'a>(&'a mut self, observations: &'a [f32]) -> &'a [f32] {
         let n_envs = observations.len() / self.observation_size;
         self.rows(observations, 0..n_envs, false)
     }
 
-    /// The inputs `[K, I]` of final observations `[K, O]` of `environments` `[K]`: those after the step that was remembered
-    /// last, as if no episode had ended.
-    pub fn of_finals<'a>(&'a mut self, observations: &'a [f32], environments: &[usize]) -> &'a [f32] {
+    /// The inputs `[K, I]` of final observations `[K, O]` of `environments` `[K]`, after the step that was remembered last, as
+    /// if no episode had ended.
+    pub fn from_final_observations<'a>(&'a mut self, observations: &'a [f32], environments: &[usize]) -> &'a [f32] {
         self.rows(observations, environments.iter().copied(), true)
     }
 
@@ -66,7 +66,7 @@ impl Inputs {
         self.rows.clear();
         for (observation, environment) in observations.chunks_exact(self.observation_size).zip(environments) {
             self.rows.extend_from_slice(observation);
-            self.rows.extend_from_slice(&self.last[environment * self.extra..][..self.extra]);
+            self.rows.extend_from_slice(&self.previous[environment * self.extra..][..self.extra]);
             if let (true, Some(done)) = (unended, self.rows.last_mut()) {
                 *done = 0.0;
             }
@@ -74,20 +74,19 @@ impl Inputs {
         &self.rows
     }
 
-    /// Remembers what was done in a step and what came of it: normalised `rewards` `[N]`, and `done` `[N]` where an episode
-    /// ended.
+    /// Remembers a step: its actions, normalised `rewards` `[N]`, and `done` `[N]` where an episode ended.
     ///
     /// # Errors
     /// Lengths that do not fit.
-    pub fn remember(&mut self, acts: &Acts, rewards: &[f32], done: &[bool]) -> Result<()> {
+    pub fn remember(&mut self, acts: &ActorOutput, rewards: &[f32], done: &[bool]) -> Result<()> {
         if self.extra == 0 {
             return Ok(());
         }
-        let (n_envs, width) = (self.last.len() / self.extra, self.action.width());
+        let (n_envs, width) = (self.previous.len() / self.extra, self.action.width());
         check_length("actions [N, A]", acts.actions.len(), n_envs * width)?;
         check_length("rewards [N]", rewards.len(), n_envs)?;
         check_length("done [N]", done.len(), n_envs)?;
-        let rows = self.last.chunks_exact_mut(self.extra).zip(acts.actions.chunks_exact(width));
+        let rows = self.previous.chunks_exact_mut(self.extra).zip(acts.actions.chunks_exact(width));
         for ((row, action), (reward, done)) in rows.zip(rewards.iter().zip(done)) {
             let (chosen, outcome) = row.split_at_mut(self.extra - 2);
             match self.action {
@@ -103,23 +102,23 @@ impl Inputs {
         Ok(())
     }
 
-    /// A new trial begins in `environment`.
+    /// Clears the previous step of `environment`, at the start of a trial.
     pub fn forget(&mut self, environment: usize) {
-        self.last[environment * self.extra..][..self.extra].fill(0.0);
+        self.previous[environment * self.extra..][..self.extra].fill(0.0);
     }
 
-    /// `[N, E]` what stands beside the next observations.
-    pub fn outcomes(&self) -> &[f32] {
-        &self.last
+    /// `[N, E]` the previous steps of all environments.
+    pub fn previous_steps(&self) -> &[f32] {
+        &self.previous
     }
 
-    /// Replaces it by what [`Inputs::outcomes`] gave.
+    /// Restores the previous steps that [`Inputs::previous_steps`] returned.
     ///
     /// # Errors
     /// Another length.
-    pub fn restore(&mut self, outcomes: &[f32]) -> Result<()> {
-        check_length("outcomes [N, E]", outcomes.len(), self.last.len())?;
-        self.last.copy_from_slice(outcomes);
+    pub fn restore(&mut self, previous_steps: &[f32]) -> Result<()> {
+        check_length("previous steps [N, E]", previous_steps.len(), self.previous.len())?;
+        self.previous.copy_from_slice(previous_steps);
         Ok(())
     }
 }
@@ -130,38 +129,45 @@ mod tests {
 
     const DISCRETE: ActionKind = ActionKind::Discrete { n: 3 };
 
-    fn acts(kind: ActionKind, actions: &[f32]) -> Acts {
-        Acts { actions: actions.to_vec(), ..Acts::new(kind, 2) }
+    fn acts(kind: ActionKind, actions: &[f32]) -> ActorOutput {
+        ActorOutput { actions: actions.to_vec(), ..ActorOutput::new(kind, 2) }
     }
 
     #[test]
-    fn observations_alone_are_passed_on() {
+    fn plain_inputs_are_the_observations() {
         let mut inputs = Inputs::new(2, DISCRETE, 2, false);
         inputs.remember(&acts(DISCRETE, &[1.0, 2.0]), &[0.5, 0.5], &[false, true]).unwrap();
         inputs.forget(1);
-        assert_eq!((inputs.size(), inputs.of(&[1.0, 2.0, 3.0, 4.0])), (2, &[1.0, 2.0, 3.0, 4.0][..]));
+        assert_eq!((inputs.size(), inputs.from_observations(&[1.0, 2.0, 3.0, 4.0])), (2, &[1.0, 2.0, 3.0, 4.0][..]));
     }
 
     #[test]
-    fn an_input_has_the_last_action_reward_and_done_flag_beside_the_observation() {
+    fn rl2_inputs_have_the_previous_step() {
         let mut inputs = Inputs::new(1, DISCRETE, 2, true);
         assert_eq!(inputs.size(), 1 + 3 + 1 + 1);
-        assert_eq!(inputs.of(&[7.0, 8.0]), [7.0, 0.0, 0.0, 0.0, 0.0, 0.0, 8.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+        assert_eq!(inputs.from_observations(&[7.0, 8.0]), [7.0, 0.0, 0.0, 0.0, 0.0, 0.0, 8.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
         inputs.remember(&acts(DISCRETE, &[2.0, 0.0]), &[0.5, -0.5], &[false, true]).unwrap();
-        assert_eq!(inputs.of(&[7.0, 8.0]), [7.0, 0.0, 0.0, 1.0, 0.5, 0.0, 8.0, 1.0, 0.0, 0.0, -0.5, 1.0]);
-        assert_eq!(inputs.of_finals(&[9.0], &[1]), [9.0, 1.0, 0.0, 0.0, -0.5, 0.0], "nothing has ended");
+        assert_eq!(
+            inputs.from_observations(&[7.0, 8.0]),
+            [7.0, 0.0, 0.0, 1.0, 0.5, 0.0, 8.0, 1.0, 0.0, 0.0, -0.5, 1.0]
+        );
+        assert_eq!(inputs.from_final_observations(&[9.0], &[1]), [9.0, 1.0, 0.0, 0.0, -0.5, 0.0], "nothing has ended");
         inputs.forget(1);
-        assert_eq!(inputs.of(&[7.0, 8.0])[6..], [8.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
-        assert_eq!(inputs.of(&[7.0, 8.0])[..6], [7.0, 0.0, 0.0, 1.0, 0.5, 0.0], "the other's trial goes on");
+        assert_eq!(inputs.from_observations(&[7.0, 8.0])[6..], [8.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+        assert_eq!(
+            inputs.from_observations(&[7.0, 8.0])[..6],
+            [7.0, 0.0, 0.0, 1.0, 0.5, 0.0],
+            "the other's trial goes on"
+        );
 
         let kind = ActionKind::Continuous { size: 2 };
         let mut inputs = Inputs::new(1, kind, 2, true);
         inputs.remember(&acts(kind, &[0.1, 0.2, 0.3, 0.4]), &[1.0, 2.0], &[true, false]).unwrap();
-        assert_eq!(inputs.of(&[7.0, 8.0]), [7.0, 0.1, 0.2, 1.0, 1.0, 8.0, 0.3, 0.4, 2.0, 0.0]);
-        let saved = inputs.outcomes().to_vec();
+        assert_eq!(inputs.from_observations(&[7.0, 8.0]), [7.0, 0.1, 0.2, 1.0, 1.0, 8.0, 0.3, 0.4, 2.0, 0.0]);
+        let saved = inputs.previous_steps().to_vec();
         inputs.forget(0);
         inputs.restore(&saved).unwrap();
-        assert_eq!(inputs.of(&[7.0, 8.0])[..5], [7.0, 0.1, 0.2, 1.0, 1.0]);
+        assert_eq!(inputs.from_observations(&[7.0, 8.0])[..5], [7.0, 0.1, 0.2, 1.0, 1.0]);
         assert!(inputs.restore(&[1.0]).is_err());
     }
 }

@@ -14,7 +14,7 @@ pub(crate) type Lane = [f32; LANES];
 
 /// Work that is compiled for every kind of vector unit.
 pub(crate) trait Kernel {
-    /// Does it with vectors of `simd`. To be inlined.
+    /// Runs with vectors of `simd`. Must be inlined.
     fn run<S: Simd>(self, simd: S);
 }
 
@@ -30,19 +30,19 @@ impl<K: Kernel> WithSimd for Compiled<K> {
     }
 }
 
-/// Does `kernel` with the widest vectors that this processor has.
+/// Runs `kernel` with the widest vectors that this processor has.
 pub(crate) fn run(kernel: impl Kernel) {
     Arch::new().dispatch(Compiled(kernel));
 }
 
-/// Does `kernel`, a part of another one, with the vectors of that one. The code is compiled once for each kind of vector unit,
-/// and not once for each place that calls it.
+/// Runs `kernel`, a part of another kernel, with the same vectors. The code is compiled once for each kind of vector unit, and not
+/// once for each place that calls it.
 #[inline(never)]
 pub(crate) fn call<S: Simd>(simd: S, kernel: impl Kernel) {
     simd.vectorize(Compiled(kernel));
 }
 
-/// [`LANES`] that `n` numbers fill.
+/// Number of lanes that hold `n` numbers.
 pub(crate) const fn lanes(n: usize) -> usize {
     n.div_ceil(LANES)
 }
@@ -75,13 +75,13 @@ impl Rows {
         Rows { width: lanes(length), data: vec![[0.0; LANES]; n * lanes(length)] }
     }
 
-    /// Row `n`, with what fills it up.
+    /// Row `n`, with its padding.
     #[inline(always)]
     pub(crate) fn row(&self, n: usize) -> &[f32] {
         self.data[n * self.width..][..self.width].as_flattened()
     }
 
-    /// The same, to be changed.
+    /// Row `n` with its padding, to be changed.
     #[inline(always)]
     pub(crate) fn row_mut(&mut self, n: usize) -> &mut [f32] {
         self.data[n * self.width..][..self.width].as_flattened_mut()
@@ -106,13 +106,13 @@ impl Rows {
         &self.data[..n * self.width]
     }
 
-    /// The same, to be changed.
+    /// The first `n` rows, to be changed.
     #[inline(always)]
     pub(crate) fn lanes_mut(&mut self, n: usize) -> &mut [Lane] {
         &mut self.data[..n * self.width]
     }
 
-    /// tanh of `rows`.
+    /// Replaces `rows` by their tanh.
     #[inline(always)]
     pub(crate) fn squash(&mut self, rows: Range<usize>) {
         for lane in &mut self.data[rows.start * self.width..rows.end * self.width] {
@@ -122,7 +122,7 @@ impl Rows {
         }
     }
 
-    /// Multiplies the first `n` rows, derivatives by a tanh, by 1 - tanh²: `tanhs` are what the tanh gave.
+    /// Multiplies the first `n` rows, derivatives by a tanh, by 1 - tanh². `tanhs` are the results of the tanh.
     #[inline(always)]
     pub(crate) fn differentiate_tanh(&mut self, tanhs: &Rows, n: usize) {
         for (lane, tanhs) in self.lanes_mut(n).iter_mut().zip(tanhs.lanes(n)) {

@@ -1,7 +1,7 @@
-//! A policy as portable arithmetic, the same bytes on every processor: what it is ([`PolicySpec`], [`Weights`]), how it acts
-//! ([`Actor`]), what stands between an environment and it ([`Inputs`], [`Normalisers`]), how it plays ([`Player`]), and how
-//! a feed-forward one learns ([`Objective`], [`Differentiator`], [`Descent`]). Plain f32 loops, without libtorch, which
-//! [differentiates recurrent ones](register_recurrent) where it is.
+//! A policy as portable arithmetic, with the same bytes on every processor: its shape and weights ([`PolicySpec`],
+//! [`Weights`]), acting ([`Actor`]), inputs and normalisation ([`Inputs`], [`Normalisers`]), playing ([`Player`]), and the
+//! learning of feed-forward policies ([`Objective`], [`Differentiator`], [`Optimiser`]). Plain f32 loops, without libtorch.
+//! libtorch [differentiates recurrent policies](register_recurrent) in programs that have it.
 #![forbid(unsafe_code)]
 #![deny(clippy::disallowed_methods)]
 
@@ -32,7 +32,7 @@ mod samples;
 mod spec;
 mod weights;
 
-pub use act::{Actor, Acts, Streams};
+pub use act::{Actor, ActorOutput, Streams};
 pub use backend::gradient_backend;
 pub use collect_until::{CollectUntil, EpisodeQuotas, Remaining};
 pub use differentiator::Differentiator;
@@ -44,8 +44,8 @@ pub use losses::Losses;
 pub use normaliser::{ObservationNormaliser, RewardNormaliser, RunningMoments};
 pub use normalisers::{Normalisers, Statistics};
 pub use objective::{Acting, Objective, Surrogate};
-pub use optimiser::{Adam, Descent, Optimiser, RmsProp};
-pub use player::{Ended, Outcome, Player, PlayerState, Role, RolloutStep, TrialStreams};
+pub use optimiser::{Adam, Optimiser, RmsProp, UpdateRule};
+pub use player::{Player, PlayerState, Role, RolloutStep, SlotEnd, StepOutcome, TrialStreams};
 pub use recurrent::{
     MakeRecurrent, RecurrentBatch, RecurrentDifferentiator, has_recurrent, recurrent_differentiator, register_recurrent,
 };

@@ -1,6 +1,6 @@
 //! Running normalisation of observations and rewards, as stable-baselines3's VecNormalize.
 //!
-//! In training, call `update` and then `normalise`; in testing only `normalise`, which changes nothing. All state is
+//! In training, call `update` and then `normalise`; in testing only `normalise`, which changes no statistics. All state is
 //! f64 and serde-serialisable, and is part of a checkpoint.
 //!
 //! The reference starts its variances from a prior of 1 with the weight of 10⁻⁴ samples. Here there is none: the
@@ -26,17 +26,17 @@ pub struct RunningMoments {
 }
 
 impl RunningMoments {
-    /// Nothing seen yet of vectors of `size` numbers.
+    /// Moments of vectors of `size` numbers, of which none was seen yet.
     pub fn new(size: usize) -> Self {
         RunningMoments { count: 0, mean: vec![0.0; size], squares: vec![0.0; size] }
     }
 
-    /// The moments with these numbers, as they were saved.
+    /// Moments with saved numbers.
     pub fn from_parts(count: u64, mean: Vec<f64>, squares: Vec<f64>) -> Self {
         RunningMoments { count, mean, squares }
     }
 
-    /// Takes in `rows` of `size` numbers: their own moments, in two passes, and then these merged.
+    /// Adds `rows` of `size` numbers: computes their own moments in two passes, and merges them.
     fn take<'a>(&mut self, rows: impl Iterator<Item = &'a [f32]> + Clone) {
         let count = rows.clone().count();
         for i in 0..self.mean.len() {
@@ -45,7 +45,7 @@ impl RunningMoments {
         self.count += count as u64;
     }
 
-    /// Takes in element `i` of `count` vectors, which are yet to be counted.
+    /// Adds element `i` of `count` vectors, which the caller counts afterwards.
     fn take_column(&mut self, i: usize, count: usize, column: impl Iterator<Item = f64> + Clone) {
         if count > 0 {
             let mean = column.clone().sum::<f64>() / count as f64;
@@ -54,8 +54,8 @@ impl RunningMoments {
         }
     }
 
-    /// Takes in what `other` has seen, so that the result is that of having seen both, in any order, up to rounding
-    /// (Chan, Golub and LeVeque, 1979): with δ = mean_b - mean_a,
+    /// Adds the vectors of `other`. The result is that of all vectors in any order, up to rounding (Chan, Golub and LeVeque,
+    /// 1979): with δ = mean_b - mean_a,
     /// mean = mean_a + δ n_b/n and squares = squares_a + squares_b + δ² n_a n_b/n.
     pub fn merge(&mut self, other: &RunningMoments) -> Result<()> {
         check_length("moments", other.mean.len(), self.mean.len())?;
@@ -76,7 +76,7 @@ impl RunningMoments {
         self.squares[i] += squares + delta * delta * a * b / (a + b);
     }
 
-    /// Whether these can be moments of vectors of `size` numbers; says what is wrong if they cannot.
+    /// Checks that these can be moments of vectors of `size` numbers. The error is the reason why they cannot.
     fn check(&self, size: usize) -> std::result::Result<(), String> {
         for (name, numbers) in [("mean", &self.mean), ("squares", &self.squares)] {
             if numbers.len() != size {
@@ -116,13 +116,13 @@ impl RunningMoments {
     }
 }
 
-/// Normalises observations: (x - mean)/√(variance + 10⁻⁸) of every element, clipped to ±10, but for those at their end
-/// that are left alone.
+/// Normalises observations: (x - mean)/√(variance + 10⁻⁸) of every element, clipped to ±10. The last `left_alone` elements
+/// are not normalised.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ObservationNormaliser {
     moments: RunningMoments,
-    /// How many elements at the end are neither normalised nor taken in.
+    /// Number of elements at the end that are neither normalised nor added to the statistics.
     #[serde(default, skip_serializing_if = "is_zero")]
     left_alone: usize,
 }
@@ -132,24 +132,24 @@ fn is_zero(number: &usize) -> bool {
 }
 
 impl ObservationNormaliser {
-    /// Nothing seen yet of observations of O = `observation_size` numbers.
+    /// A normaliser of observations of O = `observation_size` numbers, of which none was seen yet.
     pub fn new(observation_size: usize) -> Self {
         Self::from_moments(RunningMoments::new(observation_size))
     }
 
-    /// One with these statistics.
+    /// A normaliser with these statistics.
     pub fn from_moments(moments: RunningMoments) -> Self {
         ObservationNormaliser { moments, left_alone: 0 }
     }
 
-    /// The same for observations with so many elements more, which are scaled already: parameters that are observed may
-    /// be the same in all of a training, and stretched without bound by statistics of it.
+    /// Adds `left_alone` elements at the end of observations, which are not normalised: observed parameters are scaled
+    /// already. They may be the same throughout a training, and statistics of it would stretch them without bound.
     #[must_use]
     pub fn leaving_alone(self, left_alone: usize) -> Self {
         ObservationNormaliser { left_alone, ..self }
     }
 
-    /// O.
+    /// O, the length of an observation.
     fn observation_size(&self) -> usize {
         self.moments.mean.len() + self.left_alone
     }
@@ -159,8 +159,8 @@ impl ObservationNormaliser {
         &self.moments
     }
 
-    /// Whether this can normalise observations of `observation_size` numbers, of which it leaves so many alone; says
-    /// what is wrong if it cannot.
+    /// Checks that this can normalise observations of `observation_size` numbers except the last `left_alone`. The error is the
+    /// reason why it cannot.
     pub fn check(&self, observation_size: usize, left_alone: usize) -> std::result::Result<(), String> {
         if self.left_alone != left_alone {
             return Err(format!("left_alone is {}, expected {left_alone}", self.left_alone));
@@ -173,7 +173,7 @@ impl ObservationNormaliser {
         self.update_active(observations, None)
     }
 
-    /// The same with the `active` `[N]` environments alone; what the others bring is passed over.
+    /// Adds the `observations` `[N, O]` of only the `active` `[N]` environments to the statistics.
     pub fn update_active(&mut self, observations: &[f32], active: Option<&[bool]>) -> Result<()> {
         let size = self.observation_size();
         check_length("observations [N, O]", observations.len(), observations.len() / size * size)?;
@@ -206,7 +206,7 @@ impl ObservationNormaliser {
 /// Normalises rewards: divides them by the standard deviation of the discounted returns R_t = γ R_{t-1} + r_t that every
 /// environment has had so far (Engstrom et al., 2020, arXiv:2005.12729), and clips to ±10. Their mean is kept.
 ///
-/// R starts at 0 in every episode, or trial, as in stable-baselines3, or runs on over their ends, as in the reference.
+/// R starts at 0 in every episode, or trial, as in stable-baselines3; or it runs on over their ends, as in the reference.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RewardNormaliser {
@@ -220,7 +220,7 @@ pub struct RewardNormaliser {
 }
 
 impl RewardNormaliser {
-    /// Nothing seen yet of N = `n_envs` environments; `gamma` is the discount factor per step.
+    /// A normaliser for N = `n_envs` environments, of which no reward was seen yet; `gamma` is the discount factor per step.
     pub fn new(n_envs: usize, gamma: f64) -> Self {
         Self::from_parts(gamma, vec![0.0; n_envs], RunningMoments::new(1))
     }
@@ -230,12 +230,12 @@ impl RewardNormaliser {
         &self.moments
     }
 
-    /// One that goes on from saved numbers: `gamma`, R `[N]` and the statistics.
+    /// A normaliser with saved numbers: `gamma`, R `[N]` and the statistics.
     pub fn from_parts(gamma: f64, returns: Vec<f64>, moments: RunningMoments) -> Self {
         RewardNormaliser { gamma, returns, moments, runs_on: false }
     }
 
-    /// The same, but for whether R runs on over the ends of episodes and trials.
+    /// Sets whether R runs on over the ends of episodes and trials.
     pub fn running_on(self, runs_on: bool) -> Self {
         RewardNormaliser { runs_on, ..self }
     }
@@ -255,8 +255,8 @@ impl RewardNormaliser {
         &self.returns
     }
 
-    /// Whether this is that of a training of `n_envs` environments with `gamma`, whose R runs on or not; says what is wrong if
-    /// it is not.
+    /// Checks that this belongs to a training of `n_envs` environments with `gamma`, whose R runs on or not. The error is the
+    /// difference.
     pub fn fits(&self, n_envs: usize, gamma: f64, runs_on: bool) -> std::result::Result<(), String> {
         if self.returns.len() != n_envs {
             return Err(format!("returns has {} numbers, expected {n_envs}", self.returns.len()));
@@ -273,7 +273,7 @@ impl RewardNormaliser {
         Ok(())
     }
 
-    /// Whether this can normalise rewards; says what is wrong if it cannot.
+    /// Checks that this can normalise rewards. The error is the reason why it cannot.
     pub fn check(&self) -> std::result::Result<(), String> {
         if !(0.0..=1.0).contains(&self.gamma) {
             return Err(format!("gamma is {}, but must be between 0 and 1", self.gamma));
@@ -291,7 +291,8 @@ impl RewardNormaliser {
         self.update_active(rewards, done, None)
     }
 
-    /// The same with the `active` `[N]` environments alone; what the others bring is passed over.
+    /// Adds a step's `rewards` `[N]` of only the `active` `[N]` environments to the statistics, see
+    /// [`RewardNormaliser::update`].
     pub fn update_active(&mut self, rewards: &[f32], done: &[bool], active: Option<&[bool]>) -> Result<()> {
         check_length("rewards [N]", rewards.len(), self.returns.len())?;
         check_length("done [N]", done.len(), self.returns.len())?;

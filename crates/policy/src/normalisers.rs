@@ -1,29 +1,30 @@
-//! What stands between an environment's numbers and a policy's.
+//! The normalisers between an environment and a policy.
 
 use crate::error::{Result, check_length};
 use crate::normaliser::{ObservationNormaliser, RewardNormaliser};
 
-/// Statistics; `None` where nothing is normalised.
+/// The normalisers of a policy; `None` where nothing is normalised.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Normalisers {
-    /// Of observations.
+    /// The normaliser of observations.
     pub observations: Option<ObservationNormaliser>,
-    /// Of rewards.
+    /// The normaliser of rewards.
     pub rewards: Option<RewardNormaliser>,
 }
 
-/// What normalisers do with what comes.
+/// Whether statistics are updated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Statistics {
-    /// They take it in, and normalise it with the updated statistics, as stable-baselines3's VecNormalize in training.
+    /// Numbers are added to the statistics, and normalised with the updated ones, as stable-baselines3's VecNormalize does in
+    /// training.
     Running,
-    /// They stay as they are.
+    /// Statistics stay as they are.
     Frozen,
 }
 
 impl Normalisers {
-    /// Normalises `observations` `[N, O]`, after running statistics have taken in those of the `active` `[N]`
-    /// environments, or all.
+    /// Normalises `observations` `[N, O]`, after adding those of the `active` `[N]` environments, or all, to running
+    /// statistics.
     pub(crate) fn take_observations(
         &mut self,
         observations: &mut [f32],
@@ -37,8 +38,8 @@ impl Normalisers {
         normaliser.normalise(observations)
     }
 
-    /// Normalises a step's `rewards` `[N]`, after running statistics have taken in those of the `active` `[N]`
-    /// environments, or all. `done` `[N]`: where the discounted return ends.
+    /// Normalises a step's `rewards` `[N]`, after adding those of the `active` `[N]` environments, or all, to running
+    /// statistics. `done` `[N]`: where the discounted return ends.
     pub(crate) fn take_rewards(
         &mut self,
         rewards: &mut [f32],
@@ -59,11 +60,10 @@ impl Normalisers {
         self.observations.as_ref().map_or(Ok(()), |normaliser| normaliser.normalise(observations))
     }
 
-    /// Whether these can normalise what N environments with observations of O numbers give, the last `left_alone` of
-    /// which are not normalised.
+    /// Checks that these fit N environments with observations of O numbers, the last `left_alone` of which are not normalised.
     ///
     /// # Errors
-    /// [`Error::Statistics`](crate::Error::Statistics) with what is wrong; [`Error::Length`](crate::Error::Length).
+    /// [`Error::Statistics`](crate::Error::Statistics) with the reason; [`Error::Length`](crate::Error::Length).
     pub fn check(&self, n_envs: usize, observation_size: usize, left_alone: usize) -> Result<()> {
         let named = |name| move |reason| crate::error::Error::Statistics { name, reason };
         if let Some(normaliser) = &self.observations {

@@ -1,4 +1,4 @@
-//! What an update minimises, and its derivatives by a policy's outputs.
+//! The loss that an update minimises, and its derivatives by a policy's outputs.
 
 use crate::losses::Losses;
 use crate::math::{exp, ln};
@@ -32,10 +32,10 @@ pub struct Objective {
     pub ent_coef: f64,
     /// Weight of the value loss.
     pub vf_coef: f64,
-    /// How far a value may move from the rollout's to its own advantage: the value loss is
-    /// 1/B Σ_b max((V_b - R_b)², (V_b' - R_b)²), V_b' = old_b + clip(V_b - old_b, -range, range), not in the paper on PPO, but
-    /// in the reference; the unit is that of the normalised rewards. None: 1/B Σ_b (V_b - R_b)², without the further ½ of
-    /// some versions of the reference.
+    /// Range by which a value may move from the rollout's and still lower the loss, in the unit of the normalised rewards. The
+    /// value loss is 1/B Σ_b max((V_b - R_b)², (V_b' - R_b)²) with V_b' = old_b + clip(V_b - old_b, -range, range). It is not in
+    /// the paper on PPO, but in the reference. `None`: 1/B Σ_b (V_b - R_b)², without the factor ½ of some versions of the
+    /// reference.
     pub value_clip_range: Option<f64>,
     /// Weight of the divergence from the acting policy, per nat.
     pub kl_coef: f64,
@@ -50,12 +50,12 @@ pub struct Acting<'a> {
     pub log_std: &'a [f32],
 }
 
-/// One sample.
+/// A sample of a rollout.
 pub(crate) struct Sample<'a> {
     pub(crate) action: &'a [f32],
     pub(crate) old_log_prob: f32,
     pub(crate) old_value: f32,
-    /// As it counts, normalised if it is to be.
+    /// The advantage, normalised if the objective says so.
     pub(crate) advantage: f32,
     pub(crate) return_: f32,
     /// The acting policy's logits or means, and log standard deviations.
@@ -82,17 +82,17 @@ impl Gaussian {
     }
 }
 
-/// The policy at one sample, and where the derivatives of the loss by its outputs go.
+/// The policy's outputs at one sample, and the buffers for the derivatives of the loss by them.
 pub(crate) struct Outputs<'a> {
     /// `[n]` logits, or `[A]` means.
     pub(crate) head: &'a [f32],
     pub(crate) gaussian: &'a Gaussian,
     pub(crate) value: f32,
-    /// As `head`; replaced.
+    /// Derivatives by `head`; replaced.
     pub(crate) by_head: &'a mut [f32],
-    /// `[A]`, by log σ; added to.
+    /// `[A]` derivatives by log σ; added to.
     pub(crate) by_log_std: &'a mut [f32],
-    /// Replaced.
+    /// The derivative by the value; replaced.
     pub(crate) by_value: &'a mut f32,
 }
 
@@ -114,7 +114,8 @@ impl Objective {
         means
     }
 
-    /// The losses of one of `n` samples, not divided by `n`; the derivatives are.
+    /// Computes the losses of one of `n` samples, and the derivatives by the policy's outputs. The derivatives are divided by
+    /// `n`, the losses are not.
     #[inline(always)]
     pub(crate) fn differentiate(
         &self,
@@ -194,11 +195,11 @@ impl Objective {
         let moved = value - sample.old_value;
         let error = sample.old_value + moved.clamp(-range as f32, range as f32) - sample.return_;
         let clipped = error * error;
-        // Where nothing is clipped the two are one, but for rounding.
+        // Where nothing is clipped, the two are equal up to rounding.
         if free.0 >= clipped || moved.abs() <= range as f32 { free } else { (clipped, 0.0) }
     }
 
-    /// The derivative of a sample's surrogate by its log-probability; what it comes to goes into `losses`.
+    /// The derivative of a sample's surrogate by its log-probability. Stores the surrogate's figures in `losses`.
     #[inline(always)]
     fn policy_loss(&self, log_prob: f32, sample: &Sample<'_>, losses: &mut Losses) -> f32 {
         let Surrogate::Clipped { range } = self.surrogate else {

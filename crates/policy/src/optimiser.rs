@@ -9,9 +9,9 @@ use crate::weights::{NamedArray, check_arrays};
 /// Numbers that are summed side by side; the order of a sum is fixed by it.
 const SUMS: usize = 8;
 
-/// What turns a gradient into a step.
+/// The rule that turns a gradient into a step.
 #[derive(Clone, Debug)]
-pub enum Optimiser {
+pub enum UpdateRule {
     /// RMSProp.
     RmsProp(RmsProp),
     /// Adam.
@@ -51,62 +51,62 @@ pub struct Adam {
 const BETA_1: f64 = 0.9;
 const BETA_2: f64 = 0.999;
 
-impl Optimiser {
+impl UpdateRule {
     /// RMSProp with decay α and ε for `n_weights`.
     pub fn rms_prop(alpha: f64, epsilon: f64, n_weights: usize) -> Self {
         let mean_square = vec![1.0; n_weights];
-        Optimiser::RmsProp(RmsProp { alpha: alpha as f32, epsilon: epsilon as f32, mean_square })
+        UpdateRule::RmsProp(RmsProp { alpha: alpha as f32, epsilon: epsilon as f32, mean_square })
     }
 
     /// Adam with ε for `n_weights`.
     pub fn adam(epsilon: f64, n_weights: usize) -> Self {
         let (mean, mean_square) = (vec![0.0; n_weights], vec![0.0; n_weights]);
-        Optimiser::Adam(Adam { epsilon: epsilon as f32, mean, mean_square })
+        UpdateRule::Adam(Adam { epsilon: epsilon as f32, mean, mean_square })
     }
 
-    /// One step on `weights` `[P]` against a gradient; `update` counts the steps before this one.
+    /// Makes a step on `weights` `[P]` against a gradient; `update` counts the steps before this one.
     fn step(&mut self, update: u64, step: Step<'_>) {
         match self {
-            Optimiser::RmsProp(state) => run(RmsPropStep { state, step }),
-            Optimiser::Adam(state) => run(AdamStep { state, update, step }),
+            UpdateRule::RmsProp(state) => run(RmsPropStep { state, step }),
+            UpdateRule::Adam(state) => run(AdamStep { state, update, step }),
         }
     }
 
     /// P.
     fn size(&self) -> usize {
         match self {
-            Optimiser::RmsProp(state) => state.mean_square.len(),
-            Optimiser::Adam(state) => state.mean.len(),
+            UpdateRule::RmsProp(state) => state.mean_square.len(),
+            UpdateRule::Adam(state) => state.mean.len(),
         }
     }
 
     /// The running averages, by name, each `[P]`.
     fn averages(&self) -> Vec<(&'static str, &[f32])> {
         match self {
-            Optimiser::RmsProp(state) => vec![("mean_square", &state.mean_square)],
-            Optimiser::Adam(state) => vec![("mean", &state.mean), ("mean_square", &state.mean_square)],
+            UpdateRule::RmsProp(state) => vec![("mean_square", &state.mean_square)],
+            UpdateRule::Adam(state) => vec![("mean", &state.mean), ("mean_square", &state.mean_square)],
         }
     }
 
-    /// The same, to be overwritten.
+    /// The running averages by name, to be overwritten.
     fn averages_mut(&mut self) -> Vec<(&'static str, &mut [f32])> {
         match self {
-            Optimiser::RmsProp(state) => vec![("mean_square", &mut state.mean_square)],
-            Optimiser::Adam(state) => vec![("mean", &mut state.mean), ("mean_square", &mut state.mean_square)],
+            UpdateRule::RmsProp(state) => vec![("mean_square", &mut state.mean_square)],
+            UpdateRule::Adam(state) => vec![("mean", &mut state.mean), ("mean_square", &mut state.mean_square)],
         }
     }
 }
 
-/// What both optimisers need of a step.
+/// The inputs of a step.
 struct Step<'a> {
     learning_rate: f64,
     /// `[P]`
     weights: &'a mut [f32],
     /// `[P]`
     gradient: &'a [f32],
-    /// What clipping leaves of the gradient, 0 … 1.
+    /// The share of the gradient that is left after clipping, 0 … 1.
     scale: f32,
-    /// What decay leaves of each weight, 0 … 1.
+    /// The share of each weight that is left after decay, 0 … 1.
     keep: f32,
 }
 
@@ -160,25 +160,25 @@ impl Kernel for AdamStep<'_> {
 /// w_i ← (1 - η λ) w_i - the optimiser's step,
 ///
 /// Loshchilov and Hutter (2019), arXiv:1711.05101, as libtorch's AdamW: what the optimiser divides gradients by does not
-/// divide the decay.
+/// divide the decay (the decay is decoupled).
 #[derive(Clone, Debug)]
-pub struct Descent {
-    optimiser: Optimiser,
+pub struct Optimiser {
+    optimiser: UpdateRule,
     max_grad_norm: f64,
     weight_decay: f64,
     n_updates: u64,
 }
 
-impl Descent {
-    /// Fresh; gradients longer than `max_grad_norm` are scaled down to it, and no weight decays.
-    pub fn new(optimiser: Optimiser, max_grad_norm: f64) -> Self {
-        Descent { optimiser, max_grad_norm, weight_decay: 0.0, n_updates: 0 }
+impl Optimiser {
+    /// A fresh optimiser. Gradients longer than `max_grad_norm` are scaled down to it, and no weight decays.
+    pub fn new(optimiser: UpdateRule, max_grad_norm: f64) -> Self {
+        Optimiser { optimiser, max_grad_norm, weight_decay: 0.0, n_updates: 0 }
     }
 
-    /// The same with a decay λ = `weight_decay`, at least 0.
+    /// Sets the decay λ = `weight_decay`, at least 0.
     #[must_use]
-    pub fn decaying(self, weight_decay: f64) -> Self {
-        Descent { weight_decay, ..self }
+    pub fn with_weight_decay(self, weight_decay: f64) -> Self {
+        Optimiser { weight_decay, ..self }
     }
 
     /// Gradient steps so far.
@@ -186,14 +186,14 @@ impl Descent {
         self.n_updates
     }
 
-    /// One step of `weights` `[P]` down the `gradient` `[P]` of a loss that came to `loss`. Gives the gradient's global norm
-    /// before clipping.
+    /// Makes a step of `weights` `[P]` down the `gradient` `[P]` of a loss whose value is `loss`. Returns the gradient's global
+    /// norm before clipping.
     ///
     /// Clipping scales the whole gradient by max_grad_norm/norm where norm > max_grad_norm, exactly, as TensorFlow's
     /// `clip_by_global_norm`; libtorch adds 1e-6 to the norm.
     ///
     /// # Errors
-    /// [`Error::NotFinite`] for a loss or a gradient that is not, [`Error::Length`]; nothing was changed then.
+    /// [`Error::NotFinite`] for a loss or a gradient that is not finite, [`Error::Length`]; nothing is changed then.
     pub fn step(&mut self, loss: f64, gradient: &[f32], weights: &mut [f32], learning_rate: f64) -> Result<f64> {
         check_length("gradient [P]", gradient.len(), self.optimiser.size())?;
         check_length("weights [P]", weights.len(), self.optimiser.size())?;
@@ -222,7 +222,7 @@ impl Descent {
         self.optimiser.averages().into_iter().map(array).collect()
     }
 
-    /// Goes on from a saved state.
+    /// Restores a saved state.
     ///
     /// # Errors
     /// [`Error::Arrays`] if it is another optimiser's.

@@ -22,17 +22,17 @@ impl Layer {
         Layer { inputs, outputs, matrix: Matrix::new(inputs, outputs), biases: vec![[0.0; LANES]; lanes(outputs)] }
     }
 
-    /// Takes over the weights [outputs, their number] of the inputs from `first` on.
+    /// Loads the weights [outputs, their number] of the inputs from `first` on.
     pub(crate) fn load_inputs(&mut self, first: usize, weights: &[f32]) {
         self.matrix.load(first, weights, self.outputs);
     }
 
-    /// Takes over biases `[outputs]`.
+    /// Loads biases `[outputs]`.
     pub(crate) fn load_biases(&mut self, biases: &[f32]) {
         self.biases.as_flattened_mut()[..biases.len()].copy_from_slice(biases);
     }
 
-    /// Takes over weights [outputs, inputs] and biases `[outputs]` from the front of `numbers`, which move on.
+    /// Loads weights [outputs, inputs] and biases `[outputs]` from the front of `numbers`, and removes them there.
     pub(crate) fn load(&mut self, numbers: &mut &[f32]) {
         self.load_inputs(0, take(numbers, self.outputs * self.inputs));
         self.load_biases(take(numbers, self.outputs));
@@ -61,7 +61,7 @@ pub(crate) struct Perceptron {
 }
 
 impl Perceptron {
-    /// Of layers with these inputs and outputs.
+    /// A perceptron whose layers have these numbers of inputs and outputs.
     pub(crate) fn new(layers: &[(usize, usize)], squash_last: bool) -> Self {
         Perceptron {
             layers: layers.iter().map(|&(inputs, outputs)| Layer::new(inputs, outputs)).collect(),
@@ -69,12 +69,12 @@ impl Perceptron {
         }
     }
 
-    /// Room for what the layers give for a batch of `n`.
-    pub(crate) fn room(&self, n: usize) -> Vec<Rows> {
+    /// Buffers for the layers' outputs for a batch of `n`.
+    pub(crate) fn buffers(&self, n: usize) -> Vec<Rows> {
         self.layers.iter().map(|layer| Rows::new(n, layer.outputs)).collect()
     }
 
-    /// Takes over the layers' weights and biases, by turns, from the front of `numbers`, which move on.
+    /// Loads weights and biases of each layer in turn from the front of `numbers`, and removes them there.
     pub(crate) fn load(&mut self, numbers: &mut &[f32]) {
         self.layers.iter_mut().for_each(|layer| layer.load(numbers));
     }
@@ -107,10 +107,10 @@ impl Kernel for Forward<'_> {
     }
 }
 
-/// The way back through a perceptron whose last layer is without tanh.
+/// The backward pass through a perceptron whose last layer is without tanh.
 #[derive(Clone, Debug)]
 pub(crate) struct Backward {
-    /// P: the number of its weights and biases.
+    /// P, the number of weights and biases.
     n_weights: usize,
     layers: Vec<LayerBackward>,
 }
@@ -119,12 +119,12 @@ pub(crate) struct Backward {
 struct LayerBackward {
     inputs: usize,
     outputs: usize,
-    /// Derivatives by this layer's outputs before their tanh, of a batch.
+    /// Derivatives by this layer's outputs before their tanh, for a batch.
     deltas: Rows,
 }
 
 impl Backward {
-    /// Through `perceptron`, with room for batches of `n`.
+    /// The backward pass through `perceptron`, with buffers for batches of `n`.
     pub(crate) fn new(perceptron: &Perceptron, n: usize) -> Self {
         let of = |layer: &Layer| LayerBackward {
             inputs: layer.inputs,
@@ -135,19 +135,19 @@ impl Backward {
         Backward { n_weights: layers.iter().map(LayerBackward::n_weights).sum(), layers }
     }
 
-    /// P.
+    /// P, the number of weights and biases.
     pub(crate) fn n_weights(&self) -> usize {
         self.n_weights
     }
 
-    /// By the perceptron's outputs: to be filled before [`Backward::sum`].
+    /// The buffer for the derivatives by the perceptron's outputs, to be filled before [`Backward::sum`].
     pub(crate) fn by_outputs(&mut self) -> &mut Rows {
         let last = self.layers.len() - 1;
         &mut self.layers[last].deltas
     }
 
-    /// Puts the derivatives of a sum over the first `n` rows by `weights` `[P]` in `sums` `[P]`, or with `ADD` adds them:
-    /// `outputs` are what [`Perceptron::forward`] computed of `inputs`.
+    /// Writes the derivatives of a sum over the first `n` rows by `weights` `[P]` to `sums` `[P]`, or adds them with `ADD`.
+    /// `outputs` are those of [`Perceptron::forward`] for `inputs`.
     #[inline(always)]
     pub(crate) fn sum<S: Simd, const ADD: bool>(
         &mut self,

@@ -1,8 +1,8 @@
-//! A policy that plays in N environments, between whoever steps them and whoever learns.
+//! A policy that plays in N environments.
 
 use rand_chacha::ChaCha8Rng;
 
-use crate::act::{Actor, Acts, Streams};
+use crate::act::{Actor, ActorOutput, Streams};
 use crate::collect_until::Remaining;
 use crate::error::{Result, check_length};
 use crate::gradient::GradientBackend;
@@ -11,16 +11,15 @@ use crate::normalisers::{Normalisers, Statistics};
 use crate::random::{Purpose, normal, stream, trial_stream};
 use crate::spec::PolicySpec;
 
-/// Plays N environments with a policy: [`Player::act`] chooses actions, somebody steps the environments, and
-/// [`Player::observe`] takes what came of it. Learner and server play with the same code, so that they give the same
-/// bytes.
+/// Plays N environments with a policy: [`Player::act`] chooses actions, the caller steps the environments, and
+/// [`Player::observe`] takes the results. Learner and server play with the same code, so that they give the same bytes.
 ///
 /// Memories are emptied where a trial ends. In a trial of one episode that is the episode's end. In a trial of several
-/// (RL²) the policy's inputs tell it of the ends in between, and to whoever learns the trial is one episode: flags of
-/// ends in between are left out, and the discounted returns that rewards are divided by run on.
+/// episodes (RL²), the policy's inputs tell it of the ends in between. The learner treats such a trial as one episode: flags
+/// of ends in between are left out, and the discounted returns that rewards are divided by run on.
 ///
-/// Final observations are normalised with the statistics that have taken in the observations after them. Noise is on what
-/// actions are chosen on alone: neither on final observations nor in statistics.
+/// Final observations are normalised with statistics that include the observations after them. Noise is added only to the
+/// observations that actions are chosen on: neither to final observations nor to statistics.
 #[derive(Clone, Debug)]
 pub struct Player {
     actor: Actor,
@@ -29,27 +28,27 @@ pub struct Player {
     normalisers: Normalisers,
     observation_size: usize,
     episodes_per_trial: u32,
-    /// Standard deviation of what is added to observations in training, after normalisation.
+    /// Standard deviation of the noise that is added to normalised observations in training.
     noise: f64,
     /// `[N, O]` normalised observations that the next actions are chosen on.
     observations: Vec<f32>,
     /// `[N]` whether those are the first of a trial.
     starts: Vec<bool>,
-    /// What was played last.
-    last: Last,
-    /// Actions as the protocol wants them.
+    /// The previous step.
+    previous: PreviousStep,
+    /// Actions as the protocol encodes them.
     bytes: Vec<u8>,
     /// V of the present observations.
     values: Vec<f32>,
 }
 
-/// Where actions come from, and whether statistics run.
+/// The source of randomness for actions, and whether statistics run.
 #[derive(Clone, Debug)]
 #[allow(clippy::large_enum_variant)] // a player has one, and its stream is read at every action
 pub enum Role {
-    /// Statistics run, and one stream gives all noise and all actions, in the environments' order.
+    /// Statistics run. All noise and all actions come from one stream, in the environments' order.
     Training(ChaCha8Rng),
-    /// Statistics are frozen, and each trial has a stream of its own, see [`trial_stream`].
+    /// Statistics are frozen. Each trial has a stream of its own, see [`trial_stream`].
     Testing(TrialStreams),
 }
 
@@ -62,25 +61,25 @@ pub struct TrialStreams {
     streams: Vec<ChaCha8Rng>,
 }
 
-/// What stands beside a policy's weights and decides what it does next; all of a training's player but its normalisers.
+/// The state of a training's player, without weights and normalisers, that decides what it does next.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PlayerState {
     /// `[N, O]` normalised observations that the next actions are chosen on.
     pub observations: Vec<f32>,
     /// `[N]` whether those are the first of a trial.
     pub starts: Vec<bool>,
-    /// `[N, E]` what stands beside the observations, see [`Inputs`].
-    pub outcomes: Vec<f32>,
-    /// `[N, S]` what the policy remembers; empty for a feed-forward policy.
+    /// `[N, E]` the previous steps, see [`Inputs`].
+    pub previous_steps: Vec<f32>,
+    /// `[N, S]` the policy's memory; empty for a feed-forward policy.
     pub memory: Vec<f32>,
     /// The stream of sampled actions and of noise.
     pub actions: ChaCha8Rng,
 }
 
-/// An episode that ended.
+/// The end of an episode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Ended {
-    /// In which of the N environments.
+pub struct SlotEnd {
+    /// The environment, 0 … N-1.
     pub slot: usize,
     /// Counts the environment's trials from 0.
     pub trial_index: u64,
@@ -88,9 +87,9 @@ pub struct Ended {
     pub episode_in_trial: u32,
 }
 
-/// What came of a step in N environments that are reset by themselves where an episode ends.
+/// The results of a step in N environments that are reset automatically where an episode ends.
 #[derive(Clone, Copy, Debug)]
-pub struct Outcome<'a> {
+pub struct StepOutcome<'a> {
     /// `[N, O]` observations; where an episode ended, the first one of the next.
     pub observations: &'a [f32],
     /// `[N]` rewards.
@@ -102,23 +101,23 @@ pub struct Outcome<'a> {
     /// `[K, O]` last observations of the episodes that ended, in the order of `ended`.
     pub final_observations: &'a [f32],
     /// `[K]` the episodes that ended, in order of slots.
-    pub ended: &'a [Ended],
+    pub ended: &'a [SlotEnd],
 }
 
-/// A step of N environments, as a rollout wants it; or T steps of them, where every array is `[T, N, …]`.
+/// A step of N environments, as a rollout stores it; or T steps, with arrays `[T, N, …]`.
 #[derive(Clone, Copy, Debug)]
 pub struct RolloutStep<'a> {
     /// `[N, I]` inputs that the actions were chosen on, normalised.
     pub observations: &'a [f32],
-    /// `[N]` whether they are the first that the policy remembers: its memory was emptied before them.
+    /// `[N]` whether the policy's memory was emptied before the step.
     pub starts: &'a [bool],
-    /// `[N, A]` actions, as in [`Acts`].
+    /// `[N, A]` actions, as in [`ActorOutput`].
     pub actions: &'a [f32],
     /// `[N]` log-probabilities of the actions under the acting policy.
     pub log_probs: &'a [f32],
     /// `[N]` V(s_t).
     pub values: &'a [f32],
-    /// `[N]` rewards r_t that the actions brought, normalised.
+    /// `[N]` rewards r_t for the actions, normalised.
     pub rewards: &'a [f32],
     /// `[N]` whether the task ended the episode, or the trial.
     pub terminated: &'a [bool],
@@ -128,26 +127,26 @@ pub struct RolloutStep<'a> {
     pub truncation_values: &'a [f32],
 }
 
-/// The arrays of a [`RolloutStep`], and what they are made of.
+/// The arrays of a [`RolloutStep`], and buffers from which they are made.
 #[derive(Clone, Debug)]
-struct Last {
+struct PreviousStep {
     acted_on: Vec<f32>,
     starts: Vec<bool>,
-    acts: Acts,
+    acts: ActorOutput,
     rewards: Vec<f32>,
     terminated: Vec<bool>,
     truncated: Vec<bool>,
     truncation_values: Vec<f32>,
-    /// `[N]` whether an episode ended, …
+    /// `[N]` whether an episode ended.
     done: Vec<bool>,
-    /// … and a trial with it.
+    /// `[N]` whether a trial ended.
     trial_ended: Vec<bool>,
     finals: Vec<f32>,
     truncated_slots: Vec<usize>,
 }
 
 impl Streams for Role {
-    fn of(&mut self, environment: usize) -> &mut ChaCha8Rng {
+    fn stream(&mut self, environment: usize) -> &mut ChaCha8Rng {
         match self {
             Self::Training(stream) => stream,
             Self::Testing(trials) => &mut trials.streams[environment],
@@ -156,18 +155,18 @@ impl Streams for Role {
 }
 
 impl Role {
-    /// That of a training with `seed`.
+    /// The role of a training with `seed`.
     pub fn training(seed: u64) -> Self {
         Self::Training(stream(seed, Purpose::Actions))
     }
 
-    /// That of a test with `seed` in N = `n_envs` environments with successive indices, at the start of their first
+    /// The role of a test with `seed` in N = `n_envs` environments with successive indices, at the start of their first
     /// trials.
     pub fn testing(seed: u64, first_environment_index: u32, n_envs: usize) -> Self {
         Self::testing_in(seed, (0..n_envs).map(|slot| (first_environment_index + slot as u32, 0)))
     }
 
-    /// That of a test with `seed` in environments with these indices, in these of their trials.
+    /// The role of a test with `seed` in environments given by their index and the index of their trial.
     pub fn testing_in(seed: u64, environments: impl Iterator<Item = (u32, u64)>) -> Self {
         let stream = |(index, trial)| (index, trial_stream(seed, Purpose::TestActions, index, trial));
         let (indices, streams) = environments.map(stream).unzip();
@@ -180,15 +179,15 @@ impl Role {
 }
 
 impl TrialStreams {
-    /// That of the test.
+    /// The seed of the test.
     pub fn seed(&self) -> u64 {
         self.seed
     }
 }
 
 impl Player {
-    /// A player whose weights are 0 until [`Player::load`], and whose environments are unknown until
-    /// [`Player::begin`] or [`Player::restore`]. `inputs` are those of a policy of `spec`, fresh.
+    /// A player whose weights are 0 until [`Player::load`], and whose observations are 0 until [`Player::begin`] or
+    /// [`Player::restore`]. `inputs` must be fresh and fit `spec`.
     pub fn new(
         spec: &PolicySpec,
         inputs: Inputs,
@@ -208,34 +207,34 @@ impl Player {
             noise: 0.0,
             observations: vec![0.0; n_envs * observation_size],
             starts: vec![true; n_envs],
-            last: Last::new(spec, n_envs),
+            previous: PreviousStep::new(spec, n_envs),
             bytes: vec![0; 4 * n_envs * spec.action.width()],
             values: Vec::new(),
         }
     }
 
-    /// The same, see [`Actor::act_uniformly`].
+    /// Makes the player act as [`Actor::act_uniformly`] says.
     #[must_use]
     pub fn uniformly(mut self) -> Self {
         self.actor.act_uniformly();
         self
     }
 
-    /// The same, seeing observations, normalised if there is a normaliser, with normal noise of this standard deviation, at
-    /// least 0, in training. What stands beside them has none.
+    /// Adds normal noise with this standard deviation, at least 0, to observations in training, after their normalisation. The
+    /// previous step in RL²'s inputs gets none.
     #[must_use]
     pub fn with_noise(self, noise: f64) -> Self {
         Self { noise, ..self }
     }
 
-    /// The same, see [`Actor::keep_activations`].
+    /// Makes the player cache activations as [`Actor::keep_activations`] says.
     #[must_use]
     pub fn keeping_activations(mut self, n_steps: usize) -> Self {
         self.actor.keep_activations(n_steps);
         self
     }
 
-    /// N.
+    /// N, the number of environments.
     pub fn n_envs(&self) -> usize {
         self.starts.len()
     }
@@ -245,12 +244,12 @@ impl Player {
         self.episodes_per_trial
     }
 
-    /// O.
+    /// O, the length of an observation.
     pub fn observation_size(&self) -> usize {
         self.observation_size
     }
 
-    /// Takes over all weights `[P]` in a row; what is remembered stays.
+    /// Loads all weights `[P]` in a row. The memory stays.
     ///
     /// # Errors
     /// [`Error::Length`](crate::Error::Length).
@@ -264,8 +263,8 @@ impl Player {
         backend.reuse_activations(&mut self.actor);
     }
 
-    /// A trial begins in every environment with `observations` `[N, O]`; running statistics take in those of the
-    /// environments where `remaining` counts.
+    /// Begins a trial in every environment with `observations` `[N, O]`. Those of the environments where `remaining` counts are
+    /// added to running statistics.
     ///
     /// # Errors
     /// Another length; numbers that are not finite.
@@ -286,8 +285,8 @@ impl Player {
         Ok(())
     }
 
-    /// The environment of `slot` was brought to another state, where it is observed as `observation` `[O]`; statistics
-    /// stay.
+    /// Replaces the observation of `slot` by `observation` `[O]`, after its environment was brought to another state. The
+    /// statistics stay.
     ///
     /// # Errors
     /// Another length.
@@ -298,8 +297,8 @@ impl Player {
         self.normalisers.normalise(row)
     }
 
-    /// In a test: trial `trial_index` of a test with `seed` begins in `slot`. Nothing before it is remembered, and its
-    /// address alone says which actions are sampled.
+    /// Begins trial `trial_index` of a test with `seed` in `slot`. The memory is emptied, and the sampled actions depend only on
+    /// the trial's address.
     pub fn begin_trial(&mut self, slot: usize, seed: u64, trial_index: u64) {
         self.actor.forget(slot);
         self.inputs.forget(slot);
@@ -308,32 +307,32 @@ impl Player {
         }
     }
 
-    /// The next actions, as the protocol wants them.
+    /// Chooses the next actions, encoded as the protocol says.
     ///
     /// # Errors
     /// [`Error::PolicyOutput`](crate::Error::PolicyOutput).
     pub fn act(&mut self) -> Result<&[u8]> {
-        let Self { actor, inputs, role, observations, starts, last, bytes, .. } = self;
-        let rows = inputs.of(observations);
-        actor.act(rows, role, &mut last.acts)?;
-        last.acted_on.clear();
-        last.acted_on.extend_from_slice(rows);
-        last.starts.copy_from_slice(starts);
-        last.acts.write_bytes(bytes);
+        let Self { actor, inputs, role, observations, starts, previous, bytes, .. } = self;
+        let rows = inputs.from_observations(observations);
+        actor.act(rows, role, &mut previous.acts)?;
+        previous.acted_on.clear();
+        previous.acted_on.extend_from_slice(rows);
+        previous.starts.copy_from_slice(starts);
+        previous.acts.write_bytes(bytes);
         Ok(bytes)
     }
 
-    /// The last actions, as the protocol wants them.
+    /// The last actions, encoded as the protocol says.
     pub fn actions(&self) -> &[u8] {
         &self.bytes
     }
 
-    /// Takes what came of the last actions, after `remaining` was advanced: of which environments statistics take in rewards
-    /// and next observations.
+    /// Takes the results of the last actions. `remaining`, which must have been advanced already, says which environments'
+    /// rewards and next observations are added to statistics.
     ///
     /// # Errors
     /// Other lengths; numbers that are not finite.
-    pub fn observe(&mut self, outcome: &Outcome<'_>, remaining: Option<&Remaining>) -> Result<()> {
+    pub fn observe(&mut self, outcome: &StepOutcome<'_>, remaining: Option<&Remaining>) -> Result<()> {
         let n_envs = self.starts.len();
         check_length("observations [N, O]", outcome.observations.len(), self.observations.len())?;
         check_length("rewards [N]", outcome.rewards.len(), n_envs)?;
@@ -341,31 +340,31 @@ impl Player {
         check_length("truncated [N]", outcome.truncated.len(), n_envs)?;
         let finals = outcome.ended.len() * self.observation_size;
         check_length("final_observations [K, O]", outcome.final_observations.len(), finals)?;
-        self.last.take(outcome, self.episodes_per_trial);
+        self.previous.take(outcome, self.episodes_per_trial);
 
-        let Self { actor, inputs, role, normalisers, last, observations, .. } = self;
+        let Self { actor, inputs, role, normalisers, previous, observations, .. } = self;
         let (statistics, stepped) = (role.statistics(), remaining.and_then(Remaining::stepped));
         observations.copy_from_slice(outcome.observations);
-        normalisers.take_rewards(&mut last.rewards, &last.trial_ended, statistics, stepped)?;
+        normalisers.take_rewards(&mut previous.rewards, &previous.trial_ended, statistics, stepped)?;
         normalisers.take_observations(observations, statistics, remaining.and_then(Remaining::active))?;
-        inputs.remember(&last.acts, &last.rewards, &last.done)?;
-        if statistics == Statistics::Running && last.gather_truncated(outcome, self.observation_size) {
-            normalisers.normalise(&mut last.finals)?;
+        inputs.remember(&previous.acts, &previous.rewards, &previous.done)?;
+        if statistics == Statistics::Running && previous.gather_truncated(outcome, self.observation_size) {
+            normalisers.normalise(&mut previous.finals)?;
             actor.values_in(
-                inputs.of_finals(&last.finals, &last.truncated_slots),
-                &last.truncated_slots,
+                inputs.from_final_observations(&previous.finals, &previous.truncated_slots),
+                &previous.truncated_slots,
                 &mut self.values,
             )?;
-            let values = last.truncated_slots.iter().zip(&self.values);
-            values.for_each(|(&slot, value)| last.truncation_values[slot] = *value);
+            let values = previous.truncated_slots.iter().zip(&self.values);
+            values.for_each(|(&slot, value)| previous.truncation_values[slot] = *value);
         }
         let seed = if let Role::Testing(trials) = &self.role { trials.seed } else { 0 };
         for end in outcome.ended {
-            if self.last.trial_ended[end.slot] {
+            if self.previous.trial_ended[end.slot] {
                 self.begin_trial(end.slot, seed, end.trial_index + 1);
             }
         }
-        self.starts.copy_from_slice(&self.last.trial_ended);
+        self.starts.copy_from_slice(&self.previous.trial_ended);
         self.add_noise();
         Ok(())
     }
@@ -376,29 +375,31 @@ impl Player {
         }
     }
 
-    /// What was played last: the actions of [`Player::act`] and what [`Player::observe`] took.
+    /// The previous step: the actions of [`Player::act`] and the results that [`Player::observe`] took.
     pub fn played(&self) -> RolloutStep<'_> {
-        let last = &self.last;
+        let step = &self.previous;
         RolloutStep {
-            observations: &last.acted_on,
-            starts: &last.starts,
-            actions: &last.acts.actions,
-            log_probs: &last.acts.log_probs,
-            values: &last.acts.values,
-            rewards: &last.rewards,
-            terminated: &last.terminated,
-            truncated: &last.truncated,
-            truncation_values: &last.truncation_values,
+            observations: &step.acted_on,
+            starts: &step.starts,
+            actions: &step.acts.actions,
+            log_probs: &step.acts.log_probs,
+            values: &step.acts.values,
+            rewards: &step.rewards,
+            terminated: &step.terminated,
+            truncated: &step.truncated,
+            truncation_values: &step.truncation_values,
         }
     }
 
-    /// V `[N]` of the present observations, or 0 after complete episodes, which nothing follows.
+    /// V `[N]` of the present observations; 0 after complete episodes, because nothing follows them.
     ///
     /// # Errors
     /// Observations that do not fit.
     pub fn last_values(&mut self, remaining: &Remaining) -> Result<&[f32]> {
         match remaining {
-            Remaining::Steps(_) => self.actor.values(self.inputs.of(&self.observations), &mut self.values)?,
+            Remaining::Steps(_) => {
+                self.actor.values(self.inputs.from_observations(&self.observations), &mut self.values)?;
+            }
             Remaining::Episodes(_) => {
                 self.values.clear();
                 self.values.resize(self.starts.len(), 0.0);
@@ -407,12 +408,12 @@ impl Player {
         Ok(&self.values)
     }
 
-    /// `[N, S]` what the policy remembers of every environment.
+    /// `[N, S]` the policy's memory of every environment.
     pub fn memory(&self) -> &[f32] {
         self.actor.memory()
     }
 
-    /// Where actions come from.
+    /// The source of randomness for actions.
     pub fn role(&self) -> &Role {
         &self.role
     }
@@ -422,27 +423,27 @@ impl Player {
         &self.normalisers
     }
 
-    /// The state between two steps; `None` of a test.
+    /// The state between two steps; `None` in a test.
     pub fn state(&self) -> Option<PlayerState> {
         let Role::Training(actions) = &self.role else { return None };
         Some(PlayerState {
             observations: self.observations.clone(),
             starts: self.starts.clone(),
-            outcomes: self.inputs.outcomes().to_vec(),
+            previous_steps: self.inputs.previous_steps().to_vec(),
             memory: self.actor.memory().to_vec(),
             actions: actions.clone(),
         })
     }
 
-    /// Goes on as a training from a saved state.
+    /// Restores a saved state of a training.
     ///
     /// # Errors
     /// [`Error::Length`](crate::Error::Length) if an array does not fit.
     pub fn restore(&mut self, state: &PlayerState) -> Result<()> {
-        let PlayerState { observations, starts, outcomes, memory, actions } = state;
+        let PlayerState { observations, starts, previous_steps, memory, actions } = state;
         check_length("observations [N, O]", observations.len(), self.observations.len())?;
         check_length("starts [N]", starts.len(), self.starts.len())?;
-        self.inputs.restore(outcomes)?;
+        self.inputs.restore(previous_steps)?;
         self.actor.set_memory(memory)?;
         self.observations.copy_from_slice(observations);
         self.starts.copy_from_slice(starts);
@@ -451,12 +452,12 @@ impl Player {
     }
 }
 
-impl Last {
+impl PreviousStep {
     fn new(spec: &PolicySpec, n_envs: usize) -> Self {
         Self {
             acted_on: Vec::with_capacity(n_envs * spec.observation_size),
             starts: vec![true; n_envs],
-            acts: Acts::new(spec.action, n_envs),
+            acts: ActorOutput::new(spec.action, n_envs),
             rewards: vec![0.0; n_envs],
             terminated: vec![false; n_envs],
             truncated: vec![false; n_envs],
@@ -468,8 +469,8 @@ impl Last {
         }
     }
 
-    /// Takes over rewards and flags; the ends of episodes that are not the last of their trial are none.
-    fn take(&mut self, outcome: &Outcome<'_>, episodes_per_trial: u32) {
+    /// Copies rewards and flags. The flags of ends within a trial are cleared.
+    fn take(&mut self, outcome: &StepOutcome<'_>, episodes_per_trial: u32) {
         self.rewards.copy_from_slice(outcome.rewards);
         self.terminated.copy_from_slice(outcome.terminated);
         self.truncated.copy_from_slice(outcome.truncated);
@@ -485,8 +486,8 @@ impl Last {
         }
     }
 
-    /// Gathers the final observations whose values are asked for; whether there are any.
-    fn gather_truncated(&mut self, outcome: &Outcome<'_>, observation_size: usize) -> bool {
+    /// Gathers the final observations of truncated episodes. Returns whether there are any.
+    fn gather_truncated(&mut self, outcome: &StepOutcome<'_>, observation_size: usize) -> bool {
         self.truncation_values.fill(0.0);
         self.finals.clear();
         self.truncated_slots.clear();

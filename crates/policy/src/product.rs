@@ -14,7 +14,7 @@ use pulp::Simd;
 
 use crate::kernel::{Kernel, LANES, Lane, Rows, call, lanes};
 
-/// A sum's start where there is none.
+/// The start of a sum without biases.
 const ZERO: Lane = [0.0; LANES];
 
 /// A matrix in the order in which a product reads it: for each lane of outputs, for each input, that input's weights.
@@ -30,7 +30,7 @@ impl Matrix {
         Matrix { inputs, data: vec![[0.0; LANES]; lanes(outputs) * inputs] }
     }
 
-    /// Takes over the weights of the inputs from `first` on: `matrix` [outputs, their number].
+    /// Loads the weights of the inputs from `first` on: `matrix` [outputs, their number].
     pub(crate) fn load(&mut self, first: usize, matrix: &[f32], outputs: usize) {
         let inputs = matrix.len() / outputs;
         for (block, lanes) in matrix.chunks(LANES * inputs).zip(self.data.chunks_exact_mut(self.inputs)) {
@@ -42,7 +42,7 @@ impl Matrix {
         }
     }
 
-    /// What a product with it reads.
+    /// The matrix as the right side of a product.
     #[inline(always)]
     pub(crate) fn factor(&self) -> Factor<'_> {
         let outputs = self.data.len() / self.inputs * LANES;
@@ -51,20 +51,20 @@ impl Matrix {
     }
 }
 
-/// The right side of a product, wherever its numbers lie.
+/// The right side of a product, with the strides of its numbers.
 #[derive(Clone, Copy)]
 pub(crate) struct Factor<'a> {
     numbers: &'a [f32],
     inputs: usize,
     outputs: usize,
-    /// Numbers from a lane of outputs to the next, …
+    /// Stride from a lane of outputs to the next.
     per_column: usize,
-    /// … and from an input to the next.
+    /// Stride from an input to the next.
     per_input: usize,
 }
 
 impl<'a> Factor<'a> {
-    /// The rows of `matrix` [inputs, `outputs`] as they are.
+    /// The rows of `matrix` [inputs, `outputs`], without a copy.
     #[inline(always)]
     pub(crate) fn rows(matrix: &'a [f32], outputs: usize) -> Self {
         Factor { numbers: matrix, inputs: matrix.len() / outputs, outputs, per_column: LANES, per_input: outputs }
@@ -83,7 +83,7 @@ impl<'a> Factor<'a> {
         call(simd, Apply { factor: self, from, rows, start, to });
     }
 
-    /// The same, compiled into what calls it.
+    /// The product, inlined into its caller.
     #[inline(always)]
     pub(crate) fn apply_here<S: Simd>(
         self,
@@ -164,7 +164,7 @@ impl<'a> Factor<'a> {
         S::as_simd_f32s(&lane).0[vector]
     }
 
-    /// `R` rows at once: each vector of weights is loaded once for all.
+    /// Computes `R` rows at once: each vector of weights is loaded once for all of them.
     #[inline(always)]
     fn product<S: Simd, const R: usize, const WHOLE: bool>(
         self,
@@ -195,7 +195,7 @@ impl<'a> Factor<'a> {
         }
     }
 
-    /// One row, `C` columns at once: sums that do not wait for each other.
+    /// Computes one row, `C` columns at once: the sums are independent, so that the processor computes them in parallel.
     #[inline(always)]
     fn row_product<S: Simd, const C: usize, const WHOLE: bool>(
         self,
@@ -249,7 +249,7 @@ impl Kernel for Apply<'_> {
     }
 }
 
-/// Transposes `block` [[`LANES`], columns], four columns at a time; says how many of them could be.
+/// Transposes `block` [[`LANES`], columns], four columns at a time. Returns the number of columns that were transposed.
 fn transpose(block: &[f32], columns: &mut [Lane]) -> usize {
     let width = columns.len();
     let (columns, _) = columns.as_chunks_mut::<4>();
@@ -265,7 +265,7 @@ fn transpose(block: &[f32], columns: &mut [Lane]) -> usize {
     4 * columns.len()
 }
 
-/// With the instructions that are made for it, which the compiler does not find by itself.
+/// Transposes with the shuffle instructions, which the compiler does not find by itself.
 #[inline(always)]
 fn transpose_tile(rows: [[f32; 4]; 4]) -> [[f32; 4]; 4] {
     #[cfg(target_arch = "x86_64")]
@@ -283,8 +283,8 @@ fn transpose_tile(rows: [[f32; 4]; 4]) -> [[f32; 4]; 4] {
     std::array::from_fn(|column| rows.map(|row| row[column]))
 }
 
-/// Puts Σ_b deltas_bo inputs_bi, over the first `n` rows in order of b, in `sums` [outputs, `size`]; with `ADD` it goes on
-/// with the sums that are there.
+/// Writes Σ_b deltas_bo inputs_bi, over the first `n` rows in order of b, to `sums` [outputs, `size`], or adds them with
+/// `ADD`.
 pub(crate) fn outer<S: Simd, const ADD: bool>(
     simd: S,
     sums: &mut [f32],
@@ -313,7 +313,7 @@ impl<const ADD: bool> Kernel for Outer<'_, ADD> {
     }
 }
 
-/// The same, compiled into what calls it.
+/// The body of [`outer`], inlined into its caller.
 #[inline(always)]
 fn outer_here<S: Simd, const ADD: bool>(
     simd: S,
@@ -392,7 +392,7 @@ fn outers<S: Simd, const R: usize, const ADD: bool, const WHOLE: bool>(
     }
 }
 
-/// Puts the sums of the first `n` rows, in their order, in `sums`; with `ADD` it goes on with what is there.
+/// Writes the sums of the first `n` rows, in their order, to `sums`, or adds them with `ADD`.
 #[inline(always)]
 pub(crate) fn sum_rows<const ADD: bool>(sums: &mut [f32], rows: &Rows, n: usize) {
     if !ADD {
@@ -448,7 +448,7 @@ mod tests {
         (0..n).map(|_| normal(&mut rng) as f32).collect()
     }
 
-    /// What `run` computes, as bits.
+    /// The result of `run`, as bits.
     fn bits(n: usize, run: impl FnOnce(Products<'_>)) -> Vec<u32> {
         let flat = numbers(INPUTS * OUTPUTS, 1);
         let mut matrix = Matrix::new(INPUTS, OUTPUTS);
@@ -474,7 +474,7 @@ mod tests {
         all.concat().iter().map(|x| x.to_bits()).collect()
     }
 
-    /// The same by the definitions, one number after the other.
+    /// The result by the definitions, one number after the other.
     fn naive(n: usize) -> Vec<u32> {
         let (matrix, rows, start) = (numbers(INPUTS * OUTPUTS, 1), numbers(n * INPUTS, 2), numbers(OUTPUTS, 3));
         let (mut to, mut back) = (vec![0.0; n * OUTPUTS], vec![0.0; n * INPUTS]);

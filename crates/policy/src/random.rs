@@ -6,7 +6,7 @@
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// What a stream is for. The number is the ChaCha stream identifier; it must never change, or seeds lose their meaning.
+/// The purpose of a stream. The number is the ChaCha stream identifier. It must never change, or seeds lose their meaning.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u64)]
 pub enum Purpose {
@@ -14,7 +14,7 @@ pub enum Purpose {
     Weights = 1,
     /// Order of the samples in PPO's minibatches.
     Minibatches = 2,
-    /// Actions in training, and noise on what they are chosen on.
+    /// Actions in training, and noise on observations.
     Actions = 3,
     /// Actions in testing.
     TestActions = 4,
@@ -48,8 +48,8 @@ pub fn uniform(rng: &mut ChaCha8Rng) -> f64 {
     (rng.next_u64() >> 11) as f64 * (1.0 / (1u64 << 53) as f64)
 }
 
-/// A standard normal number, by Box and Muller (1958); uses two draws and keeps no state between calls, so that the
-/// stream's position alone says what comes next. Not the C library's functions, whose bytes depend on the processor.
+/// A standard normal number, by Box and Muller (1958). Uses two draws and keeps no state between calls, so that the next
+/// number depends only on the stream's position. Avoids the C library's functions, whose bytes depend on the processor.
 pub fn normal(rng: &mut ChaCha8Rng) -> f64 {
     let radius = (-2.0 * libm::log(1.0 - uniform(rng))).sqrt();
     radius * libm::cos(std::f64::consts::TAU * uniform(rng))

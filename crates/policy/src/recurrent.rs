@@ -1,4 +1,4 @@
-//! What differentiates recurrent policies. This crate does without: a library that can registers itself here.
+//! The interface to the gradients of recurrent policies. This crate has none: a library that has them registers itself here.
 
 use std::sync::OnceLock;
 
@@ -10,7 +10,7 @@ use crate::spec::PolicySpec;
 
 /// Computes gradients of recurrent policies of one shape.
 pub trait RecurrentDifferentiator {
-    /// Takes a copy of `sequences`, to be learned from several times.
+    /// Copies `sequences`, to be learned from several times.
     ///
     /// # Errors
     /// Arrays whose lengths do not fit.
@@ -19,17 +19,17 @@ pub trait RecurrentDifferentiator {
 
 /// Sequences that a recurrent policy learns from.
 pub trait RecurrentBatch {
-    /// N.
+    /// N, the number of sequences.
     fn count(&self) -> usize;
 
-    /// Takes `weights` `[P]` for those that acted, from which the KL divergence is measured.
+    /// Takes the policy with `weights` `[P]` for the one that acted. The KL divergence is measured from it.
     ///
     /// # Errors
     /// Another number of weights.
     fn remember_acting(&mut self, weights: &[f32]) -> Result<()>;
 
-    /// The losses of `objective` with `weights` `[P]` over the `sequences` with these indices, and in `gradient` `[P]` the
-    /// derivatives of their total.
+    /// Writes the derivatives of the total loss with `weights` `[P]` over the `sequences` with these indices to `gradient`
+    /// `[P]`. Returns the losses.
     ///
     /// # Errors
     /// Arrays of other lengths, or what the library refuses.
@@ -42,14 +42,14 @@ pub trait RecurrentBatch {
     ) -> Result<Losses>;
 }
 
-/// Makes what differentiates recurrent policies of a shape.
+/// Makes the differentiator of recurrent policies of a shape.
 pub type MakeRecurrent = fn(&PolicySpec) -> Result<Box<dyn RecurrentDifferentiator>>;
 
 static RECURRENT: OnceLock<MakeRecurrent> = OnceLock::new();
 
-/// Has recurrent policies differentiated by what `make` makes, from now on and in the whole process. The first call counts.
+/// Registers `make` for recurrent policies, in the whole process. Only the first call has an effect.
 pub fn register_recurrent(make: MakeRecurrent) {
-    let _ = RECURRENT.set(make); // another one would give other bytes in mid-training
+    let _ = RECURRENT.set(make); // another library would give other bytes in the middle of a training
 }
 
 /// Whether recurrent policies can be differentiated in this process.
@@ -57,7 +57,7 @@ pub fn has_recurrent() -> bool {
     RECURRENT.get().is_some()
 }
 
-/// What differentiates recurrent policies of this shape.
+/// The differentiator of recurrent policies of this shape.
 ///
 /// # Errors
 /// [`Error::NoRecurrentGradients`] if nothing is registered; what the library refuses.

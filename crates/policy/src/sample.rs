@@ -13,15 +13,14 @@ use crate::random::{normal, uniform};
 /// log 2π.
 pub(crate) const LOG_TAU: f32 = 1.837_877_1;
 
-/// The greatest of `logits`, and the sum of their exponentials relative to it: a log-probability is
-/// l_j - greatest - log total.
+/// The maximum of `logits`, and the sum of their exponentials relative to it: a log-probability is l_j - maximum - log total.
 pub(crate) fn greatest_and_total(logits: &[f32]) -> (f32, f32) {
     let greatest = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
     (greatest, logits.iter().map(|logit| exp(logit - greatest)).sum())
 }
 
 /// Draws from the categorical distribution of `logits` by inverting the cumulative sum; one uniform number a draw.
-/// Gives the choice and its log-probability.
+/// Returns the choice and its log-probability.
 pub(crate) fn sample_categorical(logits: &[f32], rng: &mut ChaCha8Rng) -> (usize, f32) {
     let (greatest, total) = greatest_and_total(logits);
     let target = uniform(rng) * f64::from(total);

@@ -13,13 +13,13 @@ pub struct Samples<'a> {
     pub actions: &'a [f32],
     /// `[B]` log-probabilities under the policy that acted.
     pub old_log_probs: &'a [f32],
-    /// `[B]` its values.
+    /// `[B]` values of the policy that acted.
     pub old_values: &'a [f32],
     /// `[B]` advantages.
     pub advantages: &'a [f32],
     /// `[B]` value targets.
     pub returns: &'a [f32],
-    /// Its distributions, for their divergence.
+    /// The distributions of the policy that acted, for the KL divergence.
     pub acting: Option<Acting<'a>>,
 }
 
@@ -27,7 +27,7 @@ pub struct Samples<'a> {
 /// step t of environment n is t·N + n.
 #[derive(Clone, Copy, Debug)]
 pub struct SequenceSamples<'a> {
-    /// What a policy learns from, `[T, N, …]`.
+    /// The samples, `[T, N, …]`.
     pub samples: Samples<'a>,
     /// T.
     pub n_steps: usize,
@@ -35,7 +35,7 @@ pub struct SequenceSamples<'a> {
     pub starts: &'a [bool],
     /// `[N, S]` the memory before the first step, S = [`PolicySpec::memory_size`].
     pub memory: &'a [f32],
-    /// `[N]`: of environment n only so many of the first steps are samples, the others fill it up. None: all are.
+    /// `[N]`: the number of first steps of environment n that are samples; the others are padding. `None`: all are samples.
     pub lengths: Option<&'a [usize]>,
 }
 

@@ -1,4 +1,4 @@
-//! What a policy is: its shape and the names of its weights.
+//! The shape of a policy, and the names of its weights.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,7 +9,7 @@ use crate::weights::{Weights, check_arrays};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ActionKind {
-    /// One of `n` choices, 0 … n-1: a categorical distribution over `n` logits.
+    /// A choice, 0 … n-1: a categorical distribution over `n` logits.
     Discrete {
         /// Number of choices.
         n: usize,
@@ -51,7 +51,7 @@ impl ActionKind {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PolicySpec {
-    /// O: numbers that enter: those of an observation, or of the whole input if it holds more, see [`Inputs`](crate::Inputs).
+    /// O, the length of an input: an observation, with RL² also the previous step, see [`Inputs`](crate::Inputs).
     pub observation_size: usize,
     /// The actions.
     pub action: ActionKind,
@@ -83,8 +83,8 @@ impl PolicySpec {
         self.lstm.map_or(Ok(()), |width| positive("the width of the LSTM", width))
     }
 
-    /// S: numbers that a policy remembers of an environment's past, 2H: the LSTM's output h, then its cell state c; 0 for
-    /// a feed-forward policy. All 0 is the memory before the first step of an episode.
+    /// S = 2H, the length of a recurrent policy's memory of an environment: the LSTM's output h, then its cell state c. 0 for a
+    /// feed-forward policy. The memory before the first step of an episode is all 0.
     pub fn memory_size(&self) -> usize {
         self.lstm.map_or(0, |width| 2 * width)
     }

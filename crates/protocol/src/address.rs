@@ -5,9 +5,9 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use crate::limits::LONGEST_SOCKET_PATH;
+use crate::limits::MAX_SOCKET_PATH_BYTES;
 
-/// Where a server listens.
+/// The address of a server.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub enum Address {
     /// A Unix socket, written `unix:/path`.
@@ -31,9 +31,9 @@ pub enum Address {
      `tcp://host:port`, with TLS `https://host:port`"
 )]
 pub struct AddressError {
-    /// What was given.
+    /// The text that was given.
     pub text: String,
-    /// What is wrong with it.
+    /// The reason.
     pub reason: String,
 }
 
@@ -46,13 +46,13 @@ impl FromStr for Address {
 }
 
 impl Address {
-    /// The same with TLS, as it is written.
+    /// The text of this address with TLS.
     pub(crate) fn with_tls(&self) -> String {
         let text = self.to_string();
         text.strip_prefix("http://").map_or_else(|| text.clone(), |rest| format!("https://{rest}"))
     }
 
-    /// What starts a server there, where it can be said.
+    /// A command that starts a server at this address.
     pub fn start_command(&self) -> String {
         let (host, port, tls) = match self {
             Self::Unix(path) => return format!("perturb-server --listen unix:{}", path.display()),
@@ -62,13 +62,13 @@ impl Address {
             "localhost" => IpAddr::from(Ipv4Addr::LOCALHOST),
             name => name.parse().unwrap_or(Ipv4Addr::UNSPECIFIED.into()),
         };
-        let guards = match (tls, ip.is_loopback()) {
+        let security = match (tls, ip.is_loopback()) {
             (true, true) => " --tls-cert FILE --tls-key FILE",
             (true, false) => " --tls-cert FILE --tls-key FILE --tokens FILE",
             (false, true) => "",
             (false, false) => " --insecure",
         };
-        format!("perturb-server --listen tcp://{}{guards}", SocketAddr::new(ip, *port))
+        format!("perturb-server --listen tcp://{}{security}", SocketAddr::new(ip, *port))
     }
 }
 
@@ -105,9 +105,9 @@ fn parse_unix(path: &str) -> Result<Address, String> {
     if !path.starts_with('/') {
         return Err("the path of the socket must be absolute".into());
     }
-    if path.len() > LONGEST_SOCKET_PATH {
+    if path.len() > MAX_SOCKET_PATH_BYTES {
         return Err(format!(
-            "the path of the socket has {} bytes, the most that Linux allows is {LONGEST_SOCKET_PATH}",
+            "the path of the socket has {} bytes, the most that Linux allows is {MAX_SOCKET_PATH_BYTES}",
             path.len()
         ));
     }
@@ -143,8 +143,7 @@ fn parse_tcp(text: &str, tls: bool) -> Result<Address, String> {
 mod tests {
     use super::*;
 
-    /// The Python package reads addresses itself, and its tests the same table: which are understood, as what, and which
-    /// are not.
+    /// The Python package has a parser of its own, whose tests read the same table of accepted and refused addresses.
     #[test]
     fn addresses_are_understood_as_in_python() {
         let table: serde_json::Value = serde_json::from_str(include_str!("../tests/addresses.json")).unwrap();
@@ -167,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn a_server_is_started_at_an_address_that_it_understands() {
+    fn start_command_has_an_address_to_listen_at() {
         for (text, expected) in [
             ("unix:/a/b", "unix:/a/b"),
             ("10.0.0.2:7", "tcp://10.0.0.2:7 --insecure"),

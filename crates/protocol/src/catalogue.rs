@@ -1,5 +1,4 @@
-//! The catalogue: what a session observes of an environment, and all of it as JSON, for those who do not speak the
-//! protocol.
+//! The catalogue of environments, and its form in JSON for programs that do not speak the protocol.
 
 use serde_json::{Value, json};
 
@@ -9,8 +8,8 @@ use crate::proto::{
     action_space::Kind,
 };
 
-/// Everything that a server tells of its environments, and the [`limits`] that hold for clients too. Names are those of
-/// the protocol; versions are called D, R and E. JSON has no infinity: an open end is null.
+/// The catalogue of a server as JSON, with the [`limits`] that hold for clients too. Keys are the protocol's names; versions
+/// are called D, R and E. JSON has no infinity: an open end is null.
 pub fn to_json(catalogue: &ListEnvironmentsResponse) -> Value {
     json!({
         "server_version": catalogue.server_version,
@@ -18,9 +17,13 @@ pub fn to_json(catalogue: &ListEnvironmentsResponse) -> Value {
         "environments": catalogue.environments.iter().map(environment).collect::<Vec<_>>(),
         "limits": {
             "picture_pixels": [limits::PICTURE_PIXELS.start(), limits::PICTURE_PIXELS.end()],
-            "usual_picture_pixels": limits::USUAL_PICTURE_PIXELS,
-            "most_intervals": limits::MOST_INTERVALS,
-            "longest_socket_path": limits::LONGEST_SOCKET_PATH,
+            "default_picture_pixels": limits::DEFAULT_PICTURE_PIXELS,
+            "max_intervals": limits::MAX_INTERVALS,
+            "max_socket_path_bytes": limits::MAX_SOCKET_PATH_BYTES,
+            // Names of version 0.1.
+            "usual_picture_pixels": limits::DEFAULT_PICTURE_PIXELS,
+            "most_intervals": limits::MAX_INTERVALS,
+            "longest_socket_path": limits::MAX_SOCKET_PATH_BYTES,
             "default_port": limits::DEFAULT_PORT,
             "default_max_envs": limits::DEFAULT_MAX_ENVS,
             "default_max_message_bytes": limits::DEFAULT_MAX_MESSAGE_BYTES,
@@ -29,7 +32,7 @@ pub fn to_json(catalogue: &ListEnvironmentsResponse) -> Value {
 }
 
 impl Environment {
-    /// As a session has it, whose observations have the parameters at their end or not.
+    /// The environment of a session whose observations end with the `parameters` or not.
     #[must_use]
     pub fn observed(&self, parameters: bool) -> Self {
         let mut session = self.clone();
@@ -40,7 +43,7 @@ impl Environment {
     }
 }
 
-/// One of them, as [`to_json`] has it.
+/// An environment as JSON, see [`to_json`].
 pub fn environment(environment: &Environment) -> Value {
     let action = match environment.action.as_ref().and_then(|action| action.kind.as_ref()) {
         Some(Kind::Discrete(discrete)) => json!({ "discrete": discrete.names }),
@@ -109,7 +112,7 @@ mod tests {
     use crate::proto::Channel;
 
     #[test]
-    fn an_open_end_is_null() {
+    fn open_end_is_null() {
         let open = Channel { name: "x".into(), unit: "m".into(), low: f64::NEG_INFINITY, high: 1.5 };
         let told = to_json(&ListEnvironmentsResponse {
             environments: vec![Environment { observation: vec![open], ..Environment::default() }],

@@ -1,4 +1,4 @@
-//! Making one connection: which machine stands for a name, and whether it takes sessions.
+//! Connects to a server: resolves its name, and checks that it takes sessions.
 
 use std::io;
 use std::net::{IpAddr, SocketAddr};
@@ -19,39 +19,39 @@ use tower::service_fn;
 use crate::address::Address;
 use crate::credentials::{Credentials, WithToken};
 use crate::encryption::{Connector, speaks_tls};
-use crate::error::{ClientError, REPLY_LIMIT, describe, lost, system_words, timed_out};
+use crate::error::{ClientError, REPLY_TIMEOUT, describe, lost, system_words, timed_out};
 use crate::limits::SERVICE;
 use crate::proto::{self, perturb_client::PerturbClient};
 
-/// How long each part of making a connection may take.
-const CONNECT_LIMIT: Duration = Duration::from_secs(5);
-/// The largest reply that is accepted, in bytes.
-const LARGEST_MESSAGE: usize = 256 << 20;
-/// Flow-control window, in bytes: a reply of a large batch must not wait for permission to be sent.
-const WINDOW: u32 = 16 << 20;
+/// Timeout of each part of making a connection.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
+/// Maximal size of a message.
+const MAX_MESSAGE_BYTES: usize = 256 << 20;
+/// Flow-control window: a reply of a large batch must not wait for permission to be sent.
+const WINDOW_BYTES: u32 = 16 << 20;
 
-/// How long a client waits for a server.
+/// The timeouts of a client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Patience {
-    /// For a reply.
+pub struct Timeouts {
+    /// Timeout of a reply.
     pub reply: Duration,
-    /// Without a word from the server, before it is asked whether it lives …
+    /// Time without bytes from the server before a keepalive ping is sent.
     pub keepalive_interval: Duration,
-    /// … and for the answer, before it is taken for dead.
+    /// Timeout of the answer to a ping.
     pub keepalive_limit: Duration,
 }
 
-impl Default for Patience {
+impl Default for Timeouts {
     fn default() -> Self {
         Self {
-            reply: REPLY_LIMIT,
+            reply: REPLY_TIMEOUT,
             keepalive_interval: Duration::from_secs(5),
             keepalive_limit: Duration::from_secs(15),
         }
     }
 }
 
-/// What calls are made with.
+/// The gRPC client of a connection.
 pub type Client = PerturbClient<InterceptedService<Channel, WithToken>>;
 
 /// A connection to a server that takes sessions.
@@ -59,42 +59,42 @@ pub type Client = PerturbClient<InterceptedService<Channel, WithToken>>;
 pub struct Connection {
     address: Address,
     client: Client,
-    patience: Patience,
+    timeouts: Timeouts,
 }
 
 impl Connection {
-    /// Connects to `address`, whose server must take sessions: one that is shutting down still answers.
+    /// Connects to `address`. The server must take sessions: one that is shutting down still answers, but is refused.
     ///
     /// # Errors
     /// [`ClientError::Connect`], [`ClientError::Unsafe`].
     pub async fn open(address: &Address) -> Result<Self, ClientError> {
-        Self::open_with(address, Patience::default()).await
+        Self::open_with(address, Timeouts::default()).await
     }
 
-    /// The same, with another patience.
+    /// Connects to `address` with these timeouts.
     ///
     /// # Errors
     /// [`ClientError::Connect`], [`ClientError::Unsafe`].
-    pub async fn open_with(address: &Address, patience: Patience) -> Result<Self, ClientError> {
+    pub async fn open_with(address: &Address, timeouts: Timeouts) -> Result<Self, ClientError> {
         let wrong = |reason| ClientError::Unsafe { address: address.clone(), reason };
-        Self::open_as(address, patience, Credentials::of_environment(address).map_err(wrong)?).await
+        Self::open_as(address, timeouts, Credentials::from_environment(address).map_err(wrong)?).await
     }
 
-    /// The same, with other credentials than the environment's.
+    /// Connects to `address` with these credentials instead of the environment's.
     ///
     /// # Errors
     /// [`ClientError::Connect`], [`ClientError::Unsafe`].
     pub async fn open_as(
         address: &Address,
-        patience: Patience,
+        timeouts: Timeouts,
         mut credentials: Credentials,
     ) -> Result<Self, ClientError> {
         let token = WithToken(credentials.token.take());
         let (host, port, name) = match address {
             Address::Tcp { host, port, tls: Some(name) } => (host, *port, name),
             _ => {
-                let channel = Self::endpoint(address, patience)?.connect().await;
-                let opened = Self::opened(address, patience, token, channel).await;
+                let channel = Self::endpoint(address, timeouts)?.connect().await;
+                let opened = Self::opened(address, timeouts, token, channel).await;
                 return match (address, opened) {
                     (
                         Address::Tcp { host, port, tls: None },
@@ -109,18 +109,18 @@ impl Connection {
         };
         let refuse = |reason| ClientError::Unsafe { address: address.clone(), reason };
         let connector = Connector::new(host, port, name, credentials).map_err(refuse)?;
-        let channel = Self::endpoint(address, patience)?.connect_with_connector(connector.clone()).await;
-        Self::opened(address, patience, token, channel).await.map_err(|error| match (error, connector.failure()) {
+        let channel = Self::endpoint(address, timeouts)?.connect_with_connector(connector.clone()).await;
+        Self::opened(address, timeouts, token, channel).await.map_err(|error| match (error, connector.failure()) {
             (ClientError::NotPerturb { .. } | ClientError::Connect { .. }, Some(reason)) => refuse(reason),
             (error, _) => error,
         })
     }
 
-    /// The same, without credentials, by streams that `connect` makes.
+    /// Connects to `address` without credentials, over byte streams that `connect` opens.
     ///
     /// # Errors
     /// [`ClientError::Connect`].
-    pub async fn open_by<C, F, S>(address: &Address, patience: Patience, connect: C) -> Result<Self, ClientError>
+    pub async fn open_by<C, F, S>(address: &Address, timeouts: Timeouts, connect: C) -> Result<Self, ClientError>
     where
         C: Fn() -> F + Send + 'static,
         F: Future<Output = io::Result<S>> + Send + 'static,
@@ -130,28 +130,28 @@ impl Connection {
             let stream = connect();
             async { stream.await.map(TokioIo::new) }
         });
-        let channel = Self::endpoint(address, patience)?.connect_with_connector(connector).await;
-        Self::opened(address, patience, WithToken(None), channel).await
+        let channel = Self::endpoint(address, timeouts)?.connect_with_connector(connector).await;
+        Self::opened(address, timeouts, WithToken(None), channel).await
     }
 
-    fn endpoint(address: &Address, patience: Patience) -> Result<Endpoint, ClientError> {
+    fn endpoint(address: &Address, timeouts: Timeouts) -> Result<Endpoint, ClientError> {
         let wrong = |error: tonic::transport::Error| ClientError::Connect {
             address: address.clone(),
             reason: error.to_string(),
         };
         Ok(Endpoint::from_shared(address.to_string())
             .map_err(wrong)?
-            .connect_timeout(CONNECT_LIMIT)
+            .connect_timeout(CONNECT_TIMEOUT)
             .tcp_nodelay(true)
-            .http2_keep_alive_interval(patience.keepalive_interval)
-            .keep_alive_timeout(patience.keepalive_limit)
-            .initial_stream_window_size(WINDOW)
-            .initial_connection_window_size(WINDOW))
+            .http2_keep_alive_interval(timeouts.keepalive_interval)
+            .keep_alive_timeout(timeouts.keepalive_limit)
+            .initial_stream_window_size(WINDOW_BYTES)
+            .initial_connection_window_size(WINDOW_BYTES))
     }
 
     async fn opened(
         address: &Address,
-        patience: Patience,
+        timeouts: Timeouts,
         token: WithToken,
         channel: Result<Channel, tonic::transport::Error>,
     ) -> Result<Self, ClientError> {
@@ -159,42 +159,42 @@ impl Connection {
         let transport = |error: tonic::transport::Error| {
             fail(
                 system_words(&error)
-                    .unwrap_or_else(|| format!("it did not answer within {} s", CONNECT_LIMIT.as_secs())),
+                    .unwrap_or_else(|| format!("it did not answer within {} s", CONNECT_TIMEOUT.as_secs())),
             )
         };
         let channel = channel.map_err(transport)?;
         takes_sessions(address, &channel).await?;
         let client = PerturbClient::with_interceptor(channel, token)
-            .max_decoding_message_size(LARGEST_MESSAGE)
-            .max_encoding_message_size(LARGEST_MESSAGE);
-        Ok(Self { address: address.clone(), client, patience })
+            .max_decoding_message_size(MAX_MESSAGE_BYTES)
+            .max_encoding_message_size(MAX_MESSAGE_BYTES);
+        Ok(Self { address: address.clone(), client, timeouts })
     }
 
-    /// Where the server is.
+    /// The address of the server.
     pub fn address(&self) -> &Address {
         &self.address
     }
 
-    /// How long its replies are waited for.
-    pub fn patience(&self) -> Patience {
-        self.patience
+    /// The timeouts of this connection.
+    pub fn timeouts(&self) -> Timeouts {
+        self.timeouts
     }
 
-    /// What calls are made with.
+    /// A gRPC client of this connection.
     pub fn client(&self) -> Client {
         self.client.clone()
     }
 
-    /// What the server can run.
+    /// Requests the server's catalogue of environments.
     ///
     /// # Errors
     /// [`ClientError::Lost`] or [`ClientError::TimedOut`].
     pub async fn catalogue(&self) -> Result<proto::ListEnvironmentsResponse, ClientError> {
         let what = "the catalogue";
         let mut client = self.client();
-        tokio::time::timeout(self.patience.reply, client.list_environments(proto::ListEnvironmentsRequest {}))
+        tokio::time::timeout(self.timeouts.reply, client.list_environments(proto::ListEnvironmentsRequest {}))
             .await
-            .map_err(|_| timed_out(&self.address, what, self.patience.reply))?
+            .map_err(|_| timed_out(&self.address, what, self.timeouts.reply))?
             .map(tonic::Response::into_inner)
             .map_err(|status| match status.code() {
                 Code::Unimplemented => ClientError::NotPerturb { address: self.address.clone() },
@@ -203,78 +203,81 @@ impl Connection {
     }
 }
 
-/// The machines that addresses stand for.
+/// The addresses that names resolve to.
 #[derive(Debug, Default, PartialEq)]
-pub struct Machines {
-    /// Any of these is as good as the others.
-    pub equal: Vec<Address>,
-    /// Other ways to the same machines, by the protocol family that the system likes less.
-    pub spare: Vec<Address>,
+pub struct ResolvedAddresses {
+    /// Addresses of different machines, in the preferred protocol family.
+    pub preferred: Vec<Address>,
+    /// Addresses of the same machines in the other protocol family.
+    pub fallback: Vec<Address>,
 }
 
-impl Machines {
-    /// All of them, beginning with number `turn` of the equal ones, counted around.
+impl ResolvedAddresses {
+    /// All addresses, beginning with number `turn` of the preferred ones, modulo their number.
     pub fn into_order(mut self, turn: usize) -> Vec<Address> {
-        if !self.equal.is_empty() {
-            let first = turn % self.equal.len();
-            self.equal.rotate_left(first);
+        if !self.preferred.is_empty() {
+            let first = turn % self.preferred.len();
+            self.preferred.rotate_left(first);
         }
-        self.equal.append(&mut self.spare);
-        self.equal
+        self.preferred.append(&mut self.fallback);
+        self.preferred
     }
 
-    /// Adds those of other addresses.
+    /// Adds the addresses of another name.
     pub fn extend(&mut self, other: Self) {
-        self.equal.extend(other.equal);
-        self.spare.extend(other.spare);
+        self.preferred.extend(other.preferred);
+        self.fallback.extend(other.fallback);
     }
 }
 
-/// The machines behind `address`: several if it has a name that stands for several, as that of a service whose replicas
-/// share it. Their order is the same wherever it is asked, whatever the order of the answer.
+/// Resolves `address`: to several addresses if its name has several, as that of a service with replicas. Their order does not
+/// depend on the order of the resolver's answer.
 ///
 /// # Errors
-/// [`ClientError::Connect`] for a name that stands for none.
-pub async fn machines(address: &Address) -> Result<Machines, ClientError> {
-    let one = || Machines { equal: vec![address.clone()], spare: Vec::new() };
+/// [`ClientError::Connect`] for a name that cannot be resolved.
+pub async fn resolve(address: &Address) -> Result<ResolvedAddresses, ClientError> {
+    let one = || ResolvedAddresses { preferred: vec![address.clone()], fallback: Vec::new() };
     let Address::Tcp { host, port, tls } = address else { return Ok(one()) };
     if host.parse::<IpAddr>().is_ok() {
         return Ok(one());
     }
     let fail = |reason| ClientError::Connect { address: address.clone(), reason };
-    let found: Vec<SocketAddr> = timeout(CONNECT_LIMIT, tokio::net::lookup_host((&**host, *port)))
+    let found: Vec<SocketAddr> = timeout(CONNECT_TIMEOUT, tokio::net::lookup_host((&**host, *port)))
         .await
-        .map_err(|_| fail(format!("its name was not resolved within {} s", CONNECT_LIMIT.as_secs())))?
+        .map_err(|_| fail(format!("its name was not resolved within {} s", CONNECT_TIMEOUT.as_secs())))?
         .map_err(|error| fail(format!("its name cannot be resolved: {error}")))?
         .collect();
-    // The name says more than a number, as long as it is clear whom it means.
+    // A name that means a single machine says more than its number.
     Ok(if found.len() > 1 { sorted(found, tls.as_deref()) } else { one() })
 }
 
-fn sorted(mut found: Vec<SocketAddr>, tls: Option<&str>) -> Machines {
-    let liked = found.first().is_some_and(SocketAddr::is_ipv4); // a resolver puts what can be reached first
+fn sorted(mut found: Vec<SocketAddr>, tls: Option<&str>) -> ResolvedAddresses {
+    let prefers_ipv4 = found.first().is_some_and(SocketAddr::is_ipv4); // resolvers list reachable families first
     found.sort_unstable();
     found.dedup();
-    let (equal, spare): (Vec<_>, Vec<_>) = found.into_iter().partition(|found| found.is_ipv4() == liked);
+    let (preferred, fallback): (Vec<_>, Vec<_>) = found.into_iter().partition(|found| found.is_ipv4() == prefers_ipv4);
     let address = |found: SocketAddr| Address::Tcp {
         host: found.ip().to_string().into(),
         port: found.port(),
         tls: tls.map(Box::from),
     };
-    Machines { equal: equal.into_iter().map(address).collect(), spare: spare.into_iter().map(address).collect() }
+    ResolvedAddresses {
+        preferred: preferred.into_iter().map(address).collect(),
+        fallback: fallback.into_iter().map(address).collect(),
+    }
 }
 
-/// Connects to the first of `machines`, of which there must be at least one, that takes sessions.
+/// Connects to the first of `addresses`, at least one, whose server takes sessions.
 ///
 /// # Errors
-/// What is wrong with each.
-pub async fn first_of(machines: &[Address]) -> Result<Connection, Vec<ClientError>> {
+/// The error of each address.
+pub async fn connect_any(addresses: &[Address]) -> Result<Connection, Vec<ClientError>> {
     let mut errors = Vec::new();
-    for (index, address) in machines.iter().enumerate() {
+    for (index, address) in addresses.iter().enumerate() {
         match Connection::open(address).await {
             Ok(connection) => return Ok(connection),
             Err(error) => {
-                if index + 1 < machines.len() {
+                if index + 1 < addresses.len() {
                     tracing::warn!("{}; trying the next server", error.in_short());
                 }
                 errors.push(error);
@@ -288,16 +291,16 @@ pub async fn first_of(machines: &[Address]) -> Result<Connection, Vec<ClientErro
 async fn takes_sessions(address: &Address, channel: &Channel) -> Result<(), ClientError> {
     let refuse = |reason| ClientError::Connect { address: address.clone(), reason };
     let request = HealthCheckRequest { service: SERVICE.into() };
-    let answer = timeout(CONNECT_LIMIT, HealthClient::new(channel.clone()).check(request)).await.map_err(|_| {
-        refuse(format!("it accepted the connection, but did not answer within {} s", CONNECT_LIMIT.as_secs()))
+    let answer = timeout(CONNECT_TIMEOUT, HealthClient::new(channel.clone()).check(request)).await.map_err(|_| {
+        refuse(format!("it accepted the connection, but did not answer within {} s", CONNECT_TIMEOUT.as_secs()))
     })?;
     match answer.map(|reply| reply.into_inner().status()) {
         Ok(ServingStatus::NotServing) => Err(refuse("it is shutting down".into())),
         Ok(_) => Ok(()),
         Err(status) => match status.code() {
-            // Something in between that lets only perturb's own calls through.
+            // A proxy that lets only perturb's own calls through.
             Code::NotFound | Code::PermissionDenied | Code::Unauthenticated | Code::Unimplemented => Ok(()),
-            // What comes back is not even a refusal.
+            // The answer is not even a gRPC status.
             _ if std::error::Error::source(&status).is_some() => {
                 Err(ClientError::NotPerturb { address: address.clone() })
             }
@@ -319,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn replicas_have_an_order_of_their_own_and_turns_go_around() {
+    fn replicas_are_sorted_and_turns_wrap_around() {
         let answers = [["10.0.0.9:7", "10.0.0.10:7", "10.0.0.2:7"], ["10.0.0.2:7", "10.0.0.9:7", "10.0.0.10:7"]];
         for answer in answers {
             let turn = |turn| sorted(found(&answer), None).into_order(turn);
@@ -330,26 +333,26 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_with_two_protocols_is_one_machine() {
-        let machines = sorted(found(&["127.0.0.1:7", "[::1]:7", "127.0.0.1:7"]), None);
-        assert_eq!(machines.equal, addresses(&["127.0.0.1:7"]));
+    fn machine_with_two_protocol_families_counts_once() {
+        let resolved = sorted(found(&["127.0.0.1:7", "[::1]:7", "127.0.0.1:7"]), None);
+        assert_eq!(resolved.preferred, addresses(&["127.0.0.1:7"]));
         for turn in 0..3 {
             assert_eq!(
                 sorted(found(&["127.0.0.1:7", "[::1]:7"]), None).into_order(turn),
                 addresses(&["127.0.0.1:7", "[::1]:7"])
             );
         }
-        assert_eq!(sorted(found(&["[::1]:7", "127.0.0.1:7"]), None).equal, addresses(&["[::1]:7"]));
+        assert_eq!(sorted(found(&["[::1]:7", "127.0.0.1:7"]), None).preferred, addresses(&["[::1]:7"]));
     }
 
     #[test]
-    fn numbers_and_sockets_stand_for_themselves() {
+    fn numbers_and_sockets_need_no_resolver() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         for text in ["10.1.2.3:7", "[::1]:7", "unix:/a"] {
-            let machines = runtime.block_on(machines(&text.parse().unwrap())).unwrap();
-            assert_eq!(machines.equal, addresses(&[text]));
+            let resolved = runtime.block_on(resolve(&text.parse().unwrap())).unwrap();
+            assert_eq!(resolved.preferred, addresses(&[text]));
         }
-        let error = runtime.block_on(machines(&"no-such-host.invalid:7".parse().unwrap())).unwrap_err().to_string();
+        let error = runtime.block_on(resolve(&"no-such-host.invalid:7".parse().unwrap())).unwrap_err().to_string();
         assert!(error.contains("http://no-such-host.invalid:7: its name"), "{error}");
     }
 }

@@ -1,4 +1,4 @@
-//! What a client shows to servers, and whose certificates it trusts.
+//! Credentials of a client: its token, its certificate, and the certificates that it trusts.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -10,42 +10,42 @@ use tonic::{Request, Status};
 
 use crate::address::Address;
 
-/// The file with a client's token.
+/// Variable with the file of a client's token.
 pub const TOKEN_FILE: &str = "PERTURB_TOKEN_FILE";
-/// Whose certificates are trusted.
+/// Variable with the file of the trusted authorities' certificates.
 pub const CA: &str = "PERTURB_CA";
-/// A client's certificate.
+/// Variable with the file of a client's certificate.
 pub const CERT: &str = "PERTURB_CERT";
-/// Its private key.
+/// Variable with the file of a client's private key.
 pub const KEY: &str = "PERTURB_KEY";
-/// 1: a token may go unencrypted to other machines.
+/// Variable that allows, if set to 1, to send a token unencrypted to other machines.
 pub const INSECURE: &str = "PERTURB_INSECURE";
-/// Where systems keep the authorities that they trust: Debian, Red Hat, Alpine and SUSE.
+/// Files in which systems keep the authorities that they trust: Debian, Red Hat, Alpine and SUSE.
 const SYSTEM_CA: [&str; 3] =
     ["/etc/ssl/certs/ca-certificates.crt", "/etc/pki/tls/certs/ca-bundle.crt", "/etc/ssl/ca-bundle.pem"];
 
-/// What a variable is set to.
+/// Looks a variable up.
 type Variable<'a> = &'a dyn Fn(&str) -> Option<OsString>;
 
-/// What a client shows, and whom it trusts. Read for each connection, so that files may be replaced.
+/// The credentials of a client. They are read for each connection, so that files may be replaced.
 #[derive(Default)]
 pub struct Credentials {
-    /// Sent with every call.
-    pub(crate) token: Option<Bearer>,
-    /// Shown to servers that ask for it.
+    /// The token, sent with every call.
+    pub(crate) token: Option<BearerHeader>,
+    /// The certificate, shown to servers that ask for it.
     pub(crate) identity: Option<Identity>,
     pub(crate) trust: Trust,
 }
 
-/// A client's certificate, those between it and its authority's, and its key.
+/// A client's certificate with the chain to its authority's, and its key.
 type Identity = (Vec<CertificateDer<'static>>, PrivateKeyDer<'static>);
 
-/// Whose certificates are trusted.
+/// The server certificates that are trusted.
 pub(crate) enum Trust {
-    /// Those that one of these authorities has signed.
+    /// Certificates that one of these authorities has signed.
     Authorities(Vec<CertificateDer<'static>>),
-    /// The one that is the first of these.
-    Exactly(Vec<CertificateDer<'static>>),
+    /// Only the first of these certificates.
+    Pinned(Vec<CertificateDer<'static>>),
 }
 
 impl Default for Trust {
@@ -55,19 +55,19 @@ impl Default for Trust {
 }
 
 impl Credentials {
-    /// As the environment says, for a server at this address.
+    /// The credentials of the process's environment variables, for a server at this address.
     ///
     /// # Errors
-    /// Those of [`Credentials::of`].
-    pub fn of_environment(address: &Address) -> Result<Self, String> {
-        Self::of(address, &environment)
+    /// Those of [`Credentials::from_variables`].
+    pub fn from_environment(address: &Address) -> Result<Self, String> {
+        Self::from_variables(address, &environment)
     }
 
-    /// As variables say, for a server at this address. A Unix socket needs none.
+    /// The credentials of these variables, for a server at this address. A Unix socket needs none.
     ///
     /// # Errors
-    /// A sentence that names the variable, the file and what is wrong.
-    pub fn of(address: &Address, variable: Variable<'_>) -> Result<Self, String> {
+    /// A sentence with the variable, the file and the reason.
+    pub fn from_variables(address: &Address, variable: Variable<'_>) -> Result<Self, String> {
         let Address::Tcp { host, tls, .. } = address else { return Ok(Self::default()) };
         let file = |name| file(name, variable);
         let token = file(TOKEN_FILE).map(|path| token(&path)).transpose()?;
@@ -90,12 +90,12 @@ impl Credentials {
         Ok(Self { token, identity: identity(variable)?, trust })
     }
 
-    /// The same for a server whose certificate is known, the first of a file of PEM.
+    /// Credentials that trust only one server certificate, the first of a file of PEM.
     ///
     /// # Errors
     /// Those of the file, and of the variables for a client's certificate.
-    pub fn knowing(certificate: &Path) -> Result<Self, String> {
-        let trust = Trust::Exactly(certificates("the server's certificate", certificate)?);
+    pub fn pinned(certificate: &Path) -> Result<Self, String> {
+        let trust = Trust::Pinned(certificates("the server's certificate", certificate)?);
         Ok(Self { token: None, identity: identity(&environment)?, trust })
     }
 }
@@ -133,7 +133,7 @@ fn certificates(what: &str, path: &Path) -> Result<Vec<CertificateDer<'static>>,
     if all.is_empty() { Err(wrong(&"there is no certificate")) } else { Ok(all) }
 }
 
-fn token(path: &Path) -> Result<Bearer, String> {
+fn token(path: &Path) -> Result<BearerHeader, String> {
     let wrong = |reason: &dyn std::fmt::Display| {
         format!("{TOKEN_FILE}={}: {reason}; expected one line with a token", path.display())
     };
@@ -144,20 +144,20 @@ fn token(path: &Path) -> Result<Bearer, String> {
     }
     let mut value: MetadataValue<Ascii> = format!("Bearer {text}").parse().map_err(|_| wrong(&"there is none"))?;
     value.set_sensitive(true);
-    Ok(Bearer(value))
+    Ok(BearerHeader(value))
 }
 
-/// A token, which is never shown.
+/// The header with a token. It is marked as sensitive, so that no log shows it.
 #[derive(Clone, Debug)]
-pub(crate) struct Bearer(MetadataValue<Ascii>);
+pub(crate) struct BearerHeader(MetadataValue<Ascii>);
 
 /// Sends a token with each call, if there is one.
 #[derive(Clone, Debug, Default)]
-pub struct WithToken(pub(crate) Option<Bearer>);
+pub struct WithToken(pub(crate) Option<BearerHeader>);
 
 impl Interceptor for WithToken {
     fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
-        if let Some(Bearer(value)) = &self.0 {
+        if let Some(BearerHeader(value)) = &self.0 {
             request.metadata_mut().insert("authorization", value.clone());
         }
         Ok(request)

@@ -5,11 +5,11 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::limits::MOST_INTERVALS;
+use crate::limits::MAX_INTERVALS;
 use crate::proto;
 pub use crate::proto::Interval;
 
-/// The most intervals that a refusal repeats.
+/// Maximal number of intervals that an error repeats.
 const SHOWN_INTERVALS: usize = 8;
 
 impl Interval {
@@ -29,26 +29,26 @@ impl fmt::Display for Interval {
     }
 }
 
-/// Uniform over a union of intervals: a point is as likely in any of them, so an interval's probability is its share
-/// of the total length. One interval of length 0 is a fixed value.
+/// A uniform distribution over a union of intervals: an interval's probability is its share of the total length. One interval
+/// of length 0 is a fixed value.
 ///
 /// Written `0.1` or `0.3..0.4,0.8..0.9`; in TOML and JSON a fixed value may also be a number.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Written", into = "Written")]
 pub struct Distribution(Vec<Interval>);
 
-/// Why intervals or a text are no distribution.
+/// Why intervals or a text are not a distribution.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{got} is no set of values; expected {expected}")]
 pub struct DistributionError {
-    /// What came.
+    /// The intervals or the text.
     pub got: String,
-    /// What would be right.
+    /// The expected form.
     pub expected: &'static str,
 }
 
 impl Distribution {
-    /// Always `value`.
+    /// The distribution that is always `value`.
     ///
     /// # Panics
     /// If it is not finite.
@@ -57,7 +57,7 @@ impl Distribution {
         Self(vec![Interval::new(value, value)])
     }
 
-    /// Over the union of `intervals`.
+    /// The distribution over the union of `intervals`.
     ///
     /// # Errors
     /// [`DistributionError`] unless there are 1 to 64 intervals, all ends are finite, each `low` is at most its
@@ -73,7 +73,7 @@ impl Distribution {
             }
             Err(DistributionError { got, expected })
         };
-        if !(1..=MOST_INTERVALS).contains(&intervals.len()) {
+        if !(1..=MAX_INTERVALS).contains(&intervals.len()) {
             return refuse("1 to 64 intervals");
         }
         if intervals.iter().any(|i| !i.low.is_finite() || !i.high.is_finite()) {
@@ -109,13 +109,13 @@ impl Distribution {
         self.0[self.0.len() - 1].high
     }
 
-    /// Whether `value` is in one of the intervals, or so near as rounding brings it.
+    /// Whether `value` is in one of the intervals, up to rounding.
     pub fn contains(&self, value: f64) -> bool {
         let margin = 1e-9 * value.abs();
         self.0.iter().any(|interval| interval.low - margin <= value && value <= interval.high + margin)
     }
 
-    /// Whether all its values are `other`'s, too, whose intervals may touch.
+    /// Whether all values of this are values of `other`, too, whose intervals may touch.
     pub fn is_within(&self, other: &Self) -> bool {
         let mut wider: Vec<Interval> = Vec::with_capacity(other.0.len());
         for &interval in &other.0 {
@@ -127,8 +127,8 @@ impl Distribution {
         self.0.iter().all(|own| wider.iter().any(|other| other.low <= own.low && own.high <= other.high))
     }
 
-    /// Whether values of it are `other`'s, too. Of two intervals the ends are none, since both are never drawn: R and E, which
-    /// touch, do not overlap; a fixed value is in an interval whose end it is.
+    /// Whether some values of this are values of `other`, too. A common end of two intervals does not count, since it is never
+    /// drawn: R and E, which touch, do not overlap. A fixed value overlaps an interval whose end it is.
     pub fn overlaps(&self, other: &Self) -> bool {
         let meet = |one: &Interval, other: &Interval| {
             let (low, high) = (one.low.max(other.low), one.high.min(other.high));
@@ -138,7 +138,7 @@ impl Distribution {
         self.0.iter().any(|one| other.0.iter().any(|other| meet(one, other)))
     }
 
-    /// As [`FromStr`] reads it.
+    /// The text that [`FromStr`] reads.
     pub fn written(&self) -> String {
         let interval = |&Interval { low, high }: &Interval| {
             if low == high { low.to_string() } else { format!("{low}..{high}") }
@@ -146,7 +146,7 @@ impl Distribution {
         self.0.iter().map(interval).collect::<Vec<_>>().join(",")
     }
 
-    /// Least and greatest value.
+    /// Minimum and maximum.
     pub fn range(&self) -> (f64, f64) {
         (self.0[0].low, self.0[self.0.len() - 1].high)
     }
@@ -224,7 +224,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_distribution_reads_back_from_what_is_written() {
+    fn distribution_survives_a_round_trip() {
         for text in ["0.1", "0.3..0.4", "0.3..0.4,0.8..0.9", "-1..1"] {
             let distribution: Distribution = text.parse().unwrap();
             let json = serde_json::to_string(&distribution).unwrap();
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn sets_are_within_and_overlap_as_their_values_do() {
+    fn containment_and_overlap_follow_the_values() {
         let of = |text: &str| text.parse::<Distribution>().unwrap();
         for (one, other, within, overlaps) in [
             ("1", "1", true, true),
@@ -259,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn a_text_that_is_none_is_refused_with_what_would_be() {
+    fn wrong_text_is_refused_with_the_expected_form() {
         for text in ["", "x", "1..", "..2", "1..2..3", "1,", "2..1", "1..3,2..4", "1,2", "nan", "inf"] {
             let error = text.parse::<Distribution>().unwrap_err().to_string();
             assert!(error.contains("expected"), "{text}: {error}");

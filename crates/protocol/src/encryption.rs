@@ -26,9 +26,9 @@ use tonic::codegen::{Service, http::Uri};
 
 use crate::credentials::{CA, CERT, Credentials, KEY, Trust};
 
-/// How long a server may take to show that it speaks TLS.
-const PROBE_LIMIT: Duration = Duration::from_secs(1);
-/// What a client of HTTP/2 sends first.
+/// Time that a server has to show that it speaks TLS.
+const PROBE_TIMEOUT: Duration = Duration::from_secs(1);
+/// The first bytes of a client of HTTP/2.
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 /// The first byte of an alert of TLS.
 const ALERT: u8 = 0x15;
@@ -44,19 +44,19 @@ pub(crate) struct Connector {
     failure: Failure,
 }
 
-/// Why there is no connection that can be trusted, once that is known.
+/// The reason why no trusted connection is possible, once it is known.
 type Failure = Arc<Mutex<Option<String>>>;
 
 impl Connector {
-    /// To the server at host and port, whose certificate must be for that name.
+    /// A connector to the server at host and port, whose certificate must be for `name`.
     ///
     /// # Errors
-    /// What is wrong with the credentials.
+    /// The reason why the credentials cannot be used.
     pub(crate) fn new(host: &str, port: u16, name: &str, credentials: Credentials) -> Result<Self, String> {
         let provider = Arc::new(ring::default_provider());
         let words = |error: &dyn ToString| error.to_string();
         let verifier: Arc<dyn ServerCertVerifier> = match credentials.trust {
-            Trust::Exactly(known) => Arc::new(Known { known, provider: Arc::clone(&provider) }),
+            Trust::Pinned(pinned) => Arc::new(PinnedVerifier { pinned, provider: Arc::clone(&provider) }),
             Trust::Authorities(authorities) => {
                 let mut roots = RootCertStore::empty();
                 roots.add_parsable_certificates(authorities);
@@ -68,7 +68,7 @@ impl Connector {
         let builder = ClientConfig::builder_with_provider(provider)
             .with_protocol_versions(&[&TLS13])
             .map_err(|error| words(&error))?
-            .dangerous() // for a server whose certificate is known as it is
+            .dangerous() // for a pinned certificate
             .with_custom_certificate_verifier(verifier);
         let mut config = match credentials.identity {
             Some((chain, key)) => builder
@@ -83,14 +83,14 @@ impl Connector {
         Ok(Self { host, port, name, config: Arc::new(config), shows_certificate, failure })
     }
 
-    /// Why who is there is not trusted, or does not trust, where that is why there is no connection.
+    /// The reason why the server is not trusted, or does not trust this client, if the connection failed because of it.
     pub(crate) fn failure(&self) -> Option<String> {
         self.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 }
 
 impl Service<Uri> for Connector {
-    type Response = TokioIo<Watched>;
+    type Response = TokioIo<AlertRecordingStream>;
     type Error = io::Error;
     type Future = Pin<Box<dyn Future<Output = io::Result<Self::Response>> + Send>>;
 
@@ -106,20 +106,20 @@ impl Service<Uri> for Connector {
             let stream = TlsConnector::from(config).connect(name, tcp).await;
             let reason = stream.as_ref().err().and_then(|error| words(error, &host));
             *failure.lock().unwrap_or_else(PoisonError::into_inner) = reason;
-            stream.map(|stream| TokioIo::new(Watched { stream, shows_certificate, failure })).map_err(|error| {
-                match error.kind() {
+            stream.map(|stream| TokioIo::new(AlertRecordingStream { stream, shows_certificate, failure })).map_err(
+                |error| match error.kind() {
                     io::ErrorKind::UnexpectedEof | io::ErrorKind::ConnectionReset => io::Error::other(
                         "it ended the connection in TLS's handshake; if it speaks no TLS, write tcp:// for https://",
                     ),
                     _ => error,
-                }
-            })
+                },
+            )
         })
     }
 }
 
-/// What is wrong with who answers; none if it may only be the line: what was changed on its way, for instance, is not
-/// believed, but may come whole the next time.
+/// The reason why the server is not trusted. `None` for errors of the connection, e.g. bytes that were changed on the way: the
+/// next attempt may succeed.
 fn words(error: &io::Error, host: &str) -> Option<String> {
     use CertificateError as Bad;
     let error = error.get_ref()?.downcast_ref::<Error>()?;
@@ -150,15 +150,16 @@ fn words(error: &io::Error, host: &str) -> Option<String> {
     })
 }
 
-/// An encrypted connection, whose end may be the server's word on the client's certificate, which servers see last.
-pub(crate) struct Watched {
+/// A TLS stream that records the alert by which the server rejects the client's certificate. In TLS 1.3 the alert arrives after
+/// the handshake.
+pub(crate) struct AlertRecordingStream {
     stream: TlsStream<TcpStream>,
     shows_certificate: bool,
     failure: Failure,
 }
 
-impl Watched {
-    fn hear(&self, error: &io::Error) {
+impl AlertRecordingStream {
+    fn record_alert(&self, error: &io::Error) {
         use AlertDescription as Alert;
         let Some(Error::AlertReceived(
             alert @ (Alert::CertificateRequired
@@ -169,7 +170,7 @@ impl Watched {
             | Alert::CertificateUnknown
             | Alert::UnknownCA
             | Alert::AccessDenied
-            | Alert::DecryptError), // a signature that is not its issuer's
+            | Alert::DecryptError), // the signature is not its issuer's
         )) = error.get_ref().and_then(|error| error.downcast_ref())
         else {
             return;
@@ -185,7 +186,7 @@ impl Watched {
     }
 }
 
-impl AsyncRead for Watched {
+impl AsyncRead for AlertRecordingStream {
     fn poll_read(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
@@ -193,13 +194,13 @@ impl AsyncRead for Watched {
     ) -> Poll<io::Result<()>> {
         let polled = Pin::new(&mut self.stream).poll_read(context, buffer);
         if let Poll::Ready(Err(error)) = &polled {
-            self.hear(error);
+            self.record_alert(error);
         }
         polled
     }
 }
 
-impl AsyncWrite for Watched {
+impl AsyncWrite for AlertRecordingStream {
     fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         Pin::new(&mut self.stream).poll_write(context, bytes)
     }
@@ -213,24 +214,25 @@ impl AsyncWrite for Watched {
     }
 }
 
-/// Whether who listens there speaks TLS, and answers what is none as TLS does.
+/// Whether a server at this address speaks TLS: it answers a request without TLS with an alert.
 pub(crate) async fn speaks_tls(host: &str, port: u16) -> bool {
     let ask = async {
         let mut tcp = TcpStream::connect((host, port)).await?;
         tcp.write_all(PREFACE).await?;
         tcp.read_u8().await
     };
-    matches!(timeout(PROBE_LIMIT, ask).await, Ok(Ok(ALERT)))
+    matches!(timeout(PROBE_TIMEOUT, ask).await, Ok(Ok(ALERT)))
 }
 
-/// Trusts one certificate, whatever is in it.
+/// Trusts only one certificate, whatever its content.
 #[derive(Debug)]
-struct Known {
-    known: Vec<CertificateDer<'static>>,
+struct PinnedVerifier {
+    /// The first one is trusted.
+    pinned: Vec<CertificateDer<'static>>,
     provider: Arc<CryptoProvider>,
 }
 
-impl ServerCertVerifier for Known {
+impl ServerCertVerifier for PinnedVerifier {
     fn verify_server_cert(
         &self,
         certificate: &CertificateDer<'_>,
@@ -239,7 +241,7 @@ impl ServerCertVerifier for Known {
         _: &[u8],
         _: UnixTime,
     ) -> Result<ServerCertVerified, Error> {
-        if self.known.first().is_some_and(|known| known == certificate) {
+        if self.pinned.first().is_some_and(|pinned| pinned == certificate) {
             return Ok(ServerCertVerified::assertion());
         }
         Err(Error::InvalidCertificate(CertificateError::ApplicationVerificationFailure))

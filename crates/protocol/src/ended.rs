@@ -1,11 +1,11 @@
-//! What clients keep of an episode's end.
+//! The end of an episode, as clients store it.
 
 use crate::proto;
 
 /// An episode that ended, with the parameters that it ran with.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EndedEpisode {
-    /// Where in the session's batch, 0 … N-1.
+    /// The slot in the session's batch, 0 … N-1.
     pub slot: usize,
     /// The environment's index: its place among those that were opened with it, unless that was given or restored.
     pub environment_index: u32,
@@ -15,28 +15,28 @@ pub struct EndedEpisode {
     pub trial_index: u64,
     /// Counts the trial's episodes from 0.
     pub episode_in_trial: u32,
-    /// The undiscounted sum of its rewards.
+    /// The undiscounted sum of the rewards.
     pub episode_return: f64,
-    /// Its number of steps.
+    /// The number of steps.
     pub length: u32,
-    /// Whether it was a success.
+    /// Whether the episode was a success.
     pub success: bool,
-    /// Whether the task ended it, as opposed to the step limit alone.
+    /// Whether the task ended the episode, as opposed to the step limit alone.
     pub terminated: bool,
     /// Whether the physics diverged.
     pub diverged: bool,
-    /// What it achieved of what the environment's success rule compares; `None` if nothing.
+    /// The quantity that the environment's success rule compares; `None` if it was never measured.
     pub achieved: Option<f64>,
-    /// The same of the rule of the paper's published code.
+    /// The quantity that the rule of the paper's published code compares.
     pub code_achieved: Option<f64>,
-    /// The parameters that were drawn or given and what the physics had, in the catalogue's order.
+    /// The requested parameters, and those of the physics, in the catalogue's order.
     pub receipt: proto::Receipt,
 }
 
 impl EndedEpisode {
-    /// What a server says of an episode, whose slot is `slot` of the batch; `None` if it leaves out the address or the
-    /// receipt.
-    pub fn of(end: proto::EpisodeEnd, slot: usize, terminated: bool) -> Option<Self> {
+    /// The end of an episode in `slot` of the batch, from a server's message; `None` if the message lacks the episode's address
+    /// or the receipt.
+    pub fn from_proto(end: proto::EpisodeEnd, slot: usize, terminated: bool) -> Option<Self> {
         let (episode, receipt) = end.episode.zip(end.receipt)?;
         Some(Self {
             slot,

@@ -1,4 +1,4 @@
-//! What can go wrong between a client and its servers.
+//! Errors between a client and its servers.
 
 use std::io::ErrorKind;
 use std::path::PathBuf;
@@ -9,18 +9,18 @@ use tonic::{Code, Status};
 use crate::address::Address;
 use crate::names::UnknownEnvironment;
 
-/// How long a server may take for one reply unless told otherwise; also that of a batch of thousands of environments comes much sooner.
-pub const REPLY_LIMIT: Duration = Duration::from_secs(60);
+/// Default timeout of a reply. Even a batch of thousands of environments replies much sooner.
+pub const REPLY_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// A failure of a server, of the connection to it, or of a request.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum ClientError {
-    /// Nobody answers at the address.
+    /// No server answers at the address.
     #[error("no server answers at {address}: {reason}; start one with `{}`, or correct --server", address.start_command())]
     Connect { address: Address, reason: String },
-    /// Something answers at the address that is no server of ours.
+    /// The program that answers at the address is no perturb-server.
     #[error(
         "what answers at {address} is no perturb-server: correct --server, or start one at a free port with \
          `perturb-server --listen tcp://127.0.0.1:0`"
@@ -29,15 +29,15 @@ pub enum ClientError {
     /// The server is not trusted, or does not trust this client.
     #[error("no safe connection to the server at {address}: {reason}")]
     Unsafe { address: Address, reason: String },
-    /// None of several servers takes sessions.
+    /// No one of several servers takes sessions.
     #[error(
         "no server answers ({reasons}); start one of them with `perturb-server --listen ADDRESS`, or correct --server"
     )]
     NoneConnects {
-        /// Every address with what is wrong there.
+        /// Every address with its error.
         reasons: String,
     },
-    /// The server understood a request and refused it. The session lives on.
+    /// The server understood a request and refused it. The session continues.
     #[error("the server at {address} refused {request}: {message}")]
     Refused { address: Address, request: &'static str, code: Code, message: String },
     /// The connection or the server is gone, and with it the session's environments.
@@ -49,7 +49,7 @@ pub enum ClientError {
         code: Code,
         reason: String,
     },
-    /// The server is there, but a reply did not come in time.
+    /// A reply did not come in time.
     #[error("the server at {address} did not answer {request} within {} s", limit.as_secs_f64())]
     TimedOut { address: Address, request: &'static str, limit: Duration },
     /// A reply does not follow the protocol.
@@ -67,7 +67,7 @@ pub enum ClientError {
          perturb-server of this version, or leave out `observe = \"parameters\"`"
     )]
     NoParameters { address: Address },
-    /// There is not one snapshot for each environment.
+    /// The number of snapshots is not that of the environments.
     #[error("there are {got} snapshots to restore, expected {expected}: one for each environment")]
     Snapshots { got: usize, expected: usize },
     /// The program `perturb-server` was not found.
@@ -76,7 +76,7 @@ pub enum ClientError {
          to its path, or name a running server with --server"
     )]
     NoServerProgram {
-        /// Where it was looked for.
+        /// The places in which it was looked for.
         tried: String,
     },
     /// The private server did not start.
@@ -88,7 +88,7 @@ pub enum ClientError {
 }
 
 impl ClientError {
-    /// Which address and why, for a list of several.
+    /// The address and the reason, for a list of several.
     pub(crate) fn in_short(&self) -> String {
         match self {
             Self::Connect { address, reason } => format!("{address}: {reason}"),
@@ -98,34 +98,35 @@ impl ClientError {
         }
     }
 
-    /// The errors of all addresses that were tried as one.
-    pub fn of_all(mut errors: Vec<Self>) -> Self {
+    /// A single error for all addresses that were tried.
+    pub fn from_all(mut errors: Vec<Self>) -> Self {
         if errors.len() == 1 || errors.iter().all(|error| matches!(error, Self::Unsafe { .. })) && !errors.is_empty() {
             return errors.remove(0);
         }
         Self::NoneConnects { reasons: errors.iter().map(Self::in_short).collect::<Vec<_>>().join("; ") }
     }
 
-    /// Whether the same may go well later or with another server: the fault is not that of what was asked for.
+    /// Whether the request may succeed later or with another server: the request itself is not at fault.
     pub fn can_be_retried(&self) -> bool {
         match self {
-            Self::Refused { code, .. } => *code == Code::ResourceExhausted, // full; others' sessions will end
+            Self::Refused { code, .. } => *code == Code::ResourceExhausted, // full until other sessions end
             Self::Snapshots { .. } | Self::NoEnvironment(_) | Self::Unsafe { .. } => false,
             Self::Connect { .. }
-            | Self::NotPerturb { .. } // a name that stands for another machine tomorrow
+            | Self::NotPerturb { .. } // a name may resolve to another machine later
             | Self::NoneConnects { .. }
             | Self::Lost { .. }
             | Self::TimedOut { .. }
             | Self::Protocol { .. } // a server of another version
             | Self::Disagreement { .. }
-            | Self::NoParameters { .. } // likewise
+            | Self::NoParameters { .. } // a server of another version
             | Self::NoServerProgram { .. }
             | Self::Start { .. }
             | Self::System { .. } => true,
         }
     }
 
-    /// Whether the server or the way to it is gone, or silent: what it had is lost, and the same may go well when it is back.
+    /// Whether the server is gone or silent, or the connection to it. The session is lost, and the request may succeed when the
+    /// server is back.
     pub fn is_absence(&self) -> bool {
         match self {
             Self::Lost { code, .. } => matches!(
@@ -144,22 +145,22 @@ impl ClientError {
     }
 }
 
-/// "during a step", "when it was to save a player".
+/// The time of an error: "during a step", "when it was to save a player".
 fn when(request: &str) -> String {
     if request.starts_with("to ") { format!("when it was {request}") } else { format!("during {request}") }
 }
 
-/// What ended a call: the server's own words, if it said any.
+/// The reason why a call ended: the server's message, if there is one.
 pub(crate) fn describe(status: &Status) -> String {
     match std::error::Error::source(status) {
-        // The transport's words, of frames and streams, help nobody who did not write it.
+        // Messages of the transport are about frames and streams, which does not help users.
         Some(cause) => system_words(cause).unwrap_or_else(|| "the connection broke off".into()),
         None if status.message().is_empty() => format!("{:?}", status.code()),
         None => status.message().to_owned(),
     }
 }
 
-/// What the operating system has against a connection; `None` if it is not at fault.
+/// The operating system's error of a connection, in words; `None` if there is none.
 pub(crate) fn system_words(error: &(dyn std::error::Error + 'static)) -> Option<String> {
     let mut chain = std::iter::successors(Some(error), |error| error.source());
     let system = chain.find_map(|error| error.downcast_ref::<std::io::Error>())?;

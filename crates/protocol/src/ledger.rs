@@ -1,8 +1,8 @@
-//! The ledger of a server: what every token drew, line by line, each chained to all before it.
+//! The ledger of a server: the parameter regions that every token drew from, line by line, each chained to all before it.
 //!
 //! A line is a digest, a space, and an [`Entry`] as JSON. The digest is SHA-256, in hexadecimal, of the digest of the line
-//! before (64 zeros before the first), a space, and the JSON; so nobody can change, leave out or add a line before
-//! another without changing all digests behind it. Whoever knows one digest can prove everything up to it.
+//! before (64 zeros before the first), a space, and the JSON. So a line cannot be changed, left out or added without changing
+//! all digests behind it. A single digest proves everything up to it.
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read as _};
@@ -13,9 +13,9 @@ use sha2::{Digest, Sha256};
 
 use crate::region::Region;
 
-/// No line is longer, bytes, its end among them.
-pub const LONGEST: u64 = 64 << 20;
-/// Digits of a digest.
+/// Maximal length of a line with its end.
+pub const MAX_LINE_BYTES: u64 = 64 << 20;
+/// Number of digits of a digest.
 const DIGITS: usize = 64;
 
 /// A line without its digest.
@@ -23,106 +23,106 @@ const DIGITS: usize = 64;
 pub struct Entry {
     /// Counts the ledger's lines from 0.
     pub n: u64,
-    /// When it was written, ms since 1970.
+    /// The time of writing, ms since 1970.
     pub unix_ms: u64,
-    /// What happened.
+    /// The event.
     #[serde(flatten)]
     pub event: Event,
 }
 
-/// What is written down.
+/// An event of the ledger.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub enum Event {
     /// A server began.
     Began {
-        /// Its version.
+        /// The server's version.
         version: String,
-        /// Its commit.
+        /// The server's commit.
         commit: String,
-        /// Bytes of a line that the server before did not finish, and that were taken away: nobody had an answer then.
+        /// Bytes of a line that the server before did not finish, and that were removed: its request had no answer yet.
         unfinished: u64,
     },
-    /// A session draws from something else from now on.
-    Draws(Draws),
-    /// A session was refused what it wanted to draw from.
+    /// A session draws from other regions from now on.
+    Draws(DrawRecord),
+    /// A session was not allowed to draw from a region.
     Refused {
-        /// Who.
+        /// The session.
         #[serde(flatten)]
         who: Who,
-        /// From what.
+        /// The region.
         region: Region,
-        /// Why not.
+        /// The reason.
         reason: String,
     },
-    /// The server ended, all sessions before it.
+    /// The server ended, after all sessions had ended.
     Ended,
 }
 
-/// Whose entry it is.
+/// The session of an entry.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Who {
-    /// Tells the sessions of a server apart, from one beginning to the next.
+    /// Number of the session, unique until the server starts again.
     pub session: u64,
-    /// The name of its token; none: it needed none.
+    /// The name of the session's token; none if it needed none.
     pub token: Option<String>,
-    /// Of which environment.
+    /// The environment.
     pub environment: String,
-    /// Its revision.
+    /// The environment's revision.
     pub revision: u32,
 }
 
-/// Environments of a session that draw from something else from now on, and what they drew before.
+/// A change of the regions that environments of a session draw from.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Draws {
-    /// Who.
+pub struct DrawRecord {
+    /// The session.
     #[serde(flatten)]
     pub who: Who,
-    /// What is drawn from.
+    /// The new regions.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub regions: Vec<Region>,
-    /// What begins.
+    /// Environments that begin to draw from them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub begins: Vec<Begin>,
-    /// What has ended.
+    /// Environments that no longer draw from the regions before.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub ends: Vec<End>,
 }
 
-/// Environments that begin to draw: each with the seed, its index and an episode's number fixes the episode.
+/// Environments that begin to draw. The seed, an environment's index and an episode's number fix the episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Begin {
     /// The seed.
     pub seed: u64,
     /// The index of the first environment.
     pub index: u32,
-    /// How many there are, of successive indices.
+    /// The number of environments, with successive indices.
     pub count: u32,
-    /// Which of [`Draws::regions`] they draw from.
+    /// The place of their region in [`DrawRecord::regions`].
     pub region: u32,
-    /// The first episode that is drawn so.
+    /// The first episode that is drawn from it.
     pub episode: u64,
 }
 
-/// Environments that draw so no more.
+/// Environments that no longer draw from their region.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct End {
     /// The seed.
     pub seed: u64,
     /// The index of the first environment.
     pub index: u32,
-    /// How many there are, of successive indices.
+    /// The number of environments, with successive indices.
     pub count: u32,
-    /// The last episode that was begun; none, if the request was refused or failed and nothing was drawn.
+    /// The last episode that was begun; none if the request was refused or failed, and nothing was drawn.
     pub episode: Option<u64>,
 }
 
-/// The chain, as far as it was written or read.
+/// The chain of the lines that were written or read so far.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Chain {
-    /// Lines.
+    /// Number of lines.
     lines: u64,
-    /// The last one's digest.
+    /// Digest of the last line.
     head: String,
 }
 
@@ -132,7 +132,7 @@ impl Default for Chain {
     }
 }
 
-/// Why a ledger cannot be believed, or read.
+/// Why a ledger cannot be read, or is not valid.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The file cannot be read.
@@ -140,17 +140,17 @@ pub enum Error {
     Io {
         /// The file.
         path: PathBuf,
-        /// Why not.
+        /// The reason.
         source: io::Error,
     },
-    /// A line is not what was written.
+    /// A line was changed.
     #[error("line {line} of {path} {what}: the file was changed after it was written, or is no ledger")]
     Broken {
         /// The file.
         path: PathBuf,
-        /// Which line, from 1.
+        /// The line, from 1.
         line: u64,
-        /// What is wrong with it.
+        /// The reason.
         what: &'static str,
     },
 }
@@ -166,10 +166,10 @@ impl Chain {
         &self.head
     }
 
-    /// The line of an event, with its end.
+    /// Appends an event. Returns its line with the end of line.
     ///
     /// # Errors
-    /// One that cannot be written as JSON.
+    /// An event that cannot be written as JSON.
     pub fn add(&mut self, event: &Event, unix_ms: u64) -> serde_json::Result<String> {
         let entry = Entry { n: self.lines, unix_ms, event: event.clone() };
         let json = serde_json::to_string(&entry)?;
@@ -178,7 +178,7 @@ impl Chain {
         Ok(format!("{} {json}\n", self.head))
     }
 
-    /// Takes a line that was read, without its end.
+    /// Appends a line that was read, without its end. The error is the reason why it is not valid.
     fn take(&mut self, line: &str) -> Result<Entry, &'static str> {
         let (digest, json) = line.split_once(' ').ok_or("has no digest")?;
         let own = self.digest(json);
@@ -198,18 +198,18 @@ impl Chain {
     }
 }
 
-/// A ledger that was read.
+/// The result of reading a ledger.
 #[derive(Debug)]
 pub struct Read {
     /// The chain after the last whole line.
     pub chain: Chain,
     /// Bytes of whole lines.
     pub bytes: u64,
-    /// Bytes behind them: of a line that a server did not finish, or of one that is being written.
+    /// Bytes behind the whole lines: a line that a server did not finish, or that is being written.
     pub unfinished: u64,
 }
 
-/// Reads a ledger, checks its chain, and hands every entry, with its digest, to `each`.
+/// Reads a ledger, checks its chain, and calls `each` with every entry and its digest.
 ///
 /// # Errors
 /// [`Error`].
@@ -220,10 +220,10 @@ pub fn read(path: &Path, mut each: impl FnMut(Entry, &str)) -> Result<Read, Erro
     let mut line = Vec::new();
     loop {
         line.clear();
-        let n = file.by_ref().take(LONGEST).read_until(b'\n', &mut line).map_err(io)? as u64;
+        let n = file.by_ref().take(MAX_LINE_BYTES).read_until(b'\n', &mut line).map_err(io)? as u64;
         let broken = |line: u64, what| Error::Broken { path: path.to_owned(), line: line + 1, what };
         let Some(whole) = line.strip_suffix(b"\n") else {
-            if n == LONGEST {
+            if n == MAX_LINE_BYTES {
                 return Err(broken(read.chain.lines(), "is longer than any that was written"));
             }
             read.unfinished = n;
@@ -244,7 +244,7 @@ mod tests {
         let who = Who { session: 1, token: Some(token.into()), environment: "CartPole".into(), revision: 1 };
         let region = serde_json::from_str(r#"[{"length":"0.3..0.4,0.8..0.9","mass":"1"}]"#).unwrap();
         let begin = Begin { seed: u64::MAX, index: 3, count: 2, region: 0, episode: 0 };
-        Event::Draws(Draws { who, regions: vec![region], begins: vec![begin], ends: vec![] })
+        Event::Draws(DrawRecord { who, regions: vec![region], begins: vec![begin], ends: vec![] })
     }
 
     fn written(file: &Path, tokens: &[&str]) -> Chain {
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ledger_reads_back_as_it_was_written_and_goes_on() {
+    fn ledger_survives_a_round_trip() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("ledger");
         let chain = written(&path, &["ann", "bob"]);
@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_changed_left_out_or_put_in_is_found() {
+    fn changed_removed_and_added_lines_are_found() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("ledger");
         written(&path, &["ann", "bob", "cid"]);

@@ -1,19 +1,19 @@
-//! The contract between perturb's servers and their clients, which both sides take from here.
+//! The contract between perturb's servers and their clients. Both sides use this crate.
 //!
 //! - [`proto`]: the messages.
-//! - [`Version`], [`Distribution`], [`Address`], [`limits`]: what both sides mean by them.
-//! - [`names`]: how people may spell names.
+//! - [`Version`], [`Distribution`], [`Address`], [`limits`]: values with the same meaning on both sides.
+//! - [`names`]: the accepted spellings of names.
 //! - [`catalogue`]: the environments and limits as JSON.
 //! - [`Connection`] and [`Stream`]: a client's side of a session, one typed reply for each request.
-//! - [`Awake`]: how both sides wait for each other.
-//! - [`credentials`]: what a client shows, and whom it trusts.
-//! - [`EndedEpisode`]: what came of an episode.
-//! - [`player`]: a policy that plays, between its messages and [`perturb_policy`].
-//! - [`PrivateServer`]: a server of a program's own.
+//! - [`AdaptiveSpin`]: waiting for the other side with low latency.
+//! - [`credentials`]: a client's token and certificate, and the certificates that it trusts.
+//! - [`EndedEpisode`]: the end of an episode.
+//! - [`player`]: conversions between a player's messages and [`perturb_policy`].
+//! - [`PrivateServer`]: a server that belongs to one client program.
 #![forbid(unsafe_code)]
 
+mod adaptive_spin;
 mod address;
-mod awake;
 pub mod catalogue;
 mod connection;
 pub mod credentials;
@@ -30,14 +30,14 @@ pub mod region;
 mod stream;
 mod version;
 
+pub use adaptive_spin::AdaptiveSpin;
 pub use address::{Address, AddressError};
-pub use awake::Awake;
-pub use connection::{Connection, Machines, Patience, first_of, machines};
+pub use connection::{Connection, ResolvedAddresses, Timeouts, connect_any, resolve};
 pub use distribution::{Distribution, DistributionError, Interval};
 pub use ended::EndedEpisode;
-pub use error::{ClientError, REPLY_LIMIT};
+pub use error::{ClientError, REPLY_TIMEOUT};
 pub use private_server::PrivateServer;
-pub use stream::{Ask, Stream};
+pub use stream::{Stream, TypedRequest};
 pub use version::{UnknownVersion, Version};
 
 /// The protocols: generated from `proto`, whose comments specify every field. `perturb.v1` is here at the top.
@@ -49,11 +49,11 @@ pub mod proto {
 
     /// DeepMind's protocol between agents and environments.
     pub mod dm_env_rpc {
-        /// Its first version.
+        /// Version 1 of the protocol.
         pub mod v1 {
             include!("generated/dm_env_rpc.v1.rs");
 
-            /// Its extensions.
+            /// Extensions of the protocol.
             pub mod extensions {
                 /// Values by name.
                 pub mod properties {

@@ -1,11 +1,10 @@
-//! Names as people write them, the same everywhere: letters count in either case, `-` and `_` not at all, and an
-//! environment may have the id that Gymnasium knows it by. What is written otherwise is refused, with the name that was
-//! probably meant.
+//! Spellings of names, the same everywhere: case does not count, nor do `-` and `_`, and an environment may also have its id
+//! in Gymnasium. Other spellings are refused, with the name that was probably meant.
 
-/// How alike two names must be for one to be taken for the other, by Jaro and Winkler's measure: 1 is the same. Below
-/// it there is more chance than likeness.
-const ALIKE: f64 = 0.8;
-/// What ids in Gymnasium begin with.
+/// Similarity from which a name is suggested for another, by Jaro and Winkler's measure: 1 is the same. Lower similarities
+/// are mostly chance.
+const MIN_SIMILARITY: f64 = 0.8;
+/// The prefix of ids in Gymnasium.
 const NAMESPACE: &str = "perturb/";
 
 /// Whether `written` stands for the name `known`: `cart-pole` for `CartPole`, `r+e` for `R+E`.
@@ -27,7 +26,7 @@ pub fn closest<'a>(written: &str, known: impl Iterator<Item = &'a str>) -> Optio
     let written: String = letters(written).collect();
     let alike = |name: &str| strsim::jaro_winkler(&written, &letters(name).collect::<String>());
     let (best, name) = known.map(|name| (alike(name), name)).max_by(|(a, _), (b, _)| a.total_cmp(b))?;
-    (best >= ALIKE).then_some(name)
+    (best >= MIN_SIMILARITY).then_some(name)
 }
 
 /// " (did you mean `CartPole`?)", or nothing.
@@ -38,7 +37,7 @@ pub fn did_you_mean<'a>(written: &str, known: impl Iterator<Item = &'a str>) -> 
 /// An environment as it is written: its name in the catalogue, or its id in Gymnasium.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct EnvironmentName {
-    /// Without the id's other parts.
+    /// The name, without the id's other parts.
     pub name: String,
     /// The revision that an id asks for.
     pub revision: Option<u32>,
@@ -48,17 +47,17 @@ pub struct EnvironmentName {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum UnknownEnvironment {
-    /// None is called so.
+    /// No environment has the name.
     #[error("there is no environment {name:?}{hint}; there are {known}")]
     Name {
-        /// What was asked for.
+        /// The name that was given.
         name: String,
-        /// The name that was probably meant, if one was.
+        /// A hint at the name that was probably meant, or nothing.
         hint: String,
-        /// The names there are.
+        /// The names of all environments.
         known: String,
     },
-    /// It has another revision.
+    /// The environment has another revision.
     #[error(
         "`perturb/{name}-v{asked}` is another revision than that of the server, `perturb/{name}-v{served}`: write that, \
          or just `{name}`, or run a server of the revision"
@@ -68,13 +67,13 @@ pub enum UnknownEnvironment {
         name: String,
         /// The revision that was asked for.
         asked: u32,
-        /// That which there is.
+        /// The revision of the server.
         served: u32,
     },
 }
 
 impl EnvironmentName {
-    /// Takes an id apart; what is none is a name.
+    /// Parses an id of Gymnasium; any other text is a name.
     pub fn new(written: &str) -> Self {
         let plain = |name: &str| Self { name: name.to_owned(), revision: None };
         let id = written.get(..NAMESPACE.len()).filter(|start| start.eq_ignore_ascii_case(NAMESPACE));
@@ -85,7 +84,7 @@ impl EnvironmentName {
         }
     }
 
-    /// The place of the environment among the names and revisions that there are.
+    /// The place of the environment among the known names and revisions.
     ///
     /// # Errors
     /// [`UnknownEnvironment`].
@@ -116,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn an_environment_is_found_however_it_is_spelled() {
+    fn environment_is_found_in_all_spellings() {
         for written in
             ["CartPole", "cartpole", "Cartpole", "cart_pole", "cart-pole", "perturb/CartPole-v1", "Perturb/cartpole"]
         {
@@ -126,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn another_name_is_refused_with_the_one_that_was_meant() {
+    fn unknown_name_is_refused_with_a_hint() {
         let refused = |written| found(written).unwrap_err();
         assert_eq!(
             refused("CartPool"),
@@ -141,14 +140,14 @@ mod tests {
     }
 
     #[test]
-    fn a_name_that_is_written_exactly_is_that_one() {
+    fn exact_spelling_wins() {
         let known = ["cart_pole", "CartPole"];
         assert_eq!(find("CartPole", known.into_iter()), Some(1));
         assert_eq!(find("CARTPOLE", known.into_iter()), Some(0));
     }
 
     #[test]
-    fn what_is_like_nothing_is_no_hint() {
+    fn hint_needs_similarity() {
         let keys = ["learning_rate", "n_steps", "num_envs"];
         assert_eq!(closest("learning-rat", keys.into_iter()), Some("learning_rate"));
         assert_eq!(closest("nsteps", keys.into_iter()), Some("n_steps"));

@@ -1,4 +1,4 @@
-//! What a player is made of, on the wire and in memory.
+//! Conversions of a player's parts between messages and [`perturb_policy`].
 
 use bytes::Bytes;
 use perturb_policy::{CollectUntil, ObservationNormaliser, PlayerState, RewardNormaliser, RunningMoments};
@@ -7,24 +7,24 @@ use rand_chacha::rand_core::SeedableRng;
 
 use crate::proto;
 
-/// Why something that came is no part of a player.
+/// Why a message cannot be decoded.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{field} is {got}, expected {expected}")]
-pub struct Unreadable {
-    /// Which of its fields, e.g. "mean" or "moments.mean".
+pub struct DecodeError {
+    /// The field, e.g. "mean" or "moments.mean".
     pub field: String,
-    /// What came, e.g. "7 bytes".
+    /// The value, e.g. "7 bytes".
     pub got: String,
-    /// What was expected.
+    /// The expected value.
     pub expected: &'static str,
 }
 
-impl Unreadable {
+impl DecodeError {
     fn new(field: &str, got: impl Into<String>, expected: &'static str) -> Self {
         Self { field: field.into(), got: got.into(), expected }
     }
 
-    /// The same of the message that this one is in.
+    /// Adds the name of the field that holds the message.
     pub fn within(self, field: &str) -> Self {
         Self { field: format!("{field}.{}", self.field), ..self }
     }
@@ -55,30 +55,30 @@ impl From<&RunningMoments> for proto::Moments {
 }
 
 impl TryFrom<&proto::Moments> for RunningMoments {
-    type Error = Unreadable;
+    type Error = DecodeError;
 
-    fn try_from(moments: &proto::Moments) -> Result<Self, Unreadable> {
-        /// Counts are computed with as float64.
-        const MOST: u64 = 1 << 53;
-        if moments.count > MOST {
-            return Err(Unreadable::new("count", moments.count.to_string(), "at most 2^53"));
+    fn try_from(moments: &proto::Moments) -> Result<Self, DecodeError> {
+        /// Larger counts are not exact in float64.
+        const MAX_COUNT: u64 = 1 << 53;
+        if moments.count > MAX_COUNT {
+            return Err(DecodeError::new("count", moments.count.to_string(), "at most 2^53"));
         }
         let (mean, squares) = (read_doubles("mean", &moments.mean)?, read_doubles("squares", &moments.squares)?);
         Ok(Self::from_parts(moments.count, mean, squares))
     }
 }
 
-/// Statistics of observations of which as many numbers are left alone at the end as there are more, O, than means.
+/// Builds an observation normaliser. If O exceeds the number of means, the trailing entries are not normalised.
 ///
 /// # Errors
-/// [`Unreadable`], also if there are fewer than means.
+/// [`DecodeError`], also if there are fewer than means.
 pub fn observation_normaliser(
     moments: &proto::Moments,
     observation_size: usize,
-) -> Result<ObservationNormaliser, Unreadable> {
+) -> Result<ObservationNormaliser, DecodeError> {
     let moments = RunningMoments::try_from(moments)?;
     let got = moments.mean().len();
-    let too_many = || Unreadable::new("mean", format!("of {got} numbers"), "at most those of an observation");
+    let too_many = || DecodeError::new("mean", format!("of {got} numbers"), "at most those of an observation");
     let left_alone = observation_size.checked_sub(got).ok_or_else(too_many)?;
     Ok(ObservationNormaliser::from_moments(moments).leaving_alone(left_alone))
 }
@@ -91,11 +91,11 @@ impl From<&RewardNormaliser> for proto::RewardMoments {
 }
 
 impl TryFrom<&proto::RewardMoments> for RewardNormaliser {
-    type Error = Unreadable;
+    type Error = DecodeError;
 
-    fn try_from(rewards: &proto::RewardMoments) -> Result<Self, Unreadable> {
+    fn try_from(rewards: &proto::RewardMoments) -> Result<Self, DecodeError> {
         let given = rewards.moments.as_ref();
-        let moments = given.ok_or_else(|| Unreadable::new("moments", "missing", "their statistics"))?;
+        let moments = given.ok_or_else(|| DecodeError::new("moments", "missing", "their statistics"))?;
         let returns = read_doubles("returns", &rewards.returns)?;
         let moments = RunningMoments::try_from(moments).map_err(|wrong| wrong.within("moments"))?;
         Ok(Self::from_parts(rewards.gamma, returns, moments).running_on(rewards.runs_on))
@@ -103,7 +103,7 @@ impl TryFrom<&proto::RewardMoments> for RewardNormaliser {
 }
 
 impl From<&ChaCha8Rng> for proto::RandomStream {
-    /// Positions are modulo 2^64 words.
+    /// Converts a stream. Positions are modulo 2^64 words.
     fn from(stream: &ChaCha8Rng) -> Self {
         let (key, position) = (stream.get_seed().to_vec().into(), stream.get_word_pos() as u64);
         Self { key, stream: stream.get_stream(), position }
@@ -111,11 +111,11 @@ impl From<&ChaCha8Rng> for proto::RandomStream {
 }
 
 impl TryFrom<&proto::RandomStream> for ChaCha8Rng {
-    type Error = Unreadable;
+    type Error = DecodeError;
 
-    fn try_from(stream: &proto::RandomStream) -> Result<Self, Unreadable> {
+    fn try_from(stream: &proto::RandomStream) -> Result<Self, DecodeError> {
         let key = <[u8; 32]>::try_from(&stream.key[..]);
-        let key = key.map_err(|_| Unreadable::new("key", format!("{} bytes", stream.key.len()), "32 bytes"))?;
+        let key = key.map_err(|_| DecodeError::new("key", format!("{} bytes", stream.key.len()), "32 bytes"))?;
         let mut rng = Self::from_seed(key);
         rng.set_stream(stream.stream);
         rng.set_word_pos(stream.position.into());
@@ -124,65 +124,65 @@ impl TryFrom<&proto::RandomStream> for ChaCha8Rng {
 }
 
 impl From<&PlayerState> for proto::PlayerState {
-    /// But for the stream of actions.
+    /// Converts all but the stream of actions.
     fn from(state: &PlayerState) -> Self {
         Self {
             observations: floats(&state.observations),
             starts: state.starts.iter().map(|&start| u8::from(start)).collect(),
-            outcomes: floats(&state.outcomes),
+            outcomes: floats(&state.previous_steps),
             memory: floats(&state.memory),
         }
     }
 }
 
-/// A player's state whose next action is the stream's next. Whether its arrays have the player's shapes is not looked at.
+/// Builds a player's state, with the stream of its next actions. Does not check that its arrays have the player's shapes.
 ///
 /// # Errors
-/// [`Unreadable`], also if a number is not finite.
-pub fn player_state(state: &proto::PlayerState, actions: ChaCha8Rng) -> Result<PlayerState, Unreadable> {
+/// [`DecodeError`], also if a number is not finite.
+pub fn player_state(state: &proto::PlayerState, actions: ChaCha8Rng) -> Result<PlayerState, DecodeError> {
     if let Some(slot) = state.starts.iter().position(|&flag| flag > 1) {
         let got = format!("{} in slot {slot}", state.starts[slot]);
-        return Err(Unreadable::new("starts", got, "0 or 1"));
+        return Err(DecodeError::new("starts", got, "0 or 1"));
     }
     Ok(PlayerState {
         observations: read_floats("observations", &state.observations)?,
         starts: state.starts.iter().map(|&flag| flag == 1).collect(),
-        outcomes: read_floats("outcomes", &state.outcomes)?,
+        previous_steps: read_floats("outcomes", &state.outcomes)?,
         memory: read_floats("memory", &state.memory)?,
         actions,
     })
 }
 
-/// Little-endian.
+/// Encodes numbers as little-endian float32.
 pub fn floats(numbers: &[f32]) -> Bytes {
     numbers.iter().flat_map(|x| x.to_le_bytes()).collect()
 }
 
-/// Little-endian.
+/// Encodes numbers as little-endian float64.
 pub fn doubles(numbers: &[f64]) -> Bytes {
     numbers.iter().flat_map(|x| x.to_le_bytes()).collect()
 }
 
-/// Finite little-endian numbers.
+/// Decodes finite little-endian float32 numbers.
 ///
 /// # Errors
-/// [`Unreadable`] if bytes are left over or a number is not finite.
-pub fn read_floats(field: &str, bytes: &[u8]) -> Result<Vec<f32>, Unreadable> {
+/// [`DecodeError`] if bytes are left over or a number is not finite.
+pub fn read_floats(field: &str, bytes: &[u8]) -> Result<Vec<f32>, DecodeError> {
     let (words, rest) = bytes.as_chunks::<4>();
     if !rest.is_empty() {
-        return Err(Unreadable::new(field, format!("{} bytes", bytes.len()), "4 bytes for each float32"));
+        return Err(DecodeError::new(field, format!("{} bytes", bytes.len()), "4 bytes for each float32"));
     }
     let numbers: Vec<f32> = words.iter().map(|word| f32::from_le_bytes(*word)).collect();
     match numbers.iter().position(|x| !x.is_finite()) {
-        Some(i) => Err(Unreadable::new(field, format!("{} in element {i}", numbers[i]), "finite numbers")),
+        Some(i) => Err(DecodeError::new(field, format!("{} in element {i}", numbers[i]), "finite numbers")),
         None => Ok(numbers),
     }
 }
 
-fn read_doubles(field: &str, bytes: &[u8]) -> Result<Vec<f64>, Unreadable> {
+fn read_doubles(field: &str, bytes: &[u8]) -> Result<Vec<f64>, DecodeError> {
     let (words, rest) = bytes.as_chunks::<8>();
     if !rest.is_empty() {
-        return Err(Unreadable::new(field, format!("{} bytes", bytes.len()), "8 bytes for each float64"));
+        return Err(DecodeError::new(field, format!("{} bytes", bytes.len()), "8 bytes for each float64"));
     }
     Ok(words.iter().map(|word| f64::from_le_bytes(*word)).collect())
 }
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read_again() {
+    fn messages_survive_a_round_trip() {
         assert_eq!(RunningMoments::try_from(&proto::Moments::from(&moments())), Ok(moments()));
         let rewards = RewardNormaliser::from_parts(0.97, vec![1.5], moments()).running_on(true);
         let read = RewardNormaliser::try_from(&proto::RewardMoments::from(&rewards)).unwrap();
@@ -211,7 +211,7 @@ mod tests {
         let state = PlayerState {
             observations: vec![1.0, 2.0],
             starts: vec![true, false],
-            outcomes: vec![0.0],
+            previous_steps: vec![0.0],
             memory: vec![-1.0],
             actions: stream.clone(),
         };
@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn observations_may_have_more_numbers_than_are_normalised_and_no_fewer() {
+    fn normaliser_may_have_fewer_means_than_observations() {
         let given = proto::Moments::from(&moments());
         assert!(observation_normaliser(&given, 2).is_ok() && observation_normaliser(&given, 5).is_ok());
         let error = observation_normaliser(&given, 1).unwrap_err();
@@ -228,9 +228,9 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_part_of_a_player_is_refused() {
+    fn malformed_messages_are_refused() {
         let good = proto::Moments::from(&moments());
-        let wrong = |error: Result<RunningMoments, Unreadable>| error.unwrap_err().to_string();
+        let wrong = |error: Result<RunningMoments, DecodeError>| error.unwrap_err().to_string();
         let many = proto::Moments { count: (1 << 53) + 1, ..good.clone() };
         assert_eq!(wrong((&many).try_into()), "count is 9007199254740993, expected at most 2^53");
         let odd = proto::Moments { squares: Bytes::from_static(&[0; 7]), ..good };

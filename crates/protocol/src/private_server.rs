@@ -1,4 +1,4 @@
-//! A server of a program's own, on a private Unix socket.
+//! A server that belongs to this program, on a private Unix socket.
 
 use std::fs::{DirBuilder, Permissions};
 use std::io::{BufRead, BufReader, ErrorKind};
@@ -17,37 +17,38 @@ use crate::address::Address;
 use crate::error::ClientError;
 
 const PROGRAM: &str = "perturb-server";
-/// Overrides where the program is looked for.
+/// Variable with the path of the program.
 const VARIABLE: &str = "PERTURB_SERVER";
-/// How long a start may take.
-const START_LIMIT: Duration = Duration::from_secs(20);
-/// How long a server may take to end before it is killed.
-const END_LIMIT: Duration = Duration::from_secs(5);
-/// How long its last words are waited for.
-const HEARING_LIMIT: Duration = Duration::from_secs(1);
+/// Timeout of a start.
+const START_TIMEOUT: Duration = Duration::from_secs(20);
+/// Time that a server has to end before it is killed.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(5);
+/// Time to wait for a server's last lines after its end.
+const STDERR_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Is told the lines that private servers write to standard error.
-static HEARD: OnceLock<fn(String)> = OnceLock::new();
+/// Gets the lines that private servers write to standard error.
+static STDERR_HANDLER: OnceLock<fn(String)> = OnceLock::new();
 
-/// A `perturb-server` that lives no longer than this value, and no longer than this process: it holds the other end of
-/// the server's standard input, whose closing ends the server even if this process is killed.
+/// A `perturb-server` that lives no longer than this value, and no longer than this process: the server ends when its standard
+/// input is closed, which happens even if this process is killed.
 ///
-/// It runs in a process group of its own, so that Ctrl-C reaches this process alone, which can then finish what it does.
+/// The server runs in its own process group, so that Ctrl-C reaches only this process, which can then finish its work.
 #[derive(Debug)]
 pub struct PrivateServer {
     process: Process,
     address: Address,
     workers: Option<usize>,
-    /// Holds the socket; only its owner may enter.
+    /// The directory of the socket, which only its owner may enter.
     directory: TempDir,
 }
 
 impl PrivateServer {
-    /// Starts a server, `perturb-server --private`, with so many physics threads (`None`: one a core), and waits until it
+    /// Starts a server, `perturb-server --private`, with `workers` physics threads (`None`: one a core), and waits until it
     /// listens.
     ///
     /// # Errors
-    /// [`ClientError::NoServerProgram`] if there is none, [`ClientError::Start`] if it ends or does not listen within 20 s.
+    /// [`ClientError::NoServerProgram`] if the program is missing, [`ClientError::Start`] if it ends or does not listen within
+    /// 20 s.
     pub fn start(workers: Option<usize>) -> Result<Self, ClientError> {
         let program = find_program()?;
         let system = |action| move |source| ClientError::System { action, source };
@@ -65,14 +66,14 @@ impl PrivateServer {
         Ok(Self { process, address, workers, directory })
     }
 
-    /// Has `hear` told what all servers that this process starts from now on have to say, line by line; without it they
-    /// write to this process's standard error themselves, through whatever is shown there. What they say after this process
-    /// was killed is lost. The first call counts.
-    pub fn have_heard(hear: fn(String)) {
-        let _ = HEARD.set(hear);
+    /// Passes every line that servers started from now on write to standard error to `handler`. Without it they write to this
+    /// process's standard error themselves, in between its own output. Lines after this process was killed are lost. Only the
+    /// first call has an effect.
+    pub fn set_stderr_handler(handler: fn(String)) {
+        let _ = STDERR_HANDLER.set(handler);
     }
 
-    /// Ends it, if it still runs, and starts it again at the same address.
+    /// Ends the server, if it still runs, and starts it again at the same address.
     ///
     /// # Errors
     /// Those of [`PrivateServer::start`].
@@ -84,17 +85,17 @@ impl PrivateServer {
         Ok(())
     }
 
-    /// Where it listens.
+    /// The address at which the server listens.
     pub fn address(&self) -> &Address {
         &self.address
     }
 
-    /// The operating system's number of the process.
+    /// The process id.
     pub fn process_id(&self) -> u32 {
         self.process.child.id()
     }
 
-    /// How it ended; `None` while it runs.
+    /// The exit status; `None` while the server runs.
     pub fn exit_status(&mut self) -> Option<ExitStatus> {
         self.process.child.try_wait().ok().flatten()
     }
@@ -109,15 +110,15 @@ impl Drop for PrivateServer {
 #[derive(Debug)]
 struct Process {
     child: Child,
-    /// Hangs up once all is told that it said; nothing if nobody hears.
-    hearing: Option<Receiver<()>>,
+    /// Disconnects when all lines of standard error were handled; `None` without a handler.
+    stderr_done: Option<Receiver<()>>,
 }
 
 impl Process {
-    /// Closes its standard input, and waits until it has ended.
+    /// Closes the process's standard input, and waits until it has ended.
     fn end(&mut self) {
         drop(self.child.stdin.take());
-        let deadline = Instant::now() + END_LIMIT;
+        let deadline = Instant::now() + SHUTDOWN_TIMEOUT;
         while Instant::now() < deadline && matches!(self.child.try_wait(), Ok(None)) {
             thread::sleep(Duration::from_millis(5));
         }
@@ -128,12 +129,12 @@ impl Process {
         // An error means that it has ended.
         let _ = self.child.kill();
         let _ = self.child.wait();
-        // Whoever inherited its standard error may live on.
-        self.hearing.take().map(|hearing| hearing.recv_timeout(HEARING_LIMIT));
+        // A process that inherited the standard error may live on.
+        self.stderr_done.take().map(|done| done.recv_timeout(STDERR_TIMEOUT));
     }
 }
 
-/// Makes the directory again, which a server that ended in order has deleted. One that is there must be this user's alone.
+/// Creates the directory again, which a server deletes at its regular end. An existing one must belong to this user alone.
 fn own_directory(path: &Path) -> std::io::Result<()> {
     match DirBuilder::new().mode(0o700).create(path) {
         Err(error) if error.kind() == ErrorKind::AlreadyExists => {
@@ -156,17 +157,17 @@ fn spawn(program: &Path, address: &Address, workers: Option<usize>) -> Result<Pr
     let mut child = command
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
-        .stderr(if HEARD.get().is_some() { Stdio::piped() } else { Stdio::inherit() })
+        .stderr(if STDERR_HANDLER.get().is_some() { Stdio::piped() } else { Stdio::inherit() })
         .process_group(0)
         .spawn()
         .map_err(|error| fail(error.to_string()))?;
-    let hearing = HEARD.get().zip(child.stderr.take()).map(|(hear, words)| {
-        let (told, hearing) = channel();
-        thread::spawn(move || pass_on(words, hear, &told));
-        hearing
+    let stderr_done = STDERR_HANDLER.get().zip(child.stderr.take()).map(|(handler, stderr)| {
+        let (sender, done) = channel();
+        thread::spawn(move || forward_stderr(stderr, handler, &sender));
+        done
     });
     let ready = wait_until_ready(&mut child);
-    let mut process = Process { child, hearing };
+    let mut process = Process { child, stderr_done };
     match ready {
         Ok(()) => Ok(process),
         Err(reason) => {
@@ -176,23 +177,24 @@ fn spawn(program: &Path, address: &Address, workers: Option<usize>) -> Result<Pr
     }
 }
 
-/// Tells `hear` the lines of `words` to their end, so that the server never waits for a reader.
-fn pass_on(words: ChildStderr, hear: &fn(String), _told: &Sender<()>) {
-    for line in BufReader::new(words).split(b'\n').map_while(Result::ok) {
-        hear(String::from_utf8_lossy(&line).into_owned());
+/// Passes the lines of `stderr` to `handler` until the end, so that the server never waits for a reader. The end is signalled by
+/// the drop of the sender.
+fn forward_stderr(stderr: ChildStderr, handler: &fn(String), _done: &Sender<()>) {
+    for line in BufReader::new(stderr).split(b'\n').map_while(Result::ok) {
+        handler(String::from_utf8_lossy(&line).into_owned());
     }
 }
 
-/// Waits until `child` says that it listens.
+/// Waits until `child` prints that it listens.
 fn wait_until_ready(child: &mut Child) -> Result<(), String> {
     let lines = child.stdout.take().map(read_lines).ok_or("its output cannot be read")?;
-    let deadline = Instant::now() + START_LIMIT;
+    let deadline = Instant::now() + START_TIMEOUT;
     loop {
         match lines.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
             Ok(line) if line.starts_with("listening on ") => return Ok(()),
             Ok(_) => {}
             Err(RecvTimeoutError::Timeout) => {
-                return Err(format!("it did not listen within {} s", START_LIMIT.as_secs()));
+                return Err(format!("it did not listen within {} s", START_TIMEOUT.as_secs()));
             }
             Err(RecvTimeoutError::Disconnected) => {
                 let status = child.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
@@ -202,7 +204,7 @@ fn wait_until_ready(child: &mut Child) -> Result<(), String> {
     }
 }
 
-/// The output's lines, read to its end, so that the server never waits for a reader.
+/// Reads the lines of the output until its end, so that the server never waits for a reader.
 fn read_lines(output: ChildStdout) -> Receiver<String> {
     let (sender, receiver) = channel();
     thread::spawn(move || {
@@ -213,7 +215,7 @@ fn read_lines(output: ChildStdout) -> Receiver<String> {
     receiver
 }
 
-/// `$PERTURB_SERVER`, else beside the running program, else in its parent directory (tests run in
+/// Finds the server's program: `$PERTURB_SERVER`, else beside the running program, else in its parent directory (tests run in
 /// `target/release/deps`), else on the PATH.
 fn find_program() -> Result<PathBuf, ClientError> {
     if let Some(path) = std::env::var_os(VARIABLE) {

@@ -1,4 +1,4 @@
-//! Sets of parameter values: what is drawn from, what may be, and whether two meet.
+//! Regions of parameter values: the sets that parameters are drawn from, and whether two overlap.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -8,21 +8,21 @@ use serde::{Deserialize, Serialize};
 use crate::version::Version;
 use crate::{Distribution, DistributionError, proto};
 
-/// The values of all parameters that may come together: a box, each parameter in its own set whatever the others are, or
-/// several boxes, as R+E is.
+/// A region in the space of all parameters: one box, in which each parameter has a set of its own, or several boxes, as R+E.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Written", into = "Written")]
-pub struct Region(Vec<Box>);
+pub struct Region(Vec<ParameterBox>);
 
-/// One set of values for each parameter, by name.
-pub type Box = BTreeMap<String, Distribution>;
+/// A box: a set of values for each parameter, by name.
+pub type ParameterBox = BTreeMap<String, Distribution>;
 
-/// A region in a file: sets of values as [`Distribution::written`], which loses no digit of them.
+/// A region in a file: sets of values as [`Distribution::written`], which loses no digit.
 type Written = Vec<BTreeMap<String, String>>;
 
 impl From<Region> for Written {
     fn from(region: Region) -> Self {
-        let written = |values: Box| values.into_iter().map(|(name, values)| (name, values.written())).collect();
+        let written =
+            |values: ParameterBox| values.into_iter().map(|(name, values)| (name, values.written())).collect();
         region.0.into_iter().map(written).collect()
     }
 }
@@ -38,17 +38,17 @@ impl TryFrom<Written> for Region {
 }
 
 impl Region {
-    /// Of these boxes.
-    pub fn new(boxes: Vec<Box>) -> Self {
+    /// The region of these boxes.
+    pub fn new(boxes: Vec<ParameterBox>) -> Self {
         Self(boxes)
     }
 
-    /// What `version` of an environment draws from, but for the parameters that have sets of their own.
-    pub fn of(environment: &proto::Environment, version: Version, own: &Box) -> Self {
+    /// The region that `version` of an environment draws from, with the sets of `own` for the parameters in it.
+    pub fn from_version(environment: &proto::Environment, version: Version, own: &ParameterBox) -> Self {
         let of_part = |part: &Version| {
             let values = |parameter: &proto::Parameter| {
                 let of_version = match part {
-                    Version::D | Version::RE => None, // which is of the two others
+                    Version::D | Version::RE => None, // R+E has R and E as parts
                     Version::R => parameter.random.as_ref(),
                     Version::E => parameter.extreme.as_ref(),
                 };
@@ -61,26 +61,26 @@ impl Region {
         Self(version.parts().iter().map(of_part).collect())
     }
 
-    /// Its boxes.
-    pub fn boxes(&self) -> &[Box] {
+    /// The boxes.
+    pub fn boxes(&self) -> &[ParameterBox] {
         &self.0
     }
 
-    /// Whether everything in it is in one of the boxes of `others`.
+    /// Whether each box of this region is inside one of the boxes of `others`.
     pub fn is_within<'a>(&self, others: impl IntoIterator<Item = &'a Self> + Clone) -> bool {
-        let is_in = |own: &Box, other: &Box| pairs(own, other, Distribution::is_within);
+        let is_in = |own: &ParameterBox, other: &ParameterBox| pairs(own, other, Distribution::is_within);
         self.0.iter().all(|own| others.clone().into_iter().flat_map(Self::boxes).any(|other| is_in(own, other)))
     }
 
-    /// Whether some of it is in `other`, see [`Distribution::overlaps`].
+    /// Whether a part of this region is in `other`, see [`Distribution::overlaps`].
     pub fn overlaps(&self, other: &Self) -> bool {
         self.0.iter().any(|own| other.0.iter().any(|other| pairs(own, other, Distribution::overlaps)))
     }
 }
 
-/// Whether all parameters' sets are so; boxes of other parameters never are.
-fn pairs(one: &Box, other: &Box, are: fn(&Distribution, &Distribution) -> bool) -> bool {
-    one.len() == other.len() && one.iter().all(|(name, own)| other.get(name).is_some_and(|others| are(own, others)))
+/// Whether `holds` is true for the sets of every parameter. False if the boxes have different parameters.
+fn pairs(one: &ParameterBox, other: &ParameterBox, holds: fn(&Distribution, &Distribution) -> bool) -> bool {
+    one.len() == other.len() && one.iter().all(|(name, own)| other.get(name).is_some_and(|others| holds(own, others)))
 }
 
 impl fmt::Display for Region {
@@ -123,11 +123,11 @@ mod tests {
 
     fn region(version: Version, own: &[(&str, &str)]) -> Region {
         let own = own.iter().map(|(name, values)| ((*name).to_owned(), values.parse().unwrap())).collect();
-        Region::of(&environment(), version, &own)
+        Region::from_version(&environment(), version, &own)
     }
 
     #[test]
-    fn the_versions_are_in_each_other_as_the_paper_has_them() {
+    fn versions_contain_and_overlap_each_other_as_in_the_paper() {
         use Version::{D, E, R, RE};
         let is_within = |one, other| region(one, &[]).is_within([&region(other, &[])]);
         assert!(is_within(D, R) && is_within(R, RE) && is_within(E, RE) && is_within(E, E));
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn one_parameter_of_e_beside_one_of_r_is_neither() {
+    fn mixture_of_r_and_e_is_in_neither() {
         let mixed = region(Version::R, &[("length", "0.2..0.3")]);
         let (r, e) = (region(Version::R, &[]), region(Version::E, &[]));
         assert!(!mixed.is_within([&r, &e]) && !mixed.overlaps(&r) && !mixed.overlaps(&e));
@@ -148,7 +148,7 @@ mod tests {
 
     #[test]
     fn regions_of_other_parameters_have_nothing_in_common() {
-        let other = Region::new(vec![Box::from([("power".to_owned(), Distribution::fixed(1.0))])]);
+        let other = Region::new(vec![ParameterBox::from([("power".to_owned(), Distribution::fixed(1.0))])]);
         let r = region(Version::R, &[]);
         assert!(!other.is_within([&r]) && !r.overlaps(&other) && !r.is_within([]));
     }

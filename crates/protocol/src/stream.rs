@@ -9,30 +9,30 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Status, Streaming};
 
-use self::lease::{Lease, MOST_WITHOUT_REPLY};
+use self::lease::{Lease, MAX_RESUMES_WITHOUT_REPLY};
 
+use crate::adaptive_spin::AdaptiveSpin;
 use crate::address::Address;
-use crate::awake::Awake;
 use crate::connection::Connection;
 use crate::error::{ClientError, lost, timed_out};
 use crate::proto::{self, SessionRequest, SessionResponse, session_request::Request, session_response::Response};
 
-/// Requests that may lie in the channel before they are sent.
-const QUEUE: usize = 4;
-/// How long [`Stream::close`] waits for the server.
-const FAREWELL: Duration = Duration::from_secs(1);
+/// Requests that may wait in the channel before they are sent.
+const QUEUE_LENGTH: usize = 4;
+/// Time that [`Stream::close`] waits for the server.
+const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// A request of a session.
-pub trait Ask: Into<Request> {
-    /// What answers it.
+/// A request of a session, with the type of its reply.
+pub trait TypedRequest: Into<Request> {
+    /// The type of the reply.
     type Reply;
-    /// What it is called in errors.
+    /// The name of the request in errors.
     const NAME: &'static str;
 
-    /// Its reply in a response, or what the protocol calls another one that came instead.
+    /// Takes the reply out of a response.
     ///
     /// # Errors
-    /// The other response's name.
+    /// The name of a response that is not the reply.
     fn reply(response: Response) -> Result<Self::Reply, &'static str>;
 }
 
@@ -45,7 +45,7 @@ macro_rules! requests {
                 }
             }
 
-            impl Ask for proto::$request {
+            impl TypedRequest for proto::$request {
                 type Reply = proto::$reply;
                 const NAME: &'static str = $name;
 
@@ -80,38 +80,38 @@ requests! {
     Resume => Resumed, Resume, Resumed, "resumed", "to take up a session";
 }
 
-/// One session. Requests may be sent ahead; replies are taken in the order of their requests.
+/// A session. Requests may be sent ahead; replies are taken in the order of their requests.
 ///
-/// One that was opened with [a lease](proto::Open::lease) survives the loss of its connection: it is taken up again by
-/// another, and nobody notices but for a warning in the log. No more requests than that says may wait for their replies.
+/// A session that was opened with [a lease](proto::Open::lease) survives the loss of its connection: it is resumed over another,
+/// with a warning in the log. At most as many requests as the lease says may wait for their replies.
 #[derive(Debug)]
 pub struct Stream {
     connection: Connection,
-    line: Line,
+    raw: RawStream,
     /// Replies that came while a request could not be sent.
     arrived: VecDeque<SessionResponse>,
-    awake: Awake,
+    spin: AdaptiveSpin,
     lease: Option<Lease>,
 }
 
-/// What goes out and what comes in.
+/// A bidirectional gRPC stream.
 #[derive(Debug)]
-struct Line {
+struct RawStream {
     requests: mpsc::Sender<SessionRequest>,
     replies: Streaming<SessionResponse>,
 }
 
-impl Line {
-    /// Begins a stream with its first request, and with room for so many more. That lies in the channel before the call is
-    /// made: a server may wait for it before it answers at all.
+impl RawStream {
+    /// Begins a stream with its first request, and with space for `room` more. The first request is in the channel before the
+    /// call is made, since a server may wait for it before it answers at all.
     async fn begin(
         connection: &Connection,
         first: impl Into<Request>,
         room: usize,
     ) -> Result<Result<Self, Status>, ClientError> {
-        let (requests, receiver) = mpsc::channel(QUEUE + room);
+        let (requests, receiver) = mpsc::channel(QUEUE_LENGTH + room);
         let message = SessionRequest { request: Some(first.into()) };
-        let limit = connection.patience().reply;
+        let limit = connection.timeouts().reply;
         if let Err(error) = requests.try_send(message) {
             return Ok(Err(Status::internal(error.to_string())));
         }
@@ -128,22 +128,22 @@ impl Stream {
     /// # Errors
     /// [`ClientError::Refused`] with the server's sentence, and the failures of a connection.
     pub async fn open(connection: &Connection, open: proto::Open) -> Result<(Self, proto::Opened), ClientError> {
-        let line = Line::begin(connection, open, 0).await?;
-        let line = line.map_err(|status| lost(connection.address(), proto::Open::NAME, &status))?;
-        let (connection, arrived, awake) = (connection.clone(), VecDeque::new(), Awake::default());
-        let mut stream = Self { connection, line, arrived, awake, lease: None };
+        let raw = RawStream::begin(connection, open, 0).await?;
+        let raw = raw.map_err(|status| lost(connection.address(), proto::Open::NAME, &status))?;
+        let (connection, arrived, spin) = (connection.clone(), VecDeque::new(), AdaptiveSpin::default());
+        let mut stream = Self { connection, raw, arrived, spin, lease: None };
         let opened = stream.receive::<proto::Open>().await?;
-        stream.lease = Lease::of(&opened);
+        stream.lease = Lease::from_proto(&opened);
         Ok((stream, opened))
     }
 
-    /// From now on waits for replies [awake](Awake) less where other threads want the core: for one of several programs that
-    /// keep all cores busy.
-    pub fn be_considerate(&mut self) {
-        self.awake.be_considerate();
+    /// From now on [spins](AdaptiveSpin) less while waiting for replies if other threads want the core: for one of several
+    /// programs that keep all cores busy.
+    pub fn back_off_when_contended(&mut self) {
+        self.spin.back_off_when_contended();
     }
 
-    /// Where the server is.
+    /// The address of the server.
     pub fn address(&self) -> &Address {
         self.connection.address()
     }
@@ -152,25 +152,25 @@ impl Stream {
     ///
     /// # Errors
     /// [`ClientError::Lost`].
-    pub async fn send<A: Ask>(&mut self, request: A) -> Result<(), ClientError> {
+    pub async fn send<A: TypedRequest>(&mut self, request: A) -> Result<(), ClientError> {
         let message = SessionRequest { request: Some(request.into()) };
         if let Some(lease) = &mut self.lease {
-            // Whatever becomes of it, it is sent again if it must be when the reply is waited for.
-            lease.asked(&message);
-            let _ = self.line.requests.send(message).await;
+            // If it is lost, it is sent again while the reply is waited for.
+            lease.on_request(&message);
+            let _ = self.raw.requests.send(message).await;
             return Ok(());
         }
-        // The channel has room for a request, and is closed only after the stream has ended.
+        // The channel has space for a request, and is closed only after the stream has ended.
         let ended = |_| lost(self.connection.address(), A::NAME, &Status::unavailable("the stream has ended"));
-        self.line.requests.send(message).await.map_err(ended)
+        self.raw.requests.send(message).await.map_err(ended)
     }
 
-    /// Sends one of many requests whose replies are taken later. A server that has no room for replies reads no requests
-    /// either: so those that come are kept while this one has to wait. With a lease it is as [`Stream::send`].
+    /// Sends one of many requests whose replies are taken later. A server whose replies are not read reads no requests either.
+    /// So replies that come while this request has to wait are stored. With a lease this is [`Stream::send`].
     ///
     /// # Errors
     /// [`ClientError::Lost`].
-    pub async fn send_ahead<A: Ask>(&mut self, request: A) -> Result<(), ClientError> {
+    pub async fn send_ahead<A: TypedRequest>(&mut self, request: A) -> Result<(), ClientError> {
         if self.lease.is_some() {
             return self.send(request).await;
         }
@@ -180,25 +180,26 @@ impl Stream {
         loop {
             let arrived = tokio::select! {
                 biased;
-                room = self.line.requests.reserve() => {
+                room = self.raw.requests.reserve() => {
                     room.map_err(|_| ended())?.send(message);
                     return Ok(());
                 }
-                arrived = self.line.replies.message() => arrived,
+                arrived = self.raw.replies.message() => arrived,
             };
             let arrived = arrived.map_err(|status| lost(address, A::NAME, &status))?;
             self.arrived.push_back(arrived.ok_or_else(ended)?);
         }
     }
 
-    /// Ends a session with a lease, which the server would otherwise hold for a while; any other ends when it is dropped.
-    /// Waits a second at most.
+    /// Ends a session with a lease, which the server would otherwise hold until the lease ends. Other sessions end when they are
+    /// dropped. Waits at most a second.
     pub async fn close(self) {
-        let Self { line: Line { requests, mut replies }, lease, .. } = self;
+        let Self { raw: RawStream { requests, mut replies }, lease, .. } = self;
         drop(requests);
         if lease.is_some() {
             // However it ends.
-            let _ = tokio::time::timeout(FAREWELL, async { while let Ok(Some(_)) = replies.message().await {} }).await;
+            let _ =
+                tokio::time::timeout(CLOSE_TIMEOUT, async { while let Ok(Some(_)) = replies.message().await {} }).await;
         }
     }
 
@@ -207,7 +208,7 @@ impl Stream {
     /// # Errors
     /// [`ClientError::Refused`] with the server's sentence; then the session lives on. Otherwise the failures of a
     /// connection.
-    pub async fn receive<A: Ask>(&mut self) -> Result<A::Reply, ClientError> {
+    pub async fn receive<A: TypedRequest>(&mut self) -> Result<A::Reply, ClientError> {
         let message = match self.arrived.pop_front() {
             Some(arrived) => Some(arrived),
             None => self.message::<A>().await?,
@@ -227,29 +228,31 @@ impl Stream {
     }
 
     /// The next message that comes, of another stream if this one is lost and there is a lease.
-    async fn message<A: Ask>(&mut self) -> Result<Option<SessionResponse>, ClientError> {
-        let limit = self.connection.patience().reply;
+    async fn message<A: TypedRequest>(&mut self) -> Result<Option<SessionResponse>, ClientError> {
+        let limit = self.connection.timeouts().reply;
         let mut taken_up = 0;
         loop {
-            let next = self.awake.until(self.line.replies.message());
+            let next = self.spin.until(self.raw.replies.message());
             let next = tokio::time::timeout(limit, next).await;
             let status = match next.map_err(|_| timed_out(self.connection.address(), A::NAME, limit))? {
                 Ok(message) => {
-                    self.lease.iter_mut().for_each(Lease::answered);
+                    self.lease.iter_mut().for_each(Lease::on_reply);
                     return Ok(message);
                 }
                 Err(status) => status,
             };
             let error = lost(self.connection.address(), A::NAME, &status);
-            let Some(lease) =
-                self.lease.as_mut().filter(|_| lease::is_of_the_line(&status) && taken_up < MOST_WITHOUT_REPLY)
+            let Some(lease) = self
+                .lease
+                .as_mut()
+                .filter(|_| lease::is_of_connection(&status) && taken_up < MAX_RESUMES_WITHOUT_REPLY)
             else {
                 return Err(error);
             };
-            match lease.take_up(&self.connection).await {
+            match lease.resume(&self.connection).await {
                 Some(line) => {
                     tracing::warn!("{error}; took the session up again");
-                    self.line = line;
+                    self.raw = line;
                     taken_up += 1;
                 }
                 None => {
@@ -264,7 +267,7 @@ impl Stream {
     ///
     /// # Errors
     /// Those of [`Stream::receive`].
-    pub async fn ask<A: Ask>(&mut self, request: A) -> Result<A::Reply, ClientError> {
+    pub async fn ask<A: TypedRequest>(&mut self, request: A) -> Result<A::Reply, ClientError> {
         // If the stream has ended already, its status says why.
         let _ = self.send(request).await;
         self.receive::<A>().await
@@ -274,7 +277,12 @@ impl Stream {
     ///
     /// # Errors
     /// [`ClientError::Protocol`] if there are more or fewer.
-    pub fn decode<A: Ask>(&self, field: &'static str, bytes: &[u8], out: &mut [f32]) -> Result<(), ClientError> {
+    pub fn decode<A: TypedRequest>(
+        &self,
+        field: &'static str,
+        bytes: &[u8],
+        out: &mut [f32],
+    ) -> Result<(), ClientError> {
         let (numbers, rest) = bytes.as_chunks::<4>();
         if numbers.len() != out.len() || !rest.is_empty() {
             let got = format!("{} bytes of {field}", bytes.len());
@@ -285,7 +293,7 @@ impl Stream {
     }
 
     /// The error for a reply to an `A` that does not follow the protocol.
-    pub fn mismatch<A: Ask>(&self, got: String, expected: String) -> ClientError {
+    pub fn mismatch<A: TypedRequest>(&self, got: String, expected: String) -> ClientError {
         ClientError::Protocol { address: self.address().clone(), request: A::NAME, got, expected }
     }
 }

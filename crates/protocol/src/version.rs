@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::proto;
 
-/// Where an environment's parameters come from.
+/// A version of an environment: the distributions of its parameters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String")]
 pub enum Version {
@@ -30,12 +30,12 @@ pub struct UnknownVersion(String);
 impl Version {
     /// The paper's, in its order.
     pub const ALL: [Version; 3] = [Version::D, Version::R, Version::E];
-    /// These and what is made of them.
+    /// The paper's versions, and R+E.
     pub const KNOWN: [Version; 4] = [Version::D, Version::R, Version::E, Version::RE];
     /// The names of [`Version::KNOWN`].
     pub const NAMES: [&str; 4] = ["D", "R", "E", "R+E"];
 
-    /// Those of which a trial is of one, each as likely: itself, but of R+E both.
+    /// Versions that a trial is drawn from with equal probability: R and E for R+E, else the version itself.
     pub fn parts(self) -> &'static [Version] {
         match self {
             Version::D => &[Version::D],
@@ -45,13 +45,13 @@ impl Version {
         }
     }
 
-    /// Its name where only letters, digits, `.`, `-` and `_` may stand: in ids and names of files. No own set has that
-    /// of R+E.
+    /// The name in ids and file names, where only letters, digits, `.`, `-` and `_` are allowed. No parameter set of a user can
+    /// have the name of R+E.
     pub fn file_name(self) -> &'static str {
         if self == Version::RE { "R-or-E" } else { Self::NAMES[self as usize] }
     }
 
-    /// The protocol's name for it.
+    /// The protocol's name for the version.
     pub fn to_proto(self) -> proto::Version {
         match self {
             Version::D => proto::Version::Default,
@@ -61,7 +61,7 @@ impl Version {
         }
     }
 
-    /// What the protocol's name stands for; `None` if none was given.
+    /// The version with this name in the protocol; `None` if it is unspecified.
     pub fn from_proto(version: proto::Version) -> Option<Self> {
         Version::KNOWN.into_iter().find(|known| known.to_proto() == version)
     }
@@ -96,7 +96,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_version_is_read_from_what_it_is_called_everywhere() {
+    fn version_is_read_from_all_its_names() {
         for version in Version::KNOWN {
             assert_eq!(version.to_string().parse(), Ok(version));
             assert_eq!(version.to_string().to_lowercase().parse(), Ok(version));

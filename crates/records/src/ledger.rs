@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use perturb_protocol::ledger::{Begin, Draws, End, Entry, Event, Read, Who, read};
+use perturb_protocol::ledger::{Begin, DrawRecord, End, Entry, Event, Read, Who, read};
 use perturb_protocol::proto;
 use perturb_protocol::region::Region;
 use perturb_settings::Common;
@@ -189,7 +189,7 @@ impl Ledgers {
     }
 
     /// What a line ends it ends before it begins something.
-    fn take_draws(&mut self, line: Line, Draws { regions, begins, ends, .. }: Draws) {
+    fn take_draws(&mut self, line: Line, DrawRecord { regions, begins, ends, .. }: DrawRecord) {
         let named = begins.iter().map(|begin| begin.count).chain(ends.iter().map(|end| end.count));
         if named.fold(0, u32::saturating_add) > MOST_ENVS {
             self.defect = Some((line.at.n, "names more environments than a session has"));
@@ -244,7 +244,7 @@ impl Ledgers {
         environment: &proto::Environment,
         records: &Records,
     ) -> Proof {
-        let claimed = Region::of(environment, training.version, &training.parameters);
+        let claimed = Region::from_version(environment, training.version, &training.parameters);
         // Other trainings with its seed, on something else, are told by what they draw from.
         let is_own = |drawn: &&Drawn| {
             drawn.line.who.environment == environment.name
@@ -314,7 +314,7 @@ impl Ledgers {
 
 /// What a test draws from, context by context, where that is not what the training draws from, too.
 fn tested(environment: &proto::Environment, test: &RecordedTest, claimed: &Region) -> Vec<Region> {
-    let of = |context| Region::of(environment, test.set.version, &test.set.parameters(context));
+    let of = |context| Region::from_version(environment, test.set.version, &test.set.parameters(context));
     test.set.listed().iter().map(of).filter(|region| !region.is_within([claimed])).collect()
 }
 

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use perturb_protocol::Version::*;
-use perturb_protocol::ledger::{Begin, Chain, Draws, End, Event, Who};
+use perturb_protocol::ledger::{Begin, Chain, DrawRecord, End, Event, Who};
 use perturb_protocol::region::Region;
 use perturb_protocol::{Version, proto};
 use perturb_settings::TrainConfig;
@@ -59,14 +59,14 @@ fn who(session: u64, token: &str) -> Who {
 }
 
 fn begins(session: u64, token: &str, version: Version, (seed, index, count, episode): (u64, u32, u32, u64)) -> Event {
-    let region = Region::of(&environment(), version, &Default::default());
+    let region = Region::from_version(&environment(), version, &Default::default());
     let begins = vec![Begin { seed, index, count, region: 0, episode }];
-    Event::Draws(Draws { who: who(session, token), regions: vec![region], begins, ends: Vec::new() })
+    Event::Draws(DrawRecord { who: who(session, token), regions: vec![region], begins, ends: Vec::new() })
 }
 
 fn ends(session: u64, token: &str, (seed, index, count, episode): (u64, u32, u32, u64)) -> Event {
     let ends = vec![End { seed, index, count, episode: Some(episode) }];
-    Event::Draws(Draws { who: who(session, token), regions: Vec::new(), begins: Vec::new(), ends })
+    Event::Draws(DrawRecord { who: who(session, token), regions: Vec::new(), begins: Vec::new(), ends })
 }
 
 /// The training, by ann.
@@ -155,7 +155,7 @@ fn an_end_is_that_of_what_was_open_and_of_nothing_later() {
     let early = [begun.clone(), ends(0, "ann", (1, 0, 1, 49)), begins(1, "ann", E, (9, 0, 1, 0))];
     says(&proof(&early), "of the test set E");
     // What was refused by the server drew nothing.
-    let withdrawn = Event::Draws(Draws {
+    let withdrawn = Event::Draws(DrawRecord {
         who: who(1, "ann"),
         regions: Vec::new(),
         begins: Vec::new(),

@@ -119,8 +119,8 @@ impl Counting {
 
 /// What each parameter may be in a context of a set, in a trial of each part of its version.
 fn asked(environment: &proto::Environment, set: &TestSet, context: &Context) -> Vec<Vec<Distribution>> {
-    let region = Region::of(environment, set.version, &set.parameters(context));
-    let in_order = |values: &region::Box| {
+    let region = Region::from_version(environment, set.version, &set.parameters(context));
+    let in_order = |values: &region::ParameterBox| {
         environment.parameters.iter().filter_map(|parameter| values.get(&parameter.name).cloned()).collect()
     };
     region.boxes().iter().map(in_order).collect()
@@ -187,7 +187,7 @@ mod tests {
             receipt: Some(receipt),
             ..Default::default()
         };
-        EndedEpisode::of(end, slot as usize, slot == 0).unwrap()
+        EndedEpisode::from_proto(end, slot as usize, slot == 0).unwrap()
     }
 
     fn finished(version: Version, ends: &[EndedEpisode]) -> Result<Records, NotRecorded> {

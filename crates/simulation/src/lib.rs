@@ -26,7 +26,7 @@ use perturb::server::shutdown::Controller;
 use perturb::server::transport::budget::Budget;
 use perturb::server::transport::message_reader::Transit;
 use perturb::server::transport::raw_body::{self, RawBodyService};
-use perturb_protocol::{Address, ClientError, Connection, Patience};
+use perturb_protocol::{Address, ClientError, Connection, Timeouts};
 use tonic::transport::Server;
 use tonic::{Request, Response, Status, Streaming};
 
@@ -129,7 +129,7 @@ pub async fn serve(ledger: Ledger) -> turmoil::Result {
 /// [`ClientError::Connect`].
 pub async fn connect() -> Result<Connection, ClientError> {
     let address = Address::Tcp { host: SERVER.into(), port: PORT, tls: None };
-    let patience = Patience { keepalive_interval: KEEPALIVE, keepalive_limit: KEEPALIVE, ..Patience::default() };
+    let patience = Timeouts { keepalive_interval: KEEPALIVE, keepalive_limit: KEEPALIVE, ..Timeouts::default() };
     Connection::open_by(&address, patience, stream).await
 }
 

@@ -1,4 +1,4 @@
-//! What an update learns from, as tensors.
+//! The samples of an update, as tensors.
 
 use perturb_policy::{PolicySpec, SequenceSamples};
 use tch::Tensor;
@@ -10,7 +10,7 @@ use crate::error::{Error, Result};
 /// A rollout, or a minibatch of it: M sequences of L steps. Arrays `[V]` are over its V samples in order, those of
 /// padding left out.
 pub(crate) struct TensorBatch {
-    /// What the policy is evaluated on.
+    /// The sequences that the policy is evaluated on.
     pub(crate) sequences: Sequences,
     /// `[L, M, A]`.
     pub(crate) actions: Tensor,
@@ -64,12 +64,12 @@ impl TensorBatch {
         })
     }
 
-    /// Takes `policy` as it is for the acting one, from which the KL divergence is measured.
+    /// Takes `policy` with its present weights for the one that acted. The KL divergence is measured from it.
     pub(crate) fn remember_acting(&mut self, policy: &TorchPolicy) {
         self.acting = Some(policy.distributions(&self.sequences));
     }
 
-    /// What a loss over the V samples is computed from.
+    /// The targets of a loss over the V samples.
     pub(crate) fn targets(&self) -> Result<Targets> {
         let samples = |tensor: &Tensor| self.sequences.samples(tensor);
         Ok(Targets {

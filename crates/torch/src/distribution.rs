@@ -21,7 +21,7 @@ pub struct Distributions {
 }
 
 impl Distributions {
-    /// The same with other outputs.
+    /// Distributions with the same log standard deviations and other outputs.
     pub(crate) fn map(&self, change: impl FnOnce(&Tensor) -> Result<Tensor>) -> Result<Self> {
         Ok(Distributions { outputs: change(&self.outputs)?, log_std: self.log_std.as_ref().map(Tensor::shallow_clone) })
     }
@@ -79,7 +79,7 @@ mod tests {
     use super::*;
     use crate::fixture::{assert_close, fixture, tensor};
 
-    /// Of results around 10 in f32, from up to ten roundings of 2⁻²⁴ each.
+    /// Tolerance of results around 10 in f32, from up to ten roundings of 2⁻²⁴ each.
     const TOLERANCE: f64 = 5e-6;
 
     #[test]

@@ -1,4 +1,4 @@
-//! What libtorch refuses.
+//! Errors of policies on libtorch.
 
 use perturb_policy::Error as PolicyError;
 

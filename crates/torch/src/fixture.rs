@@ -10,12 +10,12 @@ pub(crate) fn fixture(case: &str, name: &str) -> Vec<f64> {
     numbers.iter().map(|x| x.as_f64().expect("a number")).collect()
 }
 
-/// The same as f32.
+/// The array `name` of `case`, as f32.
 pub(crate) fn fixture_f32(case: &str, name: &str) -> Vec<f32> {
     fixture(case, name).iter().map(|&x| x as f32).collect()
 }
 
-/// The same as a tensor without further axes.
+/// The array `name` of `case`, as a flat tensor.
 pub(crate) fn tensor(case: &str, name: &str) -> Tensor {
     Tensor::of_slice(&fixture_f32(case, name))
 }

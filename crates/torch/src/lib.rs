@@ -24,7 +24,7 @@ pub use loss::{Targets, evaluate};
 pub use policy::{Evaluated, TorchPolicy};
 pub use sequences::Sequences;
 
-/// Has libtorch differentiate the recurrent policies of this process.
+/// Registers libtorch for the gradients of recurrent policies in this process.
 pub fn register() {
     register_recurrent(|spec| Ok(Box::new(Networks(Rc::new(TorchPolicy::zeros(spec)?)))));
 }

@@ -9,12 +9,12 @@ use crate::error::Result;
 /// Added to the standard deviation that advantages are divided by.
 const EPSILON: f64 = 1e-8;
 
-/// What a loss is computed from beside the policy's view of the samples.
+/// The inputs of a loss beside the policy's evaluation of the samples.
 #[derive(Debug)]
 pub struct Targets {
     /// Log-probabilities under the acting policy.
     pub old_log_probs: Tensor,
-    /// Its values.
+    /// Values of the acting policy.
     pub old_values: Tensor,
     /// Advantages.
     pub advantages: Tensor,

@@ -17,7 +17,7 @@ pub struct TorchPolicy {
     spec: PolicySpec,
     /// `[P]`, without gradient; shares its storage with `leaves`.
     all: Tensor,
-    /// In order of [`PolicySpec::layout`], with gradients.
+    /// The weights in order of [`PolicySpec::layout`], with gradients.
     leaves: Vec<Tensor>,
     /// Whether libtorch differentiates the recurrence.
     plain_autograd: bool,
@@ -34,7 +34,7 @@ pub struct Evaluated {
     pub values: Tensor,
     /// B action distributions.
     pub distributions: Distributions,
-    /// What the gradient of a recurrence needs.
+    /// The intermediate results for the gradient of a recurrence.
     tape: Option<rc::Tape>,
 }
 

@@ -43,13 +43,13 @@ struct Places {
 }
 
 impl Places {
-    fn of(spec: &PolicySpec) -> Self {
+    fn new(spec: &PolicySpec) -> Self {
         let input = 2 * spec.hidden.len();
         Places { input, recurrent: input + 1, bias: input + 2, heads: input + 3 }
     }
 }
 
-/// What the second stage needs of the first.
+/// The results of the first stage that the second needs.
 #[derive(Debug)]
 pub(super) struct Tape {
     /// W_x x + b `[L·M, 4H]`, with a graph to the layers below.
@@ -76,7 +76,7 @@ pub(super) fn forward(
     sequences: &Sequences,
     plain: bool,
 ) -> (Tensor, Tensor, Option<Tape>) {
-    let places = Places::of(spec);
+    let places = Places::new(spec);
     let (input, recurrent) = (&leaves[places.input], &leaves[places.recurrent]);
     let x = perceptron(&leaves[..places.input], &sequences.flat_observations(), true);
     let driven = x.linear(input, Some(&leaves[places.bias]));
@@ -151,7 +151,7 @@ fn run(driven: Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tape {
 
 /// The gradients of `loss` in all `leaves`, in order.
 pub(super) fn backward(spec: &PolicySpec, leaves: &[Tensor], loss: &Tensor, tape: &Tape) -> Result<Vec<Tensor>> {
-    let places = Places::of(spec);
+    let places = Places::new(spec);
     let heads: Vec<&Tensor> = leaves[places.heads..].iter().chain([&tape.hidden]).collect();
     let mut of_heads = Tensor::f_run_backward(&[loss], &heads, false, false)?;
     let of_hidden = of_heads.remove(of_heads.len() - 1);

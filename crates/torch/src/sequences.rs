@@ -1,4 +1,4 @@
-//! What a policy is evaluated on.
+//! The sequences that a policy is evaluated on.
 
 use tch::{Device, Kind, Tensor};
 
@@ -20,11 +20,11 @@ pub struct Sequences {
     starts: Tensor,
     /// `[M, S]`, S = [`PolicySpec::memory_size`].
     memory: Tensor,
-    /// None if all L·M steps are samples.
+    /// The mask of the samples; `None` if all L·M steps are samples.
     padding: Option<Padding>,
 }
 
-/// Which of L·M steps are samples.
+/// A mask of the steps, L·M, that are samples.
 #[derive(Debug)]
 struct Padding {
     /// `[L, M]`: 1 for samples, 0 for padding.
@@ -38,10 +38,10 @@ impl Padding {
     fn new(n_steps: i64, lengths: &[usize]) -> Result<Self> {
         let lengths: Vec<i64> = lengths.iter().map(|&length| length as i64).collect();
         let steps = Tensor::f_arange(n_steps, (Kind::Int64, Device::Cpu))?.f_unsqueeze(1)?;
-        Padding::of(steps.f_lt_tensor(&Tensor::f_of_slice(&lengths)?.f_unsqueeze(0)?)?)
+        Padding::from_mask(steps.f_lt_tensor(&Tensor::f_of_slice(&lengths)?.f_unsqueeze(0)?)?)
     }
 
-    fn of(mask: Tensor) -> Result<Self> {
+    fn from_mask(mask: Tensor) -> Result<Self> {
         Ok(Padding { samples: mask.f_flatten(0, 1)?.f_nonzero()?.f_squeeze_dim(1)?, mask })
     }
 }
@@ -73,7 +73,7 @@ impl Sequences {
         })
     }
 
-    /// Of sequence m only the first `lengths[m]` steps are samples, the others fill it up.
+    /// Makes only the first `lengths[m]` steps of sequence m samples; the others are padding.
     ///
     /// # Errors
     /// A number of lengths other than M.
@@ -83,12 +83,12 @@ impl Sequences {
         Ok(Sequences { padding, ..self })
     }
 
-    /// L.
+    /// L, the number of steps.
     pub fn n_steps(&self) -> i64 {
         self.starts.size()[0]
     }
 
-    /// M.
+    /// M, the number of sequences.
     pub fn count(&self) -> i64 {
         self.starts.size()[1]
     }
@@ -100,7 +100,7 @@ impl Sequences {
             starts: self.starts.f_index_select(1, indices)?,
             memory: self.memory.f_index_select(0, indices)?,
             padding: match &self.padding {
-                Some(padding) => Some(Padding::of(padding.mask.f_index_select(1, indices)?)?),
+                Some(padding) => Some(Padding::from_mask(padding.mask.f_index_select(1, indices)?)?),
                 None => None,
             },
         })

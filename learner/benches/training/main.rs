@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use perturb_faults::{FaultPlan, FaultyProxy};
 use perturb_files::interrupt::StopFlag;
-use perturb_learner::client::{ActAt, Address, PrivateServer, Servers};
+use perturb_learner::client::{ActorLocation, Address, PrivateServer, Servers};
 use perturb_learner::logging::TimeShares;
 use perturb_learner::training::{Entry, RunDirectory, Start, train, train_together};
 use perturb_settings::TrainConfig;
@@ -23,7 +23,7 @@ const ALONE: &str = "algorithm = 'ppo'\nnum_envs = 8\nn_steps = 128\nn_epochs = 
 const ITERATIONS: u64 = 100;
 const SIGNAL: i32 = 15;
 const GROUPS: usize = 2;
-/// How long groups are measured, after as long a warm-up.
+/// Time for which groups are measured, after a warm-up of the same length.
 const MEASURED: Duration = Duration::from_secs(5);
 const DELAY: Duration = Duration::from_millis(5);
 
@@ -32,7 +32,7 @@ fn main() -> Result<()> {
     let is_wanted = |name: &str| wanted.is_empty() || wanted.iter().any(|part| name.contains(part.as_str()));
     let server = PrivateServer::start(None)?;
     let address = server.address().clone();
-    for (name, act) in [("alone/act_server", ActAt::Server), ("alone/act_client", ActAt::Client)] {
+    for (name, act) in [("alone/act_server", ActorLocation::Server), ("alone/act_client", ActorLocation::Client)] {
         if is_wanted(name) {
             alone(name, &Servers::connect(std::slice::from_ref(&address))?.with_act(act))?;
         }

@@ -1,6 +1,6 @@
 //! Advantage actor-critic.
 
-use perturb_policy::{CollectUntil, Descent, Losses, Objective, Optimiser, Surrogate};
+use perturb_policy::{CollectUntil, Losses, Objective, Optimiser, Surrogate, UpdateRule};
 use perturb_settings::A2cConfig;
 
 use super::{Algorithm, AlgorithmState, BaseAlgorithm, UpdateStats, check_rollout, explained_variance};
@@ -17,7 +17,7 @@ use crate::rollout::{Estimates, Rollout, Trajectories};
 /// averages start at 1 and ε is inside the root.
 pub struct A2c {
     config: A2cConfig,
-    descent: Descent,
+    optimiser: Optimiser,
 }
 
 impl A2c {
@@ -25,9 +25,9 @@ impl A2c {
     pub fn new(config: A2cConfig, policy: &Policy) -> Result<Self> {
         config.validate()?;
         let n_weights = policy.flat_weights().len();
-        let optimiser = Optimiser::rms_prop(config.rms_alpha, config.rms_eps, n_weights);
-        let descent = Descent::new(optimiser, config.max_grad_norm).decaying(config.weight_decay);
-        Ok(A2c { config, descent })
+        let optimiser = UpdateRule::rms_prop(config.rms_alpha, config.rms_eps, n_weights);
+        let optimiser = Optimiser::new(optimiser, config.max_grad_norm).with_weight_decay(config.weight_decay);
+        Ok(A2c { config, optimiser })
     }
 }
 
@@ -41,12 +41,12 @@ impl Algorithm for A2c {
     }
 
     fn state(&self) -> AlgorithmState {
-        let (n_updates, optimiser) = (self.descent.n_updates(), self.descent.state());
+        let (n_updates, optimiser) = (self.optimiser.n_updates(), self.optimiser.state());
         AlgorithmState { n_updates, iterations: 0, optimiser, rng: None }
     }
 
     fn load_state(&mut self, state: &AlgorithmState) -> Result<()> {
-        Ok(self.descent.load_state(state.n_updates, &state.optimiser)?)
+        Ok(self.optimiser.load_state(state.n_updates, &state.optimiser)?)
     }
 }
 
@@ -75,7 +75,7 @@ impl BaseAlgorithm for A2c {
             let Policy { weights, gradient, backend, .. } = &mut *policy;
             let batch = backend.batch(&rollout.sequences(&estimated))?;
             let loss = backend.gradient(weights, &batch, &batch.sequences(), &objective, gradient)?;
-            norms += self.descent.step(loss.total, gradient, weights, learning_rate)?;
+            norms += self.optimiser.step(loss.total, gradient, weights, learning_rate)?;
             backend.weights_changed();
             losses += loss;
             drop(batch);
@@ -94,7 +94,7 @@ impl BaseAlgorithm for A2c {
             clip_range: None,
             explained_variance: explained_variance(rollouts, &estimates),
             grad_norm: mean(norms),
-            n_updates: self.descent.n_updates(),
+            n_updates: self.optimiser.n_updates(),
             std: policy.mean_std(),
             selection: None,
         })

@@ -6,27 +6,27 @@ use perturb_settings::{EpoptConfig, Ranking};
 use super::{Algorithm, AlgorithmState, BaseAlgorithm, UpdateStats};
 use crate::error::Result;
 use crate::policy::Policy;
-use crate::rollout::{Rollout, Span};
+use crate::rollout::{EpisodeSlice, Rollout};
 
 /// EPOpt-ε, Rajeswaran et al. (2017), arXiv:1610.01283, around another algorithm: an iteration generates L complete
 /// episodes, each in a freshly drawn environment, and the other algorithm learns from those whose undiscounted return is
 /// at most the ε-percentile of all L. That percentile interpolates linearly between order statistics, as numpy's; where
 /// returns are equal to it more than the share ε is kept. After Packer et al. (2018), ε is 1 at first. Episodes may also be
-/// ranked by the sums of their normalised rewards.
+/// ranked by the sums of their normalised rewards ([`Ranking`]).
 pub struct Epopt {
     config: EpoptConfig,
     base: Box<dyn BaseAlgorithm>,
     iterations: u64,
 }
 
-/// What EPOpt did in an iteration.
+/// The episodes that EPOpt chose in an iteration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Selection {
     /// ε of this iteration.
     pub epsilon: f64,
-    /// Episodes that were learned from.
+    /// Number of episodes that were learned from.
     pub kept: u64,
-    /// Their steps.
+    /// Number of steps in these episodes.
     pub kept_steps: u64,
     /// Mean return of all L episodes.
     pub mean_return: f64,
@@ -55,7 +55,7 @@ impl Algorithm for Epopt {
         let episodes = rollout.episodes();
         let kept = match self.config.rank_by {
             Ranking::Raw => worst(episodes, &returns(episodes), epsilon),
-            Ranking::Normalized => worst(episodes, &rollout.learned_returns(), epsilon),
+            Ranking::Normalized => worst(episodes, &rollout.normalized_returns(), epsilon),
         };
         let selection = Selection {
             epsilon,
@@ -64,7 +64,8 @@ impl Algorithm for Epopt {
             mean_return: mean_return(episodes),
             cvar: conditional_value_at_risk(episodes, self.config.epsilon),
         };
-        let parts: Vec<&[Span]> = if self.config.update_per_episode { kept.chunks(1).collect() } else { vec![&kept] };
+        let parts: Vec<&[EpisodeSlice]> =
+            if self.config.update_per_episode { kept.chunks(1).collect() } else { vec![&kept] };
         let parts = parts.into_iter().map(|episodes| rollout.select(episodes)).collect::<Result<Vec<Rollout>>>()?;
         let mut stats = self.base.update_many(policy, &parts.iter().collect::<Vec<_>>(), progress_remaining)?;
         stats.selection = Some(selection);
@@ -84,18 +85,18 @@ impl Algorithm for Epopt {
 }
 
 /// The episodes whose rank is at most the `epsilon`-percentile of `ranks`, in their order.
-fn worst(episodes: &[Span], ranks: &[f64], epsilon: f64) -> Vec<Span> {
+fn worst(episodes: &[EpisodeSlice], ranks: &[f64], epsilon: f64) -> Vec<EpisodeSlice> {
     let mut sorted = ranks.to_vec();
     sorted.sort_by(f64::total_cmp);
     let threshold = percentile(&sorted, epsilon);
     episodes.iter().zip(ranks).filter(|(_, rank)| **rank <= threshold).map(|(episode, _)| *episode).collect()
 }
 
-fn returns(episodes: &[Span]) -> Vec<f64> {
+fn returns(episodes: &[EpisodeSlice]) -> Vec<f64> {
     episodes.iter().map(|episode| episode.episode_return).collect()
 }
 
-/// The `share`-percentile of `sorted`, linear between order statistics; never below the least.
+/// The `share`-percentile of `sorted`, linear between order statistics; never below the minimum.
 fn percentile(sorted: &[f64], share: f64) -> f64 {
     let Some(last) = sorted.len().checked_sub(1) else { return f64::NAN };
     let position = share * last as f64;
@@ -103,15 +104,15 @@ fn percentile(sorted: &[f64], share: f64) -> f64 {
     if fraction == 0.0 { sorted[low] } else { sorted[low] + fraction * (sorted[low + 1] - sorted[low]) }
 }
 
-/// The mean return of the ⌈share · L⌉ worst of L episodes; of equally bad ones no more than that.
-fn conditional_value_at_risk(episodes: &[Span], share: f64) -> f64 {
+/// The mean return of the ⌈share · L⌉ worst of L episodes. Ties do not add further episodes.
+fn conditional_value_at_risk(episodes: &[EpisodeSlice], share: f64) -> f64 {
     let mut returns = returns(episodes);
     returns.sort_by(f64::total_cmp);
     returns.truncate((share * returns.len() as f64).ceil() as usize);
     returns.iter().sum::<f64>() / returns.len() as f64
 }
 
-fn mean_return(episodes: &[Span]) -> f64 {
+fn mean_return(episodes: &[EpisodeSlice]) -> f64 {
     episodes.iter().map(|episode| episode.episode_return).sum::<f64>() / episodes.len() as f64
 }
 
@@ -119,8 +120,8 @@ fn mean_return(episodes: &[Span]) -> f64 {
 mod tests {
     use super::*;
 
-    fn episodes(returns: &[f64]) -> Vec<Span> {
-        let span = |(environment, &episode_return)| Span { environment, start: 0, length: 1, episode_return };
+    fn episodes(returns: &[f64]) -> Vec<EpisodeSlice> {
+        let span = |(environment, &episode_return)| EpisodeSlice { environment, start: 0, length: 1, episode_return };
         returns.iter().enumerate().map(span).collect()
     }
 
@@ -129,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn percentiles_are_numpys() {
+    fn percentiles_equal_those_of_numpy() {
         let sorted = [-3.0, 0.0, 1.0, 10.0];
         for (share, expected) in [(0.0, -3.0), (0.1, -2.1), (0.5, 0.5), (0.9, 7.3), (1.0, 10.0)] {
             assert!((percentile(&sorted, share) - expected).abs() < 1e-12, "rounding of a few f64 operations: {share}");
@@ -137,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn the_worst_share_is_kept_in_order_and_equal_returns_all() {
+    fn worst_share_is_kept_in_order_with_all_ties() {
         let returns: Vec<f64> = (0..100).map(|i| f64::from((i * 37) % 100)).collect();
         let kept_returns: Vec<f64> =
             worst(&episodes(&returns), &returns, 0.1).iter().map(|e| e.episode_return).collect();
@@ -150,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn the_value_at_risk_is_that_of_the_worst_share_alone_also_among_equals() {
+    fn cvar_with_ties_has_no_further_episodes() {
         let returns: Vec<f64> = (0..100).map(|i| if i < 95 { 200.0 } else { 0.0 }).collect();
         assert_eq!(conditional_value_at_risk(&episodes(&returns), 0.1), 100.0);
         assert_eq!(conditional_value_at_risk(&episodes(&[3.0, 1.0, 2.0]), 0.5), 1.5);

@@ -1,4 +1,4 @@
-//! Algorithms: what turns a rollout into better weights.
+//! Algorithms: they turn a rollout into better weights.
 
 mod a2c;
 mod epopt;
@@ -19,7 +19,7 @@ use crate::rollout::{self, Estimates, Rollout};
 
 /// Learns from rollouts.
 pub trait Algorithm: Send {
-    /// How much is collected between two updates.
+    /// The amount of experience to collect between two updates.
     fn collect_until(&self) -> CollectUntil;
 
     /// Improves `policy` by a finished rollout. `progress_remaining` falls from 1 at the start of training to 0 at its
@@ -30,7 +30,7 @@ pub trait Algorithm: Send {
     /// Everything beside the policy's weights that a later update depends on.
     fn state(&self) -> AlgorithmState;
 
-    /// Goes on from a saved state: later updates give the same bytes as if there had been no break.
+    /// Restores a saved state. Later updates give the same bytes as without the break.
     fn load_state(&mut self, state: &AlgorithmState) -> Result<()>;
 }
 
@@ -55,16 +55,16 @@ pub trait BaseAlgorithm: Algorithm {
 pub struct AlgorithmState {
     /// Gradient steps so far.
     pub n_updates: u64,
-    /// Iterations so far, where they count: EPOpt's.
+    /// Iterations so far; EPOpt only.
     #[serde(default)]
     pub iterations: u64,
     /// The optimiser's running averages.
     pub optimiser: Vec<NamedArray>,
-    /// The stream of minibatch orders, where there is one.
+    /// The random stream of minibatch orders; PPO only.
     pub rng: Option<ChaCha8Rng>,
 }
 
-/// What happened in an update, by stable-baselines3's names. Averages are over the update's gradient steps.
+/// Figures of an update, with stable-baselines3's names. Averages are over the update's gradient steps.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct UpdateStats {
     /// The optimiser's step size.
@@ -93,11 +93,11 @@ pub struct UpdateStats {
     pub n_updates: u64,
     /// Mean standard deviation of the actions; continuous actions only.
     pub std: Option<f64>,
-    /// Which episodes were learned from; EPOpt only.
+    /// The episodes that were learned from; EPOpt only.
     pub selection: Option<Selection>,
 }
 
-/// Whether a rollout's axes fit the algorithm and the policy. One of complete episodes is as long as these were.
+/// Checks that a rollout's axes fit the algorithm and the policy. The length of a rollout of complete episodes is free.
 fn check_rollout(rollout: &Rollout, policy: &Policy, n_steps: usize) -> Result<()> {
     if rollout.lengths().is_none() {
         check_length("the rollout's axis T", rollout.n_steps(), n_steps)?;

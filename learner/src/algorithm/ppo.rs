@@ -1,7 +1,7 @@
 //! Proximal policy optimisation.
 
 use perturb_policy::random::{Purpose, stream, uniform};
-use perturb_policy::{Batch, CollectUntil, Descent, Losses, Objective, Optimiser, Surrogate};
+use perturb_policy::{Batch, CollectUntil, Losses, Objective, Optimiser, Surrogate, UpdateRule};
 use perturb_settings::{PpoConfig, SettingError};
 use rand_chacha::ChaCha8Rng;
 
@@ -19,7 +19,7 @@ use crate::rollout::{Estimates, Rollout, Trajectories};
 /// with [`gae`]'s advantages and returns, computed once from the rollout's values, and the acting policy π_old.
 pub struct Ppo {
     config: PpoConfig,
-    descent: Descent,
+    optimiser: Optimiser,
     rng: ChaCha8Rng,
 }
 
@@ -28,9 +28,9 @@ impl Ppo {
     pub fn new(config: PpoConfig, policy: &Policy, seed: u64) -> Result<Self> {
         config.validate()?;
         let n_weights = policy.flat_weights().len();
-        let descent = Descent::new(Optimiser::adam(config.adam_eps, n_weights), config.max_grad_norm)
-            .decaying(config.weight_decay);
-        Ok(Ppo { config, descent, rng: stream(seed, Purpose::Minibatches) })
+        let optimiser = Optimiser::new(UpdateRule::adam(config.adam_eps, n_weights), config.max_grad_norm)
+            .with_weight_decay(config.weight_decay);
+        Ok(Ppo { config, optimiser, rng: stream(seed, Purpose::Minibatches) })
     }
 
     fn objective(&self) -> Objective {
@@ -56,14 +56,14 @@ impl Algorithm for Ppo {
     }
 
     fn state(&self) -> AlgorithmState {
-        let (n_updates, optimiser) = (self.descent.n_updates(), self.descent.state());
+        let (n_updates, optimiser) = (self.optimiser.n_updates(), self.optimiser.state());
         AlgorithmState { n_updates, iterations: 0, optimiser, rng: Some(self.rng.clone()) }
     }
 
     fn load_state(&mut self, state: &AlgorithmState) -> Result<()> {
         let missing = SettingError { name: "rng", got: "missing".to_owned(), expected: "the saved minibatch stream" };
         let rng = state.rng.clone().ok_or(missing)?;
-        self.descent.load_state(state.n_updates, &state.optimiser)?;
+        self.optimiser.load_state(state.n_updates, &state.optimiser)?;
         self.rng = rng;
         Ok(())
     }
@@ -104,7 +104,7 @@ impl BaseAlgorithm for Ppo {
                 for minibatch in sequences.chunks_exact(sequences.len() / n_minibatches) {
                     let Policy { weights, gradient, backend, .. } = &mut *policy;
                     let loss = backend.gradient(weights, batch, minibatch, &objective, gradient)?;
-                    norms += self.descent.step(loss.total, gradient, weights, learning_rate)?;
+                    norms += self.optimiser.step(loss.total, gradient, weights, learning_rate)?;
                     backend.weights_changed();
                     losses += loss;
                 }
@@ -123,7 +123,7 @@ impl BaseAlgorithm for Ppo {
             clip_range: Some(self.config.clip_range),
             explained_variance: explained_variance(rollouts, &estimates),
             grad_norm: mean(norms),
-            n_updates: self.descent.n_updates(),
+            n_updates: self.optimiser.n_updates(),
             std: policy.mean_std(),
             selection: None,
         })

@@ -1,4 +1,4 @@
-//! Doing cells: train, test, write the result.
+//! Runs cells of an experiment: train, test, write the result.
 
 mod result;
 
@@ -18,119 +18,119 @@ use crate::evaluation::TestError;
 use crate::logging::Progress;
 use crate::training::{Entry, Outcome, RunDirectory, RunDirectoryError, Start, TrainError, is_over, train_together};
 
-/// What a stop without a signal counts as.
+/// The signal that a stop without a signal counts as.
 const SIGTERM: i32 = 15;
 
 /// Why a cell has no result.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CellError {
-    /// It cannot be trained.
+    /// The training failed.
     #[error(transparent)]
     Train(#[from] TrainError),
-    /// It cannot be tested.
+    /// The test failed.
     #[error(transparent)]
     Test(#[from] TestError),
-    /// Its episodes cannot be recorded.
+    /// The episodes cannot be recorded.
     #[error(transparent)]
     Records(#[from] RecordsError),
 }
 
 impl CellError {
-    /// Whose fault it is.
+    /// The cause of the failure.
     fn fault(&self) -> Fault {
         match self {
-            Self::Train(error) if error.is_for_want_of_room() => Fault::Room,
+            Self::Train(error) if error.is_server_full() => Fault::Room,
             Self::Train(error) if error.can_be_retried() => Fault::Server,
             Self::Test(error) if error.can_be_retried() => Fault::Server,
             Self::Train(error) if error.is_file_fault() => Fault::Files,
             Self::Records(RecordsError::File(error)) if error.is_fault() => Fault::Files,
-            Self::Train(error) if error.must_begin_anew() => Fault::Training,
+            Self::Train(error) if error.requires_restart() => Fault::Training,
             Self::Test(TestError::Numbers(_)) => Fault::Training,
             _ => Fault::Other,
         }
     }
 }
 
-/// Whose fault it is that a cell has no result, which decides whether it may have one later.
+/// The cause of a failure. It decides whether the cell may have a result later.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Fault {
-    /// That of the servers or of the way to them.
+    /// A server, or the connection to it.
     Server,
-    /// The same: the server has no room for so many environments.
+    /// A server that has no room for so many environments.
     Room,
-    /// That of the disk.
+    /// The disk.
     Files,
-    /// That of what was trained, from which another attempt would come to the same.
+    /// The trained policy: another attempt would fail in the same way.
     Training,
-    /// Anything else of the cell.
+    /// Anything else.
     Other,
 }
 
-/// A cell that is to be done.
+/// A cell to run.
 #[derive(Clone, Debug)]
-pub struct CellOrder<'a> {
-    /// What is to be done.
+pub struct CellJob<'a> {
+    /// The cell.
     pub cell: &'a Cell,
-    /// Where it is kept.
+    /// The folder of the cell's files.
     pub folder: CellFolder,
-    /// The failure that may be forgotten, and no other.
+    /// The earlier failure that may be cleared; any other failure stays.
     pub retry: Option<FailureMark>,
 }
 
-/// A cell in work.
-struct Work<'a> {
-    order: &'a CellOrder<'a>,
+/// A cell that is being run.
+struct RunningCell<'a> {
+    job: &'a CellJob<'a>,
     _lock: Lock,
-    /// Where and from where it is to be trained; `None` if it has been.
+    /// The directory and the start of the training; `None` if the cell is trained already.
     training: Option<(RunDirectory, Start)>,
-    /// What came of that: `None` of one that was stopped, or has not ended.
-    trained: Option<Result<Checkpoint, Broken>>,
+    /// The result of the training; `None` if it was stopped, or has not ended.
+    trained: Option<Result<Checkpoint, CellFailure>>,
 }
 
 /// Why a cell has no result.
 #[derive(Clone, Debug)]
-struct Broken {
+struct CellFailure {
     reason: String,
     fault: Fault,
 }
 
-/// Trains and tests the cells of `orders`, which have the same environment and architecture: trains all in lockstep over one
-/// session, and then tests one after the other. Leaves alone those that are done, have failed otherwise than they may, or
-/// that others work on. Calls `tell` with what is being done with each cell, and at last, once, with how that ended: an
-/// event that is [last](CellEvent::is_last).
+/// Trains and tests the cells of `jobs`, which have the same environment and architecture: trains all together, and then
+/// tests one after the other. Skips cells that are done, that have another failure than the one to retry, or that another
+/// process runs. Calls `tell` with the progress of each cell, and once with its end: an event that is
+/// [last](CellEvent::is_last).
 ///
-/// What goes wrong with a cell is recorded in its folder, and the others go on. All that are left have lost their server
-/// if one has, and are stopped by `stop`.
-pub fn run_cells(servers: &Servers, orders: &[CellOrder<'_>], stop: &StopFlag, tell: &mut dyn FnMut(&Cell, CellEvent)) {
+/// The failure of a cell is recorded in its folder, and the others go on. If one cell loses its server, the rest end with
+/// [`CellEvent::LostServer`]; `stop` interrupts all.
+pub fn run_cells(servers: &Servers, jobs: &[CellJob<'_>], stop: &StopFlag, tell: &mut dyn FnMut(&Cell, CellEvent)) {
     let mut all = Vec::new();
-    for order in orders {
-        match Work::begin(order, tell) {
+    for job in jobs {
+        match RunningCell::lock(job, tell) {
             Ok(work) => all.push(work),
-            Err(end) => tell(order.cell, end),
+            Err(end) => tell(job.cell, end),
         }
     }
     let begun = Instant::now();
     let places: Vec<usize> = (0..all.len()).filter(|&place| all[place].training.is_some()).collect();
-    if let Err(broken) = train(servers, &mut all, &places, stop, tell) {
+    if let Err(failure) = train(servers, &mut all, &places, stop, tell) {
         let left: Vec<usize> = places.iter().copied().filter(|&place| all[place].trained.is_none()).collect();
         for place in left {
-            // One that is refused must not keep the others from their turn, nor a server that has no room for all at once.
-            let alone = if places.len() == 1 || broken.fault == Fault::Server {
-                Err(broken.clone())
+            // A cell that is refused must not stop the others, nor must a server that has no room for all at once.
+            let alone = if places.len() == 1 || failure.fault == Fault::Server {
+                Err(failure.clone())
             } else {
-                all[place].look_back_again(tell).and_then(|()| train(servers, &mut all, &[place], stop, tell))
+                all[place].recover_after_failure(tell).and_then(|()| train(servers, &mut all, &[place], stop, tell))
             };
-            if let Err(broken) = alone {
-                all[place].trained = Some(Err(broken));
+            if let Err(failure) = alone {
+                all[place].trained = Some(Err(failure));
             }
         }
     }
-    // Each cell's share of the time in which all were trained.
+    // Seconds per cell: all were trained at the same time.
     let share = begun.elapsed().as_secs_f64() / places.len().max(1) as f64;
     let mut lost = None;
     for work in all {
-        let cell = work.order.cell;
+        let cell = work.job.cell;
         let end = match (&lost, stop.signal()) {
             (_, Some(signal)) => CellEvent::Stopped { signal },
             (Some(reason), None) => CellEvent::LostServer { reason: String::clone(reason) },
@@ -143,28 +143,28 @@ pub fn run_cells(servers: &Servers, orders: &[CellOrder<'_>], stop: &StopFlag, t
     }
 }
 
-/// Trains those in `places` together.
+/// Trains the cells in `places` together.
 ///
 /// # Errors
-/// What ended all that have not ended.
+/// The failure that ended all cells that had not ended.
 fn train(
     servers: &Servers,
-    all: &mut [Work<'_>],
+    all: &mut [RunningCell<'_>],
     places: &[usize],
     stop: &StopFlag,
     tell: &mut dyn FnMut(&Cell, CellEvent),
-) -> Result<(), Broken> {
+) -> Result<(), CellFailure> {
     let places: Vec<usize> = places.iter().copied().filter(|&place| all[place].training.is_some()).collect();
     if places.is_empty() {
         return Ok(());
     }
     let entry = |&place: &usize| {
-        let Work { order, training, .. } = &all[place];
+        let RunningCell { job, training, .. } = &all[place];
         let (directory, start) = training.as_ref()?;
-        Some(Entry { directory, start: start.clone(), marks: &order.cell.tests.marks })
+        Some(Entry { directory, start: start.clone(), marks: &job.cell.tests.marks })
     };
     let entries = places.iter().filter_map(entry).collect();
-    let cells: Vec<&Cell> = places.iter().map(|&place| all[place].order.cell).collect();
+    let cells: Vec<&Cell> = places.iter().map(|&place| all[place].job.cell).collect();
     let mut outcomes: Vec<(usize, Result<Outcome, TrainError>)> = Vec::new();
     let mut report = |index: usize, &Progress { episodes, timesteps, saved_timesteps: saved, .. }: &Progress| {
         tell(cells[index], CellEvent::Training { episodes, timesteps, saved });
@@ -177,7 +177,7 @@ fn train(
             Err(error) => Some(Err(CellError::from(error).into())),
             Ok(outcome) => {
                 let Counters { episodes, timesteps, .. } = outcome.checkpoint.state.counters;
-                tell(work.order.cell, CellEvent::Training { episodes, timesteps, saved: timesteps });
+                tell(work.job.cell, CellEvent::Training { episodes, timesteps, saved: timesteps });
                 outcome.signal.is_none().then_some(Ok(outcome.checkpoint))
             }
         };
@@ -185,10 +185,10 @@ fn train(
     all_ended.map_err(|error| CellError::from(error).into())
 }
 
-impl<'a> Work<'a> {
-    /// Takes the cell, or says how it has ended already.
-    fn begin(order: &'a CellOrder<'a>, tell: &mut dyn FnMut(&Cell, CellEvent)) -> Result<Self, CellEvent> {
-        let CellOrder { folder, retry, .. } = order;
+impl<'a> RunningCell<'a> {
+    /// Locks the cell. The error is the end of a cell that is not to be run.
+    fn lock(job: &'a CellJob<'a>, tell: &mut dyn FnMut(&Cell, CellEvent)) -> Result<Self, CellEvent> {
+        let CellJob { folder, retry, .. } = job;
         let Some(lock) = folder.try_lock().map_err(failed)? else { return Err(CellEvent::Busy) };
         match folder.state().map_err(failed)? {
             CellState::Done(_) => return Err(CellEvent::Done),
@@ -198,19 +198,19 @@ impl<'a> Work<'a> {
             CellState::Failed(_) => folder.forget_failure().map_err(failed)?,
             CellState::Missing => {}
         }
-        let mut work = Self { order, _lock: lock, training: None, trained: None };
-        match work.look_back(tell) {
+        let mut work = Self { job, _lock: lock, training: None, trained: None };
+        match work.recover(tell) {
             Ok(()) => {}
             Err(error) => work.trained = Some(Err(CellError::from(TrainError::from(error)).into())),
         }
         Ok(work)
     }
 
-    /// Decides what becomes of a training that was broken off: one that had finished is taken as it is, another goes on
-    /// from its last checkpoint, to the same bytes as without the break, and one without a usable checkpoint begins again.
-    fn look_back(&mut self, tell: &mut dyn FnMut(&Cell, CellEvent)) -> Result<(), RunDirectoryError> {
-        let Cell { config, tests, .. } = self.order.cell;
-        let path = self.order.folder.training();
+    /// Recovers a training that was interrupted. A finished training is taken as it is. Another is resumed from its last
+    /// checkpoint, to the same bytes as without the break. A training without a usable checkpoint begins again.
+    fn recover(&mut self, tell: &mut dyn FnMut(&Cell, CellEvent)) -> Result<(), RunDirectoryError> {
+        let Cell { config, tests, .. } = self.job.cell;
+        let path = self.job.folder.training();
         let over = |(_, checkpoint, state): &(RunDirectory, Checkpoint, ResumeState)| {
             is_over(&config.common, &checkpoint.state.counters, state.history.recent.iter())
         };
@@ -224,7 +224,7 @@ impl<'a> Work<'a> {
         }
         let Counters { episodes, timesteps, .. } =
             earlier.as_ref().map_or_else(Counters::default, |(_, checkpoint, _)| checkpoint.state.counters);
-        tell(self.order.cell, CellEvent::Training { episodes, timesteps, saved: timesteps });
+        tell(self.job.cell, CellEvent::Training { episodes, timesteps, saved: timesteps });
         match earlier {
             Some(earlier) if over(&earlier) => self.trained = Some(Ok(earlier.1)),
             Some((directory, checkpoint, state)) => {
@@ -235,16 +235,16 @@ impl<'a> Work<'a> {
         Ok(())
     }
 
-    /// The same after an attempt that may have left a checkpoint.
-    fn look_back_again(&mut self, tell: &mut dyn FnMut(&Cell, CellEvent)) -> Result<(), Broken> {
+    /// Recovers the training after an attempt that may have left a checkpoint.
+    fn recover_after_failure(&mut self, tell: &mut dyn FnMut(&Cell, CellEvent)) -> Result<(), CellFailure> {
         self.training = None; // its directory is locked by it
-        self.look_back(tell).map_err(|error| CellError::from(TrainError::from(error)).into())
+        self.recover(tell).map_err(|error| CellError::from(TrainError::from(error)).into())
     }
 
-    /// Tests what was trained in so many seconds, writes the result, and says how that ended.
+    /// Tests the policy, whose training took `seconds`, and writes the result. Returns the end of the cell.
     ///
     /// # Errors
-    /// [`FolderError`]: the folder cannot be read or written. Whatever else goes wrong is recorded in it.
+    /// [`FolderError`]: the folder cannot be read or written. Other failures are recorded in the folder.
     fn end(
         self,
         servers: &Servers,
@@ -252,27 +252,31 @@ impl<'a> Work<'a> {
         stop: &StopFlag,
         tell: &mut dyn FnMut(CellEvent),
     ) -> Result<CellEvent, FolderError> {
-        let CellOrder { cell, folder, .. } = self.order;
+        let CellJob { cell, folder, .. } = self.job;
         let testing = Instant::now();
         let tested = match self.trained {
             None => return Ok(CellEvent::Stopped { signal: stop.signal().unwrap_or(SIGTERM) }),
-            Some(Err(broken)) => Err(broken),
-            Some(Ok(checkpoint)) => result::tested(servers, cell, folder, checkpoint, stop, tell).map_err(Broken::from),
+            Some(Err(failure)) => Err(failure),
+            Some(Ok(checkpoint)) => {
+                result::tested(servers, cell, folder, checkpoint, stop, tell).map_err(CellFailure::from)
+            }
         };
         let seconds = if self.training.is_some() { seconds } else { 0.0 } + testing.elapsed().as_secs_f64();
         match (tested, stop.signal()) {
             (Ok(Some(result)), _) => {
                 folder.write_timing(&Timing { seconds })?;
-                folder.write_result(&result)?; // last: whoever sees it may read everything else
+                folder.write_result(&result)?; // last: a reader who sees it may read everything else
                 Ok(CellEvent::Done)
             }
             (Ok(None), signal) => Ok(CellEvent::Stopped { signal: signal.unwrap_or(SIGTERM) }),
-            // Whoever stops a run may end its servers too.
+            // The signal that stops a run may have ended its servers too.
             (Err(_), Some(signal)) => Ok(CellEvent::Stopped { signal }),
-            (Err(Broken { reason, fault: Fault::Server | Fault::Room }), None) => Ok(CellEvent::LostServer { reason }),
-            (Err(Broken { reason, fault: Fault::Files }), None) => Ok(CellEvent::FileFault { reason }),
-            (Err(Broken { reason, fault }), None) => {
-                // Without the folder's place: wherever the same happens, the same is recorded.
+            (Err(CellFailure { reason, fault: Fault::Server | Fault::Room }), None) => {
+                Ok(CellEvent::LostServer { reason })
+            }
+            (Err(CellFailure { reason, fault: Fault::Files }), None) => Ok(CellEvent::FileFault { reason }),
+            (Err(CellFailure { reason, fault }), None) => {
+                // Without the folder's path, so that equal failures have equal texts.
                 let reason = reason.replace(&format!("{}/", folder.path().display()), "");
                 let (commit, begins_anew) = (perturb_experiment::VERSION.into(), fault == Fault::Training);
                 let failure = Failure { id: cell.id.clone(), reason, commit, begins_anew };
@@ -283,13 +287,13 @@ impl<'a> Work<'a> {
     }
 }
 
-impl From<CellError> for Broken {
+impl From<CellError> for CellFailure {
     fn from(error: CellError) -> Self {
         Self { reason: error.to_string(), fault: error.fault() }
     }
 }
 
-/// How a cell ends whose folder cannot be read or written.
+/// The end of a cell whose folder cannot be read or written.
 fn failed(error: impl Into<FolderError>) -> CellEvent {
     let error = error.into();
     let reason = error.to_string();
@@ -299,15 +303,15 @@ fn failed(error: impl Into<FolderError>) -> CellEvent {
     }
 }
 
-/// What is left of a training that was broken off; `None` if there is nothing that could go on.
+/// The last checkpoint of a training that was interrupted; `None` if nothing can be resumed.
 ///
 /// # Errors
-/// Whatever else keeps it from being read, a lock for instance: then it may still go on later, and is left as it is.
+/// Any other failure to read it, e.g. a lock: the training may still be resumed later, and is left as it is.
 fn earlier(directory: &Path) -> Result<Option<(RunDirectory, Checkpoint, ResumeState)>, RunDirectoryError> {
     match RunDirectory::resume(directory) {
         Ok(earlier) => Ok(Some(earlier)),
         Err(RunDirectoryError::Missing { .. }) => Ok(None),
-        Err(error) if error.is_hopeless() => {
+        Err(error) if error.is_unrecoverable() => {
             tracing::warn!("the training begins again: {error}");
             Ok(None)
         }
@@ -326,7 +330,7 @@ mod tests {
         assert!(earlier(&training).unwrap().is_none(), "nothing there");
         let checkpoint = training.join("checkpoint");
         std::fs::create_dir_all(&checkpoint).unwrap();
-        assert!(earlier(&training).unwrap().is_none(), "broken off before the first checkpoint");
+        assert!(earlier(&training).unwrap().is_none(), "interrupted before the first checkpoint");
         std::fs::write(checkpoint.join("checkpoint.json"), "{").unwrap();
         assert!(earlier(&training).unwrap().is_none(), "damaged");
         let (newer, json) = (r#"{"format_version": 99, "unheard_of": 1}"#, checkpoint.join("checkpoint.json"));

@@ -1,4 +1,4 @@
-//! The result of a cell: tests of its policy, and all that says what they are of.
+//! The result of a cell: tests of its policy, and the description of the training.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -16,7 +16,7 @@ use crate::client::Servers;
 use crate::evaluation::{TestError, TestOptions, Tester};
 use crate::training::{TrainError, mark_in};
 
-/// Stands for the program that began a training whose checkpoint does not say.
+/// The commit of a training whose checkpoint does not name one.
 const UNKNOWN: &str = "unknown";
 
 /// Tests the policy that was trained for `cell`, and records the episodes in `folder`; `None` if the stop flag was raised.
@@ -83,13 +83,13 @@ pub(super) fn tested(
     }))
 }
 
-/// The figures of each test.
+/// The figures of each test, by the name of its set.
 fn results(records: &Records) -> BTreeMap<String, TestResult> {
     let result = |test: &RecordedTest| (test.set.name.clone(), records.result(&test.set.name, None));
     records.about.tests.iter().map(result).collect()
 }
 
-/// Of the programs that trained, those that are not this one.
+/// The commits of the programs that trained before this one.
 fn earlier_commits(mut commits: Vec<String>) -> Vec<String> {
     if commits.is_empty() {
         return vec![UNKNOWN.into()];
@@ -98,7 +98,7 @@ fn earlier_commits(mut commits: Vec<String>) -> Vec<String> {
     commits
 }
 
-/// Parameters as they are typed.
+/// Parameters as arguments of `--parameters`.
 fn parameters(parameters: &Parameters) -> String {
     let written = |values: &Distribution| match serde_json::to_value(values) {
         Ok(serde_json::Value::String(text)) => text,
@@ -108,7 +108,7 @@ fn parameters(parameters: &Parameters) -> String {
     texts.collect::<Vec<_>>().join(" ")
 }
 
-/// What gives a cell's numbers again without the plan.
+/// The command that reproduces a cell's numbers without the plan.
 fn command(cell: &Cell) -> String {
     let common = &cell.config.common;
     let mut text = format!(
@@ -137,7 +137,7 @@ fn command(cell: &Cell) -> String {
     if !versions.is_empty() {
         evaluate(format!("--versions {}", versions.join(",")), *episodes);
     }
-    // What a set of contexts is stands in the recorded episodes alone.
+    // A set of listed contexts has no command: only the recorded episodes hold them.
     let own = |set: &TestSet| format!("--parameters {} --base-version {}", parameters(&set.drawn()), set.version);
     for set in sets.iter().filter(|set| set.plain().is_none() && !set.drawn().is_empty()) {
         evaluate(own(set), *episodes);
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn the_command_has_every_setting() {
+    fn command_has_every_setting() {
         let cell = cell();
         let command = command(&cell);
         let expected = "perturb train --out RUN --env Pendulum --version E --algorithm a2c --architecture rc --episodes 3 \
@@ -181,9 +181,9 @@ mod tests {
     }
 
     #[test]
-    fn only_programs_that_differ_are_named_beside_the_one_that_finished() {
+    fn earlier_commits_leave_out_the_present_one() {
         let of = |commits: &[&str]| earlier_commits(commits.iter().map(|&commit| commit.to_owned()).collect());
-        assert!(of(&[perturb_experiment::VERSION]).is_empty(), "as if it had not been broken off");
+        assert!(of(&[perturb_experiment::VERSION]).is_empty(), "as if it had not been interrupted");
         assert_eq!(of(&["a", perturb_experiment::VERSION, "b"]), ["a", "b"]);
         assert_eq!(of(&[]), [UNKNOWN], "a checkpoint of a program that did not say");
     }

@@ -1,6 +1,6 @@
-//! [Checkpoints](perturb_checkpoint) with what a training needs beside its policy to go on exactly where it was.
+//! [Checkpoints](perturb_checkpoint) with the state that a training needs beside its policy to be resumed exactly.
 //!
-//! Large arrays are in a file of their own, which testing does not read; the rest is `resume` in `checkpoint.json`.
+//! Large arrays are in a file of their own, which a test does not read; the rest is `resume` in `checkpoint.json`.
 
 #[cfg(test)]
 mod tests;
@@ -37,9 +37,9 @@ pub struct History {
     pub recent: Vec<EpisodeFigures>,
     /// Seconds of training.
     pub elapsed: f64,
-    /// Where they went; format 1 has no names here, nor in `recent`.
+    /// Seconds by activity. Format 1 has no names here, nor in `recent`.
     pub shares: TimeShares,
-    /// How long the logs were.
+    /// The lengths of the logs.
     pub logs: LogLengths,
 }
 
@@ -48,7 +48,7 @@ pub struct History {
 #[serde(deny_unknown_fields)]
 struct Document {
     arrays: ArraysFile,
-    /// Its arrays are without their data.
+    /// The algorithm's state; the data of its arrays are in the file of arrays.
     algorithm: AlgorithmState,
     /// The stream of actions.
     actions: ChaCha8Rng,
@@ -88,7 +88,7 @@ impl ResumeState {
 
     fn encode(&self) -> std::result::Result<Vec<u8>, String> {
         let CollectorState { snapshots, player } = &self.collector;
-        let PlayerState { observations, starts, outcomes, memory, actions: _ } = player;
+        let PlayerState { observations, starts, previous_steps, memory, actions: _ } = player;
         let num_envs = starts.len();
         let rows = |data: &[f32]| vec![num_envs, data.len() / num_envs.max(1)];
         let mut arrays = vec![
@@ -96,7 +96,7 @@ impl ResumeState {
             Array::u64("snapshot_lengths", snapshots.iter().map(|snapshot| snapshot.len() as u64)),
             Array::f32("observations", rows(observations), observations),
             Array::u8("starts", starts.iter().map(|&start| u8::from(start)).collect()),
-            Array::f32("outcomes", rows(outcomes), outcomes),
+            Array::f32("outcomes", rows(previous_steps), previous_steps),
             Array::f32("memory", rows(memory), memory),
         ];
         for array in &self.algorithm.optimiser {
@@ -116,7 +116,7 @@ impl Document {
         let player = PlayerState {
             observations: arrays.f32("observations")?.data,
             starts: arrays.u8("starts")?.iter().map(|&start| start != 0).collect(),
-            outcomes: arrays.f32("outcomes")?.data,
+            previous_steps: arrays.f32("outcomes")?.data,
             memory: arrays.f32("memory")?.data,
             actions: self.actions,
         };

@@ -8,7 +8,7 @@ use rand::Rng;
 
 use super::*;
 
-/// Of a shipped experiment, and told from others by its counters and a weight.
+/// A checkpoint of a shipped experiment, with its own counters and a weight of its own.
 fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
     let cells = Path::new(env!("CARGO_MANIFEST_DIR")).join("../results/beyond/confirm-2/cells");
     let cell = files::list(&cells).unwrap().into_iter().next().unwrap();
@@ -18,7 +18,7 @@ fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
     checkpoint
 }
 
-/// Of two environments; snapshots differ in length, floats are none that text would round well.
+/// The resume state of two environments. Snapshots differ in length, and floats need all their digits.
 fn resume_state(seed: u64) -> ResumeState {
     let mut rng = stream(seed, Purpose::Actions);
     for _ in 0..seed {
@@ -32,7 +32,7 @@ fn resume_state(seed: u64) -> ResumeState {
             player: PlayerState {
                 observations: vec![0.1, f32::MIN_POSITIVE, -3.0, 1e-7, 10.0, seed as f32],
                 starts: vec![true, false],
-                outcomes: vec![0.5; 6],
+                previous_steps: vec![0.5; 6],
                 memory: if recurrent { vec![0.25; 12] } else { vec![] },
                 actions: rng.clone(),
             },
@@ -75,7 +75,7 @@ fn what_resuming_needs_is_saved_and_loaded_bit_for_bit() {
 }
 
 #[test]
-fn a_checkpoint_without_the_state_of_its_training_can_be_tested_but_not_resumed() {
+fn checkpoint_without_resume_state_can_only_be_tested() {
     let directory = tempfile::tempdir().unwrap();
     resume_state(1).save(&checkpoint(1, 1), directory.path()).unwrap();
     checkpoint(1, 2).save(directory.path(), None).unwrap();

@@ -1,28 +1,28 @@
-//! Players and what servers played, between the protocol and the domain.
+//! Policies that servers play, and their rollouts.
 
 use std::io::ErrorKind;
 use std::ops::Range;
 
 use perturb_policy::{Normalisers, Player, PlayerState, PolicySpec, Role};
-use perturb_protocol::player::{Unreadable, doubles, observation_normaliser, player_state};
+use perturb_protocol::player::{DecodeError, doubles, observation_normaliser, player_state};
 use perturb_protocol::{ClientError, EndedEpisode};
 
-use super::part::Part;
 use super::session::Session;
+use super::shard::ServerShard;
 use crate::proto;
 
-/// Steps that one server played in all its environments, with the episodes that ended in them.
+/// A reply with steps that one server played in all its environments, and the episodes that ended in them.
 #[derive(Clone, Debug, Default)]
 pub struct Played {
-    /// As the protocol has them, `[T, N, …]`.
+    /// The steps as the protocol encodes them, `[T, N, …]`.
     pub acted: proto::Acted,
-    /// In order of steps and slots, with the steps, 0 … T-1.
+    /// The ended episodes with their steps, 0 … T-1, in order of steps and slots.
     pub ended: Vec<(usize, EndedEpisode)>,
 }
 
 impl Session<'_> {
-    /// Has servers play: `request` makes what each is asked for, if anything, of its slots, and `take` gets these and each
-    /// one's reply. They compute at the same time.
+    /// Lets servers play at the same time. `request` makes the request for the slots of a server, if there is one. `take` gets
+    /// the slots and the reply.
     ///
     /// # Errors
     /// [`ClientError::Refused`] with the server's sentence; [`ClientError::Protocol`] if the reply does not fit; the
@@ -36,13 +36,13 @@ impl Session<'_> {
             |part| request(part.range.clone()),
             |part, acted: proto::Acted| {
                 let played = part.played(acted)?;
-                take(part.range.clone(), played).map_err(|got| part.misplayed(got))
+                take(part.range.clone(), played).map_err(|got| part.malformed_rollout(got))
             },
         )
     }
 
-    /// Asks the one server of a batch that is [played as a whole](Session::plays_together) to play, without waiting for its
-    /// reply, which [`Session::played`] takes.
+    /// Asks the one server of a batch that is [played as a whole](Session::plays_together) to play. Does not wait for the
+    /// reply; [`Session::played`] does.
     ///
     /// # Errors
     /// The failures of a connection.
@@ -51,14 +51,14 @@ impl Session<'_> {
         let [part] = parts.as_mut_slice() else { return Err(not_played_together()) };
         let sent = servers.block_on(async {
             part.stream.send(act).await?;
-            // What drives the connection has its turn before the caller computes for long.
+            // Lets the task that drives the connection run before the caller computes for long.
             tokio::task::yield_now().await;
             Ok(())
         });
         sent.map_err(|error| servers.explain(error))
     }
 
-    /// The reply to [`Session::ask_to_play`], when it comes.
+    /// Waits for the reply to [`Session::ask_to_play`].
     ///
     /// # Errors
     /// Those of [`Session::play`].
@@ -70,11 +70,11 @@ impl Session<'_> {
     }
 
     /// The error for a reply to [`Session::played`] that does not fit.
-    pub fn misplayed(&self, got: String) -> ClientError {
-        self.parts.first().map_or_else(not_played_together, |part| part.misplayed(got))
+    pub fn malformed_rollout(&self, got: String) -> ClientError {
+        self.parts.first().map_or_else(not_played_together, |part| part.malformed_rollout(got))
     }
 
-    /// What stands beside the weights of the policy that a server plays; `None` if the batch is not on one server.
+    /// The player's state and statistics at the server; `None` if the batch is not on one server.
     ///
     /// # Errors
     /// Those of [`Session::play`].
@@ -100,8 +100,8 @@ fn not_played_together() -> ClientError {
     ClientError::System { action: "play a batch of several servers as a whole", source: ErrorKind::Unsupported.into() }
 }
 
-impl Part {
-    fn misplayed(&self, got: String) -> ClientError {
+impl ServerShard {
+    fn malformed_rollout(&self, got: String) -> ClientError {
         self.stream.mismatch::<proto::Act>(got, "arrays as the protocol describes them".into())
     }
 
@@ -111,7 +111,7 @@ impl Part {
         for proto::EndedAt { step, end, terminated, .. } in std::mem::take(&mut acted.ended) {
             let slot = end.as_ref().map_or(usize::MAX, |end| self.range.start.saturating_add(end.slot as usize));
             let inside = self.range.contains(&slot) && step < acted.steps;
-            let episode = end.filter(|_| inside).and_then(|end| EndedEpisode::of(end, slot, terminated));
+            let episode = end.filter(|_| inside).and_then(|end| EndedEpisode::from_proto(end, slot, terminated));
             let Some(episode) = episode else {
                 let got = format!("an ended episode of slot {slot} in step {step}");
                 let expected = "a named episode with its receipt".into();
@@ -123,7 +123,7 @@ impl Part {
     }
 }
 
-/// A player as the protocol has it, to begin where it is.
+/// The message by which a server starts to play from the state of `player`.
 pub fn policy(spec: &PolicySpec, player: &Player) -> proto::Policy {
     let Normalisers { observations, rewards } = player.normalisers();
     proto::Policy {
@@ -140,22 +140,22 @@ pub fn policy(spec: &PolicySpec, player: &Player) -> proto::Policy {
     }
 }
 
-/// The policy of a test, for one of several servers that has `n_envs` environments.
+/// The policy of a test for one of several servers, which has `n_envs` environments.
 pub fn for_server(policy: &proto::Policy, n_envs: usize) -> proto::Policy {
     let mut policy = policy.clone();
     if let Some(rewards) = &mut policy.rewards {
-        rewards.returns = doubles(&vec![0.0; n_envs]); // of no use where statistics are frozen
+        rewards.returns = doubles(&vec![0.0; n_envs]); // unused while statistics are frozen
     }
     policy
 }
 
-/// What is wrong if it is none. `observation_size` is that of the session, O, of which statistics may leave the end
-/// alone.
+/// Reads a player that a server saved. `observation_size` is the session's O; statistics may leave the last entries alone.
+/// The error names the field that is wrong.
 fn saved_player(saved: &proto::PlayerSaved, observation_size: usize) -> Result<(PlayerState, Normalisers), String> {
     let (Some(actions), Some(state)) = (&saved.actions, &saved.state) else {
         return Err("state or stream of actions is missing".into());
     };
-    let of = |field: &'static str| move |wrong: Unreadable| wrong.within(field).to_string();
+    let of = |field: &'static str| move |wrong: DecodeError| wrong.within(field).to_string();
     let normaliser = |moments| observation_normaliser(moments, observation_size);
     let observations = saved.observations.as_ref().map(normaliser).transpose().map_err(of("observations"))?;
     let rewards = saved.rewards.as_ref().map(TryInto::try_into).transpose().map_err(of("rewards"))?;

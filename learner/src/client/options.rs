@@ -1,4 +1,4 @@
-//! What is opened: environments of one or several trainings; where actions are chosen, and how long servers are waited for.
+//! Options of sessions: the environments to open, the place where actions are chosen, and the wait for lost servers.
 
 use std::ops::Range;
 use std::time::Duration;
@@ -9,43 +9,43 @@ use perturb_settings::sets::Parameters;
 
 use crate::proto::AutoresetMode;
 
-/// What to open.
+/// The environments of one training or test.
 #[derive(Clone, Debug)]
 pub struct OpenOptions {
     /// A name from the catalogue.
     pub environment: String,
-    /// Where parameters come from.
+    /// The version whose distributions parameters are drawn from.
     pub version: Version,
-    /// What replaces the version's distributions of some parameters.
+    /// Distributions that replace the version's, by parameter.
     pub parameters: Parameters,
-    /// N, at least 1.
+    /// N, the number of environments, at least 1.
     pub num_envs: usize,
     /// Fixes all randomness of the environments.
     pub seed: u64,
     /// Episodes in a trial.
     pub episodes_per_trial: u32,
-    /// What observations have; the same in all options of a session.
+    /// The entries of observations; the same in all options of a session.
     pub observe: Observe,
 }
 
-/// Where actions of trainings and tests are chosen, which changes no byte.
+/// The place where actions of trainings and tests are chosen. It changes no byte.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum ActAt {
-    /// At the server, if it can: a line's delay is then paid once a rollout, not at each step. Trainings over several
-    /// servers, several together whose rollouts are [short](perturb_settings::Rollouts), and those that see noise
-    /// choose theirs at the client all the same.
+pub enum ActorLocation {
+    /// At the server, if it can: the network's delay is then paid once a rollout, not at each step. Trainings over several
+    /// servers, groups of trainings with [short](perturb_settings::Rollouts) rollouts, and trainings with observation noise
+    /// choose their actions at the client in any case.
     #[default]
     Server,
     /// At the client.
     Client,
 }
 
-/// How long lost servers are waited for.
+/// The wait for lost servers.
 #[derive(Clone, Copy, Debug)]
 pub struct ServerWait {
-    /// In all, until something is gained; zero does not wait at all.
+    /// The longest wait without progress; zero does not wait at all.
     pub limit: Duration,
-    /// Hears what is waited for, in a sentence.
+    /// Gets a sentence on each wait.
     pub tell: fn(&str),
 }
 
@@ -56,7 +56,8 @@ impl Default for ServerWait {
 }
 
 /// The request for the slots of `range`, counted over all `options`; `None` if an index is beyond what the protocol can
-/// number. Slots of one option alone are asked for as servers of every age understand it. `lease` is that of the protocol.
+/// number. The slots of a single option are requested in the form that older servers understand, too. `lease` is the
+/// protocol's field.
 pub(super) fn open_request(
     options: &[OpenOptions],
     range: Range<usize>,
@@ -122,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn slots_of_several_options_are_groups_that_count_from_their_own_first() {
+    fn slots_of_several_options_are_groups() {
         let options = [options(3, 7), options(2, 8)];
         let groups = |range| {
             let open = open_request(&options, range, AutoresetMode::SameStep, 0).unwrap();

@@ -1,11 +1,11 @@
-//! What a step brings.
+//! The reply to a step.
 
 use std::ops::Range;
 
-use perturb_policy::{Ended, Outcome};
+use perturb_policy::{SlotEnd, StepOutcome};
 use perturb_protocol::EndedEpisode;
 
-/// The outcome of a step, in buffers that are used again.
+/// The reply to a step, in buffers that are used again.
 #[derive(Clone, Debug, Default)]
 pub struct StepReply {
     /// `[N, O]` observations; where an episode ended, the first one of the next.
@@ -22,7 +22,7 @@ pub struct StepReply {
     pub ended: Vec<EndedEpisode>,
 }
 
-/// What a step brought to successive slots: the fields of [`StepReply`].
+/// The reply to a step for successive slots: the fields of [`StepReply`].
 #[derive(Clone, Copy, Debug)]
 pub struct StepSlice<'a> {
     /// The first of the slots.
@@ -42,12 +42,12 @@ pub struct StepSlice<'a> {
 }
 
 impl StepReply {
-    /// All of it.
+    /// The whole reply.
     pub fn all(&self) -> StepSlice<'_> {
         self.slice(0..self.rewards.len())
     }
 
-    /// What belongs to the slots of `range`.
+    /// The part of the slots of `range`.
     pub fn slice(&self, range: Range<usize>) -> StepSlice<'_> {
         let size = self.observations.len() / self.rewards.len().max(1);
         let place = |slot| self.ended.partition_point(|end| end.slot < slot);
@@ -74,15 +74,15 @@ impl StepReply {
 }
 
 impl<'a> StepSlice<'a> {
-    /// What a player of these slots takes; `ended` holds the ends meanwhile.
-    pub fn outcome(&self, ended: &'a mut Vec<Ended>) -> Outcome<'a> {
+    /// The outcome for a player of these slots. `ended` is a buffer for the ends of episodes.
+    pub fn outcome(&self, ended: &'a mut Vec<SlotEnd>) -> StepOutcome<'a> {
         ended.clear();
-        ended.extend(self.ended.iter().map(|end| Ended {
+        ended.extend(self.ended.iter().map(|end| SlotEnd {
             slot: end.slot - self.first_slot,
             trial_index: end.trial_index,
             episode_in_trial: end.episode_in_trial,
         }));
-        Outcome {
+        StepOutcome {
             observations: self.observations,
             rewards: self.rewards,
             terminated: self.terminated,

@@ -9,10 +9,10 @@ use tokio::runtime::{Builder, Runtime};
 use tokio::sync::oneshot;
 
 use perturb_protocol::names::EnvironmentName;
-use perturb_protocol::{Address, ClientError, Connection, Machines, PrivateServer, first_of, machines};
+use perturb_protocol::{Address, ClientError, Connection, PrivateServer, ResolvedAddresses, connect_any, resolve};
 use perturb_settings::Common;
 
-use super::options::{ActAt, ServerWait};
+use super::options::{ActorLocation, ServerWait};
 use crate::proto;
 
 /// Connections to servers, all of which serve the same environments.
@@ -22,39 +22,39 @@ pub struct Servers {
     connections: Mutex<Vec<Connection>>,
     runtime: Runtime,
     local: Option<Mutex<PrivateServer>>,
-    /// Where servers are looked for when they were lost.
+    /// Addresses at which lost servers are looked for.
     named: Vec<Address>,
-    act: ActAt,
+    act: ActorLocation,
     wait: ServerWait,
 }
 
 impl Servers {
-    /// The same, with actions chosen there.
-    pub fn with_act(self, act: ActAt) -> Self {
+    /// Sets the place where actions are chosen.
+    pub fn with_act(self, act: ActorLocation) -> Self {
         Self { act, ..self }
     }
 
-    /// The same, which are waited for when they are lost.
+    /// Sets the wait for servers that are lost.
     pub fn with_wait(self, wait: ServerWait) -> Self {
         Self { wait, ..self }
     }
 
-    /// How long they are waited for when they are lost.
+    /// The wait for servers that are lost.
     pub(super) fn wait(&self) -> ServerWait {
         self.wait
     }
 
-    /// Whether it is one of this process's own, which [`Servers::reconnect`] starts again.
+    /// Whether the server is a private one of this process, which [`Servers::reconnect`] starts again.
     pub(super) fn is_private(&self) -> bool {
         self.local.is_some()
     }
 
-    /// Where actions are chosen.
-    pub(super) fn act(&self) -> ActAt {
+    /// The place where actions are chosen.
+    pub(super) fn act(&self) -> ActorLocation {
         self.act
     }
 
-    /// Starts a private server with so many physics threads (`None`: one a core), and connects to it.
+    /// Starts a private server with `workers` physics threads (`None`: one a core), and connects to it.
     ///
     /// # Errors
     /// Those of [`PrivateServer::start`] and of [`Servers::connect`].
@@ -65,28 +65,28 @@ impl Servers {
         Ok(servers)
     }
 
-    /// Connects to every server of `addresses`, of which there must be at least one, and which share each batch. A name
-    /// that stands for several machines counts as one server: any of them. Proxy settings are ignored.
+    /// Connects to every server of `addresses`, at least one. The servers share each batch. A name that resolves to several
+    /// machines counts as one server: any of them. Proxy settings are ignored.
     ///
     /// # Errors
     /// [`ClientError::Connect`] if one does not answer within some seconds, or is shutting down.
     pub fn connect(addresses: &[Address]) -> Result<Self, ClientError> {
         let runtime = runtime()?;
         let connections = addresses.iter().map(|address| runtime.block_on(one(address))).collect::<Result<_, _>>()?;
-        Ok(Self { named: addresses.to_vec(), ..Self::of(connections, runtime) })
+        Ok(Self { named: addresses.to_vec(), ..Self::new(connections, runtime) })
     }
 
-    fn of(connections: Vec<Connection>, runtime: Runtime) -> Self {
+    fn new(connections: Vec<Connection>, runtime: Runtime) -> Self {
         let named = connections.iter().map(|connection| connection.address().clone()).collect();
-        let (act, wait) = (ActAt::default(), ServerWait::default());
+        let (act, wait) = (ActorLocation::default(), ServerWait::default());
         Self { connections: Mutex::new(connections), runtime, local: None, named, act, wait }
     }
 
-    /// Connects again to those of the servers that are there, of which there must be at least one, and says what is wrong
-    /// with the others. A private one is started again.
+    /// Connects again to the servers that answer, at least one. Returns the errors of the others. A private server is started
+    /// again.
     ///
     /// # Errors
-    /// What is wrong with all of them.
+    /// The errors of all servers, if none answers.
     pub(super) async fn reconnect(&self) -> Result<Vec<ClientError>, ClientError> {
         if let Some(local) = &self.local {
             local.lock().unwrap_or_else(PoisonError::into_inner).restart()?;
@@ -99,14 +99,14 @@ impl Servers {
             }
         }
         if there.is_empty() {
-            return Err(ClientError::of_all(errors));
+            return Err(ClientError::from_all(errors));
         }
         *self.locked() = there;
         Ok(errors)
     }
 
-    /// Connects to one server of `addresses`, where every machine that a name stands for counts: to number `turn`, counted
-    /// around, or to the next one that takes sessions. Whoever has successive turns spreads evenly.
+    /// Connects to one server of `addresses`, where every machine that a name resolves to counts: to number `turn`, modulo
+    /// their number, or to the next one that takes sessions. Callers with successive turns are spread evenly.
     ///
     /// # Errors
     /// [`ClientError::Connect`] if there is only one and it does not take sessions, [`ClientError::NoneConnects`] if none
@@ -115,19 +115,19 @@ impl Servers {
         let runtime = runtime()?;
         let connection = runtime.block_on(async {
             let (all, mut errors) = all_machines(addresses).await;
-            match first_of(&all.into_order(turn)).await {
+            match connect_any(&all.into_order(turn)).await {
                 Ok(connection) => Ok(connection),
                 Err(others) => {
                     errors.extend(others);
-                    Err(ClientError::of_all(errors))
+                    Err(ClientError::from_all(errors))
                 }
             }
         })?;
-        Ok(Self::of(vec![connection], runtime))
+        Ok(Self::new(vec![connection], runtime))
     }
 
-    /// Connects to all servers of `addresses` that take sessions, where every machine that a name stands for counts, and
-    /// says what is wrong with the others.
+    /// Connects to all servers of `addresses` that take sessions, where every machine that a name resolves to counts. Returns
+    /// the errors of the others.
     ///
     /// # Errors
     /// Those of [`Servers::connect_to_one`].
@@ -136,14 +136,14 @@ impl Servers {
         let (connections, errors) = runtime.block_on(async {
             let (all, mut errors) = all_machines(addresses).await;
             let mut connections = Vec::new();
-            for address in &all.equal {
+            for address in &all.preferred {
                 match Connection::open(address).await {
                     Ok(connection) => connections.push(connection),
                     Err(error) => errors.push(error),
                 }
             }
             if connections.is_empty() {
-                match first_of(&all.spare).await {
+                match connect_any(&all.fallback).await {
                     Ok(connection) => connections.push(connection),
                     Err(others) => errors.extend(others),
                 }
@@ -151,12 +151,12 @@ impl Servers {
             (connections, errors)
         });
         if connections.is_empty() {
-            return Err(ClientError::of_all(errors));
+            return Err(ClientError::from_all(errors));
         }
-        Ok((Self::of(connections, runtime), errors))
+        Ok((Self::new(connections, runtime), errors))
     }
 
-    /// Where the servers are, one address for each connection.
+    /// The addresses of the servers, one for each connection.
     pub fn addresses(&self) -> Vec<Address> {
         self.locked().iter().map(|connection| connection.address().clone()).collect()
     }
@@ -170,24 +170,24 @@ impl Servers {
         self.connections.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits for `future`, which may wait for servers.
+    /// Runs `future` on the runtime that drives the connections, and waits for it.
     pub(crate) fn block_on<T>(&self, future: impl Future<Output = T>) -> T {
         self.runtime.block_on(future)
     }
 
-    /// What drives the connections.
+    /// The runtime that drives the connections.
     pub(super) fn runtime(&self) -> &Runtime {
         &self.runtime
     }
 
-    /// Does `work`, which may take long, on this thread, and meanwhile answers on another one when servers ask whether
-    /// the learner lives. Without it a server drops its sessions after its `--keepalive-seconds`, because otherwise the
-    /// connections are driven only while a request waits.
+    /// Runs `work`, which may take long, on this thread. Meanwhile another thread answers the servers' keepalive pings.
+    /// Otherwise the connections are driven only while a request waits, and a server drops its sessions after its
+    /// `--keepalive-seconds`.
     pub fn keep_alive_during<T>(&self, work: impl FnOnce() -> T) -> T {
         let (done, end) = oneshot::channel::<()>();
         let runtime = &self.runtime;
         std::thread::scope(|scope| {
-            // Either way of its ending, by `done` or by a panic in `work`, is the end.
+            // Ends when `done` is dropped, by the line below or by a panic in `work`.
             scope.spawn(move || drop(runtime.block_on(end)));
             let result = work();
             drop(done);
@@ -209,8 +209,7 @@ impl Servers {
         self.runtime.block_on(connection.catalogue()).map_err(|error| self.explain(error))
     }
 
-    /// The entry `name`, however it is [spelled](perturb_protocol::names), of the catalogues, which must be the same in all of
-    /// them.
+    /// The entry `name` of the catalogues, in any [spelling](perturb_protocol::names). It must be the same in all of them.
     ///
     /// # Errors
     /// [`ClientError::NoEnvironment`] with the names that there are, [`ClientError::Disagreement`], and those of
@@ -233,7 +232,7 @@ impl Servers {
         Ok(environment)
     }
 
-    /// The same as a training's policy sees it.
+    /// The environment as a training's policy sees it.
     ///
     /// # Errors
     /// Those of [`Servers::environment`]; [`ClientError::NoParameters`] if it sees parameters and the servers cannot
@@ -256,7 +255,7 @@ impl Servers {
         Ok(catalogue[place].clone())
     }
 
-    /// Says how the private server ended, if it did and a stream was lost with it.
+    /// Adds the exit status of the private server to an error, if the server ended and a stream was lost with it.
     pub(super) fn explain(&self, error: ClientError) -> ClientError {
         let (ClientError::Lost { address, request, code, .. }, Some(server)) = (&error, &self.local) else {
             return error;
@@ -276,11 +275,11 @@ fn runtime() -> Result<Runtime, ClientError> {
         .map_err(|source| ClientError::System { action: "start the network runtime", source })
 }
 
-/// The machines of all addresses, and what is wrong with names that stand for none.
-async fn all_machines(addresses: &[Address]) -> (Machines, Vec<ClientError>) {
-    let (mut all, mut errors) = (Machines::default(), Vec::new());
+/// The machines of all addresses, and the errors of names that do not resolve.
+async fn all_machines(addresses: &[Address]) -> (ResolvedAddresses, Vec<ClientError>) {
+    let (mut all, mut errors) = (ResolvedAddresses::default(), Vec::new());
     for address in addresses {
-        match machines(address).await {
+        match resolve(address).await {
             Ok(found) => all.extend(found),
             Err(error) => errors.push(error),
         }
@@ -290,18 +289,19 @@ async fn all_machines(addresses: &[Address]) -> (Machines, Vec<ClientError>) {
 
 /// Connects to the server at `address`.
 async fn one(address: &Address) -> Result<Connection, ClientError> {
-    any_of(address, machines(address).await?.into_order(own_turn())).await
+    any_of(address, resolve(address).await?.into_order(own_turn())).await
 }
 
-/// Connects to one of the machines that `address` stands for.
+/// Connects to one of the machines that `address` resolves to.
 async fn any_of(address: &Address, machines: Vec<Address>) -> Result<Connection, ClientError> {
-    first_of(&machines).await.map_err(|errors| match ClientError::of_all(errors) {
+    connect_any(&machines).await.map_err(|errors| match ClientError::from_all(errors) {
         ClientError::NoneConnects { reasons } => ClientError::Connect { address: address.clone(), reason: reasons },
         error => error,
     })
 }
 
-/// A turn for a process that has no other: processes on one machine have different numbers, containers different names.
+/// The turn of this process, from its id and its host's name: processes of one machine differ in the id, containers in the
+/// name.
 fn own_turn() -> usize {
     let mut hasher = DefaultHasher::new(); // always with the same key
     std::fs::read("/proc/sys/kernel/hostname").unwrap_or_default().hash(&mut hasher);

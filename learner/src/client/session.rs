@@ -3,28 +3,28 @@
 use std::ops::Range;
 
 use bytes::Bytes;
-use perturb_protocol::{Address, Ask, ClientError, Distribution};
+use perturb_protocol::{Address, ClientError, Distribution, TypedRequest};
 use tokio::runtime::Handle;
 
-use super::options::{ActAt, OpenOptions};
-use super::part::Part;
+use super::options::{ActorLocation, OpenOptions};
 use super::reply::StepReply;
 use super::servers::Servers;
+use super::shard::ServerShard;
 use crate::proto::{self, AutoresetMode};
 
-/// So many snapshots are restored by one request: of HalfCheetah some 600 kB, far below what a server accepts.
-const RESTORED_AT_ONCE: usize = 1024;
+/// Snapshots that one request restores. Those of HalfCheetah are some 600 kB, far below a server's limit.
+const SNAPSHOTS_PER_RESTORE: usize = 1024;
 
-/// Requests to one server that wait for their replies, of which none is sent before the last is answered.
-const WAITING: u32 = 1;
+/// Requests to one server that may wait for their replies: none is sent before the last is answered.
+const MAX_IN_FLIGHT: u32 = 1;
 
 /// N environments in same-step autoreset mode, of one training or of several. Environment i of a training has index i and
-/// gives the same bytes however many servers share the batch, and whatever else is in it: each server owns a contiguous
-/// range. Where a connection by TCP is lost, but not the server, its part [goes on](perturb_protocol::Stream) as it was.
+/// gives the same bytes whatever the number of servers and whatever else is in the batch. Each server owns a contiguous range
+/// of slots. If a TCP connection is lost, but not the server, its part is [resumed](perturb_protocol::Stream).
 #[derive(Debug)]
 pub struct Session<'a> {
     pub(super) servers: &'a Servers,
-    pub(super) parts: Vec<Part>,
+    pub(super) parts: Vec<ServerShard>,
     environment: proto::Environment,
     observation_size: usize,
     num_envs: usize,
@@ -41,8 +41,8 @@ impl<'a> Session<'a> {
         Self::open_together(servers, std::slice::from_ref(options), observations)
     }
 
-    /// The same with the slots of several `options`, one after the other, which must name the same environment
-    /// and observe the same.
+    /// Opens the environments of several `options`, one after the other. All must name the same environment and observe the
+    /// same.
     ///
     /// # Errors
     /// Those of [`Session::open`].
@@ -54,7 +54,7 @@ impl<'a> Session<'a> {
         let num_envs = options.iter().map(|options| options.num_envs).sum();
         let connections = servers.connections();
         let ranges = split(num_envs, connections.len());
-        let acts = servers.act() == ActAt::Server;
+        let acts = servers.act() == ActorLocation::Server;
         let environment = proto::Environment::default();
         let mut session = Self { servers, parts: Vec::new(), environment, observation_size: 0, num_envs, acts };
         observations.clear();
@@ -62,12 +62,12 @@ impl<'a> Session<'a> {
             if range.is_empty() {
                 continue; // more servers than environments
             }
-            // A Unix socket is lost with its server alone.
-            let lease = if matches!(connection.address(), Address::Tcp { .. }) { WAITING } else { 0 };
-            let opening = Part::open(connection, options, range, AutoresetMode::SameStep, lease);
+            // A Unix socket is lost only with its server.
+            let lease = if matches!(connection.address(), Address::Tcp { .. }) { MAX_IN_FLIGHT } else { 0 };
+            let opening = ServerShard::open(connection, options, range, AutoresetMode::SameStep, lease);
             let (mut part, opened) = servers.runtime().block_on(opening).map_err(|error| servers.explain(error))?;
             if let [_, _, ..] = options {
-                part.stream.be_considerate(); // groups often run beside others
+                part.stream.back_off_when_contended(); // groups often run beside others
             }
             let described = opened.environment.unwrap_or_default();
             session.acts &= opened.acts;
@@ -89,17 +89,17 @@ impl<'a> Session<'a> {
         Ok(session)
     }
 
-    /// What was opened.
+    /// The environment, as the servers describe it.
     pub fn environment(&self) -> &proto::Environment {
         &self.environment
     }
 
-    /// N.
+    /// N, the number of environments.
     pub fn num_envs(&self) -> usize {
         self.num_envs
     }
 
-    /// Whether servers are to act, and all can, see [`Session::play`].
+    /// Whether servers shall act, and all of them can, see [`Session::play`].
     pub fn acts(&self) -> bool {
         self.acts
     }
@@ -109,7 +109,7 @@ impl<'a> Session<'a> {
         self.acts && self.parts.len() == 1
     }
 
-    /// O.
+    /// O, the length of an observation.
     pub fn observation_size(&self) -> usize {
         self.observation_size
     }
@@ -124,7 +124,7 @@ impl<'a> Session<'a> {
         let width = actions.len() / self.num_envs.max(1);
         reply.resize(self.num_envs, self.observation_size);
         let size = self.observation_size;
-        let request = |part: &mut Part| {
+        let request = |part: &mut ServerShard| {
             part.actions.clear();
             part.actions.extend_from_slice(&actions[part.range.start * width..part.range.end * width]);
             Some(proto::Step { actions: part.actions.split().freeze() })
@@ -173,8 +173,8 @@ impl<'a> Session<'a> {
         part.stream.decode::<proto::Reset>("observations", &done.observations, observation)
     }
 
-    /// Saves the environments of `slots` whole: opaque snapshots in their order. Changes nothing. All servers work at the
-    /// same time.
+    /// Saves the environments of `slots`: opaque snapshots, in order of slots. Changes nothing. All servers work at the same
+    /// time.
     ///
     /// # Errors
     /// The failures of a connection.
@@ -195,8 +195,8 @@ impl<'a> Session<'a> {
         Ok(snapshots)
     }
 
-    /// Brings the environments of `slots` back from as many snapshots in their order, taken of this environment on any
-    /// number of servers; gives the observations `[n, O]` at which they were saved. What follows is what followed the
+    /// Restores the environments of `slots` from as many snapshots in their order, taken of this environment on any number
+    /// of servers. Returns the observations `[n, O]` at which they were saved. The environments continue as they did after the
     /// snapshots.
     ///
     /// # Errors
@@ -241,12 +241,12 @@ impl<'a> Session<'a> {
         )
     }
 
-    /// Frees the environments of `slots`; those behind them are counted from the first of these on.
+    /// Frees the environments of `slots`. The slots behind them move down.
     ///
     /// # Errors
     /// The failures of a connection.
     pub fn release(&mut self, slots: Range<usize>) -> Result<(), ClientError> {
-        // What would be left without environments is closed.
+        // A part that would be left without environments is closed.
         self.close(|part| part.overlap(&slots) == part.range);
         self.exchange(|part| part.mask(&slots).map(|mask| proto::Release { mask }), |_, _| Ok(()))?;
         let mut first = 0;
@@ -259,8 +259,8 @@ impl<'a> Session<'a> {
         Ok(())
     }
 
-    /// Closes those parts, so that no server keeps them for a lease's time.
-    fn close(&mut self, over: impl Fn(&Part) -> bool) {
+    /// Closes the parts that are `over`, so that no server keeps them until their lease ends.
+    fn close(&mut self, over: impl Fn(&ServerShard) -> bool) {
         let closing = self.parts.extract_if(.., |part| over(part)).map(|part| part.stream.close());
         let closing = futures_util::future::join_all(closing);
         // Within a runtime nothing can be waited for.
@@ -269,12 +269,12 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Sends every server its request, if it has one, and takes its reply. All are heard before the first failure is returned, so that
-    /// no reply is left for a later request.
-    pub(super) fn exchange<A: Ask>(
+    /// Sends every server its request, if it has one, and takes its reply. All replies are received before the first failure is
+    /// returned, so that none is left for a later request.
+    pub(super) fn exchange<A: TypedRequest>(
         &mut self,
-        mut request: impl FnMut(&mut Part) -> Option<A>,
-        mut take: impl FnMut(&Part, A::Reply) -> Result<(), ClientError>,
+        mut request: impl FnMut(&mut ServerShard) -> Option<A>,
+        mut take: impl FnMut(&ServerShard, A::Reply) -> Result<(), ClientError>,
     ) -> Result<(), ClientError> {
         let Self { servers, parts, .. } = self;
         let exchanged = servers.runtime().block_on(async {
@@ -310,7 +310,7 @@ fn split(num_envs: usize, parts: usize) -> Vec<Range<usize>> {
 /// Cuts `slots` into ranges that one request restores.
 fn chunks(slots: Range<usize>) -> impl Iterator<Item = Range<usize>> {
     let end = slots.end;
-    slots.step_by(RESTORED_AT_ONCE).map(move |first| first..end.min(first + RESTORED_AT_ONCE))
+    slots.step_by(SNAPSHOTS_PER_RESTORE).map(move |first| first..end.min(first + SNAPSHOTS_PER_RESTORE))
 }
 
 #[cfg(test)]
@@ -330,10 +330,11 @@ mod tests {
 
     #[test]
     fn requests_to_restore_cover_a_part_in_order() {
-        for slots in [0..1, 5..RESTORED_AT_ONCE, 7..7 + RESTORED_AT_ONCE, 1..3 * RESTORED_AT_ONCE] {
+        const MAX: usize = SNAPSHOTS_PER_RESTORE;
+        for slots in [0..1, 5..MAX, 7..7 + MAX, 1..3 * MAX] {
             let all: Vec<usize> = chunks(slots.clone()).flatten().collect();
             assert_eq!(all, slots.clone().collect::<Vec<_>>());
-            assert!(chunks(slots).all(|chunk| (1..=RESTORED_AT_ONCE).contains(&chunk.len())));
+            assert!(chunks(slots).all(|chunk| (1..=MAX).contains(&chunk.len())));
         }
     }
 }

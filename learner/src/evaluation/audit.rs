@@ -1,4 +1,4 @@
-//! Playing recorded episodes again.
+//! Replays recorded episodes.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -7,25 +7,25 @@ use perturb_protocol::Version;
 use perturb_records::{About, EpisodeRecord, Records};
 
 use super::error::TestError;
-use super::test::outlasting;
+use super::test::retry_on_disconnect;
 use super::trials::Trials;
 use crate::checkpoint::Checkpoint;
 use crate::client::{EndedEpisode, OpenOptions, Servers, Session};
 
-/// What came of playing recorded episodes again.
+/// The result of a replay.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Audit {
-    /// Episodes that were played again.
+    /// Number of episodes that were replayed.
     pub episodes: u64,
-    /// Those that came out otherwise, each in a sentence.
+    /// A sentence for each episode that differs from its record.
     pub different: Vec<String>,
 }
 
-/// Why recorded episodes could not be played again.
+/// Why recorded episodes could not be replayed.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum AuditError {
-    /// They are of another policy.
+    /// The episodes were recorded of another policy.
     #[error(
         "the episodes were recorded of the policy {recorded}, the checkpoint is {got}: give the checkpoint that was tested"
     )]
@@ -35,13 +35,13 @@ pub enum AuditError {
         /// The checkpoint's.
         got: String,
     },
-    /// They cannot be played.
+    /// The episodes cannot be played.
     #[error(transparent)]
     Test(#[from] TestError),
 }
 
-/// Plays at most `most` of the recorded episodes again, evenly spread over them, each from its address alone: its seed,
-/// its indices and the parameters that were requested. Calls `report` with the number of episodes done.
+/// Replays at most `max_episodes` of the recorded episodes, evenly spread over them, each from its address alone: its seed,
+/// its indices and the requested parameters. Calls `report` with the number of episodes done.
 ///
 /// # Errors
 /// [`AuditError`].
@@ -49,7 +49,7 @@ pub fn audit(
     servers: &Servers,
     checkpoint: &Checkpoint,
     records: &Records,
-    most: usize,
+    max_episodes: usize,
     stop: &StopFlag,
     report: &mut dyn FnMut(u64),
 ) -> Result<Audit, AuditError> {
@@ -57,19 +57,19 @@ pub fn audit(
     if got != records.about.policy {
         return Err(AuditError::Policy { recorded: records.about.policy.clone(), got });
     }
-    Ok(outlasting(servers, stop, || play_again(servers, checkpoint, records, most, stop, report))?)
+    Ok(retry_on_disconnect(servers, stop, || replay(servers, checkpoint, records, max_episodes, stop, report))?)
 }
 
-fn play_again(
+fn replay(
     servers: &Servers,
     checkpoint: &Checkpoint,
     records: &Records,
-    most: usize,
+    max_episodes: usize,
     stop: &StopFlag,
     report: &mut dyn FnMut(u64),
 ) -> Result<Audit, TestError> {
     let mut queues: BTreeMap<usize, VecDeque<&EpisodeRecord>> = BTreeMap::new();
-    let chosen = spread(&records.episodes, most);
+    let chosen = spread(&records.episodes, max_episodes);
     for episode in chosen {
         queues.entry(episode.environment_index as usize).or_default().push_back(episode);
     }
@@ -100,17 +100,17 @@ fn play_again(
     }
 }
 
-/// At most `most` of `episodes`: one of each of so many equal parts, the next place in each, so that first and later
-/// episodes of environments are among them.
-fn spread(episodes: &[EpisodeRecord], most: usize) -> impl Iterator<Item = &EpisodeRecord> {
-    let count = most.min(episodes.len());
+/// At most `max_episodes` of `episodes`: one of each of as many equal parts, at the next place in each part, so that first
+/// and later episodes of environments are among them.
+fn spread(episodes: &[EpisodeRecord], max_episodes: usize) -> impl Iterator<Item = &EpisodeRecord> {
+    let count = max_episodes.min(episodes.len());
     (0..count).map(move |i| {
         let (first, next) = (i * episodes.len() / count, (i + 1) * episodes.len() / count);
         &episodes[first + i % (next - first)]
     })
 }
 
-/// Environments in which recorded episodes are played.
+/// The environments in which recorded episodes are replayed.
 struct Replay<'a> {
     trials: Trials<'a>,
     names: Vec<String>,
@@ -145,7 +145,7 @@ impl<'a> Replay<'a> {
         })
     }
 
-    /// Brings the environment of `slot` to the start of the trial that `episode` is the last one of.
+    /// Brings the environment of `slot` to the start of the trial whose last episode is `episode`.
     fn begin(&mut self, slot: usize, episode: &EpisodeRecord) -> Result<(), TestError> {
         let Trials { session, player, .. } = &mut self.trials;
         let mut observation = vec![0.0; session.observation_size()];
@@ -160,7 +160,7 @@ impl<'a> Replay<'a> {
     }
 }
 
-/// In what an episode differs from its record; `None` if in nothing.
+/// A sentence on the first difference of an episode from its record; `None` if there is none.
 fn difference(about: &About, recorded: &EpisodeRecord, end: EndedEpisode) -> Option<String> {
     let got = EpisodeRecord::of(about, &recorded.set, recorded.seed, end);
     let what = |told: fn(&EpisodeRecord) -> String| (told(recorded), told(&got));

@@ -1,4 +1,4 @@
-//! Why a checkpoint could not be tested.
+//! Errors of tests.
 
 use perturb_records::testing::NotRecorded;
 use perturb_settings::ValueError;
@@ -16,17 +16,17 @@ pub enum TestError {
     /// The policy gives numbers that are not finite, or does not fit.
     #[error(transparent)]
     Numbers(#[from] perturb_policy::Error),
-    /// The environment does not have the set's parameters, or refuses their values; or the threshold is of something
-    /// else than what its success rule compares.
+    /// The environment does not have the set's parameters, or refuses their values; or the threshold does not fit the
+    /// environment's success rule.
     #[error(transparent)]
     Value(#[from] ValueError),
     /// The checkpoint cannot be named.
     #[error("the checkpoint cannot be named: {0}")]
     Unnamed(String),
-    /// The server played something else than what was asked for.
+    /// The server played other episodes than it was asked for.
     #[error(transparent)]
     NotRecorded(#[from] NotRecorded),
-    /// The environment is no longer what the policy was trained in.
+    /// The environment has changed since the policy was trained.
     #[error(transparent)]
     Changed(#[from] Changed),
     /// The program was asked to end.
@@ -38,7 +38,7 @@ pub enum TestError {
 }
 
 impl TestError {
-    /// Whether the same may go well later or with another server, see [`ClientError::can_be_retried`].
+    /// Whether the test may succeed later or with another server, see [`ClientError::can_be_retried`].
     pub fn can_be_retried(&self) -> bool {
         matches!(self, Self::Client(error) if error.can_be_retried())
     }

@@ -1,4 +1,4 @@
-//! Testing a policy over two parameters.
+//! Tests a policy over a grid of two parameters.
 
 use perturb_files::interrupt::StopFlag;
 use perturb_protocol::proto;
@@ -10,23 +10,24 @@ use super::test::{TestOptions, Tester};
 use crate::checkpoint::Checkpoint;
 use crate::client::Servers;
 
-/// Why there is no heatmap.
+/// Why a heatmap cannot be made.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum HeatmapError {
-    /// The environment has no such parameter, or it is the same twice.
+    /// The environment has no such parameter, or both axes have the same.
     #[error("`{name}` cannot be an axis: expected two of {}'s parameters {}", environment, parameters.join(", "))]
     Parameter {
-        /// What was given.
+        /// The name that was given.
         name: String,
         /// The environment.
         environment: String,
-        /// Its parameters.
+        /// The environment's parameters.
         parameters: Vec<String>,
     },
     /// Recorded episodes are of another policy.
     #[error(
-        "the episodes were recorded of the policy {recorded}, the checkpoint is {got}: give the checkpoint of then"
+        "the episodes were recorded of the policy {recorded}, the checkpoint is {got}: pass the checkpoint these episodes \
+         were recorded with"
     )]
     Policy {
         /// The recorded policy.
@@ -34,23 +35,25 @@ pub enum HeatmapError {
         /// The checkpoint's.
         got: String,
     },
-    /// An axis has a value of its own.
+    /// An axis has a fixed value, too.
     #[error("{name} is an axis and has a value, too: leave it out of --parameters")]
     Fixed {
         /// The parameter.
         name: String,
     },
-    /// Recorded episodes are of something else.
-    #[error("the recorded episodes are not those of a heatmap over these two parameters: give the --x and --y of then")]
+    /// Recorded episodes are not those of a heatmap over these parameters.
+    #[error(
+        "the recorded episodes are not those of a heatmap over these two parameters: pass the original --x and --y"
+    )]
     NotOfAxes,
     /// The policy cannot be tested.
     #[error(transparent)]
     Test(#[from] TestError),
 }
 
-/// Tests `checkpoint` at every point of a grid over two parameters, whose range is that of R and E together; the others come
-/// from the options' base. Each point is an environment with random numbers of its own, so that points differ by their
-/// parameters and by chance. Calls `report` with the number of episodes; gives the recorded episodes, too.
+/// Tests `checkpoint` at every point of a grid over two parameters. The range of an axis is that of R and E together; the other
+/// parameters come from the options' base. Each point is an environment with its own random numbers, so that points differ by
+/// their parameters and by chance. Calls `report` with the number of episodes. Returns the recorded episodes, too.
 ///
 /// # Errors
 /// [`HeatmapError`].
@@ -77,7 +80,7 @@ pub fn heatmap(
     Ok((heatmap, records))
 }
 
-/// The heatmap of a test that was recorded, without playing it again. `environment` says what the parameters' axes are.
+/// The heatmap of a recorded test. `environment` gives the ranges of the axes.
 ///
 /// # Errors
 /// [`HeatmapError`] if the episodes are not those of a heatmap over these parameters.

@@ -1,4 +1,4 @@
-//! Testing: does a trained policy still work when the physics changes?
+//! Tests of trained policies: does a policy still work when the physics changes?
 
 mod audit;
 mod error;

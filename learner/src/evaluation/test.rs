@@ -1,4 +1,4 @@
-//! Testing a checkpoint on a set of its environment's parameters, and recording every episode.
+//! Tests a checkpoint on sets of its environment's parameters, and records every episode.
 
 use perturb_files::interrupt::StopFlag;
 use perturb_policy::random::Purpose;
@@ -12,18 +12,18 @@ use perturb_settings::{TrainConfig, sets};
 use super::error::TestError;
 use super::trials::{RemoteTrials, Trials};
 use crate::checkpoint::Checkpoint;
-use crate::client::{After, EndedEpisode, OpenOptions, Servers, Session, Waiting};
+use crate::client::{Backoff, EndedEpisode, OpenOptions, Reconnect, Servers, Session};
 
-/// How to test.
+/// Options of a test.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TestOptions {
-    /// Episodes on each set, at least 1; a set of contexts has at least one in each.
+    /// Episodes on each set, at least 1. A set of contexts has at least one in each context.
     pub episodes: u64,
     /// Fixes all randomness.
     pub seed: u64,
-    /// With selection episodes, which no other test has.
+    /// Whether to use the held-out selection episodes, which no other test has.
     pub selects: bool,
-    /// What decides about success; `None` for the environment's own rule.
+    /// The success rule; `None` for the environment's own.
     pub success: Option<Rule>,
 }
 
@@ -43,7 +43,7 @@ pub struct Tester<'a> {
 }
 
 impl<'a> Tester<'a> {
-    /// Checks that the served environment is the one that the policy was trained in, and that it knows the threshold.
+    /// Checks that the served environment is the one that the policy was trained in, and that the success rule fits it.
     ///
     /// # Errors
     /// [`TestError`].
@@ -68,7 +68,7 @@ impl<'a> Tester<'a> {
     /// The sets are checked before anything is played.
     ///
     /// # Errors
-    /// [`TestError`]. Episodes that did not run with what was requested end everything.
+    /// [`TestError`], also if an episode did not run with the requested parameters.
     pub fn test(
         &self,
         sets: &[TestSet],
@@ -82,7 +82,7 @@ impl<'a> Tester<'a> {
             let episodes_per_trial = self.about.episodes_per_trial;
             let TestOptions { episodes, seed, .. } = self.options;
             let purpose = self.options.purpose();
-            let counting = outlasting(self.servers, stop, || {
+            let counting = retry_on_disconnect(self.servers, stop, || {
                 let mut counting = Counting::new(set.clone(), purpose, seed, episodes, episodes_per_trial);
                 self.play(&mut counting, stop, &mut |done| report(set, done))?;
                 Ok(counting)
@@ -92,8 +92,8 @@ impl<'a> Tester<'a> {
         Ok(records)
     }
 
-    /// Plays the episodes of a test, with sampled actions and frozen statistics. The result depends on the checkpoint, the
-    /// set, the number of episodes and the seed alone.
+    /// Plays the episodes of a test, with sampled actions and frozen statistics. The result depends only on the checkpoint,
+    /// the set, the number of episodes and the seed.
     fn play(&self, counting: &mut Counting, stop: &StopFlag, report: &mut dyn FnMut(u64)) -> Result<(), TestError> {
         let (test, num_envs) = (counting.test(), counting.num_envs());
         let contexts = test.set.listed();
@@ -136,33 +136,34 @@ impl<'a> Tester<'a> {
             if let Some(signal) = stop.signal() {
                 return Err(TestError::Stopped { signal });
             }
-            // Environments that are done go on, unseen: they cost less than a smaller batch would save.
+            // Environments that are done are stepped on, unrecorded: a smaller batch would save less than it costs.
             counting.take(trials()?);
         }
     }
 }
 
-/// Does `work`, from its beginning again when servers were lost and have come back: what it gives depends on neither.
-pub(super) fn outlasting<T>(
+/// Runs `work`, and runs it again from its beginning when servers were lost and have come back. Its result must not depend on
+/// this.
+pub(super) fn retry_on_disconnect<T>(
     servers: &Servers,
     stop: &StopFlag,
     mut work: impl FnMut() -> Result<T, TestError>,
 ) -> Result<T, TestError> {
-    let mut waiting = Waiting::default();
+    let mut backoff = Backoff::default();
     loop {
         let error = match work() {
             Err(TestError::Client(error)) => error,
             done => return done,
         };
-        match waiting.wait(servers, &error, stop) {
-            After::Again => {}
-            After::GivenUp => return Err(error.into()),
-            After::Stopped { signal } => return Err(TestError::Stopped { signal }),
+        match backoff.reconnect(servers, &error, stop) {
+            Reconnect::Connected => {}
+            Reconnect::TimedOut => return Err(error.into()),
+            Reconnect::Stopped { signal } => return Err(TestError::Stopped { signal }),
         }
     }
 }
 
-/// The figures of a test on one version, see [`Tester::test`].
+/// Tests on one version and returns the figures, see [`Tester::test`].
 ///
 /// # Errors
 /// [`TestError`].
@@ -181,7 +182,7 @@ pub fn test(
     Ok(records.result(&version.to_string(), None))
 }
 
-/// What a test of one environment opens of a policy that was trained so.
+/// The environment that a test of a policy with this configuration opens, with a single slot.
 pub fn open_options(TrainConfig { common, settings }: &TrainConfig, set: &TestSet, seed: u64) -> OpenOptions {
     OpenOptions {
         environment: common.environment.clone(),
@@ -199,7 +200,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_shown_is_what_is_tested() {
+    fn rendered_episodes_are_the_tested_ones() {
         let config = TrainConfig::from_table("", "environment = 'CartPole'".parse().unwrap()).unwrap();
         for version in Version::KNOWN {
             let options = open_options(&config, &version.into(), 5);

@@ -1,9 +1,9 @@
-//! Trials of a policy in the environments of a session.
+//! Plays trials of a policy in the environments of a session.
 
 use std::collections::BTreeSet;
 use std::ops::Range;
 
-use perturb_policy::{Ended, Player, Result as PolicyResult};
+use perturb_policy::{Player, Result as PolicyResult, SlotEnd};
 use perturb_protocol::player::floats;
 
 use super::error::TestError;
@@ -11,33 +11,33 @@ use crate::checkpoint::Checkpoint;
 use crate::client::{EndedEpisode, Played, Session, StepReply, acting};
 use crate::proto;
 
-/// So many steps are asked for at a time: few beside those of a test, many beside the delay of a line.
-const STEPS: u32 = 64;
+/// Steps of a request to a server: few compared with a test's, but enough to hide the network's delay.
+const STEPS_PER_REQUEST: u32 = 64;
 
-/// A policy that plays trials, acting here.
+/// A policy that plays trials, with actions chosen in this process.
 pub(super) struct Trials<'a> {
     pub(super) session: Session<'a>,
     pub(super) player: Player,
     reply: StepReply,
-    ended: Vec<Ended>,
+    ended: Vec<SlotEnd>,
 }
 
-/// One that plays them at the servers.
+/// A policy that plays trials, with actions chosen by the servers.
 pub(super) struct RemoteTrials<'a> {
     session: Session<'a>,
-    /// Until the servers have it: the policy, and its weights.
+    /// The policy and its weights, until the servers have them.
     policy: Option<(proto::Policy, bytes::Bytes)>,
     episodes_per_trial: u32,
 }
 
 impl<'a> Trials<'a> {
-    /// `player` begins trials in the environments of `session`, which are observed as `observations` `[N, O]`.
+    /// Begins trials of `player` in the environments of `session`, whose observations `[N, O]` are given.
     pub(super) fn begin(session: Session<'a>, mut player: Player, observations: &[f32]) -> PolicyResult<Self> {
         player.begin(observations, None)?;
         Ok(Self { session, player, reply: StepReply::default(), ended: Vec::new() })
     }
 
-    /// A step in all environments; gives the episodes that ended a trial in it.
+    /// Steps all environments. Returns the episodes that ended a trial.
     pub(super) fn step(&mut self) -> Result<Vec<EndedEpisode>, TestError> {
         let Self { session, player, reply, ended } = self;
         session.step(player.act()?, reply)?;
@@ -48,20 +48,20 @@ impl<'a> Trials<'a> {
 }
 
 impl<'a> RemoteTrials<'a> {
-    /// `player`, which plays the policy of `checkpoint`, begins trials in the environments of `session`.
+    /// Begins trials of `player`, which has the policy of `checkpoint`, in the environments of `session`.
     pub(super) fn new(session: Session<'a>, player: &Player, checkpoint: &Checkpoint) -> Self {
         let policy = (acting::policy(&checkpoint.policy, player), floats(&checkpoint.flat_weights()));
         Self { session, policy: Some(policy), episodes_per_trial: player.episodes_per_trial() }
     }
 
-    /// Some steps in all environments; gives the episodes that ended a trial in them.
+    /// Makes some steps in all environments. Returns the episodes that ended a trial.
     pub(super) fn play(&mut self) -> Result<Vec<EndedEpisode>, TestError> {
         let (policy, episodes_per_trial) = (self.policy.take(), self.episodes_per_trial);
         let mut ended = Vec::new();
         let first = |slots: Range<usize>| proto::Act {
             policy: policy.as_ref().map(|(policy, _)| acting::for_server(policy, slots.len())),
             weights: policy.as_ref().map(|(_, weights)| weights.clone()).unwrap_or_default(),
-            task: Some(proto::act::Task::Steps(STEPS)),
+            task: Some(proto::act::Task::Steps(STEPS_PER_REQUEST)),
             only_ended: true,
             ..proto::Act::default()
         };
@@ -77,7 +77,7 @@ impl<'a> RemoteTrials<'a> {
         Ok(ended)
     }
 
-    /// A request to servers; notes the first slots of those that have not finished.
+    /// Sends a request to each server. Adds the first slots of the servers that have not finished to `unfinished`.
     fn play_part(
         &mut self,
         request: impl FnMut(Range<usize>) -> Option<proto::Act>,

@@ -1,8 +1,8 @@
-//! How long a training has run, over all the processes that it ran in.
+//! Seconds of training, over all the processes of a run.
 
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
-/// Seconds of training. Goes on after a break as if there had been none.
+/// Counts seconds of training. A break does not count.
 #[derive(Clone, Copy, Debug)]
 pub struct Clock {
     t_start: f64,
@@ -11,14 +11,13 @@ pub struct Clock {
 }
 
 impl Clock {
-    /// Begins at `elapsed` seconds, 0 for a new training, and now.
+    /// Starts now, at `elapsed` seconds: 0 for a new training.
     pub fn start(elapsed: f64) -> Self {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64();
         Self::new(now - elapsed, elapsed)
     }
 
-    /// The same at another time of day: `t_start` is that at which the training began, or would have begun without a
-    /// break, in seconds since 1970.
+    /// Starts now, at `elapsed` seconds. `t_start` is the time of second 0, in seconds since 1970.
     pub fn new(t_start: f64, elapsed: f64) -> Self {
         Self { t_start, before: elapsed, since: Instant::now() }
     }
@@ -28,7 +27,7 @@ impl Clock {
         self.before + self.since.elapsed().as_secs_f64()
     }
 
-    /// The time of day at second 0, in seconds since 1970.
+    /// The time of second 0, in seconds since 1970.
     pub fn t_start(&self) -> f64 {
         self.t_start
     }

@@ -1,8 +1,8 @@
-//! Bringing a log to the disk.
+//! Flushes logs to the disk.
 
 use std::fs::File;
 
-/// Brings `file` to the disk and gives its length.
+/// Flushes `file` to the disk and returns its length.
 pub(super) fn sync(file: &File) -> std::io::Result<u64> {
     file.sync_data()?;
     Ok(file.metadata()?.len())

@@ -1,4 +1,4 @@
-//! The logs of a run together: created, or cut back to a checkpoint and gone on with.
+//! All logs of a run: created, or cut back to a checkpoint and continued.
 
 use std::fs::{File, OpenOptions};
 use std::io::ErrorKind;
@@ -15,7 +15,7 @@ use crate::client::EndedEpisode;
 const MONITOR: &str = "monitor.csv";
 const PROGRESS: &str = "progress.csv";
 
-/// The files of a run that grow.
+/// The log files of a run.
 #[derive(Debug)]
 pub struct Logs {
     directory: PathBuf,
@@ -23,21 +23,21 @@ pub struct Logs {
     progress: ProgressLog,
 }
 
-/// How long the logs were at a moment, in bytes.
+/// Lengths of the logs, in bytes.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LogLengths {
-    /// Of `monitor.csv`.
+    /// Length of `monitor.csv`.
     pub monitor: u64,
-    /// Of `progress.csv`.
+    /// Length of `progress.csv`.
     pub progress: u64,
-    /// Of the TensorBoard events.
+    /// Length of the file of TensorBoard events.
     pub events: u64,
-    /// Their file's name.
+    /// Name of the file of TensorBoard events.
     pub events_file: String,
 }
 
-/// Why a log cannot be gone on with.
+/// Why a log cannot be continued.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum LogError {
@@ -53,7 +53,7 @@ pub enum LogError {
     Changed {
         /// The log.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The change.
         reason: String,
     },
 }
@@ -71,7 +71,7 @@ impl Logs {
         Ok(Self { directory: directory.to_owned(), monitor, progress })
     }
 
-    /// Goes on with the files in `directory` where they had these `lengths`: what was written later is deleted.
+    /// Continues the files in `directory` at these `lengths`. Later lines are deleted.
     ///
     /// # Errors
     /// [`LogError::Changed`] if one is shorter, or does not end a line there; then none was changed. [`LogError::File`].
@@ -110,7 +110,7 @@ impl Logs {
         self.progress.write(progress).map_err(io("write", &self.directory.join(PROGRESS)))
     }
 
-    /// Brings all that was written to the disk, and says how much it is.
+    /// Flushes the logs to the disk, and returns their lengths.
     ///
     /// # Errors
     /// [`FileError`].
@@ -121,7 +121,7 @@ impl Logs {
     }
 }
 
-/// Opens a log for appending that has at least `length` bytes, with the end of a line there if it consists of `lines`.
+/// Opens a log for appending. It must have at least `length` bytes and, if it consists of `lines`, end a line there.
 fn open(path: &Path, length: u64, lines: bool) -> Result<File, LogError> {
     let changed = |reason| Err(LogError::Changed { path: path.to_owned(), reason });
     let file = match OpenOptions::new().read(true).append(true).open(path) {
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn logs_go_on_where_they_were_synced() {
+    fn logs_continue_where_they_were_synced() {
         let directory = tempfile::tempdir().unwrap();
         let mut logs = start(directory.path());
         logs.episode(&episode(1)).unwrap();
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn logs_that_were_edited_are_refused_and_left_alone() {
+    fn edited_logs_are_refused_and_left_alone() {
         let directory = tempfile::tempdir().unwrap();
         let mut logs = start(directory.path());
         logs.episode(&episode(1)).unwrap();

@@ -1,5 +1,5 @@
-//! What a training writes while it runs: `monitor.csv`, `progress.csv` and TensorBoard events, all with
-//! stable-baselines3's names, so that the tools that people have read them.
+//! Logs of a training: `monitor.csv`, `progress.csv` and TensorBoard events, all with stable-baselines3's names, so that
+//! existing tools read them.
 
 mod clock;
 mod disk;

@@ -1,4 +1,4 @@
-//! `monitor.csv`: a line for every episode.
+//! The log `monitor.csv`: a line for every episode.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -18,7 +18,7 @@ use crate::client::EndedEpisode;
 pub struct Monitor {
     writer: csv::Writer<BufWriter<File>>,
     clock: Clock,
-    /// Columns of applied values: files that were begun by earlier programs have none.
+    /// Number of columns of applied values. Files of earlier programs have none.
     applied: usize,
 }
 
@@ -48,7 +48,7 @@ impl Monitor {
         Ok(Self { writer, clock, applied: spec.applied.len() })
     }
 
-    /// Goes on at the end of `file`.
+    /// Continues at the end of `file`.
     pub(super) fn resume(file: File, spec: &EnvironmentSummary, clock: Clock) -> Self {
         Self { writer: csv::Writer::from_writer(BufWriter::new(file)), clock, applied: spec.applied.len() }
     }
@@ -79,15 +79,15 @@ impl Monitor {
         Ok(self.writer.write_record(fixed.into_iter().chain(values))?)
     }
 
-    /// Hands what was written to the operating system.
+    /// Passes buffered lines to the operating system.
     ///
     /// # Errors
-    /// Its answer.
+    /// The operating system's.
     pub fn flush(&mut self) -> std::io::Result<()> {
         self.writer.flush()
     }
 
-    /// Brings what was written to the disk; gives the file's length.
+    /// Flushes the file to the disk and returns its length.
     pub(super) fn sync(&mut self) -> std::io::Result<u64> {
         self.flush()?;
         sync(self.writer.get_ref().get_ref())
@@ -101,7 +101,7 @@ mod tests {
     use perturb_policy::ActionKind;
 
     #[test]
-    fn the_file_is_one_that_stable_baselines3_reads() {
+    fn file_has_the_format_of_stable_baselines3() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("monitor.csv");
         let spec = EnvironmentSummary {

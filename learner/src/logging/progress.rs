@@ -10,7 +10,7 @@ use super::disk::sync;
 use crate::algorithm::UpdateStats;
 use crate::client::EndedEpisode;
 
-/// What the last episodes came to: of one, or means over several.
+/// Figures of an episode, or means over several episodes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EpisodeFigures {
     /// The undiscounted return.
@@ -21,7 +21,7 @@ pub struct EpisodeFigures {
     pub success: f64,
 }
 
-/// Where the time of a training went.
+/// Seconds of a training by activity.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct TimeShares {
     /// Choosing actions.
@@ -41,7 +41,7 @@ pub struct Progress {
     pub timesteps: u64,
     /// Seconds since the start.
     pub elapsed: f64,
-    /// Where these went.
+    /// Seconds by activity.
     pub shares: TimeShares,
     /// Episodes that the budget counts.
     pub episodes: u64,
@@ -84,7 +84,7 @@ impl Progress {
         self.timesteps as f64 / self.elapsed.max(1e-9)
     }
 
-    /// Where the time went, %.
+    /// Percentages of the time by activity.
     pub fn percent(&self) -> TimeShares {
         let percent = |seconds: f64| 100.0 * seconds / self.elapsed.max(1e-9);
         let TimeShares { acting, waiting, updating } = self.shares;
@@ -152,7 +152,7 @@ impl ProgressLog {
         Ok(Self { csv, events: EventWriter::create(directory, t_start)? })
     }
 
-    /// Goes on at the ends of `csv` and of `events`, which is called `events_file`.
+    /// Continues at the ends of `csv` and of `events`, whose name is `events_file`.
     pub(super) fn resume(csv: File, events: File, events_file: String, t_start: f64) -> Self {
         Self { csv: csv::Writer::from_writer(csv), events: EventWriter::resume(events, events_file, t_start) }
     }
@@ -162,13 +162,13 @@ impl ProgressLog {
         self.events.file_name()
     }
 
-    /// Brings what was written to the disk; gives the lengths of `progress.csv` and of the events.
+    /// Flushes both files to the disk. Returns the lengths of `progress.csv` and of the events.
     pub(super) fn sync(&mut self) -> std::io::Result<[u64; 2]> {
         self.csv.flush()?;
         Ok([sync(self.csv.get_ref())?, self.events.sync()?])
     }
 
-    /// Adds a line and an event, and hands them to the operating system. A value that there is not is an empty cell.
+    /// Adds a line and an event, and passes them to the operating system. A missing value is an empty cell.
     ///
     /// # Errors
     /// The operating system's.
@@ -187,7 +187,7 @@ mod tests {
     use crate::algorithm::Selection;
 
     #[test]
-    fn a_line_has_a_value_under_each_name() {
+    fn line_has_a_value_under_each_name() {
         let directory = tempfile::tempdir().unwrap();
         let mut log = ProgressLog::create(directory.path(), 0.0).unwrap();
         let update = UpdateStats {

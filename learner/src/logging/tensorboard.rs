@@ -11,7 +11,7 @@ use prost::Message;
 
 use super::disk::sync;
 
-/// The parts of tensorflow/core/util/event.proto that scalars need.
+/// The fields of tensorflow/core/util/event.proto that scalars need.
 #[derive(Clone, PartialEq, Message)]
 struct Event {
     /// Seconds since 1970.
@@ -25,7 +25,7 @@ struct Event {
     summary: Option<Summary>,
 }
 
-/// Of tensorflow/core/framework/summary.proto.
+/// The fields of tensorflow/core/framework/summary.proto that scalars need.
 #[derive(Clone, PartialEq, Message)]
 struct Summary {
     #[prost(message, repeated, tag = "1")]
@@ -64,23 +64,23 @@ impl EventWriter {
         Ok(writer)
     }
 
-    /// Goes on at the end of `file`, which is called `file_name`.
+    /// Continues at the end of `file`, whose name is `file_name`.
     pub(super) fn resume(file: File, file_name: String, t_start: f64) -> Self {
         Self { file: BufWriter::new(file), file_name, t_start }
     }
 
-    /// What the file is called.
+    /// The name of the file.
     pub(super) fn file_name(&self) -> &str {
         &self.file_name
     }
 
-    /// Brings what was written to the disk; gives the file's length.
+    /// Flushes the file to the disk and returns its length.
     pub(super) fn sync(&mut self) -> std::io::Result<u64> {
         self.file.flush()?;
         sync(self.file.get_ref())
     }
 
-    /// Adds scalars at `step`, `elapsed` seconds after the start, and hands them to the operating system.
+    /// Adds scalars at `step`, `elapsed` seconds after the start, and passes them to the operating system.
     ///
     /// # Errors
     /// The operating system's.
@@ -117,7 +117,7 @@ fn frame(data: &[u8]) -> Vec<u8> {
     record
 }
 
-/// CRC-32C, rotated and shifted, so that a checksum of data that holds checksums stays a good one.
+/// CRC-32C, rotated and shifted. The plain checksum would be weak for data that contain checksums.
 fn masked_crc(data: &[u8]) -> u32 {
     crc32c::crc32c(data).rotate_right(15).wrapping_add(0xa282_ead8)
 }
@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn a_record_is_that_of_tensorboards_own_writer() {
+    fn record_equals_that_of_tensorboard() {
         // What tensorboard 2.21's RecordWriter makes of b"abc".
         let expected = "0300000000000000b099490e6162636e57f121";
         let hexadecimal: String = frame(b"abc").iter().map(|byte| format!("{byte:02x}")).collect();

@@ -6,12 +6,12 @@ use perturb_policy::{RolloutStep, Samples, SequenceSamples, check_length};
 
 /// A complete episode in a rollout.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Span {
-    /// Which of the N environments.
+pub struct EpisodeSlice {
+    /// The environment, 0 … N-1.
     pub environment: usize,
-    /// Its first step, 0 … T-1.
+    /// The first step, 0 … T-1.
     pub start: usize,
-    /// Its number of steps.
+    /// The number of steps.
     pub length: usize,
     /// The undiscounted sum of its rewards, before they were normalised.
     pub episode_return: f64,
@@ -20,11 +20,11 @@ pub struct Span {
 /// T steps of N environments. Arrays are row-major [T, N, …], so that a step is pushed as one piece; flattened to
 /// T·N samples, sample t·N + n is step t of environment n.
 ///
-/// One of complete episodes takes steps until it is finished, and says where the episodes are.
+/// A rollout of complete episodes takes steps until it is finished, and lists the episodes.
 #[derive(Clone, Debug)]
 pub struct Rollout {
     /// T, if it is fixed beforehand.
-    wanted: Option<usize>,
+    fixed_steps: Option<usize>,
     n_envs: usize,
     observation_size: usize,
     action_width: usize,
@@ -41,7 +41,7 @@ pub struct Rollout {
     truncation_values: Vec<f32>,
     last_values: Vec<f32>,
     memory: Vec<f32>,
-    episodes: Vec<Span>,
+    episodes: Vec<EpisodeSlice>,
     lengths: Option<Vec<usize>>,
 }
 
@@ -49,24 +49,24 @@ impl Rollout {
     /// An empty rollout for T = `n_steps`, N = `n_envs`, O = `observation_size` and A = `action_width` (see
     /// [`ActionKind::width`](perturb_policy::ActionKind::width)). Allocates everything that it will need.
     pub fn new(n_steps: usize, n_envs: usize, observation_size: usize, action_width: usize) -> Self {
-        Self::with_room(Some(n_steps), n_steps, n_envs, observation_size, action_width)
+        Self::with_capacity(Some(n_steps), n_steps, n_envs, observation_size, action_width)
     }
 
     /// An empty rollout for complete episodes, as long as these will be.
     pub fn of_episodes(n_envs: usize, observation_size: usize, action_width: usize) -> Self {
-        Self::with_room(None, 0, n_envs, observation_size, action_width)
+        Self::with_capacity(None, 0, n_envs, observation_size, action_width)
     }
 
-    fn with_room(
-        wanted: Option<usize>,
-        room: usize,
+    fn with_capacity(
+        fixed_steps: Option<usize>,
+        capacity: usize,
         n_envs: usize,
         observation_size: usize,
         action_width: usize,
     ) -> Self {
-        let size = room * n_envs;
+        let size = capacity * n_envs;
         Rollout {
-            wanted,
+            fixed_steps,
             n_envs,
             observation_size,
             action_width,
@@ -88,14 +88,14 @@ impl Rollout {
         }
     }
 
-    /// Forgets all steps, and takes over what the policy remembers before the first: `memory` `[N, S]`, empty for a
-    /// feed-forward policy. Allocated room is kept.
+    /// Clears the rollout, and stores the policy's memory before the first step: `memory` `[N, S]`, empty for a feed-forward
+    /// policy. Allocated capacity is kept.
     pub fn begin(&mut self, memory: &[f32]) {
         self.clear();
         self.memory.extend_from_slice(memory);
     }
 
-    /// Forgets all steps; allocated room is kept.
+    /// Removes all steps. Allocated capacity is kept.
     pub fn clear(&mut self) {
         self.len = 0;
         self.finished = false;
@@ -117,7 +117,7 @@ impl Rollout {
     /// Appends a step, or several, whose arrays are `[T, N, …]`. A wrong length, or a step too many, changes nothing.
     pub fn push(&mut self, step: RolloutStep<'_>) -> Result<()> {
         let steps = (step.rewards.len() / self.n_envs).max(1);
-        if self.wanted.is_some_and(|wanted| self.len + steps > wanted) {
+        if self.fixed_steps.is_some_and(|fixed_steps| self.len + steps > fixed_steps) {
             return Err(Error::RolloutLength { got: self.len, expected: self.n_steps(), what: "a step was pushed" });
         }
         let n = steps * self.n_envs;
@@ -146,7 +146,7 @@ impl Rollout {
     /// Sets `last_values` `[N]` = V(s_T), where s_T are the observations after the last step. Comes after the last
     /// [`Rollout::push`] and before an update.
     pub fn finish(&mut self, last_values: &[f32]) -> Result<()> {
-        if !self.is_full() && self.wanted.is_some() {
+        if !self.is_full() && self.fixed_steps.is_some() {
             return Err(Error::RolloutLength { got: self.len, expected: self.n_steps(), what: "it was finished" });
         }
         check_length("last_values [N]", last_values.len(), self.n_envs)?;
@@ -156,7 +156,10 @@ impl Rollout {
         Ok(())
     }
 
-    /// What advantages are estimated from. An error before [`Rollout::finish`].
+    /// The arrays that advantages are estimated from.
+    ///
+    /// # Errors
+    /// Before [`Rollout::finish`].
     pub fn trajectories(&self) -> Result<Trajectories<'_>> {
         if !self.finished {
             let what = "it was used before it was finished";
@@ -200,21 +203,21 @@ impl Rollout {
 
     /// Whether T steps were pushed, if T is fixed beforehand.
     pub fn is_full(&self) -> bool {
-        self.wanted == Some(self.len)
+        self.fixed_steps == Some(self.len)
     }
 
     /// T.
     pub fn n_steps(&self) -> usize {
-        self.wanted.unwrap_or(self.len)
+        self.fixed_steps.unwrap_or(self.len)
     }
 
-    /// Notes that the last of `end` steps ended an episode of which the rollout has every step.
+    /// Adds an episode that ended with the last of `end` steps, and whose `length` steps are all in the rollout.
     ///
     /// # Errors
-    /// One that the rollout does not hold: without steps, longer than the rollout, of an environment that is not there.
+    /// An episode that the rollout does not hold: without steps, longer than the rollout, of an environment beyond N.
     pub fn note_episode(&mut self, environment: usize, end: usize, length: usize, episode_return: f64) -> Result<()> {
         self.check_episode(environment, end, length)?;
-        self.episodes.push(Span { environment, start: end - length, length, episode_return });
+        self.episodes.push(EpisodeSlice { environment, start: end - length, length, episode_return });
         Ok(())
     }
 
@@ -228,30 +231,32 @@ impl Rollout {
     }
 
     /// The complete episodes, in the order in which they ended.
-    pub fn episodes(&self) -> &[Span] {
+    pub fn episodes(&self) -> &[EpisodeSlice] {
         &self.episodes
     }
 
-    /// The sums of the complete episodes' rewards as they are learned from, normalised or not, in the order of
+    /// The sums of the complete episodes' rewards as stored, normalised if rewards are, in the order of
     /// [`Rollout::episodes`].
-    pub fn learned_returns(&self) -> Vec<f64> {
+    pub fn normalized_returns(&self) -> Vec<f64> {
         let reward = |step: usize, environment: usize| f64::from(self.rewards[step * self.n_envs + environment]);
-        let sum = |span: &Span| (span.start..span.start + span.length).map(|step| reward(step, span.environment)).sum();
+        let sum = |span: &EpisodeSlice| {
+            (span.start..span.start + span.length).map(|step| reward(step, span.environment)).sum()
+        };
         self.episodes.iter().map(sum).collect()
     }
 
-    /// A rollout of the given episodes of this one alone. T is the longest one's length; shorter ones stand one after the
-    /// other in the same column where they fit, and what fills a column up is no sample. Every episode begins without
-    /// memories.
+    /// A rollout of only the given episodes of this one. T is the length of the longest episode. Shorter ones are put one after
+    /// the other into the same column where they fit. Steps that fill a column up are no samples. Every episode begins with an
+    /// empty memory.
     ///
     /// # Errors
     /// No episode at all; one that the rollout does not hold.
-    pub fn select(&self, episodes: &[Span]) -> Result<Rollout> {
+    pub fn select(&self, episodes: &[EpisodeSlice]) -> Result<Rollout> {
         let longest = episodes.iter().map(|episode| episode.length).max().unwrap_or(0);
         if longest == 0 {
             return Err(Error::RolloutLength { got: 0, expected: 1, what: "its episodes were selected" });
         }
-        for &Span { environment, start, length, .. } in episodes {
+        for &EpisodeSlice { environment, start, length, .. } in episodes {
             self.check_episode(environment, start.saturating_add(length), length)?;
         }
         let columns = pack(episodes, longest);
@@ -299,11 +304,11 @@ impl Rollout {
             truncation_values: vec![0.0; size],
             last_values: vec![0.0; n_envs],
             memory: vec![0.0; n_envs * memory_size],
-            ..Rollout::with_room(Some(n_steps), 0, n_envs, self.observation_size, self.action_width)
+            ..Rollout::with_capacity(Some(n_steps), 0, n_envs, self.observation_size, self.action_width)
         }
     }
 
-    /// `[N]` how many steps of each environment are samples; None if all are.
+    /// `[N]` the number of first steps of each environment that are samples; None if all steps are.
     pub fn lengths(&self) -> Option<&[usize]> {
         self.lengths.as_deref()
     }
@@ -340,7 +345,7 @@ impl Rollout {
         &self.starts
     }
 
-    /// `[N, S]` what the policy remembered before the first step.
+    /// `[N, S]` the policy's memory before the first step.
     pub fn memory(&self) -> &[f32] {
         &self.memory
     }
@@ -361,11 +366,11 @@ impl Rollout {
     }
 }
 
-/// Puts episodes into columns of `height` steps, the longest first and each into the first column with room for it.
-fn pack(episodes: &[Span], height: usize) -> Vec<Vec<Span>> {
+/// Puts episodes into columns of `height` steps, the longest first, each into the first column in which it fits.
+fn pack(episodes: &[EpisodeSlice], height: usize) -> Vec<Vec<EpisodeSlice>> {
     let mut sorted = episodes.to_vec();
     sorted.sort_by_key(|episode| std::cmp::Reverse(episode.length)); // keeps the order of equally long ones
-    let mut columns: Vec<(usize, Vec<Span>)> = Vec::new();
+    let mut columns: Vec<(usize, Vec<EpisodeSlice>)> = Vec::new();
     for episode in sorted {
         match columns.iter_mut().find(|(used, _)| used + episode.length <= height) {
             Some((used, column)) => {

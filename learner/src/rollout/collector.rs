@@ -1,10 +1,10 @@
-//! Collecting rollouts from environments that somebody else steps.
+//! Collects rollouts with actions chosen in this process.
 
 use bytes::Bytes;
 
 use super::Rollout;
 use crate::client::{ClientError, EndedEpisode, Session, StepReply, StepSlice};
-use perturb_policy::{CollectUntil, Ended, Player, PlayerState, Remaining};
+use perturb_policy::{CollectUntil, Player, PlayerState, Remaining, SlotEnd};
 
 /// Why a rollout could not be collected.
 #[derive(Debug, thiserror::Error)]
@@ -25,14 +25,14 @@ impl From<perturb_policy::Error> for CollectError {
 }
 
 impl CollectError {
-    /// Whether the same may go well later or with another server, see [`ClientError::can_be_retried`].
+    /// Whether collecting may succeed later or with another server, see [`ClientError::can_be_retried`].
     pub fn can_be_retried(&self) -> bool {
         matches!(self, Self::Client(error) if error.can_be_retried())
     }
 }
 
-/// Fills a rollout with what a player does: with T steps of each of N environments, where episodes run on from one rollout
-/// to the next, and with them what a recurrent policy remembers; or with complete episodes.
+/// Fills a rollout with the steps of a player: T steps of each of N environments, where episodes and a recurrent policy's
+/// memory continue from one rollout to the next; or complete episodes.
 ///
 /// [`Collector::begin`], then [`Collector::act`] and [`Collector::take`] in turn until [`Collector::is_done`], then
 /// [`Collector::finish`].
@@ -40,21 +40,21 @@ impl CollectError {
 pub struct Collector {
     player: Player,
     remaining: Remaining,
-    /// Buffer of a step.
-    ended: Vec<Ended>,
+    /// Buffer for the ends of episodes in a step.
+    ended: Vec<SlotEnd>,
 }
 
-/// Everything beside its statistics that a training's environments and player depend on, for exact resumption.
+/// The state of a training's environments and player, without statistics, for exact resumption.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CollectorState {
-    /// `[N]` the environments.
+    /// `[N]` snapshots of the environments.
     pub snapshots: Vec<Bytes>,
-    /// The player.
+    /// The player's state.
     pub player: PlayerState,
 }
 
 impl Collector {
-    /// Collects what `player` does.
+    /// A collector of the steps of `player`.
     pub fn new(player: Player) -> Self {
         Self { player, remaining: Remaining::Steps(0), ended: Vec::new() }
     }
@@ -64,13 +64,13 @@ impl Collector {
         &self.player
     }
 
-    /// The player, to be brought to another state.
+    /// The player, to be changed.
     pub fn player_mut(&mut self) -> &mut Player {
         &mut self.player
     }
 
-    /// Begins a rollout under the policy of the weights that the player has loaded. For complete episodes `reset` breaks off
-    /// what runs: it resets all environments and writes their observations `[N, O]`.
+    /// Begins a rollout with the weights that the player has loaded. For complete episodes `reset` ends the running
+    /// episodes: it resets all environments and writes their observations `[N, O]`.
     ///
     /// # Errors
     /// [`CollectError`].
@@ -95,7 +95,7 @@ impl Collector {
         self.remaining.is_done()
     }
 
-    /// The next actions, as the protocol wants them.
+    /// Chooses the next actions, encoded for the protocol.
     ///
     /// # Errors
     /// [`CollectError::Numbers`].
@@ -103,10 +103,10 @@ impl Collector {
         Ok(self.player.act()?)
     }
 
-    /// Takes what came of the last actions; gives the episodes that ended, and were to be collected, to `on_episode`.
+    /// Appends the reply to the last actions. Passes the episodes that ended, and were to be collected, to `on_episode`.
     ///
     /// # Errors
-    /// [`CollectError::Numbers`]; what was collected of this rollout is lost.
+    /// [`CollectError::Numbers`]; the steps of this rollout are lost.
     pub fn take(
         &mut self,
         reply: &StepSlice<'_>,
@@ -135,10 +135,10 @@ impl Collector {
         Ok(rollout.finish(self.player.last_values(&self.remaining)?)?)
     }
 
-    /// A whole rollout under the policy of `weights`, from a session of this collector's environments alone.
+    /// Collects a whole rollout under the policy of `weights`, from a session with only this collector's environments.
     ///
     /// # Errors
-    /// [`CollectError`]; what was collected of this rollout is lost.
+    /// [`CollectError`]; the steps of this rollout are lost.
     pub fn collect(
         &mut self,
         session: &mut Session<'_>,

@@ -18,7 +18,7 @@ use crate::rollout::Collector;
 /// Collects the rollouts of runs that share a session: every step is one request for the environments of all runs.
 pub(super) struct ClientSide<'a> {
     session: Session<'a>,
-    /// One for each run, in the order of their slots.
+    /// The lanes of the runs, in the order of their slots.
     lanes: Vec<Lane>,
     /// Whether runs act and are updated in reverse order. The order is reversed after updates, so that the run that was
     /// updated last comes first: its weights are still in the processor's caches, which are too small for all runs.
@@ -36,7 +36,7 @@ struct Times {
     waiting: Duration,
 }
 
-/// What a run has in the session.
+/// The part of a run in the session.
 struct Lane {
     /// The run's index.
     index: usize,
@@ -85,7 +85,7 @@ impl<'a> ClientSide<'a> {
         Ok((client_side, runs))
     }
 
-    /// One step of all environments.
+    /// Steps all environments once.
     fn step(&mut self, runs: &mut [Run<'_>]) -> Result<()> {
         let Self { session, lanes, is_reversed, actions, reply, times } = self;
         let start = Instant::now();

@@ -1,15 +1,15 @@
-//! When a training is over.
+//! The end of a training: by its budget, or by its success.
 
 use perturb_checkpoint::Counters;
 use perturb_settings::Common;
 
 use crate::logging::EpisodeFigures;
 
-/// Means over the last episodes are over so many, as in stable-baselines3.
+/// Number of last episodes that means are taken over, as in stable-baselines3.
 pub(super) const RECENT: usize = 100;
 
-/// Whether a training has used up its budget, or the last 100 episodes of its environments, `recent`, had the success rate
-/// that it is to stop at.
+/// Whether a training has used up its budget, or its last 100 episodes, `recent`, reached the success rate
+/// `stop_at_success`.
 pub fn is_over<'a>(
     common: &Common,
     counters: &Counters,

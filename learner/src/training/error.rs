@@ -1,4 +1,4 @@
-//! Why a training cannot begin, go on, or be kept.
+//! Errors of trainings.
 
 use std::path::PathBuf;
 
@@ -12,7 +12,7 @@ use crate::error::Error;
 use crate::logging::LogError;
 use crate::rollout::CollectError;
 
-/// Why a training cannot begin, go on, or be kept.
+/// Why a training cannot begin, continue, or be saved.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum TrainError {
@@ -28,17 +28,17 @@ pub enum TrainError {
     /// The checkpoint cannot be written.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// The box of the action space has no volume, or an infinite one.
+    /// An action's interval is empty or infinite.
     #[error("a random policy draws actions from their bounds, but `{name}` is in [{low}, {high}]: train another")]
     Unbounded {
         /// The action's entry.
         name: String,
-        /// Its lower bound.
+        /// The lower bound.
         low: f64,
-        /// Its upper bound.
+        /// The upper bound.
         high: f64,
     },
-    /// A log cannot be gone on with.
+    /// A log cannot be continued.
     #[error(transparent)]
     Log(#[from] LogError),
     /// The operating system refused a file.
@@ -47,8 +47,11 @@ pub enum TrainError {
     /// The served environment has no action space.
     #[error("the server does not say what actions the environment takes: are both of one version?")]
     NoActions,
-    /// An episode did not run with the parameters that it was to run with.
-    #[error("an episode of environment {environment_index}, number {episode_index}: {difference}; mend the server")]
+    /// An episode did not run with the requested parameters.
+    #[error(
+        "an episode of environment {environment_index}, number {episode_index}: {difference}; this is a server bug, please \
+         report it"
+    )]
     NotApplied {
         /// The environment's index.
         environment_index: u32,
@@ -57,7 +60,7 @@ pub enum TrainError {
         /// The largest difference.
         difference: Difference,
     },
-    /// The environment is no longer what the run began in.
+    /// The environment has changed since the run began.
     #[error(
         "the run was trained in {environment} with {what} {trained}, the server's has {served}; resume with the version \
          of perturb-server that it began with, or train again"
@@ -65,19 +68,19 @@ pub enum TrainError {
     Changed {
         /// The environment.
         environment: String,
-        /// What differs.
+        /// The property that differs.
         what: &'static str,
         /// In training.
         trained: String,
         /// On the server.
         served: String,
     },
-    /// What a checkpoint holds does not fit.
-    #[error("cannot bring the {what} back: {source}")]
+    /// A part of a checkpoint does not fit.
+    #[error("cannot restore the {what}: {source}")]
     Restore {
-        /// What should go on where it was.
+        /// The part.
         what: &'static str,
-        /// Why it cannot.
+        /// The reason.
         source: Box<TrainError>,
     },
     /// The program was asked to end while a lost server was waited for.
@@ -85,7 +88,7 @@ pub enum TrainError {
     Stopped {
         /// The signal.
         signal: i32,
-        /// What was lost.
+        /// The error of the lost server.
         source: Box<TrainError>,
     },
     /// A training that had begun ended.
@@ -93,12 +96,12 @@ pub enum TrainError {
     Failed {
         /// The last checkpoint, if there is one.
         last: Option<LastCheckpoint>,
-        /// Why.
+        /// The reason.
         source: Box<TrainError>,
     },
 }
 
-/// What a failed training leaves.
+/// The checkpoint that a failed training leaves.
 #[derive(Debug)]
 pub struct LastCheckpoint {
     /// Episodes that it was trained for.
@@ -108,7 +111,7 @@ pub struct LastCheckpoint {
 }
 
 impl TrainError {
-    /// What a server failed with, if that is what failed.
+    /// The error of a server, if a server failed.
     pub fn of_server(&self) -> Option<&ClientError> {
         match self {
             Self::Client(error) => Some(error),
@@ -120,12 +123,12 @@ impl TrainError {
     }
 
     /// Whether a server had no room for the environments.
-    pub fn is_for_want_of_room(&self) -> bool {
+    pub fn is_server_full(&self) -> bool {
         let full = tonic::Code::ResourceExhausted;
         matches!(self.of_server(), Some(ClientError::Refused { code, .. }) if *code == full)
     }
 
-    /// Whether the machine is at fault that has the files, see [`FileError::is_fault`].
+    /// Whether the disk or the machine that has the files is at fault, see [`FileError::is_fault`].
     pub fn is_file_fault(&self) -> bool {
         match self {
             Self::File(error)
@@ -138,17 +141,18 @@ impl TrainError {
         }
     }
 
-    /// Whether the training would come to the same from its last checkpoint: to numbers that are not finite, for instance.
-    pub fn must_begin_anew(&self) -> bool {
+    /// Whether the training would fail in the same way if it were resumed from its last checkpoint, e.g. with numbers that are
+    /// not finite.
+    pub fn requires_restart(&self) -> bool {
         match self {
             Self::Numbers(_) | Self::Log(LogError::Changed { .. }) => true,
             Self::Restore { source, .. } => !source.can_be_retried() && !source.is_file_fault(),
-            Self::Failed { source, .. } => source.must_begin_anew(),
+            Self::Failed { source, .. } => source.requires_restart(),
             _ => false,
         }
     }
 
-    /// Whether the same may go well later or with another server, see [`ClientError::can_be_retried`].
+    /// Whether the training may succeed later or with another server, see [`ClientError::can_be_retried`].
     pub fn can_be_retried(&self) -> bool {
         self.of_server().is_some_and(ClientError::can_be_retried)
     }
@@ -165,8 +169,8 @@ impl From<CollectError> for TrainError {
 
 fn what_is_left(last: Option<&LastCheckpoint>, error: &TrainError) -> String {
     let Some(LastCheckpoint { episodes, run }) = last else { return "there was no checkpoint yet".into() };
-    let again = if let TrainError::Numbers(_) = error { ": resumed, it would come to the same numbers" } else { "" };
-    format!("the checkpoint after {episodes} episodes is kept in {}{again}", run.display())
+    let advice = if let TrainError::Numbers(_) = error { ": resumed, it would fail with the same numbers" } else { "" };
+    format!("the checkpoint after {episodes} episodes is kept in {}{advice}", run.display())
 }
 
 #[cfg(test)]
@@ -174,7 +178,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lost_server_is_told_from_a_failure() {
+    fn lost_server_can_be_retried() {
         let address: crate::client::Address = "unix:/x".parse().unwrap();
         let lost = || {
             let (request, code, reason) = ("a step", tonic::Code::Unavailable, "gone".into());
@@ -193,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn a_failure_says_what_is_left_and_what_to_do() {
+    fn failure_names_the_last_checkpoint() {
         let shown = |saved: bool, source: TrainError| {
             let last = saved.then(|| LastCheckpoint { episodes: 7, run: "runs/a".into() });
             TrainError::Failed { last, source: Box::new(source) }.to_string()
@@ -201,7 +205,7 @@ mod tests {
         let numbers = || TrainError::Numbers(perturb_policy::Error::PolicyOutput { environment: 0 }.into());
         assert!(shown(false, numbers()).ends_with("; there was no checkpoint yet"));
         let kept = "; the checkpoint after 7 episodes is kept in runs/a";
-        assert!(shown(true, numbers()).ends_with(&format!("{kept}: resumed, it would come to the same numbers")));
+        assert!(shown(true, numbers()).ends_with(&format!("{kept}: resumed, it would fail with the same numbers")));
         let other = shown(true, TrainError::NoActions);
         assert!(other.starts_with("the server does not") && other.ends_with(kept), "{other}");
     }

@@ -35,7 +35,7 @@ use server_side::ServerSide;
 use trainer::Trainer;
 
 use crate::checkpoint::{Checkpoint, ResumeState};
-use crate::client::{After, Servers, Waiting};
+use crate::client::{Backoff, Reconnect, Servers};
 use crate::logging::Progress;
 use crate::policy::GradientWorkspace;
 
@@ -90,7 +90,8 @@ fn train_with_retry(
 ) -> Result<Outcome> {
     let Entry { directory, mut start, marks } = entry;
     let config = start.config().clone();
-    let (mut waiting, mut saved) = (Waiting::default(), start.timesteps());
+    let mut backoff = Backoff::default();
+    let mut saved = start.timesteps();
     loop {
         let mut outcome = None;
         let attempt = train_together(
@@ -101,7 +102,7 @@ fn train_with_retry(
             &mut |_, progress| {
                 if progress.saved_timesteps > saved {
                     saved = progress.saved_timesteps;
-                    waiting.progressed();
+                    backoff.reset();
                 }
                 report(progress);
             },
@@ -113,10 +114,10 @@ fn train_with_retry(
             Err(error) => error,
         };
         let Some(lost) = error.of_server() else { return Err(error) };
-        match waiting.wait(servers, lost, stop) {
-            After::Again => start = Start::resume_point(directory, &config)?,
-            After::GivenUp => return Err(error),
-            After::Stopped { signal } => return Err(TrainError::Stopped { signal, source: Box::new(error) }),
+        match backoff.reconnect(servers, lost, stop) {
+            Reconnect::Connected => start = Start::resume_point(directory, &config)?,
+            Reconnect::TimedOut => return Err(error),
+            Reconnect::Stopped { signal } => return Err(TrainError::Stopped { signal, source: Box::new(error) }),
         }
     }
 }
@@ -255,7 +256,7 @@ fn train_loop(
     Ok(())
 }
 
-/// One iteration of the runs whose rollouts are whole first: collect, update, then log and save.
+/// Runs one iteration of the runs whose rollouts are whole first: collect, update, then log and save.
 fn train_iteration(
     servers: &Servers,
     collector: &mut dyn CollectRollouts,

@@ -1,8 +1,8 @@
-//! The random policy: a checkpoint to test like any other, which no training leads to.
+//! The random policy: a checkpoint to test like any other, without a training.
 //!
-//! As Gymnasium's `action_space.sample()`: choices are equally likely, and continuous actions uniform in the box of the
-//! action space, each entry by itself, whatever is observed. The weights say so: none of an observation, the middles of the
-//! box as biases, and the logarithms of half its widths where log standard deviations stand.
+//! The policy acts as Gymnasium's `action_space.sample()`: discrete actions are equally likely, and continuous actions are
+//! uniform in the box of the action space, whatever is observed. The weights encode this: those of observations are 0, the
+//! biases are the middles of the box, and `log_std` has the logarithms of half its widths.
 
 use perturb_checkpoint::Counters;
 use perturb_files::write_atomically;
@@ -16,7 +16,7 @@ use crate::client::Servers;
 use crate::logging::Progress;
 use crate::proto::{Channel, Environment, action_space::Kind};
 
-/// Writes the random policy to the directory of `entry`, as the last checkpoint and as that of all its marks.
+/// Writes the random policy to the directory of `entry`, as the last checkpoint and as that of every mark.
 ///
 /// # Errors
 /// A server that does not know the environment, actions without bounds, a full disk.
@@ -94,7 +94,7 @@ mod tests {
         Kind::Continuous(Continuous { channels: bounds.iter().map(channel).collect() })
     }
 
-    /// The actions of the first step in so many environments, which all see something else.
+    /// The actions of the first step in `n` environments with different observations.
     fn actions(checkpoint: &Checkpoint, n: usize) -> Vec<[u8; 4]> {
         let mut player = checkpoint.player(n, 7, 0).unwrap();
         let observations: Vec<f32> = (0..3 * n).map(|i| i as f32 - 100.0).collect();
@@ -103,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn every_choice_is_as_frequent() {
+    fn discrete_actions_are_equally_frequent() {
         let names = vec![String::new(); 3];
         let checkpoint = checkpoint_for(Kind::Discrete(Discrete { names })).unwrap();
         let mut counts = [0u32; 3];
@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn statistics_of_rewards_are_the_presets_where_they_are_asked_for() {
+    fn reward_statistics_follow_the_preset() {
         let choices = || Kind::Discrete(Discrete { names: vec![String::new(); 3] });
         assert!(checkpoint_with("preset = 'paper'", choices()).unwrap().state.reward_normaliser.is_none());
         for (preset, num_envs, runs_on) in [("perturb", 1, false), ("paper", 1, true)] {
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn actions_without_a_box_are_refused() {
+    fn unbounded_actions_are_refused() {
         for bounds in [(f64::NEG_INFINITY, 1.0), (0.0, f64::INFINITY), (1.0, 1.0)] {
             let error = checkpoint_for(continuous(&[bounds])).unwrap_err().to_string();
             assert!(error.contains("draws actions from their bounds"), "{error}");

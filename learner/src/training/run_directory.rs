@@ -1,4 +1,4 @@
-//! The directory of a run: for one process at a time.
+//! The directory of a run, locked for one process at a time.
 
 use std::cell::{Cell, OnceCell};
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ pub struct RunDirectory {
     overwrite: bool,
     /// Taken as soon as the directory exists.
     lock: OnceCell<Lock>,
-    /// What is in it is of the run that this value is for.
+    /// Whether the files in it belong to the run of this value.
     is_own: Cell<bool>,
 }
 
@@ -27,7 +27,7 @@ pub enum RunDirectoryError {
     /// A new run cannot have the name of a file.
     #[error("--out {} is a file; give a directory", path.display())]
     IsFile {
-        /// What was given.
+        /// The path that was given.
         path: PathBuf,
     },
     /// Another process trains in it.
@@ -52,22 +52,22 @@ pub enum RunDirectoryError {
     /// There is no such directory.
     #[error("--resume {}: there is no such directory; give the --out of a training", path.display())]
     Missing {
-        /// What was given.
+        /// The path that was given.
         path: PathBuf,
     },
     /// A checkpoint was given instead of its run.
     #[error("{} is the checkpoint in a run; give the run's directory, which holds it", path.display())]
     IsCheckpoint {
-        /// What was given.
+        /// The path that was given.
         path: PathBuf,
     },
-    /// Nothing was trained in it.
+    /// The directory holds no run.
     #[error("{} holds no run; give the --out of a training", path.display())]
     NoRun {
-        /// What was given.
+        /// The path that was given.
         path: PathBuf,
     },
-    /// The run was too short.
+    /// The run ended before its first checkpoint.
     #[error(
         "the run in {path} ended before its first checkpoint, so there is nothing to resume; start again with perturb \
          train --out {} --overwrite and the same settings",
@@ -89,8 +89,8 @@ pub enum RunDirectoryError {
 type Result<T> = std::result::Result<T, RunDirectoryError>;
 
 impl RunDirectoryError {
-    /// Whether there is nothing that could be resumed, now or later.
-    pub fn is_hopeless(&self) -> bool {
+    /// Whether nothing can be resumed, now or later.
+    pub fn is_unrecoverable(&self) -> bool {
         match self {
             Self::Checkpoint(CheckpointError::Damaged { .. } | CheckpointError::NotResumable { .. })
             | Self::Missing { .. }
@@ -117,7 +117,7 @@ impl RunDirectory {
         if path.exists() && !path.is_dir() {
             return Err(RunDirectoryError::IsFile { path: path.to_owned() });
         }
-        let directory = Self::of(path, overwrite, false);
+        let directory = Self::new(path, overwrite, false);
         if path.exists() {
             directory.lock()?;
         }
@@ -125,7 +125,7 @@ impl RunDirectory {
         Ok(directory)
     }
 
-    /// Opens the run in `path` to go on with it, with the policy and the state of its last checkpoint.
+    /// Opens the run in `path` to resume it. Returns the policy and the state of its last checkpoint, too.
     ///
     /// # Errors
     /// If there is no run, no checkpoint, or one that cannot be resumed; if another process trains in it; the operating
@@ -134,7 +134,7 @@ impl RunDirectory {
         if !files::look(path)?.is_some_and(|metadata| metadata.is_dir()) {
             return Err(RunDirectoryError::Missing { path: path.to_owned() });
         }
-        let directory = Self::of(path, false, true);
+        let directory = Self::new(path, false, true);
         directory.lock()?;
         match ResumeState::load(&directory.checkpoint()) {
             Err(CheckpointError::Missing { .. }) => Err(directory.nothing_to_resume()?),
@@ -142,14 +142,14 @@ impl RunDirectory {
         }
     }
 
-    fn of(path: &Path, overwrite: bool, is_own: bool) -> Self {
+    fn new(path: &Path, overwrite: bool, is_own: bool) -> Self {
         Self { path: path.to_owned(), overwrite, lock: OnceCell::new(), is_own: Cell::new(is_own) }
     }
 
-    /// The last checkpoint of the run that this value is for; `None` if there is none yet.
+    /// The last checkpoint of this value's run; `None` if there is none yet.
     ///
     /// # Errors
-    /// One that cannot be read.
+    /// A checkpoint that cannot be read.
     pub(crate) fn last_checkpoint(&self) -> Result<Option<(Checkpoint, ResumeState)>> {
         if !self.is_own.get() {
             return Ok(None);
@@ -160,7 +160,7 @@ impl RunDirectory {
         }
     }
 
-    /// Why there is no checkpoint.
+    /// The reason why there is no checkpoint.
     fn nothing_to_resume(&self) -> Result<RunDirectoryError> {
         let path = self.path.clone();
         Ok(if files::has_file(&path.join("checkpoint.json"))? {
@@ -172,12 +172,12 @@ impl RunDirectory {
         })
     }
 
-    /// Keeps other processes out.
+    /// Locks the directory against other processes.
     fn lock(&self) -> Result<()> {
         let lock = match Lock::try_take(&self.path)? {
             Some(lock) => Some(lock),
             None => {
-                // Somebody may only have looked.
+                // Another process may have locked it only to look.
                 std::thread::sleep(Duration::from_millis(20));
                 Lock::try_take(&self.path)?
             }
@@ -199,7 +199,7 @@ impl RunDirectory {
         }
     }
 
-    /// Creates it, or empties it of the earlier run.
+    /// Creates the directory, or deletes the earlier run in it.
     pub(crate) fn prepare(&self) -> Result<()> {
         files::create_folder(&self.path)?;
         if self.lock.get().is_none() {
@@ -210,22 +210,22 @@ impl RunDirectory {
         Ok(())
     }
 
-    /// Where it is.
+    /// The path of the directory.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Where its checkpoint is.
+    /// The path of the last checkpoint.
     pub fn checkpoint(&self) -> PathBuf {
         self.path.join("checkpoint")
     }
 
-    /// Where the policy is that a run kept when its budget had passed so many episodes: a checkpoint to test.
+    /// The path of the checkpoint that a run kept for an intermediate evaluation after `mark` episodes of its budget.
     pub fn mark(&self, mark: u64) -> PathBuf {
         mark_in(&self.path, mark)
     }
 
-    /// Whether the policies of all `marks` are there.
+    /// Whether the checkpoints of all `marks` exist.
     ///
     /// # Errors
     /// The operating system's.
@@ -244,7 +244,7 @@ pub fn mark_in(path: &Path, mark: u64) -> PathBuf {
     path.join("marks").join(mark.to_string())
 }
 
-/// What a run has written in `path`; other files are left alone.
+/// The files in `path` that a run has written; others are left alone.
 fn files_of_a_run(path: &Path) -> files::Result<Vec<PathBuf>> {
     let mut paths = files::list(path)?;
     paths.retain(|path| {

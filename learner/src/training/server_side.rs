@@ -34,7 +34,7 @@ pub(super) struct ServerSide<'a> {
     idle: Vec<Box<Lane<'a>>>,
     /// Runs whose server plays.
     playing: FuturesUnordered<Playing<'a>>,
-    /// How long no run had a rollout to learn from.
+    /// Time in which no run had a rollout to learn from.
     waited: Duration,
 }
 
@@ -193,7 +193,7 @@ impl<'a> Lane<'a> {
         let Played { acted, ended } = played?;
         let until = trainer.collect_until();
         let (rollout, tally) = trainer.collecting();
-        let mismatch = |got| CollectError::Client(session.misplayed(got));
+        let mismatch = |got| CollectError::Client(session.malformed_rollout(got));
         if std::mem::take(begins) {
             let memory = read_floats("memory", &acted.memory);
             rollout.begin(&memory.map_err(|wrong| mismatch(wrong.to_string()))?);

@@ -1,4 +1,4 @@
-//! Where runs begin: from initial weights, or from a checkpoint.
+//! Starts runs from initial weights or from a checkpoint.
 
 use std::collections::VecDeque;
 use std::ops::Range;

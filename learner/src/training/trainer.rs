@@ -49,7 +49,7 @@ pub(super) struct Tally {
     pub(super) ended: Vec<EndedEpisode>,
 }
 
-/// What follows from an iteration.
+/// Decisions after an iteration.
 pub(super) struct IterationOutcome {
     progress: Progress,
     /// Whether a checkpoint is due.
@@ -68,7 +68,7 @@ impl Trainer<'_> {
         self.policy.spec()
     }
 
-    /// How much is collected between two updates.
+    /// The amount of experience to collect between two updates.
     pub(super) fn collect_until(&self) -> CollectUntil {
         self.algorithm.collect_until()
     }

@@ -1,4 +1,4 @@
-//! What the tests of EPOpt and of RL² share.
+//! Helpers of the tests of EPOpt and of RL².
 
 use perturb_learner::algorithm::{A2c, BaseAlgorithm, Ppo};
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers};

@@ -8,10 +8,11 @@ use perturb_learner::algorithm::{
 use perturb_learner::client::{EndedEpisode, PrivateServer, Session};
 use perturb_learner::error::Error;
 use perturb_learner::policy::Policy;
-use perturb_learner::rollout::{Collector, Estimates, Normalisers, Rollout, RolloutStep, Span, Trajectories};
+use perturb_learner::rollout::{Collector, EpisodeSlice, Estimates, Normalisers, Rollout, RolloutStep, Trajectories};
 use perturb_policy::random::{Purpose, normal, stream, uniform};
 use perturb_policy::{
-    ActionKind, Actor, Acts, CollectUntil, Inputs, ObservationNormaliser, Player, PolicySpec, RewardNormaliser, Role,
+    ActionKind, Actor, ActorOutput, CollectUntil, Inputs, ObservationNormaliser, Player, PolicySpec, RewardNormaliser,
+    Role,
 };
 use perturb_settings::{A2cConfig, EpoptConfig, PpoConfig, Ranking};
 use perturb_torch::{Sequences, TorchPolicy};
@@ -43,7 +44,7 @@ fn play(policy: &Policy, lengths: &[Vec<usize>], returns: &[Vec<f64>], mut rollo
     let mut rng = stream(7, Purpose::Actions);
     let mut actor = Actor::new(policy.spec(), n_envs);
     actor.load(&policy.weights()).expect("weights that fit");
-    let mut acts = Acts::new(action, n_envs);
+    let mut acts = ActorOutput::new(action, n_envs);
     rollout.begin(actor.memory());
     let mut episodes = vec![0; n_envs];
     let mut ages = vec![0; n_envs];
@@ -95,7 +96,7 @@ fn epopt(base: Box<dyn BaseAlgorithm>, epsilon: f64, full_iterations: u64) -> Ep
 }
 
 #[test]
-fn with_epsilon_1_it_is_its_base_to_the_byte() {
+fn epopt_with_epsilon_1_equals_its_base() {
     let lengths = vec![vec![9]; 6]; // a rollout without padding
     for (lstm, action) in [(None, DISCRETE), (None, CONTINUOUS), (Some(8), DISCRETE), (Some(8), CONTINUOUS)] {
         let spec = spec(action, lstm);
@@ -127,9 +128,9 @@ fn eight() -> (Vec<Vec<usize>>, Vec<Vec<f64>>) {
 }
 
 #[test]
-fn it_learns_from_the_worst_episodes_alone() {
+fn epopt_learns_only_from_the_worst_episodes() {
     let (lengths, returns) = eight();
-    let span = |environment, start, length, episode_return| Span { environment, start, length, episode_return };
+    let span = |environment, start, length, episode_return| EpisodeSlice { environment, start, length, episode_return };
     // In the order in which they ended.
     let worst = [span(3, 0, 1, 1.0), span(2, 4, 4, 2.0), span(1, 0, 9, 0.0), span(0, 3, 7, -1.0)];
     for lstm in [None, Some(8)] {
@@ -141,7 +142,7 @@ fn it_learns_from_the_worst_episodes_alone() {
                 let rollout = play(&policy, &lengths, &returns, of_episodes(&spec, 4));
                 (if which == 0 { a2c } else { ppo }, policy, rollout)
             };
-            let of_chosen = |chosen: Option<&[Span]>| {
+            let of_chosen = |chosen: Option<&[EpisodeSlice]>| {
                 let (mut base, mut policy, rollout) = start();
                 let packed = rollout.select(chosen.unwrap_or(rollout.episodes())).expect("its own episodes");
                 (base.update(&mut policy, &packed, 1.0).expect("an update"), policy.weights())
@@ -160,12 +161,12 @@ fn it_learns_from_the_worst_episodes_alone() {
 }
 
 #[test]
-fn it_can_rank_by_what_is_learned_from() {
+fn epopt_can_rank_by_normalised_rewards() {
     let (lengths, returns) = eight();
     let spec = spec(DISCRETE, None);
     let mut policy = moved(&spec);
     let rollout = play(&policy, &lengths, &returns, of_episodes(&spec, 4));
-    let learned = rollout.learned_returns();
+    let learned = rollout.normalized_returns();
     let rewards = rollout.trajectories().expect("a finished rollout").rewards;
     let last = rollout.episodes()[7]; // of environment 1, its second
     let sum: f64 = (9..11).map(|t| f64::from(rewards[4 * t + 1])).sum();
@@ -192,7 +193,7 @@ fn each_kept_episode_can_have_an_update_of_its_own() {
             };
             let mut policy = moved(&spec);
             let rollout = play(&policy, &lengths, &returns, of_episodes(&spec, 4));
-            let mut worst: Vec<Span> = rollout.episodes().to_vec();
+            let mut worst: Vec<EpisodeSlice> = rollout.episodes().to_vec();
             worst.retain(|span| span.episode_return < 3.0);
             let alone: Vec<Rollout> = worst.iter().map(|span| rollout.select(&[*span]).expect("an episode")).collect();
 
@@ -239,7 +240,7 @@ fn an_epoch_of_ppo_is_a_round_of_all_kept_episodes() {
     for lstm in [None, Some(8)] {
         let spec = spec(DISCRETE, lstm);
         let rollout = play(&moved(&spec), &lengths, &returns, of_episodes(&spec, 4));
-        let select = |span: &Span| rollout.select(&[*span]).expect("an episode");
+        let select = |span: &EpisodeSlice| rollout.select(&[*span]).expect("an episode");
         let alone: Vec<Rollout> = rollout.episodes().iter().map(select).collect();
         let parts: Vec<&Rollout> = alone.iter().collect();
         let after = |updates: usize, n_epochs: usize| {
@@ -256,7 +257,7 @@ fn an_epoch_of_ppo_is_a_round_of_all_kept_episodes() {
 }
 
 #[test]
-fn the_share_falls_after_the_full_iterations_and_a_resumed_training_knows_when() {
+fn epsilon_falls_after_full_iterations_also_when_resumed() {
     let (lengths, returns) = eight();
     let spec = spec(DISCRETE, Some(8));
     for which in 0..2 {
@@ -345,13 +346,13 @@ fn at(rollout: &Rollout, p: usize) -> (Vec<f32>, [bool; 2]) {
 }
 
 /// Episodes of up to six environments, and some of them.
-fn some_episodes() -> impl Strategy<Value = (Rollout, Vec<Span>)> {
+fn some_episodes() -> impl Strategy<Value = (Rollout, Vec<EpisodeSlice>)> {
     let lengths = prop::collection::vec(prop::collection::vec(1usize..12, 1..6), 1..7);
     (lengths, prop::collection::vec(any::<bool>(), 36)).prop_map(|(lengths, choice)| {
         let rollout = coded(&lengths);
         let episodes = rollout.episodes();
         assert_eq!(episodes.len(), lengths.iter().map(Vec::len).sum::<usize>());
-        let mut chosen: Vec<Span> =
+        let mut chosen: Vec<EpisodeSlice> =
             episodes.iter().zip(&choice).filter(|(_, chosen)| **chosen).map(|(e, _)| *e).collect();
         if chosen.is_empty() {
             chosen.push(episodes[0]);
@@ -361,7 +362,7 @@ fn some_episodes() -> impl Strategy<Value = (Rollout, Vec<Span>)> {
 }
 
 /// An episode of a rollout as one that is alone.
-fn alone(rollout: &Rollout, episode: &Span, estimate: &dyn Fn(&Trajectories<'_>) -> Estimates) -> Estimates {
+fn alone(rollout: &Rollout, episode: &EpisodeSlice, estimate: &dyn Fn(&Trajectories<'_>) -> Estimates) -> Estimates {
     let whole = rollout.trajectories().expect("finished");
     let places = || (0..episode.length).map(|t| (episode.start + t) * rollout.n_envs() + episode.environment);
     let numbers = |data: &[f32]| places().map(|p| data[p]).collect::<Vec<_>>();
@@ -418,7 +419,7 @@ proptest! {
         }
     }
 
-    /// The same sums in the same order.
+    /// Equal bytes, since the sums are the same in the same order.
     #[test]
     fn advantages_of_chosen_episodes_are_those_of_each_alone(
         (rollout, chosen) in some_episodes(), bootstrap in any::<bool>()
@@ -451,10 +452,10 @@ fn episodes_that_a_rollout_does_not_hold_are_refused() {
     let own = rollout.episodes()[0];
     assert!(matches!(rollout.select(&[]), Err(Error::RolloutLength { .. })));
     for wrong in [
-        Span { environment: 2, ..own },
-        Span { start: 5, ..own },
-        Span { start: usize::MAX, ..own },
-        Span { length: 0, ..own },
+        EpisodeSlice { environment: 2, ..own },
+        EpisodeSlice { start: 5, ..own },
+        EpisodeSlice { start: usize::MAX, ..own },
+        EpisodeSlice { length: 0, ..own },
     ] {
         let result = rollout.select(&[own, wrong]);
         assert!(matches!(result, Err(Error::Episode { n_envs: 2, n_steps: 6, .. })), "{wrong:?}: {result:?}");
@@ -493,14 +494,14 @@ fn unequal() -> Vec<Vec<usize>> {
 }
 
 #[test]
-fn padding_is_no_sample_of_a_recurrent_policys_loss_and_gradient() {
+fn padding_does_not_count_in_recurrent_gradients() {
     for action in [DISCRETE, CONTINUOUS] {
         for plain_autograd in [false, true] {
             let policy = moved(&spec(action, Some(8)));
             let torch = TorchPolicy::new(policy.spec(), policy.flat_weights()).expect("a policy");
             let torch = if plain_autograd { torch.with_plain_autograd() } else { torch };
             let rollout = play(&policy, &unequal(), &zeros(&unequal()), of_episodes(policy.spec(), 4));
-            let select = |episodes: &[Span]| rollout.select(episodes).expect("its own episodes");
+            let select = |episodes: &[EpisodeSlice]| rollout.select(episodes).expect("its own episodes");
             let packed = select(rollout.episodes());
             let (places, steps) = (packed.n_steps() * packed.n_envs(), 30);
             assert!(packed.samples().is_some_and(|samples| samples.len() == steps) && places > steps, "{places}");
@@ -529,12 +530,12 @@ fn padding_is_no_sample_of_a_recurrent_policys_loss_and_gradient() {
 }
 
 #[test]
-fn padding_is_no_sample_of_an_update() {
+fn padding_does_not_count_in_updates() {
     for lstm in [None, Some(8)] {
         for action in [DISCRETE, CONTINUOUS] {
             let spec = spec(action, lstm);
             let rollout = play(&moved(&spec), &unequal(), &zeros(&unequal()), of_episodes(&spec, 4));
-            let update = |mut algorithm: Box<dyn BaseAlgorithm>, episodes: &[Span]| {
+            let update = |mut algorithm: Box<dyn BaseAlgorithm>, episodes: &[EpisodeSlice]| {
                 let packed = rollout.select(episodes).expect("its own episodes");
                 algorithm.update(&mut moved(&spec), &packed, 1.0).expect("an update")
             };
@@ -610,7 +611,7 @@ fn collect(servers: &[PrivateServer], normalised: bool) -> (Vec<(Rollout, Vec<En
 }
 
 #[test]
-fn which_episodes_are_collected_is_fixed_beforehand() {
+fn collected_episodes_are_fixed_beforehand() {
     let (collected, _) = collect(&[server()], false);
     let mut parameters = HashSet::new();
     for (iteration, (rollout, ended)) in collected.iter().enumerate() {
@@ -705,7 +706,7 @@ fn pull(policy: &Policy, rng: &mut ChaCha8Rng, episodes: usize) -> Rollout {
     let mut rollout = Rollout::of_episodes(ENVS, 1, 1);
     let mut actor = Actor::new(policy.spec(), ENVS);
     actor.load(&policy.weights()).expect("weights that fit");
-    let mut acts = Acts::new(policy.spec().action, ENVS);
+    let mut acts = ActorOutput::new(policy.spec().action, ENVS);
     rollout.begin(&[]);
     for _ in 0..episodes / ENVS {
         actor.act(&[1.0; ENVS], rng, &mut acts).expect("actions");
@@ -744,11 +745,11 @@ fn ppo(policy: &Policy) -> Box<dyn BaseAlgorithm> {
     Box::new(Ppo::new(config, policy, 5).expect("valid settings"))
 }
 
-/// Of the episodes of a policy that takes either arm, a tenth is catastrophic; the worst fifth holds those and safe ones.
+/// A tenth of the episodes of a policy that takes either arm is catastrophic. The worst fifth holds these and safe ones.
 #[rstest]
 #[case::a2c(a2c, 1500)]
 #[case::ppo(ppo, 100)]
-fn it_avoids_what_is_catastrophic_in_some_environments_and_its_base_does_not(
+fn epopt_avoids_catastrophes_that_its_base_accepts(
     #[case] base: fn(&Policy) -> Box<dyn BaseAlgorithm>,
     #[case] updates: usize,
     #[values(0.2, 1.0)] epsilon: f64,

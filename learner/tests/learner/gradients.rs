@@ -3,8 +3,8 @@
 use perturb_learner::policy::Policy;
 use perturb_policy::random::{Purpose, normal, stream, uniform};
 use perturb_policy::{
-    Acting, ActionKind, Actor, Acts, Descent, Differentiator, Losses, Objective, Optimiser, PolicySpec, Samples,
-    Surrogate,
+    Acting, ActionKind, Actor, ActorOutput, Differentiator, Losses, Objective, Optimiser, PolicySpec, Samples,
+    Surrogate, UpdateRule,
 };
 use perturb_torch::{Sequences, Targets, TorchPolicy, evaluate};
 use rstest::rstest;
@@ -54,7 +54,7 @@ fn the_actor_agrees_with_libtorch() {
             actor.load_flat(weights.flat_weights()).expect("weights that fit");
             for n_envs in [1, 3, 7, 64] {
                 let observations = numbers(n_envs * O, 3.0, 4);
-                let mut acts = Acts::new(action, 0);
+                let mut acts = ActorOutput::new(action, 0);
                 actor.act(&observations, &mut stream(2, Purpose::Actions), &mut acts).expect("actions");
                 let sequences =
                     Sequences::new(&spec, 1, &observations, &vec![false; n_envs], &[]).expect("shapes that fit");
@@ -90,7 +90,7 @@ impl Data {
         let observations = numbers(n * spec.observation_size, 1.0, 5);
         let mut actor = Actor::new(spec, n);
         actor.load_flat(&old).expect("weights that fit");
-        let mut acts = Acts::new(spec.action, n);
+        let mut acts = ActorOutput::new(spec.action, n);
         actor.act(&observations, &mut stream(6, Purpose::Actions), &mut acts).expect("actions");
         let mut network = Differentiator::new(spec, 1).expect("threads");
         network.load(&old).expect("weights that fit");
@@ -226,13 +226,13 @@ fn gradients_agree_with_libtorch(
 }
 
 #[rstest]
-#[case(a2c(), Optimiser::rms_prop(0.99, 1e-5, spec(DISCRETE, &[64, 64]).n_weights()), DISCRETE, 7e-3)]
-#[case(ppo(), Optimiser::adam(1e-5, spec(DISCRETE, &[64, 64]).n_weights()), DISCRETE, 3e-4)]
-#[case(a2c(), Optimiser::rms_prop(0.99, 1e-5, spec(CONTINUOUS, &[64, 64]).n_weights()), CONTINUOUS, 7e-3)]
-#[case(ppo(), Optimiser::adam(1e-5, spec(CONTINUOUS, &[64, 64]).n_weights()), CONTINUOUS, 3e-4)]
+#[case(a2c(), UpdateRule::rms_prop(0.99, 1e-5, spec(DISCRETE, &[64, 64]).n_weights()), DISCRETE, 7e-3)]
+#[case(ppo(), UpdateRule::adam(1e-5, spec(DISCRETE, &[64, 64]).n_weights()), DISCRETE, 3e-4)]
+#[case(a2c(), UpdateRule::rms_prop(0.99, 1e-5, spec(CONTINUOUS, &[64, 64]).n_weights()), CONTINUOUS, 7e-3)]
+#[case(ppo(), UpdateRule::adam(1e-5, spec(CONTINUOUS, &[64, 64]).n_weights()), CONTINUOUS, 3e-4)]
 fn ten_updates_agree_with_libtorch(
     #[case] objective: Objective,
-    #[case] optimiser: Optimiser,
+    #[case] optimiser: UpdateRule,
     #[case] action: ActionKind,
     #[case] learning_rate: f64,
 ) {
@@ -242,10 +242,10 @@ fn ten_updates_agree_with_libtorch(
     let mut rng = stream(12, Purpose::Minibatches);
     let minibatches: Vec<Vec<u32>> =
         (0..10).map(|_| (0..64).map(|_| (128.0 * uniform(&mut rng)) as u32).collect()).collect();
-    let descent = || Descent::new(optimiser.clone(), 0.5);
+    let optimiser = || Optimiser::new(optimiser.clone(), 0.5);
     let (mut own, mut own_descent, mut network) =
-        (begin.clone(), descent(), Differentiator::new(&spec, 2).expect("threads"));
-    let (mut reference, mut reference_descent) = (begin.clone(), descent());
+        (begin.clone(), optimiser(), Differentiator::new(&spec, 2).expect("threads"));
+    let (mut reference, mut reference_descent) = (begin.clone(), optimiser());
     let mut gradient = begin.clone();
     for indices in &minibatches {
         network.load(&own).expect("weights that fit");

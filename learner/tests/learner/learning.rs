@@ -5,7 +5,7 @@ use perturb_learner::error::Error;
 use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Rollout, RolloutStep};
 use perturb_policy::random::{Purpose, normal, stream, uniform};
-use perturb_policy::{ActionKind, Actor, Acts, PolicySpec};
+use perturb_policy::{ActionKind, Actor, ActorOutput, PolicySpec};
 use perturb_settings::{A2cConfig, PpoConfig, Schedule, SettingError};
 use perturb_torch::{Sequences, TorchPolicy};
 use rand_chacha::ChaCha8Rng;
@@ -87,7 +87,7 @@ impl Training {
     fn collect(&mut self) -> f64 {
         self.actor.load(&self.policy.weights()).expect("weights that fit");
         self.rollout.clear();
-        let mut acts = Acts::new(self.task.action, N_ENVS);
+        let mut acts = ActorOutput::new(self.task.action, N_ENVS);
         let mut sum = 0.0;
         while !self.rollout.is_full() {
             self.actor.act(&self.task.observations, &mut self.rng, &mut acts).expect("actions");
@@ -260,7 +260,7 @@ fn a_penalty_on_the_divergence_keeps_the_policy_near(
 }
 
 #[test]
-fn the_same_seed_learns_the_same_bytes_and_a_resumed_training_too() {
+fn same_seed_and_resume_give_same_bytes() {
     let start = |action| {
         let training = Training::new(action, 8);
         let algorithms: [Box<dyn Algorithm>; 2] = [Box::new(a2c(&training)), Box::new(ppo(&training, 2))];
@@ -297,7 +297,7 @@ fn a_state_of_another_algorithm_is_refused() {
 }
 
 #[test]
-fn a_loss_that_is_not_finite_is_an_error_and_leaves_the_policy_alone() {
+fn loss_that_is_not_finite_changes_nothing() {
     let mut training = Training::new(DISCRETE, 8);
     training.collect();
     let mut rollout = Rollout::new(8, N_ENVS, 4, 1);

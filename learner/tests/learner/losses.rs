@@ -29,7 +29,7 @@ fn explained_variance_agrees_with_numpy() {
 }
 
 #[test]
-fn explained_variance_is_1_if_values_are_perfect_0_if_constant_and_undefined_for_constant_returns() {
+fn explained_variance_has_its_limits() {
     assert_eq!(explained_variance(&[1.0, 2.0], &[1.0, 2.0]), Some(1.0));
     assert_eq!(explained_variance(&[5.0, 5.0], &[1.0, 2.0]), Some(0.0));
     assert_eq!(explained_variance(&[1.0, 2.0], &[3.0, 3.0]), None);
@@ -61,7 +61,7 @@ fn advantages_and_returns_agree_with_sums_from_the_definitions() {
     }
 }
 
-/// One environment whose episodes never end within the rollout.
+/// A rollout of one environment in which no episode ends.
 fn endless<'a>(rewards: &'a [f32], values: &'a [f32], last_values: &'a [f32]) -> Trajectories<'a> {
     const NEVER: [bool; 64] = [false; 64];
     const ZEROS: [f32; 64] = [0.0; 64];
@@ -86,7 +86,7 @@ fn n_step_returns_of_a_hand_computed_case() {
 }
 
 #[test]
-fn termination_truncation_and_neither_differ_in_what_follows_the_last_reward() {
+fn last_value_depends_on_the_kind_of_end() {
     let ended = |terminated: bool, truncated: bool, bootstrap: bool| {
         let trajectories = Trajectories {
             terminated: &[terminated, false],
@@ -108,7 +108,7 @@ fn termination_truncation_and_neither_differ_in_what_follows_the_last_reward() {
 }
 
 #[test]
-fn a_constant_reward_under_a_time_limit_is_worth_1_over_1_minus_gamma_only_with_bootstrapping() {
+fn bootstrapping_removes_the_time_limit_from_values() {
     // Value iteration on returns, with an episode of 10 steps that the time limit ends: V ← R_0, and so for every state.
     let fixed_point = |bootstrap| {
         let mut value = 0.0f32;

@@ -1,4 +1,4 @@
-//! What the presets differ in, as trainings and updates do it. docs/algorithms.md has the table, the tests of settings its
+//! Differences between the presets in trainings and updates. docs/algorithms.md has the table, the tests of settings have the
 //! values.
 
 use perturb_files::interrupt::StopFlag;
@@ -33,12 +33,12 @@ const N_ENVS: usize = 3;
 /// With it, of numbers like 1.5 a half is exact.
 const GAMMA: f64 = 0.5;
 
-/// How the task's time limit is told.
+/// The way in which the task reports its time limit.
 #[derive(Clone, Copy)]
 enum Limit {
-    /// As what it is.
+    /// A truncation.
     Truncation,
-    /// As an end of the task, which pays so much more.
+    /// An end of the task, with a bonus on the reward.
     Termination { bonus: f32 },
 }
 
@@ -86,7 +86,7 @@ fn ppo(bootstrap_truncation: bool, spec: &PolicySpec) -> Box<dyn Algorithm> {
 }
 
 #[rstest]
-fn an_update_takes_a_time_limit_for_the_tasks_end_or_goes_on_with_the_final_observations_value(
+fn updates_bootstrap_truncation_if_set(
     #[values(a2c, ppo)] algorithm: fn(bool, &PolicySpec) -> Box<dyn Algorithm>,
     #[values(None, Some(8))] lstm: Option<usize>,
 ) {
@@ -103,8 +103,8 @@ fn an_update_takes_a_time_limit_for_the_tasks_end_or_goes_on_with_the_final_obse
     assert_ne!(weights(true, Limit::Truncation), weights(false, Limit::Truncation));
 }
 
-/// What the reference counts as training is what it learns from: by steps, or with an update for each episode by episodes,
-/// which it fills up to the step limit.
+/// The reference counts only what it learns from: steps, or episodes if each has an update, since it pads these to the step
+/// limit.
 #[rstest]
 fn epopts_linear_learning_rate_falls_by_the_kept_episodes(#[values(true, false)] update_per_episode: bool) {
     let settings = "preset = 'paper'\nalgorithm = 'epopt-a2c'\nepisodes = 9\nepisodes_per_iteration = 4\nepsilon = 0.4\n\
@@ -149,7 +149,7 @@ fn ppos_log_has_a_line_for_so_many_rollouts_and_for_the_last(
 
 /// The reference tests those that it saved last, up to a hundred updates before.
 #[test]
-fn what_is_tested_has_the_weights_after_the_last_update() {
+fn tested_policy_has_the_last_weights() {
     let checkpoint = |checkpoint_interval: u64| {
         let settings = "preset = 'paper'\nalgorithm = 'a2c'\nepisodes = 5";
         let (out, progress) = trained(&format!("{settings}\ncheckpoint_interval = {checkpoint_interval}"));

@@ -6,7 +6,7 @@ use perturb_learner::error::Error;
 use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Rollout, RolloutStep};
 use perturb_policy::random::{Purpose, normal, stream, uniform};
-use perturb_policy::{ActionKind, Actor, Acts, PolicySpec, Weights};
+use perturb_policy::{ActionKind, Actor, ActorOutput, PolicySpec, Weights};
 use perturb_settings::{A2cConfig, PpoConfig};
 use perturb_torch::{Evaluated, Sequences, TorchPolicy};
 use rand_chacha::ChaCha8Rng;
@@ -37,7 +37,7 @@ struct Window {
     starts: Vec<bool>,
     /// Before the first step.
     memory: Vec<f32>,
-    acts: Vec<Acts>,
+    acts: Vec<ActorOutput>,
 }
 
 impl Window {
@@ -46,7 +46,7 @@ impl Window {
         let mut actor = Actor::new(spec, n_envs);
         actor.load(weights).expect("weights that fit");
         let mut window = Window { n_envs, observations: vec![], starts: vec![], memory: vec![], acts: vec![] };
-        let mut acts = Acts::new(spec.action, n_envs);
+        let mut acts = ActorOutput::new(spec.action, n_envs);
         for t in 0..n_steps + 3 {
             if t == 3 {
                 window = Window {
@@ -150,12 +150,12 @@ fn the_two_stage_gradient_equals_autograds() {
 }
 
 #[test]
-fn a_memory_is_emptied_alone_and_values_leave_it_as_it_is() {
+fn memory_is_emptied_per_environment() {
     let spec = spec(DISCRETE, &[16], 16);
     let mut actor = Actor::new(&spec, 3);
     actor.load(&moved(&spec)).expect("weights that fit");
     let fresh = actor.clone();
-    let (mut rng, mut acts) = (stream(1, Purpose::Actions), Acts::new(DISCRETE, 3));
+    let (mut rng, mut acts) = (stream(1, Purpose::Actions), ActorOutput::new(DISCRETE, 3));
     let observations: Vec<f32> = (0..3 * O).map(|_| normal(&mut rng) as f32).collect();
     actor.act(&observations, &mut rng, &mut acts).expect("actions");
     let remembered = actor.memory().to_vec();
@@ -170,7 +170,7 @@ fn a_memory_is_emptied_alone_and_values_leave_it_as_it_is() {
     assert!(matches!(actor.values_in(&observations, &[1, 2], &mut some), Err(perturb_policy::Error::Length { .. })));
 
     actor.forget(1);
-    let mut second = Acts::new(DISCRETE, 3);
+    let mut second = ActorOutput::new(DISCRETE, 3);
     actor.clone().act(&observations, &mut rng, &mut second).expect("actions");
     fresh.clone().act(&observations, &mut rng, &mut acts).expect("actions");
     assert_eq!(second.values[1], acts.values[1], "it begins anew");
@@ -218,7 +218,7 @@ fn nan_is_an_error_not_an_action() {
         actor.load(&moved(&spec)).expect("weights that fit");
         let mut observations = [0.5; 2 * O];
         observations[O + 2] = f32::NAN;
-        let result = actor.act(&observations, &mut stream(1, Purpose::Actions), &mut Acts::new(action, 2));
+        let result = actor.act(&observations, &mut stream(1, Purpose::Actions), &mut ActorOutput::new(action, 2));
         assert!(matches!(result, Err(perturb_policy::Error::PolicyOutput { environment: 1 })), "{result:?}");
     }
 }
@@ -288,7 +288,7 @@ impl Training {
     fn collect(&mut self) -> f64 {
         self.actor.load(&self.policy.weights()).expect("weights that fit");
         self.rollout.begin(self.actor.memory());
-        let mut acts = Acts::new(TWO, N_ENVS);
+        let mut acts = ActorOutput::new(TWO, N_ENVS);
         let (mut told, mut episodes) = (0.0, 0.0);
         while !self.rollout.is_full() {
             self.actor.act(&self.observations, &mut self.rng, &mut acts).expect("actions");
@@ -402,7 +402,7 @@ fn ppo_begins_with_ratio_1_and_clips_nothing(#[values(1, 4)] n_minibatches: usiz
 }
 
 #[test]
-fn the_same_seed_learns_the_same_bytes_and_a_resumed_training_too() {
+fn same_seed_and_resume_give_same_bytes() {
     let start = || {
         let training = Training::new(Some(16), 6);
         let algorithms: [Box<dyn Algorithm>; 2] = [Box::new(a2c(&training)), Box::new(ppo(&training, 2))];
@@ -429,7 +429,7 @@ fn the_same_seed_learns_the_same_bytes_and_a_resumed_training_too() {
 }
 
 #[test]
-fn what_does_not_fit_a_recurrent_policy_is_refused() {
+fn wrong_recurrent_arrays_are_refused() {
     let mut training = Training::new(Some(16), 6);
     training.collect();
     let mut odd = ppo(&training, 3); // divides T·N = 96, but not N = 16

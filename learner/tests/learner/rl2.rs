@@ -10,7 +10,7 @@ use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Collector, Normalisers, Rollout, RolloutStep};
 use perturb_learner::training::{RunDirectory, train};
 use perturb_policy::random::{Purpose, stream, uniform};
-use perturb_policy::{ActionKind, Actor, Acts, CollectUntil, Inputs, Player, PolicySpec, Role};
+use perturb_policy::{ActionKind, Actor, ActorOutput, CollectUntil, Inputs, Player, PolicySpec, Role};
 use perturb_protocol::Version;
 use perturb_settings::{self as settings, A2cConfig, PpoConfig, TrainConfig};
 
@@ -41,7 +41,7 @@ fn as_bits(flag: bool) -> f32 {
     f32::from(u8::from(flag))
 }
 
-/// What is seen beside an observation: the last action and reward, and that no episode has ended.
+/// The previous step in an input: the last action and reward, and that no episode has ended.
 fn beside(action: ActionKind, taken: f32, reward: f32) -> Vec<f32> {
     let mut beside: Vec<f32> = match action {
         ActionKind::Discrete { n } => (0..n).map(|j| as_bits(taken == j as f32)).collect(),
@@ -51,7 +51,7 @@ fn beside(action: ActionKind, taken: f32, reward: f32) -> Vec<f32> {
     beside
 }
 
-/// What a plain recurrent policy does whose observations are extended by hand, as `[s, a, r, 0]`, or `[s, 0, 0, 0]` at the
+/// The rollout of a plain recurrent policy whose observations are extended by hand: `[s, a, r, 0]`, or `[s, 0, 0, 0]` at the
 /// start of an episode.
 fn extended_by_hand(servers: &Servers, options: &OpenOptions, policy: &Policy, n_steps: usize) -> Rollout {
     let (spec, n) = (policy.spec(), options.num_envs);
@@ -62,7 +62,7 @@ fn extended_by_hand(servers: &Servers, options: &OpenOptions, policy: &Policy, n
     let mut rollout = Rollout::new(n_steps, n, spec.observation_size, spec.action.width());
     let mut actor = Actor::new(spec, n);
     actor.load(&policy.weights()).expect("weights that fit");
-    let (mut rng, mut acts) = (stream(1, Purpose::Actions), Acts::new(spec.action, n));
+    let (mut rng, mut acts) = (stream(1, Purpose::Actions), ActorOutput::new(spec.action, n));
     let mut beside = vec![vec![0.0; extra]; n];
     let mut starts = vec![true; n];
     let row = |observation: &[f32], beside: &[f32]| [observation, beside].concat();
@@ -113,7 +113,7 @@ fn extended_by_hand(servers: &Servers, options: &OpenOptions, policy: &Policy, n
 }
 
 #[test]
-fn a_trial_of_one_episode_is_a_recurrent_policy_with_longer_inputs() {
+fn trial_of_one_episode_equals_longer_inputs() {
     let server = [server()];
     let servers = connect(&server);
     // Falls end CartPole's episodes, the limit of 200 steps Pendulum's.
@@ -170,7 +170,7 @@ impl Steps {
 }
 
 #[test]
-fn what_is_remembered_outlives_an_episode_and_not_a_trial() {
+fn memory_lasts_for_a_trial() {
     for (environment, size, action, n_steps) in [("CartPole", 4, TWO, 150), ("Pendulum", 3, ONE, 410)] {
         let policy = policy(size, action);
         let steps = Steps::collect(environment, &policy, 2, n_steps);
@@ -313,7 +313,7 @@ fn balancing_in_the_second_episode(servers: &Servers) -> Checkpoint {
 }
 
 #[test]
-fn a_test_counts_the_last_episode_of_each_trial_with_its_memory_and_normalised_rewards() {
+fn tests_count_the_last_episode_of_each_trial() {
     let both = [server(), server()];
     let (one, two) = (connect(&both[..1]), connect(&both));
     let checkpoint = balancing_in_the_second_episode(&one);
@@ -378,13 +378,13 @@ impl Bandits {
     fn collect(&mut self) -> f64 {
         self.actor.load(&self.policy.weights()).expect("weights that fit");
         self.rollout.begin(self.actor.memory());
-        let mut acts = Acts::new(TWO, ARMS);
+        let mut acts = ActorOutput::new(TWO, ARMS);
         let (mut paid, mut pulls) = (0.0, 0.0);
         for t in 0..self.rollout.n_steps() {
             if t.is_multiple_of(TRIAL) {
                 self.paying = std::array::from_fn(|_| as_bits(uniform(&mut self.rng) < 0.5));
             }
-            let inputs = self.inputs.of(&[1.0; ARMS]);
+            let inputs = self.inputs.from_observations(&[1.0; ARMS]);
             self.actor.act(inputs, &mut self.rng, &mut acts).expect("actions");
             let rewards: [f32; ARMS] = std::array::from_fn(|n| as_bits(acts.actions[n] == self.paying[n]));
             if t % TRIAL >= EPISODE {

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::{Checkpoint, ResumeState};
-use perturb_learner::client::{ActAt, PrivateServer, Servers};
+use perturb_learner::client::{ActorLocation, PrivateServer, Servers};
 use perturb_learner::evaluation::{TestOptions, Tester};
 use perturb_learner::logging::Progress;
 use perturb_learner::training::{Entry, RunDirectory, Start, train, train_together};
@@ -112,10 +112,10 @@ fn alone(servers: &Servers, task: &str) -> Vec<String> {
 }
 
 #[rstest]
-fn the_bytes_of_a_training_are_its_own(#[values(CART_POLE, PENDULUM, SEEN_PENDULUM)] task: &str) {
+fn training_bytes_do_not_depend_on_the_group(#[values(CART_POLE, PENDULUM, SEEN_PENDULUM)] task: &str) {
     let private = [server(), server()];
     let one = connect(&private[..1]);
-    let expected = alone(&connect(&private[..1]).with_act(ActAt::Client), task);
+    let expected = alone(&connect(&private[..1]).with_act(ActorLocation::Client), task);
     assert!(alone(&one, task) == expected, "acting at the server");
     assert!(alone(&connect(&private), task) == expected, "on two servers");
 
@@ -137,9 +137,7 @@ fn the_bytes_of_a_training_are_its_own(#[values(CART_POLE, PENDULUM, SEEN_PENDUL
 
 /// The reference fills each kept episode up to the step limit, and counts all steps.
 #[rstest]
-fn with_an_update_for_each_episode_the_learning_rate_falls_by_episodes(
-    #[values(true, false)] update_per_episode: bool,
-) {
+fn learning_rate_falls_by_episodes_with_update_per_episode(#[values(true, false)] update_per_episode: bool) {
     let private = [server()];
     let text = format!(
         "preset = 'paper'\nenvironment = 'CartPole'\nalgorithm = 'epopt-a2c'\nepisodes = 6\n\
@@ -159,7 +157,7 @@ fn with_an_update_for_each_episode_the_learning_rate_falls_by_episodes(
 }
 
 #[test]
-fn a_run_that_begins_again_has_no_policies_of_the_one_before() {
+fn new_run_has_no_marks_of_the_earlier_one() {
     let base = tempfile::tempdir().expect("a directory");
     let kept = base.path().join("marks/10");
     std::fs::create_dir_all(&kept).expect("a folder");
@@ -175,7 +173,7 @@ fn a_run_that_begins_again_has_no_policies_of_the_one_before() {
 }
 
 #[rstest]
-fn one_that_fails_does_not_stop_the_others(
+fn failed_training_does_not_stop_the_others(
     #[values(CART_POLE, PENDULUM)] task: &str,
     #[values(("algorithm = 'a2c'\nn_steps = 5", 0), ("algorithm = 'ppo'\nn_steps = 64", 5))] kind: (&str, usize),
 ) {
@@ -203,7 +201,7 @@ fn one_that_fails_does_not_stop_the_others(
 }
 
 #[rstest]
-fn tests_have_the_same_episodes_wherever_actions_are_chosen(
+fn tests_do_not_depend_on_the_actor_location(
     #[values(0, 3, 4)] number: usize,
     #[values("", "\nobserve = 'parameters'")] observe: &str,
 ) {
@@ -218,7 +216,7 @@ fn tests_have_the_same_episodes_wherever_actions_are_chosen(
         let sets = [Version::D.into(), Version::E.into()];
         tester.test(&sets, &StopFlag::default(), &mut |_, _| {}).expect("records").episodes
     };
-    let expected = episodes(&connect(&private[..1]).with_act(ActAt::Client));
+    let expected = episodes(&connect(&private[..1]).with_act(ActorLocation::Client));
     assert_eq!(expected.len(), 260);
     assert!(episodes(&one) == expected);
     assert!(episodes(&connect(&private)) == expected, "on two servers");

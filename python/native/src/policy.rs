@@ -5,7 +5,7 @@ use std::sync::{Mutex, MutexGuard, TryLockError};
 
 use numpy::{PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
 use perturb_checkpoint::Checkpoint;
-use perturb_policy::{ActionKind, Ended, Outcome};
+use perturb_policy::{ActionKind, SlotEnd, StepOutcome};
 use pyo3::prelude::*;
 
 use crate::failure::{POLICY, UNUSABLE, failure};
@@ -121,7 +121,7 @@ impl Policy {
     }
 }
 
-/// Acts in N environments, and remembers. It is for one thread at a time.
+/// ActorOutput in N environments, and remembers. It is for one thread at a time.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Player(Mutex<Playing>);
 
@@ -131,7 +131,7 @@ struct Playing {
     seed: u64,
     /// `[N]` the present trial, and the episode in it.
     trials: Vec<(u64, u32)>,
-    ended: Vec<Ended>,
+    ended: Vec<SlotEnd>,
     /// Final observations, which acting has no use for.
     finals: Vec<f32>,
 }
@@ -208,12 +208,12 @@ impl Playing {
         self.ended.clear();
         let episodes_per_trial = self.player.episodes_per_trial();
         for (slot, trial) in self.trials.iter_mut().enumerate().filter(|(slot, _)| starts.get(*slot) == Some(&true)) {
-            self.ended.push(Ended { slot, trial_index: trial.0, episode_in_trial: trial.1 });
+            self.ended.push(SlotEnd { slot, trial_index: trial.0, episode_in_trial: trial.1 });
             *trial = if trial.1 + 1 >= episodes_per_trial { (trial.0 + 1, 0) } else { (trial.0, trial.1 + 1) };
         }
         self.finals.clear();
         self.finals.resize(self.ended.len() * self.player.observation_size(), 0.0);
-        let outcome = Outcome {
+        let outcome = StepOutcome {
             observations: &observations,
             rewards: &rewards,
             terminated: &starts,

@@ -88,7 +88,7 @@ impl Tests {
             let terminated = terminated.as_array();
             let ended = |end: proto::EpisodeEnd| {
                 let slot = end.slot as usize;
-                EndedEpisode::of(end, slot, terminated.get(slot).copied().unwrap_or_default())
+                EndedEpisode::from_proto(end, slot, terminated.get(slot).copied().unwrap_or_default())
             };
             let ended: Option<Vec<EndedEpisode>> = events.ended().map(ended).collect();
             let unnamed = "the server sent the end of an episode without its address or its receipt: mend the server";

@@ -9,7 +9,7 @@ use crate::{
     },
 };
 use perturb_policy::{
-    CollectUntil, Ended, Inputs, Normalisers, Outcome, Player, PlayerState, PolicySpec, Remaining, Role,
+    CollectUntil, Inputs, Normalisers, Player, PlayerState, PolicySpec, Remaining, Role, SlotEnd, StepOutcome,
 };
 use rand_chacha::ChaCha8Rng;
 use std::sync::Mutex;
@@ -65,7 +65,7 @@ pub(in crate::pool) struct Gathered {
     pub(in crate::pool) terminated: Vec<bool>,
     pub(in crate::pool) truncated: Vec<bool>,
     final_observations: Vec<f32>,
-    ended: Vec<Ended>,
+    ended: Vec<SlotEnd>,
     /// The same with all that is known of them.
     pub(in crate::pool) ends: Vec<(u32, EpisodeEnd)>,
 }
@@ -179,15 +179,15 @@ impl Gathered {
             self.final_observations.extend_from_slice(&shard.final_observations);
             self.ends.append(&mut shard.ended);
         }
-        self.ended.extend(self.ends.iter().map(|(slot, end)| Ended {
+        self.ended.extend(self.ends.iter().map(|(slot, end)| SlotEnd {
             slot: *slot as usize,
             trial_index: end.id.trial_index,
             episode_in_trial: end.id.episode_in_trial,
         }));
     }
 
-    fn outcome(&self) -> Outcome<'_> {
+    fn outcome(&self) -> StepOutcome<'_> {
         let Self { observations, rewards, terminated, truncated, final_observations, ended, .. } = self;
-        Outcome { observations, rewards, terminated, truncated, final_observations, ended }
+        StepOutcome { observations, rewards, terminated, truncated, final_observations, ended }
     }
 }

@@ -208,7 +208,7 @@ impl Draws {
     }
 
     fn event(&self, spec: &EnvironmentSpec, regions: Vec<Region>, begins: Vec<Begin>, ends: Vec<End>) -> Event {
-        Event::Draws(ledger::Draws { who: self.who(spec), regions, begins, ends })
+        Event::Draws(ledger::DrawRecord { who: self.who(spec), regions, begins, ends })
     }
 }
 

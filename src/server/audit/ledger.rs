@@ -2,7 +2,7 @@
 
 use super::Error;
 use crate::server::error::InvalidValue;
-use perturb_protocol::ledger::{Chain, Event, LONGEST, read};
+use perturb_protocol::ledger::{Chain, Event, MAX_LINE_BYTES, read};
 use std::{
     fs::{File, OpenOptions},
     io::{self, Write},
@@ -72,12 +72,12 @@ impl Ledger {
     pub async fn write(&self, event: Event) -> Result<(), Error> {
         // What a session asks for is bounded, but numbers are longer as text.
         let size = serde_json::to_vec(&event).map_or(usize::MAX, |json| json.len());
-        if size as u64 > LONGEST / 2 {
+        if size as u64 > MAX_LINE_BYTES / 2 {
             let got = format!("{size} bytes as a line of this server's ledger");
             return Err(InvalidValue::new(
                 "what is to be drawn",
                 got,
-                format!("at most {}: ask for less at a time", LONGEST / 2),
+                format!("at most {}: ask for less at a time", MAX_LINE_BYTES / 2),
             )
             .into());
         }

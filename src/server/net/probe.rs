@@ -1,7 +1,7 @@
 //! Asking a running server for its health, as container engines do by starting the server's own program.
 
 use crate::config::ListenAddress;
-use perturb_protocol::{Address, AddressError, ClientError, Connection, Patience, credentials::Credentials};
+use perturb_protocol::{Address, AddressError, ClientError, Connection, Timeouts, credentials::Credentials};
 use std::{
     io,
     net::{Ipv4Addr, Ipv6Addr},
@@ -42,12 +42,12 @@ pub async fn probe(listen: &ListenAddress, certificate: Option<&Path>) -> Result
     let mut credentials = Credentials::default();
     if let (Address::Tcp { host, tls, .. }, Some(certificate)) = (&mut address, certificate) {
         *tls = Some(host.clone());
-        credentials = match Credentials::knowing(certificate) {
+        credentials = match Credentials::pinned(certificate) {
             Ok(credentials) => credentials,
             Err(reason) => return Err(Error::NoAnswer { address, reason }),
         };
     }
-    let connecting = Connection::open_as(&address, Patience::default(), credentials);
+    let connecting = Connection::open_as(&address, Timeouts::default(), credentials);
     let reason = match tokio::time::timeout(LIMIT, connecting).await {
         Ok(Ok(_)) => return Ok(()),
         Ok(Err(ClientError::Connect { reason, .. } | ClientError::Unsafe { reason, .. })) => reason,

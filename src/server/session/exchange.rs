@@ -17,7 +17,7 @@ use crate::server::{
         precheck::decoded_at_once,
     },
 };
-use perturb_protocol::Awake;
+use perturb_protocol::AdaptiveSpin;
 use std::{convert::Infallible, sync::Arc, time::Duration};
 use tokio::time::Instant;
 use tonic::Status;
@@ -46,7 +46,7 @@ pub(super) struct Exchange<H: SessionHandler> {
     known_open: Instant,
     /// The session's steps that its token has been charged for.
     charged: u64,
-    awake: Awake,
+    awake: AdaptiveSpin,
     /// How the session ends, if nothing else happens.
     pub(super) ending: &'static str,
     /// How often another stream resumed the session.
@@ -69,7 +69,7 @@ impl<H: SessionHandler> Exchange<H> {
             was_open: false,
             known_open: start,
             charged: 0,
-            awake: Awake::default(),
+            awake: AdaptiveSpin::default(),
             ending: GONE,
             resumed: 0,
             seat,

@@ -7,8 +7,8 @@ use perturb::proto::{
     TestStreams, Version, act, action_space::Kind, policy::Role,
 };
 use perturb_policy::{
-    self as acting, ActionKind, CollectUntil, Ended, Inputs, Normalisers, ObservationNormaliser, Outcome, Player,
-    PolicySpec, Remaining, RewardNormaliser, RunningMoments,
+    self as acting, ActionKind, CollectUntil, Inputs, Normalisers, ObservationNormaliser, Player, PolicySpec,
+    Remaining, RewardNormaliser, RunningMoments, SlotEnd, StepOutcome,
     random::{Purpose, stream},
 };
 
@@ -208,10 +208,10 @@ impl Client {
         while !task.is_done() {
             let actions = Bytes::copy_from_slice(player.act().unwrap());
             let stepped = session.ask(Step { actions: actions.clone() }).await;
-            let ended: Vec<Ended> = stepped.ended.iter().map(ended).collect();
+            let ended: Vec<SlotEnd> = stepped.ended.iter().map(ended).collect();
             let flags = |bytes: &Bytes| bytes.iter().map(|&flag| flag == 1).collect::<Vec<bool>>();
             let (terminated, truncated) = (flags(&stepped.terminated), flags(&stepped.truncated));
-            let outcome = Outcome {
+            let outcome = StepOutcome {
                 observations: &floats(&stepped.observations),
                 rewards: &floats(&stepped.rewards),
                 terminated: &terminated,
@@ -233,9 +233,9 @@ impl Client {
     }
 }
 
-fn ended(end: &perturb::proto::EpisodeEnd) -> Ended {
+fn ended(end: &perturb::proto::EpisodeEnd) -> SlotEnd {
     let episode = end.episode.unwrap();
-    Ended { slot: end.slot as usize, trial_index: episode.trial_index, episode_in_trial: episode.episode_in_trial }
+    SlotEnd { slot: end.slot as usize, trial_index: episode.trial_index, episode_in_trial: episode.episode_in_trial }
 }
 
 /// An [`Acted`] that grows.

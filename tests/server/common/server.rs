@@ -5,7 +5,7 @@ use perturb::proto::{
     self, AutoresetMode, Environment, Open, Render, Restore, SessionRequest, SessionResponse, Snapshot, Step, Stepped,
     Version, action_space::Kind, perturb_client::PerturbClient, session_request::Request, session_response::Response,
 };
-use perturb_protocol::Ask;
+use perturb_protocol::TypedRequest;
 use std::{
     future::Future,
     io::{BufRead, BufReader},
@@ -275,7 +275,7 @@ impl Session {
     }
 
     /// The reply to a request that is not refused.
-    pub async fn ask<A: Ask>(&mut self, request: A) -> A::Reply {
+    pub async fn ask<A: TypedRequest>(&mut self, request: A) -> A::Reply {
         let response = self.answer(request).await;
         A::reply(response).unwrap_or_else(|other| panic!("{} was answered by {other:?}", A::NAME))
     }

@@ -4,7 +4,7 @@ use super::{Bystander, clients::room_for};
 use crate::common::server::{self, Server, within};
 use perturb::proto::{Step, Stepped};
 use perturb_faults::{FaultKind, FaultPlan, FaultyProxy, SeededRng};
-use perturb_protocol::{Address, ClientError, Connection, Patience, Stream};
+use perturb_protocol::{Address, ClientError, Connection, Stream, Timeouts};
 use std::{
     sync::{Arc, Mutex},
     time::Duration,
@@ -16,7 +16,7 @@ const STEPS: usize = 40;
 /// Beyond it there is no fault: so many bytes a client's steps come to, with what goes before them.
 const MOST: u64 = 20_000;
 /// Short, so that halves are given up soon.
-const PATIENCE: Patience = Patience {
+const PATIENCE: Timeouts = Timeouts {
     reply: Duration::from_secs(3),
     keepalive_interval: Duration::from_secs(1),
     keepalive_limit: Duration::from_secs(2),

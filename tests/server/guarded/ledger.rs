@@ -14,7 +14,7 @@ use perturb::proto::{
 use perturb_faults::disk;
 use perturb_protocol::{
     Stream,
-    ledger::{Begin, Draws, End, Entry, Event, read},
+    ledger::{Begin, DrawRecord, End, Entry, Event, read},
 };
 use std::path::Path;
 use tonic::Code;
@@ -25,7 +25,7 @@ fn entries(path: &Path) -> Vec<Entry> {
     entries
 }
 
-fn draws(path: &Path) -> Vec<Draws> {
+fn draws(path: &Path) -> Vec<DrawRecord> {
     let of = |entry: Entry| match entry.event {
         Event::Draws(draws) => Some(draws),
         _ => None,

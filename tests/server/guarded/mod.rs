@@ -10,7 +10,7 @@ mod tokens;
 pub use tokens::entry;
 
 use crate::common::server::{DEADLINE, Server, open, within};
-use perturb_protocol::{Address, ClientError, Connection, Patience, Stream, credentials::Credentials};
+use perturb_protocol::{Address, ClientError, Connection, Stream, Timeouts, credentials::Credentials};
 use std::{ffi::OsString, path::Path, time::Instant};
 use tonic::Code;
 
@@ -21,8 +21,8 @@ async fn connect(address: &str, variables: &[(&str, &Path)]) -> Result<Connectio
         let found = variables.iter().find(|(its, _)| *its == name);
         found.map(|(_, value)| OsString::from(value))
     };
-    match Credentials::of(&address, &variable) {
-        Ok(credentials) => within(Connection::open_as(&address, Patience::default(), credentials)).await,
+    match Credentials::from_variables(&address, &variable) {
+        Ok(credentials) => within(Connection::open_as(&address, Timeouts::default(), credentials)).await,
         Err(reason) => Err(ClientError::Unsafe { address, reason }),
     }
 }

@@ -8,7 +8,7 @@ mod taking_up;
 use crate::common::server::{Session, environment, open, within};
 use bytes::Bytes;
 use perturb::proto::{Environment, Open, Opened, Resume, Resumed, SessionResponse, session_response::Response};
-use perturb_protocol::Ask;
+use perturb_protocol::TypedRequest;
 use tonic::Code;
 
 const ENVS: u32 = 4;
@@ -57,6 +57,6 @@ async fn replies(session: &mut Session, count: u64) -> Vec<SessionResponse> {
 
 /// The reply in a response.
 #[track_caller]
-fn reply<A: Ask>(response: Response) -> A::Reply {
+fn reply<A: TypedRequest>(response: Response) -> A::Reply {
     A::reply(response).unwrap_or_else(|other| panic!("answered by {other:?}"))
 }

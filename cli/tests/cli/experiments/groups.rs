@@ -3,7 +3,7 @@
 use perturb_experiment::scheduler::CellEvent;
 use perturb_experiment::{Failure, FailureMark, Folder};
 use perturb_files::interrupt::StopFlag;
-use perturb_learner::cell::{CellOrder, run_cells};
+use perturb_learner::cell::{CellJob, run_cells};
 use perturb_learner::client::Servers;
 
 use super::{Experiment, PLAN};
@@ -20,9 +20,9 @@ fn ends(
     let folder = Folder::new(&experiment.out("out"));
     let order = |&(cell, retry): &(usize, Option<FailureMark>)| {
         let cell = &experiment.plan.cells[cell];
-        CellOrder { cell, folder: folder.cell(&cell.id), retry }
+        CellJob { cell, folder: folder.cell(&cell.id), retry }
     };
-    let orders: Vec<CellOrder<'_>> = cells.iter().map(order).collect();
+    let orders: Vec<CellJob<'_>> = cells.iter().map(order).collect();
     let mut told: Vec<(usize, CellEvent)> = Vec::new();
     run_cells(servers, &orders, stop, &mut |cell, event| {
         let ended = told.iter().any(|(known, event)| *known == cell.index && event.is_last());

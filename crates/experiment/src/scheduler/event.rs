@@ -15,7 +15,7 @@ use crate::folder::FailureMark;
 /// How often a worker says how far a cell is, …
 const INTERVAL: Duration = Duration::from_secs(1);
 /// … times the number of its cells, but not more than this.
-const MOST_INTERVALS: u32 = 10;
+const MAX_INTERVALS: u32 = 10;
 
 /// The only line that a worker reads. It stops when its standard input is closed, which also happens when the process
 /// that started it dies, however it dies.
@@ -127,7 +127,7 @@ pub struct Teller<W> {
 impl<W: Write> Teller<W> {
     /// Of so many cells.
     pub fn new(cells: usize, out: W) -> Self {
-        let intervals = cells.clamp(1, MOST_INTERVALS as usize) as u32;
+        let intervals = cells.clamp(1, MAX_INTERVALS as usize) as u32;
         Self { out, interval: INTERVAL * intervals, last: HashMap::new() }
     }
 

@@ -1,7 +1,7 @@
-//! What need not be computed again.
+//! Cached activations are used only where they are right.
 
 use super::*;
-use crate::act::Acts;
+use crate::act::ActorOutput;
 use crate::objective::Surrogate;
 use crate::random::{Purpose, stream};
 use crate::spec::ActionKind;
@@ -24,7 +24,7 @@ fn taken(observations: &[f32]) -> (Differentiator, Vec<f32>) {
     let mut actor = Actor::new(&spec, 1);
     actor.keep_activations(observations.len() / O);
     actor.load_flat(&weights).expect("weights that fit");
-    let (mut rng, mut acts) = (stream(1, Purpose::Actions), Acts::new(ACTION, 1));
+    let (mut rng, mut acts) = (stream(1, Purpose::Actions), ActorOutput::new(ACTION, 1));
     for observation in observations.chunks(O) {
         actor.act(observation, &mut rng, &mut acts).expect("acts");
     }

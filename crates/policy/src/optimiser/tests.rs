@@ -3,14 +3,14 @@ use super::*;
 const WEIGHTS: [f32; 3] = [1.0, -2.0, 0.5];
 
 #[test]
-fn long_gradients_are_scaled_to_the_largest_norm_and_short_ones_left_alone() {
+fn gradients_are_clipped_by_global_norm() {
     let gradient = [3.0f32, 0.0, -4.0];
     for (largest, scale) in [(0.5, 0.1), (5.0, 1.0), (10.0, 1.0)] {
         let step = |largest, gradient: [f32; 3]| {
             // With α 0 and a large ε a step is the gradient over 1000, but for ε's share.
-            let mut descent = Descent::new(Optimiser::rms_prop(0.0, 1e6, 3), largest).decaying(0.25);
+            let mut optimiser = Optimiser::new(UpdateRule::rms_prop(0.0, 1e6, 3), largest).with_weight_decay(0.25);
             let mut weights = WEIGHTS;
-            (descent.step(1.0, &gradient, &mut weights, 1.0).expect("a step"), weights)
+            (optimiser.step(1.0, &gradient, &mut weights, 1.0).expect("a step"), weights)
         };
         let (norm, weights) = step(largest, gradient);
         assert_eq!(norm, 5.0);
@@ -27,19 +27,19 @@ fn steps_agree_with_numpy() {
         let numbers = cases["optimisers"][name].as_array().expect("an array");
         numbers.iter().map(|x| x.as_f64().expect("a number") as f32).collect()
     };
-    let (adam, rms_prop) = (|| Optimiser::adam(0.25, 3), || Optimiser::rms_prop(0.99, 0.25, 3));
+    let (adam, rms_prop) = (|| UpdateRule::adam(0.25, 3), || UpdateRule::rms_prop(0.99, 0.25, 3));
     for (optimiser, weight_decay, name) in [
         (adam(), 0.0, "adam"),
         (rms_prop(), 0.0, "rms_prop"),
         (adam(), 5.0, "adam_decaying"),
         (rms_prop(), 5.0, "rms_prop_decaying"),
     ] {
-        let mut descent = Descent::new(optimiser, f64::INFINITY).decaying(weight_decay);
+        let mut optimiser = Optimiser::new(optimiser, f64::INFINITY).with_weight_decay(weight_decay);
         let mut weights = numbers("weights");
         for gradient in numbers("gradients").chunks_exact(3) {
-            descent.step(1.0, gradient, &mut weights, 0.01).expect("a step");
+            optimiser.step(1.0, gradient, &mut weights, 0.01).expect("a step");
         }
-        assert_eq!(descent.n_updates(), 5);
+        assert_eq!(optimiser.n_updates(), 5);
         for (got, expected) in weights.iter().zip(numbers(name)) {
             assert!((got - expected).abs() < 5e-7, "{name}: {got} {expected}; f32 rounding of five steps");
         }
@@ -47,12 +47,12 @@ fn steps_agree_with_numpy() {
 }
 
 #[test]
-fn what_is_not_finite_changes_nothing() {
+fn steps_that_are_not_finite_change_nothing() {
     for (loss, entry) in [(f64::NAN, 1.0), (1.0, f32::INFINITY), (1.0, f32::NAN)] {
-        let mut descent = Descent::new(Optimiser::adam(1e-5, 3), 0.5);
-        let (before, mut weights) = (descent.state(), WEIGHTS);
-        let step = descent.step(loss, &[0.0, entry, 0.0], &mut weights, 1.0);
+        let mut optimiser = Optimiser::new(UpdateRule::adam(1e-5, 3), 0.5);
+        let (before, mut weights) = (optimiser.state(), WEIGHTS);
+        let step = optimiser.step(loss, &[0.0, entry, 0.0], &mut weights, 1.0);
         assert!(matches!(step, Err(Error::NotFinite { update: 0, .. })));
-        assert_eq!((weights, descent.state(), descent.n_updates()), (WEIGHTS, before, 0));
+        assert_eq!((weights, optimiser.state(), optimiser.n_updates()), (WEIGHTS, before, 0));
     }
 }

@@ -1,7 +1,7 @@
-//! How policies begin, and how they act.
+//! Tests of initial weights and of acting.
 
 use perturb_policy::random::{Purpose, normal, stream};
-use perturb_policy::{ActionKind, Actor, Acts, Error, PolicySpec, Weights, initial_weights};
+use perturb_policy::{ActionKind, Actor, ActorOutput, Error, PolicySpec, Weights, initial_weights};
 
 const DISCRETE: ActionKind = ActionKind::Discrete { n: 3 };
 const CONTINUOUS: ActionKind = ActionKind::Continuous { size: 6 };
@@ -29,8 +29,8 @@ fn actor(spec: &PolicySpec, weights: &Weights, max_batch: usize) -> Actor {
     actor
 }
 
-fn act(actor: &mut Actor, spec: &PolicySpec, observations: &[f32], seed: u64) -> Acts {
-    let mut acts = Acts::new(spec.action, 0);
+fn act(actor: &mut Actor, spec: &PolicySpec, observations: &[f32], seed: u64) -> ActorOutput {
+    let mut acts = ActorOutput::new(spec.action, 0);
     actor.act(observations, &mut stream(seed, Purpose::Actions), &mut acts).expect("actions");
     acts
 }
@@ -45,7 +45,7 @@ fn the_same_seed_gives_the_same_bytes_and_another_seed_others() {
 }
 
 #[test]
-fn a_policy_begins_with_orthogonal_weights_zero_biases_and_unit_deviations() {
+fn initial_weights_are_orthogonal() {
     let weights = initial_weights(&spec(CONTINUOUS, &[64, 64]), &mut stream(3, Purpose::Weights));
     let names: Vec<_> = weights.iter().map(|array| (array.name.as_str(), array.shape.as_slice())).collect();
     assert_eq!(
@@ -79,14 +79,14 @@ fn weights_of_another_shape_are_refused() {
 }
 
 #[test]
-fn an_environment_gets_the_same_bytes_whatever_else_is_in_the_batch() {
+fn actions_do_not_depend_on_the_rest_of_the_batch() {
     for action in [DISCRETE, CONTINUOUS] {
         let spec = spec(action, &[64, 64]);
         let mut actor = actor(&spec, &moved(&spec), 7);
         let observations = observations(7);
         let together = act(&mut actor, &spec, &observations, 2);
         let mut rng = stream(2, Purpose::Actions);
-        let mut alone = Acts::new(action, 1);
+        let mut alone = ActorOutput::new(action, 1);
         for (n, observation) in observations.chunks(17).enumerate() {
             actor.act(observation, &mut rng, &mut alone).expect("actions");
             let width = action.width();
@@ -119,9 +119,9 @@ fn actions_follow_the_closed_form_of_the_last_layer_alone() {
 }
 
 #[test]
-fn actions_are_sent_as_the_protocol_wants_them() {
+fn actions_are_encoded_as_the_protocol_says() {
     let mut bytes = vec![1, 2, 3];
-    let acts = |kind, actions| Acts { kind, actions, log_probs: vec![], values: vec![] };
+    let acts = |kind, actions| ActorOutput { kind, actions, log_probs: vec![], values: vec![] };
     acts(DISCRETE, vec![2.0, 0.0]).write_bytes(&mut bytes);
     assert_eq!(bytes, [2, 0, 0, 0, 0, 0, 0, 0]);
     acts(ActionKind::Continuous { size: 2 }, vec![1.0, -2.0]).write_bytes(&mut bytes);
@@ -135,14 +135,14 @@ fn nan_is_an_error_not_an_action() {
         let mut actor = actor(&spec, &moved(&spec), 2);
         let mut observations = observations(2);
         observations[20] = f32::NAN;
-        let mut acts = Acts::new(action, 2);
+        let mut acts = ActorOutput::new(action, 2);
         let result = actor.act(&observations, &mut stream(1, Purpose::Actions), &mut acts);
         assert!(matches!(result, Err(Error::PolicyOutput { environment: 1 })), "{result:?}");
     }
 }
 
 #[test]
-fn more_observations_than_announced_or_a_part_of_one_are_refused() {
+fn observations_of_wrong_length_are_refused() {
     let spec = spec(DISCRETE, &[8]);
     let mut actor = actor(&spec, &moved(&spec), 2);
     let mut values = Vec::new();

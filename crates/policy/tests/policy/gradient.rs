@@ -4,7 +4,8 @@ use std::f64::consts::TAU;
 
 use perturb_policy::random::{Purpose, normal, stream};
 use perturb_policy::{
-    Acting, ActionKind, Actor, Acts, Differentiator, Error, Objective, PolicySpec, Samples, Surrogate, initial_weights,
+    Acting, ActionKind, Actor, ActorOutput, Differentiator, Error, Objective, PolicySpec, Samples, Surrogate,
+    initial_weights,
 };
 use rstest::rstest;
 
@@ -66,7 +67,7 @@ fn the_number_of_threads_changes_no_byte(
 
 /// In N environments for T steps: few, as many as are kept, more; values come between.
 #[rstest]
-fn what_an_actor_has_kept_gives_the_same_gradient(
+fn cached_activations_give_the_same_gradient(
     #[values(ActionKind::Discrete { n: 2 }, ActionKind::Continuous { size: 3 })] action: ActionKind,
     #[values((1, 5), (3, 4), (1, 63), (8, 7), (1, 64), (8, 8), (70, 1))] (n_envs, n_steps): (usize, usize),
 ) {
@@ -97,7 +98,7 @@ fn what_an_actor_has_kept_gives_the_same_gradient(
             fresh.load(weights).expect("weights that fit");
             assert_eq!(gradient(network), gradient(&mut fresh), "round {round}, {} samples", indices.len());
         };
-        let (mut acts, mut values) = (Acts::new(action, n_envs), Vec::new());
+        let (mut acts, mut values) = (ActorOutput::new(action, n_envs), Vec::new());
         actor.load_flat(&weights).expect("weights that fit");
         for observations in observations.chunks(n_envs * O) {
             actor.act(observations, &mut stream(1, Purpose::Actions), &mut acts).expect("acts");
@@ -117,7 +118,7 @@ fn what_an_actor_has_kept_gives_the_same_gradient(
 }
 
 #[rstest]
-fn an_actors_networks_give_the_same_gradient(
+fn networks_of_an_actor_give_the_same_gradient(
     #[values(ActionKind::Discrete { n: 2 }, ActionKind::Continuous { size: 3 })] action: ActionKind,
 ) {
     let spec = PolicySpec::feed_forward(O, action);
@@ -148,7 +149,7 @@ fn an_actors_networks_give_the_same_gradient(
     assert_eq!(gradient(&mut taken), expected);
 
     // The actor has what the other one had, and says so in place of acting.
-    let mut acts = Acts::new(action, 1);
+    let mut acts = ActorOutput::new(action, 1);
     let refused = actor.act(&numbers(O, 3), &mut stream(1, Purpose::Actions), &mut acts);
     assert_eq!(refused, Err(Error::NoWeights));
     assert_eq!(actor.values(&numbers(O, 3), &mut Vec::new()), Err(Error::NoWeights));
@@ -157,7 +158,7 @@ fn an_actors_networks_give_the_same_gradient(
     // Once it has weights, it acts as a new one does, and can give them, too.
     let others: Vec<f32> = numbers(spec.n_weights(), 7).iter().map(|x| 0.2 * x).collect();
     let acts = |actor: &mut Actor| {
-        let mut acts = Acts::new(action, 1);
+        let mut acts = ActorOutput::new(action, 1);
         actor.load_flat(&others).expect("weights that fit");
         actor.act(&numbers(O, 3), &mut stream(1, Purpose::Actions), &mut acts).expect("acts");
         acts
@@ -186,7 +187,11 @@ fn only_networks_of_the_same_shape_are_taken_over() {
         let mut actor = Actor::new(&other, 1);
         assert!(!differentiator.load_from(&mut actor), "{other:?}");
         actor
-            .act(&numbers(other.observation_size, 3), &mut stream(1, Purpose::Actions), &mut Acts::new(other.action, 1))
+            .act(
+                &numbers(other.observation_size, 3),
+                &mut stream(1, Purpose::Actions),
+                &mut ActorOutput::new(other.action, 1),
+            )
             .expect("it has its networks");
     }
 }

@@ -12,7 +12,7 @@ fn moments(numbers: &[f64]) -> (f64, f64) {
 
 proptest! {
     #[test]
-    fn statistics_are_those_of_all_data_however_it_was_split_and_merged(
+    fn merged_statistics_are_those_of_all_data(
         numbers in prop::collection::vec(-100.0f32..100.0, 3..200), cuts in prop::collection::vec(0usize..200, 2),
         offset in -1e3f32..1e3,
     ) {
@@ -71,7 +71,7 @@ fn normalised_numbers_are_clipped_to_10() {
 }
 
 #[test]
-fn a_first_observation_is_centred_and_not_divided() {
+fn first_observation_is_only_centred() {
     let mut normaliser = ObservationNormaliser::new(2);
     normaliser.update(&[3.0, 4.0]).expect("finite numbers");
     let mut observations = [3.0, 5.0];
@@ -80,7 +80,7 @@ fn a_first_observation_is_centred_and_not_divided() {
 }
 
 #[test]
-fn rewards_are_divided_by_the_deviation_of_the_discounted_return_which_starts_again_with_an_episode() {
+fn rewards_are_divided_by_the_deviation_of_discounted_returns() {
     let mut normaliser = RewardNormaliser::new(2, 0.5);
     normaliser.update(&[1.0, -2.0], &[false, true]).expect("two rewards"); // returns 1, -2; then 1, 0
     normaliser.update(&[3.0, 4.0], &[false, false]).expect("two rewards"); // returns 3.5, 4
@@ -125,7 +125,7 @@ fn numbers_that_are_not_finite_are_refused_and_change_nothing() {
 }
 
 #[test]
-fn a_stored_normaliser_goes_on_exactly() {
+fn stored_normaliser_continues_exactly() {
     let mut rng = stream(2, Purpose::Weights);
     let mut observations = ObservationNormaliser::new(4);
     let mut rewards = RewardNormaliser::new(8, 0.99);
@@ -140,7 +140,7 @@ fn a_stored_normaliser_goes_on_exactly() {
 }
 
 #[test]
-fn what_is_left_alone_is_neither_taken_in_nor_changed() {
+fn elements_left_alone_are_not_normalised() {
     let rows = [[1.0f32, 5.0, -3.0], [3.0, 5.0, 70.0]].concat();
     let mut normaliser = ObservationNormaliser::new(1).leaving_alone(2);
     normaliser.update(&rows).expect("rows");

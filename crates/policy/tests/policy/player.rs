@@ -1,8 +1,8 @@
-//! What a player makes of what came of its actions.
+//! Tests of players: noise, statistics, memories.
 
 use perturb_policy::{
-    ActionKind, Ended, Inputs, Normalisers, ObservationNormaliser, Outcome, Player, PolicySpec, RewardNormaliser, Role,
-    RunningMoments,
+    ActionKind, Inputs, Normalisers, ObservationNormaliser, Player, PolicySpec, RewardNormaliser, Role, RunningMoments,
+    SlotEnd, StepOutcome,
 };
 use rstest::rstest;
 
@@ -24,8 +24,8 @@ fn step(player: &mut Player, t: u64, episodes_per_trial: u32, reward: f32) {
     player.act().expect("an action");
     let (episode, ends) = (t / 2, t % 2 == 1);
     let per_trial = u64::from(episodes_per_trial);
-    let end = Ended { slot: 0, trial_index: episode / per_trial, episode_in_trial: (episode % per_trial) as u32 };
-    let outcome = Outcome {
+    let end = SlotEnd { slot: 0, trial_index: episode / per_trial, episode_in_trial: (episode % per_trial) as u32 };
+    let outcome = StepOutcome {
         observations: &[3.0],
         rewards: &[reward],
         terminated: &[ends],
@@ -61,9 +61,9 @@ fn the_return_that_rewards_are_divided_by_runs_over(
     assert_eq!(returns, expected);
 }
 
-/// Of an environment that always shows 3 where mean and deviation are 1 and 2, N(1, 0.25²).
+/// The environment always shows 3, with mean 1 and deviation 2: the policy sees N(1, 0.25²).
 #[test]
-fn a_training_sees_noise_beside_normalised_observations_and_a_test_does_not() {
+fn only_training_sees_noise() {
     let played = |noise: f64, role: Role| {
         let moments = RunningMoments::from_parts(1 << 40, vec![1.0], vec![4.0 * (1u64 << 40) as f64]);
         let observations = Some(ObservationNormaliser::from_moments(moments));
@@ -89,7 +89,7 @@ fn a_training_sees_noise_beside_normalised_observations_and_a_test_does_not() {
 
 /// Two environments with two numbers each, all of which are 3, and whose first episodes the step limit ends at once.
 #[test]
-fn each_number_has_noise_of_its_own_from_the_first_step_on_and_final_observations_none() {
+fn final_observations_have_no_noise() {
     let played = |noise: f64| {
         let spec = PolicySpec { observation_size: 2, action: DISCRETE, hidden: vec![], lstm: None };
         let (inputs, none) = (Inputs::new(2, DISCRETE, 2, false), Normalisers::default());
@@ -97,8 +97,8 @@ fn each_number_has_noise_of_its_own_from_the_first_step_on_and_final_observation
         player.load(&(0..spec.n_weights()).map(|i| i as f32 / 8.0).collect::<Vec<_>>()).expect("weights that fit");
         player.begin(&[3.0; 4], None).expect("observations");
         player.act().expect("actions");
-        let ended: Vec<_> = (0..2).map(|slot| Ended { slot, trial_index: 0, episode_in_trial: 0 }).collect();
-        let outcome = Outcome {
+        let ended: Vec<_> = (0..2).map(|slot| SlotEnd { slot, trial_index: 0, episode_in_trial: 0 }).collect();
+        let outcome = StepOutcome {
             observations: &[3.0; 4],
             rewards: &[1.0; 2],
             terminated: &[false; 2],
@@ -121,7 +121,7 @@ fn each_number_has_noise_of_its_own_from_the_first_step_on_and_final_observation
 
 /// Neither what follows the noise nor the noise that follows depends on where a training was interrupted.
 #[test]
-fn noise_goes_on_where_a_state_was_saved() {
+fn noise_continues_from_a_saved_state() {
     let none = || Normalisers::default();
     let mut expected = player(1, false, none(), Role::training(1)).with_noise(1.0);
     step(&mut expected, 0, 1, 1.0);
@@ -137,7 +137,7 @@ fn noise_goes_on_where_a_state_was_saved() {
 
 /// The reference gives a policy of RL² raw rewards in tests.
 #[test]
-fn a_test_has_the_statistics_of_the_training_and_leaves_them_as_they_are() {
+fn tests_leave_statistics_unchanged() {
     // Means of 1 and variances of 4 and 100.
     let moments = |squares: f64| RunningMoments::from_parts(2, vec![1.0], vec![squares]);
     let normalisers = Normalisers {

@@ -1,4 +1,4 @@
-//! A client's side of a lease: what it has not received yet, and how it takes up a session whose connection was lost.
+//! A client's side of a lease: the requests without replies, and the resumption of a session whose connection was lost.
 
 use std::collections::VecDeque;
 use std::error::Error;
@@ -10,39 +10,39 @@ use bytes::Bytes;
 use tokio::time::{Instant, sleep};
 use tonic::{Code, Status};
 
-use super::{Ask, Line};
+use super::{RawStream, TypedRequest};
 use crate::connection::Connection;
 use crate::proto::{self, SessionRequest, SessionResponse, session_response::Response};
 
-/// After the first attempt, which is at once, the pause before the next; it doubles with each …
-const FIRST_PAUSE: Duration = Duration::from_millis(50);
-/// … up to this.
-const LONGEST_PAUSE: Duration = Duration::from_secs(2);
-/// A line that breaks so often in a row before a reply comes will not carry it.
-pub(super) const MOST_WITHOUT_REPLY: u32 = 8;
-/// Where nobody listens this often in a row, the server is gone, and not the line to it.
-const REFUSED: u32 = 4;
+/// Pause between the first attempt, which is immediate, and the second. The pause doubles with each attempt.
+const MIN_PAUSE: Duration = Duration::from_millis(50);
+/// Upper limit of the pause between two attempts.
+const MAX_PAUSE: Duration = Duration::from_secs(2);
+/// Number of losses in a row without a reply, after which the session is given up.
+pub(super) const MAX_RESUMES_WITHOUT_REPLY: u32 = 8;
+/// Number of refused connections in a row, after which the server counts as gone.
+const MAX_REFUSED: u32 = 4;
 
-/// What a session is taken up by.
+/// A lease, by which a session is resumed.
 pub(super) struct Lease {
     name: Bytes,
     time: Duration,
     last_reply: u64,
-    /// Requests that have no reply yet; the first one's is that after `last_reply`.
+    /// Requests without a reply. The reply to the first has the number after `last_reply`.
     waiting: VecDeque<SessionRequest>,
 }
 
-/// Why a session was not taken up.
+/// Why a session was not resumed.
 enum Failure {
-    /// It may be, later.
-    Now,
-    /// Nobody listens there.
+    /// Another attempt may succeed.
+    Retry,
+    /// No server listens at the address.
     Refused,
-    /// It never will.
-    Ever,
+    /// No attempt can succeed.
+    Permanent,
 }
 
-/// Its name is a secret.
+/// Hides the lease's name, which is a secret.
 impl fmt::Debug for Lease {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.debug_struct("Lease")
@@ -53,8 +53,8 @@ impl fmt::Debug for Lease {
 }
 
 impl Lease {
-    /// The one that a server gave, if it did.
-    pub(super) fn of(opened: &proto::Opened) -> Option<Self> {
+    /// The lease that a server granted, if it did.
+    pub(super) fn from_proto(opened: &proto::Opened) -> Option<Self> {
         let time = Duration::from_secs(opened.lease_seconds.into());
         (!opened.lease.is_empty()).then(|| Self {
             name: opened.lease.clone(),
@@ -64,79 +64,79 @@ impl Lease {
         })
     }
 
-    /// A request is sent.
-    pub(super) fn asked(&mut self, request: &SessionRequest) {
+    /// Notes a request that is sent.
+    pub(super) fn on_request(&mut self, request: &SessionRequest) {
         self.waiting.push_back(request.clone());
     }
 
-    /// A reply has come.
-    pub(super) fn answered(&mut self) {
+    /// Notes a reply that was received.
+    pub(super) fn on_reply(&mut self) {
         self.waiting.pop_front();
         self.last_reply += 1;
     }
 
-    /// Takes the session up by another stream, on which those requests are sent again that did not arrive. Tries as long as
-    /// the lease holds, unless the server is gone or has it no more.
-    pub(super) async fn take_up(&self, connection: &Connection) -> Option<Line> {
-        let (since, mut pause, mut refused) = (Instant::now(), FIRST_PAUSE, 0);
+    /// Resumes the session over another stream, and sends those requests again that did not arrive. Tries until the lease ends,
+    /// unless the server is gone or no longer has the session.
+    pub(super) async fn resume(&self, connection: &Connection) -> Option<RawStream> {
+        let (since, mut pause, mut refused) = (Instant::now(), MIN_PAUSE, 0);
         while since.elapsed() < self.time {
             match self.attempt(connection).await {
-                Ok(line) => return Some(line),
-                Err(Failure::Ever) => return None,
+                Ok(stream) => return Some(stream),
+                Err(Failure::Permanent) => return None,
                 Err(Failure::Refused) => refused += 1,
-                Err(Failure::Now) => refused = 0,
+                Err(Failure::Retry) => refused = 0,
             }
-            if refused == REFUSED {
+            if refused == MAX_REFUSED {
                 return None;
             }
             sleep(pause).await;
-            pause = (pause * 2).min(LONGEST_PAUSE);
+            pause = (pause * 2).min(MAX_PAUSE);
         }
         None
     }
 
-    async fn attempt(&self, connection: &Connection) -> Result<Line, Failure> {
+    async fn attempt(&self, connection: &Connection) -> Result<RawStream, Failure> {
         let resume = proto::Resume { lease: self.name.clone(), last_reply: self.last_reply };
         // The channel connects again by itself.
-        let begun = Line::begin(connection, resume, self.waiting.len()).await.map_err(|_| Failure::Now)?;
-        let mut line = begun.map_err(Failure::of)?;
-        let limit = connection.patience().reply;
-        let reply = tokio::time::timeout(limit, line.replies.message()).await.map_err(|_| Failure::Now)?;
-        let Some(SessionResponse { response: Some(response) }) = reply.map_err(Failure::of)? else {
-            return Err(Failure::Ever);
+        let begun = RawStream::begin(connection, resume, self.waiting.len()).await.map_err(|_| Failure::Retry)?;
+        let mut stream = begun.map_err(Failure::from_status)?;
+        let limit = connection.timeouts().reply;
+        let reply = tokio::time::timeout(limit, stream.replies.message()).await.map_err(|_| Failure::Retry)?;
+        let Some(SessionResponse { response: Some(response) }) = reply.map_err(Failure::from_status)? else {
+            return Err(Failure::Permanent);
         };
         if let Response::Error(error) = &response
             && error.code == i32::from(Code::ResourceExhausted)
         {
-            return Err(Failure::Now);
+            return Err(Failure::Retry);
         }
-        // A refusal, most likely.
-        let resumed = proto::Resume::reply(response).map_err(|_| Failure::Ever)?;
-        let arrived = resumed.last_reply.checked_sub(self.last_reply).ok_or(Failure::Ever)?;
-        let arrived = usize::try_from(arrived).map_err(|_| Failure::Ever)?;
+        // Any other response is most likely an error.
+        let resumed = proto::Resume::reply(response).map_err(|_| Failure::Permanent)?;
+        let arrived = resumed.last_reply.checked_sub(self.last_reply).ok_or(Failure::Permanent)?;
+        let arrived = usize::try_from(arrived).map_err(|_| Failure::Permanent)?;
         for request in self.waiting.iter().skip(arrived) {
-            line.requests.send(request.clone()).await.map_err(|_| Failure::Now)?;
+            stream.requests.send(request.clone()).await.map_err(|_| Failure::Retry)?;
         }
-        Ok(line)
+        Ok(stream)
     }
 }
 
 impl Failure {
-    fn of(status: Status) -> Self {
+    fn from_status(status: Status) -> Self {
         match system_error(&status) {
             Some(ErrorKind::ConnectionRefused | ErrorKind::NotFound) => Self::Refused,
-            _ if is_of_the_line(&status) || status.code() == Code::ResourceExhausted => Self::Now,
-            _ => Self::Ever,
+            _ if is_of_connection(&status) || status.code() == Code::ResourceExhausted => Self::Retry,
+            _ => Self::Permanent,
         }
     }
 }
 
-/// Whether the connection ended a call, and not the server.
-pub(super) fn is_of_the_line(status: &Status) -> bool {
+/// Whether a call was ended by the connection, and not by the server.
+pub(super) fn is_of_connection(status: &Status) -> bool {
     status.source().is_some()
 }
 
-/// What the operating system has against a connection.
+/// The operating system's error of a connection.
 fn system_error(status: &Status) -> Option<ErrorKind> {
     let mut chain = std::iter::successors(status.source(), |error: &&(dyn Error + 'static)| (*error).source());
     chain.find_map(|error| error.downcast_ref::<std::io::Error>()).map(std::io::Error::kind)

@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use perturb_protocol::{Ask, ClientError, Connection, Stream};
+use perturb_protocol::{ClientError, Connection, Stream, TypedRequest};
 use pyo3::prelude::*;
 
 use super::Session;
@@ -93,7 +93,7 @@ impl Session {
 
     pub(super) fn ask<A>(&self, py: Python<'_>, open: Box<Open>, request: A) -> PyResult<(Arc<Labels>, A::Reply)>
     where
-        A: Ask + Send + 'static,
+        A: TypedRequest + Send + 'static,
         A::Reply: Send,
     {
         self.exchange::<A>(py, open, Some(request))
@@ -101,7 +101,7 @@ impl Session {
 
     pub(super) fn receive<A>(&self, py: Python<'_>, mut open: Box<Open>) -> PyResult<(Arc<Labels>, A::Reply)>
     where
-        A: Ask + Send + 'static,
+        A: TypedRequest + Send + 'static,
         A::Reply: Send,
     {
         open.under_way -= 1;
@@ -111,7 +111,7 @@ impl Session {
     /// Sends a request, or none if it was sent before, and takes the reply. After a refusal the session lives on.
     fn exchange<A>(&self, py: Python<'_>, open: Box<Open>, request: Option<A>) -> PyResult<(Arc<Labels>, A::Reply)>
     where
-        A: Ask + Send + 'static,
+        A: TypedRequest + Send + 'static,
         A::Reply: Send,
     {
         let Open { mut stream, connection, line, labels, under_way } = *open;

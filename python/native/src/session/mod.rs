@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use numpy::{PyArray1, PyArray2, PyArray3};
 use perturb_protocol::proto;
-use perturb_protocol::{Address, ClientError, Connection, Patience, Stream};
+use perturb_protocol::{Address, ClientError, Connection, Stream, Timeouts};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
@@ -42,7 +42,7 @@ type Stepped<'py> = (
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Session {
     address: Address,
-    patience: Patience,
+    patience: Timeouts,
     /// Of a reply; `None`: no limit.
     timeout: Mutex<Option<Duration>>,
     actions: Actions,
@@ -71,7 +71,7 @@ impl Session {
     ) -> PyResult<Self> {
         let address = Address::from_str(address).map_err(|error| failure(INVALID, 0, error.to_string()))?;
         let forever = |seconds| duration(seconds).unwrap_or(Duration::MAX);
-        let patience = Patience {
+        let patience = Timeouts {
             reply: Duration::MAX, // waits have a limit of their own, which can be changed
             keepalive_interval: forever(keepalive.0),
             keepalive_limit: forever(keepalive.1),

@@ -11,7 +11,7 @@ use crate::{
     render::Size,
 };
 use bytes::Bytes;
-use perturb_protocol::limits::{PICTURE_PIXELS, USUAL_PICTURE_PIXELS};
+use perturb_protocol::limits::{DEFAULT_PICTURE_PIXELS, PICTURE_PIXELS};
 use std::{collections::HashMap, sync::Arc};
 
 /// Checks an `open` of at most `most` environments.
@@ -237,11 +237,11 @@ pub fn render(n: usize, request: proto::Render) -> Result<(usize, Size), Error> 
         return Err(Error::value("render.slot", request.slot, format!("a slot of the batch, 0 … {}", n - 1)));
     }
     let pixels = |field, value| match u16::try_from(value) {
-        Ok(0) => Ok(USUAL_PICTURE_PIXELS),
+        Ok(0) => Ok(DEFAULT_PICTURE_PIXELS),
         Ok(pixels) if PICTURE_PIXELS.contains(&pixels) => Ok(pixels),
         _ => {
             let (least, most) = (PICTURE_PIXELS.start(), PICTURE_PIXELS.end());
-            let expected = format!("{least} … {most} pixels, or 0 for {USUAL_PICTURE_PIXELS}");
+            let expected = format!("{least} … {most} pixels, or 0 for {DEFAULT_PICTURE_PIXELS}");
             Err(Error::value(field, value, expected))
         }
     };

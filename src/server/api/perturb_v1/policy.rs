@@ -8,7 +8,7 @@ use crate::{
 };
 use bytes::Bytes;
 use perturb_policy::{ActionKind, CollectUntil, Inputs, Normalisers, ObservationNormaliser, PlayerState, PolicySpec};
-use perturb_protocol::player::{Unreadable, player_state, read_floats};
+use perturb_protocol::player::{DecodeError, player_state, read_floats};
 use rand_chacha::ChaCha8Rng;
 
 /// The most hidden layers of a policy …
@@ -169,7 +169,7 @@ fn weights(given: &Bytes, spec: &PolicySpec) -> Result<Vec<f32>, Error> {
 }
 
 /// What is there of it.
-fn read<'a, M, T: TryFrom<&'a M, Error = Unreadable>>(
+fn read<'a, M, T: TryFrom<&'a M, Error = DecodeError>>(
     field: &'static str,
     given: &'a Option<M>,
 ) -> Result<Option<T>, Error> {
@@ -177,9 +177,9 @@ fn read<'a, M, T: TryFrom<&'a M, Error = Unreadable>>(
 }
 
 /// Names the message that a field is of.
-fn within(message: &'static str) -> impl Fn(Unreadable) -> Error {
+fn within(message: &'static str) -> impl Fn(DecodeError) -> Error {
     move |wrong| {
-        let Unreadable { field, got, expected } = wrong.within(message);
+        let DecodeError { field, got, expected } = wrong.within(message);
         Error::value(field, got, expected)
     }
 }

@@ -1,4 +1,4 @@
-//! Waiting for servers that were lost.
+//! Reconnects to servers that were lost.
 
 use std::time::{Duration, Instant};
 
@@ -10,50 +10,50 @@ use tokio::time::sleep;
 use super::options::ServerWait;
 use super::servers::Servers;
 
-/// After the first look, which is at once, the pause before the next; it doubles with each look …
-const FIRST_PAUSE: Duration = Duration::from_millis(100);
-/// … up to this.
-const LONGEST_PAUSE: Duration = Duration::from_secs(10);
-/// How long some of several servers may stay away before the others go on without them.
-const STAYS_AWAY: Duration = Duration::from_secs(5);
-/// How often it is looked whether the program is to end.
-const TICK: Duration = Duration::from_millis(20);
+/// Pause between the first attempt, which is immediate, and the second. The pause doubles with each attempt.
+const MIN_PAUSE: Duration = Duration::from_millis(100);
+/// Upper limit of the pause between two attempts.
+const MAX_PAUSE: Duration = Duration::from_secs(10);
+/// Time after which the servers that answer go on without the others.
+const PARTIAL_RECONNECT_TIMEOUT: Duration = Duration::from_secs(5);
+/// Interval at which the stop flag is read.
+const STOP_POLL_INTERVAL: Duration = Duration::from_millis(20);
 
-/// The losses of something that goes on after them.
+/// Reconnects with growing pauses, and counts the time that was waited without progress.
 #[derive(Debug, Default)]
-pub struct Waiting {
+pub struct Backoff {
     waited: Duration,
-    looks: u32,
-    /// Whether anything was gained: then there was room once.
+    attempts: u32,
+    /// Whether any progress was made: then the servers had room once.
     has_begun: bool,
 }
 
-/// How a loss ends.
+/// The result of [`Backoff::reconnect`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum After {
-    /// There are servers again.
-    Again,
-    /// It is none, or the time is up.
-    GivenUp,
-    /// The program is to end.
+pub enum Reconnect {
+    /// Servers answer again.
+    Connected,
+    /// The error is not one that passes, or the time is up.
+    TimedOut,
+    /// The program was asked to end.
     Stopped {
         /// The signal.
         signal: i32,
     },
 }
 
-impl Waiting {
-    /// Something was gained: what is lost from now on is not lost in a row.
-    pub fn progressed(&mut self) {
+impl Backoff {
+    /// Progress was made: the next loss gets the whole wait again.
+    pub fn reset(&mut self) {
         *self = Self { has_begun: true, ..Self::default() };
     }
 
-    /// Waits for the servers that `error` speaks of, as long as [`ServerWait`] says: for all of them for some seconds, then
-    /// for any. One that has no room for what is under way, on another server before for instance, is waited for, too.
-    pub fn wait(&mut self, servers: &Servers, error: &ClientError, stop: &StopFlag) -> After {
+    /// Waits for the servers after `error`, as long as [`ServerWait`] says: for all of them for some seconds, then for any.
+    /// Also waits for a server that is full if the run had already started.
+    pub fn reconnect(&mut self, servers: &Servers, error: &ClientError, stop: &StopFlag) -> Reconnect {
         let ServerWait { limit, tell } = servers.wait();
         if !self.is_passing(error) || self.waited >= limit {
-            return After::GivenUp;
+            return Reconnect::TimedOut;
         }
         let wait = || format!("waiting for it, at most {}", duration((limit - self.waited).as_secs_f64()));
         let remedy = if servers.is_private() { "starting it again".into() } else { wait() };
@@ -61,61 +61,61 @@ impl Waiting {
         servers.block_on(async {
             tokio::select! {
                 biased;
-                signal = raised(stop) => After::Stopped { signal },
-                after = self.look(servers) => after,
+                signal = raised(stop) => Reconnect::Stopped { signal },
+                reconnect = self.retry(servers) => reconnect,
             }
         })
     }
 
-    /// Whether the same may go well later: not what is refused, unless it is for want of room where there was some.
+    /// Whether the error may pass: a server that does not answer, or one that is full although it had room before.
     fn is_passing(&self, error: &ClientError) -> bool {
-        error.is_absence() || ((self.looks > 0 || self.has_begun) && is_full(error))
+        error.is_absence() || ((self.attempts > 0 || self.has_begun) && is_full(error))
     }
 
-    async fn look(&mut self, servers: &Servers) -> After {
+    async fn retry(&mut self, servers: &Servers) -> Reconnect {
         let ServerWait { limit, tell } = servers.wait();
         let (begun, before) = (Instant::now(), self.waited);
         loop {
-            sleep(pause(self.looks).min(limit.saturating_sub(self.waited))).await;
-            self.looks += 1;
+            sleep(pause(self.attempts).min(limit.saturating_sub(self.waited))).await;
+            self.attempts += 1;
             let reached = servers.reconnect().await;
             self.waited = before + begun.elapsed();
             match reached {
-                Ok(away) if away.is_empty() => return After::Again,
-                Ok(_) if begun.elapsed() >= STAYS_AWAY.min(limit) => {
+                Ok(away) if away.is_empty() => return Reconnect::Connected,
+                Ok(_) if begun.elapsed() >= PARTIAL_RECONNECT_TIMEOUT.min(limit) => {
                     let there: Vec<String> = servers.addresses().iter().map(Address::to_string).collect();
                     tell(&format!("going on with {} alone", there.join(" and ")));
-                    return After::Again;
+                    return Reconnect::Connected;
                 }
                 Err(error @ ClientError::Unsafe { .. }) => {
                     tell(&error.to_string());
-                    return After::GivenUp;
+                    return Reconnect::TimedOut;
                 }
-                _ if self.waited >= limit => return After::GivenUp,
+                _ if self.waited >= limit => return Reconnect::TimedOut,
                 _ => {}
             }
         }
     }
 }
 
-/// Before the next look.
-fn pause(looks: u32) -> Duration {
-    let doubled = |times: u32| FIRST_PAUSE * (1 << times.min(16));
-    looks.checked_sub(1).map_or(Duration::ZERO, doubled).min(LONGEST_PAUSE)
+/// The pause before the next attempt.
+fn pause(attempts: u32) -> Duration {
+    let doubled = |times: u32| MIN_PAUSE * (1 << times.min(16));
+    attempts.checked_sub(1).map_or(Duration::ZERO, doubled).min(MAX_PAUSE)
 }
 
-/// Whether a server has no room.
+/// Whether the error says that a server has no room.
 fn is_full(error: &ClientError) -> bool {
     let (ClientError::Refused { code, .. } | ClientError::Lost { code, .. }) = error else { return false };
     *code == tonic::Code::ResourceExhausted
 }
 
-/// The signal that asks the program to end, when it comes.
+/// Waits for the signal that asks the program to end.
 async fn raised(stop: &StopFlag) -> i32 {
     loop {
         match stop.signal() {
             Some(signal) => return signal,
-            None => sleep(TICK).await,
+            None => sleep(STOP_POLL_INTERVAL).await,
         }
     }
 }
@@ -125,7 +125,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_refused_is_not_waited_for() {
+    fn refused_requests_are_not_retried() {
         let address = || "unix:/x".parse::<Address>().unwrap();
         let lost = |code| ClientError::Lost { address: address(), request: "a step", code, reason: "gone".into() };
         let refused = |code| ClientError::Refused { address: address(), request: "a step", code, message: "no".into() };
@@ -135,17 +135,17 @@ mod tests {
         assert!([Internal, Unavailable, Unknown].map(lost).iter().all(ClientError::is_absence));
         assert!(![InvalidArgument, PermissionDenied, ResourceExhausted].map(lost).iter().any(ClientError::is_absence));
         assert!(![InvalidArgument, NotFound, Unavailable].map(refused).iter().any(ClientError::is_absence));
-        let [new, mut begun] = [Waiting::default(), Waiting::default()];
-        begun.progressed();
-        let looked = Waiting { looks: 1, ..Waiting::default() };
+        let [new, mut begun] = [Backoff::default(), Backoff::default()];
+        begun.reset();
+        let looked = Backoff { attempts: 1, ..Backoff::default() };
         assert_eq!([&new, &begun, &looked].map(|one| one.is_passing(&refused(ResourceExhausted))), [false, true, true]);
         assert!(![new, begun, looked].iter().any(|one| one.is_passing(&refused(InvalidArgument))));
     }
 
     #[test]
-    fn looks_come_at_once_and_then_less_and_less_often() {
-        let pauses: Vec<u64> = (0..10).map(|looks| pause(looks).as_millis() as u64).collect();
+    fn attempts_start_at_once_and_become_rarer() {
+        let pauses: Vec<u64> = (0..10).map(|attempts| pause(attempts).as_millis() as u64).collect();
         assert_eq!(pauses, [0, 100, 200, 400, 800, 1600, 3200, 6400, 10_000, 10_000]);
-        assert_eq!(pause(u32::MAX), LONGEST_PAUSE);
+        assert_eq!(pause(u32::MAX), MAX_PAUSE);
     }
 }

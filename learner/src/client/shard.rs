@@ -1,28 +1,28 @@
-//! What one server owns of a batch.
+//! The share of a batch that one server owns.
 
 use std::ops::Range;
 
 use bytes::{Bytes, BytesMut};
-use perturb_protocol::{Address, Ask, ClientError, Connection, EndedEpisode, Stream};
+use perturb_protocol::{Address, ClientError, Connection, EndedEpisode, Stream, TypedRequest};
 
 use super::options::{OpenOptions, open_request};
 use super::reply::StepReply;
 use crate::proto::{self, AutoresetMode};
 
-/// The part of a batch that one server owns.
+/// The share of a batch that one server owns.
 #[derive(Debug)]
-pub(super) struct Part {
+pub(super) struct ServerShard {
     pub(super) stream: Stream,
-    /// Its slots.
+    /// The slots of the server.
     pub(super) range: Range<usize>,
-    /// Encoded actions; its memory comes back when a request has been sent.
+    /// Encoded actions. The buffer's memory is free again when a request has been sent.
     pub(super) actions: BytesMut,
-    /// It owes a reply.
+    /// Whether a request waits for its reply.
     pub(super) asked: bool,
 }
 
-impl Part {
-    /// Opens the slots of `range`, counted over all `options`, with a lease of so many requests that wait, or 0 for none.
+impl ServerShard {
+    /// Opens the slots of `range`, counted over all `options`. A `lease` above 0 is the number of requests that may wait.
     pub(super) async fn open(
         connection: &Connection,
         options: &[OpenOptions],
@@ -42,13 +42,13 @@ impl Part {
         Ok((Self { stream, range, actions: BytesMut::new(), asked: false }, opened))
     }
 
-    /// Those of `slots` that it owns.
+    /// The part of `slots` that this server owns.
     pub(super) fn overlap(&self, slots: &Range<usize>) -> Range<usize> {
         let start = slots.start.clamp(self.range.start, self.range.end);
         start..slots.end.clamp(start, self.range.end)
     }
 
-    /// A mask of those of `slots` that it owns; `None` if it owns none.
+    /// A mask of the `slots` that this server owns; `None` if it owns none.
     pub(super) fn mask(&self, slots: &Range<usize>) -> Option<Bytes> {
         let own = self.overlap(slots);
         (!own.is_empty()).then(|| self.range.clone().map(|slot| u8::from(own.contains(&slot))).collect())
@@ -67,7 +67,7 @@ impl Part {
         self.decode("final_observations", &stepped.final_observations, finals)?;
         for end in stepped.ended {
             let slot = start + end.slot as usize;
-            let named = self.range.contains(&slot).then(|| EndedEpisode::of(end, slot, reply.terminated[slot]));
+            let named = self.range.contains(&slot).then(|| EndedEpisode::from_proto(end, slot, reply.terminated[slot]));
             let Some(ended) = named.flatten() else {
                 let expected = "a named episode with its receipt";
                 return Err(self.mismatch(format!("an ended episode of slot {slot}"), expected.into()));
@@ -94,7 +94,7 @@ impl Part {
     }
 }
 
-/// A server that does not know what was asked for leaves it out without a word.
+/// Checks that the server observes parameters if that was asked for. An older server leaves them out without an error.
 fn check_observed(address: &Address, asked: bool, opened: &proto::Opened) -> Result<(), ClientError> {
     if opened.observes_parameters == asked {
         Ok(())
@@ -108,7 +108,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_server_that_does_not_know_parameters_as_observations_is_named() {
+    fn server_without_parameters_as_observations_is_named() {
         let address = "127.0.0.1:7447".parse().unwrap();
         let of = |asked, observes_parameters| {
             check_observed(&address, asked, &proto::Opened { observes_parameters, ..proto::Opened::default() })

@@ -1,16 +1,16 @@
-//! One environment that is looked at.
+//! A session of one environment that is rendered.
 
 use tonic::Code;
 
-use perturb_protocol::{Ask, ClientError};
+use perturb_protocol::{ClientError, TypedRequest};
 
 use super::options::OpenOptions;
-use super::part::Part;
 use super::reply::StepReply;
 use super::servers::Servers;
+use super::shard::ServerShard;
 use crate::proto::{self, AutoresetMode};
 
-/// An episode that began.
+/// The start of an episode.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct BegunEpisode {
     /// Counts the environment's episodes from 0.
@@ -23,32 +23,31 @@ pub struct BegunEpisode {
     pub parameters: Vec<f64>,
 }
 
-/// A picture of an environment.
+/// A rendered picture of an environment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Picture {
-    /// In pixels.
+    /// Pixels.
     pub width: u32,
-    /// In pixels.
+    /// Pixels.
     pub height: u32,
     /// `[height, width, 3]`: red, green, blue; the first row is the uppermost.
     pub pixels: bytes::Bytes,
 }
 
-/// One environment that waits at the end of an episode, so that its last state can be drawn.
+/// A session of one environment that waits at the end of an episode, so that its last state can be rendered.
 ///
-/// Requests are made and answered apart: a server draws while the learner computes. Answers must be taken in the order
-/// of their requests, and no more than three requests may wait for theirs.
+/// Requests and replies are separate calls: a server renders while the learner computes. Replies must be taken in the order
+/// of their requests, and at most three requests may wait for theirs.
 #[derive(Debug)]
-pub struct Single<'a> {
+pub struct RenderSession<'a> {
     servers: &'a Servers,
-    part: Part,
+    part: ServerShard,
     environment: proto::Environment,
     size: (u32, u32),
 }
 
-impl<'a> Single<'a> {
-    /// Opens one environment on the first server, whatever number `options` says, and writes its first observation
-    /// `[O]`.
+impl<'a> RenderSession<'a> {
+    /// Opens one environment on the first server, whatever `options.num_envs` is, and writes its first observation `[O]`.
     ///
     /// # Errors
     /// [`ClientError::Refused`] with the server's sentence, and the failures of a connection.
@@ -62,7 +61,7 @@ impl<'a> Single<'a> {
             let source = std::io::ErrorKind::NotConnected.into();
             return Err(ClientError::System { action: "open an environment", source });
         };
-        let opening = Part::open(connection, std::slice::from_ref(options), 0..1, AutoresetMode::Disabled, 0);
+        let opening = ServerShard::open(connection, std::slice::from_ref(options), 0..1, AutoresetMode::Disabled, 0);
         let (part, opened) = servers.runtime().block_on(opening).map_err(|error| servers.explain(error))?;
         let environment = opened.environment.unwrap_or_default();
         observation.resize(environment.observation.len(), 0.0);
@@ -72,7 +71,7 @@ impl<'a> Single<'a> {
         Ok((single, begun))
     }
 
-    /// What was opened.
+    /// The environment, as the server describes it.
     pub fn environment(&self) -> &proto::Environment {
         &self.environment
     }
@@ -86,7 +85,7 @@ impl<'a> Single<'a> {
         self.request(proto::Step { actions })
     }
 
-    /// Asks for the next episode; the trial goes on, if it has another one.
+    /// Asks for the next episode. It belongs to the same trial, unless the trial has ended.
     ///
     /// # Errors
     /// The failures of a connection.
@@ -94,7 +93,7 @@ impl<'a> Single<'a> {
         self.request(proto::Reset::default())
     }
 
-    /// Asks for a picture of so many pixels of the state after the requests before.
+    /// Asks for a picture of `width` × `height` pixels of the state after the requests before.
     ///
     /// # Errors
     /// The failures of a connection.
@@ -133,7 +132,7 @@ impl<'a> Single<'a> {
         let (width, height) = self.size;
         let rendered = match self.reply::<proto::Render>() {
             Ok(rendered) => rendered,
-            // Sizes are checked before they are sent: a server that calls the request wrong does not know it.
+            // Sizes are checked before they are sent. A server that refuses the request does not know it.
             Err(ClientError::Refused { address, request, code, message }) if code == Code::InvalidArgument => {
                 let message = format!("{message}; is the server older than this program?");
                 return Err(ClientError::Refused { address, request, code, message });
@@ -152,17 +151,17 @@ impl<'a> Single<'a> {
         Ok(Picture { width, height, pixels })
     }
 
-    fn request(&mut self, request: impl Ask) -> Result<(), ClientError> {
+    fn request(&mut self, request: impl TypedRequest) -> Result<(), ClientError> {
         let Self { servers, part, .. } = self;
         servers.runtime().block_on(part.stream.send(request)).map_err(|error| servers.explain(error))
     }
 
-    fn reply<A: Ask>(&mut self) -> Result<A::Reply, ClientError> {
+    fn reply<A: TypedRequest>(&mut self) -> Result<A::Reply, ClientError> {
         let Self { servers, part, .. } = self;
         servers.runtime().block_on(part.stream.receive::<A>()).map_err(|error| servers.explain(error))
     }
 
-    fn begun_of<A: Ask>(&self, started: Vec<proto::EpisodeStart>) -> Result<BegunEpisode, ClientError> {
+    fn begun_of<A: TypedRequest>(&self, started: Vec<proto::EpisodeStart>) -> Result<BegunEpisode, ClientError> {
         let count = started.len();
         let start = started.into_iter().next().and_then(|start| Some((start.episode?, start.receipt?)));
         let Some((episode, receipt)) = start.filter(|_| count == 1) else {
