@@ -77,7 +77,8 @@ fn recurrent(task: &str, observation_size: usize, action: ActionKind) {
         let mut actor = Actor::new(policy.spec(), n_envs);
         actor.load_flat(policy.flat_weights()).expect("weights that fit");
         let rows = observations(n_envs * observation_size);
-        let (mut rng, mut acts) = (stream(1, Purpose::Actions), ActorOutput::new(action, n_envs));
+        let mut rng = stream(1, Purpose::Actions);
+        let mut acts = ActorOutput::new(action, n_envs);
         time(&format!("act_rc/{task}/{n_envs}"), 300, || {
             actor.act(&rows, &mut rng, &mut acts).expect("actions");
             assert_eq!(acts.values.len(), n_envs);
@@ -122,7 +123,8 @@ fn main() {
             let mut actor = Actor::new(policy.spec(), n_envs);
             actor.load_flat(policy.flat_weights()).expect("weights that fit");
             let rows = observations(n_envs * observation_size);
-            let (mut rng, mut acts) = (stream(1, Purpose::Actions), ActorOutput::new(action, n_envs));
+            let mut rng = stream(1, Purpose::Actions);
+            let mut acts = ActorOutput::new(action, n_envs);
             time(&format!("act/{task}/{n_envs}"), 2000, || {
                 actor.act(&rows, &mut rng, &mut acts).expect("actions");
                 assert_eq!(acts.values.len(), n_envs);

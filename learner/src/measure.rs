@@ -198,7 +198,8 @@ impl Meter {
 /// Seconds of a step in tests. A test steps all environments until the last has finished its episode.
 fn measure_test(servers: &Servers, cell: &Cell, checkpoint: &Checkpoint, stop: &StopFlag) -> Result<f64, MeasureError> {
     let episodes = cell.tests.episodes.min(TEST_EPISODES);
-    let (seed, success) = (cell.config.common.seed, cell.tests.success.clone());
+    let seed = cell.config.common.seed;
+    let success = cell.tests.success.clone();
     let options = TestOptions { episodes, seed, selects: false, success };
     let sets = &cell.tests.sets[..1.min(cell.tests.sets.len())];
     let start = Instant::now();

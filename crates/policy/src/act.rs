@@ -145,7 +145,8 @@ impl Actor {
     /// Row n belongs to environment n: a recurrent policy adds the observation to that environment's memory.
     pub fn act(&mut self, observations: &[f32], streams: &mut impl Streams, out: &mut ActorOutput) -> Result<()> {
         let n_envs = self.count(observations)?;
-        let (width, outputs) = (self.spec.action.width(), self.spec.action.outputs());
+        let width = self.spec.action.width();
+        let outputs = self.spec.action.outputs();
         let (heads, values) = match &mut self.network {
             Network::FeedForward(network) => network.act(observations, n_envs),
             Network::Recurrent(network) => network.advance(observations, n_envs),
@@ -155,7 +156,8 @@ impl Actor {
         out.log_probs.resize(n_envs, 0.0);
         replace_by_first_column(&mut out.values, values, n_envs);
         for n in 0..n_envs {
-            let (head, action) = (&heads.row(n)[..outputs], &mut out.actions[n * width..][..width]);
+            let head = &heads.row(n)[..outputs];
+            let action = &mut out.actions[n * width..][..width];
             let rng = streams.stream(n);
             let log_prob = match self.spec.action {
                 ActionKind::Discrete { .. } => {

@@ -126,7 +126,8 @@ impl FeedForward {
         self.cached = self.cached.filter(|cached| cached + n <= self.max_cached);
         let first = self.cached.unwrap_or(0);
         let rows = first..first + n;
-        let (network, activations) = (&self.networks.value, &mut self.activations);
+        let network = &self.networks.value;
+        let activations = &mut self.activations;
         activations.observations.copy(first, observations, self.observation_size);
         let Activations { observations, value_layers, .. } = activations;
         run(Forward { network, inputs: observations, rows: rows.clone(), outputs: value_layers });

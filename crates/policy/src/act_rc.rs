@@ -41,7 +41,8 @@ pub(crate) struct Recurrent {
 
 impl Recurrent {
     pub(crate) fn new(spec: &PolicySpec, width: usize, max_batch: usize) -> Self {
-        let (hidden_size, n_outputs) = (spec.hidden_size(), spec.action.outputs());
+        let hidden_size = spec.hidden_size();
+        let n_outputs = spec.action.outputs();
         let rows = |length| Rows::new(max_batch, length);
         let hidden = Perceptron::new(&spec.hidden_layers(), true);
         Recurrent {
@@ -127,8 +128,10 @@ struct Step<'a> {
 impl Kernel for Step<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let (network, n) = (self.network, self.n);
-        let (inputs, outputs) = (&network.observations, &mut network.hidden_layers[..]);
+        let network = self.network;
+        let n = self.n;
+        let inputs = &network.observations;
+        let outputs = &mut network.hidden_layers[..];
         call(simd, Forward { network: &network.hidden, inputs, rows: 0..n, outputs });
         let x = network.hidden_layers.last().unwrap_or(&network.observations);
         for row in 0..n {

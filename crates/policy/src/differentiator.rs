@@ -166,11 +166,15 @@ impl Differentiator {
         }
         let (mean, scale) = if objective.normalize_advantages { samples.mean_and_scale(indices) } else { (0.0, 1.0) };
         let Self { spec, networks, gaussian, parts, threads, .. } = self;
-        let (spec, networks, gaussian, n) = (&*spec, &*networks, &*gaussian, indices.len());
+        let spec = &*spec;
+        let networks = &*networks;
+        let gaussian = &*gaussian;
+        let n = indices.len();
         let size = n.div_ceil(n_parts);
         let work = |place: usize, part: &mut Part, gradient: Option<&mut [f32]>| {
             let Part { block, gradient: own, losses } = part;
-            let (sums, first) = (gradient.unwrap_or(own), place * size);
+            let sums = gradient.unwrap_or(own);
+            let first = place * size;
             let indices = &indices[first..n.min(first + size)];
             let shared = Shared { spec, networks, gaussian, weights, samples, is_computed, objective, mean, scale, n };
             run(Differentiation { shared, indices, block, sums, losses });
@@ -217,7 +221,8 @@ impl Differentiator {
         check_length("observations [B, O]", observations.len(), observations.len() / size * size)?;
         self.make_parts(1);
         self.computed = 0;
-        let (activations, networks) = (&mut self.parts[0].block.activations, &self.networks);
+        let activations = &mut self.parts[0].block.activations;
+        let networks = &self.networks;
         let Activations { observations: rows, policy_layers, .. } = activations;
         outputs.clear();
         for block in observations.chunks(BLOCK * size) {
@@ -328,17 +333,21 @@ impl Differentiation<'_> {
         let Activations { observations, policy_layers, value_layers } = activations;
         let Shared { spec, networks, gaussian, weights, samples, is_computed, objective, mean, scale, n: of } =
             &self.shared;
-        let (size, n) = (spec.observation_size, indices.len());
+        let size = spec.observation_size;
+        let n = indices.len();
         if !is_computed {
             for (b, &i) in indices.iter().enumerate() {
                 observations.row_mut(b)[..size].copy_from_slice(&samples.observations[i as usize * size..][..size]);
             }
-            let (inputs, rows) = (&*observations, 0..n);
+            let inputs = &*observations;
+            let rows = 0..n;
             call(simd, Forward { network: &networks.policy, inputs, rows: rows.clone(), outputs: policy_layers });
             call(simd, Forward { network: &networks.value, inputs, rows, outputs: value_layers });
         }
-        let (heads, values) = (&policy_layers[policy_layers.len() - 1], &value_layers[value_layers.len() - 1]);
-        let (n_outputs, width) = (spec.action.outputs(), spec.action.width());
+        let heads = &policy_layers[policy_layers.len() - 1];
+        let values = &value_layers[value_layers.len() - 1];
+        let n_outputs = spec.action.outputs();
+        let width = spec.action.width();
         let (policy_sums, rest) = self.sums.split_at_mut(through_policy.n_weights());
         let (value_sums, by_log_std) = rest.split_at_mut(through_value.n_weights());
         if !ADD {

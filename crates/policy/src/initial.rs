@@ -47,7 +47,8 @@ fn gain(spec: &PolicySpec, name: &str) -> f64 {
 /// The second pass of Gram-Schmidt removes what rounding left of the first, so that Wᵀ W = gain² I holds to the
 /// rounding of the result to f32.
 fn orthogonal(rows: usize, columns: usize, gain: f64, rng: &mut ChaCha8Rng) -> Vec<f32> {
-    let (count, length) = (rows.min(columns), rows.max(columns));
+    let count = rows.min(columns);
+    let length = rows.max(columns);
     let mut vectors: Vec<Vec<f64>> = Vec::with_capacity(count);
     for _ in 0..count {
         let mut vector: Vec<f64> = (0..length).map(|_| normal(rng)).collect();
@@ -78,7 +79,8 @@ mod tests {
     fn the_shorter_side_is_orthogonal() {
         for (rows, columns, gain) in [(64, 64, HIDDEN_GAIN), (64, 4, HIDDEN_GAIN), (3, 64, POLICY_GAIN), (1, 64, 1.0)] {
             let weights = orthogonal(rows, columns, gain, &mut stream(1, Purpose::Weights));
-            let (count, length) = (rows.min(columns), rows.max(columns));
+            let count = rows.min(columns);
+            let length = rows.max(columns);
             let at = |i: usize, k: usize| {
                 f64::from(if rows <= columns { weights[i * columns + k] } else { weights[k * columns + i] })
             };

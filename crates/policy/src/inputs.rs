@@ -82,7 +82,8 @@ impl Inputs {
         if self.extra == 0 {
             return Ok(());
         }
-        let (n_envs, width) = (self.previous.len() / self.extra, self.action.width());
+        let n_envs = self.previous.len() / self.extra;
+        let width = self.action.width();
         check_length("actions [N, A]", acts.actions.len(), n_envs * width)?;
         check_length("rewards [N]", rewards.len(), n_envs)?;
         check_length("done [N]", done.len(), n_envs)?;

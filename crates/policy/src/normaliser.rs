@@ -70,7 +70,8 @@ impl RunningMoments {
     }
 
     fn merge_element(&mut self, i: usize, count: u64, mean: f64, squares: f64) {
-        let (a, b) = (self.count as f64, count as f64);
+        let a = self.count as f64;
+        let b = count as f64;
         let delta = mean - self.mean[i];
         self.mean[i] += delta * b / (a + b);
         self.squares[i] += squares + delta * delta * a * b / (a + b);
@@ -194,7 +195,8 @@ impl ObservationNormaliser {
         let size = self.observation_size();
         check_length("observations [N, O]", observations.len(), observations.len() / size * size)?;
         for i in 0..self.moments.mean.len() {
-            let (mean, scale) = (self.moments.mean[i], scale(self.moments.variance(i)));
+            let mean = self.moments.mean[i];
+            let scale = scale(self.moments.variance(i));
             for x in observations.iter_mut().skip(i).step_by(size) {
                 *x = ((f64::from(*x) - mean) * scale).clamp(-CLIP, CLIP) as f32;
             }

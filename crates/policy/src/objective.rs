@@ -142,7 +142,8 @@ impl Objective {
                 let entropy = -by_head.iter().zip(head).map(|(p, &logit)| p * log_prob(logit)).sum::<f32>();
                 losses.entropy = f64::from(entropy);
                 for (j, (by, &logit)) in by_head.iter_mut().zip(head).enumerate() {
-                    let (p, hit) = (*by, if j == chosen { 1.0 } else { 0.0 });
+                    let p = *by;
+                    let hit = if j == chosen { 1.0 } else { 0.0 };
                     *by = by_log_prob * (hit - p) - by_entropy * p * (log_prob(logit) + entropy);
                 }
                 if let Some((acting, _)) = sample.acting {
@@ -168,13 +169,18 @@ impl Objective {
                 let by_log_prob = share * self.policy_loss(log_prob, sample, &mut losses);
                 losses.entropy = f64::from(entropy);
                 for i in 0..head.len() {
-                    let (action, mean, log_std, scale) = (sample.action[i], head[i], log_std[i], inverse_std[i]);
-                    let (by_mean, by_log_std) = (&mut by_head[i], &mut by_log_std[i]);
+                    let action = sample.action[i];
+                    let mean = head[i];
+                    let log_std = log_std[i];
+                    let scale = inverse_std[i];
+                    let by_mean = &mut by_head[i];
+                    let by_log_std = &mut by_log_std[i];
                     let distance = (action - mean) * scale;
                     *by_mean = by_log_prob * distance * scale;
                     *by_log_std += by_log_prob * (distance * distance - 1.0) + by_entropy;
                     if let Some((means, log_stds)) = sample.acting {
-                        let (shift, old) = ((means[i] - mean) * scale, exp(log_stds[i] - log_std));
+                        let shift = (means[i] - mean) * scale;
+                        let old = exp(log_stds[i] - log_std);
                         let spread = old * old + shift * shift;
                         losses.kl_divergence += f64::from(log_std - log_stds[i] + 0.5 * spread - 0.5);
                         *by_mean -= by_divergence * shift * scale;

@@ -60,7 +60,8 @@ impl UpdateRule {
 
     /// Adam with ε for `n_weights`.
     pub fn adam(epsilon: f64, n_weights: usize) -> Self {
-        let (mean, mean_square) = (vec![0.0; n_weights], vec![0.0; n_weights]);
+        let mean = vec![0.0; n_weights];
+        let mean_square = vec![0.0; n_weights];
         UpdateRule::Adam(Adam { epsilon: epsilon as f32, mean, mean_square })
     }
 
@@ -120,7 +121,9 @@ impl Kernel for RmsPropStep<'_> {
     fn run<S: Simd>(self, _: S) {
         let RmsProp { alpha, epsilon, mean_square } = self.state;
         let Step { learning_rate, weights, gradient, scale, keep } = self.step;
-        let (alpha, epsilon, learning_rate) = (*alpha, *epsilon, learning_rate as f32);
+        let alpha = *alpha;
+        let epsilon = *epsilon;
+        let learning_rate = learning_rate as f32;
         for ((w, s), g) in weights.iter_mut().zip(mean_square).zip(gradient) {
             let g = scale * g;
             *s = alpha * *s + (1.0 - alpha) * g * g;
@@ -142,8 +145,10 @@ impl Kernel for AdamStep<'_> {
         let t = (self.update + 1) as f64;
         let step_size = (learning_rate / (1.0 - libm::pow(BETA_1, t))) as f32;
         let root_correction = (1.0 / (1.0 - libm::pow(BETA_2, t)).sqrt()) as f32;
-        let (beta_1, rest_1) = (BETA_1 as f32, (1.0 - BETA_1) as f32);
-        let (beta_2, rest_2) = (BETA_2 as f32, (1.0 - BETA_2) as f32);
+        let beta_1 = BETA_1 as f32;
+        let rest_1 = (1.0 - BETA_1) as f32;
+        let beta_2 = BETA_2 as f32;
+        let rest_2 = (1.0 - BETA_2) as f32;
         let Adam { epsilon, mean, mean_square } = self.state;
         let epsilon = *epsilon;
         for ((w, (m, v)), g) in weights.iter_mut().zip(mean.iter_mut().zip(mean_square)).zip(gradient) {

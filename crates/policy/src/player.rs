@@ -343,7 +343,8 @@ impl Player {
         self.previous.take(outcome, self.episodes_per_trial);
 
         let Self { actor, inputs, role, normalisers, previous, observations, .. } = self;
-        let (statistics, stepped) = (role.statistics(), remaining.and_then(Remaining::stepped));
+        let statistics = role.statistics();
+        let stepped = remaining.and_then(Remaining::stepped);
         observations.copy_from_slice(outcome.observations);
         normalisers.take_rewards(&mut previous.rewards, &previous.trial_ended, statistics, stepped)?;
         normalisers.take_observations(observations, statistics, remaining.and_then(Remaining::active))?;

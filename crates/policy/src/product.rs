@@ -95,7 +95,8 @@ impl<'a> Factor<'a> {
     ) {
         let whole = self.outputs / LANES;
         let few = if rows.len() % 8 < 4 { rows.len() % 8 } else { 0 };
-        let (many, few) = (rows.start..rows.end - few, rows.end - few..rows.end);
+        let many = rows.start..rows.end - few;
+        let few = rows.end - few..rows.end;
         for column in 0..whole {
             self.columns::<S, true>(simd, from, many.clone(), start, to, column);
         }
@@ -271,8 +272,10 @@ fn transpose_tile(rows: [[f32; 4]; 4]) -> [[f32; 4]; 4] {
     #[cfg(target_arch = "x86_64")]
     if let Some(sse) = pulp::core_arch::x86::Sse::try_new() {
         let [a, b, c, d] = rows.map(pulp::cast::<_, std::arch::x86_64::__m128>);
-        let (low, high) = (sse._mm_unpacklo_ps(a, b), sse._mm_unpackhi_ps(a, b));
-        let (low_2, high_2) = (sse._mm_unpacklo_ps(c, d), sse._mm_unpackhi_ps(c, d));
+        let low = sse._mm_unpacklo_ps(a, b);
+        let high = sse._mm_unpackhi_ps(a, b);
+        let low_2 = sse._mm_unpacklo_ps(c, d);
+        let high_2 = sse._mm_unpackhi_ps(c, d);
         return [
             pulp::cast(sse._mm_movelh_ps(low, low_2)),
             pulp::cast(sse._mm_movehl_ps(low_2, low)),
@@ -323,7 +326,8 @@ fn outer_here<S: Simd, const ADD: bool>(
     inputs: &Rows,
     n: usize,
 ) {
-    let (eights, rest) = (sums.len() / size / 8 * 8, sums.len() / size % 8);
+    let eights = sums.len() / size / 8 * 8;
+    let rest = sums.len() / size % 8;
     for column in 0..size / LANES {
         for first in (0..eights).step_by(8) {
             outers::<S, 8, ADD, true>(simd, sums, size, (deltas, first), (inputs, column), n);
@@ -453,11 +457,14 @@ mod tests {
         let flat = numbers(INPUTS * OUTPUTS, 1);
         let mut matrix = Matrix::new(INPUTS, OUTPUTS);
         matrix.load(0, &flat, OUTPUTS);
-        let (mut from, mut to, mut back) = (Rows::new(n, INPUTS), Rows::new(n, OUTPUTS), Rows::new(n, INPUTS));
+        let mut from = Rows::new(n, INPUTS);
+        let mut to = Rows::new(n, OUTPUTS);
+        let mut back = Rows::new(n, INPUTS);
         from.copy(0, &numbers(n * INPUTS, 2), INPUTS);
         let mut start = [[0.0; LANES]; lanes(OUTPUTS)];
         start.as_flattened_mut()[..OUTPUTS].copy_from_slice(&numbers(OUTPUTS, 3));
-        let (mut outer, mut sum) = (vec![f32::NAN; INPUTS * OUTPUTS], vec![f32::NAN; OUTPUTS]);
+        let mut outer = vec![f32::NAN; INPUTS * OUTPUTS];
+        let mut sum = vec![f32::NAN; OUTPUTS];
         run(Products {
             matrix: &matrix,
             flat: &flat,
@@ -476,9 +483,13 @@ mod tests {
 
     /// The result by the definitions, one number after the other.
     fn naive(n: usize) -> Vec<u32> {
-        let (matrix, rows, start) = (numbers(INPUTS * OUTPUTS, 1), numbers(n * INPUTS, 2), numbers(OUTPUTS, 3));
-        let (mut to, mut back) = (vec![0.0; n * OUTPUTS], vec![0.0; n * INPUTS]);
-        let (mut outer, mut sum) = (vec![0.0; INPUTS * OUTPUTS], vec![0.0; OUTPUTS]);
+        let matrix = numbers(INPUTS * OUTPUTS, 1);
+        let rows = numbers(n * INPUTS, 2);
+        let start = numbers(OUTPUTS, 3);
+        let mut to = vec![0.0; n * OUTPUTS];
+        let mut back = vec![0.0; n * INPUTS];
+        let mut outer = vec![0.0; INPUTS * OUTPUTS];
+        let mut sum = vec![0.0; OUTPUTS];
         for twice in [false, true] {
             for (b, row) in rows.chunks_exact(INPUTS).enumerate() {
                 for o in 0..OUTPUTS {

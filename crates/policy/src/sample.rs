@@ -67,7 +67,9 @@ mod tests {
 
     #[test]
     fn uniform_actions_fill_the_box_evenly() {
-        let (middles, half, draws) = ([0.0f32, 3.0], [2.0f32, 0.5], 100_000);
+        let middles = [0.0f32, 3.0];
+        let half = [2.0f32, 0.5];
+        let draws = 100_000;
         let mut rng = stream(1, Purpose::Actions);
         let mut counts = [[0u32; 10]; 2];
         for _ in 0..draws {
@@ -91,7 +93,8 @@ mod tests {
         let logits = [0.3f32, -1.2, 1.1];
         let total: f64 = logits.iter().map(|&l| f64::from(l).exp()).sum();
         let mut rng = stream(5, Purpose::Actions);
-        let (mut counts, draws) = ([0u32; 3], 100_000);
+        let mut counts = [0u32; 3];
+        let draws = 100_000;
         for _ in 0..draws {
             let (choice, log_prob) = sample_categorical(&logits, &mut rng);
             counts[choice] += 1;
@@ -108,9 +111,13 @@ mod tests {
 
     #[test]
     fn samples_have_the_mean_and_deviation_of_their_gaussian() {
-        let (means, log_std) = ([0.5f32, -2.0], [0.3f32, -1.0]);
+        let means = [0.5f32, -2.0];
+        let log_std = [0.3f32, -1.0];
         let mut rng = stream(6, Purpose::Actions);
-        let (draws, mut sums, mut squares, mut product) = (100_000, [0.0; 2], [0.0; 2], 0.0);
+        let draws = 100_000;
+        let mut sums = [0.0; 2];
+        let mut squares = [0.0; 2];
+        let mut product = 0.0;
         for _ in 0..draws {
             let mut action = [0.0; 2];
             sample_gaussian(&means, &log_std, &mut rng, &mut action);

@@ -86,7 +86,8 @@ mod tests {
 
     /// Waits for an event that comes after `time`. Returns how often it was polled.
     async fn polls(spin: &mut AdaptiveSpin, time: Duration) -> usize {
-        let (mut polls, mut timer) = (0, pin!(tokio::time::sleep(time)));
+        let mut polls = 0;
+        let mut timer = pin!(tokio::time::sleep(time));
         let event = poll_fn(|context| {
             polls += 1;
             if time.is_zero() { Poll::Ready(()) } else { timer.as_mut().poll(context) }
@@ -127,7 +128,8 @@ mod tests {
             let busy = Arc::downgrade(&busy);
             thread::spawn(move || while busy.strong_count() > 0 {});
         }
-        let (mut polite, mut other) = (AdaptiveSpin::default(), AdaptiveSpin::default());
+        let mut polite = AdaptiveSpin::default();
+        let mut other = AdaptiveSpin::default();
         polite.back_off_when_contended();
         let begun = Instant::now();
         while polite.blocking_waits == 0 || !other.was_contended {

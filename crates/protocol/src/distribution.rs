@@ -131,7 +131,8 @@ impl Distribution {
     /// drawn: R and E, which touch, do not overlap. A fixed value overlaps an interval whose end it is.
     pub fn overlaps(&self, other: &Self) -> bool {
         let meet = |one: &Interval, other: &Interval| {
-            let (low, high) = (one.low.max(other.low), one.high.min(other.high));
+            let low = one.low.max(other.low);
+            let high = one.high.min(other.high);
             let is_fixed = one.low == one.high || other.low == other.high;
             low < high || (is_fixed && low == high)
         };
@@ -252,7 +253,8 @@ mod tests {
             ("0..1,2..3", "0..3", true, true),
             ("0..1,2..3", "1..2", false, false),
         ] {
-            let (a, b) = (of(one), of(other));
+            let a = of(one);
+            let b = of(other);
             assert_eq!((a.is_within(&b), a.overlaps(&b)), (within, overlaps), "{one} and {other}");
             assert_eq!(a.overlaps(&b), b.overlaps(&a), "{one} and {other}");
         }

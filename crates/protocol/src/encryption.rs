@@ -79,7 +79,8 @@ impl Connector {
         config.alpn_protocols = vec![b"h2".to_vec()];
         let name =
             ServerName::try_from(name.to_owned()).map_err(|_| format!("`{name}` can be no certificate's name"))?;
-        let (host, failure) = (host.to_owned(), Arc::default());
+        let host = host.to_owned();
+        let failure = Arc::default();
         Ok(Self { host, port, name, config: Arc::new(config), shows_certificate, failure })
     }
 

@@ -180,7 +180,9 @@ pub(crate) fn system_words(error: &(dyn std::error::Error + 'static)) -> Option<
 
 pub(crate) fn lost(address: &Address, request: &'static str, status: &Status) -> ClientError {
     if status.code() == Code::Unauthenticated {
-        let (address, code, message) = (address.clone(), status.code(), describe(status));
+        let address = address.clone();
+        let code = status.code();
+        let message = describe(status);
         return ClientError::Refused { address, request, code, message };
     }
     ClientError::Lost { address: address.clone(), request, code: status.code(), reason: describe(status) }

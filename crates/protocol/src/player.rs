@@ -63,7 +63,8 @@ impl TryFrom<&proto::Moments> for RunningMoments {
         if moments.count > MAX_COUNT {
             return Err(DecodeError::new("count", moments.count.to_string(), "at most 2^53"));
         }
-        let (mean, squares) = (read_doubles("mean", &moments.mean)?, read_doubles("squares", &moments.squares)?);
+        let mean = read_doubles("mean", &moments.mean)?;
+        let squares = read_doubles("squares", &moments.squares)?;
         Ok(Self::from_parts(moments.count, mean, squares))
     }
 }
@@ -85,7 +86,8 @@ pub fn observation_normaliser(
 
 impl From<&RewardNormaliser> for proto::RewardMoments {
     fn from(rewards: &RewardNormaliser) -> Self {
-        let (returns, moments) = (doubles(rewards.returns()), Some(rewards.moments().into()));
+        let returns = doubles(rewards.returns());
+        let moments = Some(rewards.moments().into());
         Self { gamma: rewards.gamma(), returns, moments, runs_on: rewards.runs_on() }
     }
 }
@@ -105,7 +107,8 @@ impl TryFrom<&proto::RewardMoments> for RewardNormaliser {
 impl From<&ChaCha8Rng> for proto::RandomStream {
     /// Converts a stream. Positions are modulo 2^64 words.
     fn from(stream: &ChaCha8Rng) -> Self {
-        let (key, position) = (stream.get_seed().to_vec().into(), stream.get_word_pos() as u64);
+        let key = stream.get_seed().to_vec().into();
+        let position = stream.get_word_pos() as u64;
         Self { key, stream: stream.get_stream(), position }
     }
 }

@@ -138,7 +138,8 @@ impl Process {
 fn own_directory(path: &Path) -> std::io::Result<()> {
     match DirBuilder::new().mode(0o700).create(path) {
         Err(error) if error.kind() == ErrorKind::AlreadyExists => {
-            let (there, own) = (path.symlink_metadata()?, Path::new("/proc/self").metadata()?.uid());
+            let there = path.symlink_metadata()?;
+            let own = Path::new("/proc/self").metadata()?.uid();
             let is_own = there.is_dir() && there.uid() == own && there.mode().trailing_zeros() >= 6;
             if is_own { Ok(()) } else { Err(ErrorKind::PermissionDenied.into()) }
         }

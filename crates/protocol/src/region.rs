@@ -141,7 +141,8 @@ mod tests {
     #[test]
     fn mixture_of_r_and_e_is_in_neither() {
         let mixed = region(Version::R, &[("length", "0.2..0.3")]);
-        let (r, e) = (region(Version::R, &[]), region(Version::E, &[]));
+        let r = region(Version::R, &[]);
+        let e = region(Version::E, &[]);
         assert!(!mixed.is_within([&r, &e]) && !mixed.overlaps(&r) && !mixed.overlaps(&e));
         assert_eq!(mixed.to_string(), "length [0.2, 0.3], mass [0.5, 2]");
     }

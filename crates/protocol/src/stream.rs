@@ -130,7 +130,9 @@ impl Stream {
     pub async fn open(connection: &Connection, open: proto::Open) -> Result<(Self, proto::Opened), ClientError> {
         let raw = RawStream::begin(connection, open, 0).await?;
         let raw = raw.map_err(|status| lost(connection.address(), proto::Open::NAME, &status))?;
-        let (connection, arrived, spin) = (connection.clone(), VecDeque::new(), AdaptiveSpin::default());
+        let connection = connection.clone();
+        let arrived = VecDeque::new();
+        let spin = AdaptiveSpin::default();
         let mut stream = Self { connection, raw, arrived, spin, lease: None };
         let opened = stream.receive::<proto::Open>().await?;
         stream.lease = Lease::from_proto(&opened);

@@ -35,7 +35,8 @@ impl TensorBatch {
             Some(lengths) => sequences.with_lengths(lengths)?,
             None => sequences,
         };
-        let (n_steps, count) = (sequences.n_steps(), sequences.count());
+        let n_steps = sequences.n_steps();
+        let count = sequences.count();
         let shaped = |data: &[f32]| Tensor::f_of_slice(data)?.f_view((n_steps, count));
         Ok(TensorBatch {
             actions: Tensor::f_of_slice(samples.actions)?.f_view((n_steps, count, spec.action.width() as i64))?,

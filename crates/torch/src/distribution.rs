@@ -65,7 +65,8 @@ pub(super) fn categorical(logits: &Tensor, actions: &Tensor) -> (Tensor, Tensor)
 /// Log-densities `[B]` of `actions` `[B, A]` and differential entropies `[B]` of the Gaussians of `means` `[B, A]` and
 /// `log_std` `[A]`.
 pub(super) fn gaussian(means: &Tensor, log_std: &Tensor, actions: &Tensor) -> (Tensor, Tensor) {
-    let (batch, size) = (means.size()[0], means.size()[1] as f64);
+    let batch = means.size()[0];
+    let size = means.size()[1] as f64;
     let distances = (actions - means) * (-log_std).exp();
     let sum_log_std = log_std.sum(Kind::Float);
     let squares = distances.square().sum_dim_intlist(Some([-1i64].as_slice()), false, Kind::Float);

@@ -57,7 +57,8 @@ fn clipped_surrogate(log_probs: &Tensor, targets: &Targets, advantages: &Tensor,
     let against = -advantages;
     let free = &against * &ratio;
     let clipped = against * ratio.clamp(1.0 - range, 1.0 + range);
-    let (log_ratio, ratio) = (log_ratio.detach(), ratio.detach() - 1.0);
+    let log_ratio = log_ratio.detach();
+    let ratio = ratio.detach() - 1.0;
     let outside = ratio.abs().gt(range).to_kind(Kind::Float);
     [free.maximum(&clipped), ratio - log_ratio, outside].map(|terms| terms.mean(Kind::Float))
 }
@@ -95,7 +96,8 @@ mod tests {
 
     #[test]
     fn losses_agree_with_numpy() {
-        let (log_probs, values) = (tensor("losses", "log_probs"), tensor("losses", "values"));
+        let log_probs = tensor("losses", "log_probs");
+        let values = tensor("losses", "values");
         let targets = targets();
         let surrogate = clipped_surrogate(&log_probs, &targets, &targets.advantages, 0.2);
         for (got, name) in surrogate.iter().zip(["clipped_surrogate", "approx_kl", "clip_fraction"]) {

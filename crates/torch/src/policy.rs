@@ -86,7 +86,8 @@ impl TorchPolicy {
     /// If a shape is another, or a discrete action is not in 0 … n-1.
     pub fn evaluate(&self, sequences: &Sequences, actions: &Tensor) -> Evaluated {
         let (outputs, values, tape) = self.forward(sequences);
-        let (outputs, values) = (sequences.without_padding(outputs), sequences.without_padding(values));
+        let outputs = sequences.without_padding(outputs);
+        let values = sequences.without_padding(values);
         let actions = sequences.without_padding(actions.view((-1, self.spec.action.width() as i64)));
         let distributions = self.distributions_of(outputs);
         let (log_probs, entropy) = match &distributions.log_std {

@@ -77,7 +77,8 @@ pub(super) fn forward(
     plain: bool,
 ) -> (Tensor, Tensor, Option<Tape>) {
     let places = Places::new(spec);
-    let (input, recurrent) = (&leaves[places.input], &leaves[places.recurrent]);
+    let input = &leaves[places.input];
+    let recurrent = &leaves[places.recurrent];
     let x = perceptron(&leaves[..places.input], &sequences.flat_observations(), true);
     let driven = x.linear(input, Some(&leaves[places.bias]));
     let (hidden, tape) = if plain {
@@ -95,7 +96,9 @@ pub(super) fn forward(
 
 /// The loop over time, for autograd: h `[L·M, H]`.
 fn unrolled(driven: &Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tensor {
-    let (steps, count, width) = (sequences.n_steps(), sequences.count(), recurrent.size()[1]);
+    let steps = sequences.n_steps();
+    let count = sequences.count();
+    let width = recurrent.size()[1];
     let keep = sequences.keep();
     let (mut h, mut c) = sequences.initial_memory(width);
     let driven = driven.view((steps, count, 4 * width));
@@ -114,14 +117,18 @@ fn unrolled(driven: &Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tenso
 
 /// The loop over time, without a graph.
 fn run(driven: Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tape {
-    let (steps, count, width) = (sequences.n_steps(), sequences.count(), recurrent.size()[1]);
+    let steps = sequences.n_steps();
+    let count = sequences.count();
+    let width = recurrent.size()[1];
     let keep = sequences.keep();
     let starts = sequences.steps_with_starts();
     let transposed = recurrent.tr();
     let (mut h, mut c) = sequences.initial_memory(width);
     let gates = driven.detach().copy().view((steps, count, 4 * width));
-    let (mut hidden, mut hidden_before) = (Vec::with_capacity(starts.len()), Vec::with_capacity(starts.len()));
-    let (mut cells, mut cells_before) = (Vec::with_capacity(starts.len()), Vec::with_capacity(starts.len()));
+    let mut hidden = Vec::with_capacity(starts.len());
+    let mut hidden_before = Vec::with_capacity(starts.len());
+    let mut cells = Vec::with_capacity(starts.len());
+    let mut cells_before = Vec::with_capacity(starts.len());
     for (t, &any_start) in (0..steps).zip(&starts) {
         if any_start {
             let keep = keep.select(0, t);
@@ -175,7 +182,10 @@ fn deltas(recurrent: &Tensor, of_hidden: &Tensor, tape: &Tape) -> Tensor {
     let [steps, count, width] = [0, 1, 2].map(|axis: usize| tape.cells.size()[axis]);
     let of_hidden = of_hidden.view((steps, count, width));
     let block = |k: i64| tape.gates.narrow(2, k * width, width);
-    let (i, f, g, o) = (block(0), block(1), block(2), block(3));
+    let i = block(0);
+    let f = block(1);
+    let g = block(2);
+    let o = block(3);
     let tanh_c = tape.cells.tanh();
     let slope = |sigmoid: &Tensor| sigmoid * (1f64 - sigmoid);
     let tanh_slope = |tanh: &Tensor| 1f64 - tanh.square();

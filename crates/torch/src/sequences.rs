@@ -64,7 +64,8 @@ impl Sequences {
         check_length("observations [T, N, O]", observations.len(), starts.len() * spec.observation_size)?;
         check_length("memory [N, S]", memory.len(), n_envs * spec.memory_size())?;
         let (steps, count) = if spec.lstm.is_some() { (n_steps, n_envs) } else { (1, starts.len()) };
-        let (steps, count) = (steps as i64, count as i64);
+        let steps = steps as i64;
+        let count = count as i64;
         Ok(Sequences {
             observations: Tensor::f_of_slice(observations)?.f_view((steps, count, spec.observation_size as i64))?,
             starts: Tensor::f_of_slice(starts)?.f_to_kind(Kind::Float)?.f_view((steps, count))?,

@@ -87,7 +87,8 @@ fn alone(name: &str, servers: &Servers) -> Result<()> {
 
 /// Steps of all cells between two moments, over the time between. Each group has a server, as in `perturb run`.
 fn together(name: &str, settings: &str, cells: usize) -> Result<()> {
-    let (stop, start) = (StopFlag::default(), Instant::now());
+    let stop = StopFlag::default();
+    let start = Instant::now();
     let group = |group: usize| {
         let server = PrivateServer::start(Some(1))?;
         let seeds = (group * cells / GROUPS)..((group + 1) * cells / GROUPS);
@@ -120,7 +121,8 @@ fn group_of(
         |(directory, seed)| Ok(Entry { directory, start: Start::Fresh(Box::new(config(settings, seed)?)), marks: &[] });
     let entries: Vec<Entry<'_>> = directories.iter().zip(seeds.clone()).map(entry).collect::<Result<_>>()?;
     let mut steps = vec![0; seeds.len()];
-    let (mut before, mut after) = (None, None);
+    let mut before = None;
+    let mut after = None;
     let mut failure = None;
     train_together(
         &servers,

@@ -41,7 +41,8 @@ impl Algorithm for A2c {
     }
 
     fn state(&self) -> AlgorithmState {
-        let (n_updates, optimiser) = (self.optimiser.n_updates(), self.optimiser.state());
+        let n_updates = self.optimiser.n_updates();
+        let optimiser = self.optimiser.state();
         AlgorithmState { n_updates, iterations: 0, optimiser, rng: None }
     }
 
@@ -68,7 +69,8 @@ impl BaseAlgorithm for A2c {
             kl_coef: 0.0,
         };
         let mut estimates: Vec<Estimates> = Vec::with_capacity(rollouts.len());
-        let (mut losses, mut norms) = (Losses::default(), 0.0);
+        let mut losses = Losses::default();
+        let mut norms = 0.0;
         for rollout in rollouts {
             check_rollout(rollout, policy, self.config.n_steps)?;
             let estimated = n_step_returns(&rollout.trajectories()?, gamma, bootstrap_truncation);

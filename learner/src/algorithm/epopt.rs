@@ -100,7 +100,8 @@ fn returns(episodes: &[EpisodeSlice]) -> Vec<f64> {
 fn percentile(sorted: &[f64], share: f64) -> f64 {
     let Some(last) = sorted.len().checked_sub(1) else { return f64::NAN };
     let position = share * last as f64;
-    let (low, fraction) = (position.floor() as usize, position.fract());
+    let low = position.floor() as usize;
+    let fraction = position.fract();
     if fraction == 0.0 { sorted[low] } else { sorted[low] + fraction * (sorted[low + 1] - sorted[low]) }
 }
 

@@ -126,7 +126,8 @@ pub fn build(settings: &Settings, policy: &Policy, seed: u64) -> Result<Box<dyn 
 
 /// The share of the variance of the returns that the rollouts' values explain.
 fn explained_variance(rollouts: &[&Rollout], estimates: &[Estimates]) -> Option<f64> {
-    let (mut values, mut returns) = (Vec::new(), Vec::new());
+    let mut values = Vec::new();
+    let mut returns = Vec::new();
     for (rollout, estimates) in rollouts.iter().zip(estimates) {
         match rollout.samples() {
             None => {

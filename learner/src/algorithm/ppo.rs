@@ -56,7 +56,8 @@ impl Algorithm for Ppo {
     }
 
     fn state(&self) -> AlgorithmState {
-        let (n_updates, optimiser) = (self.optimiser.n_updates(), self.optimiser.state());
+        let n_updates = self.optimiser.n_updates();
+        let optimiser = self.optimiser.state();
         AlgorithmState { n_updates, iterations: 0, optimiser, rng: Some(self.rng.clone()) }
     }
 
@@ -95,7 +96,8 @@ impl BaseAlgorithm for Ppo {
         let learning_rate = self.config.learning_rate_schedule.at(self.config.learning_rate, progress_remaining)?;
 
         let objective = self.objective();
-        let (mut losses, mut norms) = (Losses::default(), 0.0);
+        let mut losses = Losses::default();
+        let mut norms = 0.0;
         for _ in 0..n_epochs {
             for (batch, sequences) in &mut batches {
                 if n_minibatches > 1 {

@@ -278,7 +278,8 @@ impl<'a> RunningCell<'a> {
             (Err(CellFailure { reason, fault }), None) => {
                 // Without the folder's path, so that equal failures have equal texts.
                 let reason = reason.replace(&format!("{}/", folder.path().display()), "");
-                let (commit, begins_anew) = (perturb_experiment::VERSION.into(), fault == Fault::Training);
+                let commit = perturb_experiment::VERSION.into();
+                let begins_anew = fault == Fault::Training;
                 let failure = Failure { id: cell.id.clone(), reason, commit, begins_anew };
                 folder.write_failure(&failure)?;
                 Ok(CellEvent::Failed { reason: failure.reason })

@@ -46,7 +46,8 @@ pub(super) fn tested(
         let when = format!(" after {mark} episodes");
         let Some(records) = test(&kept, sets, episodes, false, &when)? else { return Ok(None) };
         records.write(&folder.mark(mark).join(perturb_records::FILE))?;
-        let (results, agreement) = (results(&records), records.agreement());
+        let results = results(&records);
+        let agreement = records.agreement();
         of_marks.insert(mark, MarkResult { counters: kept.state.counters, results, agreement });
     }
     let Some(mut records) = test(&checkpoint, sets, episodes, false, "")? else { return Ok(None) };

@@ -65,7 +65,8 @@ impl ResumeState {
         let arrays = ArraysFile::write(directory, RESUME_PREFIX, checkpoint.state.counters.iterations, &content)?;
         let mut algorithm = self.algorithm.clone();
         algorithm.optimiser.iter_mut().for_each(|array| array.data.clear());
-        let (actions, history) = (self.collector.player.actions.clone(), self.history.clone());
+        let actions = self.collector.player.actions.clone();
+        let history = self.history.clone();
         let document = serde_json::to_value(Document { arrays: arrays.clone(), algorithm, actions, history });
         let document = document.map_err(|error| damaged(directory, error.to_string()))?;
         checkpoint.save(directory, Some(Resume { arrays, document }))

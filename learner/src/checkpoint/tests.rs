@@ -66,7 +66,8 @@ fn names(directory: &Path) -> Vec<String> {
 fn what_resuming_needs_is_saved_and_loaded_bit_for_bit() {
     let directory = tempfile::tempdir().unwrap();
     for seed in [1, 2, 3] {
-        let (saved, state) = (checkpoint(seed, seed), resume_state(seed));
+        let saved = checkpoint(seed, seed);
+        let state = resume_state(seed);
         state.save(&saved, directory.path()).unwrap();
         let (loaded, mut loaded_state) = ResumeState::load(directory.path()).unwrap();
         assert_eq!((&loaded, &loaded_state), (&saved, &state));
@@ -103,7 +104,8 @@ fn only_the_current_arrays_are_kept() {
 /// Every state of the directory that a crash during a save can leave.
 #[test]
 fn a_crash_at_any_moment_leaves_a_whole_checkpoint() {
-    let (old, new) = ((checkpoint(1, 1), resume_state(1)), (checkpoint(2, 2), resume_state(2)));
+    let old = (checkpoint(1, 1), resume_state(1));
+    let new = (checkpoint(2, 2), resume_state(2));
     let after = tempfile::tempdir().unwrap();
     new.1.save(&new.0, after.path()).unwrap();
     let after_names = names(after.path());
@@ -123,7 +125,8 @@ fn a_crash_at_any_moment_leaves_a_whole_checkpoint() {
         loaded
     };
     let [resume, weights] = [after_names[1].as_str(), after_names[2].as_str()];
-    let (temporary_resume, temporary_weights) = (format!(".tmp-{resume}"), format!(".tmp-{weights}"));
+    let temporary_resume = format!(".tmp-{resume}");
+    let temporary_weights = format!(".tmp-{weights}");
     let mut files: Vec<(&str, &[u8])> = Vec::new();
     assert_eq!(load_with(&[(&temporary_resume, &new_resume[..10])]), old);
     assert_eq!(load_with(&[(&temporary_resume, &new_resume)]), old);

@@ -74,7 +74,8 @@ impl Backoff {
 
     async fn retry(&mut self, servers: &Servers) -> Reconnect {
         let ServerWait { limit, tell } = servers.wait();
-        let (begun, before) = (Instant::now(), self.waited);
+        let begun = Instant::now();
+        let before = self.waited;
         loop {
             sleep(pause(self.attempts).min(limit.saturating_sub(self.waited))).await;
             self.attempts += 1;

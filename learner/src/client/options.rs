@@ -67,7 +67,8 @@ pub(super) fn open_request(
     let mut first = 0;
     let mut groups = Vec::new();
     for option in options {
-        let (start, end) = (range.start.max(first), range.end.min(first + option.num_envs));
+        let start = range.start.max(first);
+        let end = range.end.min(first + option.num_envs);
         if start < end {
             groups.push(option.group(start - first, end - start)?);
         }

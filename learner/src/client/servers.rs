@@ -78,7 +78,8 @@ impl Servers {
 
     fn new(connections: Vec<Connection>, runtime: Runtime) -> Self {
         let named = connections.iter().map(|connection| connection.address().clone()).collect();
-        let (act, wait) = (ActorLocation::default(), ServerWait::default());
+        let act = ActorLocation::default();
+        let wait = ServerWait::default();
         Self { connections: Mutex::new(connections), runtime, local: None, named, act, wait }
     }
 
@@ -91,7 +92,8 @@ impl Servers {
         if let Some(local) = &self.local {
             local.lock().unwrap_or_else(PoisonError::into_inner).restart()?;
         }
-        let (mut there, mut errors) = (Vec::new(), Vec::new());
+        let mut there = Vec::new();
+        let mut errors = Vec::new();
         for address in &self.named {
             match one(address).await {
                 Ok(connection) => there.push(connection),
@@ -225,7 +227,8 @@ impl Servers {
         let environment = self.environment_of(first, name)?;
         for other in others {
             if self.environment_of(other, name)? != environment {
-                let (first, other) = (first.address().clone(), other.address().clone());
+                let first = first.address().clone();
+                let other = other.address().clone();
                 return Err(ClientError::Disagreement { first, other, environment: name.into() });
             }
         }
@@ -277,7 +280,8 @@ fn runtime() -> Result<Runtime, ClientError> {
 
 /// The machines of all addresses, and the errors of names that do not resolve.
 async fn all_machines(addresses: &[Address]) -> (ResolvedAddresses, Vec<ClientError>) {
-    let (mut all, mut errors) = (ResolvedAddresses::default(), Vec::new());
+    let mut all = ResolvedAddresses::default();
+    let mut errors = Vec::new();
     for address in addresses {
         match resolve(address).await {
             Ok(found) => all.extend(found),

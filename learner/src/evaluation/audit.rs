@@ -105,7 +105,8 @@ fn replay(
 fn spread(episodes: &[EpisodeRecord], max_episodes: usize) -> impl Iterator<Item = &EpisodeRecord> {
     let count = max_episodes.min(episodes.len());
     (0..count).map(move |i| {
-        let (first, next) = (i * episodes.len() / count, (i + 1) * episodes.len() / count);
+        let first = i * episodes.len() / count;
+        let next = (i + 1) * episodes.len() / count;
         &episodes[first + i % (next - first)]
     })
 }

@@ -95,7 +95,8 @@ impl<'a> Tester<'a> {
     /// Plays the episodes of a test, with sampled actions and frozen statistics. The result depends only on the checkpoint,
     /// the set, the number of episodes and the seed.
     fn play(&self, counting: &mut Counting, stop: &StopFlag, report: &mut dyn FnMut(u64)) -> Result<(), TestError> {
-        let (test, num_envs) = (counting.test(), counting.num_envs());
+        let test = counting.test();
+        let num_envs = counting.num_envs();
         let contexts = test.set.listed();
         let options = OpenOptions {
             environment: self.about.environment.clone(),

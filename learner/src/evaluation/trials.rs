@@ -56,7 +56,8 @@ impl<'a> RemoteTrials<'a> {
 
     /// Makes some steps in all environments. Returns the episodes that ended a trial.
     pub(super) fn play(&mut self) -> Result<Vec<EndedEpisode>, TestError> {
-        let (policy, episodes_per_trial) = (self.policy.take(), self.episodes_per_trial);
+        let policy = self.policy.take();
+        let episodes_per_trial = self.episodes_per_trial;
         let mut ended = Vec::new();
         let first = |slots: Range<usize>| proto::Act {
             policy: policy.as_ref().map(|(policy, _)| acting::for_server(policy, slots.len())),

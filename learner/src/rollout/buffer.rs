@@ -223,7 +223,8 @@ impl Rollout {
 
     /// Whether the `length` steps before step `end` of `environment` are in the rollout, and at least one.
     fn check_episode(&self, environment: usize, end: usize, length: usize) -> Result<()> {
-        let (n_envs, n_steps) = (self.n_envs, self.len);
+        let n_envs = self.n_envs;
+        let n_steps = self.len;
         if environment < n_envs && (1..=end).contains(&length) && end <= n_steps {
             return Ok(());
         }
@@ -261,14 +262,17 @@ impl Rollout {
         }
         let columns = pack(episodes, longest);
         let mut selected = self.padding(longest, columns.len());
-        let (o, a, count) = (self.observation_size, self.action_width, columns.len());
+        let o = self.observation_size;
+        let a = self.action_width;
+        let count = columns.len();
         let mut lengths = Vec::with_capacity(count);
         for (column, episodes) in columns.iter().enumerate() {
             let mut t = 0;
             for episode in episodes {
                 selected.starts[t * count + column] = true;
                 for step in 0..episode.length {
-                    let (from, to) = ((episode.start + step) * self.n_envs + episode.environment, t * count + column);
+                    let from = (episode.start + step) * self.n_envs + episode.environment;
+                    let to = t * count + column;
                     selected.observations[to * o..][..o].copy_from_slice(&self.observations[from * o..][..o]);
                     selected.actions[to * a..][..a].copy_from_slice(&self.actions[from * a..][..a]);
                     selected.log_probs[to] = self.log_probs[from];

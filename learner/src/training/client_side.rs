@@ -62,7 +62,9 @@ impl<'a> ClientSide<'a> {
         let mut observations = Vec::new();
         let mut session = Session::open_together(servers, &options, &mut observations)?;
         let size = session.observation_size();
-        let (mut lanes, mut runs, mut failed) = (Vec::new(), Vec::new(), Vec::new());
+        let mut lanes = Vec::new();
+        let mut runs = Vec::new();
+        let mut failed = Vec::new();
         let mut first = 0;
         for ((index, entry), options) in entries.into_iter().zip(&options) {
             let slots = first..first + options.num_envs;
@@ -79,7 +81,8 @@ impl<'a> ClientSide<'a> {
                 }
             }
         }
-        let (reply, times) = (StepReply::default(), Times::default());
+        let reply = StepReply::default();
+        let times = Times::default();
         let mut client_side = Self { session, lanes, is_reversed: false, actions: Vec::new(), reply, times };
         failed.into_iter().rev().try_for_each(|slots| client_side.release_slots(slots))?;
         Ok((client_side, runs))

@@ -181,7 +181,9 @@ mod tests {
     fn lost_server_can_be_retried() {
         let address: crate::client::Address = "unix:/x".parse().unwrap();
         let lost = || {
-            let (request, code, reason) = ("a step", tonic::Code::Unavailable, "gone".into());
+            let request = "a step";
+            let code = tonic::Code::Unavailable;
+            let reason = "gone".into();
             ClientError::Lost { address: address.clone(), request, code, reason }
         };
         let refused = |code| {

@@ -70,7 +70,9 @@ impl<'a> ServerSide<'a> {
         ended: &mut dyn FnMut(usize, Result<Outcome>),
     ) -> Result<(Self, Vec<Run<'d>>, Vec<(usize, Entry<'d>)>)> {
         let is_one = entries.len() == 1;
-        let (mut idle, mut runs, mut others) = (Vec::new(), Vec::new(), Vec::new());
+        let mut idle = Vec::new();
+        let mut runs = Vec::new();
+        let mut others = Vec::new();
         for (index, entry) in entries {
             let config = entry.start.config();
             let rollouts = config.rollouts();
@@ -203,7 +205,8 @@ impl<'a> Lane<'a> {
         rollout.push(decoded.steps())?;
         for (step, episode) in &ended {
             if let CollectUntil::Episodes(_) = until {
-                let (end, length) = (before + step + 1, episode.length as usize);
+                let end = before + step + 1;
+                let length = episode.length as usize;
                 rollout.note_episode(episode.slot, end, length, episode.episode_return)?;
             }
             tally.note(episode);

@@ -95,7 +95,8 @@ fn begin<'a>(
     let checkpoint = Checkpoint { state, policy: spec, weights };
     directory.prepare()?; // from here on an earlier run is gone
     tracing::debug!(directory = %directory.path().display(), "training begins");
-    let (path, clock) = (directory.path(), Clock::start(0.0));
+    let path = directory.path();
+    let clock = Clock::start(0.0);
     let logs = Logs::create(path, &common.environment, &checkpoint.state.environment_spec, clock)?;
     write_atomically(&path.join("config.toml"), config.to_toml().as_bytes())?;
     Ok((new_trainer(directory, policy, environment, checkpoint, logs, clock)?, player))
@@ -153,7 +154,9 @@ fn new_trainer<'a>(
         commits.push(perturb_experiment::VERSION.into());
     }
     let spec = policy.spec();
-    let (n_envs, input_size, width) = (config.common.num_envs, spec.observation_size, spec.action.width());
+    let n_envs = config.common.num_envs;
+    let input_size = spec.observation_size;
+    let width = spec.action.width();
     let rollout = match algorithm.collect_until() {
         CollectUntil::Steps(n_steps) => Rollout::new(n_steps, n_envs, input_size, width),
         CollectUntil::Episodes(_) => Rollout::of_episodes(n_envs, input_size, width),
@@ -186,7 +189,8 @@ fn not_restored(what: &'static str, source: TrainError) -> TrainError {
 /// The player of a run.
 fn player(state: &State, normalisers: Normalisers) -> Player {
     let Common { num_envs, seed, observation_noise, .. } = state.config.common;
-    let (spec, inputs) = (state.policy(), state.inputs(num_envs));
+    let spec = state.policy();
+    let inputs = state.inputs(num_envs);
     let episodes_per_trial = state.config.settings.episodes_per_trial();
     let player = Player::new(&spec, inputs, num_envs, episodes_per_trial, normalisers, Role::training(seed));
     let player = player.with_noise(observation_noise);

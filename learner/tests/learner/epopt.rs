@@ -40,7 +40,8 @@ fn noise(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
 /// after the other; an environment that has no more goes on unseen until the last has ended. The task ends about half of
 /// them, the time limit the others.
 fn play(policy: &Policy, lengths: &[Vec<usize>], returns: &[Vec<f64>], mut rollout: Rollout) -> Rollout {
-    let (action, n_envs) = (policy.spec().action, lengths.len());
+    let action = policy.spec().action;
+    let n_envs = lengths.len();
     let mut rng = stream(7, Purpose::Actions);
     let mut actor = Actor::new(policy.spec(), n_envs);
     actor.load(&policy.weights()).expect("weights that fit");
@@ -101,7 +102,8 @@ fn epopt_with_epsilon_1_equals_its_base() {
     for (lstm, action) in [(None, DISCRETE), (None, CONTINUOUS), (Some(8), DISCRETE), (Some(8), CONTINUOUS)] {
         let spec = spec(action, lstm);
         for which in 0..2 {
-            let (mut plain, mut wrapped) = (moved(&spec), moved(&spec));
+            let mut plain = moved(&spec);
+            let mut wrapped = moved(&spec);
             let [a2c, ppo] = bases(9, 2, &plain);
             let mut base = if which == 0 { a2c } else { ppo };
             let [a2c, ppo] = bases(9, 2, &wrapped);
@@ -286,7 +288,8 @@ fn epsilon_falls_after_full_iterations_also_when_resumed() {
         let whole = run(None);
         let figures: Vec<_> =
             whole.0.iter().map(|s| (s.epsilon, s.kept, s.kept_steps, s.mean_return, s.cvar)).collect();
-        let (full, half) = ((1.0, 8, 36, 3.125, 0.5), (0.5, 4, 21, 3.125, 0.5));
+        let full = (1.0, 8, 36, 3.125, 0.5);
+        let half = (0.5, 4, 21, 3.125, 0.5);
         assert_eq!(figures, [full, full, half, half], "the value at risk is always that of the configured share");
         for iteration in 1..4 {
             assert_eq!(run(Some(iteration)), whole, "resumed after {iteration}");
@@ -401,7 +404,8 @@ proptest! {
         prop_assert_eq!(is_sample.len(), samples.len());
         let mut seen = HashSet::new();
         for place in 0..packed.n_steps() * columns {
-            let (t, column) = (place / columns, place % columns);
+            let t = place / columns;
+            let column = place % columns;
             let sample = t < packed.lengths().expect("packed")[column];
             prop_assert_eq!(sample, is_sample.contains(&place));
             if !sample {
@@ -503,11 +507,13 @@ fn padding_does_not_count_in_recurrent_gradients() {
             let rollout = play(&policy, &unequal(), &zeros(&unequal()), of_episodes(policy.spec(), 4));
             let select = |episodes: &[EpisodeSlice]| rollout.select(episodes).expect("its own episodes");
             let packed = select(rollout.episodes());
-            let (places, steps) = (packed.n_steps() * packed.n_envs(), 30);
+            let places = packed.n_steps() * packed.n_envs();
+            let steps = 30;
             assert!(packed.samples().is_some_and(|samples| samples.len() == steps) && places > steps, "{places}");
             let (loss, gradient) = loss_of(&torch, &packed);
 
-            let (mut mean, mut mean_gradient) = (0.0, vec![0.0f64; gradient.len()]);
+            let mut mean = 0.0;
+            let mut mean_gradient = vec![0.0f64; gradient.len()];
             for episode in rollout.episodes() {
                 let share = episode.length as f64 / steps as f64;
                 let (loss, gradient) = loss_of(&torch, &select(&[*episode]));
@@ -600,7 +606,8 @@ fn collect(servers: &[PrivateServer], normalised: bool) -> (Vec<(Rollout, Vec<En
     let mut collector = Collector::new(player);
     let mut collected = Vec::new();
     for _ in 0..2 {
-        let (mut rollout, mut ended) = (Rollout::of_episodes(CARTPOLES, size, 1), Vec::new());
+        let mut rollout = Rollout::of_episodes(CARTPOLES, size, 1);
+        let mut ended = Vec::new();
         let on_episode = |episode: &EndedEpisode| ended.push(episode.clone());
         let episodes = CollectUntil::Episodes(COUNT);
         let weights = policy.flat_weights();

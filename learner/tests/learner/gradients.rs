@@ -59,11 +59,14 @@ fn the_actor_agrees_with_libtorch() {
                 let sequences =
                     Sequences::new(&spec, 1, &observations, &vec![false; n_envs], &[]).expect("shapes that fit");
                 let evaluated = torch.evaluate(&sequences, &Tensor::of_slice(&acts.actions));
-                let (log_probs, values) = (Vec::<f32>::from(evaluated.log_probs), Vec::<f32>::from(evaluated.values));
+                let log_probs = Vec::<f32>::from(evaluated.log_probs);
+                let values = Vec::<f32>::from(evaluated.values);
                 for n in 0..n_envs {
-                    let (got, expected) = (acts.log_probs[n], log_probs[n]);
+                    let got = acts.log_probs[n];
+                    let expected = log_probs[n];
                     assert!((got - expected).abs() < TOLERANCE, "{hidden:?} {n}: log π {got} {expected}");
-                    let (got, expected) = (acts.values[n], values[n]);
+                    let got = acts.values[n];
+                    let expected = values[n];
                     assert!((got - expected).abs() < TOLERANCE, "{hidden:?} {n}: V {got} {expected}");
                 }
             }
@@ -245,7 +248,8 @@ fn ten_updates_agree_with_libtorch(
     let optimiser = || Optimiser::new(optimiser.clone(), 0.5);
     let (mut own, mut own_descent, mut network) =
         (begin.clone(), optimiser(), Differentiator::new(&spec, 2).expect("threads"));
-    let (mut reference, mut reference_descent) = (begin.clone(), optimiser());
+    let mut reference = begin.clone();
+    let mut reference_descent = optimiser();
     let mut gradient = begin.clone();
     for indices in &minibatches {
         network.load(&own).expect("weights that fit");

@@ -203,7 +203,9 @@ fn the_loss_is_the_weighted_sum_of_its_parts() {
     for action in [DISCRETE, CONTINUOUS] {
         let mut training = Training::new(action, 8);
         training.collect();
-        let (ent_coef, vf_coef, kl_coef) = (0.3, 0.7, 0.9);
+        let ent_coef = 0.3;
+        let vf_coef = 0.7;
+        let kl_coef = 0.9;
         let a2c = A2cConfig { n_steps: 8, ent_coef, vf_coef, ..A2cConfig::default() };
         let ppo = PpoConfig {
             n_steps: 8,
@@ -221,7 +223,8 @@ fn the_loss_is_the_weighted_sum_of_its_parts() {
             algorithms.push(Box::new(Ppo::new(config, &training.policy, 1).expect("valid settings")));
         }
         let penalties = algorithms.into_iter().map(|mut algorithm| {
-            let (spec, weights) = (training.policy.spec().clone(), training.policy.weights());
+            let spec = training.policy.spec().clone();
+            let weights = training.policy.weights();
             let mut policy = Policy::from_weights(spec, &weights).expect("a policy");
             let stats = algorithm.update(&mut policy, &training.rollout, 1.0).expect("an update");
             let penalty = kl_coef * stats.kl_divergence.unwrap_or(0.0);
@@ -244,7 +247,8 @@ fn a_penalty_on_the_divergence_keeps_the_policy_near(
     let copy = || Policy::from_weights(training.policy.spec().clone(), &training.policy.weights()).expect("a copy");
     let rollout = &training.rollout;
     let moved_by = |kl_coef| {
-        let (before, mut after) = (copy(), copy());
+        let before = copy();
+        let mut after = copy();
         let config = PpoConfig { n_steps: 8, n_minibatches, learning_rate: 1e-2, kl_coef, ..PpoConfig::default() };
         let mut ppo = Ppo::new(config, &after, 1).expect("valid settings");
         ppo.update(&mut after, rollout, 1.0).expect("an update");
@@ -255,7 +259,8 @@ fn a_penalty_on_the_divergence_keeps_the_policy_near(
         };
         distributions(&before).divergence_to(&distributions(&after)).mean(Kind::Float).double_value(&[])
     };
-    let (free, held) = (moved_by(0.0), moved_by(30.0));
+    let free = moved_by(0.0);
+    let held = moved_by(30.0);
     assert!(0.0 < held && held < 0.5 * free, "{action:?}, {n_minibatches} minibatches: {held} {free}");
 }
 
@@ -274,7 +279,8 @@ fn same_seed_and_resume_give_same_bytes() {
                 if resume {
                     let json = serde_json::to_string(&algorithms[which].state()).expect("JSON");
                     let state: AlgorithmState = serde_json::from_str(&json).expect("a state");
-                    let (spec, weights) = (training.policy.spec().clone(), training.policy.weights());
+                    let spec = training.policy.spec().clone();
+                    let weights = training.policy.weights();
                     training.policy = Policy::from_weights(spec, &weights).expect("a policy");
                     (_, algorithms) = start(action);
                     algorithms[which].load_state(&state).expect("a state that fits");
@@ -291,7 +297,8 @@ fn same_seed_and_resume_give_same_bytes() {
 #[test]
 fn a_state_of_another_algorithm_is_refused() {
     let training = Training::new(DISCRETE, 8);
-    let (mut a2c, mut ppo) = (a2c(&training), ppo(&training, 1));
+    let mut a2c = a2c(&training);
+    let mut ppo = ppo(&training, 1);
     assert!(matches!(a2c.load_state(&ppo.state()), Err(Error::Policy(perturb_policy::Error::Arrays { .. }))));
     assert!(ppo.load_state(&a2c.state()).is_err());
 }

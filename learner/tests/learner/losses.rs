@@ -41,8 +41,11 @@ fn advantages_and_returns_agree_with_sums_from_the_definitions() {
     for (case, bootstrap) in [("advantages_bootstrap", true), ("advantages_reference", false)] {
         let get = |name| fixture(case, name);
         let flags = |name| get(name).iter().map(|&x| x != 0.0).collect::<Vec<_>>();
-        let (rewards, values, last_values) = (get("rewards"), get("values"), get("last_values"));
-        let (terminated, truncated) = (flags("terminated"), flags("truncated"));
+        let rewards = get("rewards");
+        let values = get("values");
+        let last_values = get("last_values");
+        let terminated = flags("terminated");
+        let truncated = flags("truncated");
         let trajectories = Trajectories {
             n_envs: 3,
             rewards: &rewards,
@@ -94,7 +97,8 @@ fn last_value_depends_on_the_kind_of_end() {
             truncation_values: &[30.0, 0.0],
             ..endless(&[1.0, 2.0], &[10.0, 20.0], &[40.0])
         };
-        let (gae, n_step) = (gae(&trajectories, 0.5, 0.5, bootstrap), n_step_returns(&trajectories, 0.5, bootstrap));
+        let gae = gae(&trajectories, 0.5, 0.5, bootstrap);
+        let n_step = n_step_returns(&trajectories, 0.5, bootstrap);
         (gae.advantages[0], n_step.returns[0])
     };
     for bootstrap in [true, false] {
@@ -134,7 +138,8 @@ proptest! {
         steps in prop::collection::vec((-5.0f32..5.0, -5.0f32..5.0), 1..40), last in -5.0f32..5.0,
     ) {
         let (rewards, values): (Vec<f32>, Vec<f32>) = steps.into_iter().unzip();
-        let (size, gamma) = (rewards.len(), 0.97f64);
+        let size = rewards.len();
+        let gamma = 0.97f64;
         let last_values = [last];
         let trajectories = endless(&rewards, &values, &last_values);
         let advantages = gae(&trajectories, gamma, 1.0, true).advantages;

@@ -110,7 +110,8 @@ fn epopts_linear_learning_rate_falls_by_the_kept_episodes(#[values(true, false)]
     let settings = "preset = 'paper'\nalgorithm = 'epopt-a2c'\nepisodes = 9\nepisodes_per_iteration = 4\nepsilon = 0.4\n\
                     full_iterations = 0\nlearning_rate = 1e-3";
     let (_, progress) = trained(&format!("{settings}\nupdate_per_episode = {update_per_episode}"));
-    let (mut episodes, mut steps) = (0, 0);
+    let mut episodes = 0;
+    let mut steps = 0;
     for it in &progress {
         let done = if update_per_episode { episodes as f64 / 9.0 } else { steps as f64 / (9.0 * 200.0) };
         let expected = 1e-3 * (1.0 - done);
@@ -157,7 +158,8 @@ fn tested_policy_has_the_last_weights() {
         assert_eq!(Some(checkpoint.state.counters.iterations), progress.last().map(|it| it.iterations));
         checkpoint
     };
-    let (rarely, often) = (checkpoint(500), checkpoint(1));
+    let rarely = checkpoint(500);
+    let often = checkpoint(1);
     assert_eq!(rarely.weights, often.weights);
     assert_eq!(rarely.state.reward_normaliser, often.state.reward_normaliser);
     assert!(rarely.state.reward_normaliser.is_some_and(|rewards| rewards.runs_on()));

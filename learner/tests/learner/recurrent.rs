@@ -105,8 +105,10 @@ fn evaluating_a_window_equals_acting_step_by_step() {
                 let log_probs = Vec::<f32>::from(evaluated.log_probs);
                 let values = Vec::<f32>::from(evaluated.values);
                 for (b, (log_prob, value)) in log_probs.into_iter().zip(values).enumerate() {
-                    let (acts, n) = (&window.acts[b / window.n_envs], b % window.n_envs);
-                    let (got, got_value) = (acts.log_probs[n], acts.values[n]);
+                    let acts = &window.acts[b / window.n_envs];
+                    let n = b % window.n_envs;
+                    let got = acts.log_probs[n];
+                    let got_value = acts.values[n];
                     assert!((got - log_prob).abs() < TOLERANCE, "{hidden:?} {width} {b}: log π {got} {log_prob}");
                     assert!((got_value - value).abs() < TOLERANCE, "{hidden:?} {width} {b}: V {got_value} {value}");
                 }
@@ -132,7 +134,8 @@ fn the_two_stage_gradient_equals_autograds() {
                 gradient
             };
             let policy = || torch(&spec, &weights);
-            let (two_stage, plain) = (gradient(policy()), gradient(policy().with_plain_autograd()));
+            let two_stage = gradient(policy());
+            let plain = gradient(policy().with_plain_autograd());
             let mut start = 0;
             for array in &weights {
                 let range = start..start + array.data.len();
@@ -155,12 +158,14 @@ fn memory_is_emptied_per_environment() {
     let mut actor = Actor::new(&spec, 3);
     actor.load(&moved(&spec)).expect("weights that fit");
     let fresh = actor.clone();
-    let (mut rng, mut acts) = (stream(1, Purpose::Actions), ActorOutput::new(DISCRETE, 3));
+    let mut rng = stream(1, Purpose::Actions);
+    let mut acts = ActorOutput::new(DISCRETE, 3);
     let observations: Vec<f32> = (0..3 * O).map(|_| normal(&mut rng) as f32).collect();
     actor.act(&observations, &mut rng, &mut acts).expect("actions");
     let remembered = actor.memory().to_vec();
 
-    let (mut values, mut some) = (vec![], vec![]);
+    let mut values = vec![];
+    let mut some = vec![];
     actor.values(&observations, &mut values).expect("values");
     actor.values_in(&observations[O..], &[1, 2], &mut some).expect("values");
     assert_eq!(some, values[1..], "row k belongs to the environment that is named");
@@ -289,7 +294,8 @@ impl Training {
         self.actor.load(&self.policy.weights()).expect("weights that fit");
         self.rollout.begin(self.actor.memory());
         let mut acts = ActorOutput::new(TWO, N_ENVS);
-        let (mut told, mut episodes) = (0.0, 0.0);
+        let mut told = 0.0;
+        let mut episodes = 0.0;
         while !self.rollout.is_full() {
             self.actor.act(&self.observations, &mut self.rng, &mut acts).expect("actions");
             let done: [bool; N_ENVS] = std::array::from_fn(|n| self.task.step_of(n) == LENGTH - 1);
@@ -415,7 +421,8 @@ fn same_seed_and_resume_give_same_bytes() {
             if resume {
                 let json = serde_json::to_string(&algorithms[which].state()).expect("JSON");
                 let state: AlgorithmState = serde_json::from_str(&json).expect("a state");
-                let (spec, weights) = (training.policy.spec().clone(), training.policy.weights());
+                let spec = training.policy.spec().clone();
+                let weights = training.policy.weights();
                 training.policy = Policy::from_weights(spec, &weights).expect("a policy");
                 (_, algorithms) = start();
                 algorithms[which].load_state(&state).expect("a state that fits");

@@ -31,7 +31,9 @@ fn collector<'a>(servers: &'a Servers, options: &OpenOptions, policy: &Policy) -
     let mut observations = Vec::new();
     let session = Session::open(servers, options, &mut observations).expect("a session");
     let inputs = Inputs::new(session.observation_size(), policy.spec().action, options.num_envs, true);
-    let (n, trial, none) = (options.num_envs, options.episodes_per_trial, Normalisers::default());
+    let n = options.num_envs;
+    let trial = options.episodes_per_trial;
+    let none = Normalisers::default();
     let mut player = Player::new(policy.spec(), inputs, n, trial, none, Role::training(1));
     player.begin(&observations, None).expect("observations");
     (session, Collector::new(player))
@@ -54,7 +56,8 @@ fn beside(action: ActionKind, taken: f32, reward: f32) -> Vec<f32> {
 /// The rollout of a plain recurrent policy whose observations are extended by hand: `[s, a, r, 0]`, or `[s, 0, 0, 0]` at the
 /// start of an episode.
 fn extended_by_hand(servers: &Servers, options: &OpenOptions, policy: &Policy, n_steps: usize) -> Rollout {
-    let (spec, n) = (policy.spec(), options.num_envs);
+    let spec = policy.spec();
+    let n = options.num_envs;
     let mut reply = StepReply::default();
     let mut session = Session::open(servers, options, &mut reply.observations).expect("a session");
     let size = session.observation_size();
@@ -62,7 +65,8 @@ fn extended_by_hand(servers: &Servers, options: &OpenOptions, policy: &Policy, n
     let mut rollout = Rollout::new(n_steps, n, spec.observation_size, spec.action.width());
     let mut actor = Actor::new(spec, n);
     actor.load(&policy.weights()).expect("weights that fit");
-    let (mut rng, mut acts) = (stream(1, Purpose::Actions), ActorOutput::new(spec.action, n));
+    let mut rng = stream(1, Purpose::Actions);
+    let mut acts = ActorOutput::new(spec.action, n);
     let mut beside = vec![vec![0.0; extra]; n];
     let mut starts = vec![true; n];
     let row = |observation: &[f32], beside: &[f32]| [observation, beside].concat();
@@ -174,7 +178,8 @@ fn memory_lasts_for_a_trial() {
     for (environment, size, action, n_steps) in [("CartPole", 4, TWO, 150), ("Pendulum", 3, ONE, 410)] {
         let policy = policy(size, action);
         let steps = Steps::collect(environment, &policy, 2, n_steps);
-        let (mut trials, mut inner) = (0, 0);
+        let mut trials = 0;
+        let mut inner = 0;
         for (t, rollout) in steps.rollouts.iter().enumerate() {
             let trajectories = rollout.trajectories().expect("a finished rollout");
             for n in 0..N_ENVS {
@@ -232,10 +237,12 @@ fn advantages_run_across_the_episodes_of_a_trial() {
     let steps = CollectUntil::Steps(150);
     collector.collect(&mut session, policy.flat_weights(), steps, &mut rollout, on_episode).expect("a rollout");
     let trajectories = rollout.trajectories().expect("a finished rollout");
-    let (gamma, values) = (0.9, rollout.values());
+    let gamma = 0.9;
+    let values = rollout.values();
     let one_step = gae(&trajectories, gamma, 0.0, true).advantages;
     let all_steps = gae(&trajectories, gamma, 1.0, true).advantages;
-    let (mut inner, mut outer) = (0, 0);
+    let mut inner = 0;
+    let mut outer = 0;
     for (n, lengths) in lengths.iter().enumerate() {
         let mut end = 0;
         for &(length, episode_in_trial) in lengths {
@@ -245,7 +252,8 @@ fn advantages_run_across_the_episodes_of_a_trial() {
             if end == rollout.n_steps() {
                 continue; // what follows is in the next rollout
             }
-            let (value, reward) = (f64::from(values[place]), 1.0); // CartPole pays 1 a step
+            let value = f64::from(values[place]);
+            let reward = 1.0; // CartPole pays 1 a step
             // f32 rounding of numbers below 16.
             let close = |got: f32, expected: f64| (f64::from(got) - expected).abs() < 2e-6;
             if episode_in_trial == 0 {
@@ -280,7 +288,8 @@ fn balancing_in_the_second_episode(servers: &Servers) -> Checkpoint {
     assert_eq!(checkpoint.policy.observation_size, 4 + 2 + 1 + 1);
     let spec = PolicySpec { hidden: vec![], lstm: Some(4), ..checkpoint.policy.clone() };
     let mut weights = Policy::new(spec.clone(), 1).expect("a policy").weights();
-    let (counting, rewarded) = (1e6f32, 1e6f32);
+    let counting = 1e6f32;
+    let rewarded = 1e6f32;
     for array in &mut weights {
         array.data.fill(0.0);
         match array.name.as_str() {
@@ -294,7 +303,8 @@ fn balancing_in_the_second_episode(servers: &Servers) -> Checkpoint {
             "lstm.recurrent.weight" => array.data[3] = 40.0,
             // All others are open; the two in the middle forget.
             "lstm.bias" => {
-                let (i, f) = ([-20.0, 20.0, 20.0, 20.0], [20.0, -20.0, -20.0, 20.0]);
+                let i = [-20.0, 20.0, 20.0, 20.0];
+                let f = [20.0, -20.0, -20.0, 20.0];
                 array.data = [i, f, [0.0, 0.0, 0.0, 20.0], [20.0; 4]].concat();
             }
             "policy.weight" => array.data[4..].copy_from_slice(&[counting, 1e3, rewarded, 0.0]),
@@ -315,7 +325,8 @@ fn balancing_in_the_second_episode(servers: &Servers) -> Checkpoint {
 #[test]
 fn tests_count_the_last_episode_of_each_trial() {
     let both = [server(), server()];
-    let (one, two) = (connect(&both[..1]), connect(&both));
+    let one = connect(&both[..1]);
+    let two = connect(&both);
     let checkpoint = balancing_in_the_second_episode(&one);
     let figures_of = |servers: &Servers, checkpoint: &Checkpoint, seed| {
         // More than 100, so that environments meet more than one trial.
@@ -379,7 +390,8 @@ impl Bandits {
         self.actor.load(&self.policy.weights()).expect("weights that fit");
         self.rollout.begin(self.actor.memory());
         let mut acts = ActorOutput::new(TWO, ARMS);
-        let (mut paid, mut pulls) = (0.0, 0.0);
+        let mut paid = 0.0;
+        let mut pulls = 0.0;
         for t in 0..self.rollout.n_steps() {
             if t.is_multiple_of(TRIAL) {
                 self.paying = std::array::from_fn(|_| as_bits(uniform(&mut self.rng) < 0.5));

@@ -80,7 +80,8 @@ fn together(servers: &Servers, base: &Path, task: &str, numbers: &[usize], most_
         .collect();
     let entries =
         directories.iter().map(|(directory, start)| Entry { directory, start: start.clone(), marks: &[] }).collect();
-    let (stop, mut ended) = (StopFlag::default(), vec![false; numbers.len()]);
+    let stop = StopFlag::default();
+    let mut ended = vec![false; numbers.len()];
     train_together(
         servers,
         entries,

@@ -24,7 +24,8 @@ fn taken(observations: &[f32]) -> (Differentiator, Vec<f32>) {
     let mut actor = Actor::new(&spec, 1);
     actor.keep_activations(observations.len() / O);
     actor.load_flat(&weights).expect("weights that fit");
-    let (mut rng, mut acts) = (stream(1, Purpose::Actions), ActorOutput::new(ACTION, 1));
+    let mut rng = stream(1, Purpose::Actions);
+    let mut acts = ActorOutput::new(ACTION, 1);
     for observation in observations.chunks(O) {
         actor.act(observation, &mut rng, &mut acts).expect("acts");
     }

@@ -50,7 +50,8 @@ fn steps_agree_with_numpy() {
 fn steps_that_are_not_finite_change_nothing() {
     for (loss, entry) in [(f64::NAN, 1.0), (1.0, f32::INFINITY), (1.0, f32::NAN)] {
         let mut optimiser = Optimiser::new(UpdateRule::adam(1e-5, 3), 0.5);
-        let (before, mut weights) = (optimiser.state(), WEIGHTS);
+        let before = optimiser.state();
+        let mut weights = WEIGHTS;
         let step = optimiser.step(loss, &[0.0, entry, 0.0], &mut weights, 1.0);
         assert!(matches!(step, Err(Error::NotFinite { update: 0, .. })));
         assert_eq!((weights, optimiser.state(), optimiser.n_updates()), (WEIGHTS, before, 0));

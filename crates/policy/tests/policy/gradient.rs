@@ -78,7 +78,8 @@ fn cached_activations_give_the_same_gradient(
     let mut network = Differentiator::new(&spec, 1).expect("threads");
     for round in 0..3 {
         let weights: Vec<f32> = numbers(spec.n_weights(), 10 + round).iter().map(|x| 0.1 * x).collect();
-        let (observations, others) = (numbers(n * O, 20 + round), numbers(n_envs * O, 30 + round));
+        let observations = numbers(n * O, 20 + round);
+        let others = numbers(n_envs * O, 30 + round);
         let samples = Samples {
             observations: &observations,
             actions: &vec![1.0; n * action.width()],
@@ -98,7 +99,8 @@ fn cached_activations_give_the_same_gradient(
             fresh.load(weights).expect("weights that fit");
             assert_eq!(gradient(network), gradient(&mut fresh), "round {round}, {} samples", indices.len());
         };
-        let (mut acts, mut values) = (ActorOutput::new(action, n_envs), Vec::new());
+        let mut acts = ActorOutput::new(action, n_envs);
+        let mut values = Vec::new();
         actor.load_flat(&weights).expect("weights that fit");
         for observations in observations.chunks(n_envs * O) {
             actor.act(observations, &mut stream(1, Purpose::Actions), &mut acts).expect("acts");
@@ -229,7 +231,8 @@ fn distribution(
     let old: Vec<f64> = acting.0.iter().map(|&x| f64::from(x)).collect();
     match action {
         ActionKind::Discrete { .. } => {
-            let (new, old) = (log_softmax(head), log_softmax(&old));
+            let new = log_softmax(head);
+            let old = log_softmax(&old);
             let entropy = -new.iter().map(|l| l.exp() * l).sum::<f64>();
             let divergence = old.iter().zip(&new).map(|(p, q)| p.exp() * (p - q)).sum();
             [new[taken[0] as usize], entropy, divergence]
@@ -237,7 +240,8 @@ fn distribution(
         ActionKind::Continuous { size } => {
             let mut sums = [0.0; 3];
             for i in 0..size {
-                let (std, old_std) = (log_std[i].exp(), f64::from(acting.1[i]).exp());
+                let std = log_std[i].exp();
+                let old_std = f64::from(acting.1[i]).exp();
                 let distance = (f64::from(taken[i]) - head[i]) / std;
                 sums[0] -= 0.5 * distance * distance + log_std[i] + 0.5 * TAU.ln();
                 sums[1] += 0.5 * (1.0 + TAU.ln()) + log_std[i];
@@ -255,9 +259,11 @@ fn total(spec: &PolicySpec, weights: &[f64], samples: &Samples<'_>, objective: &
     let advantages: Vec<f64> = samples.advantages.iter().map(|&x| f64::from(x)).collect();
     let mean = advantages.iter().sum::<f64>() / n as f64;
     let deviation = (advantages.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / n as f64).sqrt();
-    let (acting, width) = (samples.acting.expect("acting distributions"), spec.action.width());
+    let acting = samples.acting.expect("acting distributions");
+    let width = spec.action.width();
     let sample = |b: usize| {
-        let (mut rest, observation) = (weights, &samples.observations[b * O..][..O]);
+        let mut rest = weights;
+        let observation = &samples.observations[b * O..][..O];
         let head = perceptron(spec, &mut rest, observation, spec.action.outputs());
         let value = perceptron(spec, &mut rest, observation, 1)[0];
         let old = &acting.outputs[b * head.len()..][..head.len()];
@@ -272,7 +278,8 @@ fn total(spec: &PolicySpec, weights: &[f64], samples: &Samples<'_>, objective: &
                 (-advantage * ratio).max(-advantage * ratio.clamp(1.0 - range, 1.0 + range))
             }
         };
-        let (target, old) = (f64::from(samples.returns[b]), f64::from(samples.old_values[b]));
+        let target = f64::from(samples.returns[b]);
+        let old = f64::from(samples.old_values[b]);
         let clipped = objective.value_clip_range.map_or(value, |range| old + (value - old).clamp(-range, range));
         let value_loss = (value - target).powi(2).max((clipped - target).powi(2));
         policy - objective.ent_coef * entropy + objective.vf_coef * value_loss + objective.kl_coef * divergence
@@ -317,7 +324,8 @@ fn gradients_are_finite_differences(
     let exact: Vec<f64> = weights.iter().map(|&w| f64::from(w)).collect();
     let expected = total(&spec, &exact, &samples, &objective);
     assert!((losses.total - expected).abs() < 1e-5 * expected.abs().max(1.0), "{} {expected}", losses.total);
-    let (mut distance, mut size) = (0.0, 0.0);
+    let mut distance = 0.0;
+    let mut size = 0.0;
     for (k, &got) in gradient.iter().enumerate() {
         let at = |step: f64| {
             let mut weights = exact.clone();

@@ -18,7 +18,8 @@ proptest! {
     ) {
         let numbers: Vec<f32> = numbers.iter().map(|x| x + offset).collect();
         let (mean, variance) = moments(&numbers.iter().map(|&x| f64::from(x)).collect::<Vec<_>>());
-        let (a, b) = (cuts[0].min(cuts[1]).min(numbers.len()), cuts[0].max(cuts[1]).min(numbers.len()));
+        let a = cuts[0].min(cuts[1]).min(numbers.len());
+        let b = cuts[0].max(cuts[1]).min(numbers.len());
         let parts = [&numbers[..a], &numbers[a..b], &numbers[b..]];
         let mut in_order = ObservationNormaliser::new(1);
         for part in parts {
@@ -114,7 +115,8 @@ fn a_discounted_return_can_run_on_over_the_ends_of_episodes() {
 
 #[test]
 fn numbers_that_are_not_finite_are_refused_and_change_nothing() {
-    let (mut observations, mut rewards) = (ObservationNormaliser::new(1), RewardNormaliser::new(1, 0.9));
+    let mut observations = ObservationNormaliser::new(1);
+    let mut rewards = RewardNormaliser::new(1, 0.9);
     let before = (observations.clone(), rewards.clone());
     for bad in [f32::NAN, f32::INFINITY] {
         assert!(matches!(observations.update(&[1.0, bad]), Err(Error::Input { .. })));

@@ -22,7 +22,8 @@ fn player(episodes_per_trial: u32, with_outcomes: bool, normalisers: Normalisers
 /// Step `t` of episodes of two steps each, observed as 3.
 fn step(player: &mut Player, t: u64, episodes_per_trial: u32, reward: f32) {
     player.act().expect("an action");
-    let (episode, ends) = (t / 2, t % 2 == 1);
+    let episode = t / 2;
+    let ends = t % 2 == 1;
     let per_trial = u64::from(episodes_per_trial);
     let end = SlotEnd { slot: 0, trial_index: episode / per_trial, episode_in_trial: (episode % per_trial) as u32 };
     let outcome = StepOutcome {
@@ -92,7 +93,8 @@ fn only_training_sees_noise() {
 fn final_observations_have_no_noise() {
     let played = |noise: f64| {
         let spec = PolicySpec { observation_size: 2, action: DISCRETE, hidden: vec![], lstm: None };
-        let (inputs, none) = (Inputs::new(2, DISCRETE, 2, false), Normalisers::default());
+        let inputs = Inputs::new(2, DISCRETE, 2, false);
+        let none = Normalisers::default();
         let mut player = Player::new(&spec, inputs, 2, 1, none, Role::training(1)).with_noise(noise);
         player.load(&(0..spec.n_weights()).map(|i| i as f32 / 8.0).collect::<Vec<_>>()).expect("weights that fit");
         player.begin(&[3.0; 4], None).expect("observations");

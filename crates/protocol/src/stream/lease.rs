@@ -78,7 +78,9 @@ impl Lease {
     /// Resumes the session over another stream, and sends those requests again that did not arrive. Tries until the lease ends,
     /// unless the server is gone or no longer has the session.
     pub(super) async fn resume(&self, connection: &Connection) -> Option<RawStream> {
-        let (since, mut pause, mut refused) = (Instant::now(), MIN_PAUSE, 0);
+        let since = Instant::now();
+        let mut pause = MIN_PAUSE;
+        let mut refused = 0;
         while since.elapsed() < self.time {
             match self.attempt(connection).await {
                 Ok(stream) => return Some(stream),
