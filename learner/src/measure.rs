@@ -116,7 +116,7 @@ fn measure_one(
     let order = |cell| CellJob { cell, folder: folder.cell(&cell.id), retry: None };
     let orders: Vec<CellJob<'_>> = cells.iter().map(order).collect();
     let enough = StopFlag::default();
-    let mut meter = Meter::new();
+    let mut meter = SpeedMeter::new();
     run_cells(servers, &orders, &enough, &mut |cell, event| {
         if meter.on_event(&cell.id, event) >= limit || stop.signal().is_some() {
             enough.raise(1);
@@ -130,7 +130,7 @@ fn measure_one(
 
 /// Measures the time from one iteration to another of the leader, the cell that reports first, and counts the steps of all
 /// cells between. Where cells take turns, all others have had an iteration between two of the leader's.
-struct Meter {
+struct SpeedMeter {
     start: Instant,
     timesteps: HashMap<String, u64>,
     /// Number of reports of each cell.
@@ -143,7 +143,7 @@ struct Meter {
     ended: Option<MeasureError>,
 }
 
-impl Meter {
+impl SpeedMeter {
     fn new() -> Self {
         let timesteps = HashMap::new();
         let heard = HashMap::new();
@@ -224,7 +224,7 @@ mod tests {
 
     #[test]
     fn steps_count_between_two_iterations_of_the_first_cell() {
-        let mut meter = Meter::new();
+        let mut meter = SpeedMeter::new();
         for id in ["a", "b"] {
             assert_eq!(meter.on_event(id, training(0)), Duration::ZERO);
         }
@@ -242,7 +242,7 @@ mod tests {
 
     #[test]
     fn failed_leader_is_replaced() {
-        let mut meter = Meter::new();
+        let mut meter = SpeedMeter::new();
         meter.on_event("a", training(5));
         for round in 1..=MAX_MISSED_UPDATES + 10 {
             meter.on_event("b", training(80 * round));
@@ -254,10 +254,10 @@ mod tests {
 
     #[test]
     fn failed_group_is_an_error() {
-        let mut meter = Meter::new();
+        let mut meter = SpeedMeter::new();
         meter.on_event("a", training(5));
         meter.on_event("a", CellEvent::Failed { reason: "NaN".into() });
         assert_eq!(meter.end().unwrap_err().to_string(), "measuring a: NaN");
-        assert!(Meter::new().end().unwrap_err().to_string().contains("it has made no step"));
+        assert!(SpeedMeter::new().end().unwrap_err().to_string().contains("it has made no step"));
     }
 }

@@ -2,7 +2,7 @@
 
 use std::ops::RangeInclusive;
 
-use perturb_learner::client::Picture;
+use perturb_learner::client::RenderedPicture;
 use perturb_protocol::limits::PICTURE_PIXELS;
 use perturb_report::plot::{FAMILY, PlotError, drawing, is_dark, load_font};
 use plotters::prelude::*;
@@ -97,7 +97,12 @@ impl Caption {
     }
 
     /// Writes the frame `[height, width, 3]`.
-    pub(super) fn compose(&self, picture: &Picture, text: &CaptionText, frame: &mut Vec<u8>) -> Result<(), VideoError> {
+    pub(super) fn compose(
+        &self,
+        picture: &RenderedPicture,
+        text: &CaptionText,
+        frame: &mut Vec<u8>,
+    ) -> Result<(), VideoError> {
         let ((width, height), (frame_width, frame_height)) = (self.picture, self.frame);
         frame.clear();
         let background = [BACKGROUND.0, BACKGROUND.1, BACKGROUND.2];
@@ -195,7 +200,7 @@ mod tests {
         let (width, height) = caption.picture;
         let pixels = vec![255; (width * height * 3) as usize].into();
         let mut frame = vec![1, 2, 3];
-        caption.compose(&Picture { width, height, pixels }, text, &mut frame).unwrap();
+        caption.compose(&RenderedPicture { width, height, pixels }, text, &mut frame).unwrap();
         frame
     }
 

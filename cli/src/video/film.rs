@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::{Checkpoint, State};
-use perturb_learner::client::{BegunEpisode, ClientError, Picture, RenderSession, Servers, StepReply};
+use perturb_learner::client::{BegunEpisode, ClientError, RenderSession, RenderedPicture, Servers, StepReply};
 use perturb_learner::evaluation::{TestError, open_options};
 use perturb_learner::proto;
 use perturb_policy::{Player, SlotEnd};
@@ -162,7 +162,7 @@ struct Film<'a> {
     /// Whether a picture of the current state was requested, and of the next state.
     pictured: [bool; 2],
     /// Last picture.
-    last: Option<Picture>,
+    last: Option<RenderedPicture>,
     frame: Vec<u8>,
     fps: f64,
     footage: Footage,

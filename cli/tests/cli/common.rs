@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::client::{Address, PrivateServer, Servers};
-use perturb_learner::training::{Outcome, RunDirectory, train};
+use perturb_learner::training::{RunDirectory, TrainOutcome, train};
 use perturb_settings::TrainConfig;
 use tempfile::TempDir;
 
@@ -30,7 +30,7 @@ pub fn config(text: &str) -> TrainConfig {
 }
 
 /// Trains in a fresh directory.
-pub fn run(servers: &Servers, text: &str) -> (TempDir, Outcome) {
+pub fn run(servers: &Servers, text: &str) -> (TempDir, TrainOutcome) {
     let out = tempfile::tempdir().expect("a directory");
     let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
     let outcome = train(servers, &config(text), &directory, 2, &StopFlag::default(), |_| {});

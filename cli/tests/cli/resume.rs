@@ -9,7 +9,7 @@ use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::{Checkpoint, ResumeState};
 use perturb_learner::client::{ClientError, OpenOptions, Servers, Session, StepReply};
 use perturb_learner::evaluation::{TestOptions, Tester};
-use perturb_learner::training::{Outcome, RunDirectory, resume, train};
+use perturb_learner::training::{RunDirectory, TrainOutcome, resume, train};
 use perturb_protocol::Version;
 
 use crate::common::{
@@ -113,7 +113,7 @@ fn assert_same(got: &Path, expected: &Path) {
 }
 
 /// Resumes the run in `path` until its end.
-fn go_on(servers: &Servers, path: &Path) -> Result<Outcome, String> {
+fn go_on(servers: &Servers, path: &Path) -> Result<TrainOutcome, String> {
     let (directory, checkpoint, state) = RunDirectory::resume(path).map_err(|error| format!("{error:#}"))?;
     let outcome = resume(servers, &directory, (checkpoint, state), 1, &StopFlag::default(), |_| {});
     outcome.map_err(|error| format!("{error:#}"))

@@ -115,17 +115,17 @@ impl Recurrent {
             self.inputs.row_mut(row)[self.hidden_size..][..self.width].copy_from_slice(&memory[..self.width]);
             self.next.row_mut(row)[..memory.len()].copy_from_slice(memory);
         }
-        run(Step { network: self, n });
+        run(RecurrentStep { network: self, n });
     }
 }
 
 /// A step of `n` environments, whose rows are filled.
-struct Step<'a> {
+struct RecurrentStep<'a> {
     network: &'a mut Recurrent,
     n: usize,
 }
 
-impl Kernel for Step<'_> {
+impl Kernel for RecurrentStep<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let network = self.network;

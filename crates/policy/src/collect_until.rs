@@ -12,7 +12,7 @@ pub enum CollectUntil {
 
 /// The part of a [`CollectUntil`] that is still to be played.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Remaining {
+pub enum RemainingRollout {
     /// Steps of each environment.
     Steps(usize),
     /// Complete episodes of each environment.
@@ -36,18 +36,18 @@ pub struct EpisodeQuotas {
 
 impl CollectUntil {
     /// Starts to count in N = `n_envs` environments.
-    pub fn begin(self, n_envs: usize) -> Remaining {
+    pub fn begin(self, n_envs: usize) -> RemainingRollout {
         let count = match self {
-            Self::Steps(count) => return Remaining::Steps(count),
+            Self::Steps(count) => return RemainingRollout::Steps(count),
             Self::Episodes(count) => count,
         };
         let left: Vec<usize> = (0..n_envs).map(|i| count / n_envs + usize::from(i < count % n_envs)).collect();
         let active: Vec<bool> = left.iter().map(|&left| left > 0).collect();
-        Remaining::Episodes(EpisodeQuotas { left, stepped: active.clone(), active })
+        RemainingRollout::Episodes(EpisodeQuotas { left, stepped: active.clone(), active })
     }
 }
 
-impl Remaining {
+impl RemainingRollout {
     /// Whether nothing is left to play.
     pub fn is_done(&self) -> bool {
         match self {

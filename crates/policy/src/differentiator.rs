@@ -29,7 +29,7 @@ pub struct Differentiator {
     n_weights: usize,
     networks: Networks,
     gaussian: Gaussian,
-    parts: Vec<Part>,
+    parts: Vec<MinibatchPart>,
     /// Whether `networks` have the weights that the next gradient is for.
     is_current: bool,
     /// Number of rows of the first part whose activations an actor has computed.
@@ -40,8 +40,8 @@ pub struct Differentiator {
 
 /// Buffers for a part of a minibatch.
 #[derive(Debug)]
-struct Part {
-    block: Block,
+struct MinibatchPart {
+    block: SampleBlock,
     /// `[P]` the derivatives of the part's losses. Empty in the first part, which writes to the caller's gradient.
     gradient: Vec<f32>,
     losses: Losses,
@@ -49,15 +49,15 @@ struct Part {
 
 /// Buffers for the forward and backward pass of a block of samples.
 #[derive(Debug)]
-struct Block {
+struct SampleBlock {
     activations: Activations,
     through_policy: Backward,
     through_value: Backward,
 }
 
-impl Block {
+impl SampleBlock {
     fn new(spec: &PolicySpec, networks: &Networks) -> Self {
-        Block {
+        SampleBlock {
             activations: Activations::new(spec, networks, BLOCK),
             through_policy: Backward::new(&networks.policy, BLOCK),
             through_value: Backward::new(&networks.value, BLOCK),
@@ -120,8 +120,8 @@ impl Differentiator {
     fn make_parts(&mut self, n: usize) {
         while self.parts.len() < n {
             let length = if self.parts.is_empty() { 0 } else { self.n_weights };
-            let block = Block::new(&self.spec, &self.networks);
-            self.parts.push(Part { block, gradient: vec![0.0; length], losses: Losses::default() });
+            let block = SampleBlock::new(&self.spec, &self.networks);
+            self.parts.push(MinibatchPart { block, gradient: vec![0.0; length], losses: Losses::default() });
         }
     }
 
@@ -171,13 +171,14 @@ impl Differentiator {
         let gaussian = &*gaussian;
         let n = indices.len();
         let size = n.div_ceil(n_parts);
-        let work = |place: usize, part: &mut Part, gradient: Option<&mut [f32]>| {
-            let Part { block, gradient: own, losses } = part;
+        let work = |place: usize, part: &mut MinibatchPart, gradient: Option<&mut [f32]>| {
+            let MinibatchPart { block, gradient: own, losses } = part;
             let sums = gradient.unwrap_or(own);
             let first = place * size;
             let indices = &indices[first..n.min(first + size)];
-            let shared = Shared { spec, networks, gaussian, weights, samples, is_computed, objective, mean, scale, n };
-            run(Differentiation { shared, indices, block, sums, losses });
+            let context =
+                MinibatchContext { spec, networks, gaussian, weights, samples, is_computed, objective, mean, scale, n };
+            run(Differentiation { context, indices, block, sums, losses });
         };
         let parts = &mut parts[..n.div_ceil(size)];
         match threads {
@@ -287,7 +288,7 @@ impl Kernel for Add<'_> {
 }
 
 /// The inputs that all parts of a minibatch share.
-struct Shared<'a> {
+struct MinibatchContext<'a> {
     spec: &'a PolicySpec,
     networks: &'a Networks,
     gaussian: &'a Gaussian,
@@ -306,9 +307,9 @@ struct Shared<'a> {
 
 /// The work on one part.
 struct Differentiation<'a> {
-    shared: Shared<'a>,
+    context: MinibatchContext<'a>,
     indices: &'a [u32],
-    block: &'a mut Block,
+    block: &'a mut SampleBlock,
     /// `[P]`.
     sums: &'a mut [f32],
     losses: &'a mut Losses,
@@ -329,10 +330,10 @@ impl Differentiation<'_> {
     /// derivatives are added to the sums.
     #[inline(always)]
     fn block<S: Simd, const ADD: bool>(&mut self, simd: S, indices: &[u32]) {
-        let Block { activations, through_policy, through_value } = &mut *self.block;
+        let SampleBlock { activations, through_policy, through_value } = &mut *self.block;
         let Activations { observations, policy_layers, value_layers } = activations;
-        let Shared { spec, networks, gaussian, weights, samples, is_computed, objective, mean, scale, n: of } =
-            &self.shared;
+        let MinibatchContext { spec, networks, gaussian, weights, samples, is_computed, objective, mean, scale, n: of } =
+            &self.context;
         let size = spec.observation_size;
         let n = indices.len();
         if !is_computed {

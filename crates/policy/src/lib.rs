@@ -34,7 +34,7 @@ mod weights;
 
 pub use act::{Actor, ActorOutput, Streams};
 pub use backend::gradient_backend;
-pub use collect_until::{CollectUntil, EpisodeQuotas, Remaining};
+pub use collect_until::{CollectUntil, EpisodeQuotas, RemainingRollout};
 pub use differentiator::Differentiator;
 pub use error::{Error, Result, check_length};
 pub use gradient::{ActingOutputs, Batch, GradientBackend};

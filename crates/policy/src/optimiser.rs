@@ -66,7 +66,7 @@ impl UpdateRule {
     }
 
     /// Makes a step on `weights` `[P]` against a gradient; `update` counts the steps before this one.
-    fn step(&mut self, update: u64, step: Step<'_>) {
+    fn step(&mut self, update: u64, step: GradientStep<'_>) {
         match self {
             UpdateRule::RmsProp(state) => run(RmsPropStep { state, step }),
             UpdateRule::Adam(state) => run(AdamStep { state, update, step }),
@@ -99,7 +99,7 @@ impl UpdateRule {
 }
 
 /// The inputs of a step.
-struct Step<'a> {
+struct GradientStep<'a> {
     learning_rate: f64,
     /// `[P]`
     weights: &'a mut [f32],
@@ -113,14 +113,14 @@ struct Step<'a> {
 
 struct RmsPropStep<'a> {
     state: &'a mut RmsProp,
-    step: Step<'a>,
+    step: GradientStep<'a>,
 }
 
 impl Kernel for RmsPropStep<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
         let RmsProp { alpha, epsilon, mean_square } = self.state;
-        let Step { learning_rate, weights, gradient, scale, keep } = self.step;
+        let GradientStep { learning_rate, weights, gradient, scale, keep } = self.step;
         let alpha = *alpha;
         let epsilon = *epsilon;
         let learning_rate = learning_rate as f32;
@@ -135,13 +135,13 @@ impl Kernel for RmsPropStep<'_> {
 struct AdamStep<'a> {
     state: &'a mut Adam,
     update: u64,
-    step: Step<'a>,
+    step: GradientStep<'a>,
 }
 
 impl Kernel for AdamStep<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
-        let Step { learning_rate, weights, gradient, scale, keep } = self.step;
+        let GradientStep { learning_rate, weights, gradient, scale, keep } = self.step;
         let t = (self.update + 1) as f64;
         let step_size = (learning_rate / (1.0 - libm::pow(BETA_1, t))) as f32;
         let root_correction = (1.0 / (1.0 - libm::pow(BETA_2, t)).sqrt()) as f32;
@@ -208,7 +208,7 @@ impl Optimiser {
         self.check_finite("the norm of the gradient", norm)?;
         let scale = if norm > self.max_grad_norm { (self.max_grad_norm / norm) as f32 } else { 1.0 };
         let keep = (1.0 - learning_rate * self.weight_decay) as f32;
-        self.optimiser.step(self.n_updates, Step { learning_rate, weights, gradient, scale, keep });
+        self.optimiser.step(self.n_updates, GradientStep { learning_rate, weights, gradient, scale, keep });
         self.n_updates += 1;
         Ok(norm)
     }

@@ -3,7 +3,7 @@
 use rand_chacha::ChaCha8Rng;
 
 use crate::act::{Actor, ActorOutput, Streams};
-use crate::collect_until::Remaining;
+use crate::collect_until::RemainingRollout;
 use crate::error::{Result, check_length};
 use crate::gradient::GradientBackend;
 use crate::inputs::Inputs;
@@ -268,10 +268,10 @@ impl Player {
     ///
     /// # Errors
     /// Another length; numbers that are not finite.
-    pub fn begin(&mut self, observations: &[f32], remaining: Option<&Remaining>) -> Result<()> {
+    pub fn begin(&mut self, observations: &[f32], remaining: Option<&RemainingRollout>) -> Result<()> {
         check_length("observations [N, O]", observations.len(), self.observations.len())?;
         self.observations.copy_from_slice(observations);
-        let active = remaining.and_then(Remaining::active);
+        let active = remaining.and_then(RemainingRollout::active);
         self.normalisers.take_observations(&mut self.observations, self.role.statistics(), active)?;
         if let (Statistics::Running, Some(normaliser)) = (self.role.statistics(), &mut self.normalisers.rewards) {
             normaliser.reset_returns();
@@ -332,7 +332,7 @@ impl Player {
     ///
     /// # Errors
     /// Other lengths; numbers that are not finite.
-    pub fn observe(&mut self, outcome: &StepOutcome<'_>, remaining: Option<&Remaining>) -> Result<()> {
+    pub fn observe(&mut self, outcome: &StepOutcome<'_>, remaining: Option<&RemainingRollout>) -> Result<()> {
         let n_envs = self.starts.len();
         check_length("observations [N, O]", outcome.observations.len(), self.observations.len())?;
         check_length("rewards [N]", outcome.rewards.len(), n_envs)?;
@@ -344,10 +344,10 @@ impl Player {
 
         let Self { actor, inputs, role, normalisers, previous, observations, .. } = self;
         let statistics = role.statistics();
-        let stepped = remaining.and_then(Remaining::stepped);
+        let stepped = remaining.and_then(RemainingRollout::stepped);
         observations.copy_from_slice(outcome.observations);
         normalisers.take_rewards(&mut previous.rewards, &previous.trial_ended, statistics, stepped)?;
-        normalisers.take_observations(observations, statistics, remaining.and_then(Remaining::active))?;
+        normalisers.take_observations(observations, statistics, remaining.and_then(RemainingRollout::active))?;
         inputs.remember(&previous.acts, &previous.rewards, &previous.done)?;
         if statistics == Statistics::Running && previous.gather_truncated(outcome, self.observation_size) {
             normalisers.normalise(&mut previous.finals)?;
@@ -396,12 +396,12 @@ impl Player {
     ///
     /// # Errors
     /// Observations that do not fit.
-    pub fn last_values(&mut self, remaining: &Remaining) -> Result<&[f32]> {
+    pub fn last_values(&mut self, remaining: &RemainingRollout) -> Result<&[f32]> {
         match remaining {
-            Remaining::Steps(_) => {
+            RemainingRollout::Steps(_) => {
                 self.actor.values(self.inputs.from_observations(&self.observations), &mut self.values)?;
             }
-            Remaining::Episodes(_) => {
+            RemainingRollout::Episodes(_) => {
                 self.values.clear();
                 self.values.resize(self.starts.len(), 0.0);
             }

@@ -32,9 +32,9 @@ impl fmt::Display for Interval {
 /// A uniform distribution over a union of intervals: an interval's probability is its share of the total length. One interval
 /// of length 0 is a fixed value.
 ///
-/// Written `0.1` or `0.3..0.4,0.8..0.9`; in TOML and JSON a fixed value may also be a number.
+/// WrittenDistribution `0.1` or `0.3..0.4,0.8..0.9`; in TOML and JSON a fixed value may also be a number.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "Written", into = "Written")]
+#[serde(try_from = "WrittenDistribution", into = "WrittenDistribution")]
 pub struct Distribution(Vec<Interval>);
 
 /// Why intervals or a text are not a distribution.
@@ -195,12 +195,12 @@ impl TryFrom<&proto::Distribution> for Distribution {
 /// A distribution in a file.
 #[derive(Serialize, Deserialize)]
 #[serde(untagged)]
-enum Written {
+enum WrittenDistribution {
     Number(f64),
     Text(String),
 }
 
-impl From<Distribution> for Written {
+impl From<Distribution> for WrittenDistribution {
     fn from(distribution: Distribution) -> Self {
         match distribution.0[..] {
             [Interval { low, high }] if low == high => Self::Number(low),
@@ -209,13 +209,13 @@ impl From<Distribution> for Written {
     }
 }
 
-impl TryFrom<Written> for Distribution {
+impl TryFrom<WrittenDistribution> for Distribution {
     type Error = DistributionError;
 
-    fn try_from(written: Written) -> Result<Self, DistributionError> {
+    fn try_from(written: WrittenDistribution) -> Result<Self, DistributionError> {
         match written {
-            Written::Number(value) => Self::union(&[Interval::new(value, value)]),
-            Written::Text(text) => text.parse(),
+            WrittenDistribution::Number(value) => Self::union(&[Interval::new(value, value)]),
+            WrittenDistribution::Text(text) => text.parse(),
         }
     }
 }

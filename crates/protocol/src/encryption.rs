@@ -41,11 +41,11 @@ pub(crate) struct Connector {
     name: ServerName<'static>,
     config: Arc<ClientConfig>,
     shows_certificate: bool,
-    failure: Failure,
+    failure: TlsFailure,
 }
 
 /// The reason why no trusted connection is possible, once it is known.
-type Failure = Arc<Mutex<Option<String>>>;
+type TlsFailure = Arc<Mutex<Option<String>>>;
 
 impl Connector {
     /// A connector to the server at host and port, whose certificate must be for `name`.
@@ -156,7 +156,7 @@ fn words(error: &io::Error, host: &str) -> Option<String> {
 pub(crate) struct AlertRecordingStream {
     stream: TlsStream<TcpStream>,
     shows_certificate: bool,
-    failure: Failure,
+    failure: TlsFailure,
 }
 
 impl AlertRecordingStream {

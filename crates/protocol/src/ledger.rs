@@ -1,6 +1,6 @@
 //! The ledger of a server: the parameter regions that every token drew from, line by line, each chained to all before it.
 //!
-//! A line is a digest, a space, and an [`Entry`] as JSON. The digest is SHA-256, in hexadecimal, of the digest of the line
+//! A line is a digest, a space, and an [`LedgerEntry`] as JSON. The digest is SHA-256, in hexadecimal, of the digest of the line
 //! before (64 zeros before the first), a space, and the JSON. So a line cannot be changed, left out or added without changing
 //! all digests behind it. A single digest proves everything up to it.
 
@@ -20,20 +20,20 @@ const DIGITS: usize = 64;
 
 /// A line without its digest.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Entry {
+pub struct LedgerEntry {
     /// Counts the ledger's lines from 0.
     pub n: u64,
     /// The time of writing, ms since 1970.
     pub unix_ms: u64,
     /// The event.
     #[serde(flatten)]
-    pub event: Event,
+    pub event: LedgerEvent,
 }
 
 /// An event of the ledger.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
-pub enum Event {
+pub enum LedgerEvent {
     /// A server began.
     Began {
         /// The server's version.
@@ -49,7 +49,7 @@ pub enum Event {
     Refused {
         /// The session.
         #[serde(flatten)]
-        who: Who,
+        who: LedgerSession,
         /// The region.
         region: Region,
         /// The reason.
@@ -61,7 +61,7 @@ pub enum Event {
 
 /// The session of an entry.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Who {
+pub struct LedgerSession {
     /// Number of the session, unique until the server starts again.
     pub session: u64,
     /// The name of the session's token; none if it needed none.
@@ -77,21 +77,21 @@ pub struct Who {
 pub struct DrawRecord {
     /// The session.
     #[serde(flatten)]
-    pub who: Who,
+    pub who: LedgerSession,
     /// The new regions.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub regions: Vec<Region>,
     /// Environments that begin to draw from them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub begins: Vec<Begin>,
+    pub begins: Vec<DrawStart>,
     /// Environments that no longer draw from the regions before.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub ends: Vec<End>,
+    pub ends: Vec<DrawEnd>,
 }
 
 /// Environments that begin to draw. The seed, an environment's index and an episode's number fix the episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Begin {
+pub struct DrawStart {
     /// The seed.
     pub seed: u64,
     /// The index of the first environment.
@@ -106,7 +106,7 @@ pub struct Begin {
 
 /// Environments that no longer draw from their region.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct End {
+pub struct DrawEnd {
     /// The seed.
     pub seed: u64,
     /// The index of the first environment.
@@ -170,8 +170,8 @@ impl Chain {
     ///
     /// # Errors
     /// An event that cannot be written as JSON.
-    pub fn add(&mut self, event: &Event, unix_ms: u64) -> serde_json::Result<String> {
-        let entry = Entry { n: self.lines, unix_ms, event: event.clone() };
+    pub fn add(&mut self, event: &LedgerEvent, unix_ms: u64) -> serde_json::Result<String> {
+        let entry = LedgerEntry { n: self.lines, unix_ms, event: event.clone() };
         let json = serde_json::to_string(&entry)?;
         self.head = self.digest(&json);
         self.lines += 1;
@@ -179,13 +179,13 @@ impl Chain {
     }
 
     /// Appends a line that was read, without its end. The error is the reason why it is not valid.
-    fn take(&mut self, line: &str) -> Result<Entry, &'static str> {
+    fn take(&mut self, line: &str) -> Result<LedgerEntry, &'static str> {
         let (digest, json) = line.split_once(' ').ok_or("has no digest")?;
         let own = self.digest(json);
         if own != digest {
             return Err("does not follow from the lines before it");
         }
-        let entry: Entry = serde_json::from_str(json).map_err(|_| "cannot be understood")?;
+        let entry: LedgerEntry = serde_json::from_str(json).map_err(|_| "cannot be understood")?;
         if entry.n != self.lines {
             return Err("has another number");
         }
@@ -213,7 +213,7 @@ pub struct Read {
 ///
 /// # Errors
 /// [`Error`].
-pub fn read(path: &Path, mut each: impl FnMut(Entry, &str)) -> Result<Read, Error> {
+pub fn read(path: &Path, mut each: impl FnMut(LedgerEntry, &str)) -> Result<Read, Error> {
     let io = |source| Error::Io { path: path.to_owned(), source };
     let mut file = BufReader::new(File::open(path).map_err(io)?);
     let mut read = Read { chain: Chain::default(), bytes: 0, unfinished: 0 };
@@ -240,11 +240,11 @@ pub fn read(path: &Path, mut each: impl FnMut(Entry, &str)) -> Result<Read, Erro
 mod tests {
     use super::*;
 
-    fn event(token: &str) -> Event {
-        let who = Who { session: 1, token: Some(token.into()), environment: "CartPole".into(), revision: 1 };
+    fn event(token: &str) -> LedgerEvent {
+        let who = LedgerSession { session: 1, token: Some(token.into()), environment: "CartPole".into(), revision: 1 };
         let region = serde_json::from_str(r#"[{"length":"0.3..0.4,0.8..0.9","mass":"1"}]"#).unwrap();
-        let begin = Begin { seed: u64::MAX, index: 3, count: 2, region: 0, episode: 0 };
-        Event::Draws(DrawRecord { who, regions: vec![region], begins: vec![begin], ends: vec![] })
+        let begin = DrawStart { seed: u64::MAX, index: 3, count: 2, region: 0, episode: 0 };
+        LedgerEvent::Draws(DrawRecord { who, regions: vec![region], begins: vec![begin], ends: vec![] })
     }
 
     fn written(file: &Path, tokens: &[&str]) -> Chain {

@@ -10,16 +10,16 @@ use crate::{Distribution, DistributionError, proto};
 
 /// A region in the space of all parameters: one box, in which each parameter has a set of its own, or several boxes, as R+E.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "Written", into = "Written")]
+#[serde(try_from = "WrittenRegion", into = "WrittenRegion")]
 pub struct Region(Vec<ParameterBox>);
 
 /// A box: a set of values for each parameter, by name.
 pub type ParameterBox = BTreeMap<String, Distribution>;
 
 /// A region in a file: sets of values as [`Distribution::written`], which loses no digit.
-type Written = Vec<BTreeMap<String, String>>;
+type WrittenRegion = Vec<BTreeMap<String, String>>;
 
-impl From<Region> for Written {
+impl From<Region> for WrittenRegion {
     fn from(region: Region) -> Self {
         let written =
             |values: ParameterBox| values.into_iter().map(|(name, values)| (name, values.written())).collect();
@@ -27,10 +27,10 @@ impl From<Region> for Written {
     }
 }
 
-impl TryFrom<Written> for Region {
+impl TryFrom<WrittenRegion> for Region {
     type Error = DistributionError;
 
-    fn try_from(written: Written) -> Result<Self, DistributionError> {
+    fn try_from(written: WrittenRegion) -> Result<Self, DistributionError> {
         let values = |(name, values): (String, String)| Ok((name, values.parse()?));
         let boxes = written.into_iter().map(|values_of| values_of.into_iter().map(values).collect());
         Ok(Self(boxes.collect::<Result<_, _>>()?))

@@ -9,7 +9,7 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Status, Streaming};
 
-use self::lease::{Lease, MAX_RESUMES_WITHOUT_REPLY};
+use self::lease::{ClientLease, MAX_RESUMES_WITHOUT_REPLY};
 
 use crate::adaptive_spin::AdaptiveSpin;
 use crate::address::Address;
@@ -91,7 +91,7 @@ pub struct Stream {
     /// Replies that came while a request could not be sent.
     arrived: VecDeque<SessionResponse>,
     spin: AdaptiveSpin,
-    lease: Option<Lease>,
+    lease: Option<ClientLease>,
 }
 
 /// A bidirectional gRPC stream.
@@ -135,7 +135,7 @@ impl Stream {
         let spin = AdaptiveSpin::default();
         let mut stream = Self { connection, raw, arrived, spin, lease: None };
         let opened = stream.receive::<proto::Open>().await?;
-        stream.lease = Lease::from_proto(&opened);
+        stream.lease = ClientLease::from_proto(&opened);
         Ok((stream, opened))
     }
 
@@ -238,7 +238,7 @@ impl Stream {
             let next = tokio::time::timeout(limit, next).await;
             let status = match next.map_err(|_| timed_out(self.connection.address(), A::NAME, limit))? {
                 Ok(message) => {
-                    self.lease.iter_mut().for_each(Lease::on_reply);
+                    self.lease.iter_mut().for_each(ClientLease::on_reply);
                     return Ok(message);
                 }
                 Err(status) => status,

@@ -1,6 +1,6 @@
 //! What servers' ledgers prove of a policy: that its training drew from what it says, and never from its test sets.
 //!
-//! Who trained is known by tokens: the names under which the training's seed was drawn. Whatever these drew before the
+//! LedgerSession trained is known by tokens: the names under which the training's seed was drawn. Whatever these drew before the
 //! training's end may have been learned from, in whichever session.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use perturb_protocol::ledger::{Begin, DrawRecord, End, Entry, Event, Read, Who, read};
+use perturb_protocol::ledger::{DrawEnd, DrawRecord, DrawStart, LedgerEntry, LedgerEvent, LedgerSession, Read, read};
 use perturb_protocol::proto;
 use perturb_protocol::region::Region;
 use perturb_settings::Common;
@@ -78,7 +78,7 @@ type Session = (usize, u64);
 struct Line {
     at: Moment,
     session: Session,
-    who: Who,
+    who: LedgerSession,
 }
 
 /// When something was written: by its place in its ledger, and between ledgers by the clock.
@@ -164,16 +164,16 @@ impl Ledgers {
         &self.heads
     }
 
-    fn take(&mut self, ledger: usize, Entry { n, unix_ms, event }: Entry) {
+    fn take(&mut self, ledger: usize, LedgerEntry { n, unix_ms, event }: LedgerEntry) {
         let at = Moment { ledger, n, unix_ms };
-        if n == 0 && !matches!(event, Event::Began { .. }) {
+        if n == 0 && !matches!(event, LedgerEvent::Began { .. }) {
             self.defect = Some((n, "does not say that a server began"));
             return;
         }
         let beginning = self.over.len().saturating_sub(1);
-        let line = |who: Who| Line { at, session: (beginning, who.session), who };
+        let line = |who: LedgerSession| Line { at, session: (beginning, who.session), who };
         match event {
-            Event::Began { .. } => {
+            LedgerEvent::Began { .. } => {
                 // The one before it, of the same ledger, ended by then.
                 if n > 0
                     && let Some(over) = self.over.last_mut()
@@ -182,9 +182,11 @@ impl Ledgers {
                 }
                 self.over.push(None);
             }
-            Event::Ended => self.over.last_mut().into_iter().for_each(|over| *over = Some(at)),
-            Event::Refused { who, region, reason } => self.refused.push(Refused { line: line(who), region, reason }),
-            Event::Draws(draws) => self.take_draws(line(draws.who.clone()), draws),
+            LedgerEvent::Ended => self.over.last_mut().into_iter().for_each(|over| *over = Some(at)),
+            LedgerEvent::Refused { who, region, reason } => {
+                self.refused.push(Refused { line: line(who), region, reason })
+            }
+            LedgerEvent::Draws(draws) => self.take_draws(line(draws.who.clone()), draws),
         }
     }
 
@@ -195,13 +197,13 @@ impl Ledgers {
             self.defect = Some((line.at.n, "names more environments than a session has"));
             return;
         }
-        for End { seed, index, count, episode } in ends {
+        for DrawEnd { seed, index, count, episode } in ends {
             for index in (0..count).map(|offset| index.saturating_add(offset)) {
                 self.end_one((line.session, seed, index), (episode, line.at));
             }
         }
         let (line, regions) = (Arc::new(line), regions.into_iter().map(Arc::new).collect::<Vec<_>>());
-        for Begin { seed, index, count, region, episode: first } in begins {
+        for DrawStart { seed, index, count, region, episode: first } in begins {
             let Some(region) = regions.get(region as usize) else {
                 self.defect = Some((line.at.n, "names a region that it does not have"));
                 return;

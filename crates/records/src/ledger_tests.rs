@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use perturb_protocol::Version::*;
-use perturb_protocol::ledger::{Begin, Chain, DrawRecord, End, Event, Who};
+use perturb_protocol::ledger::{Chain, DrawEnd, DrawRecord, DrawStart, LedgerEvent, LedgerSession};
 use perturb_protocol::region::Region;
 use perturb_protocol::{Version, proto};
 use perturb_settings::TrainConfig;
@@ -39,38 +39,43 @@ fn prove(ledgers: &Ledgers) -> Proof {
     ledgers.prove(&training, 100, &environment(), &records)
 }
 
-fn written(directory: &Path, name: &str, events: &[Event]) -> PathBuf {
+fn written(directory: &Path, name: &str, events: &[LedgerEvent]) -> PathBuf {
     let (path, mut chain) = (directory.join(name), Chain::default());
-    let began = Event::Began { version: "0.1.0".into(), commit: name.into(), unfinished: 0 };
+    let began = LedgerEvent::Began { version: "0.1.0".into(), commit: name.into(), unfinished: 0 };
     let events = std::iter::once(&began).chain(events);
     let text: String = (0..).zip(events).map(|(time, event)| chain.add(event, 1000 * time).unwrap()).collect();
     std::fs::write(&path, text).unwrap();
     path
 }
 
-fn proof(events: &[Event]) -> Proof {
+fn proof(events: &[LedgerEvent]) -> Proof {
     let directory = tempfile::tempdir().unwrap();
     let path = written(directory.path(), "ledger", events);
     prove(&Ledgers::read(&[path], &[]).unwrap())
 }
 
-fn who(session: u64, token: &str) -> Who {
-    Who { session, token: Some(token.into()), environment: "CartPole".into(), revision: 1 }
+fn who(session: u64, token: &str) -> LedgerSession {
+    LedgerSession { session, token: Some(token.into()), environment: "CartPole".into(), revision: 1 }
 }
 
-fn begins(session: u64, token: &str, version: Version, (seed, index, count, episode): (u64, u32, u32, u64)) -> Event {
+fn begins(
+    session: u64,
+    token: &str,
+    version: Version,
+    (seed, index, count, episode): (u64, u32, u32, u64),
+) -> LedgerEvent {
     let region = Region::from_version(&environment(), version, &Default::default());
-    let begins = vec![Begin { seed, index, count, region: 0, episode }];
-    Event::Draws(DrawRecord { who: who(session, token), regions: vec![region], begins, ends: Vec::new() })
+    let begins = vec![DrawStart { seed, index, count, region: 0, episode }];
+    LedgerEvent::Draws(DrawRecord { who: who(session, token), regions: vec![region], begins, ends: Vec::new() })
 }
 
-fn ends(session: u64, token: &str, (seed, index, count, episode): (u64, u32, u32, u64)) -> Event {
-    let ends = vec![End { seed, index, count, episode: Some(episode) }];
-    Event::Draws(DrawRecord { who: who(session, token), regions: Vec::new(), begins: Vec::new(), ends })
+fn ends(session: u64, token: &str, (seed, index, count, episode): (u64, u32, u32, u64)) -> LedgerEvent {
+    let ends = vec![DrawEnd { seed, index, count, episode: Some(episode) }];
+    LedgerEvent::Draws(DrawRecord { who: who(session, token), regions: Vec::new(), begins: Vec::new(), ends })
 }
 
 /// The training, by ann.
-fn trained() -> [Event; 2] {
+fn trained() -> [LedgerEvent; 2] {
     [begins(0, "ann", R, (1, 0, 2, 0)), ends(0, "ann", (1, 0, 2, 49))]
 }
 
@@ -92,7 +97,7 @@ fn a_training_that_kept_to_its_own_is_clean() {
 #[test]
 fn what_its_token_drew_of_the_tests_before_its_end_speaks_against_it() {
     let [begun, ended] = trained();
-    let with = |event: Event| proof(&[begun.clone(), event, ended.clone()]);
+    let with = |event: LedgerEvent| proof(&[begun.clone(), event, ended.clone()]);
     says(&with(begins(1, "ann", E, (9, 0, 1, 0))), "line 3 of ");
     says(&with(begins(1, "ann", RE, (9, 0, 1, 0))), "of the test set E, had been drawn");
     // The test on R and that on E have the same seed here, and so the same episode.
@@ -117,7 +122,7 @@ fn a_training_that_is_not_there_or_not_whole_is_not_believed() {
 fn a_session_without_an_end_lasts_as_long_as_its_server() {
     let leak = begins(1, "ann", E, (9, 0, 1, 0));
     let [begun, _] = trained();
-    let again = Event::Began { version: "0.1.0".into(), commit: "0".into(), unfinished: 3 };
+    let again = LedgerEvent::Began { version: "0.1.0".into(), commit: "0".into(), unfinished: 3 };
     says(&proof(&[begun.clone(), leak.clone(), again.clone()]), "of the test set E");
     assert!(proof(&[begun.clone(), again.clone(), leak.clone()]).against.is_empty(), "its server had ended by then");
     says(&proof(&[begun.clone(), leak.clone()]), "of the test set E");
@@ -148,18 +153,18 @@ fn an_end_is_that_of_what_was_open_and_of_nothing_later() {
     let found = proof(&reset);
     assert_eq!(found.against.len(), 2, "{found:?}");
     // Many short ones are not one long one for each.
-    let short: Vec<Event> =
+    let short: Vec<LedgerEvent> =
         (0..9).flat_map(|_| [begins(0, "ann", R, (1, 0, 2, 0)), ends(0, "ann", (1, 0, 2, 4))]).collect();
     says(&proof(&short), "90 were drawn");
     // A part that was given back early does not end the others.
     let early = [begun.clone(), ends(0, "ann", (1, 0, 1, 49)), begins(1, "ann", E, (9, 0, 1, 0))];
     says(&proof(&early), "of the test set E");
     // What was refused by the server drew nothing.
-    let withdrawn = Event::Draws(DrawRecord {
+    let withdrawn = LedgerEvent::Draws(DrawRecord {
         who: who(1, "ann"),
         regions: Vec::new(),
         begins: Vec::new(),
-        ends: vec![End { seed: 9, index: 0, count: 1, episode: None }],
+        ends: vec![DrawEnd { seed: 9, index: 0, count: 1, episode: None }],
     });
     assert!(proof(&[begun, begins(1, "ann", E, (9, 0, 1, 0)), withdrawn, ended]).against.is_empty());
 }

@@ -3,7 +3,7 @@
 use perturb_policy::{PolicySpec, SequenceSamples};
 use tch::Tensor;
 
-use super::loss::Targets;
+use super::loss::LossTargets;
 use super::{Distributions, Sequences, TorchPolicy};
 use crate::error::{Error, Result};
 
@@ -71,9 +71,9 @@ impl TensorBatch {
     }
 
     /// The targets of a loss over the V samples.
-    pub(crate) fn targets(&self) -> Result<Targets> {
+    pub(crate) fn targets(&self) -> Result<LossTargets> {
         let samples = |tensor: &Tensor| self.sequences.samples(tensor);
-        Ok(Targets {
+        Ok(LossTargets {
             old_log_probs: samples(&self.old_log_probs)?,
             old_values: samples(&self.old_values)?,
             advantages: samples(&self.advantages)?,

@@ -20,31 +20,31 @@ use perturb_policy::{Losses, Objective, RecurrentBatch, RecurrentDifferentiator,
 use batch::TensorBatch;
 pub use distribution::Distributions;
 pub use error::{Error, Result};
-pub use loss::{Targets, evaluate};
+pub use loss::{LossTargets, evaluate};
 pub use policy::{Evaluated, TorchPolicy};
 pub use sequences::Sequences;
 
 /// Registers libtorch for the gradients of recurrent policies in this process.
 pub fn register() {
-    register_recurrent(|spec| Ok(Box::new(Networks(Rc::new(TorchPolicy::zeros(spec)?)))));
+    register_recurrent(|spec| Ok(Box::new(TorchDifferentiator(Rc::new(TorchPolicy::zeros(spec)?)))));
 }
 
 /// The networks that all batches of a policy share.
-struct Networks(Rc<TorchPolicy>);
+struct TorchDifferentiator(Rc<TorchPolicy>);
 
-impl RecurrentDifferentiator for Networks {
+impl RecurrentDifferentiator for TorchDifferentiator {
     fn batch(&self, sequences: &SequenceSamples<'_>) -> perturb_policy::Result<Box<dyn RecurrentBatch>> {
         let batch = TensorBatch::new(self.0.spec(), sequences)?;
-        Ok(Box::new(Batch { networks: Rc::clone(&self.0), batch }))
+        Ok(Box::new(TorchBatch { networks: Rc::clone(&self.0), batch }))
     }
 }
 
-struct Batch {
+struct TorchBatch {
     networks: Rc<TorchPolicy>,
     batch: TensorBatch,
 }
 
-impl RecurrentBatch for Batch {
+impl RecurrentBatch for TorchBatch {
     fn count(&self) -> usize {
         self.batch.sequences.count() as usize
     }

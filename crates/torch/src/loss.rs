@@ -11,7 +11,7 @@ const EPSILON: f64 = 1e-8;
 
 /// The inputs of a loss beside the policy's evaluation of the samples.
 #[derive(Debug)]
-pub struct Targets {
+pub struct LossTargets {
     /// Log-probabilities under the acting policy.
     pub old_log_probs: Tensor,
     /// Values of the acting policy.
@@ -25,7 +25,7 @@ pub struct Targets {
 }
 
 /// The total of `objective`, with the gradient in what `evaluated` was computed from, and the losses.
-pub fn evaluate(objective: &Objective, evaluated: &Evaluated, targets: &Targets) -> Result<(Tensor, Losses)> {
+pub fn evaluate(objective: &Objective, evaluated: &Evaluated, targets: &LossTargets) -> Result<(Tensor, Losses)> {
     let Objective { ent_coef, vf_coef, kl_coef, .. } = *objective;
     let normalised = objective.normalize_advantages.then(|| normalise(&targets.advantages));
     let advantages = normalised.as_ref().unwrap_or(&targets.advantages);
@@ -51,7 +51,7 @@ pub fn evaluate(objective: &Objective, evaluated: &Evaluated, targets: &Targets)
 }
 
 /// PPO's surrogate; without gradient, the approximate divergence and the share of clipped samples.
-fn clipped_surrogate(log_probs: &Tensor, targets: &Targets, advantages: &Tensor, range: f64) -> [Tensor; 3] {
+fn clipped_surrogate(log_probs: &Tensor, targets: &LossTargets, advantages: &Tensor, range: f64) -> [Tensor; 3] {
     let log_ratio = log_probs - &targets.old_log_probs;
     let ratio = log_ratio.exp();
     let against = -advantages;
@@ -63,8 +63,8 @@ fn clipped_surrogate(log_probs: &Tensor, targets: &Targets, advantages: &Tensor,
     [free.maximum(&clipped), ratio - log_ratio, outside].map(|terms| terms.mean(Kind::Float))
 }
 
-fn value_loss(values: &Tensor, targets: &Targets, clip_range: Option<f64>) -> Tensor {
-    let Targets { old_values, returns, .. } = targets;
+fn value_loss(values: &Tensor, targets: &LossTargets, clip_range: Option<f64>) -> Tensor {
+    let LossTargets { old_values, returns, .. } = targets;
     let free = (values - returns).square();
     let Some(range) = clip_range else { return free.mean(Kind::Float) };
     let clipped = old_values + (values - old_values).clamp(-range, range);
@@ -83,9 +83,9 @@ mod tests {
     /// Results of order 1 in f32, from means over 11 samples: some ten roundings of 2⁻²⁴.
     const TOLERANCE: f64 = 2e-6;
 
-    fn targets() -> Targets {
+    fn targets() -> LossTargets {
         let tensor = |name| tensor("losses", name);
-        Targets {
+        LossTargets {
             old_log_probs: tensor("old_log_probs"),
             old_values: tensor("old_values"),
             advantages: tensor("advantages"),
@@ -112,7 +112,7 @@ mod tests {
     fn the_surrogate_has_no_gradient_where_moving_on_would_gain() {
         // Ratios 1.5 and 0.5: clipped for a positive and a negative advantage, free for the opposite ones.
         let advantages = Tensor::of_slice(&[1.0f32, -1.0, 1.0, -1.0]);
-        let targets = Targets { old_log_probs: Tensor::of_slice(&[0.0f32; 4]), ..targets() };
+        let targets = LossTargets { old_log_probs: Tensor::of_slice(&[0.0f32; 4]), ..targets() };
         let log_probs = [1.5f32.ln(), 1.5f32.ln(), 0.5f32.ln(), 0.5f32.ln()];
         let log_probs = Tensor::of_slice(&log_probs).set_requires_grad(true);
         let [loss, _, clip_fraction] = clipped_surrogate(&log_probs, &targets, &advantages, 0.2);

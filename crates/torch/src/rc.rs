@@ -31,7 +31,7 @@ use super::ff::perceptron;
 use crate::error::Result;
 
 /// The weights by their places, in the order of [`PolicySpec::layout`].
-struct Places {
+struct WeightIndices {
     /// W_x `[4H, X]`; all before it are hidden layers.
     input: usize,
     /// W_h `[4H, H]`.
@@ -42,10 +42,10 @@ struct Places {
     heads: usize,
 }
 
-impl Places {
+impl WeightIndices {
     fn new(spec: &PolicySpec) -> Self {
         let input = 2 * spec.hidden.len();
-        Places { input, recurrent: input + 1, bias: input + 2, heads: input + 3 }
+        WeightIndices { input, recurrent: input + 1, bias: input + 2, heads: input + 3 }
     }
 }
 
@@ -76,7 +76,7 @@ pub(super) fn forward(
     sequences: &Sequences,
     plain: bool,
 ) -> (Tensor, Tensor, Option<Tape>) {
-    let places = Places::new(spec);
+    let places = WeightIndices::new(spec);
     let input = &leaves[places.input];
     let recurrent = &leaves[places.recurrent];
     let x = perceptron(&leaves[..places.input], &sequences.flat_observations(), true);
@@ -158,7 +158,7 @@ fn run(driven: Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tape {
 
 /// The gradients of `loss` in all `leaves`, in order.
 pub(super) fn backward(spec: &PolicySpec, leaves: &[Tensor], loss: &Tensor, tape: &Tape) -> Result<Vec<Tensor>> {
-    let places = Places::new(spec);
+    let places = WeightIndices::new(spec);
     let heads: Vec<&Tensor> = leaves[places.heads..].iter().chain([&tape.hidden]).collect();
     let mut of_heads = Tensor::f_run_backward(&[loss], &heads, false, false)?;
     let of_hidden = of_heads.remove(of_heads.len() - 1);

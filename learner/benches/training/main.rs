@@ -14,7 +14,7 @@ use perturb_faults::{FaultPlan, FaultyProxy};
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::client::{ActorLocation, Address, PrivateServer, Servers};
 use perturb_learner::logging::TimeShares;
-use perturb_learner::training::{Entry, RunDirectory, Start, train, train_together};
+use perturb_learner::training::{RunDirectory, Start, TrainRequest, train, train_together};
 use perturb_settings::TrainConfig;
 
 type Result<T> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;
@@ -117,9 +117,10 @@ fn group_of(
         .clone()
         .map(|seed| RunDirectory::choose(&out.path().join(seed.to_string()), false))
         .collect::<std::result::Result<_, _>>()?;
-    let entry =
-        |(directory, seed)| Ok(Entry { directory, start: Start::Fresh(Box::new(config(settings, seed)?)), marks: &[] });
-    let entries: Vec<Entry<'_>> = directories.iter().zip(seeds.clone()).map(entry).collect::<Result<_>>()?;
+    let entry = |(directory, seed)| {
+        Ok(TrainRequest { directory, start: Start::Fresh(Box::new(config(settings, seed)?)), marks: &[] })
+    };
+    let entries: Vec<TrainRequest<'_>> = directories.iter().zip(seeds.clone()).map(entry).collect::<Result<_>>()?;
     let mut steps = vec![0; seeds.len()];
     let mut before = None;
     let mut after = None;

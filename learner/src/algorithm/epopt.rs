@@ -21,7 +21,7 @@ pub struct Epopt {
 
 /// The episodes that EPOpt chose in an iteration.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Selection {
+pub struct EpisodeSelection {
     /// ε of this iteration.
     pub epsilon: f64,
     /// Number of episodes that were learned from.
@@ -57,7 +57,7 @@ impl Algorithm for Epopt {
             Ranking::Raw => worst(episodes, &returns(episodes), epsilon),
             Ranking::Normalized => worst(episodes, &rollout.normalized_returns(), epsilon),
         };
-        let selection = Selection {
+        let selection = EpisodeSelection {
             epsilon,
             kept: kept.len() as u64,
             kept_steps: kept.iter().map(|episode| episode.length as u64).sum(),

@@ -5,7 +5,7 @@ mod epopt;
 mod ppo;
 
 pub use a2c::{A2c, n_step_returns};
-pub use epopt::{Epopt, Selection};
+pub use epopt::{EpisodeSelection, Epopt};
 pub use ppo::{Ppo, gae};
 
 use perturb_policy::{CollectUntil, NamedArray, check_length};
@@ -94,7 +94,7 @@ pub struct UpdateStats {
     /// Mean standard deviation of the actions; continuous actions only.
     pub std: Option<f64>,
     /// The episodes that were learned from; EPOpt only.
-    pub selection: Option<Selection>,
+    pub selection: Option<EpisodeSelection>,
 }
 
 /// Checks that a rollout's axes fit the algorithm and the policy. The length of a rollout of complete episodes is free.

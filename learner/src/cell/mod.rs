@@ -16,7 +16,9 @@ use crate::checkpoint::{Checkpoint, ResumeState};
 use crate::client::Servers;
 use crate::evaluation::TestError;
 use crate::logging::Progress;
-use crate::training::{Entry, Outcome, RunDirectory, RunDirectoryError, Start, TrainError, is_over, train_together};
+use crate::training::{
+    RunDirectory, RunDirectoryError, Start, TrainError, TrainOutcome, TrainRequest, is_over, train_together,
+};
 
 /// The signal that a stop without a signal counts as.
 const SIGTERM: i32 = 15;
@@ -161,11 +163,11 @@ fn train(
     let entry = |&place: &usize| {
         let RunningCell { job, training, .. } = &all[place];
         let (directory, start) = training.as_ref()?;
-        Some(Entry { directory, start: start.clone(), marks: &job.cell.tests.marks })
+        Some(TrainRequest { directory, start: start.clone(), marks: &job.cell.tests.marks })
     };
     let entries = places.iter().filter_map(entry).collect();
     let cells: Vec<&Cell> = places.iter().map(|&place| all[place].job.cell).collect();
-    let mut outcomes: Vec<(usize, Result<Outcome, TrainError>)> = Vec::new();
+    let mut outcomes: Vec<(usize, Result<TrainOutcome, TrainError>)> = Vec::new();
     let mut report = |index: usize, &Progress { episodes, timesteps, saved_timesteps: saved, .. }: &Progress| {
         tell(cells[index], CellEvent::Training { episodes, timesteps, saved });
     };

@@ -46,7 +46,7 @@ pub struct History {
 /// `resume` in `checkpoint.json`.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Document {
+struct ResumeDocument {
     arrays: ArraysFile,
     /// The algorithm's state; the data of its arrays are in the file of arrays.
     algorithm: AlgorithmState,
@@ -67,7 +67,7 @@ impl ResumeState {
         algorithm.optimiser.iter_mut().for_each(|array| array.data.clear());
         let actions = self.collector.player.actions.clone();
         let history = self.history.clone();
-        let document = serde_json::to_value(Document { arrays: arrays.clone(), algorithm, actions, history });
+        let document = serde_json::to_value(ResumeDocument { arrays: arrays.clone(), algorithm, actions, history });
         let document = document.map_err(|error| damaged(directory, error.to_string()))?;
         checkpoint.save(directory, Some(Resume { arrays, document }))
     }
@@ -80,7 +80,7 @@ impl ResumeState {
         let (checkpoint, directory, document) = Checkpoint::load_resumable(path)?;
         let not_understood =
             |error: serde_json::Error| damaged(&directory.join(JSON), format!("resume is not understood: {error}"));
-        let document: Document = serde_json::from_value(document).map_err(not_understood)?;
+        let document: ResumeDocument = serde_json::from_value(document).map_err(not_understood)?;
         let content = document.arrays.read(&directory)?;
         let path = document.arrays.path(&directory);
         let state = document.complete(&content).map_err(|reason| damaged(&path, reason))?;
@@ -107,7 +107,7 @@ impl ResumeState {
     }
 }
 
-impl Document {
+impl ResumeDocument {
     /// Puts the arrays in.
     fn complete(mut self, content: &[u8]) -> std::result::Result<ResumeState, String> {
         let arrays = Arrays::decode(content)?;

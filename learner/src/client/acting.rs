@@ -13,7 +13,7 @@ use crate::proto;
 
 /// A reply with steps that one server played in all its environments, and the episodes that ended in them.
 #[derive(Clone, Debug, Default)]
-pub struct Played {
+pub struct RolloutReply {
     /// The steps as the protocol encodes them, `[T, N, …]`.
     pub acted: proto::Acted,
     /// The ended episodes with their steps, 0 … T-1, in order of steps and slots.
@@ -30,7 +30,7 @@ impl Session<'_> {
     pub fn play(
         &mut self,
         mut request: impl FnMut(Range<usize>) -> Option<proto::Act>,
-        mut take: impl FnMut(Range<usize>, Played) -> Result<(), String>,
+        mut take: impl FnMut(Range<usize>, RolloutReply) -> Result<(), String>,
     ) -> Result<(), ClientError> {
         self.exchange(
             |part| request(part.range.clone()),
@@ -62,7 +62,7 @@ impl Session<'_> {
     ///
     /// # Errors
     /// Those of [`Session::play`].
-    pub async fn played(&mut self) -> Result<Played, ClientError> {
+    pub async fn played(&mut self) -> Result<RolloutReply, ClientError> {
         let Self { servers, parts, .. } = self;
         let [part] = parts.as_mut_slice() else { return Err(not_played_together()) };
         let acted = part.stream.receive::<proto::Act>().await.map_err(|error| servers.explain(error))?;
@@ -106,7 +106,7 @@ impl ServerShard {
     }
 
     /// Names the episodes that ended in a reply.
-    fn played(&self, mut acted: proto::Acted) -> Result<Played, ClientError> {
+    fn played(&self, mut acted: proto::Acted) -> Result<RolloutReply, ClientError> {
         let mut ended = Vec::with_capacity(acted.ended.len());
         for proto::EndedAt { step, end, terminated, .. } in std::mem::take(&mut acted.ended) {
             let slot = end.as_ref().map_or(usize::MAX, |end| self.range.start.saturating_add(end.slot as usize));
@@ -119,7 +119,7 @@ impl ServerShard {
             };
             ended.push((step as usize, episode));
         }
-        Ok(Played { acted, ended })
+        Ok(RolloutReply { acted, ended })
     }
 }
 

@@ -14,11 +14,11 @@ mod servers;
 mod session;
 mod shard;
 
-pub use acting::Played;
+pub use acting::RolloutReply;
 pub use backoff::{Backoff, Reconnect};
 pub use options::{ActorLocation, OpenOptions, ServerWait};
 pub use perturb_protocol::{Address, AddressError, ClientError, EndedEpisode, PrivateServer};
-pub use render::{BegunEpisode, Picture, RenderSession};
+pub use render::{BegunEpisode, RenderSession, RenderedPicture};
 pub use reply::{StepReply, StepSlice};
 pub use servers::Servers;
 pub use session::Session;

@@ -25,7 +25,7 @@ pub struct BegunEpisode {
 
 /// A rendered picture of an environment.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Picture {
+pub struct RenderedPicture {
     /// Pixels.
     pub width: u32,
     /// Pixels.
@@ -128,7 +128,7 @@ impl<'a> RenderSession<'a> {
     ///
     /// # Errors
     /// [`ClientError::Refused`] with the server's sentence if it cannot draw, and the failures of a connection.
-    pub fn picture(&mut self) -> Result<Picture, ClientError> {
+    pub fn picture(&mut self) -> Result<RenderedPicture, ClientError> {
         let (width, height) = self.size;
         let rendered = match self.reply::<proto::Render>() {
             Ok(rendered) => rendered,
@@ -148,7 +148,7 @@ impl<'a> RenderSession<'a> {
                 .stream
                 .mismatch::<proto::Render>(got, format!("{width} × {height}, three bytes each")));
         }
-        Ok(Picture { width, height, pixels })
+        Ok(RenderedPicture { width, height, pixels })
     }
 
     fn request(&mut self, request: impl TypedRequest) -> Result<(), ClientError> {

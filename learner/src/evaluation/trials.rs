@@ -8,7 +8,7 @@ use perturb_protocol::player::floats;
 
 use super::error::TestError;
 use crate::checkpoint::Checkpoint;
-use crate::client::{EndedEpisode, Played, Session, StepReply, acting};
+use crate::client::{EndedEpisode, RolloutReply, Session, StepReply, acting};
 use crate::proto;
 
 /// Steps of a request to a server: few compared with a test's, but enough to hide the network's delay.
@@ -85,7 +85,7 @@ impl<'a> RemoteTrials<'a> {
         ended: &mut Vec<EndedEpisode>,
         unfinished: &mut BTreeSet<usize>,
     ) -> Result<(), TestError> {
-        let take = |slots: Range<usize>, played: Played| {
+        let take = |slots: Range<usize>, played: RolloutReply| {
             ended.extend(played.ended.into_iter().map(|(_, end)| end));
             if !played.acted.finished {
                 unfinished.insert(slots.start);

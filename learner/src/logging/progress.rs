@@ -184,7 +184,7 @@ impl ProgressLog {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::algorithm::Selection;
+    use crate::algorithm::EpisodeSelection;
 
     #[test]
     fn line_has_a_value_under_each_name() {
@@ -204,7 +204,7 @@ mod tests {
             n_updates: 5,
             std: None,
             kl_divergence: None,
-            selection: Some(Selection { epsilon: 0.1, kept: 10, kept_steps: 50, mean_return: 7.0, cvar: 3.0 }),
+            selection: Some(EpisodeSelection { epsilon: 0.1, kept: 10, kept_steps: 50, mean_return: 7.0, cvar: 3.0 }),
         };
         let progress = Progress {
             iterations: 6,

@@ -13,7 +13,7 @@ use super::disk::sync;
 
 /// The fields of tensorflow/core/util/event.proto that scalars need.
 #[derive(Clone, PartialEq, Message)]
-struct Event {
+struct EventMessage {
     /// Seconds since 1970.
     #[prost(double, tag = "1")]
     wall_time: f64,
@@ -22,19 +22,19 @@ struct Event {
     #[prost(string, optional, tag = "3")]
     file_version: Option<String>,
     #[prost(message, optional, tag = "5")]
-    summary: Option<Summary>,
+    summary: Option<SummaryMessage>,
 }
 
 /// The fields of tensorflow/core/framework/summary.proto that scalars need.
 #[derive(Clone, PartialEq, Message)]
-struct Summary {
+struct SummaryMessage {
     #[prost(message, repeated, tag = "1")]
-    value: Vec<Value>,
+    value: Vec<ValueMessage>,
 }
 
 /// A scalar with its name.
 #[derive(Clone, PartialEq, Message)]
-struct Value {
+struct ValueMessage {
     #[prost(string, tag = "1")]
     tag: String,
     // In a oneof, so present even if 0.
@@ -59,7 +59,8 @@ impl EventWriter {
         let file_name = format!("events.out.tfevents.{}.perturb", t_start as u64);
         let file = File::create(directory.join(&file_name))?;
         let mut writer = Self { file: BufWriter::new(file), file_name, t_start };
-        let first = Event { wall_time: t_start, file_version: Some("brain.Event:2".into()), ..Event::default() };
+        let first =
+            EventMessage { wall_time: t_start, file_version: Some("brain.Event:2".into()), ..EventMessage::default() };
         writer.record(&first)?;
         Ok(writer)
     }
@@ -90,17 +91,18 @@ impl EventWriter {
         elapsed: f64,
         scalars: impl Iterator<Item = (&'a str, f64)>,
     ) -> std::io::Result<()> {
-        let value =
-            scalars.map(|(tag, value)| Value { tag: tag.to_owned(), simple_value: Some(value as f32) }).collect();
-        self.record(&Event {
+        let value = scalars
+            .map(|(tag, value)| ValueMessage { tag: tag.to_owned(), simple_value: Some(value as f32) })
+            .collect();
+        self.record(&EventMessage {
             wall_time: self.t_start + elapsed,
             step: i64::try_from(step).unwrap_or(i64::MAX),
             file_version: None,
-            summary: Some(Summary { value }),
+            summary: Some(SummaryMessage { value }),
         })
     }
 
-    fn record(&mut self, event: &Event) -> std::io::Result<()> {
+    fn record(&mut self, event: &EventMessage) -> std::io::Result<()> {
         self.file.write_all(&frame(&event.encode_to_vec()))?;
         self.file.flush()
     }
@@ -127,7 +129,7 @@ mod tests {
     use super::*;
 
     /// The records of a file, with their checksums verified.
-    fn read(mut bytes: &[u8]) -> Vec<Event> {
+    fn read(mut bytes: &[u8]) -> Vec<EventMessage> {
         let mut events = Vec::new();
         while !bytes.is_empty() {
             let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
@@ -135,7 +137,7 @@ mod tests {
             let number = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
             assert_eq!(number(8), masked_crc(&bytes[..8]));
             assert_eq!(number(12 + length), masked_crc(data));
-            events.push(Event::decode(data).unwrap());
+            events.push(EventMessage::decode(data).unwrap());
             bytes = &bytes[16 + length..];
         }
         events

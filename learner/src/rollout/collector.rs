@@ -4,7 +4,7 @@ use bytes::Bytes;
 
 use super::Rollout;
 use crate::client::{ClientError, EndedEpisode, Session, StepReply, StepSlice};
-use perturb_policy::{CollectUntil, Player, PlayerState, Remaining, SlotEnd};
+use perturb_policy::{CollectUntil, Player, PlayerState, RemainingRollout, SlotEnd};
 
 /// Why a rollout could not be collected.
 #[derive(Debug, thiserror::Error)]
@@ -39,7 +39,7 @@ impl CollectError {
 #[derive(Debug)]
 pub struct Collector {
     player: Player,
-    remaining: Remaining,
+    remaining: RemainingRollout,
     /// Buffer for the ends of episodes in a step.
     ended: Vec<SlotEnd>,
 }
@@ -56,7 +56,7 @@ pub struct CollectorState {
 impl Collector {
     /// A collector of the steps of `player`.
     pub fn new(player: Player) -> Self {
-        Self { player, remaining: Remaining::Steps(0), ended: Vec::new() }
+        Self { player, remaining: RemainingRollout::Steps(0), ended: Vec::new() }
     }
 
     /// The player.
@@ -119,7 +119,7 @@ impl Collector {
         player.observe(&outcome, Some(remaining))?;
         rollout.push(player.played())?;
         for (end, episode) in outcome.ended.iter().zip(reply.ended).filter(|(end, _)| remaining.counts(end.slot)) {
-            if let Remaining::Episodes(_) = remaining {
+            if let RemainingRollout::Episodes(_) = remaining {
                 rollout.note_episode(end.slot, rollout.len(), episode.length as usize, episode.episode_return)?;
             }
             on_episode(episode);

@@ -11,7 +11,7 @@ use perturb_policy::{Normalisers, Player, PlayerState};
 
 use super::start::{options, start_or_resume};
 use super::trainer::Trainer;
-use super::{CollectRollouts, Collected, Entry, Outcome, Result, Run};
+use super::{CollectRollouts, Collected, Result, Run, TrainOutcome, TrainRequest};
 use crate::client::{OpenOptions, Servers, Session, StepReply};
 use crate::rollout::Collector;
 
@@ -19,31 +19,31 @@ use crate::rollout::Collector;
 pub(super) struct ClientSide<'a> {
     session: Session<'a>,
     /// The lanes of the runs, in the order of their slots.
-    lanes: Vec<Lane>,
+    lanes: Vec<ClientLane>,
     /// Whether runs act and are updated in reverse order. The order is reversed after updates, so that the run that was
     /// updated last comes first: its weights are still in the processor's caches, which are too small for all runs.
     is_reversed: bool,
     /// The actions of all runs, in order of slots.
     actions: Vec<u8>,
     reply: StepReply,
-    times: Times,
+    times: StepTimes,
 }
 
 /// Time spent since the session was opened.
 #[derive(Clone, Copy, Debug, Default)]
-struct Times {
+struct StepTimes {
     acting: Duration,
     waiting: Duration,
 }
 
 /// The part of a run in the session.
-struct Lane {
+struct ClientLane {
     /// The run's index.
     index: usize,
     slots: Range<usize>,
     collector: Collector,
     /// The times at which the present rollout began; `None` between rollouts.
-    begun: Option<Times>,
+    begun: Option<StepTimes>,
 }
 
 impl<'a> ClientSide<'a> {
@@ -54,9 +54,9 @@ impl<'a> ClientSide<'a> {
     /// A session that cannot be opened.
     pub(super) fn open<'d>(
         servers: &'a Servers,
-        entries: Vec<(usize, Entry<'d>)>,
+        entries: Vec<(usize, TrainRequest<'d>)>,
         threads: usize,
-        ended: &mut dyn FnMut(usize, Result<Outcome>),
+        ended: &mut dyn FnMut(usize, Result<TrainOutcome>),
     ) -> Result<(Self, Vec<Run<'d>>)> {
         let options: Vec<OpenOptions> = entries.iter().map(|(_, entry)| options(entry.start.config())).collect();
         let mut observations = Vec::new();
@@ -72,7 +72,7 @@ impl<'a> ClientSide<'a> {
             let observations = &observations[slots.start * size..slots.end * size];
             match start_or_resume(entry, &mut session, slots.clone(), observations, threads) {
                 Ok((trainer, player)) => {
-                    lanes.push(Lane { index, slots, collector: Collector::new(player), begun: None });
+                    lanes.push(ClientLane { index, slots, collector: Collector::new(player), begun: None });
                     runs.push(Run { index, trainer, end: None });
                 }
                 Err(error) => {
@@ -82,7 +82,7 @@ impl<'a> ClientSide<'a> {
             }
         }
         let reply = StepReply::default();
-        let times = Times::default();
+        let times = StepTimes::default();
         let mut client_side = Self { session, lanes, is_reversed: false, actions: Vec::new(), reply, times };
         failed.into_iter().rev().try_for_each(|slots| client_side.release_slots(slots))?;
         Ok((client_side, runs))
@@ -111,7 +111,7 @@ impl<'a> ClientSide<'a> {
         Ok(())
     }
 
-    fn lane(&mut self, index: usize) -> Option<&mut Lane> {
+    fn lane(&mut self, index: usize) -> Option<&mut ClientLane> {
         self.lanes.iter_mut().find(|lane| lane.index == index)
     }
 
@@ -133,7 +133,7 @@ impl CollectRollouts for ClientSide<'_> {
         loop {
             self.step(runs)?;
             let Self { lanes, is_reversed, times, .. } = self;
-            let is_whole = |(lane, run): &(&mut Lane, &Run<'_>)| run.end.is_none() && lane.collector.is_done();
+            let is_whole = |(lane, run): &(&mut ClientLane, &Run<'_>)| run.end.is_none() && lane.collector.is_done();
             let whole = in_order(lanes.iter_mut().zip(runs.iter()), *is_reversed).filter(is_whole);
             let collected: Vec<Collected> = whole.map(|(lane, _)| lane.collected(*times)).collect();
             if !collected.is_empty() {
@@ -162,7 +162,7 @@ impl CollectRollouts for ClientSide<'_> {
 
     fn release(&mut self, index: usize) -> Result<()> {
         let Some(place) = self.lanes.iter().position(|lane| lane.index == index) else { return Ok(()) };
-        let Lane { slots, .. } = self.lanes.remove(place);
+        let ClientLane { slots, .. } = self.lanes.remove(place);
         self.release_slots(slots)
     }
 
@@ -171,9 +171,9 @@ impl CollectRollouts for ClientSide<'_> {
     }
 }
 
-impl Lane {
+impl ClientLane {
     /// Chooses actions, and begins a rollout if none is being collected.
-    fn act(&mut self, session: &mut Session<'_>, trainer: &mut Trainer<'_>, now: Times) -> Result<()> {
+    fn act(&mut self, session: &mut Session<'_>, trainer: &mut Trainer<'_>, now: StepTimes) -> Result<()> {
         if self.begun.is_none() {
             self.begun = Some(now);
             let until = trainer.collect_until();
@@ -198,7 +198,7 @@ impl Lane {
     }
 
     /// Ends the collection of a rollout that is whole.
-    fn collected(&mut self, now: Times) -> Collected {
+    fn collected(&mut self, now: StepTimes) -> Collected {
         let begun = self.begun.take().unwrap_or(now);
         Collected { index: self.index, acting: now.acting - begun.acting, waiting: now.waiting - begun.waiting }
     }

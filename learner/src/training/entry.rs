@@ -8,7 +8,7 @@ use crate::logging::Progress;
 
 /// Result of a training.
 #[derive(Debug)]
-pub struct Outcome {
+pub struct TrainOutcome {
     /// The last checkpoint, as written.
     pub checkpoint: Checkpoint,
     /// Figures of the last iteration.
@@ -19,7 +19,7 @@ pub struct Outcome {
 
 /// A training to begin or to resume.
 #[derive(Debug)]
-pub struct Entry<'a> {
+pub struct TrainRequest<'a> {
     /// The directory for logs and checkpoints.
     pub directory: &'a RunDirectory,
     /// The point at which the training starts.

@@ -25,7 +25,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use client_side::ClientSide;
 pub use ending::is_over;
-pub use entry::{Entry, Outcome, Start};
+pub use entry::{Start, TrainOutcome, TrainRequest};
 pub use error::{LastCheckpoint, TrainError};
 use perturb_files::interrupt::StopFlag;
 use perturb_policy::{Normalisers, Player, PlayerState};
@@ -58,9 +58,9 @@ pub fn train(
     threads: usize,
     stop: &StopFlag,
     report: impl FnMut(&Progress),
-) -> Result<Outcome> {
+) -> Result<TrainOutcome> {
     let start = Start::Fresh(Box::new(config.clone()));
-    train_with_retry(servers, Entry { directory, start, marks: &[] }, threads, stop, report)
+    train_with_retry(servers, TrainRequest { directory, start, marks: &[] }, threads, stop, report)
 }
 
 /// Resumes the run in `directory` from its last `checkpoint`, to the same bytes as without the break except times.
@@ -75,20 +75,20 @@ pub fn resume(
     threads: usize,
     stop: &StopFlag,
     report: impl FnMut(&Progress),
-) -> Result<Outcome> {
+) -> Result<TrainOutcome> {
     let start = Start::Checkpoint(Box::new(checkpoint));
-    train_with_retry(servers, Entry { directory, start, marks: &[] }, threads, stop, report)
+    train_with_retry(servers, TrainRequest { directory, start, marks: &[] }, threads, stop, report)
 }
 
 /// Trains one run, and resumes it from its last checkpoint each time that servers were lost and have come back.
 fn train_with_retry(
     servers: &Servers,
-    entry: Entry<'_>,
+    entry: TrainRequest<'_>,
     threads: usize,
     stop: &StopFlag,
     mut report: impl FnMut(&Progress),
-) -> Result<Outcome> {
-    let Entry { directory, mut start, marks } = entry;
+) -> Result<TrainOutcome> {
+    let TrainRequest { directory, mut start, marks } = entry;
     let config = start.config().clone();
     let mut backoff = Backoff::default();
     let mut saved = start.timesteps();
@@ -96,7 +96,7 @@ fn train_with_retry(
         let mut outcome = None;
         let attempt = train_together(
             servers,
-            vec![Entry { directory, start, marks }],
+            vec![TrainRequest { directory, start, marks }],
             threads,
             stop,
             &mut |_, progress| {
@@ -132,13 +132,13 @@ fn train_with_retry(
 /// last checkpoints stay as they are.
 pub fn train_together(
     servers: &Servers,
-    entries: Vec<Entry<'_>>,
+    entries: Vec<TrainRequest<'_>>,
     threads: usize,
     stop: &StopFlag,
     report: &mut dyn FnMut(usize, &Progress),
-    ended: &mut dyn FnMut(usize, Result<Outcome>),
+    ended: &mut dyn FnMut(usize, Result<TrainOutcome>),
 ) -> Result<()> {
-    let is_random = |(_, entry): &(usize, Entry<'_>)| entry.start.config().settings.is_random();
+    let is_random = |(_, entry): &(usize, TrainRequest<'_>)| entry.start.config().settings.is_random();
     let (random, entries): (Vec<_>, Vec<_>) = entries.into_iter().enumerate().partition(is_random);
     for (index, entry) in random {
         ended(index, random::make(servers, &entry));
@@ -158,7 +158,7 @@ struct Run<'a> {
     index: usize,
     trainer: Trainer<'a>,
     /// Set when the run has ended.
-    end: Option<Result<Outcome>>,
+    end: Option<Result<TrainOutcome>>,
 }
 
 impl Run<'_> {
@@ -232,7 +232,7 @@ fn train_loop(
     mut runs: Vec<Run<'_>>,
     stop: &StopFlag,
     report: &mut dyn FnMut(usize, &Progress),
-    ended: &mut dyn FnMut(usize, Result<Outcome>),
+    ended: &mut dyn FnMut(usize, Result<TrainOutcome>),
 ) -> Result<()> {
     let mut workspace = if let [first, _, ..] = runs.as_slice() { first.trainer.workspace()? } else { None };
     while !runs.is_empty() {

@@ -10,7 +10,7 @@ use perturb_policy::math::ln;
 use perturb_policy::{NamedArray, PolicySpec, RewardNormaliser, Weights};
 use perturb_settings::{Common, TrainConfig};
 
-use super::{Entry, Outcome, Result, TrainError};
+use super::{Result, TrainError, TrainOutcome, TrainRequest};
 use crate::checkpoint::{Checkpoint, EnvironmentSummary, State};
 use crate::client::Servers;
 use crate::logging::Progress;
@@ -20,8 +20,8 @@ use crate::proto::{Channel, Environment, action_space::Kind};
 ///
 /// # Errors
 /// A server that does not know the environment, actions without bounds, a full disk.
-pub(super) fn make(servers: &Servers, entry: &Entry<'_>) -> Result<Outcome> {
-    let Entry { directory, ref start, marks } = *entry;
+pub(super) fn make(servers: &Servers, entry: &TrainRequest<'_>) -> Result<TrainOutcome> {
+    let TrainRequest { directory, ref start, marks } = *entry;
     let config = start.config();
     let environment = servers.environment_seen(&config.common)?;
     let checkpoint = checkpoint(config, &environment)?;
@@ -29,7 +29,7 @@ pub(super) fn make(servers: &Servers, entry: &Entry<'_>) -> Result<Outcome> {
     write_atomically(&directory.path().join("config.toml"), config.to_toml().as_bytes())?;
     marks.iter().try_for_each(|&mark| checkpoint.save(&directory.mark(mark), None))?;
     checkpoint.save(&directory.checkpoint(), None)?;
-    Ok(Outcome { checkpoint, progress: Progress::default(), signal: None })
+    Ok(TrainOutcome { checkpoint, progress: Progress::default(), signal: None })
 }
 
 fn checkpoint(config: &TrainConfig, environment: &Environment) -> Result<Checkpoint> {

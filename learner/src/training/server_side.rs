@@ -15,8 +15,8 @@ use perturb_settings::Rollouts;
 
 use super::start::{options, start_or_resume};
 use super::trainer::Trainer;
-use super::{CollectRollouts, Collected, Entry, Outcome, Result, Run};
-use crate::client::{ClientError, Played, Servers, Session, acting};
+use super::{CollectRollouts, Collected, Result, Run, TrainOutcome, TrainRequest};
+use crate::client::{ClientError, RolloutReply, Servers, Session, acting};
 use crate::proto;
 use crate::rollout::{CollectError, DecodedRollout};
 
@@ -25,21 +25,22 @@ use crate::rollout::{CollectError, DecodedRollout};
 const PIECE_ENV_STEPS: usize = 4096;
 
 /// A reply that is awaited, with the run's session.
-type Playing<'a> = Pin<Box<dyn Future<Output = (Box<Lane<'a>>, std::result::Result<Played, ClientError>)> + 'a>>;
+type PendingReply<'a> =
+    Pin<Box<dyn Future<Output = (Box<ServerLane<'a>>, std::result::Result<RolloutReply, ClientError>)> + 'a>>;
 
 /// Collects the rollouts of runs whose policies the server plays.
 pub(super) struct ServerSide<'a> {
     servers: &'a Servers,
     /// Runs whose server plays nothing: between two rollouts.
-    idle: Vec<Box<Lane<'a>>>,
+    idle: Vec<Box<ServerLane<'a>>>,
     /// Runs whose server plays.
-    playing: FuturesUnordered<Playing<'a>>,
+    playing: FuturesUnordered<PendingReply<'a>>,
     /// Time in which no run had a rollout to learn from.
     waited: Duration,
 }
 
 /// The session of a run.
-struct Lane<'a> {
+struct ServerLane<'a> {
     /// The run's index.
     index: usize,
     session: Session<'a>,
@@ -65,10 +66,10 @@ impl<'a> ServerSide<'a> {
     #[allow(clippy::type_complexity)] // two lists of which each is used once
     pub(super) fn open<'d>(
         servers: &'a Servers,
-        entries: Vec<(usize, Entry<'d>)>,
+        entries: Vec<(usize, TrainRequest<'d>)>,
         threads: usize,
-        ended: &mut dyn FnMut(usize, Result<Outcome>),
-    ) -> Result<(Self, Vec<Run<'d>>, Vec<(usize, Entry<'d>)>)> {
+        ended: &mut dyn FnMut(usize, Result<TrainOutcome>),
+    ) -> Result<(Self, Vec<Run<'d>>, Vec<(usize, TrainRequest<'d>)>)> {
         let is_one = entries.len() == 1;
         let mut idle = Vec::new();
         let mut runs = Vec::new();
@@ -89,7 +90,7 @@ impl<'a> ServerSide<'a> {
             let n_envs = session.num_envs();
             match start_or_resume(entry, &mut session, 0..n_envs, &observations, threads) {
                 Ok((trainer, player)) => {
-                    idle.push(Box::new(Lane {
+                    idle.push(Box::new(ServerLane {
                         index,
                         session,
                         spec: trainer.spec().clone(),
@@ -108,7 +109,7 @@ impl<'a> ServerSide<'a> {
         Ok((server_side, runs, others))
     }
 
-    fn lane(&mut self, index: usize) -> Option<&mut Lane<'a>> {
+    fn lane(&mut self, index: usize) -> Option<&mut ServerLane<'a>> {
         self.idle.iter_mut().map(Box::as_mut).find(|lane| lane.index == index)
     }
 }
@@ -166,7 +167,7 @@ impl CollectRollouts for ServerSide<'_> {
     }
 }
 
-impl<'a> Lane<'a> {
+impl<'a> ServerLane<'a> {
     /// Asks the server for a rollout under the trainer's policy.
     fn request_rollout(&mut self, trainer: &Trainer<'_>, waited: Duration) -> Result<()> {
         (self.begins, self.waited) = (true, waited);
@@ -181,7 +182,7 @@ impl<'a> Lane<'a> {
     }
 
     /// Waits for the reply.
-    async fn played(mut self: Box<Self>) -> (Box<Self>, std::result::Result<Played, ClientError>) {
+    async fn played(mut self: Box<Self>) -> (Box<Self>, std::result::Result<RolloutReply, ClientError>) {
         let played = self.session.played().await;
         (self, played)
     }
@@ -190,9 +191,13 @@ impl<'a> Lane<'a> {
     ///
     /// # Errors
     /// A reply that does not fit, or a failure of the connection. The steps of this rollout are lost then.
-    fn take(&mut self, played: std::result::Result<Played, ClientError>, trainer: &mut Trainer<'_>) -> Result<bool> {
+    fn take(
+        &mut self,
+        played: std::result::Result<RolloutReply, ClientError>,
+        trainer: &mut Trainer<'_>,
+    ) -> Result<bool> {
         let Self { session, spec, max_steps, begins, decoded, .. } = self;
-        let Played { acted, ended } = played?;
+        let RolloutReply { acted, ended } = played?;
         let until = trainer.collect_until();
         let (rollout, tally) = trainer.collecting();
         let mismatch = |got| CollectError::Client(session.malformed_rollout(got));

@@ -10,8 +10,8 @@ use perturb_records::Comparison;
 use perturb_settings::{Base, Common, Settings, TrainConfig, Wrapper};
 
 use super::ending::RECENT;
-use super::trainer::{Tally, Trainer};
-use super::{Entry, Result, RunDirectory, Start, TrainError};
+use super::trainer::{EpisodeTally, Trainer};
+use super::{Result, RunDirectory, Start, TrainError, TrainRequest};
 use crate::checkpoint::{Checkpoint, EnvironmentSummary, ResumeState, State};
 use crate::client::{OpenOptions, Session};
 use crate::logging::{Clock, Logs, TimeShares};
@@ -36,14 +36,14 @@ pub(super) fn options(config: &TrainConfig) -> OpenOptions {
 /// Brings a run and its player to the point at which it starts, in `slots` of the session, whose first `observations`
 /// `[N, O]` are given.
 pub(super) fn start_or_resume<'a>(
-    entry: Entry<'a>,
+    entry: TrainRequest<'a>,
     session: &mut Session<'_>,
     slots: Range<usize>,
     observations: &[f32],
     threads: usize,
 ) -> Result<(Trainer<'a>, Player)> {
     let environment = session.environment().clone();
-    let Entry { directory, start, marks } = entry;
+    let TrainRequest { directory, start, marks } = entry;
     let (mut trainer, player) = match start {
         Start::Fresh(config) => begin(&config, directory, &environment, observations, threads)?,
         Start::Checkpoint(saved) => {
@@ -166,7 +166,7 @@ fn new_trainer<'a>(
         policy,
         algorithm,
         rollout,
-        tally: Tally {
+        tally: EpisodeTally {
             comparison: Comparison::of(environment),
             recent: VecDeque::with_capacity(RECENT),
             ended: Vec::new(),

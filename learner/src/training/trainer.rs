@@ -10,7 +10,7 @@ use perturb_records::Comparison;
 use perturb_settings::{Common, EpoptConfig, TrainConfig, Wrapper};
 
 use super::ending::{RECENT, is_over};
-use super::{LONG_UPDATE, LastCheckpoint, Outcome, Result, RunDirectory, TrainError};
+use super::{LONG_UPDATE, LastCheckpoint, Result, RunDirectory, TrainError, TrainOutcome};
 use crate::algorithm::{Algorithm, UpdateStats};
 use crate::checkpoint::{Checkpoint, History, ResumeState, State};
 use crate::client::EndedEpisode;
@@ -24,7 +24,7 @@ pub(super) struct Trainer<'a> {
     pub(super) policy: Policy,
     pub(super) algorithm: Box<dyn Algorithm>,
     pub(super) rollout: Rollout,
-    pub(super) tally: Tally,
+    pub(super) tally: EpisodeTally,
     pub(super) logs: Logs,
     /// The checkpoint after the last whole iteration. Weights and statistics are put in when it is saved.
     pub(super) checkpoint: Checkpoint,
@@ -40,7 +40,7 @@ pub(super) struct Trainer<'a> {
 }
 
 /// The episodes that ended while a rollout was collected.
-pub(super) struct Tally {
+pub(super) struct EpisodeTally {
     /// Compares the parameters that episodes ran with to those that were requested.
     pub(super) comparison: Comparison,
     /// The last episodes, at most [`RECENT`].
@@ -79,7 +79,7 @@ impl Trainer<'_> {
     }
 
     /// The buffers for a rollout and its episodes.
-    pub(super) fn collecting(&mut self) -> (&mut Rollout, &mut Tally) {
+    pub(super) fn collecting(&mut self) -> (&mut Rollout, &mut EpisodeTally) {
         (&mut self.rollout, &mut self.tally)
     }
 
@@ -152,7 +152,7 @@ impl Trainer<'_> {
 
     /// Logs the rollout's episodes. Returns their number, and the number of steps that the rollout counts.
     fn log_episodes(&mut self) -> Result<(u64, u64)> {
-        let Tally { comparison, ended, .. } = &mut self.tally;
+        let EpisodeTally { comparison, ended, .. } = &mut self.tally;
         for episode in &*ended {
             self.logs.episode(episode)?;
         }
@@ -250,11 +250,11 @@ impl Trainer<'_> {
     ///
     /// # Errors
     /// A full disk.
-    pub(super) fn end(&mut self, iteration: &IterationOutcome) -> Result<Outcome> {
+    pub(super) fn end(&mut self, iteration: &IterationOutcome) -> Result<TrainOutcome> {
         if !iteration.logged {
             self.logs.progress(&iteration.progress)?; // a line beyond the checkpoint, which a resumed run deletes
         }
-        Ok(Outcome { checkpoint: self.checkpoint.clone(), progress: iteration.progress, signal: iteration.signal })
+        Ok(TrainOutcome { checkpoint: self.checkpoint.clone(), progress: iteration.progress, signal: iteration.signal })
     }
 
     /// Adds to an `error` that ended the run which checkpoint is left.
@@ -280,7 +280,7 @@ impl Trainer<'_> {
     }
 }
 
-impl Tally {
+impl EpisodeTally {
     /// Notes an episode that ended.
     pub(super) fn note(&mut self, episode: &EndedEpisode) {
         while self.recent.len() >= RECENT {

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, HashSet};
 
 use perturb_learner::algorithm::{
-    A2c, Algorithm, AlgorithmState, BaseAlgorithm, Epopt, Ppo, Selection, UpdateStats, gae, n_step_returns,
+    A2c, Algorithm, AlgorithmState, BaseAlgorithm, EpisodeSelection, Epopt, Ppo, UpdateStats, gae, n_step_returns,
 };
 use perturb_learner::client::{EndedEpisode, PrivateServer, Session};
 use perturb_learner::error::Error;
@@ -156,7 +156,8 @@ fn epopt_learns_only_from_the_worst_episodes() {
             assert_eq!(UpdateStats { selection: None, ..stats }, expected, "{lstm:?}");
             assert_eq!(policy.weights(), expected_weights, "{lstm:?}");
             assert_ne!(policy.weights(), weights_of_all, "the better half would matter");
-            let expected = Selection { epsilon: 0.5, kept: 4, kept_steps: 21, mean_return: 25.0 / 8.0, cvar: 0.5 };
+            let expected =
+                EpisodeSelection { epsilon: 0.5, kept: 4, kept_steps: 21, mean_return: 25.0 / 8.0, cvar: 0.5 };
             assert_eq!(stats.selection, Some(expected));
         }
     }

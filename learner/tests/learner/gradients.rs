@@ -6,7 +6,7 @@ use perturb_policy::{
     Acting, ActionKind, Actor, ActorOutput, Differentiator, Losses, Objective, Optimiser, PolicySpec, Samples,
     Surrogate, UpdateRule,
 };
-use perturb_torch::{Sequences, Targets, TorchPolicy, evaluate};
+use perturb_torch::{LossTargets, Sequences, TorchPolicy, evaluate};
 use rstest::rstest;
 use tch::Tensor;
 
@@ -141,7 +141,7 @@ impl Data {
             &Tensor::of_slice(&pick(&self.actions, spec.action.width())),
         );
         let n_outputs = spec.action.outputs();
-        let targets = Targets {
+        let targets = LossTargets {
             old_log_probs: one(&self.old_log_probs),
             old_values: one(&self.old_values),
             advantages: one(&self.advantages),

@@ -7,7 +7,7 @@ use perturb_learner::checkpoint::{Checkpoint, ResumeState};
 use perturb_learner::client::{ActorLocation, PrivateServer, Servers};
 use perturb_learner::evaluation::{TestOptions, Tester};
 use perturb_learner::logging::Progress;
-use perturb_learner::training::{Entry, RunDirectory, Start, train, train_together};
+use perturb_learner::training::{RunDirectory, Start, TrainRequest, train, train_together};
 use perturb_protocol::Version;
 use perturb_settings::TrainConfig;
 use rstest::rstest;
@@ -78,8 +78,10 @@ fn together(servers: &Servers, base: &Path, task: &str, numbers: &[usize], most_
             }
         })
         .collect();
-    let entries =
-        directories.iter().map(|(directory, start)| Entry { directory, start: start.clone(), marks: &[] }).collect();
+    let entries = directories
+        .iter()
+        .map(|(directory, start)| TrainRequest { directory, start: start.clone(), marks: &[] })
+        .collect();
     let stop = StopFlag::default();
     let mut ended = vec![false; numbers.len()];
     train_together(
@@ -187,8 +189,11 @@ fn failed_training_does_not_stop_the_others(
     let directories: Vec<RunDirectory> =
         ["bad", "good"].map(|name| RunDirectory::choose(&base.path().join(name), false).expect("a directory")).into();
     let starts = [config(task, &bad), good].map(|config| Start::Fresh(Box::new(config)));
-    let entries =
-        directories.iter().zip(starts).map(|(directory, start)| Entry { directory, start, marks: &[] }).collect();
+    let entries = directories
+        .iter()
+        .zip(starts)
+        .map(|(directory, start)| TrainRequest { directory, start, marks: &[] })
+        .collect();
     let mut ends = vec![String::new(); 2];
     let mut ended = |index: usize, outcome: Result<_, _>| {
         ends[index] =

@@ -9,7 +9,7 @@ use crate::{
     },
 };
 use perturb_policy::{
-    CollectUntil, Inputs, Normalisers, Player, PlayerState, PolicySpec, Remaining, Role, SlotEnd, StepOutcome,
+    CollectUntil, Inputs, Normalisers, Player, PlayerState, PolicySpec, RemainingRollout, Role, SlotEnd, StepOutcome,
 };
 use rand_chacha::ChaCha8Rng;
 use std::sync::Mutex;
@@ -49,7 +49,7 @@ pub enum PolicyRole {
 /// A policy at play, between two steps.
 pub struct Play {
     player: Player,
-    pub(in crate::pool) task: Remaining,
+    pub(in crate::pool) task: RemainingRollout,
     /// In a test.
     seed: Option<u64>,
     /// What the last step brought.
@@ -82,7 +82,7 @@ impl Play {
             PolicyRole::Testing { seed } => (Role::testing_in(seed, trials.into_iter()), Some(seed)),
         };
         let player = Player::new(&spec, inputs, n_envs, episodes_per_trial, normalisers, role);
-        let mut play = Self { player, task: Remaining::Steps(0), seed, step: Gathered::default(), spec };
+        let mut play = Self { player, task: RemainingRollout::Steps(0), seed, step: Gathered::default(), spec };
         play.player.load(&weights)?;
         match state {
             Some(state) => play.player.restore(&state)?,
@@ -105,7 +105,7 @@ impl Play {
     }
 
     /// What is played.
-    pub fn task(&self) -> &Remaining {
+    pub fn task(&self) -> &RemainingRollout {
         &self.task
     }
 

@@ -14,7 +14,7 @@ use crate::{
     },
 };
 use bytes::BytesMut;
-use perturb_policy::{CollectUntil, Remaining, RolloutStep};
+use perturb_policy::{CollectUntil, RemainingRollout, RolloutStep};
 use std::sync::Mutex;
 
 /// A round of about so many bytes ends: many gRPC libraries receive no more than 4 MiB.
@@ -190,8 +190,8 @@ impl Played {
         let (n_envs, spec) = (play.player().n_envs(), play.spec());
         let step_bytes = n_envs * (4 * (spec.observation_size + spec.action.width() + 4) + 3);
         let steps = match play.task() {
-            Remaining::Steps(left) => turn.most_steps.min(*left),
-            Remaining::Episodes(_) => turn.most_steps.min(FIRST_ROOM),
+            RemainingRollout::Steps(left) => turn.most_steps.min(*left),
+            RemainingRollout::Episodes(_) => turn.most_steps.min(FIRST_ROOM),
         };
         let steps = steps.min(MOST_BYTES / step_bytes + 1);
         let room = |bytes: usize| BytesMut::with_capacity(steps * n_envs * bytes);

@@ -8,7 +8,7 @@ use crate::{
 };
 use bytes::Bytes;
 use perturb_protocol::{
-    ledger::{self, Begin, End, Event, Who},
+    ledger::{self, DrawEnd, DrawStart, LedgerEvent, LedgerSession},
     region::Region,
 };
 use std::sync::{
@@ -31,12 +31,15 @@ const MOST_REFUSED: u32 = 100;
 
 /// What was written down, until it is known whether it happens.
 #[derive(Default)]
-pub struct Begun(Vec<Begin>);
+pub struct Begun(Vec<DrawStart>);
 
 impl Begun {
     /// Nothing of it was drawn.
-    fn withdrawn(self) -> Vec<End> {
-        self.0.into_iter().map(|Begin { seed, index, count, .. }| End { seed, index, count, episode: None }).collect()
+    fn withdrawn(self) -> Vec<DrawEnd> {
+        self.0
+            .into_iter()
+            .map(|DrawStart { seed, index, count, .. }| DrawEnd { seed, index, count, episode: None })
+            .collect()
     }
 }
 
@@ -162,7 +165,7 @@ impl Draws {
         if let Some(ledger) = &self.ledger
             && self.refused.fetch_add(1, Ordering::Relaxed) < MOST_REFUSED
         {
-            ledger.note(Event::Refused { who: self.who(spec), region: region.clone(), reason: reason.clone() });
+            ledger.note(LedgerEvent::Refused { who: self.who(spec), region: region.clone(), reason: reason.clone() });
         }
         Err(Error::NotAllowed { role: role.name().into(), environment: spec.name, region: region.to_string(), reason })
     }
@@ -192,14 +195,14 @@ impl Draws {
         Ok(begun)
     }
 
-    fn note(&self, spec: &EnvironmentSpec, regions: Vec<Region>, begins: Vec<Begin>, ends: Vec<End>) {
+    fn note(&self, spec: &EnvironmentSpec, regions: Vec<Region>, begins: Vec<DrawStart>, ends: Vec<DrawEnd>) {
         if let Some(ledger) = &self.ledger {
             ledger.note(self.event(spec, regions, begins, ends));
         }
     }
 
-    fn who(&self, spec: &EnvironmentSpec) -> Who {
-        Who {
+    fn who(&self, spec: &EnvironmentSpec) -> LedgerSession {
+        LedgerSession {
             session: self.session,
             token: self.bearer.as_ref().map(|bearer| bearer.name().into()),
             environment: spec.name.into(),
@@ -207,15 +210,24 @@ impl Draws {
         }
     }
 
-    fn event(&self, spec: &EnvironmentSpec, regions: Vec<Region>, begins: Vec<Begin>, ends: Vec<End>) -> Event {
-        Event::Draws(ledger::DrawRecord { who: self.who(spec), regions, begins, ends })
+    fn event(
+        &self,
+        spec: &EnvironmentSpec,
+        regions: Vec<Region>,
+        begins: Vec<DrawStart>,
+        ends: Vec<DrawEnd>,
+    ) -> LedgerEvent {
+        LedgerEvent::Draws(ledger::DrawRecord { who: self.who(spec), regions, begins, ends })
     }
 }
 
 /// What begins, neighbours that draw alike as one, and the regions that they draw from.
-fn gathered<'a>(spec: &EnvironmentSpec, begins: impl Iterator<Item = (Next<'a>, usize)>) -> (Vec<Region>, Vec<Begin>) {
+fn gathered<'a>(
+    spec: &EnvironmentSpec,
+    begins: impl Iterator<Item = (Next<'a>, usize)>,
+) -> (Vec<Region>, Vec<DrawStart>) {
     let mut last: Option<&[Distribution]> = None;
-    let (mut regions, mut gathered): (Vec<Region>, Vec<Begin>) = (Vec::new(), Vec::new());
+    let (mut regions, mut gathered): (Vec<Region>, Vec<DrawStart>) = (Vec::new(), Vec::new());
     for (Next { draw, distributions }, count) in begins {
         if last.replace(distributions) != Some(distributions) {
             regions.push(spec.region(distributions));
@@ -229,22 +241,22 @@ fn gathered<'a>(spec: &EnvironmentSpec, begins: impl Iterator<Item = (Next<'a>, 
             {
                 last.count += count as u32;
             }
-            _ => gathered.push(Begin { seed, index, count: count as u32, region, episode }),
+            _ => gathered.push(DrawStart { seed, index, count: count as u32, region, episode }),
         }
     }
     (regions, gathered)
 }
 
 /// What ends, likewise.
-fn ended(draws: impl IntoIterator<Item = Draw>) -> Vec<End> {
-    let mut ended: Vec<End> = Vec::new();
+fn ended(draws: impl IntoIterator<Item = Draw>) -> Vec<DrawEnd> {
+    let mut ended: Vec<DrawEnd> = Vec::new();
     for Draw { seed, environment_index: index, episode_index } in draws {
         let episode = Some(episode_index);
         match ended.last_mut() {
             Some(last) if (last.seed, last.episode, last.index.wrapping_add(last.count)) == (seed, episode, index) => {
                 last.count += 1;
             }
-            _ => ended.push(End { seed, index, count: 1, episode }),
+            _ => ended.push(DrawEnd { seed, index, count: 1, episode }),
         }
     }
     ended

@@ -2,7 +2,7 @@
 
 use super::Error;
 use crate::server::error::InvalidValue;
-use perturb_protocol::ledger::{Chain, Event, MAX_LINE_BYTES, read};
+use perturb_protocol::ledger::{Chain, LedgerEvent, MAX_LINE_BYTES, read};
 use std::{
     fs::{File, OpenOptions},
     io::{self, Write},
@@ -18,7 +18,7 @@ use std::{
 use tokio::sync::oneshot;
 
 /// A line to be written, and who waits until it is.
-type Line = (Event, Option<oneshot::Sender<Result<(), String>>>);
+type Line = (LedgerEvent, Option<oneshot::Sender<Result<(), String>>>);
 
 /// A server's ledger. A thread of its own writes it.
 #[derive(Clone)]
@@ -51,7 +51,7 @@ impl Ledger {
             is_torn: true,
         };
         let (version, commit) = (env!("CARGO_PKG_VERSION").into(), env!("PERTURB_COMMIT").into());
-        let began = Event::Began { version, commit, unfinished: there.unfinished };
+        let began = LedgerEvent::Began { version, commit, unfinished: there.unfinished };
         book.write([&began]).map_err(io::Error::other)?;
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
         File::open(folder)?.sync_all()?; // the name of a new file, too
@@ -69,7 +69,7 @@ impl Ledger {
     ///
     /// # Errors
     /// [`Error::NoLedger`].
-    pub async fn write(&self, event: Event) -> Result<(), Error> {
+    pub async fn write(&self, event: LedgerEvent) -> Result<(), Error> {
         // What a session asks for is bounded, but numbers are longer as text.
         let size = serde_json::to_vec(&event).map_or(usize::MAX, |json| json.len());
         if size as u64 > MAX_LINE_BYTES / 2 {
@@ -92,13 +92,13 @@ impl Ledger {
     }
 
     /// Has a line written, sooner or later.
-    pub fn note(&self, event: Event) {
+    pub fn note(&self, event: LedgerEvent) {
         let _ = self.lines.send((event, None));
     }
 
     /// Writes that the server ends, after all lines before.
     pub async fn close(&self) {
-        if let Err(error) = self.write(Event::Ended).await {
+        if let Err(error) = self.write(LedgerEvent::Ended).await {
             tracing::error!("{error}");
         }
     }
@@ -127,7 +127,7 @@ impl Book {
             if let Err(reason) = &written {
                 tracing::error!("{} cannot be written: {reason}", self.path.display());
             }
-            if lines.iter().any(|(event, _)| matches!(event, Event::Ended)) {
+            if lines.iter().any(|(event, _)| matches!(event, LedgerEvent::Ended)) {
                 let (lines, head) = (self.chain.lines(), self.chain.head());
                 tracing::info!(lines, head, "the ledger {}", self.path.display());
             }
@@ -142,7 +142,7 @@ impl Book {
     }
 
     /// Writes lines and waits for the disk; all, or none.
-    fn write<'a>(&mut self, events: impl IntoIterator<Item = &'a Event>) -> Result<(), String> {
+    fn write<'a>(&mut self, events: impl IntoIterator<Item = &'a LedgerEvent>) -> Result<(), String> {
         #[expect(clippy::disallowed_methods, reason = "lines have their time; what is drawn does not depend on it")]
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
         let unix_ms = u64::try_from(now.as_millis()).unwrap_or(u64::MAX);

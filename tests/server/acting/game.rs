@@ -8,7 +8,7 @@ use perturb::proto::{
 };
 use perturb_policy::{
     self as acting, ActionKind, CollectUntil, Inputs, Normalisers, ObservationNormaliser, Player, PolicySpec,
-    Remaining, RewardNormaliser, RunningMoments, SlotEnd, StepOutcome,
+    RemainingRollout, RewardNormaliser, RunningMoments, SlotEnd, StepOutcome,
     random::{Purpose, stream},
 };
 
@@ -197,7 +197,7 @@ impl Client {
         let Self { game, session, environment, player } = self;
         player.load(&game.weights(environment, version)).unwrap();
         let mut task = task.begin(game.n);
-        if let Remaining::Episodes(_) = task {
+        if let RemainingRollout::Episodes(_) = task {
             let reset = session.ask(Reset::default()).await;
             player.begin(&floats(&reset.observations), Some(&task)).unwrap();
             for start in reset.started.iter().filter(|_| game.testing) {

@@ -14,20 +14,20 @@ use perturb::proto::{
 use perturb_faults::disk;
 use perturb_protocol::{
     Stream,
-    ledger::{Begin, DrawRecord, End, Entry, Event, read},
+    ledger::{DrawEnd, DrawRecord, DrawStart, LedgerEntry, LedgerEvent, read},
 };
 use std::path::Path;
 use tonic::Code;
 
-fn entries(path: &Path) -> Vec<Entry> {
+fn entries(path: &Path) -> Vec<LedgerEntry> {
     let mut entries = Vec::new();
     read(path, |entry, _| entries.push(entry)).unwrap();
     entries
 }
 
 fn draws(path: &Path) -> Vec<DrawRecord> {
-    let of = |entry: Entry| match entry.event {
-        Event::Draws(draws) => Some(draws),
+    let of = |entry: LedgerEntry| match entry.event {
+        LedgerEvent::Draws(draws) => Some(draws),
         _ => None,
     };
     entries(path).into_iter().filter_map(of).collect()
@@ -47,7 +47,7 @@ async fn what_a_session_draws_is_in_the_ledger_before_it_does_and_how_far_it_cam
     let request = Open { first_environment_index: 5, ..open("CartPole", 4, 7) };
     let (mut session, _) = within(Stream::open(&ann, request)).await.unwrap();
     let first = draws(&path);
-    assert_eq!(first[0].begins, [Begin { seed: 7, index: 5, count: 4, region: 0, episode: 0 }]);
+    assert_eq!(first[0].begins, [DrawStart { seed: 7, index: 5, count: 4, region: 0, episode: 0 }]);
     assert_eq!(first[0].who.token.as_deref(), Some("ann"));
     assert_eq!((first[0].who.environment.as_str(), first[0].regions.len(), first[0].ends.len()), ("CartPole", 1, 0));
     let region = first[0].regions[0].to_string();
@@ -58,13 +58,17 @@ async fn what_a_session_draws_is_in_the_ledger_before_it_does_and_how_far_it_cam
     within(session.ask(Reset { mask: vec![0, 0, 0, 1].into(), seeds: vec![9], ..Reset::default() })).await.unwrap();
     within(session.ask(Reset::default())).await.unwrap();
     let reset = draws(&path).pop().unwrap();
-    assert_eq!(reset.begins, [Begin { seed: 9, index: 8, count: 1, region: 0, episode: 0 }]);
-    assert!(matches!(reset.ends[..], [End { seed: 7, index: 8, count: 1, episode: Some(2..) }]), "{:?}", reset.ends);
+    assert_eq!(reset.begins, [DrawStart { seed: 9, index: 8, count: 1, region: 0, episode: 0 }]);
+    assert!(
+        matches!(reset.ends[..], [DrawEnd { seed: 7, index: 8, count: 1, episode: Some(2..) }]),
+        "{:?}",
+        reset.ends
+    );
     assert_eq!(draws(&path).len(), 2, "an empty reset draws on");
 
     within(session.ask(Release { mask: vec![1, 0, 0, 0].into() })).await.unwrap();
     until("the release is there", async || draws(&path).len() == 3).await;
-    assert!(matches!(draws(&path)[2].ends[..], [End { seed: 7, index: 5, count: 1, episode: Some(3..) }]));
+    assert!(matches!(draws(&path)[2].ends[..], [DrawEnd { seed: 7, index: 5, count: 1, episode: Some(3..) }]));
     drop(session);
     until("its end is there", async || draws(&path).len() == 4).await;
     let end = draws(&path).pop().unwrap();
@@ -89,11 +93,11 @@ async fn refusals_are_written_down_and_a_server_that_ends_says_so() {
     let kinds: Vec<&str> = entries
         .iter()
         .map(|entry| match &entry.event {
-            Event::Began { .. } => "began",
-            Event::Refused { who, .. } => who.token.as_deref().unwrap(),
-            Event::Draws(draws) if draws.ends.is_empty() => "begins",
-            Event::Draws(_) => "ends",
-            Event::Ended => "ended",
+            LedgerEvent::Began { .. } => "began",
+            LedgerEvent::Refused { who, .. } => who.token.as_deref().unwrap(),
+            LedgerEvent::Draws(draws) if draws.ends.is_empty() => "begins",
+            LedgerEvent::Draws(_) => "ends",
+            LedgerEvent::Ended => "ended",
         })
         .collect();
     assert_eq!(kinds, ["began", "ann", "begins", "ends", "ended"]);
@@ -169,11 +173,11 @@ async fn worlds_are_in_the_ledger_and_under_roles_too() {
     drop(agent);
     until("its end is there", async || draws(&path).len() == 3).await;
     let lines = draws(&path);
-    assert_eq!(lines[0].begins, [Begin { seed: 3, index: 0, count: 1, region: 0, episode: 0 }]);
-    assert_eq!(lines[1].begins, [Begin { seed: 4, index: 0, count: 1, region: 0, episode: 0 }]);
-    assert_eq!(lines[1].ends, [End { seed: 3, index: 0, count: 1, episode: Some(0) }]);
-    assert_eq!(lines[2].ends, [End { seed: 4, index: 0, count: 1, episode: Some(0) }]);
-    let refused = |entry: &&Entry| matches!(entry.event, Event::Refused { .. });
+    assert_eq!(lines[0].begins, [DrawStart { seed: 3, index: 0, count: 1, region: 0, episode: 0 }]);
+    assert_eq!(lines[1].begins, [DrawStart { seed: 4, index: 0, count: 1, region: 0, episode: 0 }]);
+    assert_eq!(lines[1].ends, [DrawEnd { seed: 3, index: 0, count: 1, episode: Some(0) }]);
+    assert_eq!(lines[2].ends, [DrawEnd { seed: 4, index: 0, count: 1, episode: Some(0) }]);
+    let refused = |entry: &&LedgerEntry| matches!(entry.event, LedgerEvent::Refused { .. });
     assert_eq!(entries(&path).iter().filter(refused).count(), 3);
 }
 
@@ -186,7 +190,7 @@ async fn what_was_refused_or_failed_after_it_was_written_is_taken_back() {
     let (mut session, _) = within(Stream::open(&connection, open("CartPole", 2, 1))).await.unwrap();
     assert!(within(Stream::open(&connection, open("CartPole", 1, 9))).await.is_err(), "the server is full");
     until("it is taken back", async || draws(&path).len() == 3).await;
-    assert_eq!(draws(&path)[2].ends, [End { seed: 9, index: 0, count: 1, episode: None }]);
+    assert_eq!(draws(&path)[2].ends, [DrawEnd { seed: 9, index: 0, count: 1, episode: None }]);
 
     // A snapshot of an episode that has ended, which same-step mode does not take.
     drop(session);
@@ -202,8 +206,8 @@ async fn what_was_refused_or_failed_after_it_was_written_is_taken_back() {
     assert!(within(session.ask(Restore { snapshots, ..Restore::default() })).await.is_err());
     until("it goes on as before", async || draws(&path).len() == 9).await;
     let last = draws(&path).pop().unwrap();
-    assert_eq!(last.ends, [End { seed: 5, index: 0, count: 1, episode: None }]);
-    assert_eq!(last.begins, [Begin { seed: 6, index: 0, count: 1, region: 0, episode: 0 }]);
+    assert_eq!(last.ends, [DrawEnd { seed: 5, index: 0, count: 1, episode: None }]);
+    assert_eq!(last.begins, [DrawStart { seed: 6, index: 0, count: 1, region: 0, episode: 0 }]);
 }
 
 #[test]

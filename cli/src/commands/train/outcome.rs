@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use perturb_learner::checkpoint::State;
 use perturb_learner::logging::{EpisodeFigures, Progress, TimeShares};
-use perturb_learner::training::{Outcome, RunDirectory, TrainError};
+use perturb_learner::training::{RunDirectory, TrainError, TrainOutcome};
 use perturb_settings::TrainConfig;
 use perturb_text::quoted;
 use serde_json::json;
@@ -21,7 +21,7 @@ pub(super) fn finish(
     args: &TrainArgs,
     config: &TrainConfig,
     directory: &RunDirectory,
-    outcome: Result<Outcome, TrainError>,
+    outcome: Result<TrainOutcome, TrainError>,
 ) -> Result<ExitCode> {
     let outcome = match outcome {
         Ok(outcome) => outcome,

@@ -24,7 +24,7 @@ pub(super) const MAX_RESUMES_WITHOUT_REPLY: u32 = 8;
 const MAX_REFUSED: u32 = 4;
 
 /// A lease, by which a session is resumed.
-pub(super) struct Lease {
+pub(super) struct ClientLease {
     name: Bytes,
     time: Duration,
     last_reply: u64,
@@ -33,7 +33,7 @@ pub(super) struct Lease {
 }
 
 /// Why a session was not resumed.
-enum Failure {
+enum ResumeFailure {
     /// Another attempt may succeed.
     Retry,
     /// No server listens at the address.
@@ -43,16 +43,16 @@ enum Failure {
 }
 
 /// Hides the lease's name, which is a secret.
-impl fmt::Debug for Lease {
+impl fmt::Debug for ClientLease {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.debug_struct("Lease")
+        out.debug_struct("ClientLease")
             .field("time", &self.time)
             .field("last_reply", &self.last_reply)
             .finish_non_exhaustive()
     }
 }
 
-impl Lease {
+impl ClientLease {
     /// The lease that a server granted, if it did.
     pub(super) fn from_proto(opened: &proto::Opened) -> Option<Self> {
         let time = Duration::from_secs(opened.lease_seconds.into());
@@ -84,9 +84,9 @@ impl Lease {
         while since.elapsed() < self.time {
             match self.attempt(connection).await {
                 Ok(stream) => return Some(stream),
-                Err(Failure::Permanent) => return None,
-                Err(Failure::Refused) => refused += 1,
-                Err(Failure::Retry) => refused = 0,
+                Err(ResumeFailure::Permanent) => return None,
+                Err(ResumeFailure::Refused) => refused += 1,
+                Err(ResumeFailure::Retry) => refused = 0,
             }
             if refused == MAX_REFUSED {
                 return None;
@@ -97,33 +97,33 @@ impl Lease {
         None
     }
 
-    async fn attempt(&self, connection: &Connection) -> Result<RawStream, Failure> {
+    async fn attempt(&self, connection: &Connection) -> Result<RawStream, ResumeFailure> {
         let resume = proto::Resume { lease: self.name.clone(), last_reply: self.last_reply };
         // The channel connects again by itself.
-        let begun = RawStream::begin(connection, resume, self.waiting.len()).await.map_err(|_| Failure::Retry)?;
-        let mut stream = begun.map_err(Failure::from_status)?;
+        let begun = RawStream::begin(connection, resume, self.waiting.len()).await.map_err(|_| ResumeFailure::Retry)?;
+        let mut stream = begun.map_err(ResumeFailure::from_status)?;
         let limit = connection.timeouts().reply;
-        let reply = tokio::time::timeout(limit, stream.replies.message()).await.map_err(|_| Failure::Retry)?;
-        let Some(SessionResponse { response: Some(response) }) = reply.map_err(Failure::from_status)? else {
-            return Err(Failure::Permanent);
+        let reply = tokio::time::timeout(limit, stream.replies.message()).await.map_err(|_| ResumeFailure::Retry)?;
+        let Some(SessionResponse { response: Some(response) }) = reply.map_err(ResumeFailure::from_status)? else {
+            return Err(ResumeFailure::Permanent);
         };
         if let Response::Error(error) = &response
             && error.code == i32::from(Code::ResourceExhausted)
         {
-            return Err(Failure::Retry);
+            return Err(ResumeFailure::Retry);
         }
         // Any other response is most likely an error.
-        let resumed = proto::Resume::reply(response).map_err(|_| Failure::Permanent)?;
-        let arrived = resumed.last_reply.checked_sub(self.last_reply).ok_or(Failure::Permanent)?;
-        let arrived = usize::try_from(arrived).map_err(|_| Failure::Permanent)?;
+        let resumed = proto::Resume::reply(response).map_err(|_| ResumeFailure::Permanent)?;
+        let arrived = resumed.last_reply.checked_sub(self.last_reply).ok_or(ResumeFailure::Permanent)?;
+        let arrived = usize::try_from(arrived).map_err(|_| ResumeFailure::Permanent)?;
         for request in self.waiting.iter().skip(arrived) {
-            stream.requests.send(request.clone()).await.map_err(|_| Failure::Retry)?;
+            stream.requests.send(request.clone()).await.map_err(|_| ResumeFailure::Retry)?;
         }
         Ok(stream)
     }
 }
 
-impl Failure {
+impl ResumeFailure {
     fn from_status(status: Status) -> Self {
         match system_error(&status) {
             Some(ErrorKind::ConnectionRefused | ErrorKind::NotFound) => Self::Refused,
