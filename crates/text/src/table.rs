@@ -136,10 +136,15 @@ impl<'r, R> TableBuilder<'r, R> {
     }
 
     /// A column under a head that may belong to a group.
-    pub fn column<E: Into<Entry>>(mut self, column: Column, entry: impl Fn(&'r R) -> E) -> Self {
+    pub fn column<E: Into<Entry>>(self, column: Column, entry: impl Fn(&'r R) -> E) -> Self {
+        self.push_column(column, &|source| entry(source).into())
+    }
+
+    /// Adds a column. The code is compiled once for each type of row, not once for each column.
+    fn push_column(mut self, column: Column, entry: &dyn Fn(&'r R) -> Entry) -> Self {
         self.table.columns.push(column);
         for (row, source) in self.table.rows.iter_mut().zip(self.sources) {
-            row.push(entry(source).into());
+            row.push(entry(source));
         }
         self
     }

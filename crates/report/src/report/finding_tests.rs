@@ -114,6 +114,7 @@ fn said_of_runs(rows: &[(&str, f64, f64, Option<[f64; 2]>)], runs: &[usize], mis
         environment: "CartPole",
         method,
         ours: BTreeMap::new(),
+        ties: BTreeMap::new(),
         papers: BTreeMap::new(),
         comparable: true,
         means,
