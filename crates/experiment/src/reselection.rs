@@ -14,7 +14,7 @@ use std::collections::HashMap;
 
 use perturb_policy::random::{Purpose, stream, uniform};
 use perturb_protocol::Version;
-use perturb_records::statistics::{Bootstrapped, mean, percentile_interval, resample};
+use perturb_records::statistics::{Bootstrapped, MIN_RUNS_FOR_INTERVAL, mean, percentile_interval, resample};
 use perturb_records::{Metric, TestResult, TrainedOn};
 use perturb_settings::Method;
 
@@ -96,8 +96,7 @@ impl<'a> Reselection<'a> {
         let sizes: Vec<usize> = reported.iter().map(Vec::len).collect();
         let mut rng = stream(SELECTION_SEED, Purpose::Bootstrap);
         let mut uniform = || uniform(&mut rng);
-        // A run alone can only be drawn again, and says nothing of others.
-        let resamples = if runs > 1 || sizes.iter().any(|size| *size > 1) { resamples } else { 0 };
+        let resamples = if runs < MIN_RUNS_FOR_INTERVAL { 0 } else { resamples };
         resample(&sizes, resamples, RUNS_SEED, |draws| {
             let winners: Vec<_> = contests.iter().map(|contest| contest.decide(&mut uniform)).collect();
             for ((drawn, runs), draws) in drawn.iter_mut().zip(&reported).zip(draws) {

@@ -2,12 +2,14 @@
 
 use perturb_policy::random::{Purpose, stream, uniform};
 
+use super::MIN_RUNS_FOR_INTERVAL;
+
 /// A number with its 95 % interval.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bootstrapped {
     /// Of the scores as they are.
     pub point: f64,
-    /// 2.5th and 97.5th percentile of the resamples; `None` if no stratum has a second run.
+    /// The ends of the interval; `None` with fewer than [`MIN_RUNS_FOR_INTERVAL`] runs.
     pub interval_95: Option<[f64; 2]>,
     /// Runs of each stratum; of the one that has fewest, if they differ.
     pub runs: usize,
@@ -58,17 +60,10 @@ pub fn bootstrap(
         estimates.iter_mut().zip(statistic(&drawn)).for_each(|(estimates, number)| estimates.push(number));
     });
     let with_interval = |(point, estimates)| {
-        let interval_95 = Some(percentile_interval(estimates));
+        let interval_95 = (runs >= MIN_RUNS_FOR_INTERVAL).then(|| percentile_interval(estimates));
         Bootstrapped { point, interval_95, runs }
     };
     Some(points.into_iter().zip(estimates).map(with_interval).collect())
-}
-
-/// Whether there are so many runs that fewer than one in 40 resamples is the lowest of all runs alone: with fewer the ends
-/// of a 95 % interval are the lowest and the highest run, whatever lies between. Of one stratum 4 are enough.
-pub fn are_enough(strata: &[Vec<f64>]) -> bool {
-    let lowest_alone = |runs: &Vec<f64>| (runs.len() as f64).powi(-(runs.len() as i32));
-    strata.iter().map(lowest_alone).product::<f64>() < 0.025
 }
 
 /// Draws runs anew, with replacement and as many, within each of the strata that have `sizes` runs, all of which have some.
@@ -119,11 +114,11 @@ mod tests {
     fn an_environment_without_runs_leaves_nothing_to_say() {
         assert_eq!(Bootstrapped::of(&[], 10, 1, mean), None);
         assert_eq!(Bootstrapped::of(&[vec![1.0], vec![]], 10, 1, mean), None);
-        let alone = Bootstrapped::of(&[vec![5.0], vec![7.0]], 10, 1, mean).unwrap();
-        assert_eq!((alone.point, alone.interval_95), (6.0, None), "a run alone can only be drawn again");
-        assert_eq!(alone.to_string(), "6.0");
-        let several = Bootstrapped::of(&[vec![5.0], vec![7.0, 9.0]], 10, 1, mean).unwrap();
-        assert_eq!((several.interval_95.is_some(), several.runs), (true, 1));
+        let two = Bootstrapped::of(&[vec![5.0; 3], vec![7.0, 9.0]], 10, 1, mean).unwrap();
+        assert_eq!((two.interval_95, two.runs), (None, 2), "fewer than three runs have no interval");
+        assert_eq!(two.to_string(), "6.2");
+        let three = Bootstrapped::of(&[vec![5.0; 3], vec![7.0, 9.0, 8.0]], 10, 1, mean).unwrap();
+        assert_eq!((three.interval_95.is_some(), three.runs), (true, 3));
     }
 
     #[test]
@@ -138,19 +133,6 @@ mod tests {
         assert!(draws.iter().all(|draws| (draws[0].len(), draws[1].len()) == (2, 5)));
         let seen = |stratum: usize, run: usize| draws.iter().any(|draws| draws[stratum].contains(&run));
         assert!((0..2).all(|run| seen(0, run)) && (0..5).all(|run| seen(1, run)) && !seen(0, 2) && !seen(1, 5));
-    }
-
-    /// What the 2.5th percentile of all resamples is.
-    #[test]
-    fn enough_runs_have_an_interval_that_is_not_from_the_lowest_to_the_highest() {
-        let runs = |count: usize| (0..count).map(|run| (run * run) as f64).collect::<Vec<_>>();
-        for strata in [vec![1], vec![2], vec![3], vec![4], vec![5], vec![2, 2], vec![2, 2, 2], vec![3, 1], vec![1, 4]] {
-            let strata: Vec<Vec<f64>> = strata.into_iter().map(runs).collect();
-            let lowest = mean(&strata.iter().map(|runs| vec![runs[0]; runs.len()]).collect::<Vec<_>>());
-            let number = Bootstrapped::of(&strata, 100_000, 1, mean).unwrap();
-            let is_inside = number.interval_95.is_some_and(|[low, _]| low > lowest + 1e-9);
-            assert_eq!(are_enough(&strata), is_inside, "{strata:?}: {number}");
-        }
     }
 
     #[test]

@@ -215,7 +215,7 @@ pub(crate) mod tests {
             x_name: "success rate, %".into(),
             x: 0.0..100.0,
             groups: ["Default", "Extrapolation"].map(group).into(),
-            legend: ["mean over runs".into(), "95 % bootstrap interval".into(), "the paper's mean".into()],
+            legend: ["mean over runs".into(), "95 % t interval".into(), "the paper's mean".into()],
             note: String::new(),
         }
     }
@@ -243,7 +243,7 @@ pub(crate) mod tests {
             row.point = row.point.filter(|point| *point > 50.0);
         });
         let shown = svg(&plot).unwrap();
-        assert!(shown.contains("mean over runs") && !shown.contains("bootstrap") && !shown.contains("paper's"));
+        assert!(shown.contains("mean over runs") && !shown.contains("t interval") && !shown.contains("paper's"));
         assert_eq!(shown.matches("missing").count(), 2, "a number that there is not is none");
     }
 }

@@ -2,7 +2,7 @@
 
 use perturb_experiment::{MethodResults, scores};
 use perturb_records::Metric;
-use perturb_records::statistics::{Bootstrapped, holm, mean, probability_of_improvement, sign_flip_p};
+use perturb_records::statistics::{Bootstrapped, holm, mean_with_t_interval, probability_of_improvement, sign_flip_p};
 use perturb_settings::Method;
 use perturb_text::Table;
 
@@ -87,7 +87,7 @@ fn compare(environment: &str, [x, y]: [&Method; 2], metric: Metric, scores: &[Ve
         x: x.clone(),
         y: y.clone(),
         metric,
-        difference: Bootstrapped::of(&differences, RESAMPLES, 1, |strata| mean(strata.concat().into_iter()))?,
+        difference: mean_with_t_interval(&differences)?,
         improvement: Bootstrapped::of(scores, RESAMPLES, 1, improvement)?,
         pairs: pairs.len(),
         p,
@@ -101,8 +101,8 @@ impl Report<'_> {
         let first = self.comparisons.first()?;
         let of_all = self.comparisons.chunk_by(|a, b| a.environment == b.environment).next()?;
         let title = format!(
-            "Methods compared in pairs, {}: differences in percentage points and probabilities of improvement with 95 % \
-             stratified bootstrap intervals, p of sign flips, corrected after Holm for the {} comparisons",
+            "Methods compared in pairs, {}: differences in percentage points with 95 % t intervals, probabilities of \
+             improvement with 95 % stratified bootstrap intervals, p of sign flips, corrected after Holm for the {} comparisons",
             if first.environment == ALL { "all environments" } else { &first.environment },
             of_all.len()
         );
@@ -142,7 +142,7 @@ impl Report<'_> {
 }
 
 /// A p-value, to three decimals.
-fn shown(p: f64) -> String {
+pub(super) fn shown(p: f64) -> String {
     if p < 0.0005 {
         "< 0.001".into()
     } else if p.is_nan() {

@@ -69,8 +69,8 @@ impl<'a> Report<'a> {
         let over = if is_average { "environments and runs" } else { "runs" };
         let of_rows = |has: &dyn Fn(&MethodMetrics<'_>) -> bool| rows.iter().any(has);
         let intervals = match of_rows(&|row| row.means.values().any(|mean| mean.interval_95.is_some())) {
-            true if is_average => " with 95 % stratified bootstrap intervals",
-            true => " with 95 % bootstrap intervals",
+            true if is_average => " with 95 % t intervals",
+            true => " with 95 % t intervals",
             false => "",
         };
         let papers = if of_rows(&|row| !row.papers.is_empty()) { ", beside the paper's means" } else { "" };
@@ -91,7 +91,7 @@ impl<'a> Report<'a> {
             groups: Metric::ALL.map(group).into(),
             legend: [
                 format!("mean over {over}"),
-                "95 % bootstrap interval of it".into(),
+                "95 % t interval of it".into(),
                 "the paper's mean, of five runs".into(),
             ],
             note: too_few(rows).unwrap_or_default(),

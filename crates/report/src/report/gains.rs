@@ -5,20 +5,19 @@ use std::collections::BTreeMap;
 use perturb_experiment::{MethodResults, SelectedRun, distinct};
 use perturb_protocol::Version;
 use perturb_records::Scenario;
-use perturb_records::statistics::{Bootstrapped, are_enough, mean};
+use perturb_records::statistics::{Bootstrapped, holm, mean_with_t_interval, sign_flip_p};
 use perturb_settings::Method;
 use perturb_text::Table;
 
 use super::Report;
 use super::columns::MethodColumns;
+use super::comparisons::shown as shown_p;
 use super::numbers::or_empty;
 use super::pictures::{Drawing, Picture};
 use super::scope::Scope;
 use crate::plot::intervals::{Group, IntervalRow};
 use crate::plot::{Intervals, panels};
 
-/// Resamples of a bootstrap.
-const RESAMPLES: usize = 10_000;
 /// One pair says nothing about others.
 const LEAST_PAIRS: usize = 2;
 /// What stands for all environments together, in files; a reader is told "all environments".
@@ -36,8 +35,12 @@ pub(super) struct Gain<'a> {
     method: Method,
     /// Of runs, all environments together.
     pairs: usize,
-    /// Percentage points, mean over environments and runs.
+    /// Percentage points, mean over environments and runs, with its t interval.
     points: Bootstrapped,
+    /// The p-value of a sign-flip test over all pairs.
+    p: f64,
+    /// The p-value after Holm's correction for all methods of the same environment.
+    corrected: f64,
 }
 
 /// Over all environments, if there are several, then those in each of them; of reference lines none, as in comparisons.
@@ -45,7 +48,10 @@ pub(super) fn gains<'a>(scope: &Scope<'a>, selections: &[MethodResults<'a>]) -> 
     let learners: Vec<_> = scope.methods.iter().filter(|method| !method.is_reference() && !method.elsewhere).collect();
     let of = |environments: &[&'a str], name: &'a str| -> Vec<Gain<'a>> {
         let gain = |method: &&Method| gain(selections, method, environments, name);
-        learners.iter().copied().filter_map(|method| gain(&method)).collect()
+        let mut gains: Vec<Gain<'a>> = learners.iter().copied().filter_map(|method| gain(&method)).collect();
+        let corrected = holm(&gains.iter().map(|gain| gain.p).collect::<Vec<_>>());
+        gains.iter_mut().zip(corrected).for_each(|(gain, corrected)| gain.corrected = corrected);
+        gains
     };
     let together = if scope.averaged.len() > 1 { of(&scope.averaged, ALL) } else { Vec::new() };
     together.into_iter().chain(scope.averaged.iter().flat_map(|name| of(&[*name], name))).collect()
@@ -67,9 +73,9 @@ fn gain<'a>(
         return None;
     }
     let strata: Vec<Vec<f64>> = of_each.iter().map(|of| runs.iter().map(|run| of[run]).collect()).collect();
-    let points = Bootstrapped::of(&strata, RESAMPLES, 1, |strata| mean(strata.concat().into_iter()))?;
-    let points = Bootstrapped { interval_95: points.interval_95.filter(|_| are_enough(&strata)), ..points };
-    Some(Gain { environment: name, method: method.clone(), pairs: strata.iter().map(Vec::len).sum(), points })
+    let points = mean_with_t_interval(&strata)?;
+    let (pairs, p) = (strata.iter().map(Vec::len).sum(), sign_flip_p(&strata.concat(), 1));
+    Some(Gain { environment: name, method: method.clone(), pairs, points, p, corrected: p })
 }
 
 /// By the numbers of the runs in which both policies were tested on E.
@@ -86,13 +92,17 @@ impl<'a> Report<'a> {
     /// `None` if there is nothing to compare.
     pub(super) fn gains_table(&self) -> Option<Table> {
         self.gains.first()?;
-        let title =
-            format!("{TITLE}: percentage points with 95 % stratified bootstrap intervals, pairs of the same seed");
+        let title = format!(
+            "{TITLE}: percentage points with 95 % t intervals, pairs of the same seed, p of sign flips, \
+             corrected after Holm for the methods of an environment"
+        );
         let table = Table::of(title, &self.gains)
             .text("environment", |row| shown(row.environment))
             .text("method", |row| &row.method)
             .number("R − D", |row| row.points)
             .number("pairs", |row| row.pairs)
+            .number("p", |row| shown_p(row.p))
+            .number("corrected", |row| shown_p(row.corrected))
             .build();
         Some(table)
     }
@@ -106,6 +116,8 @@ impl<'a> Report<'a> {
             .number("gain", |row| row.points.point)
             .number("low_95", move |row| end(row, 0))
             .number("high_95", move |row| end(row, 1))
+            .number("p", |row| row.p)
+            .number("corrected_p", |row| row.corrected)
             .build()
     }
 
@@ -131,7 +143,7 @@ impl<'a> Report<'a> {
             x_name: "percentage points".into(),
             x: -reach..reach,
             groups: distinct(self.gains.iter().map(|gain| gain.environment)).into_iter().map(group).collect(),
-            legend: ["mean over pairs of the same seed".into(), "95 % bootstrap interval of it".into(), String::new()],
+            legend: ["mean over pairs of the same seed".into(), "95 % t interval of it".into(), String::new()],
             note: "Right of 0: training on R helped.".into(),
         };
         Some(Picture {
@@ -139,7 +151,7 @@ impl<'a> Report<'a> {
             file: "gains".into(),
             name: TITLE.into(),
             caption: format!(
-                "{TITLE}: means over pairs of the same seed with 95 % stratified bootstrap intervals. Right of 0 training on R \
+                "{TITLE}: means over pairs of the same seed with 95 % t intervals. Right of 0 training on R \
                  helped."
             ),
             data: self.gains_file(),
@@ -188,9 +200,12 @@ mod tests {
             Some([50.0, 50.0, 20.0 * f64::from(cell.run) + if is_r(cell) { more } else { 0.0 }])
         };
         let row = |name: &str, pairs, points, interval| (name.to_owned(), "a2c ff".to_owned(), pairs, points, interval);
-        let expected =
-            [row(ALL, 6, 20.0, Some([20.0; 2])), row("CartPole", 3, 10.0, None), row("Pendulum", 3, 30.0, None)];
-        assert_eq!(gains_of(&file, rates), expected, "three pairs of one environment are too few for an interval");
+        let expected = [
+            row(ALL, 6, 20.0, Some([20.0; 2])),
+            row("CartPole", 3, 10.0, Some([10.0; 2])),
+            row("Pendulum", 3, 30.0, Some([30.0; 2])),
+        ];
+        assert_eq!(gains_of(&file, rates), expected, "the points of each environment");
     }
 
     /// Run 1 of Pendulum has no policy of R: over all, the others count.

@@ -6,7 +6,7 @@ use perturb_experiment::{
     MethodResults, Reselection, SelectedRun, TieRange, average, average_tie_range, interquartile, scores,
 };
 use perturb_records::outcomes::Counted;
-use perturb_records::statistics::{Bootstrapped, Summary, are_enough, interquartile_mean, mean, optimality_gap};
+use perturb_records::statistics::{Bootstrapped, Summary, interquartile_mean, mean_with_t_interval, optimality_gap};
 use perturb_records::{Metric, Scenario, TestResult, TrainedOn, paper};
 use perturb_settings::Method;
 
@@ -16,8 +16,6 @@ use super::scope::{Scope, has_scenarios, version};
 const RESAMPLES: usize = 50_000;
 /// Of one that selects anew, hundreds of times in each of them.
 const RESELECTIONS: usize = 10_000;
-/// Of the means that the page opens with, of each environment and of all.
-const MEANS: usize = 10_000;
 /// The best success rate, %, from which the optimality gap is.
 const BEST: f64 = 100.0;
 /// What stands for all environments together, here and in the paper.
@@ -183,12 +181,11 @@ fn known<T>(of: impl Fn(Metric) -> Option<T>) -> BTreeMap<Metric, T> {
     Metric::ALL.into_iter().filter_map(|metric| Some((metric, of(metric)?))).collect()
 }
 
-/// Over environments and the runs that all of them have. A resample of few runs is too often the lowest or the highest of
-/// them alone for an interval to be more than these two.
+/// The mean over environments and the runs that all of them have, with its t interval within 0 … 100 %.
 fn mean_with_interval(selections: &[&MethodResults<'_>], metric: Metric) -> Option<Bootstrapped> {
-    let strata = scores(selections, metric);
-    let mean = Bootstrapped::of(&strata, MEANS, 1, |strata| mean(strata.concat().into_iter()))?;
-    Some(Bootstrapped { interval_95: mean.interval_95.filter(|_| are_enough(&strata)), ..mean })
+    let mean = mean_with_t_interval(&scores(selections, metric))?;
+    let interval_95 = mean.interval_95.map(|interval| interval.map(|end| end.clamp(0.0, BEST)));
+    Some(Bootstrapped { interval_95, ..mean })
 }
 
 /// What has no success in a run where another of the three has.

@@ -178,10 +178,10 @@ fn success_over_the_threshold_is_judged_anew() {
 fn methods_are_compared_over_runs_of_the_same_seed() {
     with_report(|report| {
         insta::assert_snapshot!(report.comparisons_table().unwrap().to_text(), @r"
-         X       Y       metric                      X − Y           P(X > Y)  pairs      p  corrected
-         a2c ff  ppo ff  Default         50.0 [0.0, 100.0]  0.75 [0.50, 1.00]      2  1.000      1.000
-         a2c ff  ppo ff  Interpolation  -2.5 [-45.0, 40.0]  0.50 [0.00, 1.00]      2  1.000      1.000
-         a2c ff  ppo ff  Extrapolation   4.4 [-11.9, 20.8]  0.50 [0.00, 1.00]      2  1.000      1.000
+         X       Y       metric         X − Y  P(X > Y)  pairs      p  corrected
+         a2c ff  ppo ff  Default         50.0      0.75      2  1.000      1.000
+         a2c ff  ppo ff  Interpolation   -2.5      0.50      2  1.000      1.000
+         a2c ff  ppo ff  Extrapolation    4.4      0.50      2  1.000      1.000
         ");
         assert_eq!(file(report, "comparisons.csv").len(), 1 + 3);
     });

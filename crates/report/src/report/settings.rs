@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use perturb_experiment::{Cell, CellResult, CellState, Results, distinct};
-use perturb_records::statistics::{Bootstrapped, Summary, mean};
+use perturb_records::statistics::{Bootstrapped, Summary, mean, mean_with_t_interval};
 use perturb_records::{TestResult, TrainedOn};
 use perturb_settings::Method;
 use perturb_text::{Table, TableBuilder};
@@ -14,9 +14,6 @@ use super::numbers::or_empty;
 use super::pictures::{Drawing, Picture, file_name};
 use super::{MISSING, Report};
 use crate::plot::panels::{Panel, PanelLine, PanelPoint, Panels, RATES};
-
-/// Resamples of the bootstrap over runs.
-const RESAMPLES: usize = 10_000;
 
 /// A method's trainings on something, of all configurations, where there are several.
 struct Grid<'a> {
@@ -47,7 +44,7 @@ pub(super) struct GridTest<'a> {
     tested_on: &'a str,
     /// %, over the runs in which all configurations have it; in each their mean.
     success: Summary,
-    /// The mean again, %, with its bootstrap interval over runs.
+    /// The mean again, %, with its t interval over runs.
     interval: Option<[f64; 2]>,
 }
 
@@ -132,7 +129,7 @@ impl<'a> Grid<'a> {
             };
             let rates: Vec<f64> = runs.iter().filter_map(rate).collect();
             let Some(success) = Summary::of(&rates) else { continue };
-            let over_runs = Bootstrapped::of(&[rates], RESAMPLES, 1, |strata| mean(strata[0].iter().copied()));
+            let over_runs = mean_with_t_interval(&[rates]);
             tests.push(GridTest {
                 environment: self.environment,
                 method: self.method.clone(),
@@ -187,7 +184,7 @@ impl Report<'_> {
         let ends: Vec<&GridTest<'_>> = self.grid_tests.settings.iter().filter(|test| test.at_the_end).collect();
         let of_value: Vec<&[&GridTest<'_>]> = ends.chunk_by(|a, b| a.is_with(b)).collect();
         let title = "What settings do: success at the end, in each run the mean over all configurations with that value, with \
-                     the 95 % bootstrap interval over runs (settings.csv and configurations.csv have every moment and \
+                     the 95 % t interval over runs (settings.csv and configurations.csv have every moment and \
                      configuration)";
         let mut table = Table::of(title, &of_value)
             .text("environment", |tests| tests[0].environment)
@@ -266,7 +263,7 @@ fn picture(tests: &[GridTest<'_>]) -> Picture {
         title: format!("{of}: success by {setting}"),
         panels: names.iter().map(panel).collect(),
         legend: values.iter().map(|value| format!("{setting} = {value}")).collect(),
-        note: "Bands: 95 % bootstrap intervals over runs.".into(),
+        note: "Bands: 95 % t intervals over runs.".into(),
     };
     Picture {
         environment: (*environment).into(),
@@ -274,7 +271,7 @@ fn picture(tests: &[GridTest<'_>]) -> Picture {
         name: format!("{of}: what {setting} does"),
         caption: format!(
             "{of}: success in tests after so many episodes, by {setting}. Lines are means over all configurations with that \
-             value and over runs, bands their 95 % bootstrap interval over runs."
+             value and over runs, bands their 95 % t interval over runs."
         ),
         data: panels.table(),
         drawing: Drawing::Panels(panels),

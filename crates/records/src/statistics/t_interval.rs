@@ -1,0 +1,87 @@
+//! Confidence intervals of means by Student's t distribution.
+//!
+//! A percentile bootstrap of few runs is too narrow: on normal data its 95 % interval of a mean covers the true value in
+//! 73 % of the cases with three runs of one environment, and in 84 % with five. The t interval covers it in 95 %.
+
+use statrs::distribution::{ContinuousCDF, StudentsT};
+
+use super::{Bootstrapped, mean};
+
+/// The smallest number of runs in an environment that an interval is computed from.
+pub const MIN_RUNS_FOR_INTERVAL: usize = 3;
+
+/// The mean over `strata`, each of which has the same weight, with its 95 % t interval.
+///
+/// `strata` has the numbers of the runs `[environments][runs]`. The variance of the mean adds up those of the strata's
+/// means, and the degrees of freedom are Welch and Satterthwaite's (Satterthwaite, 1946). There is no interval if a
+/// stratum has fewer than [`MIN_RUNS_FOR_INTERVAL`] runs. Returns `None` if there is no stratum, or one without runs.
+pub fn mean_with_t_interval(strata: &[Vec<f64>]) -> Option<Bootstrapped> {
+    let runs = strata.iter().map(Vec::len).min().filter(|runs| *runs > 0)?;
+    let point = mean(strata.iter().map(|runs| mean(runs.iter().copied())));
+    let half_width = (runs >= MIN_RUNS_FOR_INTERVAL).then(|| half_width(strata));
+    Some(Bootstrapped { point, interval_95: half_width.map(|half| [point - half, point + half]), runs })
+}
+
+fn half_width(strata: &[Vec<f64>]) -> f64 {
+    let count = strata.len() as f64;
+    let (mut variance, mut by_freedom) = (0.0, 0.0);
+    for runs in strata {
+        let (n, center) = (runs.len() as f64, mean(runs.iter().copied()));
+        let squares: f64 = runs.iter().map(|run| (run - center).powi(2)).sum();
+        let of_mean = squares / (n - 1.0) / n / (count * count);
+        variance += of_mean;
+        by_freedom += of_mean * of_mean / (n - 1.0);
+    }
+    if variance == 0.0 {
+        return 0.0; // all runs of each stratum are equal
+    }
+    let quantile =
+        StudentsT::new(0.0, 1.0, variance * variance / by_freedom).map_or(f64::NAN, |t| t.inverse_cdf(0.975));
+    quantile * variance.sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use perturb_policy::random::{Purpose, stream, uniform};
+
+    use super::*;
+
+    fn ends(strata: &[Vec<f64>]) -> [f64; 2] {
+        mean_with_t_interval(strata).unwrap().interval_95.unwrap()
+    }
+
+    /// The expected ends are those of R's `t.test(c(1, 2, 4))` and `t.test(c(1, 2, 4, 7, 9))`.
+    #[test]
+    fn one_environment_has_the_textbook_interval() {
+        for (runs, expected) in
+            [(vec![1.0, 2.0, 4.0], [-1.461_250, 6.127_917]), (vec![1.0, 2.0, 4.0, 7.0, 9.0], [0.426_088, 8.773_912])]
+        {
+            let got = ends(&[runs]);
+            assert!(got.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-5), "{got:?}");
+        }
+    }
+
+    #[test]
+    fn fewer_than_three_runs_have_no_interval() {
+        let interval = |strata: &[Vec<f64>]| mean_with_t_interval(strata).unwrap().interval_95;
+        assert_eq!(interval(&[vec![1.0, 2.0]]), None);
+        assert_eq!(interval(&[vec![1.0, 2.0, 3.0], vec![1.0, 2.0]]), None);
+        assert_eq!(mean_with_t_interval(&[]), None);
+        assert_eq!(mean_with_t_interval(&[vec![1.0], vec![]]), None);
+        assert_eq!(ends(&[vec![100.0; 3]]), [100.0, 100.0]);
+    }
+
+    /// 4 000 samples of three runs, sums of 48 uniform numbers, which are nearly normal: the interval covers the mean in 95 ± 1.4 % (four
+    /// standard errors).
+    #[test]
+    fn three_runs_cover_the_mean_in_95_percent() {
+        let mut rng = stream(1, Purpose::Bootstrap);
+        let mut normal = || (0..48).map(|_| uniform(&mut rng)).sum::<f64>() - 24.0;
+        let covered = (0..4000).filter(|_| {
+            let [low, high] = ends(&[(0..3).map(|_| normal()).collect()]);
+            (low..=high).contains(&0.0)
+        });
+        let covered = covered.count() as f64 / 4000.0;
+        assert!((covered - 0.95).abs() < 0.014, "{covered}");
+    }
+}
