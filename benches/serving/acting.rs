@@ -58,7 +58,8 @@ pub(crate) async fn measure(lstm: Option<usize>) -> Result<(), Failure> {
         step_times.push(client.act(request.clone(), steps).await? * 1e6 / f64::from(steps));
         computed.push(compute(&mut player, steps)? * 1e6 / f64::from(steps));
     }
-    let (step, computed) = (median(&mut step_times), median(&mut computed));
+    let step = median(&mut step_times);
+    let computed = median(&mut computed);
     println!("{:<22} {step:>12.2} us a step of 8, of which {computed:.2} are the policy's", id(lstm));
     Ok(())
 }

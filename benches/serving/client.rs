@@ -54,7 +54,8 @@ impl Client {
 
     /// Steps with these actions and up to `in_flight` requests without a reply. Returns the last observations.
     pub(crate) async fn play(&mut self, actions: &[Bytes], in_flight: usize) -> Result<Bytes, Failure> {
-        let (mut sent, mut last) = (0, Bytes::new());
+        let mut sent = 0;
+        let mut last = Bytes::new();
         for received in 0..actions.len() {
             while sent < actions.len().min(received + in_flight) {
                 self.session.send(proto::Step { actions: actions[sent].clone() }).await?;

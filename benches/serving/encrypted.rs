@@ -21,13 +21,16 @@ pub(crate) async fn measure(batch: usize) -> Result<(), Failure> {
         Client::on(&connect(&plain.address, Credentials::default()).await?, "CartPole", batch).await?;
     let credentials = Credentials::pinned(&cert)?;
     let mut encrypted_client = Client::on(&connect(&encrypted.address, credentials).await?, "CartPole", batch).await?;
-    let (mut plain_times, mut ratios) = (Vec::new(), Vec::new());
+    let mut plain_times = Vec::new();
+    let mut ratios = Vec::new();
     for _ in 0..ROUNDS {
-        let (plain, encrypted) = (plain_client.run(TRIPS).await?, encrypted_client.run(TRIPS).await?);
+        let plain = plain_client.run(TRIPS).await?;
+        let encrypted = encrypted_client.run(TRIPS).await?;
         plain_times.push(plain / TRIPS as f64 * 1e6);
         ratios.push(encrypted / plain);
     }
-    let (plain, ratio) = (median(&mut plain_times), median(&mut ratios));
+    let plain = median(&mut plain_times);
+    let ratio = median(&mut ratios);
     println!("tls/CartPole/{batch:<9} {plain:>12.1} us a step by TCP, with TLS {ratio:.2} of that");
     Ok(())
 }

@@ -81,10 +81,12 @@ fn main() -> Result<(), Failure> {
 async fn classic() -> Result<(), Failure> {
     const BATCH: usize = 256;
     const TRIPS: usize = 800;
-    let (server, echo) = (ServerProcess::server(1)?, ServerProcess::echo()?);
+    let server = ServerProcess::server(1)?;
+    let echo = ServerProcess::echo()?;
     let mut served = Client::open(&server.socket, "CartPole", BATCH).await?;
     let mut bare = Client::open(&echo.socket, "CartPole", BATCH).await?;
-    let (mut ratios, mut steps) = (Vec::new(), Vec::new());
+    let mut ratios = Vec::new();
+    let mut steps = Vec::new();
     for _ in 0..ROUNDS {
         let echoed = TRIPS as f64 / bare.run(TRIPS).await?;
         let stepped = TRIPS as f64 / served.run(TRIPS).await?;

@@ -45,7 +45,8 @@ pub(crate) async fn measure(spec: &'static EnvironmentSpec, make: MakeRobot, bat
             let in_process = one_by_one(&mut halves, |half| half.step(&actions))?;
             let bare = one_by_one(&mut halves, |half| half.bare(&actions))?;
             let at_once = at_once(&mut halves, &actions)?;
-            let (start, cpu) = (Instant::now(), process_cpu(&server.proc())?);
+            let start = Instant::now();
+            let cpu = process_cpu(&server.proc())?;
             let seen = client.play(&actions, *in_flight).await?;
             let served = Cost { wall: start.elapsed().as_secs_f64(), cpu: process_cpu(&server.proc())? - cpu };
             halves.iter_mut().for_each(|half| half.check(&seen));
@@ -111,7 +112,8 @@ fn thread_cpu(thread: &Path) -> Result<f64, Failure> {
 /// Measures the cost of `work` on this thread.
 fn timed(work: impl FnOnce() -> Result<(), Failure>) -> Result<Cost, Failure> {
     let this = Path::new("/proc/thread-self");
-    let (start, cpu) = (Instant::now(), thread_cpu(this)?);
+    let start = Instant::now();
+    let cpu = thread_cpu(this)?;
     work()?;
     Ok(Cost { wall: start.elapsed().as_secs_f64(), cpu: thread_cpu(this)? - cpu })
 }
@@ -188,7 +190,8 @@ impl LocalEnvironments {
 
     /// Steps the environments, one after the other.
     fn step(&mut self, actions: &[Bytes]) -> Result<(), Failure> {
-        let (mut terms, n) = (vec![0.0; self.spec.reward_terms.len()], self.spec.observation.len());
+        let mut terms = vec![0.0; self.spec.reward_terms.len()];
+        let n = self.spec.observation.len();
         let mut action = vec![0.0; width(self.spec)];
         self.begun.clear();
         for i in 0..self.environments.len() {
@@ -245,7 +248,8 @@ impl LocalEnvironments {
 
 /// Returns the state of an environment at the start of an episode, at rest.
 fn started(initial: &[f64], environment: &Episodes) -> Vec<f64> {
-    let (mut state, qpos) = (initial.to_vec(), positions(environment));
+    let mut state = initial.to_vec();
+    let qpos = positions(environment);
     state[1..=qpos.len()].copy_from_slice(&qpos);
     state
 }

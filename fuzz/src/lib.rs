@@ -12,7 +12,7 @@ pub use seeds::{replies, seeds};
 pub use server::{connections, requests, snapshots, worlds};
 
 /// A function of untrusted bytes.
-pub struct Target {
+pub struct FuzzTarget {
     /// Name of its program and of its folder in `corpus/`.
     pub name: &'static str,
     /// Runs it on an input.
@@ -20,13 +20,13 @@ pub struct Target {
 }
 
 /// All fuzz targets.
-pub const TARGETS: [Target; 8] = [
-    Target { name: "requests", run: requests },
-    Target { name: "snapshots", run: snapshots },
-    Target { name: "worlds", run: worlds },
-    Target { name: "connections", run: connections },
-    Target { name: "checkpoints", run: checkpoints },
-    Target { name: "records", run: records },
-    Target { name: "plans", run: plans },
-    Target { name: "ledgers", run: ledgers },
+pub const TARGETS: [FuzzTarget; 8] = [
+    FuzzTarget { name: "requests", run: requests },
+    FuzzTarget { name: "snapshots", run: snapshots },
+    FuzzTarget { name: "worlds", run: worlds },
+    FuzzTarget { name: "connections", run: connections },
+    FuzzTarget { name: "checkpoints", run: checkpoints },
+    FuzzTarget { name: "records", run: records },
+    FuzzTarget { name: "plans", run: plans },
+    FuzzTarget { name: "ledgers", run: ledgers },
 ];

@@ -128,7 +128,8 @@ fn socket() -> &'static Path {
             runtime.block_on(async {
                 let listener = Listener::bind(&address, config.socket_mode).await.expect("an address");
                 listening.send(()).expect("somebody waits");
-                let (guards, forever) = (Guards::default(), std::future::pending());
+                let guards = Guards::default();
+                let forever = std::future::pending();
                 let served = server::run(vec![listener], None, &config, &guards, tasks::catalogue(), forever).await;
                 panic!("the server ended: {served:?}");
             });

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::sync::{Mutex, Once, PoisonError};
 use std::time::Instant;
 
-use perturb_fuzz::{TARGETS, Target, replies, seeds};
+use perturb_fuzz::{FuzzTarget, TARGETS, replies, seeds};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
@@ -31,7 +31,7 @@ fn attack(name: &str) {
             std::process::abort();
         }));
     });
-    let Target { run, .. } = TARGETS.iter().find(|target| target.name == name).expect("a target");
+    let FuzzTarget { run, .. } = TARGETS.iter().find(|target| target.name == name).expect("a target");
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus").join(name);
     let mut found: Vec<_> = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|file| file.path()).collect();
     found.sort();
@@ -40,8 +40,10 @@ fn attack(name: &str) {
     assert!(!inputs.is_empty());
     inputs.iter().for_each(|input| run(input));
     let number = |name: &str, default| std::env::var(name).map_or(default, |text| text.parse().expect("a number"));
-    let (count, first) = (number("PERTURB_FUZZ_INPUTS", DEFAULT_INPUTS), number("PERTURB_FUZZ_SEED", 1));
-    let (start, mut at_first) = (Instant::now(), 0);
+    let count = number("PERTURB_FUZZ_INPUTS", DEFAULT_INPUTS);
+    let first = number("PERTURB_FUZZ_SEED", 1);
+    let start = Instant::now();
+    let mut at_first = 0;
     let tenth = (count / 10).max(1);
     for seed in first..first + count {
         if seed == first + tenth {
@@ -71,7 +73,8 @@ fn mutated(inputs: &[Vec<u8>], random: &mut ChaCha8Rng) -> Vec<u8> {
     let below = |random: &mut ChaCha8Rng, end: usize| random.next_u64() as usize % end.max(1);
     let mut input = inputs[below(random, inputs.len())].clone();
     for _ in 0..=below(random, 4) {
-        let (at, length) = (below(random, input.len()), below(random, 16));
+        let at = below(random, input.len());
+        let length = below(random, 16);
         let end = (at + length).min(input.len());
         match below(random, 6) {
             0 => input.truncate(at),

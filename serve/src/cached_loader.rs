@@ -82,7 +82,9 @@ impl<T: Clone + Send + 'static> CachedLoader<T> {
         if self.is_overdue.load(Ordering::Relaxed) {
             return Err(LoadError::TimedOut);
         }
-        let (last, is_overdue, permits) = (Arc::clone(&self.last), Arc::clone(&self.is_overdue), Arc::clone(permits));
+        let last = Arc::clone(&self.last);
+        let is_overdue = Arc::clone(&self.is_overdue);
+        let permits = Arc::clone(permits);
         let task = tokio::spawn(async move {
             let mut last = last.lock_owned().await;
             if let Some(last) = last.as_ref().filter(|last| last.at.elapsed() < pause_after(last.duration)) {
@@ -128,7 +130,9 @@ mod tests {
 
     #[tokio::test]
     async fn many_callers_cause_one_load_and_a_pause() {
-        let (loads, loader, permits) = (Arc::new(AtomicUsize::new(0)), CachedLoader::default(), permits());
+        let loads = Arc::new(AtomicUsize::new(0));
+        let loader = CachedLoader::default();
+        let permits = permits();
         let get = || {
             let loads = Arc::clone(&loads);
             loader.get(&permits, move || {
@@ -148,7 +152,9 @@ mod tests {
 
     #[tokio::test]
     async fn a_panic_is_an_error_until_the_next_load() {
-        let (broken, whole, permits) = (CachedLoader::<u8>::default(), CachedLoader::default(), permits());
+        let broken = CachedLoader::<u8>::default();
+        let whole = CachedLoader::default();
+        let permits = permits();
         for _ in 0..5 {
             assert_eq!(broken.get(&permits, || panic!("as intended")).await, Err(LoadError::Panicked));
         }

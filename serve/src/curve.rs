@@ -95,7 +95,8 @@ impl EpisodeLog {
                 new
             }
             Ok(TailUpdate::LineTooLong) => {
-                let (line, limit) = (self.lines + 1, MAX_READ_BYTES >> 20);
+                let line = self.lines + 1;
+                let limit = MAX_READ_BYTES >> 20;
                 self.line_fault = Some(format!("line {line} is longer than {limit} MiB; nothing after it is read"));
                 return true;
             }
@@ -188,7 +189,8 @@ impl EpisodeLog {
             before.add(&last.clone());
             parts.pop();
         }
-        let (mut episodes, mut steps) = (0.0, 0.0);
+        let mut episodes = 0.0;
+        let mut steps = 0.0;
         let mut curve = LearningCurve { episodes_per_point, speed: speeds(&parts), ..LearningCurve::default() };
         for part in parts {
             let count = part.episodes as f64;
@@ -314,7 +316,8 @@ mod tests {
         assert_eq!(episodes.episode_count(), 15_000);
         assert!((80..=MAX_POINTS).contains(&curve.success.len()), "{}", curve.success.len());
         assert!(episodes.groups.len() <= MAX_GROUPS);
-        let (first, last) = (curve.success[0], curve.success[curve.success.len() - 1]);
+        let first = curve.success[0];
+        let last = curve.success[curve.success.len() - 1];
         assert_eq!((first, last), (0.0, 100.0));
         assert!(*curve.episodes.last().unwrap() < 15_000.0 && *curve.steps.last().unwrap() < 30_000.0);
         let mean = curve.episode_return.iter().flatten().sum::<f64>() / curve.success.len() as f64;

@@ -45,7 +45,8 @@ impl Eta {
         let time = now.duration_since(*start);
         let sum =
             |shares: &[f32]| shares.iter().zip(weights).map(|(share, weight)| f64::from(*share) * weight).sum::<f64>();
-        let (all, done) = (weights.iter().sum::<f64>(), sum(shares));
+        let all = weights.iter().sum::<f64>();
+        let done = sum(shares);
         let new = done - sum(then);
         let known = time >= MIN_TIME && new >= MIN_SHARE * all;
         known.then(|| (all - done).max(0.0) / new * time.as_secs_f64())
@@ -58,7 +59,8 @@ mod tests {
 
     #[test]
     fn the_remaining_time_follows_from_the_progress() {
-        let (begin, mut eta) = (Instant::now(), Eta::default());
+        let begin = Instant::now();
+        let mut eta = Eta::default();
         let at = |seconds| begin + Duration::from_secs(seconds);
         let weights = [10.0, 10.0, 20.0];
         eta.sample(at(0), &[0.5, 0.0, 0.0]);

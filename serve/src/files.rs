@@ -36,7 +36,8 @@ pub(crate) async fn send(root: Root, relative: RelativePath, headers: &HeaderMap
         open(&path).ok().map(|opened| (kind, opened))
     });
     let (kind, (file, metadata)) = opened.await.ok()??;
-    let (length, mut file) = (metadata.len(), tokio::fs::File::from_std(file));
+    let length = metadata.len();
+    let mut file = tokio::fs::File::from_std(file);
     let tag = format!("\"{}\"", Stamp::of_metadata(&metadata).tag());
     let header_text = |name: header::HeaderName| headers.get(name).and_then(|value| value.to_str().ok());
     let has_tag = |tags: &str| tags.split(',').any(|known| known.trim().trim_start_matches("W/") == tag);

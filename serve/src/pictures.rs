@@ -15,7 +15,7 @@ const EXTENSIONS: [&str; 5] = ["svg", "png", "gif", "mp4", "webm"];
 
 /// A picture or a film.
 #[derive(Debug)]
-pub(crate) struct Picture {
+pub(crate) struct RunPicture {
     pub(crate) relative: RelativePath,
     pub(crate) name: String,
     pub(crate) is_film: bool,
@@ -26,7 +26,7 @@ pub(crate) struct Picture {
 /// Pictures and films.
 #[derive(Debug, Default)]
 pub(crate) struct Pictures {
-    pub(crate) shown: Vec<Picture>,
+    pub(crate) shown: Vec<RunPicture>,
     /// Number of files beyond the limit.
     pub(crate) more: usize,
 }
@@ -58,8 +58,9 @@ pub(crate) fn scan_folder(relative: &RelativePath, path: &Path, max_shown: usize
         if found.shown.len() == max_shown {
             found.more += 1;
         } else if let Some(stamp) = file.is_file().then(|| Stamp::of(file)).flatten() {
-            let (relative, name) = (relative.join(name), name.to_string_lossy().into_owned());
-            found.shown.push(Picture { relative, name, is_film: ["mp4", "webm"].contains(&extension), stamp });
+            let relative = relative.join(name);
+            let name = name.to_string_lossy().into_owned();
+            found.shown.push(RunPicture { relative, name, is_film: ["mp4", "webm"].contains(&extension), stamp });
         }
     }
     found

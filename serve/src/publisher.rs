@@ -84,7 +84,8 @@ impl Publisher {
     /// Returns the page of `topic` as it is now, or was at the last load.
     pub(crate) async fn view(self: &Arc<Self>, topic: &Topic) -> Result<Arc<View>, ViewError> {
         let loader = self.loader(topic);
-        let (this, loaded_topic) = (Arc::clone(self), topic.clone());
+        let this = Arc::clone(self);
+        let loaded_topic = topic.clone();
         let view = loader.get(&self.load_permits, move || this.load(&loaded_topic)).await;
         let view = view.unwrap_or_else(|error| Err(ViewError::Load(error)));
         if matches!(view, Err(ViewError::RunNotFound)) {

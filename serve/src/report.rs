@@ -94,7 +94,8 @@ impl ReportCache {
     /// Returns the report of the experiment in `folder`, whose files have this `fingerprint`, or the reason why there
     /// is none.
     pub(crate) async fn page(self: &Arc<Self>, folder: &Path, fingerprint: u64) -> Result<Arc<str>, String> {
-        let (this, folder) = (Arc::clone(self), folder.to_owned());
+        let this = Arc::clone(self);
+        let folder = folder.to_owned();
         let Ok(permit) = Arc::clone(&self.waiting).try_acquire_owned() else {
             return Err("too many requests wait for reports already".into());
         };
@@ -109,7 +110,9 @@ impl ReportCache {
                 return report.page.clone();
             }
             tokio::time::sleep_until((*next_build).into()).await;
-            let (start, built_folder, build) = (Instant::now(), folder.clone(), this.build);
+            let start = Instant::now();
+            let built_folder = folder.clone();
+            let build = this.build;
             let mut building = tokio::task::spawn_blocking(move || build(&built_folder));
             let built = match tokio::time::timeout(this.build_timeout, &mut building).await {
                 Ok(built) => {
@@ -213,7 +216,8 @@ mod tests {
 
     #[tokio::test]
     async fn the_oldest_report_is_dropped_and_builds_have_pauses() {
-        let (cache, start) = (Arc::new(ReportCache::new(slow, BUILD_TIMEOUT)), Instant::now());
+        let cache = Arc::new(ReportCache::new(slow, BUILD_TIMEOUT));
+        let start = Instant::now();
         for number in 0..=MAX_REPORTS {
             cache.page(&PathBuf::from(number.to_string()), 1).await.unwrap();
         }

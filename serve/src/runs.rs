@@ -67,7 +67,8 @@ mod tests {
 
     #[test]
     fn a_run_is_made_again_after_a_panic() {
-        let (cache, a) = (RunCache::<u8>::default(), Path::new("a"));
+        let cache = RunCache::<u8>::default();
+        let a = Path::new("a");
         let panics = std::panic::AssertUnwindSafe(|| {
             cache.with(
                 a,

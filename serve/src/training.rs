@@ -35,7 +35,9 @@ pub(crate) struct LiveTraining {
 impl LiveTraining {
     /// Makes the state of the training in `path`, before its first refresh. Files outside of `root` are not read.
     pub(crate) fn new(root: &Path, path: &Path) -> Self {
-        let (root, path, status) = (root.to_owned(), path.to_owned(), Err("it was not read yet".into()));
+        let root = root.to_owned();
+        let path = path.to_owned();
+        let status = Err("it was not read yet".into());
         Self { root, path, stamps: Default::default(), checked: None, status, episodes: None }
     }
 
@@ -109,7 +111,9 @@ impl LiveTraining {
         let progress = self.status.as_ref().ok()?.progress.as_ref()?;
         let [acting, waiting, updating, all] =
             ["time/acting", "time/waiting", "time/updating", "time/time_elapsed"].map(|name| progress.get(name));
-        let (acting, waiting, updating) = (acting?, waiting?, updating?);
+        let acting = acting?;
+        let waiting = waiting?;
+        let updating = updating?;
         let other = (all? - acting - waiting - updating).max(0.0);
         Some([acting, waiting, updating, other])
     }

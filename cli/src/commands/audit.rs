@@ -159,7 +159,8 @@ fn policies_of_assessment(path: &Path, checkpoints: &[PathBuf]) -> Result<Vec<Re
     let ids = checkpoints.iter().map(id).collect::<Result<Vec<_>>>()?;
     let mut policies = Vec::new();
     for policy in assessed.policies() {
-        let (recorded, name) = (&policy.records.about.policy, format!("trained on {}", policy.trained_on()));
+        let recorded = &policy.records.about.policy;
+        let name = format!("trained on {}", policy.trained_on());
         match ids.iter().find(|(_, id)| id == recorded) {
             Some((checkpoint, _)) => {
                 policies.push(RecordedPolicy {

@@ -177,7 +177,10 @@ impl Demo<'_> {
     fn heatmap(&self, trained: &[DemoPolicy], axes: Vec<String>) -> Result<Option<(&'static str, PathBuf)>> {
         let Ok(parameters) = <[String; 2]>::try_from(axes) else { return Ok(None) };
         let seed = self.args.seed;
-        let (grid, episodes, base, fixed) = (GRID, POINT_EPISODES, Version::D, Context::new());
+        let grid = GRID;
+        let episodes = POINT_EPISODES;
+        let base = Version::D;
+        let fixed = Context::new();
         let options = HeatmapOptions { parameters, base, grid, episodes, seed, fixed };
         let mut policies = Vec::new();
         for DemoPolicy { version, checkpoint, .. } in trained {
@@ -186,7 +189,8 @@ impl Demo<'_> {
             let report = &mut |episodes| display.episodes(episodes);
             let (heatmap, _) = heatmap(&self.servers, checkpoint, &options, &self.stop, report)?;
             let config = &checkpoint.state.config;
-            let (method, trained_on) = (config.method().to_string(), config.common.trained_on());
+            let method = config.method().to_string();
+            let trained_on = config.common.trained_on();
             policies.push(PolicyHeatmap { method, trained_on, seed, heatmap });
         }
         let Some((panels, _)) = policies_side_by_side(&policies) else { return Ok(None) };

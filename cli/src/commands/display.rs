@@ -243,7 +243,7 @@ impl Drop for Display {
         if let Some(Bar { all, bar, lines }) = &self.bar {
             lines.iter().for_each(ProgressBar::finish_and_clear);
             bar.finish_and_clear();
-            // It fails if the terminal is gone.
+            // Clearing fails if the terminal is gone.
             let _ = all.clear();
             *current_bar() = None;
         }

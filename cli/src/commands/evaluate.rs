@@ -26,12 +26,14 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     let seed = args.seed.unwrap_or(checkpoint.state.config.common.seed);
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = playing_servers(&args.play)?;
-    let (state, config) = (&checkpoint.state, &checkpoint.state.config);
+    let state = &checkpoint.state;
+    let config = &checkpoint.state.config;
     let common = &config.common;
     let environment = servers.environment(&common.environment)?;
     let normalize = |set| sets::normalize_set(set, &environment);
     let sets = sets.into_iter().map(normalize).collect::<Result<Vec<_>, _>>()?;
-    let (text, code) = (Criterion::of(&environment), Criterion::of_code(&environment));
+    let text = Criterion::of(&environment);
+    let code = Criterion::of_code(&environment);
     let success =
         args.success.as_ref().map(|rule| sets::normalize_rule(rule, text.as_ref(), code.as_ref())).transpose()?;
     let options = TestOptions { episodes: args.episodes, seed, selects: args.selection_episodes, success };

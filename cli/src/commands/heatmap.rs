@@ -38,7 +38,8 @@ fn draw_checkpoints(args: &HeatmapArgs) -> Result<()> {
         return Err(CommandError::Usage(format!("--checkpoint names {path} twice: give different policies")));
     }
     if !args.records.is_empty() && args.records.len() != checkpoints.len() {
-        let (files, policies) = (args.records.len(), checkpoints.len());
+        let files = args.records.len();
+        let policies = checkpoints.len();
         let message = format!(
             "--records has {files} files for {policies} policies; give one file for each --checkpoint, in the same order"
         );
@@ -70,7 +71,8 @@ fn draw_checkpoints(args: &HeatmapArgs) -> Result<()> {
             heatmap
         };
         let config = &checkpoint.state.config;
-        let (method, trained_on) = (config.method().to_string(), config.common.trained_on());
+        let method = config.method().to_string();
+        let trained_on = config.common.trained_on();
         policies.push(PolicyHeatmap { method, trained_on, seed: config.common.seed, heatmap });
     }
     let (panels, figures) = policies_side_by_side(&policies).ok_or_else(|| {
@@ -119,7 +121,8 @@ fn axes(args: &HeatmapArgs, environment: &proto::Environment) -> Result<[String;
 fn axis(written: &str, environment: &proto::Environment) -> Result<String> {
     let known = environment.parameters.iter().map(|parameter| parameter.name.as_str());
     names::find(written, known.clone()).map(|index| environment.parameters[index].name.clone()).ok_or_else(|| {
-        let (hint, name) = (names::did_you_mean(written, known.clone()), &environment.name);
+        let hint = names::did_you_mean(written, known.clone());
+        let name = &environment.name;
         let known = known.collect::<Vec<_>>().join(", ");
         CommandError::Usage(format!("`{written}` cannot be an axis{hint}: give two of {name}'s parameters, {known}"))
     })

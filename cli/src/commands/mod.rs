@@ -33,7 +33,7 @@ use std::io::{ErrorKind, IsTerminal};
 use std::path::Path;
 use std::process::ExitCode;
 
-use args::{Cli, Command, PlayArgs, ServerArgs, WaitArgs};
+use args::{Cli, CliCommand, PlayArgs, ServerArgs, WaitArgs};
 use display::{AboveBar, note};
 use error::{CommandError, Result};
 use perturb_experiment::{Folder, Plan};
@@ -69,33 +69,34 @@ pub fn main() -> ExitCode {
     let lines = tracing_subscriber::fmt::layer()
         .with_ansi(colours)
         .with_writer(|| AboveBar)
-        // They would go to standard error, which is what has failed, and would end the program.
+        // Internal errors would go to standard error, which is what has failed, and would end the program.
         .log_internal_errors(false);
     tracing_subscriber::registry().with(lines).with(filter).init();
     PrivateServer::set_stderr_handler(display::say);
-    if matches!(cli.command, Command::Envs(_) | Command::Report(_) | Command::Curves(_) | Command::Serve(_)) {
+    if matches!(cli.command, CliCommand::Envs(_) | CliCommand::Report(_) | CliCommand::Curves(_) | CliCommand::Serve(_))
+    {
         // These commands have nothing to finish. The others check a flag.
-        // If it fails, signals end them as they end any program.
+        // Without a handler, signals end them as they end any program.
         let _ = end_on_signals();
     }
     let success = |()| ExitCode::SUCCESS;
     let result = match cli.command {
-        Command::Envs(args) => envs::run(&args).map(success),
-        Command::Ls(args) => ls::run(&args).map(success),
-        Command::Serve(args) => serve::run(&args).map(success),
-        Command::Train(args) => train::run(&args),
-        Command::Evaluate(args) => evaluate::run(&args).map(success),
-        Command::Demo(args) => demo::run(&args),
-        Command::Plan(args) => plan::run(&args).map(success),
-        Command::Run(args) => run::run(&args),
-        Command::Report(args) => report::run(&args).map(success),
-        Command::Curves(args) => report::curves(&args).map(success),
-        Command::Heatmap(args) => heatmap::run(&args).map(success),
-        Command::Video(args) => video::run(&args).map(success),
-        Command::Audit(args) => audit::run(&args),
-        Command::Rescore(args) => rescore::run(&args).map(success),
-        Command::Completions(args) => shell::completions(&args).map(success),
-        Command::Man(args) => shell::man(&args).map(success),
+        CliCommand::Envs(args) => envs::run(&args).map(success),
+        CliCommand::Ls(args) => ls::run(&args).map(success),
+        CliCommand::Serve(args) => serve::run(&args).map(success),
+        CliCommand::Train(args) => train::run(&args),
+        CliCommand::Evaluate(args) => evaluate::run(&args).map(success),
+        CliCommand::Demo(args) => demo::run(&args),
+        CliCommand::Plan(args) => plan::run(&args).map(success),
+        CliCommand::Run(args) => run::run(&args),
+        CliCommand::Report(args) => report::run(&args).map(success),
+        CliCommand::Curves(args) => report::curves(&args).map(success),
+        CliCommand::Heatmap(args) => heatmap::run(&args).map(success),
+        CliCommand::Video(args) => video::run(&args).map(success),
+        CliCommand::Audit(args) => audit::run(&args),
+        CliCommand::Rescore(args) => rescore::run(&args).map(success),
+        CliCommand::Completions(args) => shell::completions(&args).map(success),
+        CliCommand::Man(args) => shell::man(&args).map(success),
     };
     result.unwrap_or_else(|error| fail(&error))
 }

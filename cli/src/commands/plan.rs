@@ -70,7 +70,8 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     )?;
     let second_stage = &known.cells[plan.cells.len()..];
     if let Some(pairs) = second_stage.first().map(|cell| cell.tests.sets.len()) {
-        let (cells, runs) = (second_stage.len(), plan.runs as usize);
+        let cells = second_stage.len();
+        let runs = plan.runs as usize;
         let are = if cells / runs == 1 { "is" } else { "are" };
         let trained = format!("{} {are} selected and trained on new seeds", grouped(cells / runs));
         writeln!(out, "{trained}, {} with {}", counted(cells * pairs, "train/test pair"), count(runs, "run"))?;
@@ -86,7 +87,8 @@ fn groups_line(groups: &[Vec<usize>], Grouping { at_a_time, .. }: Grouping) -> S
     let min = sizes().min().unwrap_or_default();
     let max = sizes().max().unwrap_or_default();
     let sizes_shown = if min == max { max.to_string() } else { format!("{min} to {max}") };
-    let (cells, number) = (cells(sizes().sum()), counted(groups.len(), "group"));
+    let cells = cells(sizes().sum());
+    let number = counted(groups.len(), "group");
     format!("{cells} in {number} of {sizes_shown}, {} at a time", at_a_time.min(groups.len()))
 }
 

@@ -31,7 +31,8 @@ pub(super) fn run(args: &RescoreArgs) -> Result<()> {
     let criteria: Vec<Criterion> = match &args.success[..] {
         [] => vec![tested.clone()],
         rules => {
-            let (text, code) = (about.text_success.as_ref().unwrap_or(tested), about.code_success.as_ref());
+            let text = about.text_success.as_ref().unwrap_or(tested);
+            let code = about.code_success.as_ref();
             let criterion = |rule| about.criterion(&normalize_rule(rule, Some(text), code)?);
             rules.iter().map(criterion).collect::<Result<_, _>>()?
         }

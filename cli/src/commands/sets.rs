@@ -82,7 +82,8 @@ pub(super) fn normalize<T>(
     for (written, value) in values {
         let name = parameter(option, &written, environment)?;
         if normalized.insert(name.to_owned(), value).is_some() {
-            let (got, expected) = ("given twice".into(), "given once".into());
+            let got = "given twice".into();
+            let expected = "given once".into();
             return Err(ValueError { what: format!("{option}: {name}"), got, expected });
         }
     }
@@ -150,7 +151,9 @@ mod tests {
 
     #[test]
     fn thresholds_may_be_spelled_in_any_case() {
-        let (quantity, unit, side) = ("steps".to_owned(), "1".into(), Side::AtLeast);
+        let quantity = "steps".to_owned();
+        let unit = "1".into();
+        let side = Side::AtLeast;
         let text = Criterion { quantity, unit, side, threshold: 100.0, most: None };
         let code = Criterion { quantity: "steps_in_a_row".into(), ..text.clone() };
         let read =

@@ -119,7 +119,8 @@ impl Caption {
     }
 
     fn write(&self, caption: &mut [u8], text: &CaptionText) -> Result<(), PlotError> {
-        let (width, height) = (self.frame.0 as i32, self.frame.1 - self.picture.1);
+        let width = self.frame.0 as i32;
+        let height = self.frame.1 - self.picture.1;
         let area = BitMapBackend::with_buffer(caption, (self.frame.0, height)).into_drawing_area();
         let mut lines: Vec<(CaptionLine, RGBColor)> = vec![
             (self.title.clone(), DIM_TEXT),
@@ -143,7 +144,8 @@ impl Caption {
             if let (2, Some(ending)) = (number, text.ending) {
                 let ground = if ending.success { SUCCESS } else { NO_SUCCESS };
                 let ink = if is_dark((ground.0, ground.1, ground.2)) { WHITE } else { BLACK };
-                let (text, style) = (ending.text(), font(&ink, HPos::Right));
+                let text = ending.text();
+                let style = font(&ink, HPos::Right);
                 let (text_width, _) = area.estimate_text_size(&text, &style).map_err(drawing)?;
                 let corners = [
                     (width - margin * 2 - text_width as i32, y - margin * 2 / 5),

@@ -83,7 +83,8 @@ impl VideoFile {
     /// # Errors
     /// [`VideoError::Encode`].
     pub fn begin(self, size: (u32, u32), fps: f64, grid: EpisodeGrid) -> Result<VideoWriter, VideoError> {
-        let (path, failed) = (self.temporary.path(), encoding(&self.path));
+        let path = self.temporary.path();
+        let failed = encoding(&self.path);
         let encoder: Box<dyn Encode> = match self.format {
             Format::Gif => Box::new(GifEncoder::new(path, size, fps).map_err(failed)?),
             Format::Mp4 => Box::new(Mp4Encoder::new(path, size, fps).map_err(failed)?),

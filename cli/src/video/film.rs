@@ -101,7 +101,8 @@ pub fn film(
     report: &mut dyn FnMut(u64),
 ) -> Result<Footage, VideoError> {
     let start = Instant::now();
-    let (mut footage, mut output) = (Footage::default(), FilmOutput::Empty(file));
+    let mut footage = Footage::default();
+    let mut output = FilmOutput::Empty(file);
     for set in &options.sets {
         let mut film = Film::open(servers, checkpoint, options, set, footage)?;
         let mut writer = output.begin(&mut film)?;
@@ -350,7 +351,8 @@ impl<'a> Film<'a> {
 
     /// Updates the caption for the new episode.
     fn announce(&mut self) {
-        let (number, episodes) = (self.episodes() + 1, self.options.episodes);
+        let number = self.episodes() + 1;
+        let episodes = self.options.episodes;
         let trial = match self.state.config.settings.episodes_per_trial() {
             1 => String::new(),
             _ => format!(", trial {}", self.begun.trial_index + 1),

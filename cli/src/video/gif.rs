@@ -47,7 +47,8 @@ impl GifEncoder {
         let fits = |pixels: u32| {
             u16::try_from(pixels).map_err(|_| io::Error::other(format!("a GIF has no {pixels} pixels in a row")))
         };
-        let (size, seconds) = ((fits(width)?, fits(height)?), 1.0 / fps);
+        let size = (fits(width)?, fits(height)?);
+        let seconds = 1.0 / fps;
         // The delay must fit its field, also when an episode's last frame comes in between.
         let fits =
             |stride: &u16| *stride == 1 || u32::from(*stride) * u32::from(delay(seconds)) <= u32::from(u16::MAX / 2);
@@ -63,7 +64,8 @@ impl Encode for GifEncoder {
     }
 
     fn write(&mut self, frame: &[u8], seconds: f64) -> io::Result<()> {
-        let (width, height) = (usize::from(self.size.0), usize::from(self.size.1));
+        let width = usize::from(self.size.0);
+        let height = usize::from(self.size.1);
         let expected = width * height * 3;
         if frame.len() != expected {
             return Err(io::Error::other(format!("a frame has {} bytes, expected {expected}", frame.len())));
@@ -136,7 +138,10 @@ impl Thinned {
 /// first `seen` is empty.
 fn changes(seen: &mut Vec<u8>, indices: &[u8], width: usize) -> Frame<'static> {
     seen.resize(indices.len(), UNCHANGED); // no pixel has this index
-    let (mut left, mut right, mut top, mut bottom) = (width, 0, usize::MAX, 0);
+    let mut left = width;
+    let mut right = 0;
+    let mut top = usize::MAX;
+    let mut bottom = 0;
     for (row, (seen, new)) in seen.chunks_exact(width).zip(indices.chunks_exact(width)).enumerate() {
         let differs = |(seen, new)| seen != new;
         let Some(first) = seen.iter().zip(new).position(differs) else { continue };
@@ -182,12 +187,16 @@ mod tests {
         let mut options = gif::DecodeOptions::new();
         options.set_color_output(gif::ColorOutput::RGBA);
         let mut decoder = options.read_info(File::open(folder.path().join("a.gif")).unwrap()).unwrap();
-        let (width, height) = (usize::from(decoder.width()), usize::from(decoder.height()));
-        let (mut seen, mut frames) = (vec![0; 3 * width * height], Vec::new());
+        let width = usize::from(decoder.width());
+        let height = usize::from(decoder.height());
+        let mut seen = vec![0; 3 * width * height];
+        let mut frames = Vec::new();
         while let Some(frame) = decoder.read_next_frame().unwrap() {
-            let (left, top) = (usize::from(frame.left), usize::from(frame.top));
+            let left = usize::from(frame.left);
+            let top = usize::from(frame.top);
             for (index, pixel) in frame.buffer.chunks(4).enumerate().filter(|(_, pixel)| pixel[3] > 0) {
-                let (row, column) = (index / usize::from(frame.width), index % usize::from(frame.width));
+                let row = index / usize::from(frame.width);
+                let column = index % usize::from(frame.width);
                 seen[3 * ((top + row) * width + left + column)..][..3].copy_from_slice(&pixel[..3]);
             }
             frames.push((seen.clone(), frame.delay, frame.buffer.len() / 4));
@@ -255,7 +264,8 @@ mod tests {
             let kept: usize = encoder.films.iter().flat_map(|film| &film.frames).map(|frame| frame.buffer.len()).sum();
             assert!(kept <= STRIDES.len() * MAX_BYTES, "no more is kept than of each film a whole one");
         }
-        let (counted, stride) = (encoder.films[0].bytes, encoder.films[0].stride);
+        let counted = encoder.films[0].bytes;
+        let stride = encoder.films[0].stride;
         assert_eq!(encoder.finish().unwrap(), stride);
         let bytes = std::fs::metadata(folder.path().join("a.gif")).unwrap().len() as usize;
         assert!(stride > 1 && bytes <= counted && counted <= MAX_BYTES && bytes > MAX_BYTES / 2, "{stride}: {bytes}");

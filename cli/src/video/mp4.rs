@@ -41,7 +41,8 @@ pub(super) struct Mp4Encoder {
 impl Mp4Encoder {
     pub(super) fn new(path: &Path, size: (u32, u32), fps: f64) -> io::Result<Self> {
         let words = tempfile::tempfile()?;
-        let (size_text, fps_text) = (format!("{}x{}", size.0, size.1), fps.to_string());
+        let size_text = format!("{}x{}", size.0, size.1);
+        let fps_text = fps.to_string();
         let child = Command::new(PROGRAM)
             .args(["-hide_banner", "-loglevel", "error", "-y"])
             .args(["-f", "rawvideo", "-pixel_format", "rgb24", "-video_size", &size_text, "-framerate", &fps_text])

@@ -13,11 +13,11 @@ const FIRST_FRAME_COLOURS: usize = 128;
 /// colours are left.
 const MIN_NEW_DISTANCE: u32 = 16;
 
-type Colour = [u8; 3];
+type PixelColour = [u8; 3];
 
 /// Up to 255 colours, with the nearest of them for every colour.
 pub(super) struct Palette {
-    colours: Vec<Colour>,
+    colours: Vec<PixelColour>,
     /// Index of each colour that was used, by its 24 bits; 0 for the others. Untouched zeros take no memory.
     met: Vec<u8>,
 }
@@ -30,7 +30,7 @@ impl Palette {
         for colour in frame.as_chunks().0 {
             *counts.entry(*colour).or_insert(0_u32) += 1;
         }
-        let mut all: Vec<(Colour, u32)> = counts.into_iter().collect();
+        let mut all: Vec<(PixelColour, u32)> = counts.into_iter().collect();
         all.sort_unstable_by_key(|&(colour, count)| (Reverse(count), colour));
         let colours = (1..).find_map(|apart| spread(&all, apart)).unwrap_or_default();
         Self { colours, met: vec![UNCHANGED; 1 << 24] }
@@ -55,7 +55,7 @@ impl Palette {
         }));
     }
 
-    fn index(&mut self, colour: Colour) -> u8 {
+    fn index(&mut self, colour: PixelColour) -> u8 {
         let later = self.colours.len().saturating_sub(FIRST_FRAME_COLOURS) as u32;
         let new = MIN_NEW_DISTANCE.max(later / 2).pow(2);
         let distances = self.colours.iter().map(|&known| distance(known, colour));
@@ -73,10 +73,11 @@ impl Palette {
 
 /// Selects colours that are at least `apart`; colours of 16 pixels and more only half as far. Returns `None` if there
 /// are too many.
-fn spread(all: &[(Colour, u32)], apart: u64) -> Option<Vec<Colour>> {
-    let mut colours: Vec<Colour> = Vec::new();
+fn spread(all: &[(PixelColour, u32)], apart: u64) -> Option<Vec<PixelColour>> {
+    let mut colours: Vec<PixelColour> = Vec::new();
     for &(colour, count) in all {
-        let is_far = |&other: &Colour| u64::from(distance(colour, other)).pow(2) * u64::from(count) >= apart.pow(4);
+        let is_far =
+            |&other: &PixelColour| u64::from(distance(colour, other)).pow(2) * u64::from(count) >= apart.pow(4);
         if colours.iter().all(is_far) {
             if colours.len() == FIRST_FRAME_COLOURS {
                 return None;
@@ -88,7 +89,7 @@ fn spread(all: &[(Colour, u32)], apart: u64) -> Option<Vec<Colour>> {
 }
 
 /// Returns the squared distance.
-fn distance(a: Colour, b: Colour) -> u32 {
+fn distance(a: PixelColour, b: PixelColour) -> u32 {
     a.iter().zip(b).map(|(&a, b)| u32::from(a.abs_diff(b)).pow(2)).sum()
 }
 

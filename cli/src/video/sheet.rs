@@ -67,21 +67,24 @@ impl SheetEncoder {
         let sheet = (width, frame.1.saturating_mul(grid.episodes));
         let bytes = sheet.0.saturating_mul(sheet.1).saturating_mul(3);
         if bytes > MAX_BYTES {
-            let (max, megabytes) = (MAX_BYTES >> 20, bytes >> 20);
+            let max = MAX_BYTES >> 20;
+            let megabytes = bytes >> 20;
             return Err(io::Error::other(format!(
                 "a sheet of {} × {} pixels takes {megabytes} MiB, expected at most {max}: give fewer episodes or smaller pictures",
                 sheet.0, sheet.1
             )));
         }
         let pixels = vec![u8::MAX; bytes];
-        let (kept, last) = (Vec::new(), Vec::new());
+        let kept = Vec::new();
+        let last = Vec::new();
         Ok(Self { path: path.to_owned(), grid, frame, sheet, pixels, done: 0, kept, stride: 1, count: 0, last })
     }
 
     /// Copies a frame of the current episode to the position `index` of its row.
     fn copy_to_sheet(&mut self, frame: &[u8], index: usize) {
         let (width, height) = self.frame;
-        let (set, episode) = (self.done / self.grid.episodes, self.done % self.grid.episodes);
+        let set = self.done / self.grid.episodes;
+        let episode = self.done % self.grid.episodes;
         let x = set * (self.grid.episode_width(width) + SET_GAP) + index * (width + PICTURE_GAP);
         for (row, from) in frame.chunks_exact(3 * width).enumerate() {
             let start = 3 * ((episode * height + row) * self.sheet.0 + x);
@@ -120,7 +123,8 @@ impl Encode for SheetEncoder {
 
     fn end_episode(&mut self) {
         let pictures = self.grid.pictures().min(self.count);
-        let (kept, last) = (std::mem::take(&mut self.kept), std::mem::take(&mut self.last));
+        let kept = std::mem::take(&mut self.kept);
+        let last = std::mem::take(&mut self.last);
         for picture in 0..pictures {
             let frame = picture * (self.count - 1) / (pictures - 1).max(1);
             let nearest = (frame + self.stride / 2) / self.stride;

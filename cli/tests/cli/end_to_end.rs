@@ -224,7 +224,8 @@ fn every_test_episode_begins_without_memories() {
         let result = test(&servers, &checkpoint, Version::D, episodes, 1, &StopFlag::default(), |_| {});
         result.expect("a test").mean_length
     };
-    let (first_episodes, ten_of_each) = (length(100), length(1000));
+    let first_episodes = length(100);
+    let ten_of_each = length(1000);
     // Lengths differ by the start of an episode, by about 1; means of 100 by a tenth of that.
     assert!((first_episodes - ten_of_each).abs() < 0.5, "{first_episodes} {ten_of_each}");
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
 use perturb_faults::certificates::Authority;
-use perturb_faults::{Fault, FaultKind, FaultPlan, FaultyProxy};
+use perturb_faults::{ByteFault, FaultKind, FaultPlan, FaultyProxy};
 use rstest::rstest;
 use tempfile::TempDir;
 
@@ -154,9 +154,10 @@ fn a_changed_byte_never_changes_what_is_learnt(#[case] is_servers: bool, #[case]
     let trained = guarded.train(&guarded.address, "truth", "R", ALL);
     assert!(trained.status.success(), "{}", stderr(&trained));
     let truth = weights(&guarded.file("truth"));
-    let (mut reached, mut outlived) = (0, 0);
+    let mut reached = 0;
+    let mut outlived = 0;
     for place in places {
-        let fault = Some(Fault { at: place, kind: FaultKind::BitFlip });
+        let fault = Some(ByteFault { at: place, kind: FaultKind::BitFlip });
         let course = move |number| {
             let fault = fault.filter(|_| number == 0); // of the first connection
             let [from_server, from_client] = if is_servers { [fault, None] } else { [None, fault] };

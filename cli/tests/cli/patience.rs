@@ -11,7 +11,7 @@ use rstest::rstest;
 use tempfile::TempDir;
 
 use crate::common::{child_server, ended, kill, perturb, run, server, stderr, wait_for, wait_for_server};
-use perturb_faults::{Fault, FaultKind, FaultPlan, FaultyProxy, SeededRng};
+use perturb_faults::{ByteFault, FaultKind, FaultPlan, FaultyProxy, SeededRng};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::Servers;
 
@@ -197,7 +197,7 @@ fn a_training_over_breaking_lines_needs_no_checkpoint(#[case] text: &str, #[case
     // The first connections have no fault, because they list the server's environments.
     let course = move |number: usize| {
         let at = if number == 0 { 300_000 } else { dice.below(100_000) as usize };
-        FaultPlan { from_server: Some(Fault { at, kind: FaultKind::Close }), ..FaultPlan::default() }
+        FaultPlan { from_server: Some(ByteFault { at, kind: FaultKind::Close }), ..FaultPlan::default() }
     };
     let line = FaultyProxy::start(&server.address, course).expect("a line");
     let address = line.address();
@@ -220,7 +220,8 @@ fn a_hundred_kills_change_no_weight() {
     for text in [PPO_CART_POLE, A2C_PENDULUM] {
         let expected = undisturbed(text);
         for victim in [Victim::Private, Victim::Named, Victim::OneOfTwo] {
-            let (mut kills, mut trainings) = (0, 0);
+            let mut kills = 0;
+            let mut trainings = 0;
             while kills < 17 {
                 let (more, got) = harassed(text, victim, 17 - kills, &mut dice);
                 (kills, trainings) = (kills + more, trainings + 1);

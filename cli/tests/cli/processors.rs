@@ -33,7 +33,8 @@ impl Drop for Server {
 /// Trains with `arguments` and returns the bytes of the weights' file.
 fn weights(processor: Option<&str>, arguments: &[&str]) -> Vec<u8> {
     let directory = tempfile::tempdir().expect("a directory");
-    let (socket, out) = (directory.path().join("socket"), directory.path().join("run"));
+    let socket = directory.path().join("socket");
+    let out = directory.path().join("run");
     let learner = Path::new(env!("CARGO_BIN_EXE_perturb"));
     let address = format!("unix:{}", socket.display());
     let mut server = on(processor, &learner.with_file_name("perturb-server"));

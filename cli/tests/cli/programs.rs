@@ -58,7 +58,9 @@ fn lines(drawn: &str) -> Vec<String> {
 
 /// Returns the final contents of a terminal.
 fn screen(drawn: &str) -> Vec<String> {
-    let (mut rows, mut row, mut column) = (vec![Vec::new()], 0_usize, 0_usize);
+    let mut rows = vec![Vec::new()];
+    let mut row = 0_usize;
+    let mut column = 0_usize;
     let mut rest = drawn.chars();
     while let Some(c) = rest.next() {
         match c {

@@ -97,7 +97,8 @@ fn events(run: &Path) -> PathBuf {
 #[track_caller]
 fn assert_same(got: &Path, expected: &Path) {
     assert_eq!(Checkpoint::load(got).expect("a checkpoint"), Checkpoint::load(expected).expect("a checkpoint"));
-    let (folder, expected_folder) = (got.join("checkpoint"), expected.join("checkpoint"));
+    let folder = got.join("checkpoint");
+    let expected_folder = expected.join("checkpoint");
     let files = names(&expected_folder);
     assert_eq!(names(&folder), files, "weights and state with their checksums, nothing else");
     assert_eq!(files.len(), 3);
@@ -105,7 +106,8 @@ fn assert_same(got: &Path, expected: &Path) {
         assert!(bytes(&folder.join(file)) == bytes(&expected_folder.join(file)), "{file}");
     }
     for name in ["monitor.csv", "progress.csv"] {
-        let (got, expected) = (cells(got, name), cells(expected, name));
+        let got = cells(got, name);
+        let expected = cells(expected, name);
         assert_eq!(got.len(), expected.len(), "lines of {name}");
         got.iter().zip(&expected).for_each(|(got, expected)| assert_eq!(got, expected, "{name}"));
     }
@@ -128,7 +130,8 @@ fn servers_of(number: usize) -> (Vec<perturb_learner::client::PrivateServer>, Se
 /// Returns an unfinished run, as a kill would leave it.
 fn broken_off() -> TempDir {
     let (_server, servers) = servers_of(1);
-    let (out, copied) = (tempfile::tempdir().expect("a directory"), tempfile::tempdir().expect("a directory"));
+    let out = tempfile::tempdir().expect("a directory");
+    let copied = tempfile::tempdir().expect("a directory");
     let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
     let mut done = false;
     train(&servers, &config(RUNS[1]), &directory, 1, &StopFlag::default(), |progress| {
@@ -203,7 +206,8 @@ fn snapshots_restore_a_batch_on_any_number_of_servers() {
 fn a_run_goes_on_from_any_iteration_to_the_same_bytes() {
     let ((_one, one), (_two, two)) = (servers_of(1), servers_of(2));
     for text in RUNS {
-        let (out, kills) = (tempfile::tempdir().expect("a directory"), tempfile::tempdir().expect("a directory"));
+        let out = tempfile::tempdir().expect("a directory");
+        let kills = tempfile::tempdir().expect("a directory");
         let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
         let outcome = train(&one, &config(text), &directory, 1, &StopFlag::default(), |progress| {
             copy(out.path(), &kills.path().join(progress.iterations.to_string()));
@@ -305,7 +309,8 @@ fn a_learner_killed_repeatedly_gives_the_same_bytes() {
         let settings = out.path().join("settings.toml");
         fs::write(&settings, &text).expect("a file");
         let path = out.path().join("run");
-        let (path_text, settings) = (path.to_str().expect("a path"), settings.to_str().expect("a path"));
+        let path_text = path.to_str().expect("a path");
+        let settings = settings.to_str().expect("a path");
 
         let child = perturb(&["train", "--config", settings, "--out", path_text]).spawn().expect("perturb");
         kill_after(child, &path, budget / 6, Duration::ZERO);

@@ -53,7 +53,8 @@ fn experiment() -> TempDir {
 }
 
 fn run(directory: &Path, arguments: &[&str]) -> Output {
-    let (plan, out) = (directory.join("plan.toml"), directory.join("out"));
+    let plan = directory.join("plan.toml");
+    let out = directory.join("out");
     let mut command = perturb(&["run"]);
     command.arg(plan).arg("--out").arg(out).args(arguments);
     command.output().expect("ended")
@@ -117,7 +118,9 @@ fn episodes_of_sets_replay_on_one_and_two_servers() {
 
 fn parameters_are_those_of_the_sets(records: &Records) {
     let place = |name: &str| records.about.parameters.iter().position(|known| known.name == name).expect("known");
-    let (force, length, mass) = (place("force"), place("length"), place("mass"));
+    let force = place("force");
+    let length = place("length");
+    let mass = place("mass");
     for episode in records.of("long_poles") {
         let value = episode.requested[length];
         assert!((0.7..=0.8).contains(&value) || (0.9..=1.0).contains(&value), "{value}");

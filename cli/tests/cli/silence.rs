@@ -25,7 +25,8 @@ fn thaw(server: &Named) {
 #[case::the_only_one(PPO_CART_POLE, &["a"])]
 #[case::one_of_two(A2C_PENDULUM, &["a", "b"])]
 fn a_briefly_silent_server_is_waited_for(#[case] text: &str, #[case] names: &[&str]) {
-    let (folder, mut dice) = (tempfile::tempdir().expect("a directory"), SeededRng::new());
+    let folder = tempfile::tempdir().expect("a directory");
+    let mut dice = SeededRng::new();
     let named: Vec<Named> = names.iter().map(|name| Named::new(folder.path(), name)).collect();
     let list = named.iter().map(Named::address).collect::<Vec<_>>().join(",");
     let (mut child, out, said) = train(&folder, text, &["--server", &list]);

@@ -53,7 +53,8 @@ fn decoded(path: &Path) -> ((u16, u16), Vec<u16>, Vec<Vec<u8>>) {
     options.set_color_output(ColorOutput::RGBA);
     let mut decoder = options.read_info(File::open(path).expect("a file")).expect("a GIF");
     let size = (decoder.width(), decoder.height());
-    let (mut delays, mut frames) = (Vec::new(), Vec::new());
+    let mut delays = Vec::new();
+    let mut frames = Vec::new();
     let mut seen = vec![0; usize::from(size.0) * usize::from(size.1) * 4];
     while let Some(frame) = decoder.read_next_frame().expect("a whole GIF") {
         for (row, pixels) in frame.buffer.chunks(4 * usize::from(frame.width)).enumerate() {
@@ -224,7 +225,8 @@ fn a_contact_sheet_has_the_versions_side_by_side() {
         let mut reader = png::Decoder::new(file).read_info().expect("a PNG");
         let mut pixels = vec![0; reader.output_buffer_size().expect("a size")];
         reader.next_frame(&mut pixels).expect("a whole PNG");
-        let (width, height) = (reader.info().width as usize, reader.info().height as usize);
+        let width = reader.info().width as usize;
+        let height = reader.info().height as usize;
         assert!(stdout.contains(&format!(" frames, on {width} × {height} pixels")), "{stdout}");
         (stdout, pixels.chunks(3 * width).map(<[u8]>::to_vec).collect::<Vec<_>>())
     };

@@ -63,7 +63,8 @@ mod tests {
     #[test]
     fn a_disk_is_full_at_first_and_free_later() {
         let [disk, kept] = [(); 2].map(|()| tempfile::tempdir().expect("a folder"));
-        let (disk, kept) = (disk.path(), kept.path());
+        let disk = disk.path();
+        let kept = kept.path();
         let Some(mut twice) = on_full_then_free_disk(&writing(disk), disk, 100, kept) else {
             return eprintln!("skipped: this user may not mount disks");
         };

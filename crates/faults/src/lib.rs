@@ -10,5 +10,5 @@ pub mod disk;
 pub mod proxy;
 pub mod rng;
 
-pub use proxy::{Fault, FaultKind, FaultPlan, FaultyProxy};
+pub use proxy::{ByteFault, FaultKind, FaultPlan, FaultyProxy};
 pub use rng::SeededRng;

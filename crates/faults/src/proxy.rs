@@ -32,7 +32,7 @@ impl FaultKind {
 
 /// A fault of one direction of a connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Fault {
+pub struct ByteFault {
     /// Position of the byte at which it happens, from 0.
     pub at: usize,
     /// Kind of the fault.
@@ -45,9 +45,9 @@ pub struct FaultPlan {
     /// Delay of all bytes in both directions.
     pub delay: Duration,
     /// Fault of the server's bytes.
-    pub from_server: Option<Fault>,
+    pub from_server: Option<ByteFault>,
     /// Fault of the client's bytes.
-    pub from_client: Option<Fault>,
+    pub from_client: Option<ByteFault>,
 }
 
 /// A running proxy. It runs until the process ends.
@@ -158,11 +158,12 @@ fn forward(
     from: Box<dyn Socket>,
     mut to: Box<dyn Socket>,
     delay: Duration,
-    fault: Option<Fault>,
+    fault: Option<ByteFault>,
     counts: &Arc<ProxyCounts>,
 ) -> io::Result<()> {
     let (sender, chunks) = mpsc::channel::<(Instant, Vec<u8>)>();
-    let (mut reader, counts) = (from.duplicate()?, Arc::clone(counts));
+    let mut reader = from.duplicate()?;
+    let counts = Arc::clone(counts);
     thread::spawn(move || {
         let mut chunk = vec![0; 1 << 16];
         while let Ok(count @ 1..) = reader.read(&mut chunk) {
@@ -237,7 +238,8 @@ mod tests {
         let mut client = TcpStream::connect(proxy.address()).expect("connected");
         client.set_read_timeout(Some(if plan.delay.is_zero() { SILENCE } else { DEADLINE })).expect("set");
         client.write_all(b"0123456789").expect("sent");
-        let (mut echo, mut chunk) = (Vec::new(), [0; 64]);
+        let mut echo = Vec::new();
+        let mut chunk = [0; 64];
         let closed = loop {
             match client.read(&mut chunk) {
                 Ok(0) => break true,
@@ -252,7 +254,7 @@ mod tests {
     }
 
     fn server_fault(kind: FaultKind) -> FaultPlan {
-        FaultPlan { from_server: Some(Fault { at: 4, kind }), ..FaultPlan::default() }
+        FaultPlan { from_server: Some(ByteFault { at: 4, kind }), ..FaultPlan::default() }
     }
 
     #[test]
@@ -275,7 +277,7 @@ mod tests {
 
     #[test]
     fn client_faults_leave_the_other_direction_open() {
-        let fault = |kind| FaultPlan { from_client: Some(Fault { at: 6, kind }), ..FaultPlan::default() };
+        let fault = |kind| FaultPlan { from_client: Some(ByteFault { at: 6, kind }), ..FaultPlan::default() };
         let (echo, closed, _) = echoed(fault(FaultKind::HalfClose));
         assert_eq!((&echo[..], closed), (&b"012345"[..], true), "the server saw the end, and its reply arrived");
         assert_eq!(echoed(fault(FaultKind::BitFlip)).0, b"0123457789");

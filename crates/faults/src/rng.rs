@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
-use crate::proxy::{Fault, FaultKind};
+use crate::proxy::{ByteFault, FaultKind};
 
 /// Environment variable with the seed.
 pub const SEED_VARIABLE: &str = "PERTURB_SEED";
@@ -53,11 +53,11 @@ impl SeededRng {
     ///
     /// It is as likely between bytes 100 and 1000 as between 1000 and 10 000, because the first bytes of a connection
     /// negotiate most.
-    pub fn fault(&mut self, kinds: &[FaultKind], end: u64) -> Fault {
+    pub fn fault(&mut self, kinds: &[FaultKind], end: u64) -> ByteFault {
         let kind = kinds[self.below(kinds.len() as u64) as usize];
         let digits = u64::from(end.max(2).ilog2());
         let high = 1 << (1 + self.below(digits));
-        Fault { at: self.below(high.min(end)) as usize, kind }
+        ByteFault { at: self.below(high.min(end)) as usize, kind }
     }
 }
 

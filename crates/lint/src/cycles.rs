@@ -18,7 +18,7 @@ pub struct Cycle {
     pub parent: ModulePath,
     /// Number of the parent's children that take part in imports.
     pub siblings: usize,
-    /// Names of all modules of the cycle, in alphabetical order.
+    /// NameDefinitions of all modules of the cycle, in alphabetical order.
     pub modules: Vec<String>,
     /// A shortest path from one of them back to itself.
     pub path: Vec<Edge>,
@@ -40,7 +40,9 @@ pub struct Edge {
 impl fmt::Display for Cycle {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let parent = if self.parent.is_empty() { "the root".to_owned() } else { self.parent.join("::") };
-        let (count, siblings, modules) = (self.modules.len(), self.siblings, self.modules.join(", "));
+        let count = self.modules.len();
+        let siblings = self.siblings;
+        let modules = self.modules.join(", ");
         write!(
             f,
             "{}: {count} of {siblings} modules of {parent} import each other: {modules}; for example",
@@ -55,7 +57,7 @@ impl fmt::Display for Cycle {
 
 /// Finds every cycle of a package, the outermost modules first.
 pub fn find(package: &PackageImports) -> Vec<Cycle> {
-    let mut levels: BTreeMap<(usize, &[String]), Graph> = BTreeMap::new();
+    let mut levels: BTreeMap<(usize, &[String]), SiblingGraph> = BTreeMap::new();
     for import in &package.imports {
         let common = import.from.iter().zip(&import.to).take_while(|(from, to)| from == to).count();
         if let (Some(from), Some(to)) = (import.from.get(common), import.to.get(common)) {
@@ -79,12 +81,12 @@ pub fn find(package: &PackageImports) -> Vec<Cycle> {
 }
 
 #[derive(Default)]
-struct Graph {
+struct SiblingGraph {
     names: BTreeSet<String>,
     edges: BTreeMap<String, BTreeMap<String, Edge>>,
 }
 
-impl Graph {
+impl SiblingGraph {
     fn add(&mut self, edge: Edge) {
         self.names.extend([edge.from.clone(), edge.to.clone()]);
         self.edges.entry(edge.from.clone()).or_default().entry(edge.to.clone()).or_insert(edge);

@@ -2,7 +2,7 @@
 
 /// A token with the line on which it starts.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Token {
+pub struct SourceToken {
     /// The token itself.
     pub kind: TokenKind,
     /// Line of the file, counted from 1.
@@ -22,7 +22,7 @@ pub enum TokenKind {
     Symbol(char),
 }
 
-impl Token {
+impl SourceToken {
     /// Tells whether the token is the identifier or keyword `word`.
     pub fn is_word(&self, word: &str) -> bool {
         matches!(&self.kind, TokenKind::Word(found) if found == word)
@@ -43,12 +43,12 @@ impl Token {
 }
 
 /// Cuts Rust source into tokens. Comments, character literals and lifetimes give none.
-pub fn tokens(source: &str) -> Vec<Token> {
+pub fn tokens(source: &str) -> Vec<SourceToken> {
     Lexer { chars: source.chars().collect(), position: 0, line: 1, tokens: Vec::new() }.run()
 }
 
 /// Tells whether the attribute marks a test function: `test`, `rstest`, or a path that ends in `test`.
-pub fn is_test_attribute(content: &[Token]) -> bool {
+pub fn is_test_attribute(content: &[SourceToken]) -> bool {
     let mut name = None;
     for token in content.iter().skip_while(|token| token.word().is_none()) {
         match &token.kind {
@@ -64,11 +64,11 @@ struct Lexer {
     chars: Vec<char>,
     position: usize,
     line: usize,
-    tokens: Vec<Token>,
+    tokens: Vec<SourceToken>,
 }
 
 impl Lexer {
-    fn run(mut self) -> Vec<Token> {
+    fn run(mut self) -> Vec<SourceToken> {
         while let Some(c) = self.peek(0) {
             if c.is_whitespace() {
                 self.advance();
@@ -114,7 +114,7 @@ impl Lexer {
     }
 
     fn push(&mut self, kind: TokenKind) {
-        self.tokens.push(Token { kind, line: self.line });
+        self.tokens.push(SourceToken { kind, line: self.line });
     }
 
     /// Skips a block comment. Rust's block comments nest.
@@ -152,7 +152,7 @@ impl Lexer {
                 c => text.push(c),
             }
         }
-        self.tokens.push(Token { kind: TokenKind::Text(text), line });
+        self.tokens.push(SourceToken { kind: TokenKind::Text(text), line });
     }
 
     /// Reads a raw string, at whose first `#` or `"` the lexer stands.
@@ -173,7 +173,7 @@ impl Lexer {
             text.push(c);
             self.advance();
         }
-        self.tokens.push(Token { kind: TokenKind::Text(text), line });
+        self.tokens.push(SourceToken { kind: TokenKind::Text(text), line });
     }
 
     /// Skips a character literal or a lifetime.

@@ -1,4 +1,4 @@
-//! Limits of every check by folder, and the exemptions of types that share a name.
+//! LimitTable of every check by folder, and the exemptions of types that share a name.
 //!
 //! Both files are written in the part of TOML that they need: `[section]`, `key = value`, and comments on lines of
 //! their own.
@@ -95,13 +95,13 @@ pub struct Finding {
 
 /// Numbers by section and key, as the file of limits has them.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Limits(BTreeMap<String, BTreeMap<String, f64>>);
+pub struct LimitTable(BTreeMap<String, BTreeMap<String, f64>>);
 
-/// Names that may be defined more than once, each with its reason.
+/// NameDefinitions that may be defined more than once, each with its reason.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Exemptions(BTreeMap<String, String>);
 
-impl Limits {
+impl LimitTable {
     /// Parses the file of limits.
     ///
     /// # Errors
@@ -138,7 +138,7 @@ impl Limits {
     }
 }
 
-impl fmt::Display for Limits {
+impl fmt::Display for LimitTable {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,
@@ -146,7 +146,7 @@ impl fmt::Display for Limits {
         )?;
         writeln!(
             f,
-            "# of the doc comments, and none of all else. Limits only fall: `cargo run --release --package perturb-lint --"
+            "# of the doc comments, and none of all else. LimitTable only fall: `cargo run --release --package perturb-lint --"
         )?;
         writeln!(f, "# --write-limits` writes the numbers of today.")?;
         for check in Check::ALL {
@@ -178,7 +178,7 @@ impl Exemptions {
     }
 }
 
-struct Entry {
+struct KeyValue {
     section: String,
     key: String,
     value: String,
@@ -186,7 +186,7 @@ struct Entry {
 }
 
 /// Reads `key = value` lines with their sections. Quotation marks around keys and values are removed.
-fn entries(text: &str) -> Result<Vec<Entry>, String> {
+fn entries(text: &str) -> Result<Vec<KeyValue>, String> {
     let mut section = String::new();
     let mut entries = Vec::new();
     for (index, line) in text.lines().map(str::trim).enumerate() {
@@ -201,7 +201,7 @@ fn entries(text: &str) -> Result<Vec<Entry>, String> {
             return Err(format!("line {}: expected key = value, found {line}", index + 1));
         };
         let [key, value] = [key, value].map(|part| part.trim().trim_matches('"').to_owned());
-        entries.push(Entry { section: section.clone(), key, value, line: index + 1 });
+        entries.push(KeyValue { section: section.clone(), key, value, line: index + 1 });
     }
     Ok(entries)
 }
@@ -283,7 +283,7 @@ pub struct Verdict {
 }
 
 /// Compares findings with limits, and exemptions with the types that need them.
-pub fn judge(tree: &SourceTree, findings: &[Finding], limits: &Limits, exemptions: &Exemptions) -> Verdict {
+pub fn judge(tree: &SourceTree, findings: &[Finding], limits: &LimitTable, exemptions: &Exemptions) -> Verdict {
     let mut verdict = Verdict::default();
     for finding in findings {
         let limit = limits.get(finding.check, &finding.folder);

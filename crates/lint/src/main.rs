@@ -4,7 +4,7 @@ use std::io::Write as _;
 use std::path::Path;
 use std::process::ExitCode;
 
-use perturb_lint::limits::{self, Exemptions, Limits};
+use perturb_lint::limits::{self, Exemptions, LimitTable};
 use perturb_lint::source::SourceTree;
 
 const LIMITS: &str = "crates/lint/limits.toml";
@@ -43,7 +43,7 @@ fn exemptions() -> Result<Exemptions, String> {
 
 /// Prints errors and warnings; returns whether there was no error.
 fn check() -> Result<bool, String> {
-    let limits = Limits::parse(&read(LIMITS)?).map_err(|error| format!("{LIMITS}, {error}"))?;
+    let limits = LimitTable::parse(&read(LIMITS)?).map_err(|error| format!("{LIMITS}, {error}"))?;
     let exemptions = exemptions()?;
     let tree = SourceTree::read(Path::new("."))?;
     let findings = limits::check(&tree, &exemptions);
@@ -73,6 +73,6 @@ fn list(folder: &str) -> Result<(), String> {
 
 fn write_limits() -> Result<(), String> {
     let findings = limits::check(&SourceTree::read(Path::new("."))?, &exemptions()?);
-    std::fs::write(LIMITS, Limits::needed_for(&findings).to_string())
+    std::fs::write(LIMITS, LimitTable::needed_for(&findings).to_string())
         .map_err(|error| format!("cannot write {LIMITS}: {error}"))
 }

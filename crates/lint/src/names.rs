@@ -1,8 +1,8 @@
-//! Names: types defined twice, superlative constants, constructors called `of`, and long test names.
+//! NameDefinitions: types defined twice, superlative constants, constructors called `of`, and long test names.
 
 use std::collections::BTreeMap;
 
-use crate::lexer::{Token, TokenKind, is_test_attribute, tokens};
+use crate::lexer::{SourceToken, TokenKind, is_test_attribute, tokens};
 use crate::source::{SourceTree, is_benchmark_or_example, is_test};
 
 /// Longest name of a test, in characters.
@@ -25,7 +25,7 @@ pub struct Definition {
 
 /// Every name that the checks look at.
 #[derive(Clone, Debug, Default)]
-pub struct Names {
+pub struct NameDefinitions {
     /// Structs, enums, traits, classes and type aliases of modules, without tests, benchmarks and examples.
     pub types: Vec<Definition>,
     /// Constants and statics whose first word is one of [`SUPERLATIVES`], without tests.
@@ -37,8 +37,8 @@ pub struct Names {
 }
 
 /// Reads the names of all Rust and Python files.
-pub fn read(tree: &SourceTree) -> Names {
-    let mut names = Names::default();
+pub fn read(tree: &SourceTree) -> NameDefinitions {
+    let mut names = NameDefinitions::default();
     for (file, source) in tree.with_extension(".rs") {
         read_rust(file, source, &mut names);
     }
@@ -50,7 +50,7 @@ pub fn read(tree: &SourceTree) -> Names {
 
 /// Returns the types that are defined in more than one file of the same language, by name, with all their definitions.
 ///
-/// Names of Rust and Python are not compared, because a class often stands for the struct of the same name.
+/// NameDefinitions of Rust and Python are not compared, because a class often stands for the struct of the same name.
 pub fn defined_twice(types: &[Definition]) -> BTreeMap<&str, Vec<&Definition>> {
     let mut by_name: BTreeMap<(&str, bool), Vec<&Definition>> = BTreeMap::new();
     for definition in types {
@@ -69,7 +69,7 @@ fn is_superlative(name: &str) -> bool {
         && name.split('_').next().is_some_and(|first| SUPERLATIVES.contains(&first))
 }
 
-fn read_rust(file: &str, source: &str, names: &mut Names) {
+fn read_rust(file: &str, source: &str, names: &mut NameDefinitions) {
     let tokens = tokens(source);
     let is_test_code = is_test(file);
     let mut is_test_function = false;
@@ -81,13 +81,13 @@ fn read_rust(file: &str, source: &str, names: &mut Names) {
     let mut position = 0;
     while position < tokens.len() {
         let token = &tokens[position];
-        let next = tokens.get(position + 1).and_then(Token::word);
+        let next = tokens.get(position + 1).and_then(SourceToken::word);
         let define = |name: &str| Definition { name: name.to_owned(), file: file.to_owned(), line: token.line };
         match &token.kind {
             TokenKind::Symbol('#') => {
                 let content = attribute(&tokens[position..]);
                 is_test_function |= is_test_attribute(content);
-                let words: Vec<_> = content.iter().filter_map(Token::word).collect();
+                let words: Vec<_> = content.iter().filter_map(SourceToken::word).collect();
                 if words == ["cfg", "test"]
                     && tokens.get(position + content.len()).is_some_and(|token| token.is_word("mod"))
                 {
@@ -138,7 +138,7 @@ fn read_rust(file: &str, source: &str, names: &mut Names) {
 }
 
 /// Returns the tokens of an attribute, from its `#` to its `]`; only the `#` if it is none.
-fn attribute(tokens: &[Token]) -> &[Token] {
+fn attribute(tokens: &[SourceToken]) -> &[SourceToken] {
     let mut depth = 0;
     for (index, token) in tokens.iter().enumerate() {
         match token.kind {
@@ -153,7 +153,7 @@ fn attribute(tokens: &[Token]) -> &[Token] {
     &tokens[..1]
 }
 
-fn read_python(file: &str, source: &str, names: &mut Names) {
+fn read_python(file: &str, source: &str, names: &mut NameDefinitions) {
     for (index, line) in source.lines().enumerate() {
         let define = |name: &str| Definition { name: name.to_owned(), file: file.to_owned(), line: index + 1 };
         let start = line.trim_start();

@@ -9,23 +9,23 @@ use perturb::server::session::handler::{Reply, SessionHandler, StreamHandover};
 use perturb::server::session::lease::Leases;
 use perturb::server::transport::precheck::Field;
 
-use super::{Ledger, MAX_BYTES};
+use super::{MAX_BYTES, StepLog};
 
 /// A counting session.
-pub(super) struct Counting {
+pub(super) struct CountingSession {
     leases: Leases<proto::SessionResponse>,
-    ledger: Ledger,
+    ledger: StepLog,
     is_open: bool,
     steps: u64,
 }
 
-impl Counting {
+impl CountingSession {
     /// Makes a session that is not open yet.
-    pub(super) fn new(leases: Leases<proto::SessionResponse>, ledger: Ledger) -> Self {
+    pub(super) fn new(leases: Leases<proto::SessionResponse>, ledger: StepLog) -> Self {
         Self { leases, ledger, is_open: false, steps: 0 }
     }
 
-    fn open(&mut self, open: &proto::Open) -> Result<SessionReply, Error> {
+    fn open(&mut self, open: &proto::Open) -> Result<CountingReply, Error> {
         self.is_open = true;
         let grant = self.leases.give(None, open.lease as usize)?;
         let (lease, time) = grant.as_ref().map(|grant| (grant.name.to_vec(), grant.time())).unwrap_or_default();
@@ -35,7 +35,7 @@ impl Counting {
     }
 
     /// Replies with the number of the request and with the number of steps so far.
-    fn step(&mut self, step: &proto::Step) -> Result<SessionReply, Error> {
+    fn step(&mut self, step: &proto::Step) -> Result<CountingReply, Error> {
         let number = step.actions[..].try_into().map(u64::from_le_bytes);
         let number = number.map_err(|_| Error::value("step.actions", step.actions.len(), "8 bytes"))?;
         self.ledger.add(number);
@@ -44,7 +44,7 @@ impl Counting {
         Ok(reply(Response::Stepped(proto::Stepped { observations: Bytes::from(numbers), ..Default::default() })))
     }
 
-    async fn resume(&mut self, resume: &proto::Resume) -> Result<SessionReply, Error> {
+    async fn resume(&mut self, resume: &proto::Resume) -> Result<CountingReply, Error> {
         let ticket = self.leases.ask(&resume.lease, None, resume.last_reply).await?;
         let resumed = proto::Resumed { last_reply: ticket.last_reply };
         Ok(Reply { handover: Some(StreamHandover::Resume(ticket)), ..reply(Response::Resumed(resumed)) })
@@ -52,13 +52,13 @@ impl Counting {
 }
 
 /// A reply of this protocol.
-type SessionReply = Reply<proto::SessionResponse>;
+type CountingReply = Reply<proto::SessionResponse>;
 
-fn reply(response: Response) -> SessionReply {
+fn reply(response: Response) -> CountingReply {
     Reply::new(proto::SessionResponse { response: Some(response) })
 }
 
-impl SessionHandler for Counting {
+impl SessionHandler for CountingSession {
     type Request = proto::SessionRequest;
     type Response = proto::SessionResponse;
     type Error = Error;
@@ -89,7 +89,7 @@ impl SessionHandler for Counting {
         About { steps: self.steps, ..About::default() }
     }
 
-    async fn answer(&mut self, request: Self::Request) -> Result<SessionReply, Error> {
+    async fn answer(&mut self, request: Self::Request) -> Result<CountingReply, Error> {
         match request.request {
             Some(Request::Open(open)) => self.open(&open),
             Some(Request::Step(step)) => self.step(&step),

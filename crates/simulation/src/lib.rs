@@ -30,7 +30,7 @@ use perturb_protocol::{Address, ClientError, Connection, Timeouts};
 use tonic::transport::Server;
 use tonic::{Request, Response, Status, Streaming};
 
-use counting::Counting;
+use counting::CountingSession;
 
 /// Name of the server's machine.
 pub const SERVER: &str = "server";
@@ -51,7 +51,7 @@ const MAX_BYTES: usize = 1 << 20;
 
 /// Steps and state of the server's sessions. Clones share them.
 #[derive(Clone)]
-pub struct Ledger {
+pub struct StepLog {
     /// Numbers of the steps, in the order of the server.
     done: Arc<Mutex<Vec<u64>>>,
     numbers: Numbers,
@@ -59,14 +59,14 @@ pub struct Ledger {
     counters: ErrorCounters,
 }
 
-impl Default for Ledger {
+impl Default for StepLog {
     fn default() -> Self {
         let places = Places::new(MAX_SESSIONS, MAX_SESSIONS);
         Self { done: Arc::default(), numbers: Numbers::default(), places, counters: ErrorCounters::default() }
     }
 }
 
-impl Ledger {
+impl StepLog {
     /// Returns the numbers that clients stepped with, in the order of the server.
     pub fn done(&self) -> Vec<u64> {
         self.done.lock().unwrap_or_else(PoisonError::into_inner).clone()
@@ -96,14 +96,16 @@ impl Ledger {
 ///
 /// # Errors
 /// If the port is taken, or the transport fails.
-pub async fn serve(ledger: Ledger) -> turmoil::Result {
+pub async fn serve(ledger: StepLog) -> turmoil::Result {
     let (_controller, drain) = Controller::new();
     let budget = Budget::new(MAX_BYTES);
     let limits = Limits { bytes: MAX_BYTES, handshake: HANDSHAKE_TIMEOUT, idle: None };
-    let (places, numbers, counters) = (ledger.places.clone(), ledger.numbers.clone(), ledger.counters.clone());
+    let places = ledger.places.clone();
+    let numbers = ledger.numbers.clone();
+    let counters = ledger.counters.clone();
     let sessions = Sessions::new(places, limits, drain, counters, Access::default(), numbers.clone());
-    let counts = Counts::new::<Counting>();
-    let service = Service { sessions, leases: Leases::new(LEASE, numbers), ledger, counts };
+    let counts = Counts::new::<CountingSession>();
+    let service = CountingService { sessions, leases: Leases::new(LEASE, numbers), ledger, counts };
     let transit = Transit { budget, limit: Some(LEASE), handshake: HANDSHAKE_TIMEOUT };
     let listener = turmoil::net::TcpListener::bind((Ipv4Addr::UNSPECIFIED, PORT)).await?;
     let connections = Places::new(usize::MAX, usize::MAX);
@@ -146,15 +148,15 @@ async fn stream() -> io::Result<turmoil::net::TcpStream> {
 
 /// The service of `perturb.v1` with counting sessions.
 #[derive(Clone)]
-struct Service {
+struct CountingService {
     sessions: Sessions,
     leases: Leases<proto::SessionResponse>,
-    ledger: Ledger,
+    ledger: StepLog,
     counts: Arc<Counts>,
 }
 
 #[tonic::async_trait]
-impl proto::perturb_server::Perturb for Service {
+impl proto::perturb_server::Perturb for CountingService {
     type SessionStream = Responses<proto::SessionResponse>;
 
     async fn list_environments(
@@ -168,7 +170,7 @@ impl proto::perturb_server::Perturb for Service {
         &self,
         mut request: Request<Streaming<proto::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let counting = Counting::new(self.leases.clone(), self.ledger.clone());
+        let counting = CountingSession::new(self.leases.clone(), self.ledger.clone());
         Ok(Response::new(self.sessions.begin(raw_body::messages(&mut request)?, counting, &self.counts)?))
     }
 }

@@ -10,7 +10,7 @@ use std::time::Duration;
 use perturb_faults::SeededRng;
 use perturb_faults::rng::SEED_VARIABLE;
 use perturb_protocol::{ClientError, Stream, proto};
-use perturb_simulation::{KEEPALIVE, LEASE, Ledger, SERVER, connect, serve};
+use perturb_simulation::{KEEPALIVE, LEASE, SERVER, StepLog, connect, serve};
 use turmoil::{Builder, Sim};
 
 const CLIENT: &str = "client";
@@ -43,7 +43,7 @@ fn simulations(simulate: impl Fn(u64)) {
     }
 }
 
-fn simulation(seed: u64, ledger: &Ledger) -> Sim<'static> {
+fn simulation(seed: u64, ledger: &StepLog) -> Sim<'static> {
     let mut builder = Builder::new();
     builder.rng_seed(seed).simulation_duration(Duration::from_secs(7200)).min_message_latency(Duration::from_millis(1));
     builder.max_message_latency(Duration::from_millis(50));
@@ -71,7 +71,8 @@ async fn receive_step(session: &mut Stream) -> Result<[u64; 2], ClientError> {
 /// Takes all steps with some requests in flight and random pauses.
 async fn play(seed: u64, replies: Replies) -> turmoil::Result {
     let mut rng = SeededRng::from_seed(seed);
-    let (mut session, mut sent) = (open().await?, 0);
+    let mut session = open().await?;
+    let mut sent = 0;
     for received in 0..STEPS {
         let in_flight = 1 + rng.below(MAX_IN_FLIGHT);
         while sent < STEPS.min(received + in_flight) {
@@ -89,7 +90,9 @@ async fn play(seed: u64, replies: Replies) -> turmoil::Result {
 /// Runs the simulation to its end while the connection is interrupted at random. Returns whether the client's last
 /// message certainly arrived: a cut that nobody has noticed yet may swallow it.
 fn disturb(simulation: &mut Sim<'_>, seed: u64) -> bool {
-    let (mut rng, mut change, mut is_good) = (SeededRng::from_seed(!seed), Duration::from_secs(1), true);
+    let mut rng = SeededRng::from_seed(!seed);
+    let mut change = Duration::from_secs(1);
+    let mut is_good = true;
     let mut good_since = Duration::ZERO;
     loop {
         if simulation.elapsed() >= change {
@@ -116,7 +119,8 @@ fn disturb(simulation: &mut Sim<'_>, seed: u64) -> bool {
 
 /// Returns the replies of a client over an interrupted connection, and how often it resumed its session.
 fn disturbed(seed: u64) -> (Vec<(Duration, [u64; 2])>, u64) {
-    let (ledger, replies) = (Ledger::default(), Replies::default());
+    let ledger = StepLog::default();
+    let replies = Replies::default();
     let mut simulation = simulation(seed, &ledger);
     simulation.client(CLIENT, play(seed, Rc::clone(&replies)));
     let is_heard = disturb(&mut simulation, seed);
@@ -149,8 +153,9 @@ fn equal_seeds_give_equal_times() {
 }
 
 /// Simulates a client that steps once, and again after `gap`. The connection is cut in between.
-fn cut_off(seed: u64, gap: Duration) -> (Result<[u64; 2], ClientError>, Ledger) {
-    let (ledger, outcome) = (Ledger::default(), Rc::new(RefCell::new(None)));
+fn cut_off(seed: u64, gap: Duration) -> (Result<[u64; 2], ClientError>, StepLog) {
+    let ledger = StepLog::default();
+    let outcome = Rc::new(RefCell::new(None));
     let mut simulation = simulation(seed, &ledger);
     let result = Rc::clone(&outcome);
     simulation.client(CLIENT, async move {
@@ -175,7 +180,7 @@ fn cut_off(seed: u64, gap: Duration) -> (Result<[u64; 2], ClientError>, Ledger) 
 
 /// Checks that the client took one of two steps, and that its session was gone when it asked to resume it.
 #[track_caller]
-fn assert_gone(reply: &Result<[u64; 2], ClientError>, ledger: &Ledger) {
+fn assert_gone(reply: &Result<[u64; 2], ClientError>, ledger: &StepLog) {
     assert!(matches!(reply, Err(ClientError::Lost { request: "a step", .. })), "{reply:?}");
     assert_eq!((ledger.done(), ledger.unknown()), (vec![0], 1));
 }
@@ -196,7 +201,8 @@ fn a_session_resumes_until_its_lease_ends() {
 #[test]
 fn a_restarted_server_refuses_to_resume() {
     simulations(|seed| {
-        let (ledger, outcome) = (Ledger::default(), Rc::new(RefCell::new(None)));
+        let ledger = StepLog::default();
+        let outcome = Rc::new(RefCell::new(None));
         let mut simulation = simulation(seed, &ledger);
         let result = Rc::clone(&outcome);
         simulation.client(CLIENT, async move {

@@ -76,13 +76,15 @@ pub(crate) fn page(root: &Root, relative: &RelativePath, update: &Update) -> Str
 }
 
 fn title(name: &str, status: &ExperimentStatus, experiment: &LiveExperiment) -> String {
-    let (done, all) = (status.count(CellStatus::is_settled), status.cells.len());
+    let done = status.count(CellStatus::is_settled);
+    let all = status.cells.len();
     if experiment.state() == "in work" { format!("{done}/{all} · {name}") } else { format!("{name} · perturb") }
 }
 
 fn head(status: &ExperimentStatus, experiment: &LiveExperiment) -> Markup {
     let all = status.cells.len() as u64;
-    let (done, settled) = (status.done().count(), status.count(CellStatus::is_settled) as u64);
+    let done = status.done().count();
+    let settled = status.count(CellStatus::is_settled) as u64;
     let count = |is: fn(&CellStatus) -> bool| status.count(is);
     let failed = count(|cell| matches!(cell, CellStatus::Failed(_)));
     let working = count(|cell| *cell == CellStatus::InWork);
@@ -184,7 +186,8 @@ fn working(status: &ExperimentStatus, experiment: &LiveExperiment, relative: &Re
 
 fn one(cell: &Cell, experiment: &LiveExperiment, relative: &RelativePath) -> Markup {
     let training = experiment.training(&cell.id).and_then(|training| training.status().ok());
-    let (episodes, budget) = (training.map_or(0, |status| status.episodes), cell.config.common.episodes);
+    let episodes = training.map_or(0, |status| status.episodes);
+    let budget = cell.config.common.episodes;
     let success = training.and_then(|status| status.progress.as_ref()?.success_percent());
     let doing = match () {
         () if training.is_none() => "beginning",

@@ -3,7 +3,7 @@
 use maud::{Markup, html};
 use perturb_text::grouped;
 
-use crate::pictures::{Picture, Pictures};
+use crate::pictures::{Pictures, RunPicture};
 
 /// Shows pictures under a heading; empty if there are none.
 pub(crate) fn section(pictures: &Pictures) -> Markup {
@@ -16,7 +16,7 @@ pub(crate) fn section(pictures: &Pictures) -> Markup {
     }
 }
 
-fn figure(Picture { relative, name, is_film, stamp }: &Picture) -> Markup {
+fn figure(RunPicture { relative, name, is_film, stamp }: &RunPicture) -> Markup {
     let address = format!("/file/{}?v={}", relative.encode(), stamp.tag());
     html! {
         figure {

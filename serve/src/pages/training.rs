@@ -77,13 +77,15 @@ pub(crate) fn page(root: &Root, relative: &RelativePath, update: &Update) -> Str
 }
 
 fn title(name: &str, status: &TrainingStatus) -> String {
-    let (done, budget) = (status.episodes as f64, status.config.common.episodes.max(1) as f64);
+    let done = status.episodes as f64;
+    let budget = status.config.common.episodes.max(1) as f64;
     let percent = (100.0 * done / budget).min(100.0).floor();
     if status.state == "in work" { format!("{percent} % · {name}") } else { format!("{name} · perturb") }
 }
 
 fn head(status: &TrainingStatus, training: &LiveTraining) -> Markup {
-    let (done, budget) = (status.episodes, status.config.common.episodes);
+    let done = status.episodes;
+    let budget = status.config.common.episodes;
     let number = |number: u64| grouped(number as usize);
     html! {
         p.head { (status.what()) " " (badge(status.state)) }

@@ -3,7 +3,7 @@
 use super::{begin, connect, logged, steps, unauthenticated, unsafe_words};
 use crate::common::server::{self, Server, within};
 use perturb_faults::{
-    Fault, FaultKind, FaultPlan, FaultyProxy,
+    ByteFault, FaultKind, FaultPlan, FaultyProxy,
     certificates::{Authority, CertificateFiles},
 };
 use perturb_protocol::{
@@ -187,7 +187,7 @@ async fn with_tls_no_changed_byte_is_taken_for_the_servers() {
     let truth = played(encrypted.address().into()).await.unwrap();
     let mut errors = 0;
     for place in [3, 60, 200, 700, 1000, 1500, 2000, 3000, 4000, 6000] {
-        let from_server = Some(Fault { at: place, kind: FaultKind::BitFlip });
+        let from_server = Some(ByteFault { at: place, kind: FaultKind::BitFlip });
         let line = FaultyProxy::start(encrypted.address(), move |_| FaultPlan { from_server, ..FaultPlan::default() })
             .unwrap();
         match played(format!("https://{}", line.address())).await {

@@ -44,7 +44,7 @@ pub struct Cli {
     #[arg(short, long, global = true, action = ArgAction::Count)]
     pub verbose: u8,
     #[command(subcommand)]
-    pub command: Command,
+    pub command: CliCommand,
 }
 
 impl Cli {
@@ -68,7 +68,7 @@ impl Cli {
 }
 
 #[derive(Debug, Subcommand)]
-pub enum Command {
+pub enum CliCommand {
     /// List the environments with their parameters.
     Envs(EnvsArgs),
     /// List the trainings and experiments in a folder with budget, result and state.
@@ -223,14 +223,14 @@ mod tests {
     #[test]
     fn names_may_be_spelled_in_any_case() {
         let words = ["perturb", "train", "--algorithm", "EPOpt_PPO", "--architecture", "FF", "--preset", "Paper"];
-        let Command::Train(train) = Cli::try_parse_from(words).unwrap().command else { panic!("another command") };
+        let CliCommand::Train(train) = Cli::try_parse_from(words).unwrap().command else { panic!("another command") };
         assert_eq!(train.algorithm.as_deref(), Some("epopt-ppo"));
         assert_eq!((train.architecture.as_deref(), train.preset.as_deref()), (Some("ff"), Some("paper")));
         let refused = Cli::try_parse_from(["perturb", "train", "--algorithm", "pppo"]).unwrap_err().to_string();
         assert!(refused.contains("a similar value exists: 'ppo'"), "{refused}");
         for (rule, meant) in [("TEXT", "text"), ("Code", "code"), ("steps=9", "steps=9")] {
             let words = ["perturb", "rescore", "file", "--success", rule];
-            let Command::Rescore(rescore) = Cli::try_parse_from(words).unwrap().command else {
+            let CliCommand::Rescore(rescore) = Cli::try_parse_from(words).unwrap().command else {
                 panic!("another command")
             };
             assert_eq!(rescore.success, [meant.parse().unwrap()]);

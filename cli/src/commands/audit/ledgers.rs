@@ -16,7 +16,8 @@ use super::RecordedPolicy;
 pub(super) fn prove(args: &AuditArgs, recorded: &[RecordedPolicy]) -> Result<ExitCode> {
     let ledgers = Ledgers::read(&args.ledger, &args.head).map_err(CommandError::Failed)?;
     let servers = reconnecting_servers(&args.server, args.wait)?;
-    let (mut proofs, mut out) = (Vec::new(), std::io::stdout());
+    let mut proofs = Vec::new();
+    let mut out = std::io::stdout();
     for policy in recorded {
         let name = policy.name.as_str();
         let records = Records::read(&policy.records)?;
@@ -30,7 +31,8 @@ pub(super) fn prove(args: &AuditArgs, recorded: &[RecordedPolicy]) -> Result<Exi
         if records.about.tests.is_empty() {
             return Err(CommandError::Failed(format!("{name}: the records have no test, so nothing can be proved")));
         }
-        let (training, counters) = (&checkpoint.state.config.common, checkpoint.state.counters);
+        let training = &checkpoint.state.config.common;
+        let counters = checkpoint.state.counters;
         let environment = servers.environment(&training.environment)?;
         let episodes = counters.generated_episodes.max(counters.episodes);
         proofs.push((name, ledgers.prove(training, episodes, &environment, &records)));

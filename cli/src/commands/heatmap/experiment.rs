@@ -133,7 +133,8 @@ fn make(
 /// Loads the checkpoint of a result.
 fn checkpoint_of(folder: &Folder, Selected { cell, result }: Selected<'_>) -> Result<Checkpoint> {
     let checkpoint = Checkpoint::load(&folder.cell(&cell.id).training())?;
-    let (state, training) = (&checkpoint.state, &result.training);
+    let state = &checkpoint.state;
+    let training = &result.training;
     if training.settings != state.config.table() || training.counters != state.counters {
         let message = format!("the checkpoint of {} does not belong to its result.json", cell.id);
         return Err(CommandError::Failed(message));

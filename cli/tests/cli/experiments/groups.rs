@@ -37,7 +37,8 @@ fn ends(
 #[test]
 fn each_cell_of_a_group_ends_once() {
     let experiment = Experiment::new(PLAN);
-    let (local, stop) = (server(1), StopFlag::default());
+    let local = server(1);
+    let stop = StopFlag::default();
     let servers = Servers::connect(std::slice::from_ref(local.address())).unwrap_or_else(|error| panic!("{error}"));
     let place = |cell: usize| Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[cell].id);
     assert_eq!(ends(&experiment, &servers, &[(0, None)], &stop), [(0, CellEvent::Done)]);

@@ -66,7 +66,8 @@ fn intermediate_evaluations_survive_kills() {
     let without = Experiment::new(&PLAN.replace("evaluate_at = [10, 30, 60]\n", ""));
     succeeded(&without.run("out", &[]));
     for index in 0..3 {
-        let (marked, plain) = (experiment.cell_result("whole", index), without.cell_result("out", index));
+        let marked = experiment.cell_result("whole", index);
+        let plain = without.cell_result("out", index);
         assert_eq!((&marked.training.counters, &marked.results), (&plain.training.counters, &plain.results));
         let training = |experiment: &Experiment, name: &str| {
             let folder = Folder::new(&experiment.out(name));
@@ -123,7 +124,8 @@ fn an_intermediate_policy_is_that_of_a_shorter_training() {
             (state.counters, state.observation_normaliser, state.reward_normaliser, weights)
         };
         assert!(policy(&long, "marks/30") == policy(&short, "checkpoint"), "cell {index}");
-        let (marked, ended) = (long.cell_result("out", index), short.cell_result("out", index));
+        let marked = long.cell_result("out", index);
+        let ended = short.cell_result("out", index);
         assert_eq!((&marked.marks[&30].results, marked.marks.len()), (&ended.results, 2));
         assert_eq!(marked.marks[&10], ended.marks[&10]);
     }

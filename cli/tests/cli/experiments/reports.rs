@@ -35,7 +35,8 @@ fn reports_do_not_depend_on_interruptions() {
     let text = String::from_utf8_lossy(&partial["text"]).into_owned();
     assert!(text.contains("are missing.") && text.matches("missing").count() > 5, "{text}");
     succeeded(&experiment.run("killed", &["--jobs", "2"]));
-    let (whole, killed) = (report("whole"), report("killed"));
+    let whole = report("whole");
+    let killed = report("killed");
     assert_eq!(whole.keys().collect::<Vec<_>>(), killed.keys().collect::<Vec<_>>());
     for (name, content) in &whole {
         assert!(*content == killed[name], "{name} differs");
@@ -61,7 +62,8 @@ fn reports_do_not_depend_on_interruptions() {
 #[test]
 fn a_run_writes_its_report_at_the_end() {
     let experiment = Experiment::new(&PLAN.replace("7e-3, 7e-4", "1e38, 7e-4"));
-    let (page, again) = (experiment.out("pages/page.html"), experiment.out("again.html"));
+    let page = experiment.out("pages/page.html");
+    let again = experiment.out("again.html");
     std::fs::create_dir(experiment.out("pages")).expect("a folder");
     let output = experiment.run("out", &["--html", page.to_str().expect("a path")]);
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));

@@ -230,7 +230,8 @@ fn a_run_restarts_its_private_server_with_same_results() {
     let child = experiment.command("out", &["--jobs", "1"]).spawn().expect("started"); // the only server is in use
     let cell = experiment.out("out/cells").join(&experiment.plan.cells[0].id);
     let checkpoint = || std::fs::read(cell.join("training/checkpoint/checkpoint.json")).ok();
-    let (mut killed, mut at_its_end) = (None, None);
+    let mut killed = None;
+    let mut at_its_end = None;
     for _ in 0..2 {
         // A different process means that the next server is in use.
         wait_for("a checkpoint", || checkpoint().is_some_and(|it| at_its_end.as_ref() != Some(&it)));

@@ -74,7 +74,8 @@ fn reported_tests_share_nothing_with_selection_tests() {
     let experiment = Experiment::new(PLAN);
     succeeded(&experiment.run("out", &[]));
     let folder = Folder::new(&experiment.out("out"));
-    let (mut selecting, mut reported) = (BTreeSet::new(), BTreeSet::new());
+    let mut selecting = BTreeSet::new();
+    let mut reported = BTreeSet::new();
     for cell in experiment.cells("out") {
         let Ok(CellState::Done(result)) = folder.state(&cell) else { panic!("{} is not done", cell.id) };
         let episodes: Vec<u64> = result.results.values().map(|test| test.episodes).collect();

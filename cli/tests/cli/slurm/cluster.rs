@@ -187,7 +187,8 @@ fn configuration(path: &Path) -> String {
         let output = Command::new(program).arg(argument).output().expect(program);
         String::from_utf8_lossy(&output.stdout).trim().to_owned()
     };
-    let (host, user) = (output("uname", "-n"), output("id", "-un"));
+    let host = output("uname", "-n");
+    let user = output("id", "-un");
     let directory = path.display();
     let [control, n1, n2] = [free_port(), free_port(), free_port()];
     format!(

@@ -219,7 +219,8 @@ fn in_mid_training_on_n1(experiment: &Experiment, cluster: &Cluster, run: &mut C
 fn same_results_and_report(experiment: &Experiment) {
     assert_eq!(experiment.results("whole").len(), experiment.plan.cells.len());
     assert!(experiment.results("slurm") == experiment.results("whole"), "results differ");
-    let (whole, slurm) = (experiment.report("whole"), experiment.report("slurm"));
+    let whole = experiment.report("whole");
+    let slurm = experiment.report("slurm");
     assert!(whole.keys().eq(slurm.keys()));
     for (name, content) in &whole {
         assert!(*content == slurm[name], "{name} differs");
@@ -252,7 +253,8 @@ fn nothing_was_done_twice(experiment: &Experiment, victim: &str, moved: &[String
     for cell in &experiment.plan.cells {
         let said = |words: &str| experiment.said("slurm", &cell.id, words);
         // The warning about a missing checkpoint names the folder, too, and does not count.
-        let (begun, gone_on) = (said("training begins directory="), said("training goes on directory="));
+        let begun = said("training begins directory=");
+        let gone_on = said("training goes on directory=");
         if cell.id == victim {
             assert_eq!((begun, gone_on), (1, 1), "{}", cell.id);
         } else {
@@ -289,7 +291,8 @@ fn shared_server(experiment: &Experiment, cluster: &Cluster) {
     let id = &experiment.plan.cells[0].id;
     // The other cells have results already.
     for cell in &experiment.plan.cells[1..] {
-        let (from, to) = (experiment.cell("slurm", &cell.id), experiment.cell("shared", &cell.id));
+        let from = experiment.cell("slurm", &cell.id);
+        let to = experiment.cell("shared", &cell.id);
         fs::create_dir_all(&to).expect("a folder");
         fs::copy(from.join("result.json"), to.join("result.json")).expect("copied");
     }

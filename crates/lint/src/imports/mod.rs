@@ -60,13 +60,13 @@ struct Binding {
 
 /// The end of a path within the package.
 #[derive(Clone, Debug)]
-enum Target {
+enum ResolvedPath {
     Module(ModulePath),
     /// An item that the module defines, or imports from another package.
     ItemOf(ModulePath),
 }
 
-impl Target {
+impl ResolvedPath {
     fn into_module(self) -> ModulePath {
         match self {
             Self::Module(path) | Self::ItemOf(path) => path,
@@ -94,7 +94,7 @@ impl Modules {
     fn imports(&self) -> Vec<Import> {
         let mut imports = BTreeSet::new();
         for path in &self.paths {
-            if let Some(to) = self.resolve(&path.module, &path.names, 0).map(Target::into_module) {
+            if let Some(to) = self.resolve(&path.module, &path.names, 0).map(ResolvedPath::into_module) {
                 let from = path.module.clone();
                 imports.insert((
                     path.file.clone(),
@@ -108,27 +108,27 @@ impl Modules {
 
     /// Finds the module that `names` names, or that defines the item which `names` names, seen from `module`.
     /// Returns `None` if it is outside the package.
-    fn resolve(&self, module: &[String], names: &[String], reexports: usize) -> Option<Target> {
+    fn resolve(&self, module: &[String], names: &[String], reexports: usize) -> Option<ResolvedPath> {
         if reexports > MAX_REEXPORTS {
             return None;
         }
         let (first, mut rest) = names.split_first()?;
         let mut current = match first.as_str() {
-            "crate" => Target::Module(ModulePath::new()),
-            "self" => Target::Module(module.to_vec()),
-            "super" => Target::Module(module.split_last()?.1.to_vec()),
+            "crate" => ResolvedPath::Module(ModulePath::new()),
+            "self" => ResolvedPath::Module(module.to_vec()),
+            "super" => ResolvedPath::Module(module.split_last()?.1.to_vec()),
             name => match self.child(module, name) {
-                Some(child) => Target::Module(child),
+                Some(child) => ResolvedPath::Module(child),
                 None => self.reexport(module, name, reexports)?,
             },
         };
-        while let (Target::Module(path), Some((name, after))) = (&current, rest.split_first()) {
+        while let (ResolvedPath::Module(path), Some((name, after))) = (&current, rest.split_first()) {
             current = match name.as_str() {
-                "self" => Target::Module(path.clone()),
-                "super" => Target::Module(path.split_last()?.1.to_vec()),
+                "self" => ResolvedPath::Module(path.clone()),
+                "super" => ResolvedPath::Module(path.split_last()?.1.to_vec()),
                 name => match self.child(path, name) {
-                    Some(child) => Target::Module(child),
-                    None => self.reexport(path, name, reexports).unwrap_or(Target::ItemOf(path.clone())),
+                    Some(child) => ResolvedPath::Module(child),
+                    None => self.reexport(path, name, reexports).unwrap_or(ResolvedPath::ItemOf(path.clone())),
                 },
             };
             rest = after;
@@ -137,18 +137,18 @@ impl Modules {
     }
 
     /// Finds what `module` imports as `name`.
-    fn reexport(&self, module: &[String], name: &str, reexports: usize) -> Option<Target> {
+    fn reexport(&self, module: &[String], name: &str, reexports: usize) -> Option<ResolvedPath> {
         let bindings = self.bindings.get(module)?;
         if let Some(binding) = bindings.iter().find(|binding| binding.name.as_deref() == Some(name)) {
             return self.resolve(module, &binding.target, reexports + 1);
         }
         bindings.iter().filter(|binding| binding.name.is_none()).find_map(|glob| {
             let target = match self.resolve(module, &glob.target, reexports + 1)? {
-                Target::Module(target) if target != module => target,
+                ResolvedPath::Module(target) if target != module => target,
                 _ => return None,
             };
             match self.child(&target, name) {
-                Some(child) => Some(Target::Module(child)),
+                Some(child) => Some(ResolvedPath::Module(child)),
                 None => self.reexport(&target, name, reexports + 1),
             }
         })

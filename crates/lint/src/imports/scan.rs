@@ -1,6 +1,6 @@
 //! Finds modules, `use` items and paths in one file of Rust. Tests are left out.
 
-use crate::lexer::{Token, TokenKind, is_test_attribute, tokens};
+use crate::lexer::{SourceToken, TokenKind, is_test_attribute, tokens};
 
 /// Something that the file says about modules. `inside` names the inline modules around it, outermost first.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -30,17 +30,17 @@ struct Attributes {
 }
 
 struct Scanner {
-    tokens: Vec<Token>,
+    tokens: Vec<SourceToken>,
     position: usize,
     items: Vec<Item>,
     /// Number of open braces.
     depth: usize,
-    /// Names of the open inline modules, each with the depth of its content.
+    /// NameDefinitions of the open inline modules, each with the depth of its content.
     inside: Vec<(String, usize)>,
 }
 
 impl Scanner {
-    fn peek(&self, ahead: usize) -> Option<&Token> {
+    fn peek(&self, ahead: usize) -> Option<&SourceToken> {
         self.tokens.get(self.position + ahead)
     }
 
@@ -53,7 +53,7 @@ impl Scanner {
     }
 
     fn word(&self, ahead: usize) -> Option<String> {
-        self.peek(ahead).and_then(Token::word).map(str::to_owned)
+        self.peek(ahead).and_then(SourceToken::word).map(str::to_owned)
     }
 
     fn inside(&self) -> Vec<String> {
@@ -103,7 +103,7 @@ impl Scanner {
         let start = self.position;
         self.skip_past_matching('[', ']');
         let content = &self.tokens[start..self.position.min(self.tokens.len())];
-        let words: Vec<_> = content.iter().filter_map(Token::word).collect();
+        let words: Vec<_> = content.iter().filter_map(SourceToken::word).collect();
         attributes.is_test |= match words.first() {
             Some(&"cfg") => words.contains(&"test") && !words.contains(&"not"),
             Some(_) => is_test_attribute(content),
@@ -129,7 +129,8 @@ impl Scanner {
     fn skip_past_matching(&mut self, open: char, close: char) {
         let mut depth = 0_usize;
         while let Some(token) = self.peek(0) {
-            let (opens, closes) = (token.is_symbol(open), token.is_symbol(close));
+            let opens = token.is_symbol(open);
+            let closes = token.is_symbol(close);
             self.position += 1;
             if opens {
                 depth += 1;
@@ -152,7 +153,7 @@ impl Scanner {
             self.peek(ahead).is_some_and(|token| token.word().is_some()) && self.is_symbol(ahead + 1, ':')
         };
         let is_item = !is_field
-            && self.peek(0).and_then(Token::word).is_some_and(|word| {
+            && self.peek(0).and_then(SourceToken::word).is_some_and(|word| {
                 matches!(
                     word,
                     "pub"
