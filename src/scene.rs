@@ -189,16 +189,52 @@ pub struct Look {
     pub name: &'static str,
     /// The model, as MJCF.
     pub mjcf: &'static str,
+    /// The files that the MJCF names, with their bytes.
+    pub files: &'static [(String, Vec<u8>)],
+    /// What pictures add to the model; `None` if the model has its own ground, light and colours.
+    pub scenery: Option<Scenery>,
+    /// From where it is seen.
+    pub view: View,
+}
+
+/// What pictures add to a MuJoCo model that has no colours, lights and textures.
+#[cfg(feature = "mujoco")]
+#[derive(Debug, Clone, Copy)]
+pub struct Scenery {
     /// Elements that follow the model's own: ground, light, sky.
-    pub scenery: &'static str,
+    pub mjcf: &'static str,
     /// The geom that the scenery replaces.
     pub hidden: &'static str,
-    /// The body that the camera follows.
-    pub followed: &'static str,
-    /// The camera's distance, m.
-    pub camera_distance: f64,
-    /// The height that the camera looks at, m.
-    pub camera_height: f64,
     /// Geoms and their colours: red, green, blue, in 0 … 1.
     pub colours: &'static [(&'static str, [f32; 3])],
+}
+
+/// From where a MuJoCo model is seen.
+#[cfg(feature = "mujoco")]
+#[derive(Debug, Clone, Copy)]
+pub enum View {
+    /// Beside a robot that runs along x.
+    Beside {
+        /// The body that the camera follows.
+        followed: &'static str,
+        /// The camera's distance, m.
+        distance: f64,
+        /// The height that the camera looks at, m.
+        height: f64,
+    },
+    /// By the model's camera of this number.
+    Camera(usize),
+    /// By a camera that is placed.
+    Placed {
+        /// The point that it looks at, m.
+        look_at: [f64; 3],
+        /// Its distance, m.
+        distance: f64,
+        /// The direction of its view, turned from +x about +z, degrees.
+        azimuth: f64,
+        /// The direction's slope, negative if it looks down, degrees.
+        elevation: f64,
+        /// The body that the point moves with.
+        followed: Option<usize>,
+    },
 }

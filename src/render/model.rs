@@ -5,7 +5,7 @@
 //! parameters (power, density, friction) cannot be seen.
 
 use super::{Error, Size};
-use crate::scene::{Look, PosedModel};
+use crate::scene::{Look, PosedModel, Scenery, View};
 use perturb_mujoco::{self as mujoco, Camera, Kind};
 use std::ptr;
 
@@ -26,9 +26,8 @@ pub(super) struct Models {
 struct ShownModel {
     look: &'static Look,
     renderer: mujoco::Renderer,
-    followed: usize,
-    /// The followed body's height at the initial positions, m.
-    initial_height: f64,
+    /// The body that the camera follows, and its position at the initial positions, m.
+    followed: Option<(usize, [f64; 3])>,
 }
 
 impl Models {
@@ -62,34 +61,53 @@ impl Models {
 impl ShownModel {
     fn new(look: &'static Look, size: Size) -> Result<Self, mujoco::Error> {
         let compile = |reason: String| mujoco::Error::Compile { reason };
+        let files: Vec<(&str, &[u8])> =
+            look.files.iter().map(|(name, bytes)| (name.as_str(), bytes.as_slice())).collect();
         let (own, _) = look.mjcf.rsplit_once(END_OF_MODEL).ok_or_else(|| compile("the model has no end".into()))?;
-        let model = mujoco::Model::from_xml(&format!("{own}{}{END_OF_MODEL}", look.scenery))?;
-        let (followed, hidden) = (model.id(Kind::Body, look.followed)?, model.id(Kind::Geom, look.hidden)?);
-        let colours = look.colours.iter().map(|(geom, rgb)| Ok((model.id(Kind::Geom, geom)?, rgb)));
-        let colours = colours.collect::<Result<Vec<_>, mujoco::Error>>()?;
+        let scenery = look.scenery.map_or("", |scenery| scenery.mjcf);
+        let model = mujoco::Model::from_files(&format!("{own}{scenery}{END_OF_MODEL}"), &files)?;
+        let followed = match look.view {
+            View::Beside { followed, .. } => Some(model.id(Kind::Body, followed)?),
+            View::Placed { followed, .. } => followed,
+            View::Camera(_) => None,
+        };
+        let mut painted = Vec::new();
+        if let Some(Scenery { hidden, colours, .. }) = look.scenery {
+            for (geom, rgb) in colours {
+                painted.push((model.id(Kind::Geom, geom)?, *rgb, 1.0));
+            }
+            painted.push((model.id(Kind::Geom, hidden)?, [0.0; 3], 0.0));
+        }
         let mut renderer = mujoco::Renderer::new(model, (size.width, size.height))?;
         let simulation = renderer.simulation();
-        let initial_height = simulation.xpos(followed)[2];
+        let followed = followed.map(|body| (body, simulation.xpos(body)));
         let rgba = simulation.geom_rgba_mut();
-        for (geom, rgb) in colours {
-            rgba[4 * geom..][..3].copy_from_slice(rgb);
+        for (geom, rgb, opacity) in painted {
+            rgba[4 * geom..][..3].copy_from_slice(&rgb);
+            rgba[4 * geom + 3] = opacity;
         }
-        rgba[4 * hidden + 3] = 0.0;
-        Ok(Self { look, renderer, followed, initial_height })
+        Ok(Self { look, renderer, followed })
     }
 
     fn draw(&mut self, qpos: &[f64], size: Size) -> Result<Vec<u8>, mujoco::Error> {
         let simulation = self.renderer.simulation();
         simulation.qpos_mut().copy_from_slice(qpos);
         simulation.kinematics()?;
-        let [x, _, z] = simulation.xpos(self.followed);
-        let rise = z - self.initial_height;
-        let camera = Camera {
-            look_at: [x, 0.0, self.look.camera_height + rise - rise.clamp(-FREE_RISE, FREE_RISE)],
-            distance: self.look.camera_distance,
-            azimuth: 90.0,
-            elevation: -12.0,
+        let moved = self.followed.map(|(body, initial)| (simulation.xpos(body), initial));
+        let view = match self.look.view {
+            View::Camera(number) => mujoco::View::Fixed(number),
+            View::Beside { distance, height, .. } => {
+                let ([x, _, z], [_, _, initial_z]) = moved.unwrap_or_default();
+                let rise = z - initial_z;
+                let look_at = [x, 0.0, height + rise - rise.clamp(-FREE_RISE, FREE_RISE)];
+                mujoco::View::Free(Camera { look_at, distance, azimuth: 90.0, elevation: -12.0 })
+            }
+            View::Placed { look_at, distance, azimuth, elevation, .. } => {
+                let (now, initial) = moved.unwrap_or_default();
+                let look_at = std::array::from_fn(|i| look_at[i] + now[i] - initial[i]);
+                mujoco::View::Free(Camera { look_at, distance, azimuth, elevation })
+            }
         };
-        self.renderer.draw(&camera, (size.width, size.height))
+        self.renderer.draw(view, (size.width, size.height))
     }
 }

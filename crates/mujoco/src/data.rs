@@ -1,6 +1,6 @@
 //! A model and the data that MuJoCo computes on it.
 
-use crate::{Error, Model, Warning, model::last_error, sys};
+use crate::{Error, Field, Model, Reading, Warning, model::last_error, sys};
 use std::{
     ffi::c_int,
     ptr::{self, NonNull},
@@ -79,6 +79,33 @@ impl Simulation {
         }
     }
 
+    /// Copies fields of the model, one after the other: [`Model::n_fields`] numbers.
+    pub fn fields(&self, fields: &[Field], out: &mut [f64]) {
+        assert_eq!(out.len(), self.model.n_fields(fields), "the fields of another model");
+        let mut rest = out;
+        for field in fields {
+            let values = self.model.field(*field);
+            rest.split_off_mut(..values.len()).unwrap_or_default().copy_from_slice(values);
+        }
+    }
+
+    /// Takes back what [`fields`](Self::fields) wrote, of this or another simulation of the same model.
+    pub fn set_fields(&mut self, fields: &[Field], values: &[f64]) {
+        assert_eq!(values.len(), self.model.n_fields(fields), "the fields of another model");
+        let mut rest = values;
+        for field in fields {
+            let own = self.field_mut(*field);
+            own.copy_from_slice(rest.split_off(..own.len()).unwrap_or_default());
+        }
+    }
+
+    /// A field of the model, to be edited. Follow edits of masses, inertias, armatures and gears by
+    /// [`set_const`](Self::set_const).
+    pub fn field_mut(&mut self, field: Field) -> &mut [f64] {
+        let (start, length) = field.place(&self.model);
+        self.array_mut(start, length)
+    }
+
     /// Masses in kg, `[B]`. Follow an edit by [`set_const`](Self::set_const).
     pub fn body_mass_mut(&mut self) -> &mut [f64] {
         let (start, length) = (self.model.raw().body_mass, self.model.n_body());
@@ -104,6 +131,7 @@ impl Simulation {
     }
 
     /// Recomputes what follows from the edited arrays. It overwrites the positions: reset or set the state afterwards.
+    /// It also overwrites [`Field::Statistic`], which a model may have given by an element of its own.
     ///
     /// # Errors
     /// [`Error::Fatal`], [`Error::Poisoned`].
@@ -210,6 +238,21 @@ impl Simulation {
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
     pub fn kinematics(&mut self) -> Result<(), Error> {
         self.run(sys::perturb_mj_kinematics)
+    }
+
+    /// Computes the external forces on bodies, which neither [`step`](Self::step) nor [`forward`](Self::forward) does
+    /// unless a sensor needs them: [`Reading::BodyExternalForces`].
+    ///
+    /// # Errors
+    /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
+    pub fn external_forces(&mut self) -> Result<(), Error> {
+        self.run(sys::perturb_mj_rne_post_constraint)
+    }
+
+    /// Sets the external forces on bodies to 0, as after [`reset`](Self::reset).
+    pub fn clear_external_forces(&mut self) {
+        let (start, length) = Reading::BodyExternalForces.place(self);
+        self.array_mut(start, length).fill(0.0);
     }
 
     /// Whether a fatal error made it unusable for good.
@@ -344,6 +387,12 @@ impl Simulation {
 
     // ---- what step1 computed
 
+    /// An array that MuJoCo computed.
+    pub fn reading(&self, reading: Reading) -> &[f64] {
+        let (start, length) = reading.place(self);
+        self.array(start, length)
+    }
+
     /// The centre of mass of a body in m, world frame.
     ///
     /// # Panics
@@ -403,7 +452,7 @@ impl Simulation {
         self.data.as_ptr()
     }
 
-    fn raw(&self) -> &sys::mjData {
+    pub(crate) fn raw(&self) -> &sys::mjData {
         // SAFETY: the pointer is valid for the lifetime of `self`, and is not written through a `&Simulation`.
         unsafe { self.data.as_ref() }
     }

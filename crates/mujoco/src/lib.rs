@@ -2,6 +2,7 @@
 //!
 //! - [`Model`]: a compiled model; loaded from MJCF text, copied, read.
 //! - [`Simulation`]: a model of its own and the data that MuJoCo computes on it; stepped, edited, read.
+//! - [`Field`], [`Index`], [`Flags`] and [`Reading`]: the arrays of models and simulations, by name.
 //! - [`Renderer`]: pictures of a model, drawn without a display.
 //! - [`Error`], [`Warning`]: what can go wrong. No failure of MuJoCo ends the process or is passed over.
 //!
@@ -32,6 +33,7 @@
 
 mod data;
 mod error;
+mod fields;
 mod gl;
 mod model;
 mod render;
@@ -40,5 +42,6 @@ mod sys;
 
 pub use data::Simulation;
 pub use error::{Error, Warning};
+pub use fields::{Field, Flags, Index, Options, Reading};
 pub use model::{FloatArray, Kind, Model};
-pub use render::{Camera, Renderer};
+pub use render::{Camera, Renderer, View};

@@ -1,12 +1,21 @@
 //! A compiled model.
 
-use crate::{Error, sys};
+use crate::{
+    Error,
+    fields::{CONSTANTS, Field, Flags, Index, Options},
+    sys,
+};
 use std::{
-    ffi::{CStr, CString, c_char, c_int},
+    ffi::{CStr, CString, c_char, c_int, c_void},
     ptr::{self, NonNull},
     slice,
     sync::{Mutex, OnceLock, PoisonError},
 };
+
+/// Room for files in MuJoCo's virtual file system, beside the model's text.
+const MAX_FILES: usize = 1999;
+/// MuJoCo's room for a file's name is 1000 bytes.
+const MAX_FILE_NAME: usize = 900;
 
 /// A kind of named model element.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -19,15 +28,34 @@ pub enum Kind {
     Geom,
     /// An actuator.
     Actuator,
+    /// A site.
+    Site,
+    /// A camera.
+    Camera,
+    /// A sensor.
+    Sensor,
+    /// A tendon.
+    Tendon,
+    /// A pair of geoms whose contact the model declares.
+    Pair,
+    /// A keyframe.
+    Keyframe,
 }
 
 impl Kind {
-    fn name(self) -> &'static str {
+    /// MJCF's word for it.
+    pub fn name(self) -> &'static str {
         match self {
             Self::Body => "body",
             Self::Joint => "joint",
             Self::Geom => "geom",
             Self::Actuator => "actuator",
+            Self::Site => "site",
+            Self::Camera => "camera",
+            Self::Sensor => "sensor",
+            Self::Tendon => "tendon",
+            Self::Pair => "pair",
+            Self::Keyframe => "keyframe",
         }
     }
 
@@ -37,6 +65,12 @@ impl Kind {
             Self::Joint => sys::mjtObj__mjOBJ_JOINT,
             Self::Geom => sys::mjtObj__mjOBJ_GEOM,
             Self::Actuator => sys::mjtObj__mjOBJ_ACTUATOR,
+            Self::Site => sys::mjtObj__mjOBJ_SITE,
+            Self::Camera => sys::mjtObj__mjOBJ_CAMERA,
+            Self::Sensor => sys::mjtObj__mjOBJ_SENSOR,
+            Self::Tendon => sys::mjtObj__mjOBJ_TENDON,
+            Self::Pair => sys::mjtObj__mjOBJ_PAIR,
+            Self::Keyframe => sys::mjtObj__mjOBJ_KEY,
         }
     }
 }
@@ -70,19 +104,51 @@ impl Model {
     /// # Errors
     /// [`Error::Version`], and [`Error::Compile`] with MuJoCo's reason.
     pub fn from_xml(xml: &str) -> Result<Self, Error> {
+        Self::from_files(xml, &[])
+    }
+
+    /// Compiles MJCF text that names files, each given by its name in lower case without a folder, and its bytes. One
+    /// compilation at a time in the process.
+    ///
+    /// The text is trusted: MuJoCo reads a file from the disk if none of that name is given.
+    ///
+    /// # Errors
+    /// [`Error::Version`], and [`Error::Compile`] with MuJoCo's reason, or if there are more than 1999 files or one
+    /// longer than 2 GB.
+    pub fn from_files(xml: &str, files: &[(&str, &[u8])]) -> Result<Self, Error> {
         static LOADING: Mutex<()> = Mutex::new(());
         check_library()?;
-        let size = c_int::try_from(xml.len())
-            .map_err(|_| Error::Compile { reason: "the text is longer than 2 GB".to_owned() })?;
+        let refuse = |reason: &str| Error::Compile { reason: reason.to_owned() };
+        let size = c_int::try_from(xml.len()).map_err(|_| refuse("the text is longer than 2 GB"))?;
+        if files.len() > MAX_FILES {
+            return Err(refuse("there are more than 1999 files"));
+        }
+        let mut names = Vec::with_capacity(files.len());
+        let mut sizes = Vec::with_capacity(files.len());
+        for (name, bytes) in files {
+            if name.len() >= MAX_FILE_NAME {
+                return Err(refuse("the name of a file is longer than 900 bytes"));
+            }
+            names.push(CString::new(*name).map_err(|_| refuse("the name of a file contains a zero"))?);
+            sizes.push(c_int::try_from(bytes.len()).map_err(|_| refuse("a file is longer than 2 GB"))?);
+        }
+        let name_pointers: Vec<*const c_char> = names.iter().map(|name| name.as_ptr()).collect();
+        let data_pointers: Vec<*const c_void> = files.iter().map(|(_, bytes)| bytes.as_ptr().cast()).collect();
         let mut message = [0u8; 1024];
         // The mutex guards no data that a panic could leave half-written.
         let _loading = LOADING.lock().unwrap_or_else(PoisonError::into_inner);
-        // SAFETY: `xml` and `message` are valid for the given sizes during the call, and `xml` is only read. The mutex
-        // keeps other threads out of MuJoCo's compiler, and only this function calls it.
+        // SAFETY: `xml`, `message` and the three lists, with what they point to, are valid for the given sizes during
+        // the call, and all but `message` are only read. The names are terminated and fit in their places, and the files
+        // are not more than there are places. The mutex keeps other threads out of MuJoCo's compiler, and only this
+        // function calls it.
         let pointer = unsafe {
             sys::perturb_mj_load(
                 xml.as_ptr().cast::<c_char>(),
                 size,
+                files.len() as c_int,
+                name_pointers.as_ptr(),
+                data_pointers.as_ptr(),
+                sizes.as_ptr(),
                 message.as_mut_ptr().cast::<c_char>(),
                 message.len() as c_int,
             )
@@ -112,6 +178,37 @@ impl Model {
         // SAFETY: a valid model and a terminated string, both only read.
         let id = unsafe { sys::mj_name2id(self.pointer.as_ptr(), kind.object() as c_int, c_name.as_ptr()) };
         usize::try_from(id).map_err(|_| unknown())
+    }
+
+    /// The name of an element; `None` if it has none, or if there is no element of this number.
+    pub fn name(&self, kind: Kind, id: usize) -> Option<&str> {
+        if id >= self.count(kind) {
+            return None;
+        }
+        // SAFETY: a valid model, only read; the result is null or a terminated string of the model.
+        let name = unsafe { sys::mj_id2name(self.pointer.as_ptr(), kind.object() as c_int, id as c_int) };
+        if name.is_null() {
+            return None;
+        }
+        // SAFETY: the string belongs to the model, which lives as long as `self` is borrowed and is not written.
+        unsafe { CStr::from_ptr(name) }.to_str().ok().filter(|name| !name.is_empty())
+    }
+
+    /// The number of elements of a kind.
+    pub fn count(&self, kind: Kind) -> usize {
+        let m = self.raw();
+        (match kind {
+            Kind::Body => m.nbody,
+            Kind::Joint => m.njnt,
+            Kind::Geom => m.ngeom,
+            Kind::Actuator => m.nu,
+            Kind::Site => m.nsite,
+            Kind::Camera => m.ncam,
+            Kind::Sensor => m.nsensor,
+            Kind::Tendon => m.ntendon,
+            Kind::Pair => m.npair,
+            Kind::Keyframe => m.nkey,
+        }) as usize
     }
 
     /// The number of generalised coordinates, Q.
@@ -194,6 +291,63 @@ impl Model {
         self.array(self.raw().jnt_range, 2 * self.n_joint()).chunks_exact(2).map(|range| (range[0], range[1]))
     }
 
+    /// A floating-point array, or a part of the options.
+    pub fn field(&self, field: Field) -> &[f64] {
+        let (start, length) = field.place(self);
+        self.array(start, length)
+    }
+
+    /// The number of elements of several fields.
+    pub fn n_fields(&self, fields: &[Field]) -> usize {
+        fields.iter().map(|field| field.place(self).1).sum()
+    }
+
+    /// An array of whole numbers: types, flags and numbers of other elements.
+    pub fn index(&self, index: Index) -> &[i32] {
+        let (start, length) = index.place(self);
+        self.array(start, length)
+    }
+
+    /// An array of flags.
+    pub fn flags(&self, flags: Flags) -> &[u8] {
+        let (start, length) = flags.place(self);
+        self.array(start, length)
+    }
+
+    /// The options that are whole numbers.
+    pub fn options(&self) -> Options {
+        let opt = &self.raw().opt;
+        Options {
+            integrator: opt.integrator,
+            collision: opt.collision,
+            disable_flags: opt.disableflags,
+            enable_flags: opt.enableflags,
+        }
+    }
+
+    /// An estimate, from above, of the memory of a simulation of this model in bytes: the model and MuJoCo's data.
+    pub fn simulation_bytes(&self) -> usize {
+        let m = self.raw();
+        let [nv, njmax, nconmax, nstack, nu, nbody, n_m, nemax] =
+            [m.nv, m.njmax, m.nconmax, m.nstack, m.nu, m.nbody, m.nM, m.nemax].map(|n| n.max(0) as usize);
+        let number = size_of::<f64>();
+        // The arrays that grow with products of sizes: efc_J and its transpose with their column numbers, efc_AR with
+        // its column numbers, contacts, the stack, moments, the inertia's factors. All others grow with one size.
+        let jacobian = 2 * njmax.saturating_mul(nv).saturating_mul(number + size_of::<i32>());
+        let delassus = njmax.saturating_mul(njmax).saturating_mul(number + size_of::<i32>());
+        let contacts = nconmax.saturating_mul(size_of::<sys::mjContact>());
+        let moments = nu.saturating_mul(nv).saturating_add(4 * n_m).saturating_mul(number);
+        let linear = [njmax, nbody, nv, nemax].iter().sum::<usize>().saturating_mul(100 * number);
+        [jacobian, delassus, contacts, nstack.saturating_mul(number), moments, linear, self.model_bytes()]
+            .into_iter()
+            .fold(0, usize::saturating_add)
+    }
+
+    /// The memory of the model in bytes.
+    pub fn model_bytes(&self) -> usize {
+        size_of::<sys::mjModel>() + self.raw().nbuffer.max(0) as usize
+    }
+
     /// Every floating-point array, and the statistics as `stat`; for comparing models.
     pub fn float_arrays(&self) -> Vec<FloatArray> {
         let mut arrays = Vec::new();
@@ -229,21 +383,7 @@ impl Model {
     /// The floating-point arrays that edits of masses, inertias and friction change, or mj_setConst from them, with
     /// their lengths.
     pub(crate) fn constants(&self) -> [(*mut f64, usize); 9] {
-        let (m, bodies, dofs) = (self.raw(), self.n_body(), self.n_v());
-        // SAFETY: the pointer is a valid model for the lifetime of `self`; only an address is taken. The statistics are
-        // plain numbers of one type.
-        let stat = unsafe { &raw mut (*self.pointer.as_ptr()).stat }.cast::<f64>();
-        [
-            (m.body_mass, bodies),
-            (m.body_inertia, 3 * bodies),
-            (m.geom_friction, 3 * self.n_geom()),
-            (m.body_subtreemass, bodies),
-            (m.body_invweight0, 2 * bodies),
-            (m.dof_invweight0, dofs),
-            (m.dof_M0, dofs),
-            (m.actuator_acc0, self.n_u()),
-            (stat, size_of::<sys::mjStatistic>() / size_of::<f64>()),
-        ]
+        CONSTANTS.map(|field| field.place(self))
     }
 
     pub(crate) fn raw(&self) -> &sys::mjModel {

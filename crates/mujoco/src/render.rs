@@ -1,14 +1,16 @@
 //! Pictures of a model.
 
-use crate::{Error, Model, Simulation, gl::Gl, model::last_error, sys};
+use crate::{Error, Kind, Model, Simulation, gl::Gl, model::last_error, sys};
 use std::{
     ffi::c_int,
     mem::{self, MaybeUninit},
     sync::{Mutex, MutexGuard, PoisonError},
 };
 
-/// Room for the geoms of a scene; each of a model's gives one.
-const MOST_GEOMS: c_int = 200;
+/// Room for the geoms of a scene of a small model; each geom of a model gives one.
+const MIN_SCENE_GEOMS: usize = 200;
+/// Room for the geoms of a scene of any model.
+const MAX_SCENE_GEOMS: usize = 20_000;
 
 /// From where a picture is taken.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -21,6 +23,15 @@ pub struct Camera {
     pub azimuth: f64,
     /// The direction's slope, negative if it looks down, degrees.
     pub elevation: f64,
+}
+
+/// A camera of the model, or one that is placed for a picture.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum View {
+    /// A placed camera.
+    Free(Camera),
+    /// The model's camera of this number.
+    Fixed(usize),
 }
 
 /// Draws one model into memory. It belongs to its thread, as its OpenGL context does.
@@ -66,7 +77,11 @@ impl Renderer {
         let mut renderer = Self { gl, simulation, option, scene, context, size: (0, 0) };
         // SAFETY: a valid model and a default scene.
         check(unsafe {
-            sys::perturb_mjv_make_scene(renderer.simulation.model().as_ptr(), &raw mut *renderer.scene, MOST_GEOMS)
+            sys::perturb_mjv_make_scene(
+                renderer.simulation.model().as_ptr(),
+                &raw mut *renderer.scene,
+                scene_geoms(renderer.simulation.model()),
+            )
         })?;
         renderer.make_room(size)?;
         Ok(renderer)
@@ -82,19 +97,35 @@ impl Renderer {
     ///
     /// # Errors
     /// [`Error::Fatal`].
-    pub fn draw(&mut self, camera: &Camera, (width, height): (u16, u16)) -> Result<Vec<u8>, Error> {
+    pub fn draw(&mut self, view: View, (width, height): (u16, u16)) -> Result<Vec<u8>, Error> {
         let (most_wide, most_high) = self.size;
         if width > most_wide || height > most_high {
             self.make_room((width.max(most_wide), height.max(most_high)))?;
         }
-        let mut camera = sys::mjvCamera {
-            type_: sys::mjtCamera__mjCAMERA_FREE as c_int,
-            fixedcamid: -1,
-            trackbodyid: -1,
-            lookat: camera.look_at,
-            distance: camera.distance,
-            azimuth: camera.azimuth,
-            elevation: camera.elevation,
+        let mut camera = match view {
+            View::Free(Camera { look_at, distance, azimuth, elevation }) => sys::mjvCamera {
+                type_: sys::mjtCamera__mjCAMERA_FREE as c_int,
+                fixedcamid: -1,
+                trackbodyid: -1,
+                lookat: look_at,
+                distance,
+                azimuth,
+                elevation,
+            },
+            View::Fixed(number) => {
+                if number >= self.simulation.model().count(Kind::Camera) {
+                    return Err(Error::Fatal { message: format!("the model has no camera number {number}") });
+                }
+                sys::mjvCamera {
+                    type_: sys::mjtCamera__mjCAMERA_FIXED as c_int,
+                    fixedcamid: number as c_int,
+                    trackbodyid: -1,
+                    lookat: [0.0; 3],
+                    distance: 1.0,
+                    azimuth: 0.0,
+                    elevation: 0.0,
+                }
+            }
         };
         // SAFETY: model, data and scene belong together and are valid; `&mut self` excludes other users.
         check(unsafe {
@@ -166,6 +197,14 @@ impl Drop for Renderer {
             sys::mjv_freeScene(&raw mut *self.scene);
         }
     }
+}
+
+/// Room for the geoms of a scene: one for each geom and site, and some for each joint, actuator and tendon.
+fn scene_geoms(model: &Model) -> c_int {
+    let count = |kind| model.count(kind);
+    let decorations = 4 * (count(Kind::Joint) + count(Kind::Actuator)) + 50 * count(Kind::Tendon);
+    let all = 2 * (count(Kind::Geom) + count(Kind::Site)) + decorations;
+    all.clamp(MIN_SCENE_GEOMS, MAX_SCENE_GEOMS) as c_int
 }
 
 fn check(failed: c_int) -> Result<(), Error> {

@@ -48,7 +48,8 @@ void perturb_mj_silence(void) { mju_user_warning = ignore_warning; }
 
 const char* perturb_mj_last_error(void) { return last_error; }
 
-mjModel* perturb_mj_load(const char* xml, int xml_size, char* error, int error_size) {
+mjModel* perturb_mj_load(const char* xml, int xml_size, int n_files, const char* const* names, const void* const* data,
+                         const int* sizes, char* error, int error_size) {
   // 2 MB, of which a few pages are touched. mj_addFileVFS would read a file and mj_deleteFileVFS free `xml`.
   mjVFS* vfs = calloc(1, sizeof(mjVFS));
   if (!vfs) {
@@ -59,6 +60,12 @@ mjModel* perturb_mj_load(const char* xml, int xml_size, char* error, int error_s
   strcpy(vfs->filename[0], "model.xml");
   vfs->filesize[0] = xml_size;
   vfs->filedata[0] = (void*)xml;
+  for (int i = 0; i < n_files && vfs->nfile < mjMAXVFS; i++) {
+    int at = vfs->nfile++;
+    snprintf(vfs->filename[at], mjMAXVFSNAME, "%s", names[i]);
+    vfs->filesize[at] = sizes[i];
+    vfs->filedata[at] = (void*)data[i];
+  }
   // No handler here: the loader is C++, which no jump may cross, and catches its engine's errors itself.
   mjModel* model = mj_loadXML("model.xml", vfs, error, error_size);
   mj_freeLastXML();
@@ -225,8 +232,13 @@ int perturb_mj_forward(const mjModel* model, mjData* data) {
   return failed;
 }
 
+int perturb_mj_rne_post_constraint(const mjModel* model, mjData* data) {
+  GUARDED(mj_rnePostConstraint(model, data))
+  return failed;
+}
+
 int perturb_mj_kinematics(const mjModel* model, mjData* data) {
-  GUARDED(mj_kinematics(model, data); mj_comPos(model, data); mj_camlight(model, data))
+  GUARDED(mj_kinematics(model, data); mj_comPos(model, data); mj_camlight(model, data); mj_tendon(model, data))
   return failed;
 }
 

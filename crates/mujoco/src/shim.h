@@ -10,8 +10,10 @@ void perturb_mj_silence(void);
 // The message of the last failure on this thread; valid until the next one.
 const char* perturb_mj_last_error(void);
 
-// Compiles MJCF text. NULL on failure, with the reason in `error`. One call at a time in the whole process.
-mjModel* perturb_mj_load(const char* xml, int xml_size, char* error, int error_size);
+// Compiles MJCF text, which may name `n_files` files of these names, bytes and sizes, fewer than mjMAXVFS and with names
+// shorter than mjMAXVFSNAME. NULL on failure, with the reason in `error`. One call at a time in the whole process.
+mjModel* perturb_mj_load(const char* xml, int xml_size, int n_files, const char* const* names, const void* const* data,
+                         const int* sizes, char* error, int error_size);
 
 // NULL on failure.
 mjModel* perturb_mj_copy_model(const mjModel* source);
@@ -24,6 +26,7 @@ int perturb_mj_step1(const mjModel* model, mjData* data);
 int perturb_mj_step2(const mjModel* model, mjData* data);
 int perturb_mj_step(const mjModel* model, mjData* data);
 int perturb_mj_forward(const mjModel* model, mjData* data);
+int perturb_mj_rne_post_constraint(const mjModel* model, mjData* data);
 
 // The pairs of geoms of a model that can touch, where the world has one of each.
 typedef struct perturb_mj_pairs perturb_mj_pairs;

@@ -7,7 +7,7 @@ use super::locomotion::{
 };
 use crate::{
     env::{ActionSpace, EnvironmentSpec, Error},
-    scene::Look,
+    scene::{Look, Scenery, View},
 };
 use std::sync::OnceLock;
 
@@ -31,7 +31,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "HalfCheetah",
     revision: 0,
     description: "Run forward on two legs without falling.",
-    make: || Ok(Box::new(half_cheetah()?)),
+    make: &|| Ok(Box::new(half_cheetah()?)),
     parameters: &[power(0.9, (0.7, 1.1), (0.5, 1.3)), DENSITY, FRICTION],
     observation: NAMES.observation,
     action: ActionSpace::Continuous(NAMES.action),
@@ -53,21 +53,22 @@ static TASK: Task = Task {
     look: Look {
         name: SPEC.name,
         mjcf: include_str!("../../../models/half_cheetah.xml"),
-        scenery: SCENERY,
-        hidden: "floor",
-        followed: "torso",
-        camera_distance: 3.0,
-        camera_height: 0.55,
-        colours: &[
-            ("torso", GREY),
-            ("head", GREY),
-            ("bthigh", BLUE),
-            ("bshin", BLUE),
-            ("bfoot", SKY_BLUE),
-            ("fthigh", VERMILLION),
-            ("fshin", VERMILLION),
-            ("ffoot", ORANGE),
-        ],
+        files: &[],
+        scenery: Some(Scenery {
+            mjcf: SCENERY,
+            hidden: "floor",
+            colours: &[
+                ("torso", GREY),
+                ("head", GREY),
+                ("bthigh", BLUE),
+                ("bshin", BLUE),
+                ("bfoot", SKY_BLUE),
+                ("fthigh", VERMILLION),
+                ("fshin", VERMILLION),
+                ("ffoot", ORANGE),
+            ],
+        }),
+        view: View::Beside { followed: "torso", distance: 3.0, height: 0.55 },
     },
     names: NAMES,
     alive,

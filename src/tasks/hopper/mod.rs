@@ -7,7 +7,7 @@ use super::locomotion::{
 };
 use crate::{
     env::{ActionSpace, EnvironmentSpec, Error},
-    scene::Look,
+    scene::{Look, Scenery, View},
 };
 use std::sync::OnceLock;
 
@@ -31,7 +31,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "Hopper",
     revision: 0,
     description: "Hop forward on one leg without falling.",
-    make: || Ok(Box::new(hopper()?)),
+    make: &|| Ok(Box::new(hopper()?)),
     parameters: &[power(0.75, (0.6, 0.9), (0.4, 1.1)), DENSITY, FRICTION],
     observation: NAMES.observation,
     action: ActionSpace::Continuous(NAMES.action),
@@ -53,12 +53,13 @@ static TASK: Task = Task {
     look: Look {
         name: SPEC.name,
         mjcf: include_str!("../../../models/hopper.xml"),
-        scenery: SCENERY,
-        hidden: "floor",
-        followed: "torso",
-        camera_distance: 3.0,
-        camera_height: 0.75,
-        colours: &[("torso", BLUE), ("thigh", SKY_BLUE), ("leg", ORANGE), ("foot", VERMILLION)],
+        files: &[],
+        scenery: Some(Scenery {
+            mjcf: SCENERY,
+            hidden: "floor",
+            colours: &[("torso", BLUE), ("thigh", SKY_BLUE), ("leg", ORANGE), ("foot", VERMILLION)],
+        }),
+        view: View::Beside { followed: "torso", distance: 3.0, height: 0.75 },
     },
     names: NAMES,
     alive,

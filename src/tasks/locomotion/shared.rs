@@ -84,7 +84,7 @@ impl Shared {
 mod tests {
     use crate::{
         env::{Action, Environment},
-        scene::Look,
+        scene::{Look, Scenery, View},
         tasks::{
             hopper,
             locomotion::{
@@ -106,12 +106,9 @@ mod tests {
             look: Look {
                 name: "Hopper",
                 mjcf: include_str!("../../../models/hopper.xml").replace("20000", "200").leak(),
-                scenery: SCENERY,
-                hidden: "floor",
-                followed: "torso",
-                camera_distance: 1.0,
-                camera_height: 1.0,
-                colours: &[],
+                files: &[],
+                scenery: Some(Scenery { mjcf: SCENERY, hidden: "floor", colours: &[] }),
+                view: View::Beside { followed: "torso", distance: 1.0, height: 1.0 },
             },
             names: NAMES,
             alive: |_| true,

@@ -2,6 +2,8 @@
 #![allow(clippy::unwrap_used)]
 
 mod faults;
+mod fields;
+mod files;
 mod kinematics;
 mod pairs;
 mod render;
