@@ -1,6 +1,6 @@
 //! The environments that a server has, by name.
 
-use perturb_protocol::names::EnvironmentName;
+use perturb_protocol::names::{EnvironmentName, is_spelled};
 
 use super::{EnvironmentSpec, Error, shorten};
 
@@ -9,15 +9,23 @@ use super::{EnvironmentSpec, Error, shorten};
 pub struct Catalogue(Vec<&'static EnvironmentSpec>);
 
 impl Catalogue {
-    /// The same catalogue with one more environment, at its end.
+    /// The catalogue of these environments, whose names must differ.
+    pub(crate) fn new(specs: Vec<&'static EnvironmentSpec>) -> Self {
+        Self(specs)
+    }
+
+    /// Adds one more environment at the end.
     ///
-    /// # Panics
-    /// If an environment has its name already.
-    #[must_use]
-    pub fn with(mut self, spec: &'static EnvironmentSpec) -> Self {
-        assert!(self.names().all(|name| name != spec.name), "there are two environments {}", spec.name);
+    /// # Errors
+    /// [`Error::NameTaken`] if a client that asks for its name could mean another environment, too: names that differ
+    /// in case, hyphens and underscores alone are one name.
+    pub fn with(mut self, spec: &'static EnvironmentSpec) -> Result<Self, Error> {
+        let taken = self.names().find(|name| is_spelled(spec.name, name));
+        if let Some(taken) = taken {
+            return Err(Error::NameTaken { name: spec.name, taken });
+        }
         self.0.push(spec);
-        self
+        Ok(self)
     }
 
     /// All of them.

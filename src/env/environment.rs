@@ -6,9 +6,13 @@ use super::{
 };
 use crate::scene::Scene;
 use perturb_protocol::region::Region;
+use std::fmt;
+
+/// Makes an environment with default parameters.
+pub type MakeEnvironment = dyn Fn() -> Result<Box<dyn Environment>, Error> + Send + Sync;
 
 /// Everything that is fixed about an environment.
-#[derive(Debug, Clone, Copy)]
+#[derive(Clone, Copy)]
 pub struct EnvironmentSpec {
     /// The name to open it by.
     pub name: &'static str,
@@ -17,7 +21,7 @@ pub struct EnvironmentSpec {
     /// One sentence.
     pub description: &'static str,
     /// Makes one with default parameters; fails with [`Error::Model`] if its model cannot be loaded.
-    pub make: fn() -> Result<Box<dyn Environment>, Error>,
+    pub make: &'static MakeEnvironment,
     /// The parameters that can be changed.
     pub parameters: &'static [Parameter],
     /// The entries of an observation, `[O]`.
@@ -42,6 +46,13 @@ pub struct EnvironmentSpec {
     pub code_success: Option<Success>,
     /// The two parameters, along x and along y, that show best where a policy works.
     pub heatmap_axes: Option<[&'static str; 2]>,
+}
+
+impl fmt::Debug for EnvironmentSpec {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { name, revision, .. } = self;
+        f.debug_struct("EnvironmentSpec").field("name", name).field("revision", revision).finish_non_exhaustive()
+    }
 }
 
 impl EnvironmentSpec {
@@ -132,7 +143,7 @@ pub trait Environment: Send {
     /// Reads back from the physics the values of [`EnvironmentSpec::applied`], in order.
     fn applied(&self, out: &mut [f64]);
 
-    /// The SHA-256 of the model in hexadecimal, or `""` without one.
+    /// The SHA-256 of the model's files in hexadecimal, or `""` without a model.
     fn model_hash(&self) -> &str {
         ""
     }

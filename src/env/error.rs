@@ -61,6 +61,16 @@ pub enum Error {
         /// Why.
         reason: String,
     },
+    /// Two environments of a server would have the same name.
+    #[error(
+        "the name {name:?} is that of an environment that this server has already, {taken:?}; give it another name"
+    )]
+    NameTaken {
+        /// The name of the new environment.
+        name: &'static str,
+        /// The name of the environment that is there.
+        taken: &'static str,
+    },
     /// The environment could not be built.
     #[error("{environment} cannot be built: {reason}")]
     Model {

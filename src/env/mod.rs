@@ -12,7 +12,7 @@ mod spaces;
 mod success;
 
 pub use catalogue::Catalogue;
-pub use environment::{Environment, EnvironmentSpec, Transition, check_bounds, resolve};
+pub use environment::{Environment, EnvironmentSpec, MakeEnvironment, Transition, check_bounds, resolve};
 pub use episode::{Draw, EpisodeEnd, EpisodeId, EpisodeStart, Episodes, Outcome, Receipt, Settings};
 pub use error::Error;
 pub(crate) use error::shorten;

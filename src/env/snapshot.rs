@@ -14,9 +14,9 @@ const UNSEALED: u32 = 2;
 /// Nor with [`Progress::held_longest`], which follows [`Saved`] since.
 const FIRST: u32 = 1;
 
-/// The most bytes of a snapshot. The largest has a distribution of 64 intervals for each parameter, of R and of E; its
-/// numbers are a hundred or so.
-pub const MOST_SNAPSHOT_BYTES: usize = 64 << 10;
+/// Limit of a snapshot in bytes. The largest has a distribution of 64 intervals for each of 32 parameters, of R and of E,
+/// 64 KiB, and the numbers of a state and an observation of 4096 entries, some 50 KiB.
+pub const MOST_SNAPSHOT_BYTES: usize = 128 << 10;
 
 /// More episodes than any environment runs: a snapshot that claims more would let the counts overflow.
 const MAX_EPISODE: u64 = 1 << 63;
@@ -71,7 +71,7 @@ impl Episodes {
     /// [`Error::Snapshot`]; nothing was changed then.
     pub fn restore(&mut self, snapshot: &[u8]) -> Result<(), Error> {
         let (saved, distributions) = self.check(snapshot)?;
-        let before = self.snapshot_parts();
+        let before = self.physics_state();
         self.environment.set_parameters(&saved.values);
         if let Err(error) = self.environment.load(&saved.state) {
             self.environment.set_parameters(&self.values);
@@ -90,7 +90,8 @@ impl Episodes {
         Ok(())
     }
 
-    fn snapshot_parts(&self) -> Vec<f64> {
+    /// The physics' state as [`Environment::save`](super::Environment::save) writes it.
+    pub fn physics_state(&self) -> Vec<f64> {
         let mut state = Vec::new();
         self.environment.save(&mut state);
         state

@@ -19,7 +19,7 @@ const fn scripted_spec(achievement: Achievement, comparison: Comparison, thresho
         name: "Scripted",
         revision: 0,
         description: "Plays a script of transitions.",
-        make: || unreachable!("it is given its script"),
+        make: &|| unreachable!("it is given its script"),
         parameters: &[],
         observation: TIME,
         action: ActionSpace::Discrete(&["nothing", "something"]),

@@ -20,7 +20,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "Acrobot",
     revision: 1,
     description: "Swing the tip of a two-link pendulum above a line.",
-    make: || Ok(Box::new(Acrobot::new())),
+    make: &|| Ok(Box::new(Acrobot::new())),
     parameters: &[
         Parameter::new("length", "m", "length of both links", (0.01, 100.0)).versions(1.0, (0.75, 1.25), (0.5, 1.5)),
         Parameter::new("mass", "kg", "mass of both links", (0.001, 1000.0)).versions(1.0, (0.75, 1.25), (0.5, 1.5)),

@@ -19,7 +19,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "CartPole",
     revision: 1,
     description: "Balance a pole on a cart by pushing the cart left or right.",
-    make: || Ok(Box::new(CartPole::new())),
+    make: &|| Ok(Box::new(CartPole::new())),
     parameters: &[
         Parameter::new("force", "N", "push on the cart", (0.0, 1000.0)).versions(10.0, (5.0, 15.0), (1.0, 20.0)),
         Parameter::new("length", "m", "half the pole's length", (0.001, 100.0)).versions(

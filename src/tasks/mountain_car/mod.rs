@@ -23,7 +23,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "MountainCar",
     revision: 1,
     description: "Swing an underpowered car up a hill.",
-    make: || Ok(Box::new(MountainCar::new())),
+    make: &|| Ok(Box::new(MountainCar::new())),
     parameters: &[
         Parameter::new("force", "1", "the engine's push per step", (0.0, 1.0)).versions(
             0.001,

@@ -20,7 +20,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "Pendulum",
     revision: 1,
     description: "Swing a rod up with a weak torque and hold it upright.",
-    make: || Ok(Box::new(Pendulum::new())),
+    make: &|| Ok(Box::new(Pendulum::new())),
     parameters: &[
         Parameter::new("length", "m", "length of the rod", (0.01, 100.0)).versions(1.0, (0.75, 1.25), (0.5, 1.5)),
         Parameter::new("mass", "kg", "mass of the rod", (0.001, 1000.0)).versions(1.0, (0.75, 1.25), (0.5, 1.5)),

@@ -13,7 +13,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "Ball",
     revision: 0,
     description: "Push a ball along a line.",
-    make: || Ok(Box::new(Ball { mass: 1.0, drag: 0.5, state: [0.0; 2], distance: 0.0 })),
+    make: &|| Ok(Box::new(Ball { mass: 1.0, drag: 0.5, state: [0.0; 2], distance: 0.0 })),
     parameters: &[
         Parameter::new("mass", "kg", "the ball's mass", (0.1, 10.0)).versions(1.0, (0.5, 2.0), (0.2, 4.0)),
         Parameter::new("drag", "N s/m", "force for each m/s", (0.0, 5.0)).versions(0.5, (0.2, 0.8), (0.1, 1.0)),

@@ -36,7 +36,7 @@ impl InThread {
                 let any = "tcp://127.0.0.1:0".to_owned().try_into().unwrap();
                 let listener = Listener::bind(&any, config.socket_mode).await.unwrap();
                 tell.send(listener.address().unwrap().to_string()).unwrap();
-                let catalogue = tasks::catalogue().with(&ball::SPEC);
+                let catalogue = tasks::catalogue().with(&ball::SPEC).unwrap();
                 let end = async { drop(end.await) };
                 run(vec![listener], None, &config, &Guards::default(), catalogue, end).await.unwrap();
             });
