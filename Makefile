@@ -25,6 +25,8 @@ PROGRAMS := $(TARGET)/release
 VENV := $(TARGET)/python
 # The Python package whose compliance cases `make test` runs.
 DM_ENV_RPC := $(TARGET)/dm_env_rpc
+# The Python package whose models of MuJoCo `make test` compares tasks with.
+GYMNASIUM := $(TARGET)/gymnasium
 # The site and what builds it.
 DOCS := $(TARGET)/docs
 # What perturb's training is compared with. PUREJAXRL is an address that git can clone, or where GitHub is out of reach the
@@ -156,7 +158,8 @@ otel-test: all-deps ## build the server with traces, and test that they come to 
 
 test: export PERTURB_TEST_DM_ENV_RPC_PYTHON := $(abspath $(DM_ENV_RPC))/bin/python
 test: export RUST_TEST_THREADS := $(TEST_THREADS)
-test: all-deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the server without MuJoCo
+test: export PERTURB_TEST_GYMNASIUM_ASSETS := $(abspath $(GYMNASIUM))/gymnasium/envs/mujoco/assets
+test: all-deps opengl $(DM_ENV_RPC)/installed $(GYMNASIUM)/installed ## run all tests, then those of the server without MuJoCo
 	@$(call install,$(FFMPEG))
 	cargo test $(ALL)
 	cargo test $(WITHOUT_MUJOCO_TEST)
@@ -205,7 +208,8 @@ lint: all-deps cargo-deny ## check formatting, names, import cycles, clippy, doc
 		awk 'NF { print $$1, $$2 }' | sort -u | cut -d ' ' -f 1 | uniq -d | grep -vxE '$(TWICE)'); \
 		[ -z "$$twice" ] || { echo "perturb-server and perturb compile two versions of:" $$twice >&2; exit 1; }
 
-bench: build-all opengl ## measure throughput, latency and memory
+bench: export PERTURB_TEST_GYMNASIUM_ASSETS := $(abspath $(GYMNASIUM))/gymnasium/envs/mujoco/assets
+bench: build-all opengl $(GYMNASIUM)/installed ## measure throughput, latency and memory
 	cargo bench --workspace --locked --bench '*' -- $(BENCH_ARGS)
 
 bench-peers: build $(PEERS)/installed ## measure training beside PureJaxRL and stable-baselines3; gigabytes, minutes
@@ -297,6 +301,12 @@ $(DM_ENV_RPC)/installed: tests/server/dm_env_rpc/requirements.txt | python-venv
 	$(DM_ENV_RPC)/bin/pip install -q --disable-pip-version-check -r $<
 	touch $@
 
+# Its dependencies are not needed: its models are files.
+$(GYMNASIUM)/installed: tests/server/folder/requirements.txt | python-venv
+	python3 -m venv $(GYMNASIUM)/venv
+	$(GYMNASIUM)/venv/bin/pip install -q --disable-pip-version-check --no-deps --upgrade --target $(GYMNASIUM) -r $<
+	touch $@
+
 $(PEERS)/installed: benches/peers/requirements.txt | python-venv
 	python3 -m venv $(PEERS)
 	$(PEERS)/bin/pip install -q --disable-pip-version-check -r $<
@@ -345,14 +355,14 @@ asan-test: deps opengl ## run crates/mujoco's tests under AddressSanitizer; nigh
 	RUSTFLAGS=-Zsanitizer=address RUSTDOCFLAGS=-Zsanitizer=address LSAN_OPTIONS=suppressions=$(abspath fuzz/leaks.txt) \
 		cargo +nightly test --package perturb-mujoco --locked --target $$(rustc -vV | sed -n 's/^host: //p') --target-dir $(TARGET)/asan
 
-# Seconds for each of eight targets, and what is mutated from one time to the next. Inputs are short, for speed, but for
+# Seconds for each of ten targets, and what is mutated from one time to the next. Inputs are short, for speed, but for
 # recorded episodes, whose seed is a whole file.
 FUZZ_SECONDS ?= 38
 FUZZ = $(TARGET)/fuzz-corpus
 FUZZ_RUN = LSAN_OPTIONS=suppressions=$(abspath fuzz/leaks.txt) cargo +nightly fuzz run --fuzz-dir fuzz \
 	--target-dir $(TARGET)/fuzz --features libfuzzer
 FUZZ_BOUNDS = -timeout=60 -rss_limit_mb=4096
-FUZZ_TARGETS = requests snapshots worlds connections checkpoints records plans ledgers
+FUZZ_TARGETS = requests snapshots worlds connections checkpoints records plans ledgers tasks models
 fuzz: deps ## attack the server and the readers of files with mutated bytes, under AddressSanitizer; five minutes, nightly Rust
 	@cargo +nightly --version >/dev/null || { echo "a nightly toolchain is missing: rustup toolchain install nightly" >&2; exit 1; }
 	@cargo +nightly fuzz --version >/dev/null 2>&1 || cargo +nightly install cargo-fuzz --locked

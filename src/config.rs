@@ -153,6 +153,29 @@ pub struct Arguments {
     #[arg(long)]
     #[serde(skip)]
     pub private: bool,
+    /// A folder with an MJCF model and a file task.toml, which is served as an environment like the built-in ones; see
+    /// docs/tasks.md. Repeatable.
+    #[arg(long = "task", value_name = "FOLDER")]
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub tasks: Vec<PathBuf>,
+    /// Start no server, but load the folders of --task, each in a process of its own, and print what they are:
+    /// observations, actions, rewards, parameters, sizes, speed, and edits without an effect.
+    #[arg(long, group = "instead")]
+    #[serde(skip)]
+    pub check: bool,
+    /// Start no server, but print a JSON schema of task.toml.
+    #[arg(long, group = "instead")]
+    #[serde(skip)]
+    pub task_schema: bool,
+    /// Load this folder under limits of memory and processor time, and print what it is: what a server starts before it
+    /// loads a folder itself.
+    #[arg(long, value_name = "FOLDER", group = "instead", hide = true)]
+    #[serde(skip)]
+    pub check_task: Option<PathBuf>,
+    /// Say how fast the folder of --check-task is, too.
+    #[arg(long, hide = true, requires = "check_task")]
+    #[serde(skip)]
+    pub measure_task: bool,
     /// Start no server, but ask the one that runs with these settings, at its first address, whether it takes sessions:
     /// exit status 0 if so, else 1. For the health checks of containers.
     #[arg(long, group = "instead")]
@@ -228,6 +251,8 @@ pub struct Config {
     pub log: String,
     /// Whether to shut down when standard input closes.
     pub exit_with_stdin: bool,
+    /// The folders whose tasks are served beside the built-in environments.
+    pub tasks: Vec<PathBuf>,
 }
 
 impl Default for Config {
@@ -256,6 +281,7 @@ impl Default for Config {
             socket_mode: SocketMode::default(),
             log: "info".into(),
             exit_with_stdin: false,
+            tasks: Vec::new(),
         }
     }
 }
@@ -287,6 +313,7 @@ fn variables() -> Environment {
         .try_parsing(true)
         .list_separator(",")
         .with_list_parse_key("listen")
+        .with_list_parse_key("tasks")
         .source(Some(settings.collect()))
 }
 

@@ -32,8 +32,21 @@ impl Client {
     }
 
     pub(crate) async fn on(connection: &Connection, name: &str, batch: usize) -> Result<Self, Failure> {
+        Self::with_spec(connection, tasks::catalogue().find(name)?, batch).await
+    }
+
+    /// Opens an environment that need not be built in.
+    pub(crate) async fn open_spec(
+        socket: &Path,
+        spec: &'static EnvironmentSpec,
+        batch: usize,
+    ) -> Result<Self, Failure> {
+        Self::with_spec(&Connection::open(&Address::Unix(socket.into())).await?, spec, batch).await
+    }
+
+    async fn with_spec(connection: &Connection, spec: &'static EnvironmentSpec, batch: usize) -> Result<Self, Failure> {
         let open = proto::Open {
-            environment: name.into(),
+            environment: spec.name.into(),
             version: proto::Version::Default.into(),
             batch_size: batch as u32,
             seed: SEED,
@@ -41,7 +54,7 @@ impl Client {
             ..Default::default()
         };
         let (session, _) = Session::open(connection, open).await?;
-        Ok(Self { spec: tasks::catalogue().find(name)?, batch, session, noise: Noise(7) })
+        Ok(Self { spec, batch, session, noise: Noise(7) })
     }
 
     /// Takes `trips` steps, each after the reply to the last. Returns the seconds.
@@ -132,8 +145,13 @@ pub(crate) struct ServerProcess {
 
 impl ServerProcess {
     pub(crate) fn server(workers: usize) -> Result<Self, Failure> {
+        Self::with_flags(workers, &[])
+    }
+
+    /// A server with more flags.
+    pub(crate) fn with_flags(workers: usize, flags: &[&Path]) -> Result<Self, Failure> {
         let mut command = Command::new(env!("CARGO_BIN_EXE_perturb-server"));
-        command.args(["--log", "warn", "--workers", &workers.to_string()]);
+        command.args(["--log", "warn", "--workers", &workers.to_string()]).args(flags);
         Self::start(command, |socket| vec!["--listen".into(), format!("unix:{}", socket.display())])
     }
 

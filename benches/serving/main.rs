@@ -2,6 +2,7 @@
 //!
 //! - CartPole, batch 256, over a Unix socket, against a plain tonic echo server with the same payload;
 //! - Hopper and HalfCheetah, batches of 64, 256 and 1024, two workers, against MuJoCo's timesteps alone ([`robots`]);
+//! - tasks that are folders, against the built-in Hopper and against MuJoCo's functions alone ([`folder`]);
 //! - CartPole over TCP with TLS, against without ([`encrypted`]);
 //! - the round trip of one environment, and the memory of one Hopper;
 //! - CartPole, 8 environments in which the server acts with a policy, against computing the actions alone ([`acting`]);
@@ -13,6 +14,8 @@ mod acting;
 mod client;
 mod echo;
 mod encrypted;
+#[cfg(feature = "mujoco")]
+mod folder;
 #[cfg(feature = "mujoco")]
 mod robots;
 
@@ -50,6 +53,12 @@ fn main() -> Result<(), Failure> {
                 if wanted(&format!("step/{}/{batch}", spec.name)) {
                     robots::measure(spec, make, batch).await?;
                 }
+            }
+        }
+        #[cfg(feature = "mujoco")]
+        for id in folder::ids() {
+            if wanted(&id) {
+                folder::served(&id).await?;
             }
         }
         if wanted("round_trip/CartPole/1") {

@@ -99,12 +99,12 @@ struct Cost {
 }
 
 /// Returns the CPU seconds of a process, given by its folder in /proc.
-fn process_cpu(process: &Path) -> Result<f64, Failure> {
+pub(crate) fn process_cpu(process: &Path) -> Result<f64, Failure> {
     fs::read_dir(process.join("task"))?.map(|thread| thread_cpu(&thread?.path())).sum()
 }
 
 /// Returns the CPU seconds of a thread, given by its folder in /proc.
-fn thread_cpu(thread: &Path) -> Result<f64, Failure> {
+pub(crate) fn thread_cpu(thread: &Path) -> Result<f64, Failure> {
     let nanoseconds = fs::read_to_string(thread.join("schedstat"))?;
     Ok(nanoseconds.split(' ').next().ok_or("no schedstat")?.parse::<f64>()? * 1e-9)
 }

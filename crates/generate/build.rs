@@ -48,7 +48,9 @@ fn generate_bindings(root: &Path, out: &Path) -> Result<(), Box<dyn Error>> {
     let builder = bindgen::Builder::default()
         .header(shim.display().to_string())
         .clang_arg(format!("-I{}", prefix.join("include").display()))
-        .allowlist_function("perturb_mj[rv]?_.*|mj_version|mj_deleteModel|mj_deleteData|mj_name2id|mj_id2name|mj_objectVelocity")
+        .allowlist_function(
+            "perturb_mj[rv]?_.*|mj_version|mj_deleteModel|mj_deleteData|mj_name2id|mj_id2name|mj_objectVelocity",
+        )
         .allowlist_function("mjv_defaultOption|mjv_defaultScene|mjv_freeScene|mjr_defaultContext")
         .allowlist_type("mjtWarning|mjtObj|mjtCamera")
         .allowlist_var("mjVERSION_HEADER|mjNGAIN|mjNBIAS")

@@ -4,10 +4,12 @@
 //! AddressSanitizer), and so does a test, for a few seconds and with any compiler.
 
 mod files;
+mod folders;
 mod seeds;
 mod server;
 
 pub use files::{checkpoints, ledgers, plans, records};
+pub use folders::{models, tasks};
 pub use seeds::{replies, seeds};
 pub use server::{connections, requests, snapshots, worlds};
 
@@ -20,7 +22,7 @@ pub struct FuzzTarget {
 }
 
 /// All fuzz targets.
-pub const TARGETS: [FuzzTarget; 8] = [
+pub const TARGETS: [FuzzTarget; 10] = [
     FuzzTarget { name: "requests", run: requests },
     FuzzTarget { name: "snapshots", run: snapshots },
     FuzzTarget { name: "worlds", run: worlds },
@@ -29,4 +31,6 @@ pub const TARGETS: [FuzzTarget; 8] = [
     FuzzTarget { name: "records", run: records },
     FuzzTarget { name: "plans", run: plans },
     FuzzTarget { name: "ledgers", run: ledgers },
+    FuzzTarget { name: "tasks", run: tasks },
+    FuzzTarget { name: "models", run: models },
 ];

@@ -144,3 +144,13 @@ fn plans() {
 fn ledgers() {
     attack("ledgers");
 }
+
+#[test]
+fn tasks() {
+    attack("tasks");
+}
+
+#[test]
+fn models() {
+    attack("models");
+}

@@ -2,8 +2,11 @@
 #![forbid(unsafe_code)]
 
 use clap::{CommandFactory, Parser};
+#[cfg(feature = "mujoco")]
+use perturb::tasks::folder::{self, LoadError};
 use perturb::{
     config::{Arguments, Config, ListenAddress},
+    env::Catalogue,
     server::{
         self,
         auth::new_token,
@@ -45,6 +48,10 @@ fn main() -> ExitCode {
             }
         };
     }
+    #[cfg(feature = "mujoco")]
+    if let Some(folder) = &arguments.check_task {
+        return check_task(folder, arguments.measure_task);
+    }
     let config = match Config::load(&arguments) {
         Ok(config) => config,
         Err(error) => {
@@ -70,18 +77,20 @@ fn main() -> ExitCode {
     };
     let done = if arguments.health {
         health(&config)
+    } else if arguments.check {
+        check(&config)
     } else if arguments.catalogue {
-        catalogue(&config)
+        environments(&config, false).and_then(|environments| print_catalogue(&environments, &config))
     } else {
-        let done = run(&config);
-        if arguments.private && !matches!(done, Err(Failure::Address(_))) {
+        let done = environments(&config, false).and_then(|environments| run(&config, &environments));
+        if arguments.private && !matches!(done, Err(Failure::Setting(_))) {
             remove_folders(&config);
         }
         done
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
-        Err(Failure::Address(error)) => {
+        Err(Failure::Setting(error)) => {
             complain(error);
             ExitCode::from(2)
         }
@@ -102,6 +111,8 @@ fn about(arguments: &Arguments) -> Option<Vec<u8>> {
     let (mut command, mut page) = (Arguments::command(), Vec::new());
     if let Some(shell) = arguments.completions {
         clap_complete::generate(shell, &mut command, "perturb-server", &mut page);
+    } else if arguments.task_schema {
+        page = task_schema();
     } else if arguments.man {
         clap_mangen::Man::new(command).render(&mut page).expect("memory takes it");
     } else {
@@ -112,9 +123,15 @@ fn about(arguments: &Arguments) -> Option<Vec<u8>> {
 
 /// Why the program fails.
 enum Failure {
-    /// An address cannot be had, or a file that the settings name.
-    Address(io::Error),
+    /// An address cannot be had, or a file or folder that the settings name cannot be used.
+    Setting(Box<dyn Error>),
     Other(Box<dyn Error>),
+}
+
+impl Failure {
+    fn setting(error: impl Into<Box<dyn Error>>) -> Self {
+        Self::Setting(error.into())
+    }
 }
 
 impl<E: Into<Box<dyn Error>>> From<E> for Failure {
@@ -133,11 +150,107 @@ fn remove_folders(config: &Config) {
     }
 }
 
-fn run(config: &Config) -> Result<(), Failure> {
+/// The environments that are served: the built-in ones and those of the settings' folders, each of which is first loaded
+/// in a process of its own. If `measured`, the reports say how fast folders are.
+#[cfg(feature = "mujoco")]
+fn environments(config: &Config, measured: bool) -> Result<Environments, Failure> {
+    let mut environments = Environments { catalogue: tasks::catalogue(), folders: Vec::new(), reports: Vec::new() };
+    let program = std::env::current_exe()?;
+    for path in &config.tasks {
+        environments.reports.push(folder::child::check(&program, path, measured).map_err(Failure::setting)?);
+        let loaded = folder::load(path).map_err(|error| Failure::setting(LoadError::new(path, error)))?;
+        let added = environments.catalogue.with(loaded.spec());
+        environments.catalogue = added.map_err(|error| Failure::setting(LoadError::new(path, error)))?;
+        for parameter in loaded.parameters_without_effect().map_err(|error| LoadError::new(path, error))? {
+            tracing::warn!(task = loaded.spec().name, parameter, "no effect of this parameter was seen; see --check");
+        }
+        environments.folders.push(loaded);
+    }
+    Ok(environments)
+}
+
+#[cfg(not(feature = "mujoco"))]
+fn environments(config: &Config, _measured: bool) -> Result<Environments, Failure> {
+    if config.tasks.is_empty() {
+        return Ok(Environments { catalogue: tasks::catalogue() });
+    }
+    Err(Failure::setting("--task: this server was built without MuJoCo; build it with the feature `mujoco`"))
+}
+
+/// The environments that are served.
+struct Environments {
+    catalogue: Catalogue,
+    #[cfg(feature = "mujoco")]
+    folders: Vec<folder::Folder>,
+    /// Reports of the folders, for `--check`.
+    #[cfg(feature = "mujoco")]
+    reports: Vec<String>,
+}
+
+/// Logs, once for each folder, that its files changed. Sessions, also new ones, keep what was loaded.
+#[cfg(feature = "mujoco")]
+async fn watch_folders(mut folders: Vec<folder::Folder>) {
+    const FILES_CHECK_INTERVAL: std::time::Duration = std::time::Duration::from_secs(5);
+    while !folders.is_empty() {
+        tokio::time::sleep(FILES_CHECK_INTERVAL).await;
+        folders.retain(|folder| {
+            let is_unchanged = folder.is_unchanged();
+            if !is_unchanged {
+                tracing::warn!(
+                    task = folder.spec().name,
+                    "the files of this task changed; the server serves what it loaded, restart it to serve the new files"
+                );
+            }
+            is_unchanged
+        });
+    }
+}
+
+/// Loads the folders of the settings in processes of their own and prints what they are.
+#[cfg(feature = "mujoco")]
+fn check(config: &Config) -> Result<(), Failure> {
+    if config.tasks.is_empty() {
+        return Err(Failure::setting("--check needs a folder; give --task FOLDER"));
+    }
+    let reports = environments(config, true)?.reports;
+    Ok(io::stdout().write_all(reports.concat().as_bytes())?)
+}
+
+#[cfg(not(feature = "mujoco"))]
+fn check(config: &Config) -> Result<(), Failure> {
+    environments(config, true).map(|_| ())
+}
+
+/// Loads a folder under limits and prints what it is.
+#[cfg(feature = "mujoco")]
+fn check_task(path: &std::path::Path, measured: bool) -> ExitCode {
+    let report = folder::child::limit_this_process()
+        .map_err(|error| format!("the process cannot be limited: {error}"))
+        .and_then(|()| folder::report(path, measured).map_err(|error| error.problem().to_owned()));
+    match report {
+        Ok(report) => match io::stdout().write_all(report.as_bytes()) {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(_) => ExitCode::FAILURE,
+        },
+        Err(problem) => {
+            let _ = writeln!(io::stderr(), "{}{problem}", folder::child::COMPLAINT);
+            ExitCode::from(2)
+        }
+    }
+}
+
+fn task_schema() -> Vec<u8> {
+    #[cfg(feature = "mujoco")]
+    return folder::SCHEMA.into();
+    #[cfg(not(feature = "mujoco"))]
+    Vec::new()
+}
+
+fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
     raise_descriptors();
     // One thread for I/O: physics has threads of its own, and a hand-over between runtime threads doubles latency.
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    let guards = Guards::load(config, &tasks::catalogue()).map_err(Failure::Address)?;
+    let guards = Guards::load(config, &environments.catalogue).map_err(Failure::setting)?;
     let result = runtime.block_on(async {
         // Before the addresses are told: who reads them may send a signal at once.
         let shutdown = shutdown(config.exit_with_stdin)?;
@@ -145,12 +258,12 @@ fn run(config: &Config) -> Result<(), Failure> {
         let metrics = match &config.metrics {
             Some(address) => {
                 let bound = Listener::bind_as(address, "--metrics", config.socket_mode).await;
-                Some(bound.map_err(Failure::Address)?)
+                Some(bound.map_err(Failure::setting)?)
             }
             None => None,
         };
         for address in &config.listen {
-            let listener = Listener::bind(address, config.socket_mode).await.map_err(Failure::Address)?;
+            let listener = Listener::bind(address, config.socket_mode).await.map_err(Failure::setting)?;
             // Whoever started the server need not read on.
             let _ = writeln!(io::stdout(), "listening on {}", told(&listener.address()?, config));
             listeners.push(listener);
@@ -158,7 +271,9 @@ fn run(config: &Config) -> Result<(), Failure> {
         if let Some(listener) = &metrics {
             let _ = writeln!(io::stdout(), "metrics at {}{}", listener.address()?, server::metrics::endpoint::PATH);
         }
-        server::run(listeners, metrics, config, &guards, tasks::catalogue(), shutdown).await?;
+        #[cfg(feature = "mujoco")]
+        tokio::spawn(watch_folders(environments.folders.clone()));
+        server::run(listeners, metrics, config, &guards, environments.catalogue.clone(), shutdown).await?;
         Ok(())
     });
     // Connections that did not close by themselves must not keep the program.
@@ -183,8 +298,8 @@ fn raise_descriptors() {
 }
 
 /// Prints what would be served.
-fn catalogue(config: &Config) -> Result<(), Failure> {
-    let listing = server::listing(&tasks::catalogue(), config)?;
+fn print_catalogue(environments: &Environments, config: &Config) -> Result<(), Failure> {
+    let listing = server::listing(&environments.catalogue, config)?;
     writeln!(io::stdout(), "{:#}", perturb_protocol::catalogue::to_json(&listing))?;
     Ok(())
 }

@@ -1,6 +1,6 @@
 //! What holds for every environment of the catalogue, whichever it is.
 
-use crate::common::{action_bytes, episodes, observe, play, settings, start_line, step};
+use crate::common::{self, action_bytes, episodes, observe, play, settings, start_line, step};
 use perturb::{
     env::{
         self, ActionSpace, Channel, Comparison, Distribution, EnvironmentSpec, Episodes, Error, Parameter, Purpose,
@@ -27,16 +27,16 @@ fn some_state(spec: &EnvironmentSpec, seed: u64) -> Vec<f64> {
 
 #[test]
 fn names_are_unique_and_found() {
-    assert!(unique(tasks::catalogue().names()));
-    for spec in tasks::catalogue().specs() {
-        assert!(ptr::eq(tasks::catalogue().find(spec.name).unwrap(), spec));
+    assert!(unique(common::catalogue().names()));
+    for spec in common::catalogue().specs() {
+        assert!(ptr::eq(common::catalogue().find(spec.name).unwrap(), spec));
         assert!(ptr::eq((spec.make)().unwrap().spec(), spec));
     }
     for name in ["cartpole", "cart-pole", "perturb/CartPole-v1"] {
-        assert_eq!(tasks::catalogue().find(name).unwrap().name, "CartPole");
+        assert_eq!(common::catalogue().find(name).unwrap().name, "CartPole");
     }
     for name in ["", "CartPol", "CartPole-v0", "perturb/CartPole-v0", "CartPole "] {
-        let refused = tasks::catalogue().find(name).unwrap_err();
+        let refused = common::catalogue().find(name).unwrap_err();
         assert!(
             matches!(refused, Error::UnknownEnvironment(_)) && refused.to_string().contains("CartPole"),
             "{refused}"
@@ -53,7 +53,7 @@ fn the_catalogue_has_the_papers_environments() {
 
 #[test]
 fn specs_are_complete_and_consistent() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let name = spec.name;
         assert!(unique(spec.parameters.iter().map(|p| p.name)), "{name}: parameters");
         assert!(unique(spec.observation.iter().map(|c| c.name)), "{name}: observation");
@@ -107,7 +107,7 @@ fn limits_and_success_rules_are_the_documents() {
 
 #[test]
 fn success_is_what_was_achieved_compared_with_the_threshold() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         for index in 0..20 {
             let mut e = episodes(spec, Version::E, 6, index, 1);
             for t in 0.. {
@@ -131,7 +131,7 @@ const ROUNDING: f64 = 1e-9;
 
 #[test]
 fn every_parameter_is_read_back_from_the_physics() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let quantities: Vec<_> = (spec.parameters.iter())
             .map(|p| spec.applied.iter().position(|q| (q.name, q.unit) == (p.applied, p.unit)).expect(p.name))
             .collect();
@@ -157,7 +157,7 @@ fn every_parameter_is_read_back_from_the_physics() {
 
 #[test]
 fn observations_and_rewards_keep_to_the_spec() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         for version in VERSIONS {
             let mut e = episodes(spec, version, 11, 4, 1);
             for t in 0..2000 {
@@ -182,7 +182,7 @@ fn observations_and_rewards_keep_to_the_spec() {
 
 #[test]
 fn the_reward_is_the_sum_of_its_terms_and_the_return_that_of_the_rewards() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let mut e = episodes(spec, Version::R, 3, 0, 1);
         let mut total = 0.0;
         for t in 0..1500 {
@@ -204,7 +204,7 @@ fn the_reward_is_the_sum_of_its_terms_and_the_return_that_of_the_rewards() {
 
 #[test]
 fn the_same_seed_gives_the_same_bytes() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         for version in VERSIONS {
             let run = || {
                 let mut e = episodes(spec, version, 5, 7, 2);
@@ -218,7 +218,7 @@ fn the_same_seed_gives_the_same_bytes() {
 
 #[test]
 fn another_seed_index_or_episode_gives_another_start() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let mut observations = Vec::new();
         let mut parameters = Vec::new();
         for seed in [0, 1, u64::MAX] {
@@ -238,7 +238,7 @@ fn another_seed_index_or_episode_gives_another_start() {
 
 #[test]
 fn what_ran_before_does_not_matter() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         for version in VERSIONS {
             let run = |history: &[u64], actor| {
                 let mut e = episodes(spec, version, 21, 6, 2);
@@ -262,7 +262,7 @@ fn what_ran_before_does_not_matter() {
 
 #[test]
 fn a_reset_after_use_equals_a_fresh_environment() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         for version in VERSIONS {
             let mut fresh = episodes(spec, version, 77, 2, 3);
             let mut used = episodes(spec, Version::E, 1, 2, 3);
@@ -277,7 +277,7 @@ fn a_reset_after_use_equals_a_fresh_environment() {
 
 #[test]
 fn an_exact_state_gives_the_same_bytes_whatever_ran_before() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let state = some_state(spec, 1);
         let mut fresh = episodes(spec, Version::R, 4, 0, 10);
         let mut used = episodes(spec, Version::R, 4, 0, 10);
@@ -299,7 +299,7 @@ fn an_exact_state_gives_the_same_bytes_whatever_ran_before() {
 
 #[test]
 fn an_exact_state_spends_no_draw_of_later_episodes() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let mut drawn = episodes(spec, Version::R, 4, 0, 1);
         let mut exact = episodes(spec, Version::R, 4, 0, 1);
         drawn.begin(None);
@@ -315,7 +315,7 @@ fn an_exact_state_spends_no_draw_of_later_episodes() {
 
 #[test]
 fn parameters_stay_within_a_trial_and_are_drawn_anew_after_it() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         for n in [1, 2, 5] {
             let mut e = episodes(spec, Version::R, 8, 1, n);
             let mut trials: Vec<Vec<f64>> = Vec::new();
@@ -349,7 +349,7 @@ fn play_to_its_end(e: &mut Episodes, steps: u64) {
 
 #[test]
 fn the_trial_alone_fixes_the_parameters() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let parameters = |n: u32| {
             let mut e = episodes(spec, Version::E, 8, 1, n);
             (0..3 * n).for_each(|_| e.begin(None));
@@ -362,7 +362,7 @@ fn the_trial_alone_fixes_the_parameters() {
 
 #[test]
 fn new_distributions_or_seeds_begin_a_trial() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let mut e = episodes(spec, Version::R, 8, 1, 3);
         e.begin(None);
         assert_eq!((e.id().trial_index, e.id().episode_index, e.id().episode_in_trial), (0, 1, 1));
@@ -379,7 +379,7 @@ fn new_distributions_or_seeds_begin_a_trial() {
 
 #[test]
 fn receipts_read_back_what_was_requested() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let mut e = episodes(spec, Version::E, 13, 0, 1);
         for _ in 0..50 {
             let receipt = e.receipt();
@@ -397,7 +397,7 @@ fn receipts_read_back_what_was_requested() {
 
 #[test]
 fn derived_quantities_follow_every_edit() {
-    let mut e = episodes(tasks::catalogue().find("CartPole").unwrap(), Version::E, 13, 0, 1);
+    let mut e = episodes(common::catalogue().find("CartPole").unwrap(), Version::E, 13, 0, 1);
     for _ in 0..50 {
         let [_, length, mass] = e.receipt().requested[..] else { panic!("three parameters") };
         // 1 kg is the cart's mass.
@@ -408,7 +408,7 @@ fn derived_quantities_follow_every_edit() {
 
 #[test]
 fn every_parameter_changes_the_receipt_and_the_physics() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let run = |edited: Option<usize>| {
             let value = |i: usize| {
                 let p = spec.parameters[i];
@@ -440,7 +440,7 @@ fn every_parameter_changes_the_receipt_and_the_physics() {
 
 #[test]
 fn edits_do_not_accumulate() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let mut fresh = episodes(spec, Version::D, 1, 0, 1);
         let mut edited = episodes(spec, Version::E, 1, 0, 1);
         (0..100).for_each(|_| edited.begin(None));
@@ -455,7 +455,7 @@ fn edits_do_not_accumulate() {
 
 #[test]
 fn an_episode_is_truncated_exactly_at_the_step_limit() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let mut e = episodes(spec, Version::D, 2, 0, 1);
         let (mut length, mut truncations) = (0, 0);
         for t in 0..u64::from(6 * spec.step_limit) {
@@ -478,7 +478,7 @@ fn an_episode_is_truncated_exactly_at_the_step_limit() {
 
 #[test]
 fn everything_stays_finite_at_the_corners_of_the_bounds() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         for ends in 0..1 << spec.parameters.len() {
             let corner = |i: usize| {
                 let bounds = spec.parameters[i].bounds;

@@ -20,7 +20,7 @@ impl Target {
         match std::env::var("PERTURB_ADDRESS") {
             Ok(address) => Self { address, _server: None },
             Err(_) => {
-                let server = Server::start(&["--workers", "2"]);
+                let server = Server::with_folders(&["--workers", "2"]);
                 Self { address: server.tcp().into(), _server: Some(server) }
             }
         }

@@ -31,7 +31,7 @@ fn hash(responses: &[SessionResponse]) -> String {
 
 #[tokio::test]
 async fn bytes_depend_neither_on_the_workers_nor_on_the_transport() {
-    let (one, four) = (Server::start(&["--workers", "1"]), Server::start(&["--workers", "4"]));
+    let (one, four) = (Server::with_folders(&["--workers", "1"]), Server::with_folders(&["--workers", "4"]));
     let places = [
         ("1 worker, TCP", one.tcp()),
         ("1 worker, Unix socket", one.unix()),
@@ -58,7 +58,7 @@ async fn bytes_depend_neither_on_the_workers_nor_on_the_transport() {
 async fn bytes_do_not_depend_on_how_many_shards_a_batch_has() {
     // Large enough to be cut, and cut differently: by one worker, and by three.
     const BATCH: u32 = 1200;
-    let (one, three) = (Server::start(&["--workers", "1"]), Server::start(&["--workers", "3"]));
+    let (one, three) = (Server::with_folders(&["--workers", "1"]), Server::with_folders(&["--workers", "3"]));
     for environment in &catalogue(one.tcp()).await {
         let actor = Actor::new(environment, BATCH as usize);
         let mut hashes = Vec::new();
@@ -71,7 +71,7 @@ async fn bytes_do_not_depend_on_how_many_shards_a_batch_has() {
 
 #[tokio::test]
 async fn other_sessions_on_the_same_server_change_nothing() {
-    let server = Server::start(&["--workers", "2"]);
+    let server = Server::with_folders(&["--workers", "2"]);
     for environment in &catalogue(server.tcp()).await {
         let actor = Actor::new(environment, BATCH as usize);
         let run = || transcript(server.unix(), open(&environment.name, BATCH, 3), actor, 300);
@@ -84,7 +84,7 @@ async fn other_sessions_on_the_same_server_change_nothing() {
 #[tokio::test]
 async fn a_batch_split_over_two_servers_equals_the_whole() {
     const FIRST: usize = 3;
-    let (left, right) = (Server::start(&["--workers", "1"]), Server::start(&["--workers", "2"]));
+    let (left, right) = (Server::with_folders(&["--workers", "1"]), Server::with_folders(&["--workers", "2"]));
     for environment in &catalogue(left.tcp()).await {
         let part = |first: usize, n: usize| {
             let open = Open { first_environment_index: first as u32, ..open(&environment.name, n as u32, 11) };

@@ -12,6 +12,8 @@ mod distributions;
 mod dm_env_rpc;
 mod drawing;
 mod faults;
+#[cfg(feature = "mujoco")]
+mod folder;
 mod following;
 mod groups;
 mod guarded;

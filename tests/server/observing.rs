@@ -80,7 +80,7 @@ async fn the_parameters_of_its_own_episode_follow_every_observation(
     #[values(AutoresetMode::NextStep, AutoresetMode::SameStep)] mode: AutoresetMode,
 ) {
     const N: u32 = 3;
-    let server = Server::start(&["--workers", "2"]);
+    let server = Server::with_folders(&["--workers", "2"]);
     let episodes_per_trial = if mode == AutoresetMode::NextStep { 1 } else { 2 };
     for environment in &catalogue(server.unix()).await {
         let open = Open {
@@ -120,7 +120,7 @@ fn observation(environment: &Environment) -> Vec<perturb::proto::Channel> {
 
 #[tokio::test]
 async fn the_catalogue_says_how_each_parameter_is_observed() {
-    let server = Server::start(&[]);
+    let server = Server::with_folders(&[]);
     for environment in catalogue(server.unix()).await {
         assert_eq!(environment.parameter_observations.len(), environment.parameters.len());
         let mut names: Vec<String> = observation(&environment).into_iter().map(|channel| channel.name).collect();
@@ -149,7 +149,7 @@ async fn own_values_are_observed_beyond_the_versions(
     #[case] value: fn(&perturb::proto::Parameter) -> f64,
     #[case] bound: fn(&perturb::proto::Channel) -> f64,
 ) {
-    let server = Server::start(&[]);
+    let server = Server::with_folders(&[]);
     for environment in catalogue(server.unix()).await {
         let sets: Vec<(&str, [(f64, f64); 1])> =
             environment.parameters.iter().map(|it| (it.name.as_str(), [(value(it), value(it))])).collect();
@@ -167,7 +167,7 @@ async fn own_values_are_observed_beyond_the_versions(
 #[cfg_attr(feature = "mujoco", case("Hopper"))]
 #[tokio::test]
 async fn a_reset_and_a_restore_bring_other_parameters(#[case] name: &str) {
-    let server = Server::start(&[]);
+    let server = Server::with_folders(&[]);
     let (mut session, opened) = Session::open(server.unix(), observing(open(name, 2, 5))).await;
     let environment = catalogue(server.unix()).await.into_iter().find(|it| it.name == name).unwrap();
     let before = rows(&environment, &opened.observations);
@@ -201,7 +201,7 @@ async fn a_reset_and_a_restore_bring_other_parameters(#[case] name: &str) {
 
 #[tokio::test]
 async fn groups_observe_as_sessions_of_their_own_also_when_others_have_left() {
-    let server = Server::start(&["--workers", "2"]);
+    let server = Server::with_folders(&["--workers", "2"]);
     let groups: Vec<SlotGroup> = [(Version::Random, 3), (Version::Extreme, 2), (Version::Default, 60)]
         .map(|(version, size)| SlotGroup { size, version: version.into(), seed: 9, ..SlotGroup::default() })
         .into();

@@ -5,7 +5,6 @@ use bytes::Bytes;
 use perturb::{
     env::{Distribution, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings, Version},
     pool::{Autoreset, Batch, BatchSettings, Error, Pool, ResetEntry, SlotGroup, Stepped},
-    tasks,
 };
 use rstest::rstest;
 use std::{
@@ -123,7 +122,7 @@ impl Model {
 
 #[tokio::test]
 async fn a_batch_gives_the_bytes_of_its_environments_in_every_autoreset_mode() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         for mode in MODES {
             let size = 5;
             let pool = Pool::new(2, size).unwrap();
@@ -160,7 +159,7 @@ async fn a_batch_gives_the_bytes_of_its_environments_in_every_autoreset_mode() {
 
 /// A CartPole batch of one, pushed to one side until it falls; the step at which it does and what it gave.
 async fn fall(pool: &Pool, mode: Autoreset) -> (Batch, Stepped) {
-    let spec = tasks::catalogue().find("CartPole").unwrap();
+    let spec = common::catalogue().find("CartPole").unwrap();
     let (mut batch, _, _) = Batch::open(pool, batch_settings(spec, 1, mode)).await.unwrap();
     loop {
         let stepped = batch.step(&[1, 0, 0, 0]).await.unwrap();
@@ -235,7 +234,7 @@ async fn in_disabled_mode_an_ended_environment_refuses_the_step_until_it_is_rese
 
 #[tokio::test]
 async fn a_refused_step_names_the_slots_that_ended() {
-    let spec = tasks::catalogue().find("CartPole").unwrap();
+    let spec = common::catalogue().find("CartPole").unwrap();
     let pool = Pool::new(4, 2000).unwrap();
     // So many that there are several shards.
     let size = 2000;
@@ -256,7 +255,7 @@ async fn a_refused_step_names_the_slots_that_ended() {
 
 #[tokio::test]
 async fn what_was_not_asked_for_is_not_sent() {
-    let spec = tasks::catalogue().find("CartPole").unwrap();
+    let spec = common::catalogue().find("CartPole").unwrap();
     let pool = Pool::new(1, 4).unwrap();
     let asked = batch_settings(spec, 4, Autoreset::SameStep);
     let settings = BatchSettings { receipts: false, reward_terms: false, ..asked };
@@ -303,7 +302,7 @@ fn cut(spec: &EnvironmentSpec, size: usize, stepped: &Stepped) -> Vec<Seen> {
 
 #[tokio::test]
 async fn bytes_do_not_depend_on_the_number_of_workers() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         // Several shards, also for the cheapest environment.
         let size = (100.0 / spec.step_cost).ceil() as usize;
         let mut runs: Vec<Vec<Stepped>> = Vec::new();
@@ -323,7 +322,7 @@ async fn bytes_do_not_depend_on_the_number_of_workers() {
 
 #[tokio::test]
 async fn bytes_do_not_depend_on_how_a_batch_is_split() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         for mode in [Autoreset::NextStep, Autoreset::SameStep] {
             let size = 12;
             let steps = u64::from(spec.step_limit) + 20;
@@ -370,7 +369,7 @@ impl Wake for Bell {
 #[tokio::test]
 async fn small_batches_finish_before_a_large_one_that_came_first() {
     const ATTEMPTS: usize = 50;
-    let spec = tasks::catalogue().find("Acrobot").unwrap();
+    let spec = common::catalogue().find("Acrobot").unwrap();
     let size = 40_000; // over 200 shards
     // Still too long for their sessions to wait awake, which would ring the bells before the end.
     let small = 1000;
@@ -425,7 +424,7 @@ async fn a_step_that_is_soon_done_waits_for_no_worker() {
     for (name, size, is_tiny) in [("CartPole", 1, true), ("CartPole", 150, true), ("CartPole", 600, false)] {
         let pool = Pool::new(1, 41_000).unwrap();
         let open = |name, size| {
-            Batch::open(&pool, batch_settings(tasks::catalogue().find(name).unwrap(), size, Autoreset::SameStep))
+            Batch::open(&pool, batch_settings(common::catalogue().find(name).unwrap(), size, Autoreset::SameStep))
         };
         let (mut busy, ..) = open("Acrobot", 40_000).await.unwrap();
         let (mut batch, ..) = open(name, size).await.unwrap();
@@ -441,7 +440,7 @@ async fn a_step_that_is_soon_done_waits_for_no_worker() {
 async fn a_session_that_steps_alone_waits_for_no_worker_for_somewhat_longer_steps() {
     let pool = Pool::new(1, 10_000).unwrap();
     let open = |name, size| {
-        Batch::open(&pool, batch_settings(tasks::catalogue().find(name).unwrap(), size, Autoreset::SameStep))
+        Batch::open(&pool, batch_settings(common::catalogue().find(name).unwrap(), size, Autoreset::SameStep))
     };
     let (mut one, ..) = open("CartPole", 1024).await.unwrap();
     let (mut other, ..) = open("CartPole", 1).await.unwrap();
@@ -469,7 +468,7 @@ async fn a_session_that_steps_alone_waits_for_no_worker_for_somewhat_longer_step
 async fn workers_that_fell_asleep_are_woken_for_every_job() {
     let pool = Pool::new(2, 1000).unwrap();
     let open = |name, size| {
-        Batch::open(&pool, batch_settings(tasks::catalogue().find(name).unwrap(), size, Autoreset::SameStep))
+        Batch::open(&pool, batch_settings(common::catalogue().find(name).unwrap(), size, Autoreset::SameStep))
     };
     let work = async {
         // Too long to be done without workers.
@@ -489,7 +488,7 @@ async fn workers_that_fell_asleep_are_woken_for_every_job() {
 
 #[tokio::test]
 async fn a_full_pool_refuses_and_has_room_again_when_a_batch_is_dropped() {
-    let spec = tasks::catalogue().find("CartPole").unwrap();
+    let spec = common::catalogue().find("CartPole").unwrap();
     let pool = Pool::new(2, 10).unwrap();
     let open = |size| Batch::open(&pool, batch_settings(spec, size, Autoreset::SameStep));
     assert_eq!(open(11).await.err(), Some(Error::Full { requested: 11, used: 0, limit: 10 }));
@@ -508,7 +507,7 @@ async fn a_full_pool_refuses_and_has_room_again_when_a_batch_is_dropped() {
 
 #[tokio::test]
 async fn a_batch_dropped_in_mid_step_gives_its_environments_back() {
-    let spec = tasks::catalogue().find("Acrobot").unwrap();
+    let spec = common::catalogue().find("Acrobot").unwrap();
     let size = 20_000;
     let pool = Pool::new(2, size).unwrap();
     let mut in_mid_step = 0;
@@ -536,7 +535,7 @@ async fn a_batch_dropped_in_mid_step_gives_its_environments_back() {
 async fn a_batch_whose_step_nobody_waits_for_settles_and_goes_on_after_it() {
     const N: usize = 2000;
     let pool = Pool::new(2, N * 2).unwrap();
-    let spec = tasks::catalogue().find("Acrobot").unwrap();
+    let spec = common::catalogue().find("Acrobot").unwrap();
     let settings = batch_settings(spec, N, Autoreset::SameStep);
     let (mut batch, ..) = Batch::open(&pool, settings.clone()).await.unwrap();
     let (mut twin, ..) = Batch::open(&pool, settings).await.unwrap();
@@ -554,7 +553,7 @@ async fn a_batch_whose_step_nobody_waits_for_settles_and_goes_on_after_it() {
 
 #[tokio::test]
 async fn a_batch_outlives_others_and_a_pool_ends_with_batches_alive() {
-    let spec = tasks::catalogue().find("Pendulum").unwrap();
+    let spec = common::catalogue().find("Pendulum").unwrap();
     let pool = Pool::new(2, 20).unwrap();
     let open = || Batch::open(&pool, batch_settings(spec, 10, Autoreset::SameStep));
     let (mut a, ..) = open().await.unwrap();
@@ -568,7 +567,7 @@ async fn a_batch_outlives_others_and_a_pool_ends_with_batches_alive() {
 // Resets, as proto/perturb/v1/perturb.proto specifies them.
 
 async fn open_four(pool: &Pool, name: &str) -> Batch {
-    let settings = batch_settings(tasks::catalogue().find(name).unwrap(), 4, Autoreset::SameStep);
+    let settings = batch_settings(common::catalogue().find(name).unwrap(), 4, Autoreset::SameStep);
     Batch::open(pool, settings).await.unwrap().0
 }
 
@@ -578,7 +577,7 @@ fn ids(started: &[(u32, EpisodeStart)]) -> Vec<(u32, u64, u64, u32)> {
 
 #[tokio::test]
 async fn a_reset_touches_the_selected_slots_only_and_goes_on_with_their_trials() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let pool = Pool::new(2, 8).unwrap();
         let (mut batch, mut untouched) = (open_four(&pool, spec.name).await, open_four(&pool, spec.name).await);
         for t in 0..5 {
@@ -609,7 +608,7 @@ async fn a_reset_touches_the_selected_slots_only_and_goes_on_with_their_trials()
 
 #[tokio::test]
 async fn a_broken_off_episode_is_not_reported() {
-    let spec = tasks::catalogue().find("CartPole").unwrap();
+    let spec = common::catalogue().find("CartPole").unwrap();
     let pool = Pool::new(1, 4).unwrap();
     let mut batch = open_four(&pool, "CartPole").await;
     batch.step(&[0; 16]).await.unwrap();
@@ -620,7 +619,7 @@ async fn a_broken_off_episode_is_not_reported() {
 
 #[tokio::test]
 async fn seeds_restart_the_counts_and_keep_the_index() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let pool = Pool::new(1, 8).unwrap();
         let mut batch = open_four(&pool, spec.name).await;
         for t in 0..30 {
@@ -644,7 +643,7 @@ async fn seeds_restart_the_counts_and_keep_the_index() {
 
 #[tokio::test]
 async fn distributions_hold_from_now_on_and_begin_a_trial() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let pool = Pool::new(1, 4).unwrap();
         let mut batch = open_four(&pool, spec.name).await;
         let values: Vec<f64> = spec.parameters.iter().map(|p| p.extreme[1].high).collect();
@@ -674,7 +673,7 @@ async fn an_exact_state_is_taken_and_holds_for_this_episode(#[case] name: &str, 
     let exact = |slot| ResetEntry { state: Some(state.to_vec()), ..entry(slot) };
     let (first, started) = batch.reset(vec![exact(1), entry(2), exact(3)]).await.unwrap();
     assert_eq!(ids(&started), [(1, 0, 1, 1), (2, 0, 1, 1), (3, 0, 1, 1)], "the trial goes on");
-    let mut environment = tasks::catalogue().find(name).and_then(|spec| (spec.make)()).unwrap();
+    let mut environment = common::catalogue().find(name).and_then(|spec| (spec.make)()).unwrap();
     environment.reset_to(state);
     let mut expected = vec![0.0; environment.spec().observation.len()];
     environment.observe(&mut expected);
@@ -686,7 +685,7 @@ async fn an_exact_state_is_taken_and_holds_for_this_episode(#[case] name: &str, 
 
 #[tokio::test]
 async fn a_seed_a_distribution_and_a_state_go_together() {
-    let spec = tasks::catalogue().find("CartPole").unwrap();
+    let spec = common::catalogue().find("CartPole").unwrap();
     let pool = Pool::new(1, 4).unwrap();
     let mut batch = open_four(&pool, "CartPole").await;
     let fixed: Arc<[Distribution]> = [9.0, 0.5, 0.25].map(Distribution::fixed).into();

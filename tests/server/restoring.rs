@@ -5,7 +5,6 @@ use bytes::Bytes;
 use perturb::{
     env::{Distribution, EnvironmentSpec, Episodes, Error, Interval, Version},
     pool::{self, Autoreset, Batch, BatchSettings, Pool, ResetEntry, SlotGroup, Stepped},
-    tasks,
 };
 use proptest::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -89,7 +88,7 @@ fn refused(result: Result<(), Error>) -> String {
 
 #[test]
 fn an_environment_of_r_and_e_goes_on_with_both_and_more_sets_are_refused() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let mut e = episodes(spec, Version::RE, 31, 5, 1);
         let saved = e.snapshot();
         let mut other = episodes(spec, Version::D, 1, 1, 1);
@@ -109,7 +108,7 @@ fn an_environment_of_r_and_e_goes_on_with_both_and_more_sets_are_refused() {
 
 #[test]
 fn a_snapshot_in_mid_episode_continues_with_the_same_bytes() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let mut e = used(spec);
         assert!(!e.ended(), "{}", spec.name);
         let snapshot = e.snapshot();
@@ -127,7 +126,7 @@ fn a_snapshot_in_mid_episode_continues_with_the_same_bytes() {
 
 #[test]
 fn every_moment_of_an_episode_can_be_restored() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let mut e = episodes(spec, Version::E, 31, 5, 2);
         let mut target = other(spec);
         for t in 0..150 {
@@ -151,7 +150,7 @@ fn every_moment_of_an_episode_can_be_restored() {
 
 #[test]
 fn an_ended_environment_stays_ended_and_goes_on_with_its_next_episode() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         for episode_in_trial in 0..2 {
             let mut e = episodes(spec, Version::R, 31, 5, 2);
             (0..episode_in_trial).for_each(|_| e.begin(None));
@@ -178,7 +177,7 @@ fn an_ended_environment_stays_ended_and_goes_on_with_its_next_episode() {
 
 #[test]
 fn overridden_distributions_are_saved() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let distributions: Vec<Distribution> = spec
             .parameters
             .iter()
@@ -197,7 +196,7 @@ fn overridden_distributions_are_saved() {
 
 #[test]
 fn an_episode_from_an_exact_state_can_be_restored() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let mut e = episodes(spec, Version::R, 3, 0, 1);
         let state: Vec<f64> = spec.state.iter().map(|c| 0.01_f64.clamp(c.low, c.high)).collect();
         e.begin(Some(&state));
@@ -213,7 +212,7 @@ const CHILD: &str = "PERTURB_TEST_SNAPSHOTS";
 fn a_snapshot_continues_in_another_process() {
     if let Some(directory) = std::env::var_os(CHILD) {
         // This is the other process.
-        for spec in tasks::catalogue().specs() {
+        for spec in common::catalogue().specs() {
             let path = Path::new(&directory).join(spec.name);
             let mut e = episodes(spec, Version::D, 0, 0, 1);
             e.restore(&std::fs::read(&path).unwrap()).unwrap();
@@ -222,7 +221,7 @@ fn a_snapshot_continues_in_another_process() {
         return;
     }
     let directory = tempfile::tempdir().unwrap();
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         std::fs::write(directory.path().join(spec.name), used(spec).snapshot()).unwrap();
     }
     let output = Command::new(std::env::current_exe().unwrap())
@@ -231,7 +230,7 @@ fn a_snapshot_continues_in_another_process() {
         .output()
         .unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stdout));
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let lines = std::fs::read_to_string(directory.path().join(spec.name).with_extension("lines")).unwrap();
         assert_eq!(lines, play(&mut used(spec), 3, 0, 700).join("\n"), "{}", spec.name);
     }
@@ -241,7 +240,7 @@ fn a_snapshot_continues_in_another_process() {
 
 #[test]
 fn the_layout_here_is_that_of_snapshots() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let snapshot = used(spec).snapshot();
         assert_eq!(encode(&decode(&snapshot)), snapshot);
     }
@@ -249,8 +248,8 @@ fn the_layout_here_is_that_of_snapshots() {
 
 #[test]
 fn snapshots_of_other_environments_are_refused() {
-    for spec in tasks::catalogue().specs() {
-        for foreign in tasks::catalogue().specs().filter(|foreign| foreign.name != spec.name) {
+    for spec in common::catalogue().specs() {
+        for foreign in common::catalogue().specs().filter(|foreign| foreign.name != spec.name) {
             let mut e = used(spec);
             let before = e.snapshot();
             let reason = refused(e.restore(&used(foreign).snapshot()));
@@ -301,7 +300,7 @@ fn snapshots_that_contradict_themselves_are_refused_and_change_nothing() {
         ("a state that is no number", |s, _| s.state[0] = f64::NAN),
         ("an infinite state", |s, _| s.state[1] = f64::NEG_INFINITY),
     ];
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let valid = decode(&used(spec).snapshot());
         for (what, edit) in edits {
             let mut saved = valid.clone();
@@ -322,7 +321,7 @@ fn play_other(spec: &EnvironmentSpec) -> Vec<String> {
 
 #[test]
 fn every_truncated_snapshot_is_refused() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let snapshot = used(spec).snapshot();
         let mut e = other(spec);
         let before = e.snapshot();
@@ -335,7 +334,7 @@ fn every_truncated_snapshot_is_refused() {
 
 #[test]
 fn every_changed_byte_of_a_snapshot_is_refused() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let snapshot = used(spec).snapshot();
         let mut e = other(spec);
         let before = e.snapshot();
@@ -350,7 +349,7 @@ fn every_changed_byte_of_a_snapshot_is_refused() {
 
 #[test]
 fn a_snapshot_with_something_behind_it_is_refused() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         refused(other(spec).restore(&[used(spec).snapshot(), vec![0]].concat()));
     }
 }
@@ -381,14 +380,14 @@ proptest! {
 
     #[test]
     fn garbage_does_no_harm(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
-        for spec in tasks::catalogue().specs() {
+        for spec in common::catalogue().specs() {
             try_restore(spec, &bytes)?;
         }
     }
 
     #[test]
     fn flipped_bits_do_no_harm(flips in prop::collection::vec((any::<prop::sample::Index>(), 0..8_u32), 1..4)) {
-        for spec in tasks::catalogue().specs() {
+        for spec in common::catalogue().specs() {
             let mut snapshot = used(spec).snapshot();
             snapshot.truncate(snapshot.len() - CHECKSUM);
             for (index, bit) in &flips {
@@ -431,7 +430,7 @@ async fn run(batch: &mut Batch, steps: std::ops::Range<u64>) -> Vec<Stepped> {
 
 #[tokio::test]
 async fn a_batch_restored_into_another_goes_on_with_the_same_bytes() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         for mode in [Autoreset::NextStep, Autoreset::SameStep] {
             // So many that there are several shards, cut differently by one and by four workers.
             let size = (if spec.step_cost < 1.0 { 60.0 } else { 200.0 } / spec.step_cost).ceil() as usize;
@@ -457,7 +456,7 @@ async fn a_batch_restored_into_another_goes_on_with_the_same_bytes() {
 
 #[tokio::test]
 async fn a_snapshot_goes_on_in_another_slot() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let pool = Pool::new(2, 6).unwrap();
         let (mut batch, ..) = Batch::open(&pool, batch_settings(spec, 1, 6, Autoreset::SameStep)).await.unwrap();
         run(&mut batch, 0..9).await;
@@ -481,7 +480,7 @@ async fn a_snapshot_goes_on_in_another_slot() {
 
 #[tokio::test]
 async fn a_refused_restore_of_several_changes_nothing_in_any_shard() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let size = (if spec.step_cost < 1.0 { 60.0 } else { 200.0 } / spec.step_cost).ceil() as usize;
         let pool = Pool::new(4, size).unwrap();
         let settings = batch_settings(spec, 1, size, Autoreset::SameStep);
@@ -508,7 +507,7 @@ async fn a_refused_restore_of_several_changes_nothing_in_any_shard() {
 
 #[tokio::test]
 async fn an_environment_saved_after_its_end_is_restored_in_next_step_mode_and_refused_in_same_step_mode() {
-    let spec = tasks::catalogue().find("CartPole").unwrap();
+    let spec = common::catalogue().find("CartPole").unwrap();
     let pool = Pool::new(1, 2).unwrap();
     let (mut next, ..) = Batch::open(&pool, batch_settings(spec, 1, 1, Autoreset::NextStep)).await.unwrap();
     while next.step(&0_i32.to_le_bytes()).await.unwrap().ended.is_empty() {}
@@ -524,7 +523,7 @@ async fn an_environment_saved_after_its_end_is_restored_in_next_step_mode_and_re
 
 #[tokio::test]
 async fn after_a_refused_restore_observations_are_those_of_before() {
-    for spec in tasks::catalogue().specs() {
+    for spec in common::catalogue().specs() {
         let pool = Pool::new(1, 3).unwrap();
         let (mut batch, ..) = Batch::open(&pool, batch_settings(spec, 1, 3, Autoreset::Disabled)).await.unwrap();
         let early = batch.snapshot(vec![0]).await.unwrap().remove(0);
@@ -548,7 +547,7 @@ async fn after_a_refused_restore_observations_are_those_of_before() {
 #[case("Acrobot", 0, 3.2)]
 #[case("Acrobot", 3, 29.0)]
 fn a_state_that_the_dynamics_never_reach_is_refused(#[case] name: &str, #[case] entry: usize, #[case] value: f64) {
-    let spec = tasks::catalogue().find(name).unwrap();
+    let spec = common::catalogue().find(name).unwrap();
     let mut environment = episodes(spec, Version::D, 1, 0, 1);
     let before = environment.snapshot();
     let mut saved: Saved = postcard::from_bytes(&before).unwrap();

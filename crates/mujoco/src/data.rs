@@ -102,7 +102,7 @@ impl Simulation {
     /// A field of the model, to be edited. Follow edits of masses, inertias, armatures and gears by
     /// [`set_const`](Self::set_const).
     pub fn field_mut(&mut self, field: Field) -> &mut [f64] {
-        let (start, length) = field.place(&self.model);
+        let (start, length) = self.model.place(field);
         self.array_mut(start, length)
     }
 
@@ -251,7 +251,7 @@ impl Simulation {
 
     /// Sets the external forces on bodies to 0, as after [`reset`](Self::reset).
     pub fn clear_external_forces(&mut self) {
-        let (start, length) = Reading::BodyExternalForces.place(self);
+        let (start, length) = Reading::BodyExternalForces.place(self.raw(), self.model.raw());
         self.array_mut(start, length).fill(0.0);
     }
 
@@ -389,7 +389,7 @@ impl Simulation {
 
     /// An array that MuJoCo computed.
     pub fn reading(&self, reading: Reading) -> &[f64] {
-        let (start, length) = reading.place(self);
+        let (start, length) = reading.place(self.raw(), self.model.raw());
         self.array(start, length)
     }
 
@@ -452,7 +452,7 @@ impl Simulation {
         self.data.as_ptr()
     }
 
-    pub(crate) fn raw(&self) -> &sys::mjData {
+    fn raw(&self) -> &sys::mjData {
         // SAFETY: the pointer is valid for the lifetime of `self`, and is not written through a `&Simulation`.
         unsafe { self.data.as_ref() }
     }

@@ -1,6 +1,6 @@
 //! The arrays of a model and of a simulation, by name.
 
-use crate::{Model, Simulation, sys};
+use crate::sys;
 
 /// Declares an enum of arrays of the model, each with its MuJoCo name and its number of elements.
 macro_rules! model_arrays {
@@ -13,8 +13,7 @@ macro_rules! model_arrays {
 
         impl $name {
             /// The first element of the array in this model, and the number of elements.
-            pub(crate) fn place(self, model: &Model) -> (*mut $type, usize) {
-                let m = model.raw();
+            pub(crate) fn place(self, m: &sys::mjModel) -> (*mut $type, usize) {
                 match self {
                     $(Self::$field => {
                         let length: fn(&sys::mjModel) -> i32 = $length;
@@ -46,15 +45,18 @@ macro_rules! float_fields {
 
         impl Field {
             /// The first element of the array in this model, and the number of elements.
-            pub(crate) fn place(self, model: &Model) -> (*mut f64, usize) {
-                let m = model.raw();
-                let raw = model.as_ptr();
+            ///
+            /// # Safety
+            /// `raw` is a valid model, which nobody writes during the call.
+            pub(crate) unsafe fn place(self, raw: *mut sys::mjModel) -> (*mut f64, usize) {
+                // SAFETY: the caller passes a valid model.
+                let m = unsafe { &*raw };
                 match self {
                     $(Self::$field => {
                         let length: fn(&sys::mjModel) -> i32 = $length;
                         (m.$raw, length(m).max(0) as usize)
                     })*
-                    // SAFETY: the pointer is a valid model for the lifetime of `model`; only addresses are taken.
+                    // SAFETY: the caller passes a valid model; only addresses are taken.
                     Self::Gravity => (unsafe { &raw mut (*raw).opt.gravity }.cast(), 3),
                     // SAFETY: as above.
                     Self::Wind => (unsafe { &raw mut (*raw).opt.wind }.cast(), 3),
@@ -143,7 +145,7 @@ pub(crate) const CONSTANTS: [Field; 9] = [
 ];
 
 impl Field {
-    /// The fields that [`Simulation::set_const`] computes and that physics depends on.
+    /// The fields that [`Simulation::set_const`](crate::Simulation::set_const) computes and that physics depends on.
     pub const DERIVED: [Self; 9] = [
         Self::BodySubtreeMass,
         Self::BodyInvWeight,
@@ -166,9 +168,9 @@ model_arrays! {
         BodyWeld = body_weldid: |m| m.nbody,
         /// Types of joints: 0 free, 1 ball, 2 slide, 3 hinge, `[J]`.
         JointType = jnt_type: |m| m.njnt,
-        /// Where each joint's coordinates begin in `qpos`, `[J]`.
+        /// First entries of joints in `qpos`, `[J]`.
         JointPosition = jnt_qposadr: |m| m.njnt,
-        /// Where each joint's velocities begin in `qvel`, `[J]`.
+        /// First entries of joints in `qvel`, `[J]`.
         JointVelocity = jnt_dofadr: |m| m.njnt,
         /// Bodies of geoms, `[G]`.
         GeomBody = geom_bodyid: |m| m.ngeom,
@@ -196,7 +198,7 @@ model_arrays! {
         ActuatorTransmission = actuator_trntype: |m| m.nu,
         /// Targets of actuators, `[U, 2]`.
         ActuatorTarget = actuator_trnid: |m| 2 * m.nu,
-        /// Where each sensor's numbers begin, `[S]`.
+        /// First numbers of sensors, `[S]`.
         SensorAddress = sensor_adr: |m| m.nsensor,
         /// Numbers of each sensor, `[S]`.
         SensorDimension = sensor_dim: |m| m.nsensor,
@@ -254,9 +256,8 @@ macro_rules! data_arrays {
         }
 
         impl Reading {
-            /// The first element of the array in this simulation, and the number of elements.
-            pub(crate) fn place(self, simulation: &Simulation) -> (*mut f64, usize) {
-                let (d, m) = (simulation.raw(), simulation.model().raw());
+            /// The first element of the array in these data of a model, and the number of elements.
+            pub(crate) fn place(self, d: &sys::mjData, m: &sys::mjModel) -> (*mut f64, usize) {
                 match self {
                     $(Self::$field => {
                         let length: fn(&sys::mjModel) -> i32 = $length;

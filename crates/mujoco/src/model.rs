@@ -293,24 +293,30 @@ impl Model {
 
     /// A floating-point array, or a part of the options.
     pub fn field(&self, field: Field) -> &[f64] {
-        let (start, length) = field.place(self);
+        let (start, length) = self.place(field);
         self.array(start, length)
     }
 
     /// The number of elements of several fields.
     pub fn n_fields(&self, fields: &[Field]) -> usize {
-        fields.iter().map(|field| field.place(self).1).sum()
+        fields.iter().map(|&field| self.place(field).1).sum()
+    }
+
+    /// The first element of a field, and the number of its elements.
+    pub(crate) fn place(&self, field: Field) -> (*mut f64, usize) {
+        // SAFETY: the pointer is a valid model for the lifetime of `self`, and is not written through a `&Model`.
+        unsafe { field.place(self.as_ptr()) }
     }
 
     /// An array of whole numbers: types, flags and numbers of other elements.
     pub fn index(&self, index: Index) -> &[i32] {
-        let (start, length) = index.place(self);
+        let (start, length) = index.place(self.raw());
         self.array(start, length)
     }
 
     /// An array of flags.
     pub fn flags(&self, flags: Flags) -> &[u8] {
-        let (start, length) = flags.place(self);
+        let (start, length) = flags.place(self.raw());
         self.array(start, length)
     }
 
@@ -383,7 +389,7 @@ impl Model {
     /// The floating-point arrays that edits of masses, inertias and friction change, or mj_setConst from them, with
     /// their lengths.
     pub(crate) fn constants(&self) -> [(*mut f64, usize); 9] {
-        CONSTANTS.map(|field| field.place(self))
+        CONSTANTS.map(|field| self.place(field))
     }
 
     pub(crate) fn raw(&self) -> &sys::mjModel {

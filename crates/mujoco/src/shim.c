@@ -8,6 +8,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #include "kinematics.h"
 
@@ -44,7 +45,18 @@ static void ignore_warning(const char* message) {
   _mjPRIVATE__set_tls_error_fn(previous);                 \
   landing = NULL;
 
-void perturb_mj_silence(void) { mju_user_warning = ignore_warning; }
+// An error outside of a guarded call, which the compiler of MJCF may raise: MuJoCo would write a log file, and wait for a
+// key, before it ended the process.
+static void end_process(const char* message) {
+  fprintf(stderr, "MuJoCo: %s\n", message);
+  fflush(stderr);
+  _exit(EXIT_FAILURE);
+}
+
+void perturb_mj_silence(void) {
+  mju_user_warning = ignore_warning;
+  mju_user_error = end_process;
+}
 
 const char* perturb_mj_last_error(void) { return last_error; }
 

@@ -4,7 +4,8 @@
 
 #include <mujoco/mujoco.h>
 
-// Silences MuJoCo's log file. Idempotent, but not to be raced.
+// Silences MuJoCo's log file: an error outside of a guarded call ends the process with a line on standard error.
+// Idempotent, but not to be raced.
 void perturb_mj_silence(void);
 
 // The message of the last failure on this thread; valid until the next one.

@@ -58,8 +58,14 @@ async fn the_server_plays_the_bytes_of_a_client_in_robots_too() {
     same_bytes(Game { environment: "Hopper", ..FULL }).await;
 }
 
+#[cfg(feature = "mujoco")]
+#[tokio::test]
+async fn the_server_plays_the_bytes_of_a_client_in_folders_too() {
+    same_bytes(Game { environment: "ReachingArm", ..FULL }).await;
+}
+
 async fn same_bytes(game: Game) {
-    let server = Server::start(&["--workers", "2"]);
+    let server = Server::with_folders(&["--workers", "2"]);
     let mut client = Client::begin(game, &server).await;
     let (mut session, environment) = game.session(&server).await;
     // Some steps, other weights and more steps than an episode has, complete episodes, and steps after them.

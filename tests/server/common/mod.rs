@@ -3,7 +3,34 @@
 pub mod proxy;
 pub mod server;
 
-use perturb::env::{Action, ActionSpace, EnvironmentSpec, Episodes, Outcome, Purpose, Settings, Stream, Version};
+use perturb::env::{
+    Action, ActionSpace, Catalogue, EnvironmentSpec, Episodes, Outcome, Purpose, Settings, Stream, Version,
+};
+
+/// The folders of examples/tasks.
+#[cfg(feature = "mujoco")]
+pub fn folders() -> Vec<std::path::PathBuf> {
+    let examples = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/tasks");
+    ["quadruped", "reaching_arm"].map(|name| examples.join(name)).into()
+}
+
+/// The built-in environments, and those of the folders in examples/tasks.
+pub fn catalogue() -> Catalogue {
+    #[cfg(feature = "mujoco")]
+    {
+        static LOADED: std::sync::OnceLock<Catalogue> = std::sync::OnceLock::new();
+        LOADED.get_or_init(|| perturb::tasks::catalogue_with(&folders()).unwrap()).clone()
+    }
+    #[cfg(not(feature = "mujoco"))]
+    perturb::tasks::catalogue()
+}
+
+/// The environments of the folders in examples/tasks.
+#[cfg(feature = "mujoco")]
+pub fn folder_specs() -> Vec<&'static EnvironmentSpec> {
+    let built_in = perturb::tasks::catalogue();
+    catalogue().specs().filter(|spec| built_in.names().all(|name| name != spec.name)).collect()
+}
 
 /// Settings of an environment of this version.
 pub fn settings(spec: &EnvironmentSpec, version: Version, seed: u64, index: u32, per_trial: u32) -> Settings {

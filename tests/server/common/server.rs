@@ -46,6 +46,18 @@ impl Server {
         Self::spawn(command, directory, 2)
     }
 
+    /// The same with the tasks of examples/tasks, where there is MuJoCo.
+    pub fn with_folders(flags: &[&str]) -> Self {
+        #[cfg(feature = "mujoco")]
+        {
+            let folders = super::folders();
+            let tasks = folders.iter().flat_map(|folder| ["--task", folder.to_str().unwrap()]);
+            Self::start(&flags.iter().copied().chain(tasks).collect::<Vec<_>>())
+        }
+        #[cfg(not(feature = "mujoco"))]
+        Self::start(flags)
+    }
+
     /// Runs a command that listens at so many addresses.
     pub fn spawn(mut command: Command, directory: TempDir, addresses: usize) -> Self {
         let log = std::fs::File::create(directory.path().join("log")).unwrap();

@@ -41,10 +41,11 @@ fn python(program: &str, arguments: &[&str]) -> Option<String> {
 
 #[tokio::test]
 async fn the_packages_44_compliance_cases_pass_on_discrete_and_continuous_environments() {
-    let server = Server::start(&[]);
+    let server = Server::with_folders(&[]);
     let catalogue = server::catalogue(server.tcp()).await;
     let has = |name: &&str| catalogue.iter().any(|e| e.name == **name);
-    let names: Vec<&str> = ["CartPole", "Pendulum", "Hopper"].into_iter().filter(|name| has(name)).collect();
+    let names: Vec<&str> =
+        ["CartPole", "Pendulum", "Hopper", "ReachingArm"].into_iter().filter(|name| has(name)).collect();
     if let Some(output) = python("compliance.py", &[&[server.port()], &names[..]].concat()) {
         let expected: String = names.iter().map(|name| format!("{name}: 44 cases, 0 not passed\n")).collect();
         assert_eq!(output, expected);

@@ -1,0 +1,233 @@
+//! The cost of tasks that are folders, beside the built-in Hopper and beside MuJoCo's functions alone.
+//!
+//! - `step/folder/Hopper`: the built-in Hopper's model as a folder, with terms like its own, against the built-in one:
+//!   steps a second of 64 environments on one server of two workers.
+//! - `step/folder/Walker2d`, `Ant` and `Humanoid`: Gymnasium's tasks, 64 environments, the server's CPU time against a bare
+//!   loop that calls the same MuJoCo functions as often: mj_step, and mj_rnePostConstraint where contact forces are read.
+//!   They need Gymnasium's models; `PERTURB_TEST_GYMNASIUM_ASSETS` names their folder.
+
+use crate::{
+    Failure,
+    client::{Client, Process, SEED, width},
+    median,
+    robots::{process_cpu, thread_cpu},
+};
+use bytes::Bytes;
+use perturb::{
+    env::{Action, EnvironmentSpec, Episodes, Settings, Version},
+    tasks::folder,
+};
+use perturb_mujoco::{Model, Simulation};
+use std::{fs, path::Path, time::Instant};
+use tempfile::TempDir;
+
+const BATCH: usize = 64;
+const ROUNDS: usize = 11;
+/// Environment steps of a round.
+const STEPS: usize = 1 << 13;
+
+/// The built-in Hopper's task, as far as a folder can say it: roboschool's terms, and its observation without the clipping
+/// of single entries.
+const HOPPER: &str = r#"
+format = 1
+name = "FolderHopper"
+description = "Hop forward on one leg."
+model = "hopper.xml"
+frame_skip = 4
+step_limit = 1000
+poses = "after"
+observation = [
+  { body = "torso", get = "com", axes = "z", clip = 5.0 },
+  { body = "torso", get = "velocity", scale = 0.3, clip = 5.0 },
+  { body = "torso", get = "roll", clip = 5.0 },
+  { body = "torso", get = "pitch", clip = 5.0 },
+  { joint = ["thigh", "leg", "foot"], get = "scaled", clip = 5.0 },
+  { joint = ["thigh", "leg", "foot"], get = "velocity", scale = 0.1, clip = 5.0 },
+]
+reward = [
+  { name = "alive", healthy = 1.0, otherwise = -1.0 },
+  { name = "progress", rate = { com = "*", axes = "x" } },
+  { name = "electricity", power = { actuator = "*" }, weight = -0.2, mean = true },
+  { name = "stall_torque", squared = { action = "*" }, weight = -0.1, mean = true },
+  { name = "joint_limits", limits = { joint = ["thigh", "leg", "foot"] }, weight = -0.2 },
+]
+healthy = [
+  { of = { body = "torso", get = "com", axes = "z" }, above = 0.8 },
+  { of = { body = "torso", get = "pitch" }, above = -1.0, below = 1.0 },
+]
+success = { description = "the torso came 20 m far", greatest = { body = "torso", get = "com", axes = "x" }, quantity = "distance", at_least = 20.0 }
+actions = { range = [-1.0, 1.0] }
+reset = { joints = [{ joint = ["thigh", "leg", "foot"], position = { uniform = 0.1 } }] }
+"#;
+
+/// Gymnasium's tasks that are measured: the name, the task's file, and whether contact forces are read.
+const GYMNASIUM: [(&str, &str, bool); 3] =
+    [("Walker2d", "walker2d_v5", false), ("Ant", "ant_v5", true), ("Humanoid", "humanoid_v5", true)];
+
+/// The identifiers of the figures.
+pub(crate) fn ids() -> impl Iterator<Item = String> {
+    std::iter::once("Hopper").chain(GYMNASIUM.map(|(name, ..)| name)).map(|name| format!("step/folder/{name}"))
+}
+
+/// Prints the figures of one identifier.
+pub(crate) async fn served(id: &str) -> Result<(), Failure> {
+    let name = id.rsplit('/').next().unwrap_or_default();
+    if name == "Hopper" {
+        return beside_the_built_in(id).await;
+    }
+    let Some(assets) = std::env::var_os("PERTURB_TEST_GYMNASIUM_ASSETS") else {
+        println!("{id:<22} not measured: PERTURB_TEST_GYMNASIUM_ASSETS does not name gymnasium's envs/mujoco/assets");
+        return Ok(());
+    };
+    for (task, file, external_forces) in GYMNASIUM {
+        if task == name {
+            let text = fs::read_to_string(format!("python/src/perturb/task_files/{file}.toml"))?;
+            let model = text.split("model = \"").nth(1).and_then(|rest| rest.split('"').next()).ok_or("no model")?;
+            let mjcf = fs::read_to_string(Path::new(&assets).join(model))?;
+            let folder = written(&text, model, &mjcf)?;
+            beside_mujoco(id, folder.path(), &mjcf, external_forces).await?;
+        }
+    }
+    Ok(())
+}
+
+fn written(task: &str, model: &str, mjcf: &str) -> Result<TempDir, Failure> {
+    let folder = tempfile::tempdir()?;
+    fs::write(folder.path().join("task.toml"), task)?;
+    fs::write(folder.path().join(model), mjcf)?;
+    Ok(folder)
+}
+
+async fn beside_the_built_in(id: &str) -> Result<(), Failure> {
+    const TRIPS: usize = 128;
+    let folder = written(HOPPER, "hopper.xml", include_str!("../../models/hopper.xml"))?;
+    let own = folder::load(folder.path())?.spec();
+    let server = Process::with_flags(2, &["--task".as_ref(), folder.path()])?;
+    let mut built_in = Client::open(&server.socket, "Hopper", BATCH).await?;
+    let mut from_folder = Client::open_spec(&server.socket, own, BATCH).await?;
+    let (mut ratios, mut steps) = (Vec::new(), Vec::new());
+    for _ in 0..2 * ROUNDS {
+        let expected = TRIPS as f64 / built_in.run(TRIPS).await?;
+        let found = TRIPS as f64 / from_folder.run(TRIPS).await?;
+        ratios.push(found / expected);
+        steps.push(found * BATCH as f64);
+    }
+    println!("{id:<22} {:>8.0} env steps/s", median(&mut steps));
+    println!("{id:<22} {:>8.3} of the built-in one's steps/s (at least 0.9)", median(&mut ratios));
+    Ok(())
+}
+
+async fn beside_mujoco(id: &str, path: &Path, mjcf: &str, external_forces: bool) -> Result<(), Failure> {
+    let spec = folder::load(path)?.spec();
+    let server = Process::with_flags(1, &["--task".as_ref(), path])?;
+    let mut client = Client::open_spec(&server.socket, spec, BATCH).await?;
+    let before = server.resident()?;
+    let mut bare = Bare::new(spec, mjcf, external_forces)?;
+    let (mut served_ratios, mut own_ratios, mut micros) = (Vec::new(), Vec::new(), Vec::new());
+    for _ in 0..ROUNDS {
+        let actions: Vec<Bytes> = (0..STEPS / BATCH).map(|_| client.actions()).collect();
+        let own = bare.environments(&actions)?;
+        let mujoco = bare.run(&actions)?;
+        let cpu = process_cpu(&server.proc())?;
+        client.play(&actions, 1).await?;
+        let served = process_cpu(&server.proc())? - cpu;
+        served_ratios.push(served / mujoco);
+        own_ratios.push(own / mujoco);
+        micros.push(mujoco * 1e6 / STEPS as f64);
+    }
+    println!("{id:<22} {:>8.2} us of CPU time an env step in the bare loop", median(&mut micros));
+    println!("{id:<22} {:>8.3} of it in the server (at most 1.10)", median(&mut served_ratios));
+    println!("{id:<22} {:>8.3} of it without the server, in this process", median(&mut own_ratios));
+    let more = 1024;
+    let mut many = Client::open_spec(&server.socket, spec, more).await?;
+    many.run(5).await?;
+    println!(
+        "{id:<22} {:>8.1} kB of the server for each environment (at most 8)",
+        (server.resident()? - before) / 1e3 / more as f64
+    );
+    Ok(())
+}
+
+/// Environments of the same seed in this process, and their physics alone.
+struct Bare {
+    spec: &'static EnvironmentSpec,
+    episodes: Vec<Episodes>,
+    simulation: Simulation,
+    /// For each environment its state before the round, and the steps after which an episode began, with its state.
+    starts: Vec<(Vec<f64>, Vec<(usize, Vec<f64>)>)>,
+    n_substeps: usize,
+    external_forces: bool,
+}
+
+impl Bare {
+    fn new(spec: &'static EnvironmentSpec, mjcf: &str, external_forces: bool) -> Result<Self, Failure> {
+        let episodes = (0..BATCH as u32)
+            .map(|environment_index| {
+                let distributions = spec.distributions(Version::D);
+                let settings = Settings { seed: SEED, environment_index, distributions, episodes_per_trial: 1 };
+                Ok(Episodes::new((spec.make)()?, settings))
+            })
+            .collect::<Result<Vec<_>, Failure>>()?;
+        let simulation = Simulation::new(Model::from_xml(mjcf)?)?;
+        let n_substeps = (spec.control_timestep / simulation.model().timestep()).round() as usize;
+        Ok(Self { spec, episodes, simulation, starts: Vec::new(), n_substeps, external_forces })
+    }
+
+    fn state(&self, i: usize) -> Vec<f64> {
+        let n = self.simulation.model().n_state();
+        // The flag of divergence stands before the state of MuJoCo.
+        self.episodes[i].physics_state()[1..=n].to_vec()
+    }
+
+    /// Steps the environments; returns the CPU time, s.
+    fn environments(&mut self, actions: &[Bytes]) -> Result<f64, Failure> {
+        let n = width(self.spec);
+        let mut terms = vec![0.0; self.spec.reward_terms.len()];
+        self.starts = (0..BATCH).map(|i| (self.state(i), Vec::new())).collect();
+        let this = Path::new("/proc/thread-self");
+        let (start, mut apart) = (thread_cpu(this)?, 0.0);
+        for (t, action) in actions.iter().enumerate() {
+            let floats: Vec<f32> = action.as_chunks::<4>().0.iter().map(|x| f32::from_le_bytes(*x)).collect();
+            for i in 0..BATCH {
+                self.episodes[i].step(Action::Continuous(&floats[i * n..][..n]), &mut terms);
+                if self.episodes[i].ended() {
+                    self.episodes[i].begin(None);
+                    let recording = Instant::now();
+                    let state = self.state(i);
+                    self.starts[i].1.push((t + 1, state));
+                    apart += recording.elapsed().as_secs_f64();
+                }
+            }
+        }
+        Ok(thread_cpu(this)? - start - apart)
+    }
+
+    /// The physics of the last [`Bare::environments`], one environment after the other; returns the CPU time, s.
+    fn run(&mut self, actions: &[Bytes]) -> Result<f64, Failure> {
+        let n = width(self.spec);
+        let this = Path::new("/proc/thread-self");
+        let start = thread_cpu(this)?;
+        for (i, (state, episodes)) in self.starts.iter().enumerate() {
+            self.simulation.set_state(state)?;
+            let mut next = episodes.iter();
+            let mut begins = next.next();
+            for (t, action) in actions.iter().enumerate() {
+                if let Some((_, state)) = begins.filter(|(at, _)| *at == t) {
+                    self.simulation.set_state(state)?;
+                    begins = next.next();
+                }
+                let floats = &action.as_chunks::<4>().0[i * n..][..n];
+                for (ctrl, a) in self.simulation.ctrl_mut().iter_mut().zip(floats) {
+                    *ctrl = f32::from_le_bytes(*a).into();
+                }
+                for _ in 0..self.n_substeps {
+                    self.simulation.step()?;
+                }
+                if self.external_forces {
+                    self.simulation.external_forces()?;
+                }
+            }
+        }
+        Ok(thread_cpu(this)? - start)
+    }
+}

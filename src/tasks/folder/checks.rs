@@ -1,0 +1,251 @@
+//! Edits that can do nothing are refused when a folder is loaded.
+
+use super::{
+    elements::Elements,
+    error::{Result, escaped},
+    parameter::{Edit, EditedParameter},
+    table::Table,
+    target::{Change, is_limited, without_effect},
+};
+use perturb_mujoco::{Field, Index, Kind, Model, Options};
+
+/// Contact dimensions from which torsional and rolling friction count.
+const TORSION_DIMENSION: i32 = 4;
+const ROLL_DIMENSION: i32 = 6;
+
+/// Refuses the edits that cannot change the physics.
+///
+/// # Errors
+/// [`super::Error`] with the parameter and the reason.
+pub(super) fn check(
+    tables: &[Table<'_>],
+    parameters: &[EditedParameter],
+    model: &Model,
+    elements: &Elements,
+) -> Result<()> {
+    for (i, (table, parameter)) in tables.iter().zip(parameters).enumerate() {
+        let table = &table.clone().at(format!("parameter {}", parameter.parameter.name));
+        same_number(table, parameter, &parameters[..i])?;
+        for edit in &parameter.edits {
+            switched_off(table, edit, model)?;
+            if edit.change == Change::Scale && edit.targets.all.iter().all(|target| target.is_zero(model)) {
+                let field = edit.targets.field;
+                return Err(without_effect(
+                    table,
+                    format_args!("the {field} is 0 in the model, and so is every multiple of it; use by = \"set\""),
+                ));
+            }
+            match (edit.targets.subject, edit.targets.field) {
+                ("geom", field) => friction(table, edit, (parameter, parameters), model, elements, field)?,
+                ("joint", "range") | ("actuator", "forcerange") => limits(table, edit, model)?,
+                ("option", "wind") => wind(table, parameters, model)?,
+                _ => {}
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Refuses a number that two parameters edit, or one twice.
+fn same_number(table: &Table<'_>, parameter: &EditedParameter, earlier: &[EditedParameter]) -> Result<()> {
+    let mut seen = std::collections::HashMap::new();
+    for other in earlier {
+        seen.extend(other.places().map(|place| (place, other.parameter.name)));
+    }
+    for edit in &parameter.edits {
+        for target in &edit.targets.all {
+            if let Some(other) = seen.insert(target.place(), parameter.parameter.name) {
+                let (subject, field) = (edit.targets.subject, edit.targets.field);
+                let what = if subject == "option" { field.to_owned() } else { format!("the {field} of a {subject}") };
+                return Err(table.error(if other == parameter.parameter.name {
+                    format!("it edits {what} twice; name each element once")
+                } else {
+                    format!("{what} is edited by parameter {other}, too; let one parameter edit it")
+                }));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Refuses edits of what the model's flags switch off.
+fn switched_off(table: &Table<'_>, edit: &Edit, model: &Model) -> Result<()> {
+    let flags = model.options().disable_flags;
+    let (bits, what) = match (edit.targets.subject, edit.targets.field) {
+        ("geom" | "pair", _) => (Options::DISABLE_CONTACT | Options::DISABLE_CONSTRAINT, "contacts"),
+        ("joint", "range") => (Options::DISABLE_LIMIT | Options::DISABLE_CONSTRAINT, "limits"),
+        ("joint", "frictionloss") => (Options::DISABLE_FRICTION_LOSS | Options::DISABLE_CONSTRAINT, "friction losses"),
+        ("joint", "damping" | "stiffness") | ("tendon", _) => (Options::DISABLE_PASSIVE, "passive forces"),
+        ("option", "wind" | "density" | "viscosity") => (Options::DISABLE_PASSIVE, "passive forces"),
+        ("option", "gravity") => (Options::DISABLE_GRAVITY, "gravity"),
+        ("actuator", _) => (Options::DISABLE_ACTUATION, "actuation"),
+        _ => return Ok(()),
+    };
+    if flags & bits == 0 {
+        return Ok(());
+    }
+    Err(without_effect(table, format_args!("the model switches {what} off by a <flag>; leave the flag out")))
+}
+
+/// Refuses ranges of elements without limits.
+fn limits(table: &Table<'_>, edit: &Edit, model: &Model) -> Result<()> {
+    let free = edit.targets.ids.iter().zip(&edit.targets.names);
+    let mut free = free.filter(|(id, _)| !is_limited(model, edit.targets.subject, **id));
+    match free.next() {
+        None => Ok(()),
+        Some((_, name)) => {
+            let attribute = if edit.targets.subject == "joint" { "limited" } else { "forcelimited" };
+            let (subject, name) = (edit.targets.subject, escaped(name));
+            Err(without_effect(table, format_args!("{subject} {name:?} has no limits; give it {attribute}=\"true\"")))
+        }
+    }
+}
+
+/// Refuses wind without air.
+fn wind(table: &Table<'_>, parameters: &[EditedParameter], model: &Model) -> Result<()> {
+    let is_edited = |field: Field| parameters.iter().any(|other| other.places().any(|(edited, _)| edited == field));
+    let has_medium =
+        [Field::Density, Field::Viscosity].into_iter().any(|field| model.field(field)[0] > 0.0 || is_edited(field));
+    if has_medium {
+        return Ok(());
+    }
+    Err(without_effect(table, "there is no air; give the model <option density=\"1.2\" viscosity=\"0.00002\"/>"))
+}
+
+/// Refuses frictions that no contact has.
+fn friction(
+    table: &Table<'_>,
+    edit: &Edit,
+    (parameter, parameters): (&EditedParameter, &[EditedParameter]),
+    model: &Model,
+    elements: &Elements,
+    field: &str,
+) -> Result<()> {
+    let geoms = &edit.targets.ids;
+    let contacts: Vec<Contact> = geoms.iter().flat_map(|&geom| contacts_of(model, geom)).collect();
+    if contacts.is_empty() {
+        let name = escaped(edit.targets.names.first().map_or("", String::as_str));
+        let why = if model.options().collision == 1 || model.count(Kind::Pair) > 0 {
+            "only declared pairs of it can touch, which have a friction of their own; edit the pairs"
+        } else {
+            "it can touch nothing; see its contype and conaffinity"
+        };
+        return Err(without_effect(table, format_args!("geom {name:?}: {why}")));
+    }
+    let (needed, word) = match field {
+        "friction" => (3, "sliding"),
+        "friction_torsion" => (TORSION_DIMENSION, "torsional"),
+        _ => (ROLL_DIMENSION, "rolling"),
+    };
+    if contacts.iter().all(|contact| contact.dimension < needed) {
+        let most = contacts.iter().map(|contact| contact.dimension).max().unwrap_or(0);
+        return Err(without_effect(
+            table,
+            format_args!(
+                "its contacts have condim {most}, which has no {word} friction; give the geoms condim=\"{needed}\""
+            ),
+        ));
+    }
+    // Friction of others that this parameter or another one edits, too, is no bound.
+    let edited: Vec<usize> = parameters
+        .iter()
+        .flat_map(EditedParameter::places)
+        .filter(|(array, _)| *array == Field::GeomFriction)
+        .map(|(_, at)| at)
+        .collect();
+    let column =
+        ["friction", "friction_torsion", "friction_roll"].iter().position(|&known| known == field).unwrap_or(0);
+    let others = contacts.iter().filter(|contact| {
+        contact.dimension >= needed && !contact.has_priority && !edited.contains(&(3 * contact.other + column))
+    });
+    let limit = |contact: &Contact| {
+        if contact.other_has_priority {
+            f64::INFINITY
+        } else {
+            model.field(Field::GeomFriction)[3 * contact.other + column]
+        }
+    };
+    // What stands still is what robots walk on: the largest friction there counts. Otherwise the smallest of what moves.
+    let fixed = others.clone().filter(|contact| contact.other_is_fixed).max_by(|a, b| limit(a).total_cmp(&limit(b)));
+    let moving = others.min_by(|a, b| limit(a).total_cmp(&limit(b)));
+    let counts = |contact: &&Contact| contact.dimension >= needed;
+    let is_edited = |contact: &Contact| edited.contains(&(3 * contact.other + column));
+    let free = contacts.iter().filter(counts).any(|contact| contact.has_priority || is_edited(contact));
+    let Some(worst) = fixed.or(moving.filter(|_| !free)) else { return Ok(()) };
+    let least = smallest(edit, parameter, model);
+    let limit = limit(worst);
+    if least >= limit {
+        return Ok(());
+    }
+    let (own, other) = (escaped(elements.name(Kind::Geom, worst.own)), escaped(elements.name(Kind::Geom, worst.other)));
+    Err(table.error(if limit.is_finite() {
+        format!(
+            "below {limit} it would do nothing: MuJoCo takes the larger friction of two geoms that touch, and {other:?} \
+             has {limit}; begin the bounds there, give {own:?} priority=\"1\", or edit {other:?}, too"
+        )
+    } else {
+        format!(
+            "it has no effect: {other:?} has a higher priority than {own:?}, and MuJoCo takes its friction; edit {other:?}"
+        )
+    }))
+}
+
+/// The smallest number that the parameter sets.
+fn smallest(edit: &Edit, parameter: &EditedParameter, model: &Model) -> f64 {
+    let bounds = parameter.parameter.bounds;
+    let numbers = edit
+        .targets
+        .all
+        .iter()
+        .flat_map(|target| [bounds.low, bounds.high].map(|value| edit.number(target.value(model), value)));
+    numbers.fold(f64::INFINITY, f64::min)
+}
+
+/// A contact that MuJoCo may find between an edited geom and another one.
+struct Contact {
+    own: usize,
+    other: usize,
+    dimension: i32,
+    has_priority: bool,
+    other_has_priority: bool,
+    other_is_fixed: bool,
+}
+
+/// The contacts of a geom, but those of declared pairs.
+fn contacts_of(model: &Model, geom: usize) -> Vec<Contact> {
+    // 1: declared pairs only.
+    if model.options().collision == 1 {
+        return Vec::new();
+    }
+    let (body, weld, parent) =
+        (model.index(Index::GeomBody), model.index(Index::BodyWeld), model.index(Index::BodyParent));
+    let (contact_type, affinity) = (model.index(Index::GeomContactType), model.index(Index::GeomContactAffinity));
+    let (priority, dimension) = (model.index(Index::GeomPriority), model.index(Index::GeomContactDimension));
+    let pairs = model.index(Index::PairGeom1).iter().zip(model.index(Index::PairGeom2));
+    let declared: Vec<(usize, usize)> = pairs.map(|(&a, &b)| (a as usize, b as usize)).collect();
+    let weld_of = |geom: usize| weld[body[geom] as usize];
+    let can_touch = |&other: &usize| {
+        let (own, its) = (weld_of(geom), weld_of(other));
+        // The body that the parent of a group of welded bodies is welded to.
+        let parent_of = |body: i32| weld[parent[body as usize] as usize];
+        let fits = contact_type[geom] & affinity[other] != 0 || contact_type[other] & affinity[geom] != 0;
+        let related = own != 0 && its != 0 && (parent_of(own) == its || parent_of(its) == own);
+        let is_declared = declared.contains(&(geom, other)) || declared.contains(&(other, geom));
+        other != geom && own != its && fits && !related && !is_declared
+    };
+    (0..model.n_geom())
+        .filter(can_touch)
+        .map(|other| Contact {
+            own: geom,
+            other,
+            dimension: match priority[geom].cmp(&priority[other]) {
+                std::cmp::Ordering::Greater => dimension[geom],
+                std::cmp::Ordering::Less => dimension[other],
+                std::cmp::Ordering::Equal => dimension[geom].max(dimension[other]),
+            },
+            has_priority: priority[geom] > priority[other],
+            other_has_priority: priority[other] > priority[geom],
+            other_is_fixed: weld_of(other) == 0,
+        })
+        .collect()
+}

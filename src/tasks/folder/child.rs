@@ -1,0 +1,118 @@
+//! The first load of a folder, in a process of its own: MuJoCo 2.2.2 aborts on some models, and compiles others for ever.
+
+use super::error::{LoadError, escaped};
+use rustix::process::{Resource, Rlimit, setrlimit};
+use std::{
+    io::{self, Read},
+    os::unix::process::ExitStatusExt,
+    path::Path,
+    process::{Child, Command, ExitStatus, Stdio},
+    thread,
+    time::Duration,
+};
+
+/// Limits of the process that loads a folder.
+const MAX_MEMORY_BYTES: u64 = 2 << 30;
+const MAX_CPU_SECONDS: u64 = 60;
+const MAX_WALL_SECONDS: u64 = 120;
+/// Interval between looks at the process.
+const POLL_INTERVAL: Duration = Duration::from_millis(2);
+/// Limit of what is kept of the process's words, in bytes.
+const MAX_OUTPUT_BYTES: u64 = 1 << 20;
+
+/// Limits this process before it loads a folder that was never loaded before.
+///
+/// # Errors
+/// [`io::Error`] if the system refuses.
+pub fn limit_this_process() -> io::Result<()> {
+    let limit = |resource, most: u64| setrlimit(resource, Rlimit { current: Some(most), maximum: Some(most) });
+    limit(Resource::As, MAX_MEMORY_BYTES)?;
+    limit(Resource::Cpu, MAX_CPU_SECONDS)?;
+    // A crash need not leave a file of two gigabytes.
+    limit(Resource::Core, 0)?;
+    Ok(())
+}
+
+/// Loads a folder in a process of `program`, a `perturb-server`, and returns what it is, as `--check` prints it; with its
+/// speed if `measured`.
+///
+/// # Errors
+/// [`LoadError`] with the process's sentence, or with how it ended if it could not say why.
+pub fn check(program: &Path, folder: &Path, measured: bool) -> Result<String, LoadError> {
+    let refuse = |problem: String| LoadError::new(folder, problem);
+    let mut child = Command::new(program)
+        .arg("--check-task")
+        .arg(folder)
+        .args(measured.then_some("--measure-task"))
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .map_err(|error| refuse(format!("it could not be loaded in a process of its own: {error}")))?;
+    let (output, complaint) = (collect(child.stdout.take()), collect(child.stderr.take()));
+    let status = wait(&mut child).map_err(|error| refuse(format!("its process could not be waited for: {error}")))?;
+    let words = |reader: thread::JoinHandle<String>| reader.join().unwrap_or_default();
+    let (output, complaint) = (words(output), words(complaint));
+    match status {
+        Some(status) if status.success() => Ok(output),
+        Some(status) => Err(match complaint.lines().find_map(|line| line.strip_prefix(COMPLAINT)) {
+            Some(problem) => refuse(problem.to_owned()),
+            None => refuse(how_it_ended(status, complaint.lines().next())),
+        }),
+        None => Err(refuse(format!(
+            "it was not loaded within {MAX_WALL_SECONDS} s; use a smaller model, or one with fewer elements of a composite"
+        ))),
+    }
+}
+
+/// The beginning of the line that the process writes on standard error about a folder that it refuses.
+pub const COMPLAINT: &str = "perturb-server: refused: ";
+
+fn how_it_ended(status: ExitStatus, last_words: Option<&str>) -> String {
+    const ABORTED: i32 = 6;
+    const KILLED: i32 = 9;
+    const CPU_TIME: i32 = 24;
+    let memory = MAX_MEMORY_BYTES >> 30;
+    match status.signal() {
+        Some(CPU_TIME | KILLED) => {
+            format!("MuJoCo needed more than {MAX_CPU_SECONDS} s to compile the model; use a smaller one")
+        }
+        Some(ABORTED) => format!(
+            "MuJoCo 2.2.2 aborted while it compiled the model, for instance because it needs more than {memory} GiB; look at \
+             the numbers in <size>, and at the sizes of composites and height fields"
+        ),
+        Some(signal) => {
+            format!("MuJoCo 2.2.2 crashed by signal {signal} while it compiled the model; change the model")
+        }
+        None => match last_words {
+            Some(words) => format!("MuJoCo 2.2.2 ended the process while it compiled the model: {}", escaped(words)),
+            None => format!("its process ended with {status} and did not say why"),
+        },
+    }
+}
+
+/// Waits for the end of a process, and kills it after [`MAX_WALL_SECONDS`].
+fn wait(child: &mut Child) -> io::Result<Option<ExitStatus>> {
+    let polls = MAX_WALL_SECONDS * 1000 / POLL_INTERVAL.as_millis() as u64;
+    for _ in 0..polls {
+        if let Some(status) = child.try_wait()? {
+            return Ok(Some(status));
+        }
+        thread::sleep(POLL_INTERVAL);
+    }
+    child.kill()?;
+    child.wait()?;
+    Ok(None)
+}
+
+/// Reads all that a process writes, on a thread, and keeps the beginning.
+fn collect(stream: Option<impl Read + Send + 'static>) -> thread::JoinHandle<String> {
+    thread::spawn(move || {
+        let mut kept = Vec::new();
+        if let Some(mut stream) = stream {
+            let _ = (&mut stream).take(MAX_OUTPUT_BYTES).read_to_end(&mut kept);
+            let _ = io::copy(&mut stream, &mut io::sink()); // so that it can end
+        }
+        String::from_utf8_lossy(&kept).into_owned()
+    })
+}

@@ -1,0 +1,56 @@
+//! Edits without an effect that can be seen: the physics is the same, byte for byte, at both ends of E.
+
+use super::{environment::Task, template};
+use crate::env::{Purpose, Stream};
+use perturb_mujoco::{Error, Simulation};
+use std::sync::Arc;
+
+/// Timesteps of random controls from the initial state.
+const N_STEPS: usize = 200;
+
+/// The parameters whose edits change nothing in 200 timesteps of random controls from the initial state. They may have an
+/// effect elsewhere: a friction has none before the robot falls.
+///
+/// # Errors
+/// MuJoCo's fatal ones.
+pub(super) fn unseen(task: &'static Task) -> Result<Vec<&'static str>, Error> {
+    let defaults: Vec<f64> = task.spec.parameters.iter().map(|parameter| parameter.default).collect();
+    let own = trajectory(task, &defaults)?;
+    let mut unseen = Vec::new();
+    for (i, parameter) in task.spec.parameters.iter().enumerate() {
+        let at = |value: f64| {
+            let mut values = defaults.clone();
+            values[i] = value;
+            trajectory(task, &values)
+        };
+        let [below, above] = parameter.extreme;
+        if at(below.low)? == own && at(above.high)? == own {
+            unseen.push(parameter.name);
+        }
+    }
+    Ok(unseen)
+}
+
+/// The states, as bits, of timesteps of random controls; they end where the physics diverge.
+fn trajectory(task: &'static Task, values: &[f64]) -> Result<Vec<u64>, Error> {
+    template::with(&task.template, |shared| {
+        let edit = shared.edit(&task.parameters, values)?;
+        let (simulation, _) = shared.at(&Arc::clone(&edit), &task.template.state)?;
+        let mut stream = Stream::new(0, 0, Purpose::InitialState, 0);
+        let mut states = Vec::new();
+        for _ in 0..N_STEPS {
+            for (ctrl, &(low, high)) in simulation.ctrl_mut().iter_mut().zip(&task.controls) {
+                *ctrl = stream.uniform(low, high);
+            }
+            if let Err(error) = simulation.step() {
+                return if simulation.is_poisoned() { Err(error) } else { Ok(states) };
+            }
+            states.extend(bits(simulation));
+        }
+        Ok(states)
+    })
+}
+
+fn bits(simulation: &Simulation) -> impl Iterator<Item = u64> + '_ {
+    simulation.qpos().iter().chain(simulation.qvel()).map(|value| value.to_bits())
+}

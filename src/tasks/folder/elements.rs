@@ -1,0 +1,147 @@
+//! The elements of a model by name, as a task names them.
+
+use super::{
+    error::{Result, escaped, listed},
+    table::Value,
+};
+use perturb_mujoco::{Index, Kind, Model};
+use perturb_protocol::names::did_you_mean;
+
+/// The names of a model's elements. An element without a name is called `#3`, after its number.
+#[derive(Debug)]
+pub(super) struct Elements {
+    names: Vec<(Kind, Vec<String>)>,
+}
+
+const KINDS: [Kind; 10] = [
+    Kind::Body,
+    Kind::Joint,
+    Kind::Geom,
+    Kind::Site,
+    Kind::Actuator,
+    Kind::Sensor,
+    Kind::Tendon,
+    Kind::Pair,
+    Kind::Camera,
+    Kind::Keyframe,
+];
+
+impl Elements {
+    pub(super) fn new(model: &Model) -> Self {
+        let name = |kind, id| model.name(kind, id).map_or_else(|| format!("#{id}"), str::to_owned);
+        let names = |kind| (0..model.count(kind)).map(|id| name(kind, id)).collect();
+        Self { names: KINDS.map(|kind| (kind, names(kind))).into() }
+    }
+
+    /// The names of a kind, in the model's order.
+    pub(super) fn names(&self, kind: Kind) -> &[String] {
+        self.names.iter().find(|(known, _)| *known == kind).map_or(&[], |(_, names)| names)
+    }
+
+    /// The name of an element.
+    pub(super) fn name(&self, kind: Kind, id: usize) -> &str {
+        self.names(kind).get(id).map_or("", String::as_str)
+    }
+
+    /// The number of the element of this name.
+    pub(super) fn find(&self, kind: Kind, value: &Value<'_>) -> Result<usize> {
+        let name = value.text()?;
+        self.names(kind).iter().position(|known| known == name).ok_or_else(|| self.unknown(kind, name, value))
+    }
+
+    /// The numbers of the elements that a value names: a name, a pattern with `*` and `?`, or a list of these, in the
+    /// list's order and within a pattern in the model's. A pattern never means the world.
+    pub(super) fn select(&self, kind: Kind, value: &Value<'_>) -> Result<Vec<usize>> {
+        let mut selected = Vec::new();
+        for pattern in value.texts()? {
+            let names = self.names(kind).iter().enumerate();
+            let is_pattern = pattern.contains(['*', '?']);
+            let first = usize::from(is_pattern && kind == Kind::Body);
+            let hits = names.skip(first).filter(|(_, name)| matches(pattern, name)).map(|(id, _)| id);
+            let hits: Vec<usize> = hits.collect();
+            if hits.is_empty() {
+                return Err(self.unknown(kind, pattern, value));
+            }
+            if let Some(&twice) = hits.iter().find(|id| selected.contains(*id)) {
+                let name = escaped(self.name(kind, twice));
+                return Err(value.error(format_args!("{} {name:?} is named twice; name it once", kind.name())));
+            }
+            selected.extend(hits);
+        }
+        Ok(selected)
+    }
+
+    fn unknown(&self, kind: Kind, name: &str, value: &Value<'_>) -> super::error::Error {
+        let names = self.names(kind).iter().map(String::as_str);
+        let hint = did_you_mean(name, names.clone());
+        let kind = kind.name();
+        value.error(format_args!("the model has no {kind} {:?}{hint}; it has {}", escaped(name), listed(names)))
+    }
+}
+
+/// An actuator's name; without one that of its joint.
+pub(super) fn actuator_name(model: &Model, elements: &Elements, actuator: usize) -> String {
+    let name = elements.name(Kind::Actuator, actuator);
+    match actuated_joint(model, actuator) {
+        Some(joint) if name.starts_with('#') => elements.name(Kind::Joint, joint).to_owned(),
+        _ => name.to_owned(),
+    }
+}
+
+/// The joint that an actuator drives, if it drives one.
+pub(super) fn actuated_joint(model: &Model, actuator: usize) -> Option<usize> {
+    let drives_a_joint = matches!(model.index(Index::ActuatorTransmission)[actuator], 0 | 1);
+    drives_a_joint.then(|| model.index(Index::ActuatorTarget)[2 * actuator] as usize)
+}
+
+/// Whether a name fits a pattern, in which `*` stands for any text and `?` for any character.
+fn matches(pattern: &str, name: &str) -> bool {
+    let (pattern, name): (Vec<char>, Vec<char>) = (pattern.chars().collect(), name.chars().collect());
+    let (mut p, mut n) = (0, 0);
+    // The last star and the name's place where it was met: from there it is tried with one more character.
+    let mut star: Option<(usize, usize)> = None;
+    while n < name.len() {
+        match pattern.get(p) {
+            Some('*') => {
+                star = Some((p, n));
+                p += 1;
+            }
+            Some(&c) if c == '?' || c == name[n] => {
+                p += 1;
+                n += 1;
+            }
+            _ => {
+                let Some((at, met)) = star else { return false };
+                star = Some((at, met + 1));
+                p = at + 1;
+                n = met + 1;
+            }
+        }
+    }
+    pattern[p..].iter().all(|&c| c == '*')
+}
+
+#[cfg(test)]
+mod tests {
+    use super::matches;
+
+    #[test]
+    fn patterns_match_whole_names() {
+        for (pattern, name, fits) in [
+            ("*", "", true),
+            ("*", "foot", true),
+            ("foot", "foot", true),
+            ("foot", "foot_left", false),
+            ("foot*", "foot_left", true),
+            ("*_joint", "leg_left_joint", true),
+            ("*_joint", "leg_left_joints", false),
+            ("a*b*c", "axxbyybzc", true),
+            ("a*b*c", "axxbyybz", false),
+            ("hip_?", "hip_1", true),
+            ("hip_?", "hip_10", false),
+            ("?", "é", true),
+        ] {
+            assert_eq!(matches(pattern, name), fits, "{pattern} {name}");
+        }
+    }
+}

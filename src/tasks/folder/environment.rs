@@ -1,0 +1,401 @@
+//! The environment of a folder: physics by MuJoCo, and observations, rewards and ends as its file says.
+
+use super::{
+    number::{Context, Stage},
+    parameter::{AppliedQuantity, EditedParameter},
+    reading::Reading,
+    reset::Reset,
+    reward::{Step, Term},
+    rules::{Best, Goal, Range},
+    template::{self, ModelEdit, Template},
+};
+use crate::{
+    env::{Action, Environment, EnvironmentSpec, Error, Stream, Transition},
+    scene::{Look, PosedModel, Scene},
+};
+use perturb_mujoco::{Error as SimulationError, Simulation};
+use std::sync::Arc;
+
+/// Limit of positions and velocities in a saved state: MuJoCo's own, beyond which it takes them for divergence.
+const MAX_STATE: f64 = 1e10;
+/// A worker that panics of it loses the batch, not the server.
+const NO_MEMORY: &str = "there is memory for the one simulation of this thread";
+
+/// The time of the poses of bodies that a step's readings see.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Poses {
+    /// They are those of MuJoCo's step: of the state at the beginning of the last timestep, or of the last stage of RK4.
+    Before,
+    /// They are computed anew for the state after the step.
+    After,
+}
+
+/// A task as its folder says, compiled. It lives as long as the process.
+pub(super) struct Task {
+    pub(super) spec: EnvironmentSpec,
+    pub(super) template: Template,
+    pub(super) hash: String,
+    pub(super) look: Look,
+    pub(super) frame_skip: u32,
+    pub(super) poses: Poses,
+    pub(super) observation: Vec<Reading>,
+    pub(super) reward: Vec<Term>,
+    pub(super) healthy: Vec<Range>,
+    pub(super) terminate_when_unhealthy: bool,
+    pub(super) goal: Goal,
+    pub(super) reset: Reset,
+    /// The range of each control, `[A]`.
+    pub(super) controls: Vec<(f64, f64)>,
+    /// Whether actions of ±1 mean the ends of these ranges.
+    pub(super) scaled: bool,
+    pub(super) parameters: Vec<EditedParameter>,
+    pub(super) applied: Vec<AppliedQuantity>,
+    pub(super) needs: Needs,
+    /// Whether the model's text scales its masses to a total, which edited masses are not.
+    pub(super) has_total_mass: bool,
+}
+
+/// The computations that readings need, all of them together.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Needs {
+    pub(super) stage: Stage,
+    pub(super) external_forces: bool,
+    /// The numbers that terms remember from one step to the next.
+    pub(super) n_remembered: usize,
+}
+
+impl Needs {
+    /// The needs of a task's readings.
+    pub(super) fn new(observation: &[Reading], reward: &[Term], healthy: &[Range], goal: &Goal) -> Self {
+        let ranges = healthy.iter().chain(&goal.ranges).map(Range::reading);
+        let achieved = goal.achieved.iter().map(|(_, reading)| reading);
+        let readings: Vec<&Reading> = observation.iter().chain(ranges).chain(achieved).collect();
+        let stages = readings.iter().map(|reading| reading.stage()).chain(reward.iter().map(Term::stage));
+        Self {
+            stage: stages.max().unwrap_or(Stage::State),
+            external_forces: readings.iter().any(|reading| reading.needs_external_forces())
+                || reward.iter().any(Term::needs_external_forces),
+            n_remembered: reward.iter().filter_map(Term::remembered).map(Reading::len).sum(),
+        }
+    }
+}
+
+/// An environment of a folder.
+///
+/// A step sets the controls to the action, clipped to their range, and holds them for `frame_skip` timesteps. Then come,
+/// in this order, what is healthy, the reward's terms, the observation, and what was achieved; all see the same state.
+///
+/// If the physics diverge (MuJoCo warns of a number, or of lost contacts, or fails, or a number that is read is not
+/// finite), the step terminates, all terms are 0 but those of health, and the observation stays that of the step before;
+/// after a reset to a state that diverges at once it is zeros.
+///
+/// It has no simulation of its own: it is what a simulation of its model is given before it runs for it, and what is kept
+/// of it afterwards.
+pub(super) struct FolderEnvironment {
+    task: &'static Task,
+    edit: Arc<ModelEdit>,
+    /// State of MuJoCo, as [`Simulation::state`] has it. Undefined once the physics diverged.
+    state: Box<[f64]>,
+    /// The numbers that terms remember.
+    remembered: Box<[f64]>,
+    /// The last action, `[A]`; zeros after a reset.
+    action: Box<[f32]>,
+    observation: Box<[f32]>,
+    achieved: f64,
+    /// Until the next reset.
+    diverged: bool,
+}
+
+impl FolderEnvironment {
+    /// An environment with default parameters.
+    ///
+    /// # Errors
+    /// [`Error::Model`] if there is no memory for a simulation.
+    pub(super) fn new(task: &'static Task) -> Result<Self, Error> {
+        let defaults: Vec<f64> = task.spec.parameters.iter().map(|parameter| parameter.default).collect();
+        let edit = template::with(&task.template, |shared| shared.edit(&task.parameters, &defaults))
+            .map_err(|error| Error::Model { environment: task.spec.name, reason: error.to_string() })?;
+        let mut environment = Self {
+            task,
+            edit,
+            state: task.template.state.clone().into(),
+            remembered: vec![0.0; task.needs.n_remembered].into(),
+            action: vec![0.0; task.controls.len()].into(),
+            observation: vec![0.0; task.spec.observation.len()].into(),
+            achieved: 0.0,
+            diverged: false,
+        };
+        environment.start();
+        Ok(environment)
+    }
+
+    /// Positions and velocities; the time stands before them.
+    fn positions_mut(&mut self) -> (&mut [f64], &mut [f64]) {
+        let model = &self.task.template.model;
+        let (qpos, rest) = self.state[1..].split_at_mut(model.n_q());
+        (qpos, &mut rest[..model.n_v()])
+    }
+
+    /// The model's initial state.
+    fn clear(&mut self) {
+        self.state.copy_from_slice(&self.task.template.state);
+        self.action.fill(0.0);
+        self.observation.fill(0.0);
+        self.achieved = 0.0;
+    }
+
+    /// Begins an episode at the state.
+    fn start(&mut self) {
+        let task = self.task;
+        let started = template::with(&task.template, |shared| {
+            let (simulation, numbers) = shared.at(&self.edit, &self.state)?;
+            // What an environment before left there must not be seen. Sensors may compute it anew.
+            simulation.clear_external_forces();
+            simulation.forward()?;
+            simulation.state(&mut self.state);
+            if task.poses == Poses::After && task.needs.external_forces {
+                simulation.external_forces()?;
+            }
+            let action = vec![0.0; self.action.len()];
+            let context = Context { action: &action, previous_action: &action };
+            let mut remembered = Vec::with_capacity(self.remembered.len());
+            for reading in task.reward.iter().filter_map(Term::remembered) {
+                reading.read(simulation, &context, &mut remembered);
+            }
+            self.remembered.copy_from_slice(&remembered);
+            Ok(is_finite(&self.remembered) && self.observe_now(simulation, &context, numbers, true))
+        });
+        self.diverged = !matches!(started, Ok(true));
+    }
+
+    /// Computes the observation and what is achieved, and keeps them if all numbers are finite.
+    fn observe_now(
+        &mut self,
+        simulation: &Simulation,
+        context: &Context<'_>,
+        numbers: &mut Vec<f64>,
+        is_first: bool,
+    ) -> bool {
+        numbers.clear();
+        for reading in &self.task.observation {
+            reading.read(simulation, context, numbers);
+        }
+        if !numbers.iter().all(|&value| (value as f32).is_finite()) {
+            return false;
+        }
+        let achieved = self.task.goal.achieved.as_ref().map(|(best, reading)| {
+            let n = numbers.len();
+            reading.read(simulation, context, numbers);
+            let now = numbers.drain(n..).next().unwrap_or(f64::NAN);
+            match best {
+                Best::Greatest if !is_first => self.achieved.max(now),
+                Best::Least if !is_first => self.achieved.min(now),
+                _ => now,
+            }
+        });
+        let achieved = achieved.unwrap_or(0.0);
+        if !achieved.is_finite() {
+            return false;
+        }
+        self.achieved = achieved;
+        for (entry, &value) in self.observation.iter_mut().zip(numbers.iter()) {
+            *entry = value as f32;
+        }
+        true
+    }
+
+    /// Advances by one step. Returns none if a number that follows is not finite.
+    fn advance(
+        &mut self,
+        (simulation, numbers): (&mut Simulation, &mut Vec<f64>),
+        action: &[f32],
+        reward_terms: &mut [f64],
+    ) -> Result<Option<Transition>, SimulationError> {
+        let task = self.task;
+        for ((ctrl, &a), &(low, high)) in simulation.ctrl_mut().iter_mut().zip(action).zip(&task.controls) {
+            let a = f64::from(a);
+            *ctrl =
+                if task.scaled { low + (high - low) * ((a.clamp(-1.0, 1.0) + 1.0) / 2.0) } else { a.clamp(low, high) };
+        }
+        for _ in 0..task.frame_skip {
+            simulation.step_without_search()?;
+        }
+        // Before poses are computed anew, which would change where the solver starts, and normalise quaternions.
+        simulation.state(&mut self.state);
+        if task.poses == Poses::After {
+            match task.needs.stage {
+                Stage::State => {}
+                Stage::Motion => simulation.motion()?,
+                Stage::Forward => simulation.forward()?,
+            }
+        }
+        if task.needs.external_forces {
+            simulation.external_forces()?;
+        }
+        let (mut previous, mut remembered) = (std::mem::take(&mut self.action), std::mem::take(&mut self.remembered));
+        let context = Context { action, previous_action: &previous };
+        let healthy = is_finite(simulation.qpos())
+            && is_finite(simulation.qvel())
+            && task.healthy.iter().all(|range| range.holds(simulation, &context, numbers));
+        let step = Step { context, healthy, seconds: task.spec.control_timestep, before: &remembered };
+        for (value, term) in reward_terms.iter_mut().zip(&task.reward) {
+            *value = term.compute(simulation, &step, numbers);
+        }
+        let context = Context { action, previous_action: &previous };
+        numbers.clear();
+        for reading in task.reward.iter().filter_map(Term::remembered) {
+            reading.read(simulation, &context, numbers);
+        }
+        remembered.copy_from_slice(numbers);
+        let goal = !task.goal.ranges.is_empty()
+            && task.goal.ranges.iter().all(|range| range.holds(simulation, &context, numbers));
+        let is_observed = self.observe_now(simulation, &context, numbers, false) && is_finite(&remembered);
+        previous.copy_from_slice(action);
+        (self.action, self.remembered) = (previous, remembered);
+        if !is_observed || !is_finite(reward_terms) {
+            return Ok(None);
+        }
+        let terminated = !healthy && task.terminate_when_unhealthy && !task.healthy.is_empty();
+        Ok(Some(Transition { terminated, goal, diverged: false }))
+    }
+
+    /// Writes the terms after divergence, which ends the episode.
+    fn fail(&mut self, reward_terms: &mut [f64]) -> Transition {
+        self.diverged = true;
+        for (value, term) in reward_terms.iter_mut().zip(&self.task.reward) {
+            *value = term.diverged();
+        }
+        Transition { terminated: true, goal: false, diverged: true }
+    }
+
+    fn n_saved(&self) -> usize {
+        2 + self.state.len() + self.remembered.len() + self.action.len() + self.observation.len()
+    }
+}
+
+fn is_finite(numbers: &[f64]) -> bool {
+    numbers.iter().all(|value| value.is_finite())
+}
+
+impl Environment for FolderEnvironment {
+    fn spec(&self) -> &'static EnvironmentSpec {
+        &self.task.spec
+    }
+
+    fn set_parameters(&mut self, values: &[f64]) {
+        let task = self.task;
+        let edit = || template::with(&task.template, |shared| shared.edit(&task.parameters, values));
+        // After a fatal error once more, with a new simulation.
+        self.edit = edit().or_else(|_| edit()).expect(NO_MEMORY);
+    }
+
+    fn applied(&self, out: &mut [f64]) {
+        let task = self.task;
+        let read = template::with(&task.template, |shared| {
+            let model = shared.edited(&self.edit).model();
+            let parameters = task.parameters.iter().zip(&self.edit.values);
+            let read_back =
+                parameters.map(|(parameter, &value)| parameter.read_back(&task.template.model, model, value));
+            let values = read_back.chain(task.applied.iter().map(|quantity| quantity.read(model)));
+            out.iter_mut().zip(values).for_each(|(out, value)| *out = value);
+            Ok(())
+        });
+        read.expect(NO_MEMORY);
+    }
+
+    fn achieved(&self) -> Option<f64> {
+        self.task.goal.achieved.is_some().then_some(self.achieved)
+    }
+
+    fn model_hash(&self) -> &str {
+        &self.task.hash
+    }
+
+    fn reset(&mut self, stream: &mut Stream) {
+        self.clear();
+        let reset = &self.task.reset;
+        let (qpos, qvel) = self.positions_mut();
+        reset.draw(stream, qpos, qvel);
+        self.start();
+    }
+
+    fn reset_to(&mut self, state: &[f64]) {
+        self.clear();
+        let (qpos, qvel) = self.positions_mut();
+        let (positions, velocities) = state.split_at(qpos.len());
+        qpos.copy_from_slice(positions);
+        qvel.copy_from_slice(velocities);
+        self.start();
+    }
+
+    fn observe(&self, out: &mut [f32]) {
+        out.copy_from_slice(&self.observation);
+    }
+
+    fn scene(&self) -> Option<Scene> {
+        let qpos = &self.state[1..][..self.task.template.model.n_q()];
+        (!self.diverged).then(|| Scene::Model(PosedModel { look: &self.task.look, qpos: qpos.to_vec() }))
+    }
+
+    fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
+        let Action::Continuous(action) = action else { unreachable!("folders are stepped with validated controls") };
+        if self.diverged {
+            return self.fail(reward_terms);
+        }
+        let edit = Arc::clone(&self.edit);
+        let stepped = template::with(&self.task.template, |shared| {
+            let at = shared.at(&edit, &self.state)?;
+            self.advance(at, action, reward_terms)
+        });
+        match stepped {
+            Ok(Some(transition)) => transition,
+            _ => self.fail(reward_terms),
+        }
+    }
+
+    fn save(&self, out: &mut Vec<f64>) {
+        out.push(f64::from(u8::from(self.diverged)));
+        let physics = out.len();
+        out.extend_from_slice(&self.state);
+        out.extend_from_slice(&self.remembered);
+        if self.diverged {
+            out[physics..].fill(0.0); // nothing follows from it any more, and it may not be finite
+        }
+        out.extend(self.action.iter().chain(&self.observation).map(|&value| f64::from(value)));
+        out.push(self.achieved);
+    }
+
+    fn load(&mut self, state: &[f64]) -> Result<(), Error> {
+        let refuse = |reason: String| Err(Error::Snapshot { reason });
+        if state.len() != self.n_saved() {
+            return refuse(format!("its state has {} numbers, expected {}", state.len(), self.n_saved()));
+        }
+        if !is_finite(state) {
+            return refuse("its state is not finite".into());
+        }
+        let mut rest = state;
+        let mut take = |n: usize| rest.split_off(..n).unwrap_or_default();
+        let diverged = take(1) != [0.0];
+        let physics = take(self.state.len());
+        let model = &self.task.template.model;
+        if physics[1..][..model.n_q() + model.n_v()].iter().any(|value| value.abs() > MAX_STATE) {
+            return refuse("its state diverges".into());
+        }
+        self.diverged = diverged;
+        self.state.copy_from_slice(physics);
+        self.remembered.copy_from_slice(take(self.remembered.len()));
+        let single =
+            |value: f64, low: f64, high: f64| value.clamp(low, high).clamp(f32::MIN.into(), f32::MAX.into()) as f32;
+        let actions = take(self.action.len());
+        for (own, &saved) in self.action.iter_mut().zip(actions) {
+            *own = single(saved, f64::NEG_INFINITY, f64::INFINITY);
+        }
+        let channels = self.task.spec.observation;
+        let observations = take(self.observation.len());
+        for ((own, &saved), channel) in self.observation.iter_mut().zip(observations).zip(channels) {
+            *own = single(saved, channel.low, channel.high);
+        }
+        self.achieved = take(1).first().copied().unwrap_or(0.0);
+        Ok(())
+    }
+}

@@ -1,0 +1,163 @@
+//! The files of a folder: read once, none from outside of the folder, within limits, hashed.
+
+use super::error::{Error, Result, escaped};
+use sha2::{Digest, Sha256};
+use std::{
+    collections::BTreeMap,
+    fmt::Write,
+    io::Read,
+    path::{Component, Path, PathBuf},
+    time::SystemTime,
+};
+
+/// The task's own file.
+pub(super) const TASK: &str = "task.toml";
+/// Limit of all files that are read, in bytes.
+const MAX_BYTES: u64 = 64 << 20;
+/// Limit of the files that are read. MuJoCo has room for 1999 beside the model's text.
+const MAX_FILES: usize = 1900;
+/// Limit of the task's own file, in bytes.
+const MAX_TASK_BYTES: usize = 1 << 20;
+
+/// The files that were read, by their paths within the folder.
+#[derive(Debug)]
+pub(super) struct Files {
+    root: PathBuf,
+    read: BTreeMap<String, FileContent>,
+    bytes: u64,
+}
+
+/// A file as it was read.
+#[derive(Debug)]
+struct FileContent {
+    bytes: Vec<u8>,
+    modified: Option<SystemTime>,
+}
+
+impl Files {
+    /// Opens a folder and reads its task.
+    ///
+    /// # Errors
+    /// [`Error`] if it is no folder, or has no task that can be read.
+    pub(super) fn open(folder: &Path) -> Result<Self> {
+        let refuse = |problem: String| Error::folder(problem);
+        let root = folder.canonicalize().map_err(|error| refuse(format!("the folder cannot be opened: {error}")))?;
+        if !root.is_dir() {
+            return Err(refuse("this is not a folder; give the folder that holds task.toml".into()));
+        }
+        if !root.join(TASK).exists() {
+            return Err(refuse("the folder has no task.toml; docs/tasks.md says what stands in it".into()));
+        }
+        let mut files = Self { root, read: BTreeMap::new(), bytes: 0 };
+        if files.read(TASK, "it")?.len() > MAX_TASK_BYTES {
+            return Err(Error::file(TASK, "the file is longer than 1 MiB"));
+        }
+        Ok(files)
+    }
+
+    /// The task's own file.
+    pub(super) fn task(&self) -> &[u8] {
+        self.read.get(TASK).map_or(&[], |file| file.bytes.as_slice())
+    }
+
+    /// Reads a file, given by its path within the folder. `who` names it in errors, for instance `robot.xml`.
+    ///
+    /// # Errors
+    /// [`Error`] if the path leaves the folder, if the file cannot be read, or beyond the limits.
+    pub(super) fn read(&mut self, path: &str, who: &str) -> Result<&[u8]> {
+        let name = self.resolve(path, who)?;
+        if !self.read.contains_key(&name) {
+            let content = self.read_from_disk(&name, who)?;
+            self.read.insert(name.clone(), content);
+        }
+        Ok(self.read.get(&name).map_or(&[], |file| file.bytes.as_slice()))
+    }
+
+    /// A path within the folder without `.` and `..`, after all links are followed.
+    fn resolve(&self, path: &str, who: &str) -> Result<String> {
+        let shown = escaped(path);
+        let refuse = |problem: &str| Error::folder(format_args!("{who} names the file {shown:?}, which {problem}"));
+        let outside = "is outside of the folder; put the file into the folder and name it by a relative path";
+        let relative = Path::new(path);
+        if relative.components().any(|part| matches!(part, Component::RootDir | Component::Prefix(_))) {
+            return Err(refuse(outside));
+        }
+        let found = self.root.join(relative).canonicalize();
+        let found = found.map_err(|error| refuse(&format!("cannot be read: {error}")))?;
+        let inside = found.strip_prefix(&self.root).map_err(|_| refuse(outside))?;
+        inside.to_str().map(str::to_owned).ok_or_else(|| refuse("has a name that is not UTF-8; rename it"))
+    }
+
+    fn read_from_disk(&mut self, name: &str, who: &str) -> Result<FileContent> {
+        let path = self.root.join(name);
+        let shown = escaped(name);
+        let refuse = |problem: String| Error::folder(format_args!("{who} names the file {shown:?}, which {problem}"));
+        let unreadable = |error: std::io::Error| refuse(format!("cannot be read: {error}"));
+        let about = path.metadata().map_err(unreadable)?;
+        if !about.is_file() {
+            return Err(refuse("is not a regular file".into()));
+        }
+        let mut bytes = Vec::new();
+        let room = MAX_BYTES - self.bytes;
+        std::fs::File::open(&path).and_then(|file| file.take(room + 1).read_to_end(&mut bytes)).map_err(unreadable)?;
+        if bytes.len() as u64 > room {
+            return Err(Error::folder("the files of the folder that are read have more than 64 MiB together"));
+        }
+        if self.read.len() >= MAX_FILES {
+            return Err(Error::folder(format_args!("more than {MAX_FILES} files of the folder are read")));
+        }
+        self.bytes += bytes.len() as u64;
+        Ok(FileContent { bytes, modified: about.modified().ok() })
+    }
+
+    /// The SHA-256, in hexadecimal, of the list of all files that were read: each with its path and the SHA-256 of its
+    /// bytes, the task first, the others in the order of their paths.
+    pub(super) fn hash(&self) -> String {
+        let task = self.read.get_key_value(TASK);
+        let others = self.read.iter().filter(|(name, _)| *name != TASK);
+        let mut all = Sha256::new();
+        for (name, FileContent { bytes, .. }) in task.into_iter().chain(others) {
+            all.update((name.len() as u64).to_le_bytes());
+            all.update(name.as_bytes());
+            all.update(Sha256::digest(bytes));
+        }
+        hexadecimal(&all.finalize())
+    }
+
+    /// Whether the files on the disk still have the bytes that were read.
+    pub(super) fn are_unchanged(&self) -> bool {
+        self.read.iter().all(|(name, file)| self.is_unchanged(name, file))
+    }
+
+    /// Like [`Files::are_unchanged`], but does not read files that were not written since.
+    pub(super) fn look_unchanged(&self) -> bool {
+        let is_as_old = |name: &str, file: &FileContent| {
+            let modified = self.root.join(name).metadata().and_then(|about| about.modified()).ok();
+            modified.is_some() && modified == file.modified
+        };
+        self.read.iter().all(|(name, file)| is_as_old(name, file) || self.is_unchanged(name, file))
+    }
+
+    fn is_unchanged(&self, name: &str, file: &FileContent) -> bool {
+        let path = self.root.join(name);
+        let has_length = path.metadata().is_ok_and(|about| about.len() == file.bytes.len() as u64);
+        has_length && std::fs::read(&path).is_ok_and(|now| now == file.bytes)
+    }
+
+    /// The names of the files that were read.
+    pub(super) fn names(&self) -> impl Iterator<Item = &str> {
+        self.read.keys().map(String::as_str)
+    }
+
+    /// The bytes of all files that were read.
+    pub(super) fn n_bytes(&self) -> u64 {
+        self.bytes
+    }
+}
+
+fn hexadecimal(bytes: &[u8]) -> String {
+    bytes.iter().fold(String::new(), |mut text, byte| {
+        let _ = write!(text, "{byte:02x}"); // writing to a String cannot fail
+        text
+    })
+}

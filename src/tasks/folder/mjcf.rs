@@ -1,0 +1,399 @@
+//! The MJCF of a folder: its includes are resolved here, inside the folder only, and MuJoCo is given a text and files of
+//! our own, so that it reads nothing from the disk.
+//!
+//! The physics' text lacks textures, materials, skins and `<visual>`, which cost memory in every simulation and change no
+//! byte of the physics; the picture's text has them.
+
+use super::{
+    error::{Error, Result, escaped},
+    files::Files,
+    table::decode,
+};
+use roxmltree::{Document, Node, ParsingOptions};
+use std::{collections::BTreeMap, fmt::Write};
+
+/// Limit of the depth of elements; MuJoCo's and this file's recursions follow it.
+const MAX_DEPTH: usize = 200;
+/// Limit of the elements, attributes and texts of one file.
+const MAX_NODES: u32 = 2_000_000;
+/// Attributes that name files, by element. `true`: the physics needs the file.
+const FILE_ATTRIBUTES: [(&str, &[&str], bool); 4] = [
+    ("mesh", &["file"], true),
+    ("hfield", &["file"], true),
+    ("texture", &["file", "fileright", "fileleft", "fileup", "filedown", "filefront", "fileback"], false),
+    ("skin", &["file"], false),
+];
+
+/// A model as MuJoCo is given it.
+#[derive(Debug)]
+pub(super) struct Mjcf {
+    /// Text that the physics is compiled from.
+    pub(super) physics: Text,
+    /// Text that pictures are drawn from.
+    pub(super) picture: Text,
+    /// The attributes that `<statistic>` gives.
+    pub(super) statistic: Vec<String>,
+    /// Whether the model's masses are scaled to a total.
+    pub(super) has_total_mass: bool,
+}
+
+/// A text of one element a line, and the files that it names.
+#[derive(Debug, Default)]
+pub(super) struct Text {
+    pub(super) xml: String,
+    /// Names and bytes, as [`perturb_mujoco::Model::from_files`] takes them.
+    pub(super) files: Vec<(String, Vec<u8>)>,
+    /// For each line of the text the file and the line it comes from.
+    lines: Vec<(usize, u32)>,
+    /// The files that lines come from.
+    sources: Vec<String>,
+}
+
+impl Text {
+    /// The file and line of a line of the text, both counted from 1.
+    pub(super) fn source(&self, line: usize) -> Option<(&str, u32)> {
+        let (file, line) = *self.lines.get(line.checked_sub(1)?)?;
+        Some((self.sources.get(file)?, line))
+    }
+
+    fn push(&mut self, element: &str, (file, line): (usize, u32)) {
+        self.xml.push_str(element);
+        self.xml.push('\n');
+        self.lines.push((file, line));
+    }
+
+    /// The name under which MuJoCo finds a file of the folder.
+    fn add_file(&mut self, path: &str, bytes: &[u8], known: &mut BTreeMap<String, String>) -> String {
+        if let Some(name) = known.get(path) {
+            return name.clone();
+        }
+        let extension: String = path.rsplit_once('.').map_or("", |(_, extension)| extension).chars().take(8).collect();
+        let extension: String = extension.to_lowercase().chars().filter(char::is_ascii_alphanumeric).collect();
+        let name = format!("file{}.{extension}", self.files.len());
+        known.insert(path.to_owned(), name.clone());
+        self.files.push((name.clone(), bytes.to_vec()));
+        name
+    }
+}
+
+/// Reads the model `main` of a folder.
+///
+/// # Errors
+/// [`Error`] with file and line.
+pub(super) fn read(files: &mut Files, main: &str) -> Result<Mjcf> {
+    let mut sources = Vec::new();
+    collect(files, main, "task.toml", &mut sources)?;
+    let documents = sources.iter().map(|(name, text)| parse(name, text)).collect::<Result<Vec<_>>>()?;
+    let root = documents[0].root_element();
+    check_root(&sources[0].0, &root)?;
+    let parts: Vec<Part<'_>> = sources
+        .iter()
+        .zip(&documents)
+        .map(|((name, text), document)| Part { name, document, line_ends: line_ends(text) })
+        .collect();
+    let folders = Folders::find(&parts);
+    let attributes = |element: &str| {
+        let all = documents.iter().flat_map(|document| document.descendants());
+        let found =
+            all.filter(|node| node.has_tag_name(element)).flat_map(|node| node.attributes().collect::<Vec<_>>());
+        found.map(|attribute| attribute.name().to_owned()).collect::<Vec<_>>()
+    };
+    let (statistic, compiler) = (attributes("statistic"), attributes("compiler"));
+    let mut writer = Writer {
+        files,
+        parts: &parts,
+        folders,
+        physics: Text::default(),
+        picture: Text::default(),
+        physics_names: BTreeMap::new(),
+        picture_names: BTreeMap::new(),
+    };
+    writer.physics.sources = parts.iter().map(|part| part.name.to_owned()).collect();
+    writer.picture.sources.clone_from(&writer.physics.sources);
+    writer.element(0, root, Kept::Both, 0)?;
+    let Writer { physics, picture, .. } = writer;
+    Ok(Mjcf { physics, picture, statistic, has_total_mass: compiler.iter().any(|name| name == "settotalmass") })
+}
+
+/// Reads a file and those that it includes, each once.
+fn collect(files: &mut Files, path: &str, who: &str, sources: &mut Vec<(String, String)>) -> Result<()> {
+    let text = decode(path, files.read(path, who)?)?.to_owned();
+    let included: Vec<String> = {
+        let document = parse(path, &text)?;
+        let included = document.descendants().filter(|node| node.has_tag_name("include"));
+        let file = |node: Node<'_, '_>| {
+            let name = node.attribute("file").map(|file| file.replace('\\', "/"));
+            name.ok_or_else(|| at(path, &node, "<include> has no file; give file=\"name.xml\""))
+        };
+        included.map(file).collect::<Result<_>>()?
+    };
+    sources.push((path.to_owned(), text));
+    for file in included {
+        if sources.iter().any(|(name, _)| *name == file) {
+            return Err(Error::file(path, format_args!("{} is included twice; include it once", escaped(&file))));
+        }
+        collect(files, &file, path, sources)?;
+    }
+    Ok(())
+}
+
+fn parse<'a>(name: &str, text: &'a str) -> Result<Document<'a>> {
+    let options = ParsingOptions { allow_dtd: false, nodes_limit: MAX_NODES, ..ParsingOptions::default() };
+    let document = Document::parse_with_options(text, options).map_err(|error| {
+        let line = error.pos().row as usize;
+        Error::line(name, line, format_args!("this is not XML: {}", escaped(&error.to_string())))
+    })?;
+    let mut depth = vec![(document.root_element(), 0)];
+    while let Some((node, level)) = depth.pop() {
+        if level > MAX_DEPTH {
+            return Err(at(name, &node, format_args!("elements are nested more than {MAX_DEPTH} deep")));
+        }
+        depth.extend(node.children().filter(Node::is_element).map(|child| (child, level + 1)));
+    }
+    Ok(document)
+}
+
+/// An error at an element.
+fn at(name: &str, node: &Node<'_, '_>, problem: impl std::fmt::Display) -> Error {
+    let line = node.document().text_pos_at(node.range().start).row;
+    Error::line(name, line as usize, problem)
+}
+
+fn check_root(name: &str, root: &Node<'_, '_>) -> Result<()> {
+    match root.tag_name().name() {
+        "mujoco" => Ok(()),
+        "robot" => {
+            Err(at(name, root, "this is URDF; convert it to MJCF, for instance with MuJoCo's program `compile`"))
+        }
+        other => Err(at(name, root, format_args!("the element is <{}>; expected <mujoco>", escaped(other)))),
+    }
+}
+
+/// A file of the model.
+struct Part<'a> {
+    name: &'a str,
+    document: &'a Document<'a>,
+    /// The offsets of line ends.
+    line_ends: Vec<usize>,
+}
+
+impl Part<'_> {
+    /// The line of an element, counted from 1.
+    fn line(&self, node: &Node<'_, '_>) -> u32 {
+        1 + self.line_ends.partition_point(|&end| end < node.range().start) as u32
+    }
+}
+
+fn line_ends(text: &str) -> Vec<usize> {
+    text.bytes().enumerate().filter(|&(_, byte)| byte == b'\n').map(|(offset, _)| offset).collect()
+}
+
+/// Folders in which the compiler looks for files. The last `<compiler>` that names one counts, as in MuJoCo.
+#[derive(Default)]
+struct Folders {
+    mesh: String,
+    texture: String,
+    strip_path: bool,
+}
+
+impl Folders {
+    fn find(parts: &[Part<'_>]) -> Self {
+        let mut folders = Self::default();
+        let elements = parts.iter().flat_map(|part| part.document.descendants());
+        for compiler in elements.filter(|node| node.has_tag_name("compiler")) {
+            if let Some(folder) = compiler.attribute("meshdir") {
+                folders.mesh = folder.to_owned();
+            }
+            if let Some(folder) = compiler.attribute("texturedir") {
+                folders.texture = folder.to_owned();
+            }
+            if let Some(strip) = compiler.attribute("strippath") {
+                folders.strip_path = strip == "true";
+            }
+        }
+        folders
+    }
+
+    /// The path within the folder of a file that an element names.
+    fn path(&self, element: &str, file: &str) -> String {
+        let file = file.replace('\\', "/");
+        let name = if self.strip_path { file.rsplit('/').next().unwrap_or_default() } else { &file };
+        let folder = if element == "texture" { &self.texture } else { &self.mesh };
+        match folder.trim_end_matches(['/', '\\']) {
+            "" => name.to_owned(),
+            folder => format!("{}/{name}", folder.replace('\\', "/")),
+        }
+    }
+}
+
+/// The texts that an element stands in.
+#[derive(Clone, Copy, PartialEq)]
+enum Kept {
+    Both,
+    PictureOnly,
+}
+
+struct Writer<'a> {
+    files: &'a mut Files,
+    parts: &'a [Part<'a>],
+    folders: Folders,
+    physics: Text,
+    picture: Text,
+    /// The files of the physics' text, by their paths.
+    physics_names: BTreeMap<String, String>,
+    picture_names: BTreeMap<String, String>,
+}
+
+impl Writer<'_> {
+    fn element(&mut self, part: usize, node: Node<'_, '_>, kept: Kept, depth: usize) -> Result<()> {
+        let (name, tag) = (self.parts[part].name, node.tag_name().name());
+        if depth > MAX_DEPTH {
+            return Err(at(name, &node, format_args!("elements are nested more than {MAX_DEPTH} deep")));
+        }
+        if tag == "include" {
+            return self.include(node, kept, depth);
+        }
+        let kept = if is_visual(&node) { Kept::PictureOnly } else { kept };
+        let (mut physics, mut picture) = (format!("<{tag}"), format!("<{tag}"));
+        for attribute in node.attributes() {
+            let key = attribute.name();
+            if tag == "compiler" && ["meshdir", "texturedir", "strippath"].contains(&key) {
+                continue;
+            }
+            let (value, picture_value) = match names_file(tag, key) {
+                Some(needed) => self.file(part, &node, attribute.value(), needed && kept == Kept::Both)?,
+                None => (attribute.value().to_owned(), attribute.value().to_owned()),
+            };
+            if key != "material" {
+                write_attribute(&mut physics, key, &value);
+            }
+            write_attribute(&mut picture, key, &picture_value);
+        }
+        // Without a name the element would be called after its file, which has another name now.
+        if let Some(file) = node.attribute("file").filter(|_| names_file(tag, "file").is_some()) {
+            if !node.has_attribute("name") && !in_defaults(&node) {
+                let stem = file.rsplit(['/', '\\']).next().unwrap_or_default();
+                let stem = stem.rsplit_once('.').map_or(stem, |(stem, _)| stem);
+                write_attribute(&mut physics, "name", stem);
+                write_attribute(&mut picture, "name", stem);
+            }
+        }
+        let place = (part, self.parts[part].line(&node));
+        let children: Vec<Node<'_, '_>> = node.children().filter(Node::is_element).collect();
+        let end = if children.is_empty() { "/>" } else { ">" };
+        if kept == Kept::Both {
+            self.physics.push(&format!("{physics}{end}"), place);
+        }
+        self.picture.push(&format!("{picture}{end}"), place);
+        for &child in &children {
+            self.element(part, child, kept, depth + 1)?;
+        }
+        if !children.is_empty() {
+            if kept == Kept::Both {
+                self.physics.push(&format!("</{tag}>"), place);
+            }
+            self.picture.push(&format!("</{tag}>"), place);
+        }
+        Ok(())
+    }
+
+    /// Writes the elements of an included file in its place.
+    fn include(&mut self, node: Node<'_, '_>, kept: Kept, depth: usize) -> Result<()> {
+        let file = node.attribute("file").unwrap_or_default().replace('\\', "/");
+        let parts = self.parts;
+        let Some(part) = parts.iter().position(|part| part.name == file) else { return Ok(()) };
+        for child in parts[part].document.root_element().children().filter(Node::is_element) {
+            self.element(part, child, kept, depth + 1)?;
+        }
+        Ok(())
+    }
+
+    /// The names of a file in both texts. Files of pictures alone are read, too: they count for the hash.
+    fn file(&mut self, part: usize, node: &Node<'_, '_>, value: &str, needed: bool) -> Result<(String, String)> {
+        let source = &self.parts[part];
+        let path = self.folders.path(node.tag_name().name(), value);
+        let who = format!("{}, line {}", escaped(source.name), source.line(node));
+        let bytes = self.files.read(&path, &who)?;
+        let picture = self.picture.add_file(&path, bytes, &mut self.picture_names);
+        let physics =
+            if needed { self.physics.add_file(&path, bytes, &mut self.physics_names) } else { picture.clone() };
+        Ok((physics, picture))
+    }
+}
+
+/// Whether an attribute names a file, and whether the physics needs it.
+fn names_file(tag: &str, key: &str) -> Option<bool> {
+    FILE_ATTRIBUTES.iter().find(|(element, keys, _)| *element == tag && keys.contains(&key)).map(|entry| entry.2)
+}
+
+/// Whether an element concerns pictures alone.
+fn is_visual(node: &Node<'_, '_>) -> bool {
+    match node.tag_name().name() {
+        "visual" | "texture" | "material" => true,
+        // A composite's skin is a part of its geometry's description.
+        "skin" => node.parent().is_some_and(|parent| parent.has_tag_name("asset")),
+        _ => false,
+    }
+}
+
+fn in_defaults(node: &Node<'_, '_>) -> bool {
+    node.ancestors().any(|ancestor| ancestor.has_tag_name("default"))
+}
+
+fn write_attribute(element: &mut String, key: &str, value: &str) {
+    let _ = write!(element, " {key}=\""); // writing to a String cannot fail
+    for character in value.chars() {
+        match character {
+            '&' => element.push_str("&amp;"),
+            '<' => element.push_str("&lt;"),
+            '>' => element.push_str("&gt;"),
+            '"' => element.push_str("&quot;"),
+            '\n' | '\r' | '\t' => element.push(' '),
+            other => element.push(other),
+        }
+    }
+    element.push('"');
+}
+
+/// Returns MuJoCo's error about a text, with the file and line of the user, and a hint where a newer MuJoCo is needed.
+pub(super) fn explain(text: &Text, main: &str, reason: &str) -> Error {
+    let said = escaped_reason(reason);
+    let line = reason.split("line ").nth(1).and_then(|rest| {
+        let digits: String = rest.chars().take_while(char::is_ascii_digit).collect();
+        digits.parse::<usize>().ok()
+    });
+    let hint = HINTS.iter().find(|(word, _)| reason.contains(&format!("'{word}'")));
+    let hint = hint.map_or_else(String::new, |(word, hint)| {
+        format!("; {word} came with a newer MuJoCo than this server's, 2.2.2: {hint}")
+    });
+    let problem = format!("MuJoCo 2.2.2 says: {said}{hint}");
+    match line.and_then(|line| text.source(line)) {
+        Some((file, line)) => Error::line(file, line as usize, problem),
+        None => Error::file(main, problem),
+    }
+}
+
+/// MuJoCo's words without its own line and column, which are those of the rewritten text.
+fn escaped_reason(reason: &str) -> String {
+    let cut = reason.find(", line ").unwrap_or(reason.len());
+    let words: String = reason[..cut].chars().flat_map(char::escape_debug).collect();
+    words.replace("\\'", "'").replace("\\\"", "\"").trim().to_owned()
+}
+
+/// Words of newer versions of MJCF, and what to write for 2.2.2.
+const HINTS: [(&str, &str); 14] = [
+    ("actuatorfrcrange", "limit the actuator's force by its forcerange"),
+    ("actuatorfrclimited", "limit the actuator's force by its forcerange"),
+    ("implicitfast", "use integrator=\"implicit\""),
+    ("nativeccd", "leave the flag out"),
+    ("multiccd", "leave the flag out"),
+    ("gravcomp", "leave it out, or cancel the gravity of the body by a force of your own"),
+    ("memory", "use nstack, njmax and nconmax"),
+    ("assetdir", "use meshdir and texturedir"),
+    ("resolution", "leave it out; requests for pictures say their size"),
+    ("distance", "use a rangefinder, or the positions of two sites"),
+    ("adhesion", "use another actuator"),
+    ("dampratio", "compute kv from it"),
+    ("timeconst", "use dyntype=\"filter\" of a general actuator"),
+    ("inheritrange", "give ctrlrange"),
+];

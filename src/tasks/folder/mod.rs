@@ -1,0 +1,40 @@
+//! Tasks that are folders: an MJCF model and a file `task.toml`. docs/tasks.md explains the file.
+//!
+//! A folder is loaded in this order:
+//!
+//! - `files` reads what the folder holds, and nothing outside of it; `table` reads TOML with places for errors.
+//! - `mjcf` resolves includes and gives MuJoCo texts of our own; `elements` knows the model's names.
+//! - `file` puts the task together of `reading` with its `number`s, `reward`, `rules`, `reset` and `parameter` with its `target`s.
+//! - `checks` refuses edits that can do nothing, and `effect` looks for edits without an effect that can be seen.
+//! - `environment` is the environment, whose simulations `template` shares among all of a thread.
+//! - `child` loads a folder for the first time in a process of its own, and `report` says what `--check` prints.
+
+mod checks;
+pub mod child;
+mod effect;
+mod elements;
+mod environment;
+mod error;
+mod file;
+mod files;
+mod load;
+mod mjcf;
+mod number;
+mod parameter;
+mod picture;
+mod reading;
+mod reading_source;
+mod report;
+mod reset;
+mod reward;
+mod rules;
+mod table;
+mod target;
+mod template;
+
+pub use error::{Error, LoadError};
+pub use load::{Folder, load, read_model};
+pub use report::report;
+
+/// A JSON schema of `task.toml`.
+pub const SCHEMA: &str = include_str!("schema.json");

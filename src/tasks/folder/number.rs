@@ -1,0 +1,197 @@
+//! The numbers of readings, and how each is read.
+
+use perturb_mujoco::{Field, Model, Reading as Array, Simulation};
+
+/// The computation that a reading needs before it is read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Stage {
+    /// Positions, velocities, actions: they are always there.
+    State,
+    /// Poses and velocities of bodies.
+    Motion,
+    /// Contacts, forces and sensors.
+    Forward,
+}
+
+/// A number that is read.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Number {
+    /// Consecutive numbers of an array: (first, how many).
+    Array(Array, usize, usize),
+    /// Sine of an entry of `qpos`.
+    Sin(usize),
+    /// Cosine of an entry of `qpos`.
+    Cos(usize),
+    /// A joint's position, with its range scaled to ±1: (joint, entry of `qpos`).
+    Scaled(usize, usize),
+    /// A component of a body's velocity at its centre of mass: 0 to 2 angular, 3 to 5 linear.
+    BodyVelocity(usize, usize),
+    /// A body's turn about x, y or z: 0 roll, 1 pitch, 2 yaw.
+    Angle(usize, usize),
+    /// Whether a geom touches another.
+    Touching(usize),
+    /// A component of the common centre of mass of bodies.
+    Centre(Vec<usize>, usize),
+    /// A component of the vector between two points.
+    Between(Point, Point, usize),
+    /// The distance of two points.
+    Distance(Point, Point),
+    /// An entry of the action as it was received.
+    Action(usize),
+    /// An entry of the action of the step before.
+    PreviousAction(usize),
+    Constant(f64),
+    /// Simulated seconds since the reset.
+    Time,
+}
+
+/// A point whose position MuJoCo computes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Point {
+    pub(super) array: Array,
+    pub(super) id: usize,
+}
+
+/// A number's name within the language, such as `root.x`, its name as a channel, and its unit and range.
+#[derive(Debug, Clone)]
+pub(super) struct Entry {
+    /// Name by which `without` and `axes` find it.
+    pub(super) name: String,
+    /// The element's name alone.
+    pub(super) element: String,
+    /// The kind of element, to tell names apart that occur twice.
+    pub(super) kind: &'static str,
+    /// Name as a channel of the observation.
+    pub(super) channel: String,
+    pub(super) unit: &'static str,
+    pub(super) low: f64,
+    pub(super) high: f64,
+}
+
+/// The actions that numbers of a step follow from, beside the simulation.
+pub(super) struct Context<'a> {
+    /// The action as received, `[A]`.
+    pub(super) action: &'a [f32],
+    /// The action of the step before, `[A]`.
+    pub(super) previous_action: &'a [f32],
+}
+
+/// The names of numbers as channels, each unique.
+pub(super) fn unique_channels<'a>(entries: impl Iterator<Item = &'a Entry>) -> Vec<String> {
+    let mut names: Vec<String> = Vec::new();
+    let mut taken = std::collections::BTreeSet::new();
+    for entry in entries {
+        let mut name = entry.channel.clone();
+        if taken.contains(&name) {
+            name = format!("{}_{name}", entry.kind);
+        }
+        let base = name.clone();
+        let mut number = 2;
+        while !taken.insert(name.clone()) {
+            name = format!("{base}_{number}");
+            number += 1;
+        }
+        names.push(name);
+    }
+    names
+}
+
+/// An entry without bounds.
+pub(super) fn entry(element: &str, part: &str, suffix: String, unit: &'static str) -> Entry {
+    let name = if part.is_empty() { element.to_owned() } else { format!("{element}.{part}") };
+    Entry {
+        name,
+        element: element.to_owned(),
+        kind: "",
+        channel: channel_name(&suffix),
+        unit,
+        low: f64::NEG_INFINITY,
+        high: f64::INFINITY,
+    }
+}
+
+/// A text as a channel's name: letters, digits and underscores, and `#` before the number of an element without a name.
+pub(super) fn channel_name(text: &str) -> String {
+    text.chars().map(|c| if c.is_alphanumeric() || c == '#' { c } else { '_' }).collect()
+}
+
+impl Number {
+    /// Returns the computation that is needed before.
+    pub(super) fn stage(&self) -> Stage {
+        use Array::{
+            Activations, BodyCentres, BodyInertias, BodyPositions, BodyRotations, BodyVelocities, Controls,
+            GeomPositions, Positions, SitePositions, Velocities,
+        };
+        match self {
+            Self::Array(Positions | Velocities | Controls | Activations, ..)
+            | Self::Sin(_)
+            | Self::Cos(_)
+            | Self::Scaled(..)
+            | Self::Action(_)
+            | Self::PreviousAction(_)
+            | Self::Constant(_)
+            | Self::Time => Stage::State,
+            Self::Array(
+                BodyPositions | BodyRotations | BodyCentres | BodyInertias | BodyVelocities | GeomPositions
+                | SitePositions,
+                ..,
+            )
+            | Self::BodyVelocity(..)
+            | Self::Angle(..)
+            | Self::Centre(..)
+            | Self::Between(..)
+            | Self::Distance(..) => Stage::Motion,
+            Self::Array(..) | Self::Touching(_) => Stage::Forward,
+        }
+    }
+
+    /// Appends the number, or the numbers of an array.
+    pub(super) fn read(&self, simulation: &Simulation, context: &Context<'_>, out: &mut Vec<f64>) {
+        let value = match self {
+            Self::Array(array, first, length) => {
+                out.extend_from_slice(&simulation.reading(*array)[*first..first + length]);
+                return;
+            }
+            Self::Sin(at) => libm::sin(simulation.qpos()[*at]),
+            Self::Cos(at) => libm::cos(simulation.qpos()[*at]),
+            Self::Scaled(joint, at) => scaled(simulation.model(), *joint, simulation.qpos()[*at]),
+            Self::BodyVelocity(body, i) => simulation.body_velocity(*body)[*i],
+            Self::Angle(body, which) => {
+                let m = simulation.xmat(*body);
+                match which {
+                    0 => libm::atan2(m[7], m[8]),
+                    1 => libm::asin((-m[6]).clamp(-1.0, 1.0)),
+                    _ => libm::atan2(m[3], m[0]),
+                }
+            }
+            Self::Touching(geom) => f64::from(u8::from(simulation.contacts().any(|(a, b)| a == *geom || b == *geom))),
+            Self::Centre(bodies, axis) => {
+                let (mass, centres) = (simulation.model().body_mass(), simulation.reading(Array::BodyCentres));
+                let weighted: f64 = bodies.iter().map(|&body| mass[body] * centres[3 * body + axis]).sum();
+                weighted / bodies.iter().map(|&body| mass[body]).sum::<f64>()
+            }
+            Self::Between(from, to, axis) => to.read(simulation)[*axis] - from.read(simulation)[*axis],
+            Self::Distance(from, to) => {
+                let (from, to) = (from.read(simulation), to.read(simulation));
+                (0..3).map(|i| (to[i] - from[i]) * (to[i] - from[i])).sum::<f64>().sqrt()
+            }
+            Self::Action(at) => f64::from(context.action[*at]),
+            Self::PreviousAction(at) => f64::from(context.previous_action[*at]),
+            Self::Constant(value) => *value,
+            Self::Time => simulation.time(),
+        };
+        out.push(value);
+    }
+}
+
+impl Point {
+    fn read(self, simulation: &Simulation) -> &[f64] {
+        &simulation.reading(self.array)[3 * self.id..][..3]
+    }
+}
+
+/// A joint's position, with its range scaled to ±1.
+pub(super) fn scaled(model: &Model, joint: usize, position: f64) -> f64 {
+    let range = &model.field(Field::JointRange)[2 * joint..][..2];
+    2.0 * (position - (range[0] + range[1]) / 2.0) / (range[1] - range[0])
+}

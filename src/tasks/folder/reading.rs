@@ -1,0 +1,149 @@
+//! Readings: what a task reads from the simulation, as a list of numbers with names.
+
+use super::{
+    elements::Elements,
+    error::{Result, escaped, listed},
+    number::{Context, Entry, Number, Stage},
+    reading_source::Source,
+    table::{Table, Value},
+};
+use perturb_mujoco::{Kind, Model, Reading as Array, Simulation};
+
+/// Subjects of readings, by the key that names them.
+const SUBJECTS: [&str; 12] = [
+    "joint",
+    "body",
+    "site",
+    "geom",
+    "com",
+    "from",
+    "sensor",
+    "actuator",
+    "action",
+    "previous_action",
+    "constant",
+    "time",
+];
+/// The keys of a reading beside its subject.
+const OPTIONS: [&str; 6] = ["to", "get", "axes", "without", "scale", "clip"];
+
+/// A list of numbers.
+#[derive(Debug, Clone)]
+pub(super) struct Reading {
+    numbers: Vec<Number>,
+    entries: Vec<Entry>,
+    scale: f64,
+    clip: Option<(f64, f64)>,
+}
+
+impl Reading {
+    /// Reads the table of a reading.
+    pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements) -> Result<Self> {
+        table.only(&[&SUBJECTS[..], &OPTIONS].concat())?;
+        let (subject, value) = table.one_of(&SUBJECTS).map_err(|_| {
+            let subjects = SUBJECTS.join(", ");
+            table.error(format_args!("this reads nothing, or more than one thing; name one of {subjects}"))
+        })?;
+        let source = Source { table, model, elements };
+        let mut all = source.numbers(subject, &value)?;
+        if subject != "from" && table.has("to") {
+            return Err(table.error("`to` goes with `from`: the vector from one point to another"));
+        }
+        if let Some(axes) = table.get("axes") {
+            source.only_axes(&axes, &mut all)?;
+        }
+        if let Some(without) = table.get("without") {
+            for name in without.texts()? {
+                let fits = |entry: &Entry| entry.name == name || entry.element == name;
+                let is_left_out = subject == "joint" && elements.names(Kind::Joint).iter().any(|joint| joint == name);
+                if !is_left_out && !all.iter().any(|(_, entry)| fits(entry)) {
+                    let there = listed(all.iter().map(|(_, entry)| entry.name.as_str()));
+                    return Err(without.error(format_args!("there is no {:?} to leave out of {there}", escaped(name))));
+                }
+                all.retain(|(_, entry)| !fits(entry));
+            }
+        }
+        if all.is_empty() {
+            return Err(table.error("nothing is left to be read"));
+        }
+        let scale = table.number("scale")?.unwrap_or(1.0);
+        let clip = table.get("clip").map(|value| clip(&value)).transpose()?;
+        let (numbers, mut entries): (Vec<_>, Vec<_>) = all.into_iter().unzip();
+        for entry in &mut entries {
+            (entry.low, entry.high) = range((entry.low, entry.high), scale, clip);
+            if scale != 1.0 {
+                entry.unit = "1";
+                entry.channel.push_str("_scaled");
+            }
+        }
+        Ok(Self { numbers: join(numbers), entries, scale, clip })
+    }
+
+    /// The number of numbers.
+    pub(super) fn len(&self) -> usize {
+        self.entries.len()
+    }
+
+    /// The numbers' names, units and ranges.
+    pub(super) fn entries(&self) -> &[Entry] {
+        &self.entries
+    }
+
+    /// Returns the computation that is needed before.
+    pub(super) fn stage(&self) -> Stage {
+        self.numbers.iter().map(Number::stage).max().unwrap_or(Stage::State)
+    }
+
+    /// Whether the external forces on bodies are read.
+    pub(super) fn needs_external_forces(&self) -> bool {
+        self.numbers.iter().any(|number| matches!(number, Number::Array(Array::BodyExternalForces, ..)))
+    }
+
+    /// Appends the numbers.
+    pub(super) fn read(&self, simulation: &Simulation, context: &Context<'_>, out: &mut Vec<f64>) {
+        let begin = out.len();
+        for number in &self.numbers {
+            number.read(simulation, context, out);
+        }
+        if self.scale != 1.0 {
+            out[begin..].iter_mut().for_each(|value| *value *= self.scale);
+        }
+        if let Some((low, high)) = self.clip {
+            out[begin..].iter_mut().for_each(|value| *value = value.clamp(low, high));
+        }
+    }
+}
+
+fn clip(value: &Value<'_>) -> Result<(f64, f64)> {
+    if value.is_list() {
+        let (low, high) = value.interval()?;
+        return Ok((low, high));
+    }
+    match value.number()? {
+        limit if limit > 0.0 => Ok((-limit, limit)),
+        limit => Err(value.error(format_args!("{limit} is not above 0; give a limit, or [low, high]"))),
+    }
+}
+
+fn range((low, high): (f64, f64), scale: f64, clip: Option<(f64, f64)>) -> (f64, f64) {
+    let ends = if scale == 0.0 { [0.0, 0.0] } else { [low * scale, high * scale] };
+    let (low, high) = (ends[0].min(ends[1]), ends[0].max(ends[1]));
+    let (low, high) = clip.map_or((low, high), |(least, most)| (low.clamp(least, most), high.clamp(least, most)));
+    if low < high { (low, high) } else { (low, low + 1.0) }
+}
+
+/// Joins neighbouring numbers of an array.
+fn join(numbers: Vec<Number>) -> Vec<Number> {
+    let mut joined: Vec<Number> = Vec::new();
+    for number in numbers {
+        if let (Some(Number::Array(last, first, length)), Number::Array(array, next, 1)) = (joined.last_mut(), &number)
+        {
+            if last == array && *first + *length == *next {
+                *length += 1;
+                continue;
+            }
+        }
+        joined.push(number);
+    }
+    joined
+}

@@ -1,0 +1,183 @@
+//! The report that `--check` prints of a folder.
+
+use super::{
+    effect,
+    environment::{Poses, Task},
+    error::{Error, LoadError},
+    files::Files,
+    load::{Folder, load},
+};
+use crate::env::{Action, ActionSpace, Channel, Episodes, Purpose, Settings, Stream, Version};
+use perturb_mujoco::Kind;
+use std::{fmt::Write, path::Path, time::Duration};
+use tokio::time::Instant;
+
+/// Duration for which steps are timed.
+const TIMED: Duration = Duration::from_millis(200);
+/// Lists longer than this are shortened.
+const MAX_LISTED: usize = 24;
+
+impl Folder {
+    /// The parameters whose edits have no effect that can be seen in some steps from the initial state.
+    ///
+    /// # Errors
+    /// [`Error`] if MuJoCo raises a fatal error.
+    pub fn parameters_without_effect(&self) -> Result<Vec<&'static str>, Error> {
+        effect::unseen(self.task).map_err(Error::folder)
+    }
+}
+
+/// Loads a folder and describes it: model, observations, actions, rewards, ends, parameters, sizes, speed, and which
+/// edits have no effect that can be seen. The speed is measured if `measured`.
+///
+/// # Errors
+/// [`LoadError`] with the place and the remedy.
+pub fn report(path: &Path, measured: bool) -> Result<String, LoadError> {
+    let refuse = |error: Error| LoadError::new(path, error);
+    let folder = load(path).map_err(refuse)?;
+    let unseen = folder.parameters_without_effect().map_err(refuse)?;
+    let trial = measured.then(|| try_steps(folder.task)).transpose();
+    let trial = trial.map_err(|error| LoadError::new(path, error))?;
+    let mut text = String::new();
+    // Writing to a String cannot fail.
+    let _ = describe(&mut text, folder.task, folder.files, &unseen, trial);
+    Ok(text)
+}
+
+fn describe(out: &mut String, task: &Task, files: &Files, unseen: &[&str], trial: Option<Trial>) -> std::fmt::Result {
+    let (spec, model) = (&task.spec, &task.template.model);
+    let names: Vec<&str> = files.names().collect();
+    writeln!(out, "{}: {}", spec.name, spec.description)?;
+    writeln!(out, "  files         {} ({} kB): {}", names.len(), files.n_bytes() / 1000, shortened(&names))?;
+    writeln!(out, "  hash          {}", task.hash)?;
+    writeln!(
+        out,
+        "  model         {} bodies, {} joints, {} degrees of freedom, {} geoms, {} actuators, {} sensors",
+        model.n_body() - 1,
+        model.n_joint(),
+        model.n_v(),
+        model.n_geom(),
+        model.n_u(),
+        model.count(Kind::Sensor)
+    )?;
+    writeln!(
+        out,
+        "  step          {} timesteps of {} s, at most {} steps an episode; poses of bodies are {}",
+        task.frame_skip,
+        model.timestep(),
+        spec.step_limit,
+        if task.poses == Poses::Before { "those before the last timestep" } else { "those after the step" }
+    )?;
+    let channels = |channels: &[Channel]| shortened(&channels.iter().map(|channel| channel.name).collect::<Vec<_>>());
+    writeln!(out, "  observation   {} numbers: {}", spec.observation.len(), channels(spec.observation))?;
+    if let ActionSpace::Continuous(actions) = spec.action {
+        writeln!(out, "  action        {} numbers: {}", actions.len(), channels(actions))?;
+    }
+    writeln!(out, "  exact state   {} numbers: {}", spec.state.len(), channels(spec.state))?;
+    for term in spec.reward_terms {
+        writeln!(out, "  reward        {}: {}", term.name, term.description)?;
+    }
+    let ends = match (task.healthy.len(), task.terminate_when_unhealthy) {
+        (0, _) => "at the limit of steps",
+        (_, true) => "where it is not healthy, or at the limit of steps",
+        (_, false) => "at the limit of steps; where it is not healthy, terms of health change",
+    };
+    writeln!(out, "  episodes end  {ends}")?;
+    writeln!(out, "  success       {}", spec.success.description)?;
+    if spec.parameters.is_empty() {
+        writeln!(out, "  parameters    none: versions D, R and E are the same")?;
+    }
+    for parameter in spec.parameters {
+        let [below, above] = parameter.extreme;
+        writeln!(
+            out,
+            "  parameter     {} ({}): D {}, R [{}, {}], E [{}, {}] and [{}, {}], within [{}, {}]: {}",
+            parameter.name,
+            parameter.unit,
+            parameter.default,
+            parameter.random.low,
+            parameter.random.high,
+            below.low,
+            below.high,
+            above.low,
+            above.high,
+            parameter.bounds.low,
+            parameter.bounds.high,
+            parameter.description
+        )?;
+    }
+    for quantity in &task.applied {
+        writeln!(out, "  receipts have {} ({}), too", quantity.quantity.name, quantity.quantity.unit)?;
+    }
+    if task.has_total_mass {
+        writeln!(out, "  note          the model has settotalmass: an edited mass is not rescaled to that total")?;
+    }
+    writeln!(
+        out,
+        "  memory        at most {} kB a thread for the simulation; {} kB of it for the model",
+        model.simulation_bytes() / 1000,
+        model.model_bytes() / 1000
+    )?;
+    if let Some(Trial { steps_per_second, episodes, diverged }) = trial {
+        writeln!(out, "  speed         {steps_per_second:.0} steps a second on one core")?;
+        if diverged > 0 {
+            writeln!(
+                out,
+                "  warning       the physics diverged in {diverged} of {episodes} episodes of random actions; try a smaller \
+                 timestep"
+            )?;
+        }
+    }
+    for name in unseen {
+        writeln!(
+            out,
+            "  warning       parameter {name}: 200 timesteps from the initial state are the same bytes at both ends of E; \
+             it may have no effect"
+        )?;
+    }
+    Ok(())
+}
+
+fn shortened(names: &[&str]) -> String {
+    if names.len() <= MAX_LISTED {
+        return names.join(", ");
+    }
+    format!("{}, …, {}", names[..MAX_LISTED - 1].join(", "), names[names.len() - 1])
+}
+
+/// Steps of random actions on version D.
+struct Trial {
+    steps_per_second: f64,
+    /// Episodes that ended.
+    episodes: u32,
+    /// Episodes that ended because the physics diverged.
+    diverged: u32,
+}
+
+/// Takes steps for [`TIMED`].
+fn try_steps(task: &'static Task) -> Result<Trial, crate::env::Error> {
+    let spec = &task.spec;
+    let distributions = spec.distributions(Version::D);
+    let settings = Settings { seed: 0, environment_index: 0, distributions, episodes_per_trial: 1 };
+    let mut episodes = Episodes::new((spec.make)()?, settings);
+    let mut trial = Trial { steps_per_second: 0.0, episodes: 0, diverged: 0 };
+    let ActionSpace::Continuous(channels) = spec.action else { return Ok(trial) };
+    let mut stream = Stream::new(1, 0, Purpose::InitialState, 0);
+    let mut terms = vec![0.0; spec.reward_terms.len()];
+    let mut action = vec![0.0; channels.len()];
+    let (start, mut steps) = (Instant::now(), 0.0);
+    while start.elapsed() < TIMED {
+        for (value, channel) in action.iter_mut().zip(channels) {
+            *value = stream.uniform(channel.low, channel.high) as f32;
+        }
+        episodes.step(Action::Continuous(&action), &mut terms);
+        steps += 1.0;
+        if episodes.ended() {
+            trial.episodes += 1;
+            trial.diverged += u32::from(episodes.finished(false).diverged);
+            episodes.begin(None);
+        }
+    }
+    trial.steps_per_second = steps / start.elapsed().as_secs_f64();
+    Ok(trial)
+}

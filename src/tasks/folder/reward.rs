@@ -1,0 +1,356 @@
+//! The reward's terms.
+
+use super::{
+    elements::{Elements, actuated_joint},
+    error::{Result, escaped},
+    number::{Context, Stage, scaled},
+    reading::Reading,
+    rules::leaked,
+    table::{Table, Value},
+};
+use crate::env::RewardTerm;
+use perturb_mujoco::{Flags, Index, Kind, Model, Simulation};
+
+/// Kinds of terms, by the key that names them.
+pub(super) const KINDS: [&str; 10] =
+    ["value", "rate", "squared", "norm", "within", "near", "power", "limits", "healthy", "constant"];
+pub(super) const OPTIONS: [&str; 11] =
+    ["name", "description", "weight", "mean", "target", "at_least", "at_most", "range", "margin", "sigma", "otherwise"];
+/// Limit of the absolute value of a term: actions may be as large as an f32 can be, and their squares must not make a
+/// reward that is not finite.
+const MAX_TERM: f64 = 1e30;
+/// The part of a joint's range beyond which it is at its limit.
+const AT_LIMIT: f64 = 0.99;
+
+/// A term of the reward.
+#[derive(Debug, Clone)]
+pub(super) struct Term {
+    pub(super) about: RewardTerm,
+    kind: TermKind,
+    weight: f64,
+    mean: bool,
+    target: Vec<f64>,
+    at_least: Option<f64>,
+    at_most: Option<f64>,
+}
+
+#[derive(Debug, Clone)]
+enum TermKind {
+    Value(Reading),
+    /// The first of its numbers among those of the step before.
+    Rate(Reading, usize),
+    Squared(Reading),
+    Norm(Reading),
+    Within {
+        reading: Reading,
+        low: f64,
+        high: f64,
+        margin: f64,
+    },
+    Near {
+        reading: Reading,
+        sigma: f64,
+    },
+    /// For each actuator its number and the entry of `qvel`.
+    Power(Vec<(usize, usize)>),
+    /// For each joint its number and the entry of `qpos`.
+    Limits(Vec<(usize, usize)>),
+    Healthy {
+        otherwise: f64,
+    },
+    Constant,
+}
+
+/// Values that terms follow from, beside the simulation.
+pub(super) struct Step<'a> {
+    pub(super) context: Context<'a>,
+    pub(super) healthy: bool,
+    /// Simulated seconds of a step.
+    pub(super) seconds: f64,
+    /// The numbers of [`Term::remembered`] after the step before, of all terms.
+    pub(super) before: &'a [f64],
+}
+
+impl Term {
+    /// Reads the table of a term; `n_remembered` is the number of numbers that earlier terms remember.
+    pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements, n_remembered: usize) -> Result<Self> {
+        let name = table.require("name", "\"forward\"")?;
+        let name = identifier(&name, name.text()?)?;
+        let table = &table.clone().at(format!("reward {name}"));
+        table.only(&[&KINDS[..], &OPTIONS].concat())?;
+        let (key, value) = table.one_of(&KINDS)?;
+        let reading = || Reading::new(&value.table()?, model, elements);
+        for (option, kinds) in [
+            ("target", &["squared", "norm", "near"][..]),
+            ("range", &["within"]),
+            ("margin", &["within"]),
+            ("sigma", &["near"]),
+            ("otherwise", &["healthy"]),
+            ("mean", &["value", "rate", "squared", "power", "limits"]),
+        ] {
+            if let Some(value) = table.get(option).filter(|_| !kinds.contains(&key)) {
+                return Err(value.error(format_args!("{option} goes with {}, not with {key}", kinds.join(", "))));
+            }
+        }
+        let mut weight = table.number("weight")?;
+        let kind = match key {
+            "value" => TermKind::Value(reading()?),
+            "rate" => TermKind::Rate(reading()?, n_remembered),
+            "squared" => TermKind::Squared(reading()?),
+            "norm" => TermKind::Norm(reading()?),
+            "within" => {
+                let (low, high) = table.require("range", "[0.0, 1.0]")?.interval()?;
+                let margin = table.number("margin")?.unwrap_or(0.0);
+                if margin < 0.0 {
+                    return Err(table.error(format_args!("margin is {margin}; expected 0 or more")));
+                }
+                TermKind::Within { reading: reading()?, low, high, margin }
+            }
+            "near" => {
+                let sigma = table.require("sigma", "0.1")?;
+                let width = sigma.number()?;
+                if width <= 0.0 {
+                    return Err(sigma.error(format_args!("{width} is not above 0")));
+                }
+                TermKind::Near { reading: reading()?, sigma: width }
+            }
+            "power" => TermKind::Power(power(&value, model, elements)?),
+            "limits" => TermKind::Limits(limits(&value, model, elements)?),
+            "healthy" | "constant" => {
+                if let Some(value) = table.get("weight") {
+                    return Err(value.error(format_args!("{key} is the term's value itself; leave weight out")));
+                }
+                weight = Some(value.number()?);
+                if key == "healthy" {
+                    TermKind::Healthy { otherwise: table.number("otherwise")?.unwrap_or(0.0) }
+                } else {
+                    TermKind::Constant
+                }
+            }
+            _ => return Err(value.error("this kind of term is unknown")),
+        };
+        let weight = weight.unwrap_or(1.0);
+        let mut term = Self {
+            about: RewardTerm { name: leaked(name), description: "" },
+            target: target(table, kind.reading())?,
+            kind,
+            weight,
+            mean: table.flag("mean")?.unwrap_or(false),
+            at_least: table.number("at_least")?,
+            at_most: table.number("at_most")?,
+        };
+        for (key, limit) in [("at_least", term.at_least), ("at_most", term.at_most)] {
+            if let Some(limit) = limit.filter(|&limit| limit < 0.0) {
+                return Err(
+                    table.error(format_args!("{key} is {limit}; it limits the term's absolute value: give 0 or more"))
+                );
+            }
+        }
+        if let (Some(least), Some(most)) = (term.at_least, term.at_most) {
+            if least > most {
+                return Err(table.error(format_args!("at_least {least} is above at_most {most}")));
+            }
+        }
+        term.about.description = match table.text("description")? {
+            Some(description) => leaked(description),
+            None => leaked(&term.formula(key)),
+        };
+        Ok(term)
+    }
+
+    /// The term as a formula.
+    fn formula(&self, key: &str) -> String {
+        let names = self.kind.reading().map_or_else(String::new, |reading| {
+            let channels: Vec<&str> = reading.entries().iter().map(|entry| entry.channel.as_str()).collect();
+            match channels[..] {
+                [one] => one.to_owned(),
+                [first, .., last] => format!("{first} … {last}"),
+                [] => String::new(),
+            }
+        });
+        let weight = self.weight;
+        let target = match self.target[..] {
+            [] => String::new(),
+            [target] => format!(" less {target}"),
+            _ => " less its target".into(),
+        };
+        let sum = if self.mean { "mean" } else { "sum" };
+        match &self.kind {
+            TermKind::Value(_) => format!("{weight} × {sum} of {names}"),
+            TermKind::Rate(..) => format!("{weight} × change of {names} a second"),
+            TermKind::Squared(_) => format!("{weight} × {sum} of squares of {names}{target}"),
+            TermKind::Norm(_) => format!("{weight} × length of {names}{target}"),
+            TermKind::Within { low, high, .. } => format!("{weight} while {names} is within [{low}, {high}]"),
+            TermKind::Near { sigma, .. } => format!("{weight} × exp(-|{names}{target}|² / {sigma}²)"),
+            TermKind::Power(_) => format!("{weight} × {sum} of |action × joint velocity|"),
+            TermKind::Limits(_) => format!("{weight} × {sum} of joints beyond 99 % of their range"),
+            TermKind::Healthy { otherwise } => format!("{weight} while healthy, else {otherwise}"),
+            TermKind::Constant => format!("{weight} ({key})"),
+        }
+    }
+
+    /// The reading whose numbers must be remembered from one step to the next.
+    pub(super) fn remembered(&self) -> Option<&Reading> {
+        match &self.kind {
+            TermKind::Rate(reading, _) => Some(reading),
+            _ => None,
+        }
+    }
+
+    /// Returns the computation that is needed before.
+    pub(super) fn stage(&self) -> Stage {
+        self.kind.reading().map_or(Stage::State, Reading::stage)
+    }
+
+    /// Whether the external forces on bodies are read.
+    pub(super) fn needs_external_forces(&self) -> bool {
+        self.kind.reading().is_some_and(Reading::needs_external_forces)
+    }
+
+    /// The term after a step. `numbers` is scratch.
+    pub(super) fn compute(&self, simulation: &Simulation, step: &Step<'_>, numbers: &mut Vec<f64>) -> f64 {
+        numbers.clear();
+        if let Some(reading) = self.kind.reading() {
+            reading.read(simulation, &step.context, numbers);
+        }
+        let value = match &self.kind {
+            TermKind::Value(_) => self.total(numbers.iter().copied()),
+            TermKind::Rate(reading, first) => {
+                let before = &step.before[*first..first + reading.len()];
+                self.total(numbers.iter().zip(before).map(|(now, before)| (now - before) / step.seconds))
+            }
+            TermKind::Squared(_) => self.total(self.differences(numbers).map(|x| x * x)),
+            TermKind::Norm(_) => self.differences(numbers).map(|x| x * x).sum::<f64>().sqrt(),
+            TermKind::Within { low, high, margin, .. } => {
+                let outside = numbers.iter().map(|&x| (low - x).max(x - high).max(0.0)).fold(0.0, f64::max);
+                if outside == 0.0 {
+                    1.0
+                } else if outside < *margin {
+                    1.0 - outside / margin
+                } else {
+                    0.0
+                }
+            }
+            TermKind::Near { sigma, .. } => {
+                libm::exp(-self.differences(numbers).map(|x| x * x).sum::<f64>() / (sigma * sigma))
+            }
+            TermKind::Power(joints) => {
+                let qvel = simulation.qvel();
+                let action = step.context.action;
+                self.total(joints.iter().map(|&(actuator, dof)| (f64::from(action[actuator]) * qvel[dof]).abs()))
+            }
+            TermKind::Limits(joints) => {
+                let (model, qpos) = (simulation.model(), simulation.qpos());
+                let beyond = |&(joint, at): &(usize, usize)| scaled(model, joint, qpos[at]).abs() > AT_LIMIT;
+                self.total(joints.iter().map(|joint| f64::from(u8::from(beyond(joint)))))
+            }
+            TermKind::Healthy { otherwise } => return if step.healthy { self.weight } else { *otherwise },
+            TermKind::Constant => 1.0,
+        };
+        self.limited(self.weight * value)
+    }
+
+    /// Returns the term's value once the physics diverged.
+    pub(super) fn diverged(&self) -> f64 {
+        match self.kind {
+            TermKind::Healthy { otherwise } => otherwise,
+            _ => 0.0,
+        }
+    }
+
+    /// The sum, in order, or the mean.
+    fn total(&self, numbers: impl ExactSizeIterator<Item = f64>) -> f64 {
+        let n = numbers.len() as f64;
+        let sum: f64 = numbers.sum();
+        if self.mean { sum / n } else { sum }
+    }
+
+    /// The numbers less the target.
+    fn differences<'a>(&'a self, numbers: &'a [f64]) -> impl ExactSizeIterator<Item = f64> + 'a {
+        let target = |i: usize| self.target.get(i).or(self.target.first()).copied().unwrap_or(0.0);
+        numbers.iter().enumerate().map(move |(i, x)| x - target(i))
+    }
+
+    fn limited(&self, value: f64) -> f64 {
+        let (least, most) = (self.at_least.unwrap_or(0.0), self.at_most.unwrap_or(MAX_TERM).min(MAX_TERM));
+        if value.is_nan() { value } else { value.signum() * value.abs().min(most).max(least) }
+    }
+}
+
+impl TermKind {
+    fn reading(&self) -> Option<&Reading> {
+        match self {
+            Self::Value(reading)
+            | Self::Rate(reading, _)
+            | Self::Squared(reading)
+            | Self::Norm(reading)
+            | Self::Within { reading, .. }
+            | Self::Near { reading, .. } => Some(reading),
+            Self::Power(_) | Self::Limits(_) | Self::Healthy { .. } | Self::Constant => None,
+        }
+    }
+}
+
+/// Reads the target: a number for all that is read, or a list with a number for each.
+fn target(table: &Table<'_>, reading: Option<&Reading>) -> Result<Vec<f64>> {
+    let Some(value) = table.get("target") else { return Ok(Vec::new()) };
+    if !value.is_list() {
+        return Ok(vec![value.number()?]);
+    }
+    let (target, n) = (value.numbers()?, reading.map_or(0, Reading::len));
+    if target.len() == n {
+        Ok(target)
+    } else {
+        Err(value.error(format_args!(
+            "the target has {} numbers, but {n} are read; give one, or one for each",
+            target.len()
+        )))
+    }
+}
+
+/// The actuators of a table `{ actuator = "*" }` that drive joints of one degree of freedom.
+fn power(value: &Value<'_>, model: &Model, elements: &Elements) -> Result<Vec<(usize, usize)>> {
+    let table = value.table()?;
+    table.only(&["actuator"])?;
+    let actuators = elements.select(Kind::Actuator, &table.require("actuator", "\"*\"")?)?;
+    let place = |actuator| {
+        let joint = actuated_joint(model, actuator).filter(|&joint| model.index(Index::JointType)[joint] > 1);
+        let joint = joint.ok_or_else(|| {
+            let name = escaped(elements.name(Kind::Actuator, actuator));
+            value.error(format_args!("actuator {name:?} does not drive a hinge or slide; name those that do"))
+        })?;
+        Ok((actuator, model.index(Index::JointVelocity)[joint] as usize))
+    };
+    actuators.into_iter().map(place).collect()
+}
+
+/// The joints of a table `{ joint = "*" }` that have limits; a pattern leaves the others out.
+fn limits(value: &Value<'_>, model: &Model, elements: &Elements) -> Result<Vec<(usize, usize)>> {
+    let table = value.table()?;
+    table.only(&["joint"])?;
+    let joints = elements.select(Kind::Joint, &table.require("joint", "\"*\"")?)?;
+    let limited =
+        |&joint: &usize| model.flags(Flags::JointLimited)[joint] != 0 && model.index(Index::JointType)[joint] > 1;
+    let places: Vec<(usize, usize)> = joints
+        .into_iter()
+        .filter(limited)
+        .map(|joint| (joint, model.index(Index::JointPosition)[joint] as usize))
+        .collect();
+    if places.is_empty() {
+        Err(value.error("none of these joints is a hinge or slide with a range"))
+    } else {
+        Ok(places)
+    }
+}
+
+/// A name of a term, parameter or quantity: letters, digits and underscores, at most 64.
+pub(super) fn identifier<'a>(value: &Value<'_>, name: &'a str) -> Result<&'a str> {
+    const MAX_CHARS: usize = 64;
+    let starts = name.starts_with(|c: char| c.is_ascii_alphabetic());
+    let plain = name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_');
+    if starts && plain && name.len() <= MAX_CHARS {
+        return Ok(name);
+    }
+    let problem = "is no name; expected a letter, then letters, digits and underscores, at most 64 together";
+    Err(value.error(format_args!("{:?} {problem}", escaped(name))))
+}

@@ -1,0 +1,174 @@
+//! Ranges that readings keep to: what is healthy, and what a goal is. And the success of an episode.
+
+use super::{
+    elements::Elements,
+    error::Result,
+    number::{Context, unique_channels},
+    reading::Reading,
+    table::{Table, Value},
+};
+use crate::env::{Achievement, Comparison, Quantity, Success};
+use perturb_mujoco::{Model, Simulation};
+
+const RANGE: &[&str] = &["of", "above", "below", "from", "to"];
+const SUCCESS: &[&str] = &[
+    "description",
+    "greatest",
+    "least",
+    "last",
+    "steps",
+    "first",
+    "last_steps",
+    "longest",
+    "quantity",
+    "unit",
+    "at_least",
+    "at_most",
+];
+const ACHIEVEMENTS: [&str; 7] = ["greatest", "least", "last", "steps", "first", "last_steps", "longest"];
+
+/// The range of a reading. All of its numbers must lie in it.
+#[derive(Debug, Clone)]
+pub(super) struct Range {
+    reading: Reading,
+    above: Option<f64>,
+    below: Option<f64>,
+    from: Option<f64>,
+    to: Option<f64>,
+}
+
+impl Range {
+    /// Reads the table of a range.
+    pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements) -> Result<Self> {
+        table.only(RANGE)?;
+        let of = table.require("of", "{ joint = \"root\", get = \"position\" }")?.table()?;
+        let range = Self {
+            reading: Reading::new(&of, model, elements)?,
+            above: table.number("above")?,
+            below: table.number("below")?,
+            from: table.number("from")?,
+            to: table.number("to")?,
+        };
+        let (low, high) = (range.above.or(range.from), range.below.or(range.to));
+        if range.above.is_some() && range.from.is_some() || range.below.is_some() && range.to.is_some() {
+            return Err(
+                table.error("give above or from, and below or to: above and below are strict, from and to are not")
+            );
+        }
+        match (low, high) {
+            (None, None) => Err(table.error("the range has no end; give above, below, from or to")),
+            (Some(low), Some(high)) if low >= high => {
+                Err(table.error(format_args!("no number lies between {low} and {high}; give the smaller one first")))
+            }
+            _ => Ok(range),
+        }
+    }
+
+    /// Reads a list of ranges.
+    pub(super) fn list(tables: &[Table<'_>], model: &Model, elements: &Elements) -> Result<Vec<Self>> {
+        tables.iter().map(|table| Self::new(table, model, elements)).collect()
+    }
+
+    /// Returns the reading whose numbers are compared.
+    pub(super) fn reading(&self) -> &Reading {
+        &self.reading
+    }
+
+    /// Whether all numbers lie in it. A number that is not finite lies in none. `numbers` is scratch.
+    pub(super) fn holds(&self, simulation: &Simulation, context: &Context<'_>, numbers: &mut Vec<f64>) -> bool {
+        numbers.clear();
+        self.reading.read(simulation, context, numbers);
+        numbers.iter().all(|&x| {
+            x.is_finite()
+                && self.above.is_none_or(|above| x > above)
+                && self.below.is_none_or(|below| x < below)
+                && self.from.is_none_or(|from| x >= from)
+                && self.to.is_none_or(|to| x <= to)
+        })
+    }
+}
+
+/// Rule by which the number that an episode achieves follows from a reading.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Best {
+    Greatest,
+    Least,
+    Last,
+}
+
+/// The rule of success, as far as the environment computes it.
+#[derive(Debug, Clone)]
+pub(super) struct Goal {
+    /// Reading that the rule compares, if it compares one.
+    pub(super) achieved: Option<(Best, Reading)>,
+    /// The goal whose steps are counted, if the rule does.
+    pub(super) ranges: Vec<Range>,
+    pub(super) rule: Success,
+}
+
+impl Goal {
+    /// Reads the table of success, for episodes of at most `step_limit` steps.
+    pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements, step_limit: u32) -> Result<Self> {
+        table.only(SUCCESS)?;
+        let description = table.require("description", "\"the torso came 10 m far\"")?.text()?;
+        let (key, value) = table.one_of(&ACHIEVEMENTS)?;
+        let (comparison, threshold) = match (table.number("at_least")?, table.number("at_most")?) {
+            (Some(threshold), None) => (Comparison::AtLeast, threshold),
+            (None, Some(threshold)) => (Comparison::AtMost, threshold),
+            _ => return Err(table.error("give at_least or at_most: the number that the achieved one is compared with")),
+        };
+        let ranges = |value: &Value<'_>| Range::list(&value.tables()?, model, elements);
+        let mut goal = Self {
+            achieved: None,
+            ranges: Vec::new(),
+            rule: Success { description: leaked(description), achievement: Achievement::Length, comparison, threshold },
+        };
+        goal.rule.achievement = match key {
+            "steps" if !value.flag()? => {
+                return Err(value.error("expected true; leave it out to compare something else"));
+            }
+            "steps" => Achievement::Length,
+            "first" | "last_steps" | "longest" => {
+                goal.ranges = ranges(&value)?;
+                match key {
+                    "first" => Achievement::FirstGoal,
+                    "last_steps" => Achievement::LastGoals,
+                    _ => Achievement::LongestGoals,
+                }
+            }
+            _ => {
+                let reading = Reading::new(&value.table()?, model, elements)?;
+                let [entry] = reading.entries() else {
+                    return Err(value.error(format_args!("this reads {} numbers; expected one", reading.len())));
+                };
+                let name = match table.text("quantity")? {
+                    Some(name) => name.to_owned(),
+                    None => unique_channels([entry].into_iter()).concat(),
+                };
+                let quantity =
+                    Quantity { name: leaked(&name), unit: table.text("unit")?.map_or(entry.unit, |unit| leaked(unit)) };
+                let best = match key {
+                    "greatest" => Best::Greatest,
+                    "least" => Best::Least,
+                    _ => Best::Last,
+                };
+                goal.achieved = Some((best, reading));
+                Achievement::Own(quantity)
+            }
+        };
+        if goal.achieved.is_none() {
+            if let Some(unit) = table.get("unit").or_else(|| table.get("quantity")) {
+                return Err(unit.error("steps are counted here, which have neither unit nor quantity; leave it out"));
+            }
+            if !(1.0..=f64::from(step_limit)).contains(&threshold) || threshold.fract() != 0.0 {
+                return Err(table.error(format_args!("{threshold} is no number of steps within 1 … {step_limit}")));
+            }
+        }
+        Ok(goal)
+    }
+}
+
+/// A text that lives as long as the process, as all that is fixed about an environment does.
+pub(super) fn leaked(text: &str) -> &'static str {
+    Box::leak(text.to_owned().into_boxed_str())
+}

@@ -1,0 +1,364 @@
+//! The numbers of a model that edits change, and how each is set and read back.
+
+use super::{
+    elements::{Elements, actuator_name},
+    error::{Error, Result, escaped},
+    table::{Table, Value},
+};
+use perturb_mujoco::{Field, Flags, Index, Kind, Model, Simulation};
+
+/// The kinds of elements that can be edited, by the key that names them, with their fields.
+pub(super) const EDITABLE: [(&str, Kind, &[&str]); 6] = [
+    ("body", Kind::Body, &["mass"]),
+    ("geom", Kind::Geom, &["friction", "friction_torsion", "friction_roll"]),
+    ("pair", Kind::Pair, &["friction"]),
+    ("joint", Kind::Joint, &["damping", "armature", "frictionloss", "stiffness", "range"]),
+    ("actuator", Kind::Actuator, &["gear", "kp", "kv", "forcerange"]),
+    ("tendon", Kind::Tendon, &["stiffness", "damping"]),
+];
+/// The options that can be edited.
+pub(super) const OPTIONS: &[&str] = &["gravity", "wind", "density", "viscosity"];
+/// The keys that say what is edited.
+pub(super) const KEYS: [&str; 10] =
+    ["body", "geom", "pair", "joint", "actuator", "tendon", "option", "field", "axis", "end"];
+
+/// The numbers of an actuator's gain and bias.
+const N_GAIN: usize = 10;
+/// The numbers of an actuator's gear.
+const N_GEAR: usize = 6;
+
+/// A value of the model.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Target {
+    /// A number by itself.
+    Number(Field, usize),
+    /// Two numbers that are always the same: (array, first).
+    Twins(Field, usize),
+    /// Both ends of a range: the lower end is the negative of the upper end. (array, lower)
+    Symmetric(Field, usize),
+    /// Both ends of a range, which are scaled together. (array, lower)
+    Ends(Field, usize),
+    /// A body's mass. Its inertia follows in proportion.
+    Mass(usize),
+    /// An actuator's gear: the first number; the others follow in proportion.
+    Gear(usize),
+    /// A position servo's gain, and its bias.
+    PositionGain(usize),
+    /// A velocity servo's gain, and its bias.
+    VelocityGain(usize),
+    /// The damping of an actuator with an affine bias.
+    ActuatorDamping(usize),
+}
+
+/// Several targets, and the element and field that they have in common.
+#[derive(Debug, Clone)]
+pub(super) struct Targets {
+    pub(super) all: Vec<Target>,
+    /// The kind, or `option`.
+    pub(super) subject: &'static str,
+    /// The field, or the option.
+    pub(super) field: &'static str,
+    /// The numbers of the elements; empty for an option.
+    pub(super) ids: Vec<usize>,
+    /// The names of the elements, or the option's.
+    pub(super) names: Vec<String>,
+}
+
+/// Rule by which a value enters a target.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Change {
+    Set,
+    Scale,
+    Add,
+}
+
+impl Targets {
+    /// Reads what a table names.
+    pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements, change: Change) -> Result<Self> {
+        let subjects = ["body", "geom", "pair", "joint", "actuator", "tendon", "option"];
+        let (subject, value) = table.one_of(&subjects)?;
+        if subject == "option" {
+            return Self::option(table, &value);
+        }
+        let (subject, kind, fields) = *EDITABLE
+            .iter()
+            .find(|(key, ..)| *key == subject)
+            .ok_or_else(|| value.error(format_args!("{subject} cannot be edited")))?;
+        let field_value = table.require("field", &format!("{:?}", fields[0]))?;
+        let name = field_value.text()?;
+        let field = fields.iter().copied().find(|&field| field == name).ok_or_else(|| {
+            let known = fields.join(", ");
+            field_value.error(format_args!("{:?} is unknown; of a {subject} there are {known}", escaped(name)))
+        })?;
+        if let Some(axis) = table.get("axis") {
+            return Err(axis.error("axis goes with the options gravity and wind"));
+        }
+        if let Some(end) = table.get("end").filter(|_| !matches!(field, "range" | "forcerange")) {
+            return Err(end.error("end goes with the fields range and forcerange"));
+        }
+        let ids = elements.select(kind, &value)?;
+        let mut all = Vec::new();
+        for &id in &ids {
+            let shown = match kind {
+                Kind::Actuator => actuator_name(model, elements, id),
+                _ => elements.name(kind, id).to_owned(),
+            };
+            let refuse = |problem: &str| value.error(format_args!("{subject} {:?} {problem}", escaped(&shown)));
+            match (subject, field) {
+                ("body", _) => all.push(mass(model, id).ok_or_else(|| refuse("has no mass, or is the world"))?),
+                ("geom", _) => all.push(Target::Number(Field::GeomFriction, 3 * id + friction_column(field))),
+                ("pair", _) => all.push(Target::Twins(Field::PairFriction, 5 * id)),
+                ("joint", "stiffness") => all.push(Target::Number(Field::JointStiffness, id)),
+                ("joint", "range") => all.push(range(table, Field::JointRange, 2 * id, change)?),
+                ("joint", _) => {
+                    let array = match field {
+                        "damping" => Field::DofDamping,
+                        "armature" => Field::DofArmature,
+                        _ => Field::DofFrictionLoss,
+                    };
+                    all.extend(degrees_of_freedom(model, id).map(|dof| Target::Number(array, dof)));
+                }
+                ("actuator", "forcerange") => all.push(range(table, Field::ActuatorForceRange, 2 * id, change)?),
+                ("actuator", "gear") => {
+                    let is_zero = model.field(Field::ActuatorGear)[N_GEAR * id] == 0.0;
+                    all.push(if is_zero { Err(refuse("has a gear that begins with 0"))? } else { Target::Gear(id) });
+                }
+                ("actuator", "kp") => {
+                    all.push(position_gain(model, id).ok_or_else(|| refuse("is no position servo, so it has no kp"))?);
+                }
+                ("actuator", _) => {
+                    all.push(velocity_gain(model, id).ok_or_else(|| refuse("is no velocity servo, so it has no kv"))?);
+                }
+                (_, "stiffness") => all.push(Target::Number(Field::TendonStiffness, id)),
+                _ => all.push(Target::Number(Field::TendonDamping, id)),
+            }
+        }
+        let names = ids.iter().map(|&id| elements.name(kind, id).to_owned()).collect();
+        let targets = Self { all, subject, field, ids, names };
+        if targets.all.iter().any(|target| !target.is_consistent(model)) {
+            let problem =
+                "the model's range is not symmetric, which set and add need; say end = \"upper\" or end = \"lower\"";
+            return Err(value.error(problem));
+        }
+        Ok(targets)
+    }
+
+    fn option(table: &Table<'_>, value: &Value<'_>) -> Result<Self> {
+        let name = value.text()?;
+        let option = OPTIONS.iter().copied().find(|&option| option == name).ok_or_else(|| {
+            value.error(format_args!("{:?} is unknown; of options there are {}", escaped(name), OPTIONS.join(", ")))
+        })?;
+        for key in ["field", "end"] {
+            if let Some(value) = table.get(key) {
+                return Err(value.error(format_args!("an option has no {key}; leave it out")));
+            }
+        }
+        let has_axes = matches!(option, "gravity" | "wind");
+        let axis = match table.get("axis") {
+            None if has_axes => return Err(table.error(format_args!("{option} has three axes; give axis = \"z\""))),
+            None => 0,
+            Some(axis) if !has_axes => return Err(axis.error(format_args!("{option} has no axes; leave axis out"))),
+            Some(axis) => {
+                let text = axis.text()?;
+                let found = ["x", "y", "z"].iter().position(|&known| known == text);
+                found.ok_or_else(|| axis.error(format_args!("{:?} is no axis; expected x, y or z", escaped(text))))?
+            }
+        };
+        let field = match option {
+            "gravity" => Field::Gravity,
+            "wind" => Field::Wind,
+            "density" => Field::Density,
+            _ => Field::Viscosity,
+        };
+        let all = vec![Target::Number(field, axis)];
+        Ok(Self { all, subject: "option", field: option, ids: Vec::new(), names: vec![option.to_owned()] })
+    }
+
+    /// The values that are physical, as (least, whether it is excluded): masses are positive, most others not negative.
+    pub(super) fn least(&self) -> Option<(f64, bool)> {
+        match (self.subject, self.field) {
+            ("body", _) => Some((0.0, true)),
+            ("option", "gravity" | "wind") | ("actuator", "gear") | ("joint", "range") => None,
+            ("actuator", "forcerange") if matches!(self.all[..], [Target::Number(..), ..]) => None,
+            _ => Some((0.0, false)),
+        }
+    }
+}
+
+fn friction_column(field: &str) -> usize {
+    match field {
+        "friction" => 0,
+        "friction_torsion" => 1,
+        _ => 2,
+    }
+}
+
+fn mass(model: &Model, body: usize) -> Option<Target> {
+    (model.field(Field::BodyMass)[body] > 0.0).then_some(Target::Mass(body))
+}
+
+/// The degrees of freedom of a joint.
+pub(super) fn degrees_of_freedom(model: &Model, joint: usize) -> std::ops::Range<usize> {
+    let starts = model.index(Index::JointVelocity);
+    let end = starts.get(joint + 1).map_or(model.n_v(), |&next| next as usize);
+    starts[joint] as usize..end
+}
+
+fn range(table: &Table<'_>, field: Field, first: usize, change: Change) -> Result<Target> {
+    match (table.text("end")?, change) {
+        (Some("lower"), _) => Ok(Target::Number(field, first)),
+        (Some("upper"), _) => Ok(Target::Number(field, first + 1)),
+        (Some(other), _) => {
+            let problem = format!("end is {:?}; expected \"lower\" or \"upper\"", escaped(other));
+            Err(table.error(problem))
+        }
+        (None, Change::Scale) => Ok(Target::Ends(field, first)),
+        (None, Change::Set | Change::Add) => Ok(Target::Symmetric(field, first)),
+    }
+}
+
+/// MuJoCo's type of an affine bias.
+const AFFINE: i32 = 1;
+
+fn position_gain(model: &Model, actuator: usize) -> Option<Target> {
+    let gain = model.field(Field::ActuatorGain)[N_GAIN * actuator];
+    let bias = model.field(Field::ActuatorBias)[N_GAIN * actuator + 1];
+    let is_servo = model.index(Index::ActuatorGainType)[actuator] == 0
+        && model.index(Index::ActuatorBiasType)[actuator] == AFFINE
+        && gain != 0.0
+        && bias == -gain;
+    is_servo.then_some(Target::PositionGain(actuator))
+}
+
+fn velocity_gain(model: &Model, actuator: usize) -> Option<Target> {
+    let gain = model.field(Field::ActuatorGain)[N_GAIN * actuator];
+    let bias = &model.field(Field::ActuatorBias)[N_GAIN * actuator..][..3];
+    if model.index(Index::ActuatorBiasType)[actuator] != AFFINE || bias[2] == 0.0 {
+        None
+    } else if bias[1] == 0.0 && bias[2] == -gain {
+        Some(Target::VelocityGain(actuator))
+    } else {
+        Some(Target::ActuatorDamping(actuator))
+    }
+}
+
+impl Target {
+    /// The array that holds the value, and its place there.
+    pub(super) fn place(self) -> (Field, usize) {
+        match self {
+            Self::Number(field, at) | Self::Twins(field, at) => (field, at),
+            Self::Symmetric(field, at) | Self::Ends(field, at) => (field, at + 1),
+            Self::Mass(body) => (Field::BodyMass, body),
+            Self::Gear(actuator) => (Field::ActuatorGear, N_GEAR * actuator),
+            Self::PositionGain(actuator) | Self::VelocityGain(actuator) => (Field::ActuatorGain, N_GAIN * actuator),
+            Self::ActuatorDamping(actuator) => (Field::ActuatorBias, N_GAIN * actuator + 2),
+        }
+    }
+
+    /// The arrays that an edit changes itself.
+    pub(super) fn fields(self) -> Vec<Field> {
+        match self {
+            Self::Mass(_) => vec![Field::BodyMass, Field::BodyInertia],
+            Self::PositionGain(_) | Self::VelocityGain(_) => vec![Field::ActuatorGain, Field::ActuatorBias],
+            _ => vec![self.place().0],
+        }
+    }
+
+    /// Whether derived constants have to be computed anew after an edit.
+    pub(super) fn changes_constants(self) -> bool {
+        matches!(self.place().0, Field::BodyMass | Field::DofArmature | Field::ActuatorGear)
+    }
+
+    /// Whether the value is what both ends of a symmetric range say.
+    fn is_consistent(self, model: &Model) -> bool {
+        match self {
+            Self::Symmetric(field, at) => model.field(field)[at] == -model.field(field)[at + 1],
+            _ => true,
+        }
+    }
+
+    /// The value in a model.
+    pub(super) fn value(self, model: &Model) -> f64 {
+        let (field, at) = self.place();
+        let value = model.field(field)[at];
+        if matches!(self, Self::ActuatorDamping(_)) { -value } else { value }
+    }
+
+    /// Sets the value in a simulation's model, which has the values of `pristine` there.
+    pub(super) fn set(self, pristine: &Model, simulation: &mut Simulation, value: f64) {
+        let (field, at) = self.place();
+        let own = self.value(pristine);
+        simulation.field_mut(field)[at] = if matches!(self, Self::ActuatorDamping(_)) { -value } else { value };
+        match self {
+            Self::Number(..) | Self::ActuatorDamping(_) => {}
+            Self::Twins(..) => simulation.field_mut(field)[at + 1] = value,
+            Self::Symmetric(..) => simulation.field_mut(field)[at - 1] = -value,
+            // Both ends are scaled only.
+            Self::Ends(..) => {}
+            Self::Mass(body) => {
+                let factor = value / own;
+                let inertia = &pristine.field(Field::BodyInertia)[3 * body..][..3];
+                for (moment, own) in simulation.field_mut(Field::BodyInertia)[3 * body..][..3].iter_mut().zip(inertia) {
+                    *moment = own * factor;
+                }
+            }
+            Self::Gear(_) => {
+                let factor = value / own;
+                let gear = &pristine.field(field)[at + 1..][..N_GEAR - 1];
+                for (number, own) in simulation.field_mut(field)[at + 1..][..N_GEAR - 1].iter_mut().zip(gear) {
+                    *number = own * factor;
+                }
+            }
+            Self::PositionGain(actuator) => simulation.field_mut(Field::ActuatorBias)[N_GAIN * actuator + 1] = -value,
+            Self::VelocityGain(actuator) => simulation.field_mut(Field::ActuatorBias)[N_GAIN * actuator + 2] = -value,
+        }
+    }
+
+    /// Multiplies the value, and all that belongs to it, by a factor.
+    pub(super) fn scale(self, pristine: &Model, simulation: &mut Simulation, factor: f64) {
+        let (field, at) = self.place();
+        let mut multiply =
+            |field: Field, at: usize| simulation.field_mut(field)[at] = pristine.field(field)[at] * factor;
+        multiply(field, at);
+        match self {
+            Self::Number(..) | Self::ActuatorDamping(_) => {}
+            Self::Twins(..) => multiply(field, at + 1),
+            Self::Symmetric(..) | Self::Ends(..) => multiply(field, at - 1),
+            Self::Mass(body) => (0..3).for_each(|i| multiply(Field::BodyInertia, 3 * body + i)),
+            Self::Gear(_) => (1..N_GEAR).for_each(|i| multiply(field, at + i)),
+            Self::PositionGain(actuator) => multiply(Field::ActuatorBias, N_GAIN * actuator + 1),
+            Self::VelocityGain(actuator) => multiply(Field::ActuatorBias, N_GAIN * actuator + 2),
+        }
+    }
+
+    /// The factor by which the value was multiplied.
+    pub(super) fn factor(self, pristine: &Model, model: &Model) -> f64 {
+        let (field, at) = self.place();
+        let own = pristine.field(field)[at];
+        match self {
+            // The upper end may be 0.
+            Self::Ends(..) if own == 0.0 => model.field(field)[at - 1] / pristine.field(field)[at - 1],
+            _ => model.field(field)[at] / own,
+        }
+    }
+
+    /// Whether a factor has no effect.
+    pub(super) fn is_zero(self, pristine: &Model) -> bool {
+        let (field, at) = self.place();
+        let lower = matches!(self, Self::Ends(..)).then(|| pristine.field(field)[at - 1]);
+        pristine.field(field)[at] == 0.0 && lower.is_none_or(|lower| lower == 0.0)
+    }
+}
+
+/// Whether an element of a kind has limits that its range could change.
+pub(super) fn is_limited(model: &Model, subject: &str, id: usize) -> bool {
+    match subject {
+        "joint" => model.flags(Flags::JointLimited)[id] != 0,
+        _ => model.flags(Flags::ActuatorForceLimited)[id] != 0,
+    }
+}
+
+/// An error that an edit can have no effect, in one wording.
+pub(super) fn without_effect(table: &Table<'_>, why: impl std::fmt::Display) -> Error {
+    table.error(format_args!("it has no effect: {why}"))
+}

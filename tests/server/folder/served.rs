@@ -1,0 +1,107 @@
+//! A server with folders: all that a server does for its own environments.
+
+use super::{CART, TASK, folder};
+use crate::{
+    common::{
+        self,
+        server::{self, Actor, Server, Session, doubles, floats, open, parameters},
+    },
+    dm_env_rpc::client::{Agent, double, settings, text, vector},
+};
+use perturb::proto::{Open, Reset, Version};
+use std::fs;
+
+#[tokio::test]
+async fn folders_are_listed_after_the_built_in_environments() {
+    let server = Server::with_folders(&[]);
+    let served = server::catalogue(server.tcp()).await;
+    let names: Vec<&str> = served.iter().map(|environment| environment.name.as_str()).collect();
+    assert_eq!(names, common::catalogue().names().collect::<Vec<_>>());
+    let quadruped = &served[names.len() - 2];
+    assert_eq!(quadruped.name, "Quadruped");
+    assert_eq!(quadruped.model_hash.len(), 64);
+    assert_eq!(quadruped.heatmap_axes, ["mass", "friction"]);
+    let applied: Vec<&str> = quadruped.applied.iter().map(|quantity| quantity.name.as_str()).collect();
+    assert_eq!(applied, ["mass", "friction", "strength", "front_left_mass"]);
+}
+
+#[tokio::test]
+async fn a_folder_is_opened_edited_drawn_saved_and_restored() {
+    let server = Server::with_folders(&[]);
+    for name in ["Quadruped", "ReachingArm"] {
+        let environment = server::environment(server.tcp(), name).await;
+        let actor = Actor::new(&environment, 3);
+        let (mut session, opened) = Session::open(server.tcp(), open(name, 3, 5)).await;
+        assert_eq!(opened.environment.as_ref(), Some(&environment));
+        session.play(actor, 0, 7).await;
+        let first = &environment.parameters[0];
+        let value = first.extreme.as_ref().unwrap().intervals[1].high;
+        let edit = Reset { parameters: parameters(&[(&first.name, &[(value, value)])]), ..Reset::default() };
+        let started = session.ask(edit).await.started;
+        assert_eq!(started.len(), 3);
+        for receipt in started.iter().filter_map(|start| start.receipt.as_ref()) {
+            assert_eq!((receipt.requested[0], receipt.applied[0]), (value, value), "the edit took effect");
+        }
+        let snapshots = session.snapshot(&[]).await;
+        let picture = session.render(0, (96, 64)).await;
+        assert!(picture.iter().any(|&byte| byte != picture[0]), "{name}: the picture shows something");
+        let after = session.play(actor, 7, 30).await;
+        assert_ne!(session.render(0, (96, 64)).await, picture, "{name}: it moved");
+        session.restore(&[], snapshots).await;
+        assert_eq!(session.render(0, (96, 64)).await, picture);
+        assert_eq!(session.play(actor, 7, 30).await, after, "{name}: the same bytes");
+    }
+}
+
+#[tokio::test]
+async fn observed_parameters_stand_at_the_end_of_observations() {
+    let server = Server::with_folders(&[]);
+    let environment = server::environment(server.tcp(), "ReachingArm").await;
+    let seen = Open { observe_parameters: true, version: Version::Default.into(), ..open("ReachingArm", 1, 1) };
+    let (_, opened) = Session::open(server.tcp(), seen).await;
+    let plain = environment.observation.len();
+    let observation = floats(&opened.observations);
+    assert_eq!(observation.len(), plain + environment.parameters.len());
+    for (value, p) in observation[plain..].iter().zip(&environment.parameters) {
+        let (low, high) = (p.extreme.as_ref().unwrap().intervals[0].low, p.extreme.as_ref().unwrap().intervals[1].high);
+        let expected = 2.0 * (p.default_value - low) / (high - low) - 1.0;
+        assert!((f64::from(*value) - expected).abs() < 1e-6, "{}", p.name);
+    }
+}
+
+#[tokio::test]
+async fn a_folder_is_a_world_of_dm_env_rpc() {
+    let server = Server::with_folders(&[]);
+    let settings = settings("ReachingArm", [("version", text("R")), ("lower_mass", double(1.5))]);
+    let (mut agent, _) = Agent::in_world(server.tcp(), settings).await;
+    let first = agent.step(vector(&[0.0, 0.0])).await;
+    assert_eq!(first.observation.len(), server::environment(server.tcp(), "ReachingArm").await.observation.len());
+    assert_eq!(agent.read("parameters.lower_mass").await, double(1.5));
+    assert_eq!(agent.read("applied.lower_mass").await, double(1.5));
+}
+
+#[tokio::test]
+async fn tasks_may_stand_in_the_file_of_settings() {
+    let task = folder(&[("task.toml", TASK), ("cart.xml", CART)]);
+    let file = task.path().join("settings.toml");
+    fs::write(&file, format!("tasks = [{:?}]\n", task.path())).unwrap();
+    let server = Server::start(&["--config", file.to_str().unwrap()]);
+    assert!(server::catalogue(server.tcp()).await.iter().any(|environment| environment.name == "CartAndPole"));
+}
+
+#[tokio::test]
+async fn sessions_keep_what_was_loaded_when_files_change() {
+    let task = folder(&[("task.toml", TASK), ("cart.xml", CART)]);
+    let server = Server::start(&["--task", task.path().to_str().unwrap()]);
+    let environment = server::environment(server.tcp(), "CartAndPole").await;
+    let run = async || {
+        let (mut session, _) = Session::open(server.tcp(), open("CartAndPole", 2, 1)).await;
+        session.ask(Reset { states: doubles(&[0.1; 8]), ..Reset::default() }).await;
+        session.play(Actor::new(&environment, 2), 0, 20).await
+    };
+    let before = run().await;
+    fs::write(task.path().join("cart.xml"), CART.replace("gear=\"20\"", "gear=\"30\"")).unwrap();
+    assert_eq!(run().await, before);
+    server::until("the server notices", async || server.log().contains("the files of this task changed")).await;
+    assert_eq!(run().await, before, "until it is restarted");
+}
