@@ -7,7 +7,7 @@
 //! - [`transport`]: messages off the wire and onto it, and the bytes of both.
 //! - [`audit`]: what a session draws from, by its token's role, and the ledger that has it.
 //! - [`auth`]: tokens, their quotas and roles.
-//! - [`net`]: connections.
+//! - [`net`]: connections, their limits and encryption.
 //! - [`shutdown`]: how far the shutdown is; [`error`]: the classes of errors, with their gRPC codes; [`limits`], [`id`].
 
 pub mod api;

@@ -58,5 +58,5 @@ fn an_address_that_others_reach_is_warned_about() {
     let output = ended(child);
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(said.contains("everybody who reaches this address can see the whole folder"), "{said}");
-    assert!(said.contains("so can any site that somebody who reaches it opens in a browser"), "{said}");
+    assert!(said.contains("so can any web site that they open"), "{said}");
 }

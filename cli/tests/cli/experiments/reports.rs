@@ -188,7 +188,7 @@ fn a_heatmap_of_several_policies_is_their_mean() {
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(2), "{said}");
     assert!(
-        said.contains("was trained in CartPole") && said.contains("in Pendulum: a picture is of one environment"),
+        said.contains("was trained in CartPole") && said.contains("in Pendulum: give policies of one environment"),
         "{said}"
     );
     let output = draw(&[a, b, a], &small(&[]));
@@ -334,11 +334,7 @@ fn heatmaps_of_an_experiment_have_any_two_parameters() {
 
     let none = experiment.heatmap("out", &["--x", "force", "--y", "colour"]);
     assert_eq!(none.status.code(), Some(1));
-    assert!(
-        stderr(&none).contains("no environment of this experiment has two parameters to show"),
-        "{}",
-        stderr(&none)
-    );
+    assert!(stderr(&none).contains("no environment of this experiment has both parameters"), "{}", stderr(&none));
     let same = experiment.heatmap("out", &["--x", "mass", "--y", "mass"]);
     assert!(same.status.code() == Some(1) && stderr(&same).contains("`mass` cannot be an axis"), "{}", stderr(&same));
     for wrong in [&["--x", "mass"][..], &["--parameters", "force=7"], &["--runs", "0"], &["--out", "x"]] {

@@ -47,7 +47,7 @@ fn an_early_stop_equals_a_training_of_that_budget() {
     // A stopped training is not continued, neither by `perturb train` nor by a run that has lost the result.
     let output = perturb(&["train", "--resume"]).arg(training(&early)).output().expect("ended");
     let said = stderr(&output);
-    assert!(said.contains(&format!("it has {episodes} of 2000 episodes, and stopped at ")), "{said}");
+    assert!(said.contains(&format!("it has {episodes} of 2000 episodes and stopped at ")), "{said}");
     let result = Folder::new(&early.out("out")).cell(&early.plan.cells[0].id).path().join("result.json");
     let before = std::fs::read(&result).expect("a result");
     std::fs::remove_file(&result).expect("removed");

@@ -187,7 +187,7 @@ fn interrupted_and_begun_again(experiment: &Experiment, cluster: &Cluster) -> Ch
     kill("-INT", first.id());
     let first = end(first);
     assert_eq!(first.status.code(), Some(130), "{}", stderr(&first));
-    assert!(stderr(&first).contains("to end it: scancel "), "{}", stderr(&first));
+    assert!(stderr(&first).contains("to cancel it: scancel "), "{}", stderr(&first));
     experiment.on(cluster, "slurm", &arguments).spawn().expect("started")
 }
 
