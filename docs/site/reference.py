@@ -20,8 +20,8 @@ GIVEN = {"environment", "architecture"}
 # Policies of results/ that were trained with PPO on D and can be filmed, by the page about their experiment. A step of
 # MountainCar simulates a second.
 FILMED = {
-    "beyond-the-paper": "results/beyond/confirm-2/cells/{}-ppo-ff-D-9bd6546b-s7/training",
-    "hopper-and-halfcheetah": "results/locomotion/cells/{}-ppo-ff-D-348d15d9-s2/training",
+    "beyond": "results/beyond/confirm-2/cells/{}-ppo-ff-D-9bd6546b-s7/training",
+    "locomotion": "results/locomotion/cells/{}-ppo-ff-D-348d15d9-s2/training",
 }
 FASTER = {"MountainCar": ["--fps", "30"]}
 
@@ -84,7 +84,7 @@ def environment(entry, filmed):
         ends = ["a success" if episode[3] == "yes" else "no success" for episode in episodes]
         page += f'<video controls muted loop preload="metadata" src="{name}.mp4"></video>\n\n'
         page += "PPO, trained on D, in two episodes with parameters of E: " + ", then ".join(ends) + ". "
-        page += f"The policy is one of [results](../results.md#{study}); the film shows its parameters.\n\n"
+        page += f"The policy is one of the study [{study}](../findings/{study}.md); the film shows its parameters.\n\n"
     if not filmed:
         page += f"![{name}](../pictures/{name}.png)\n\n"
     page += "## Facts\n\n"
