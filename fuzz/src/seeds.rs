@@ -52,15 +52,15 @@ pub fn seeds(name: &str) -> Vec<Vec<u8>> {
                 std::fs::read(repository_path("experiments").join(name).with_extension("toml")).expect("a file")
             })
             .to_vec(),
-        "tasks" => {
-            ["examples/tasks/reaching_arm/task.toml"].map(|name| std::fs::read(kept(name)).expect("a file")).to_vec()
-        }
+        "tasks" => ["examples/tasks/reaching_arm/task.toml"]
+            .map(|name| std::fs::read(repository_path(name)).expect("a file"))
+            .to_vec(),
         "models" => [
             "examples/tasks/reaching_arm/arm.xml",
             "examples/tasks/quadruped/robot.xml",
             "examples/tasks/quadruped/scenery.xml",
         ]
-        .map(|name| std::fs::read(kept(name)).expect("a file"))
+        .map(|name| std::fs::read(repository_path(name)).expect("a file"))
         .to_vec(),
         "ledgers" => vec![include_str!("ledger.jsonl").into()],
         _ => Vec::new(),
