@@ -245,8 +245,10 @@ struct Stuck(Box<dyn Environment>);
 impl Stuck {
     fn spec() -> &'static EnvironmentSpec {
         static SPEC: OnceLock<EnvironmentSpec> = OnceLock::new();
-        let make = || Ok(Box::new(Stuck((cart_pole::SPEC.make)()?)) as Box<dyn Environment>);
-        SPEC.get_or_init(|| EnvironmentSpec { make, ..cart_pole::SPEC })
+        SPEC.get_or_init(|| EnvironmentSpec {
+            make: &|| Ok(Box::new(Stuck((cart_pole::SPEC.make)()?)) as Box<dyn Environment>),
+            ..cart_pole::SPEC
+        })
     }
 }
 
@@ -330,7 +332,7 @@ impl Drop for InThread {
 #[test]
 fn an_ineffective_parameter_edit_stops_a_training() {
     let directory = tempfile::tempdir().expect("a directory");
-    let server = InThread::start(Catalogue::default().with(Stuck::spec()));
+    let server = InThread::start(Catalogue::default().with(Stuck::spec()).expect("a free name"));
     let out = directory.path().join("out").display().to_string();
     let train = ["train", "--env", "CartPole", "--version", "R", "--episodes", "20", "--out", &out];
     let output = perturb(&train).args(["--server", &server.address]).output().expect("ended");
@@ -354,7 +356,7 @@ fn the_base_version_of_a_set_belongs_to_its_cells() {
 #[test]
 fn an_edit_that_does_not_take_effect_stops_a_cell() {
     let directory = experiment();
-    let server = InThread::start(Catalogue::default().with(Stuck::spec()));
+    let server = InThread::start(Catalogue::default().with(Stuck::spec()).expect("a free name"));
     let output = run(directory.path(), &["--jobs", "1", "--server", &server.address]);
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
     let folder = Folder::new(&directory.path().join("out"));
