@@ -8,7 +8,7 @@
 
 use crate::{
     Failure,
-    client::{Client, Process, SEED, width},
+    client::{Client, SEED, ServerProcess, width},
     median,
     robots::{process_cpu, thread_cpu},
 };
@@ -102,7 +102,7 @@ async fn beside_the_built_in(id: &str) -> Result<(), Failure> {
     const TRIPS: usize = 128;
     let folder = written(HOPPER, "hopper.xml", include_str!("../../models/hopper.xml"))?;
     let own = folder::load(folder.path())?.spec();
-    let server = Process::with_flags(2, &["--task".as_ref(), folder.path()])?;
+    let server = ServerProcess::with_flags(2, &["--task".as_ref(), folder.path()])?;
     let mut built_in = Client::open(&server.socket, "Hopper", BATCH).await?;
     let mut from_folder = Client::open_spec(&server.socket, own, BATCH).await?;
     let (mut ratios, mut steps) = (Vec::new(), Vec::new());
@@ -119,7 +119,7 @@ async fn beside_the_built_in(id: &str) -> Result<(), Failure> {
 
 async fn beside_mujoco(id: &str, path: &Path, mjcf: &str, external_forces: bool) -> Result<(), Failure> {
     let spec = folder::load(path)?.spec();
-    let server = Process::with_flags(1, &["--task".as_ref(), path])?;
+    let server = ServerProcess::with_flags(1, &["--task".as_ref(), path])?;
     let mut client = Client::open_spec(&server.socket, spec, BATCH).await?;
     let before = server.resident()?;
     let mut bare = Bare::new(spec, mjcf, external_forces)?;
