@@ -18,7 +18,7 @@ pub struct Cycle {
     pub parent: ModulePath,
     /// Number of the parent's children that take part in imports.
     pub siblings: usize,
-    /// NameDefinitions of all modules of the cycle, in alphabetical order.
+    /// Names of all modules of the cycle, in alphabetical order.
     pub modules: Vec<String>,
     /// A shortest path from one of them back to itself.
     pub path: Vec<Edge>,

@@ -4,7 +4,7 @@
 //! comment opens with its subject, or with a verb whose subject is the documented item: "Returns the result of the
 //! request".
 
-use crate::source::{SourceTree, folder_of, is_test};
+use crate::source::{SourceTree, folder_of, is_generated, is_test};
 
 /// Openings that leave the subject open.
 pub const OPENINGS: [&str; 22] = [
@@ -27,10 +27,13 @@ pub struct DocComment {
     pub lacks_subject: bool,
 }
 
-/// Reads the first line of every doc comment of Rust code, without tests.
+/// Reads the first line of every doc comment of Rust code and of every comment of `.proto` files. Tests and generated
+/// code are left out.
 pub fn read(tree: &SourceTree) -> Vec<DocComment> {
     let mut comments = Vec::new();
-    for (file, source) in tree.with_extension(".rs").filter(|(path, _)| !is_test(path)) {
+    let files = tree.with_extension(".rs").chain(tree.with_extension(".proto"));
+    for (file, source) in files.filter(|(path, _)| !is_test(path) && !is_generated(path)) {
+        let marks: &[&str] = if file.ends_with(".proto") { &["//"] } else { &["///", "//!"] };
         let mut lines = source.lines().map(str::trim_start).enumerate().peekable();
         let mut is_continued = false;
         while let Some((index, line)) = lines.next() {
@@ -39,7 +42,7 @@ pub fn read(tree: &SourceTree) -> Vec<DocComment> {
             {
                 break;
             }
-            let comment = line.strip_prefix("///").or_else(|| line.strip_prefix("//!"));
+            let comment = marks.iter().find_map(|mark| line.strip_prefix(mark));
             let text = comment.map(|text| text.strip_prefix(' ').unwrap_or(text));
             if let Some(text) = text.filter(|text| !is_continued && !text.is_empty()) {
                 comments.push(DocComment {

@@ -1,4 +1,4 @@
-//! LimitTable of every check by folder, and the exemptions of types that share a name.
+//! Limits of every check by folder, and the exemptions of types that share a name.
 //!
 //! Both files are written in the part of TOML that they need: `[section]`, `key = value`, and comments on lines of
 //! their own.
@@ -97,7 +97,7 @@ pub struct Finding {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LimitTable(BTreeMap<String, BTreeMap<String, f64>>);
 
-/// NameDefinitions that may be defined more than once, each with its reason.
+/// Names that may be defined more than once, each with its reason.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Exemptions(BTreeMap<String, String>);
 
@@ -146,7 +146,7 @@ impl fmt::Display for LimitTable {
         )?;
         writeln!(
             f,
-            "# of the doc comments, and none of all else. LimitTable only fall: `cargo run --release --package perturb-lint --"
+            "# of the doc comments, and none of all else. Limits only fall: `cargo run --release --package perturb-lint --"
         )?;
         writeln!(f, "# --write-limits` writes the numbers of today.")?;
         for check in Check::ALL {

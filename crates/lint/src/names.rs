@@ -1,9 +1,9 @@
-//! NameDefinitions: types defined twice, superlative constants, constructors called `of`, and long test names.
+//! Names: types defined twice, superlative constants, constructors called `of`, and long test names.
 
 use std::collections::BTreeMap;
 
 use crate::lexer::{SourceToken, TokenKind, is_test_attribute, tokens};
-use crate::source::{SourceTree, is_benchmark_or_example, is_test};
+use crate::source::{SourceTree, is_benchmark_or_example, is_generated, is_test};
 
 /// Longest name of a test, in characters.
 pub const MAX_TEST_NAME: usize = 60;
@@ -36,10 +36,10 @@ pub struct NameDefinitions {
     pub long_tests: Vec<Definition>,
 }
 
-/// Reads the names of all Rust and Python files.
+/// Reads the names of all Rust and Python files without generated ones.
 pub fn read(tree: &SourceTree) -> NameDefinitions {
     let mut names = NameDefinitions::default();
-    for (file, source) in tree.with_extension(".rs") {
+    for (file, source) in tree.with_extension(".rs").filter(|(path, _)| !is_generated(path)) {
         read_rust(file, source, &mut names);
     }
     for (file, source) in tree.with_extension(".py") {
@@ -50,7 +50,7 @@ pub fn read(tree: &SourceTree) -> NameDefinitions {
 
 /// Returns the types that are defined in more than one file of the same language, by name, with all their definitions.
 ///
-/// NameDefinitions of Rust and Python are not compared, because a class often stands for the struct of the same name.
+/// Names of Rust and Python are not compared, because a class often stands for the struct of the same name.
 pub fn defined_twice(types: &[Definition]) -> BTreeMap<&str, Vec<&Definition>> {
     let mut by_name: BTreeMap<(&str, bool), Vec<&Definition>> = BTreeMap::new();
     for definition in types {

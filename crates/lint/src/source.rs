@@ -16,7 +16,7 @@ impl SourceTree {
         Self { files: files.into_iter().map(|(path, text)| (path.into(), text.into())).collect() }
     }
 
-    /// Reads the Rust, Python and `Cargo.toml` files of a git checkout. Files that git ignores are left out.
+    /// Reads the Rust, Python, `.proto` and `Cargo.toml` files of a git checkout. Files that git ignores are left out.
     ///
     /// # Errors
     ///
@@ -33,7 +33,7 @@ impl SourceTree {
         }
         let mut files = BTreeMap::new();
         for path in String::from_utf8_lossy(&output.stdout).split('\0') {
-            if !(path.ends_with(".rs") || path.ends_with(".py") || path.ends_with("Cargo.toml")) {
+            if ![".rs", ".py", ".proto", "Cargo.toml"].iter().any(|end| path.ends_with(end)) {
                 continue;
             }
             // A file that was deleted but is still in the index is not part of the tree.
@@ -73,6 +73,13 @@ pub fn is_test(path: &str) -> bool {
         || name.ends_with("_test.rs")
         || name.ends_with("_tests.rs")
         || (name.starts_with("test_") && name.ends_with(".py"))
+}
+
+/// Tells whether a file was generated from other files of the repository, such as `.proto` files.
+///
+/// These are the files below folders called `generated`, and the bindings of MuJoCo.
+pub fn is_generated(path: &str) -> bool {
+    path.contains("/generated/") || path.ends_with("/bindings.rs")
 }
 
 /// Tells whether a file belongs to a benchmark or an example, which are programs of their own.

@@ -205,6 +205,19 @@ fn comments_without_subject_are_counted_by_folder() {
 }
 
 #[test]
+fn proto_comments_are_counted_but_not_generated_code() {
+    let tree = SourceTree::from_files([
+        ("proto/a.proto", "// What it is.\n// Whatever.\nmessage A {\n  // The number.\n  int32 b = 1;\n}\n"),
+        ("a/src/generated/a.rs", "/// What it is.\npub struct A;\nconst MOST: u8 = 1;\n"),
+        ("a/src/lib.rs", "/// The type.\npub struct A;\n"),
+    ]);
+    assert_eq!(count(&tree, Check::DocComments, "proto"), 50.0);
+    assert_eq!(count(&tree, Check::DocComments, "a"), 0.0);
+    assert_eq!(count(&tree, Check::TypesDefinedTwice, "all"), 0.0);
+    assert_eq!(count(&tree, Check::SuperlativeConstants, "a"), 0.0);
+}
+
+#[test]
 fn types_of_two_files_with_one_name_are_found() {
     let tree = rust(&[
         ("a/src/one.rs", "pub struct State;\nimpl Iterator for State { type Item = u8; }\nmod x { enum Line {} }\n"),

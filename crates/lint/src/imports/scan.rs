@@ -35,7 +35,7 @@ struct Scanner {
     items: Vec<Item>,
     /// Number of open braces.
     depth: usize,
-    /// NameDefinitions of the open inline modules, each with the depth of its content.
+    /// Names of the open inline modules, each with the depth of its content.
     inside: Vec<(String, usize)>,
 }
 

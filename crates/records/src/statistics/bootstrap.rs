@@ -2,7 +2,8 @@
 
 use perturb_policy::random::{Purpose, stream, uniform};
 
-use super::MIN_RUNS_FOR_INTERVAL;
+/// The smallest number of runs in an environment that an interval is computed from.
+pub const MIN_RUNS_FOR_INTERVAL: usize = 3;
 
 /// A number with its 95 % interval.
 #[derive(Clone, Copy, Debug, PartialEq)]

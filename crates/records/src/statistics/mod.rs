@@ -11,10 +11,10 @@ mod paired;
 mod t_interval;
 
 pub use aggregates::{interquartile_mean, optimality_gap, probability_of_improvement, profile};
-pub use bootstrap::{Bootstrapped, bootstrap, percentile_interval, resample};
+pub use bootstrap::{Bootstrapped, MIN_RUNS_FOR_INTERVAL, bootstrap, percentile_interval, resample};
 pub use means::{geometric_mean, mean, wilson};
 pub use paired::{holm, sign_flip_p};
-pub use t_interval::{MIN_RUNS_FOR_INTERVAL, mean_with_t_interval};
+pub use t_interval::mean_with_t_interval;
 
 /// Mean and deviation over runs.
 #[derive(Clone, Copy, Debug, PartialEq)]

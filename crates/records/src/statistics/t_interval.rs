@@ -5,10 +5,7 @@
 
 use statrs::distribution::{ContinuousCDF, StudentsT};
 
-use super::{Bootstrapped, mean};
-
-/// The smallest number of runs in an environment that an interval is computed from.
-pub const MIN_RUNS_FOR_INTERVAL: usize = 3;
+use super::{Bootstrapped, MIN_RUNS_FOR_INTERVAL, mean};
 
 /// The mean over `strata`, each of which has the same weight, with its 95 % t interval.
 ///
