@@ -1,4 +1,4 @@
-"""How pip builds the package: maturin, after what the package takes from the server is written.
+"""Build backend for pip: writes the server's catalogue, then calls maturin.
 
 That is src/perturb/catalogue.json, the environments and limits as the program perturb-server prints them, which git
 does not keep. The program is PERTURB_SERVER, else what cargo built in the clone, else what is on PATH.

@@ -31,7 +31,7 @@ Step = Callable[[Any], Any]
 
 @dataclass(frozen=True)
 class Case:
-    """What is stepped, EnvPool's name for it, and what to reach."""
+    """A case: the environment, EnvPool's name for it, the batch size, and the target ratio."""
 
     name: str
     peer: str

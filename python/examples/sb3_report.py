@@ -19,7 +19,7 @@ for environment in ("CartPole", "Hopper"):
         PPO("MlpPolicy", envs, n_steps=256, seed=1, device="cpu").learn(steps).save(folder / f"{environment}-{version}")
         envs.close()
     models = {version: PPO.load(folder / f"{environment}-{version}", device="cpu") for version in ("D", "R")}
-    assessments.append(perturb.assess(models, environment, episodes=episodes, seed=1, name="SB3 PPO"))
+    assessments.append(perturb.evaluate(models, environment, episodes=episodes, seed=1, name="SB3 PPO"))
     assessments[-1].save(folder / environment)
     print(assessments[-1])
 assessments[0].to_html(folder / "report.html", beside=[assessments[1], ours])

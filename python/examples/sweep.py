@@ -1,4 +1,4 @@
-"""What if the pole were longer? One batch, each environment with another pole, one simple policy. Needs nothing more.
+"""A simple policy on poles of many lengths: one batch, in which each environment has another pole. Needs nothing more.
 
 Every environment of a batch may have parameters of its own: reset it by a mask. All begin in the same state.
 Run: python sweep.py [--server unix:/path]

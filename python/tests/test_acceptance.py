@@ -75,13 +75,13 @@ def test_the_report_has_an_agent_of_stable_baselines3_and_its_checkpoint_gives_t
     for row in ("SB3 PPO (trained elsewhere)", "ppo ff", "CartPole", "Hopper"):
         assert row in page
     models = {version: PPO.load(tmp_path / f"CartPole-{version}", device="cpu") for version in ("D", "R")}
-    again = perturb.assess(models, "CartPole", episodes=20, seed=1, name="SB3 PPO", server=server)
+    again = perturb.evaluate(models, "CartPole", episodes=20, seed=1, name="SB3 PPO", server=server)
     again.save(tmp_path / "again")
     files = sorted(path.name for path in (tmp_path / "again").iterdir())
     assert files == ["assessment.json", "episodes-D.parquet", "episodes-R.parquet"]
     for name in files:
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "CartPole" / name).read_bytes()
-    other = perturb.assess(models, "CartPole", episodes=20, seed=2, name="SB3 PPO", server=server)
+    other = perturb.evaluate(models, "CartPole", episodes=20, seed=2, name="SB3 PPO", server=server)
     other.save(tmp_path / "other")
     assert (tmp_path / "other" / files[1]).read_bytes() != (tmp_path / "again" / files[1]).read_bytes()
     known = '"timesteps": 2048'

@@ -49,7 +49,7 @@ def saved(assessment: perturb.Assessment, folder: Path) -> bytes:
 def test_shipped_policies_have_their_shipped_records(cell: str, tmp_path: Path, server: str) -> None:
     """The 3000 test episodes that the experiment recorded, judged by its rule, to the byte."""
     policy = perturb.load_policy(CELLS / cell / "training")
-    assessment = perturb.assess(policy, policy.environment, success="code", server=server)
+    assessment = perturb.evaluate(policy, policy.environment, success="code", server=server)
     # Records that were kept before files had checksums are the same without.
     unsealed = re.sub(rb"perturb\.crc32c=[0-9a-f]{8}", b"", saved(assessment, tmp_path / "saved"))
     assert unsealed == (CELLS / cell / "episodes.parquet").read_bytes()
@@ -59,7 +59,7 @@ def test_shipped_policies_have_their_shipped_records(cell: str, tmp_path: Path, 
 def test_evaluate_and_assess_give_the_same_records(checkpoint: Path, tmp_path: Path, server: str) -> None:
     evaluated(checkpoint, tmp_path / "records", server, "--episodes", "250", "--seed", "77", "--versions", "D,E,R+E")
     policy = perturb.load_policy(checkpoint)
-    assessment = perturb.assess(
+    assessment = perturb.evaluate(
         policy, policy.environment, versions=("R+E", "D", "E"), episodes=250, seed=77, server=server
     )
     assert saved(assessment, tmp_path / "saved") == (tmp_path / "records").read_bytes()
@@ -81,7 +81,7 @@ def test_so_they_do_for_policies_that_remember(
     out = tmp_path / "run"
     run("train", "--env", environment, *settings, "--episodes", "20", "--server", server, "--out", str(out))
     evaluated(out, tmp_path / "records", server, "--episodes", "30", "--seed", "5")
-    assessment = perturb.assess(perturb.load_policy(out), environment, episodes=30, seed=5, server=server)
+    assessment = perturb.evaluate(perturb.load_policy(out), environment, episodes=30, seed=5, server=server)
     assert saved(assessment, tmp_path / "saved") == (tmp_path / "records").read_bytes()
 
 
@@ -89,7 +89,7 @@ def test_so_they_do_on_sets_of_ones_own_and_with_another_rule(tmp_path: Path, se
     own = ["--parameters", "length=0.3..0.4,0.8..0.9", "mass=0.1", "--base-version", "E", "--success", "steps=90"]
     evaluated(CART_POLE, tmp_path / "records", server, "--episodes", "20", *own)
     policy = perturb.load_policy(CART_POLE)
-    assessment = perturb.assess(
+    assessment = perturb.evaluate(
         policy,
         "CartPole",
         parameters={"length": [(0.3, 0.4), (0.8, 0.9)], "mass": 0.1},
@@ -104,7 +104,7 @@ def test_so_they_do_on_sets_of_ones_own_and_with_another_rule(tmp_path: Path, se
     (tmp_path / "contexts.csv").write_text("length,mass\n0.3,0.1\n0.5,0.2\n0.9,0.3\n")
     evaluated(CART_POLE, tmp_path / "records", server, "--episodes", "30", "--contexts", str(tmp_path / "contexts.csv"))
     contexts = [{"length": 0.3, "mass": 0.1}, {"length": 0.5, "mass": 0.2}, {"length": 0.9, "mass": 0.3}]
-    assessment = perturb.assess(policy, "CartPole", contexts=contexts, episodes=30, server=server)
+    assessment = perturb.evaluate(policy, "CartPole", contexts=contexts, episodes=30, server=server)
     assert saved(assessment, tmp_path / "listed") == (tmp_path / "records").read_bytes()
 
 
@@ -124,8 +124,8 @@ def same_episodes(a: perturb.Assessment, b: perturb.Assessment) -> None:
 
 def test_a_function_is_tested_in_the_same_episodes_as_a_checkpoint(server: str) -> None:
     policy = perturb.load_policy(CART_POLE)
-    of_policy = perturb.assess(policy, "CartPole", episodes=120, seed=3, server=server).columns()
-    assessment = perturb.assess(upright, "CartPole", episodes=120, seed=3, server=server)
+    of_policy = perturb.evaluate(policy, "CartPole", episodes=120, seed=3, server=server).columns()
+    assessment = perturb.evaluate(upright, "CartPole", episodes=120, seed=3, server=server)
     of_function = assessment.columns()
     assert list(of_function) == list(of_policy)
     for name in ("set", "seed", "environment_index", "episode_index", "requested_length", "applied_mass"):
@@ -146,11 +146,11 @@ def test_a_function_with_memory_is_told_where_episodes_begin(server: str) -> Non
         lengths.extend(memory[starts].tolist())
         return np.zeros(len(observations), np.int64), np.where(starts, 1, memory + 1)
 
-    assessment = perturb.assess(counts, "CartPole", versions=("R",), episodes=300, seed=3, server=server)
+    assessment = perturb.evaluate(counts, "CartPole", versions=("R",), episodes=300, seed=3, server=server)
     recorded = assessment.columns()["length"].tolist()
     assert set(recorded) <= set(lengths)
     assert len(set(recorded)) > 2
-    again = perturb.assess(
+    again = perturb.evaluate(
         lambda observations: np.zeros(len(observations), np.int64),
         "CartPole",
         versions=("R",),
@@ -169,10 +169,10 @@ def test_random_functions_are_seeded_and_the_callers_numbers_go_on(server: str) 
     expected = np.random.random(2)
     np.random.seed(1)
     first = np.random.random()
-    one = perturb.assess(guesses, "CartPole", versions=("D",), episodes=50, server=server)
+    one = perturb.evaluate(guesses, "CartPole", versions=("D",), episodes=50, server=server)
     assert [first, np.random.random()] == expected.tolist()
-    same_episodes(one, perturb.assess(guesses, "CartPole", versions=("D",), episodes=50, server=server))
-    other = perturb.assess(guesses, "CartPole", versions=("D",), episodes=50, seed=2, server=server)
+    same_episodes(one, perturb.evaluate(guesses, "CartPole", versions=("D",), episodes=50, server=server))
+    other = perturb.evaluate(guesses, "CartPole", versions=("D",), episodes=50, seed=2, server=server)
     assert (one.columns()["length"] != other.columns()["length"]).any()
 
 
@@ -182,7 +182,7 @@ def test_policies_of_each_version_give_the_nine_scenarios(server: str) -> None:
         "D": perturb.load_policy(CART_POLE),
         "E": upright,
     }
-    assessment = perturb.assess(trained, "CartPole", episodes=100, seed=1, server=server)
+    assessment = perturb.evaluate(trained, "CartPole", episodes=100, seed=1, server=server)
     names = [result.scenario for result in assessment.results]
     assert names == ["DD", "DR", "DE", "RD", "RR", "RE", "ED", "ER", "EE"]
     rate = {name: assessment[name].success_percent for name in names}
@@ -198,18 +198,18 @@ def test_policies_of_each_version_give_the_nine_scenarios(server: str) -> None:
 
 
 def test_one_policy_has_the_metrics_of_its_training(server: str) -> None:
-    assessment = perturb.assess(perturb.load_policy(CART_POLE), "CartPole", episodes=50, server=server)
+    assessment = perturb.evaluate(perturb.load_policy(CART_POLE), "CartPole", episodes=50, server=server)
     default = assessment["DD"].success_percent
     assert assessment.metrics == {"Default": default, "Interpolation": None, "Extrapolation": None}
-    unknown = perturb.assess(upright, "CartPole", episodes=10, server=server)
+    unknown = perturb.evaluate(upright, "CartPole", episodes=10, server=server)
     assert set(unknown.metrics.values()) == {None}
     assert "paper" not in str(unknown)
-    named = perturb.assess(upright, "CartPole", episodes=10, trained_on="R", server=server)
+    named = perturb.evaluate(upright, "CartPole", episodes=10, trained_on="R", server=server)
     assert named.metrics["Interpolation"] == named["RR"].success_percent
 
 
 def test_figures_follow_from_the_episodes(server: str) -> None:
-    assessment = perturb.assess(upright, "CartPole", versions=("E",), episodes=1000, server=server)
+    assessment = perturb.evaluate(upright, "CartPole", versions=("E",), episodes=1000, server=server)
     result, columns = assessment["E"], assessment.columns()
     n, successes = result.episodes, int(columns["success"].sum())
     assert (n, result.success_percent) == (1000, 100 * successes / 1000)
@@ -237,7 +237,7 @@ def test_figures_follow_from_the_episodes(server: str) -> None:
         assert part.episodes == within.sum()
         assert part.successes == columns["success"][within].sum()
     assert (
-        perturb.assess(upright, "CartPole", versions=("D",), episodes=5, server=server).success_by_parameter(
+        perturb.evaluate(upright, "CartPole", versions=("D",), episodes=5, server=server).success_by_parameter(
             "D", "length"
         )
         == ()
@@ -250,7 +250,7 @@ def test_figures_follow_from_the_episodes(server: str) -> None:
 
 def test_what_is_saved_is_loaded(tmp_path: Path, server: str) -> None:
     trained = {"D": perturb.load_policy(CART_POLE), "E": upright}
-    assessment = perturb.assess(trained, "CartPole", episodes=20, server=server)
+    assessment = perturb.evaluate(trained, "CartPole", episodes=20, server=server)
     assessment.save(tmp_path / "saved")
     loaded = perturb.Assessment.load(tmp_path / "saved")
     assert loaded.agent == assessment.agent == "ppo ff, function upright"
@@ -259,7 +259,7 @@ def test_what_is_saved_is_loaded(tmp_path: Path, server: str) -> None:
     same_episodes(loaded, assessment)
     with pytest.raises(perturb.InvalidArgumentError, match="overwrite=True replaces it"):
         assessment.save(tmp_path / "saved")
-    one = perturb.assess(upright, "CartPole", episodes=10, server=server)
+    one = perturb.evaluate(upright, "CartPole", episodes=10, server=server)
     one.save(tmp_path / "saved", overwrite=True)
     assert sorted(path.name for path in (tmp_path / "saved").iterdir()) == ["assessment.json", "episodes.parquet"]
     (tmp_path / "other").mkdir()
@@ -272,7 +272,7 @@ def test_what_is_saved_is_loaded(tmp_path: Path, server: str) -> None:
 def test_what_is_no_assessment_is_refused(tmp_path: Path, server: str) -> None:
     with pytest.raises(perturb.InvalidArgumentError, match="holds no assessment"):
         perturb.Assessment.load(tmp_path)
-    perturb.assess(upright, "CartPole", episodes=10, server=server).save(tmp_path)
+    perturb.evaluate(upright, "CartPole", episodes=10, server=server).save(tmp_path)
     (tmp_path / "episodes.parquet").write_bytes(b"PAR1")
     with pytest.raises(perturb.InvalidArgumentError, match="does not hold recorded episodes"):
         perturb.Assessment.load(tmp_path)
@@ -291,7 +291,7 @@ def test_what_is_no_assessment_is_refused(tmp_path: Path, server: str) -> None:
 
 
 def test_pandas_has_every_episode_where_it_is_installed(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    assessment = perturb.assess(upright, "CartPole", episodes=10, server=server)
+    assessment = perturb.evaluate(upright, "CartPole", episodes=10, server=server)
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "pandas", None)
         with pytest.raises(ImportError, match="pip install pandas"):
@@ -348,7 +348,7 @@ def test_what_cannot_be_tested_is_refused(
 ) -> None:
     settings = {"policy": upright, "environment": "CartPole", "episodes": 5, "server": server, **change}
     with pytest.raises(error, match=words):
-        perturb.assess(**settings)
+        perturb.evaluate(**settings)
 
 
 @pytest.mark.parametrize(
@@ -364,7 +364,7 @@ def test_what_cannot_be_tested_is_refused(
 def test_a_loaded_policy_is_what_it_is(change: dict[str, Any], words: str, server: str) -> None:
     settings = {"environment": "CartPole", "episodes": 1, "server": server, **change}
     with pytest.raises(perturb.PolicyError, match=words):
-        perturb.assess(perturb.load_policy(CART_POLE), **settings)
+        perturb.evaluate(perturb.load_policy(CART_POLE), **settings)
 
 
 def test_parameters_can_be_observed(server: str) -> None:
@@ -374,12 +374,12 @@ def test_parameters_can_be_observed(server: str) -> None:
         seen.append(observations.shape)
         return np.zeros(len(observations), np.int64)
 
-    perturb.assess(looks, "CartPole", versions=("R",), episodes=3, observe="parameters", server=server)
+    perturb.evaluate(looks, "CartPole", versions=("R",), episodes=3, observe="parameters", server=server)
     assert set(seen) == {(3, 7)}
 
 
 def test_without_a_server_a_private_one_plays() -> None:
-    assert perturb.assess(upright, "CartPole", versions=("D",), episodes=2)["D"].episodes == 2
+    assert perturb.evaluate(upright, "CartPole", versions=("D",), episodes=2)["D"].episodes == 2
 
 
 def test_the_papers_numbers_are_there_for_all_environments() -> None:

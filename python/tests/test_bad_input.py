@@ -16,6 +16,7 @@ from .conftest import ROOT, identifier
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
 NAN, INF = float("nan"), float("inf")
 
@@ -79,8 +80,22 @@ def test_wrong_actions_of_a_batch_move_nothing(actions: Any, says: str, server: 
         ({"server": "nowhere"}, perturb.InvalidArgumentError, "port is missing"),
         ({"server": 7}, perturb.InvalidArgumentError, "no text"),
         ({"parameters": ["force"]}, perturb.InvalidArgumentError, "expected a dict"),
-        ({"parameters": {"force": "strong"}}, perturb.InvalidArgumentError, "'strong'"),
-        ({"parameters": {"force": "5"}}, perturb.InvalidArgumentError, "'5'"),
+        ({"parameters": {"force": "strong"}}, perturb.InvalidArgumentError, "`strong`, but must be a value"),
+        ({"parameters": {"force": "7,5"}}, perturb.InvalidArgumentError, "7.5 for one number, or `7, 5` for two"),
+        ({"parameters": {"force": "7.5,8.5"}}, perturb.InvalidArgumentError, "which are points"),
+        ({"parameters": {"force": "5..9/3"}}, perturb.InvalidArgumentError, "perturb.sets.grid"),
+        (
+            {"parameters": {"force": [5, 9]}},
+            perturb.InvalidArgumentError,
+            r"may be an interval or two values; write \(5, 9\)",
+        ),
+        ({"parameters": {"force": np.array([5, 9])}}, perturb.InvalidArgumentError, "may be an interval or two values"),
+        ({"max_episode_steps": 5, "forse": 1}, perturb.InvalidArgumentError, "max_episode_steps= is no setting"),
+        (
+            {"versions": "R"},
+            perturb.InvalidArgumentError,
+            r"versions= is no setting of environments \(did you mean version=",
+        ),
         ({"parameters": {"force": (1, 2, 3)}}, perturb.InvalidArgumentError, r"\(1, 2, 3\)"),
         ({"parameters": {"force": [(1, 2), 3]}}, perturb.InvalidArgumentError, "several intervals"),
         ({"parameters": {7: 7}}, perturb.InvalidArgumentError, "key 7"),
@@ -126,6 +141,8 @@ def test_unknown_names_are_key_errors_with_a_plain_sentence(server: str) -> None
         ({"num_envs": 2**32}, "4294967296"),
         ({"autoreset_mode": "Sometimes"}, "'SameStep'"),
         ({"first_environment_index": "first"}, "'first'"),
+        ({"max_episode_steps": 50}, "the step limit of the server, 200"),
+        ({"daemon": True}, "daemon= is no setting of environments; there are"),
     ],
 )
 def test_wrong_settings_of_a_batch_are_refused(settings: dict[str, Any], says: str, server: str) -> None:
@@ -144,7 +161,7 @@ def test_wrong_settings_of_a_batch_are_refused(settings: dict[str, Any], says: s
         (np.array([1, 2]), None, "2 numbers"),
         (np.array([1.0, 2.0, 3.0]), None, "1.0"),
         (np.array([[1], [2], [3]]), None, "integer"),
-        ([1, 2, None], None, "None"),
+        ([1, 2, "x"], None, "'x'"),
         (None, ["state"], "expected a dict"),
         (None, {"states": [[0] * 4] * 3}, "unknown keys"),
         (None, {"state": [0] * 4}, "3 rows"),
@@ -234,6 +251,11 @@ def test_addresses_are_understood_as_in_rust(text: str, target: str) -> None:
     assert parse_address(text).target == target
 
 
+def test_relative_socket_becomes_absolute(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert parse_address("unix:my.sock").target == f"unix:{tmp_path}/my.sock"
+
+
 @pytest.mark.parametrize("text", ADDRESSES["refused"])
 def test_addresses_are_refused_as_in_rust(text: str) -> None:
     with pytest.raises(perturb.InvalidArgumentError, match="is not a server's address"):
@@ -244,7 +266,8 @@ def test_addresses_are_refused_as_in_rust(text: str) -> None:
     ("text", "says"),
     [
         ("", "port is missing"),
-        ("unix:relative", "absolute"),
+        ("unix://relative", "absolute"),
+        ("unix:", "missing"),
         ("unix:/" + "x" * 200, "107"),
         ("https://host", "port is missing"),
         ("ftp://host:1", "not a host name"),

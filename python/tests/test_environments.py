@@ -87,7 +87,14 @@ def test_a_copied_batch_plays_the_same_episodes_after_a_reset(server: str) -> No
     for _ in range(3):
         np.testing.assert_array_equal(batch.step(np.ones((5, 1)))[0], other.step(np.ones((5, 1)))[0])
     batch.reset(options={"parameters": {"mass": 1.2}, "reset_mask": np.array([True, False, False, False, False])})
-    with pytest.raises(perturb.OutOfOrderError, match="do not all have the parameters"):
+    third = pickle.loads(pickle.dumps(batch))
+    (one, infos), (two, other_infos) = batch.reset(seed=2), third.reset(seed=2)
+    np.testing.assert_array_equal(one, two)
+    assert infos["parameters"]["mass"].tolist() == other_infos["parameters"]["mass"].tolist()
+    assert infos["parameters"]["mass"][0] == 1.2
+    third.close()
+    batch.restore(batch.snapshot())
+    with pytest.raises(perturb.OutOfOrderError, match="a snapshot was restored"):
         pickle.dumps(batch)
     batch.close()
     other.close()
@@ -102,10 +109,10 @@ def test_versions_are_refused_alike_everywhere(version: Any) -> None:
         gymnasium.make_vec(identifier("CartPole"), version=version)
     for settings in ({"versions": [version]}, {"base": version}):
         with pytest.raises(perturb.InvalidArgumentError, match=words):
-            perturb.assess(lambda observations: observations, "CartPole", **settings)
+            perturb.evaluate(lambda observations: observations, "CartPole", **settings)
     if version is not None:
         with pytest.raises(perturb.InvalidArgumentError, match=words):
-            perturb.assess(lambda observations: observations, "CartPole", trained_on=version)
+            perturb.evaluate(lambda observations: observations, "CartPole", trained_on=version)
 
 
 def test_versions_are_typed() -> None:

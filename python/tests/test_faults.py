@@ -101,17 +101,33 @@ def test_a_reset_finds_a_server_that_runs_again(start_server: Callable[..., Any]
         env.close()
 
 
-@pytest.mark.parametrize("by", ["mask", "snapshot"])
-def test_parameters_of_some_environments_are_not_forgotten_silently(by: str, start_server: Callable[..., Any]) -> None:
+def test_parameters_of_some_environments_survive_a_lost_server(start_server: Callable[..., Any]) -> None:
+    with tempfile.TemporaryDirectory() as directory:
+        listen = f"unix:{directory}/server.sock"
+        running = start_server(listen=listen)
+        envs = perturb.PerturbVectorEnv("CartPole", 3, version="R", parameters={"mass": 0.1}, server=listen)
+        envs.reset(seed=1)
+        for mass, mask in ((0.3, [True, False, False]), (0.4, [False, False, True])):
+            envs.reset(options={"parameters": {"mass": mass}, "reset_mask": np.array(mask)})
+        expected, infos = envs.reset(seed=1)
+        running.process.kill()
+        running.process.wait()
+        start_server(listen=listen)
+        with pytest.raises(perturb.ServerConnectionError):
+            envs.step(np.zeros(3, dtype=np.int64))
+        observations, again = envs.reset(seed=1)
+        assert again["parameters"]["mass"].tolist() == [0.3, 0.1, 0.4]
+        np.testing.assert_array_equal(observations, expected)
+        np.testing.assert_array_equal(again["parameters"]["length"], infos["parameters"]["length"])
+
+
+def test_parameters_of_a_snapshot_are_not_forgotten_silently(start_server: Callable[..., Any]) -> None:
     with tempfile.TemporaryDirectory() as directory:
         listen = f"unix:{directory}/server.sock"
         running = start_server(listen=listen)
         envs = perturb.PerturbVectorEnv("CartPole", 2, server=listen)
         envs.reset(seed=1)
-        if by == "mask":
-            envs.reset(options={"parameters": {"mass": 0.3}, "reset_mask": np.array([True, False])})
-        else:
-            envs.restore(envs.snapshot())
+        envs.restore(envs.snapshot())
         running.process.kill()
         running.process.wait()
         start_server(listen=listen)

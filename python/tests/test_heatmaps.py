@@ -15,18 +15,31 @@ from .test_policy import CART_POLE, PENDULUM
 @pytest.mark.parametrize("checkpoint", [CART_POLE, PENDULUM])
 def test_a_test_over_two_parameters_is_that_of_the_program(checkpoint: Path, tmp_path: Path, server: str) -> None:
     made = str(tmp_path / "made")
-    arguments = ("--grid", "3", "--episodes", "2", "--seed", "5", "--base-version", "R", "--out", made, "--server", server)
+    arguments = (
+        "--grid",
+        "3",
+        "--episodes",
+        "2",
+        "--seed",
+        "5",
+        "--base-version",
+        "R",
+        "--out",
+        made,
+        "--server",
+        server,
+    )
     run("heatmap", "--checkpoint", str(checkpoint), *arguments)
     policy = perturb.load_policy(checkpoint)
     over = perturb.sets.heatmap(policy.environment, points=3, base="R")
-    assessment = perturb.assess(policy, policy.environment, versions=[over], episodes=18, seed=5, server=server)
+    assessment = perturb.evaluate(policy, policy.environment, versions=[over], episodes=18, seed=5, server=server)
     assert saved(assessment, tmp_path / "saved") == Path(made + ".parquet").read_bytes()
 
 
 def test_reports_have_it_beside_those_of_others(tmp_path: Path, server: str) -> None:
     over = perturb.sets.heatmap("CartPole", "length", "force", points=4, fixed={"mass": 0.2})
     policies = {"D": upright, "E": upright}
-    assessment = perturb.assess(policies, "CartPole", versions=["D", over], episodes=32, server=server, name="pushes")
+    assessment = perturb.evaluate(policies, "CartPole", versions=["D", over], episodes=32, server=server, name="pushes")
     assessment.save(tmp_path / "saved")
     page = assessment.to_html()
     assert "pushes (trained elsewhere): mean return and success over length and force" in page
@@ -36,7 +49,7 @@ def test_reports_have_it_beside_those_of_others(tmp_path: Path, server: str) -> 
     lines = figures.read_text("utf-8").splitlines()
     assert lines[0] == "train,runs,length,force,mean_return,success_percent"
     assert len(lines) == 1 + 2 * 16
-    without = perturb.assess(upright, "CartPole", versions=["D"], episodes=10, server=server, name="pushes")
+    without = perturb.evaluate(upright, "CartPole", versions=["D"], episodes=10, server=server, name="pushes")
     assert "mean return and success over" not in without.to_html()
 
 

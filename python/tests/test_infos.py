@@ -1,83 +1,119 @@
-"""Infos that are filled when somebody looks."""
+"""Infos of a batch are plain dictionaries, whoever reads or rebuilds them."""
 
 from __future__ import annotations
 
-import copy
 import json
-import operator
 import pickle
-from collections.abc import Callable
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode
 
 import perturb
-from perturb.infos import Later
+from perturb.infos import merge
 
-FILLED = {"a": 1, "_a": 2}
-
-LOOKS: list[Callable[[Any], Any]] = [
-    dict,
-    list,
-    len,
-    repr,
-    bool,
-    json.dumps,
-    copy.copy,
-    copy.deepcopy,
-    lambda it: pickle.loads(pickle.dumps(it)),
-    lambda it: {**it},
-    lambda it: it | {"b": 3},
-    lambda it: {"b": 3} | it,
-    lambda it: it == FILLED,
-    lambda it: operator.eq(FILLED, it),
-    lambda it: it != FILLED,
-    lambda it: "a" in it,
-    lambda it: it["a"],
-    lambda it: it.get("a"),
-    lambda it: list(it.items()),
-    lambda it: list(it.values()),
-    lambda it: list(reversed(it)),
-    lambda it: (it.pop("a"), dict(it)),
-    lambda it: (it.setdefault("a", 7), dict(it)),
-    lambda it: (it.update(b=4), dict(it)),
-    lambda it: (it.__setitem__("a", 9), dict(it)),
-    lambda it: (it.__delitem__("a"), dict(it)),
-]
+from .conftest import identifier
 
 
-@pytest.mark.parametrize("look", LOOKS)
-def test_whatever_looks_sees_what_a_plain_dictionary_has(look: Callable[[Any], Any]) -> None:
-    fills = []
-
-    def fill() -> dict[str, Any]:
-        fills.append(1)
-        return dict(FILLED)
-
-    assert look(Later(fill)) == look(dict(FILLED))
-    assert fills == [1]
+def every_dictionary(infos: dict[str, Any]) -> list[dict[str, Any]]:
+    return [infos, *(inner for value in infos.values() if isinstance(value, dict) for inner in every_dictionary(value))]
 
 
-def test_pickled_and_copied_it_is_a_plain_one() -> None:
-    for made in (pickle.loads(pickle.dumps(Later(FILLED.copy))), copy.deepcopy(Later(FILLED.copy))):
-        assert type(made) is dict
-
-
-def test_what_a_step_brings_is_filled_when_somebody_looks(server: str) -> None:
-    envs = perturb.PerturbVectorEnv("CartPole", 16, version="R", server=server)
-    envs.reset(seed=1)
-    looked = 0
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_infos_are_plain_dictionaries_of_arrays(mode: AutoresetMode, server: str) -> None:
+    envs = perturb.PerturbVectorEnv("CartPole", 16, version="R", autoreset_mode=mode, server=server)
+    _, infos = envs.reset(seed=1)
+    seen = 0
     for _ in range(60):
-        *_, infos = envs.step(np.ones(16, dtype=np.int64))
-        if "parameters" not in infos:
-            continue
-        assert [list(dict.__iter__(infos[key])) for key in ("parameters", "receipt")] == [["unfilled"]] * 2
-        told = infos["_parameters"]
-        for name, values in infos["receipt"]["applied"].items():
-            if not name.startswith("_") and name in infos["parameters"]:
-                np.testing.assert_allclose(values[told], infos["parameters"][name][told], rtol=1e-9)
-                looked += int(told.sum())
-        assert infos["context_id"][told].tolist() == infos["receipt"]["trial_index"][told].tolist()
-    assert looked > 0
+        for one in every_dictionary(infos):
+            assert type(one) is dict
+            for key, value in one.items():
+                assert isinstance(value, dict | np.ndarray), key
+                assert one[f"_{key.removeprefix('_')}"].shape == (16,)
+        if "parameters" in infos:
+            told = infos["_parameters"]
+            for name, values in infos["receipt"]["applied"].items():
+                if not name.startswith("_") and name in infos["parameters"]:
+                    np.testing.assert_allclose(values[told], infos["parameters"][name][told], rtol=1e-9)
+                    seen += int(told.sum())
+            assert infos["context_id"][told].tolist() == infos["receipt"]["trial_index"][told].tolist()
+            assert infos["receipt"]["model_hash"].shape == (16, 32)
+            assert not infos["receipt"]["model_hash"].any(), "CartPole has no model"
+        *_, terminated, truncated, infos = envs.step(np.ones(16, dtype=np.int64))
+        if mode is AutoresetMode.DISABLED and (terminated | truncated).any():
+            _, infos = envs.reset(options={"reset_mask": terminated | truncated})
+    assert seen > 30
     envs.close()
+
+
+def test_readers_in_c_see_all_of_infos(server: str) -> None:
+    envs = perturb.PerturbVectorEnv("CartPole", 3, version="R", server=server)
+    _, infos = envs.reset(seed=1)
+    read = json.loads(json.dumps(infos["parameters"], default=lambda array: array.tolist()))
+    assert read == {name: values.tolist() for name, values in infos["parameters"].items()}
+    assert list(pickle.loads(pickle.dumps(infos))) == list(infos)
+    rebuilt = type(infos["receipt"])(infos["receipt"].items())
+    assert list(rebuilt) == list(infos["receipt"])
+
+
+def test_infos_have_numbers_alone(server: str) -> None:
+    """Libraries that convert arrays, as NumpyToTorch of Gymnasium, can convert neither text nor objects."""
+    expected = bytes.fromhex(perturb.environments()["Hopper"].model_hash)
+    assert len(expected) == 32
+    single = perturb.PerturbEnv("Hopper", server=server)
+    _, info = single.reset(seed=1)
+    assert info["receipt"]["model_hash"].tobytes() == expected
+    envs = perturb.PerturbVectorEnv("Hopper", 2, server=server, autoreset_mode="Disabled")
+    _, infos = envs.reset(seed=1)
+    assert [row.tobytes() for row in infos["receipt"]["model_hash"]] == [expected] * 2
+    _, infos = envs.reset(options={"reset_mask": np.array([True, False])})
+    assert [row.tobytes() for row in infos["receipt"]["model_hash"]] == [expected, bytes(32)]
+    for one in [*every_dictionary(info), *every_dictionary(infos)]:
+        for value in one.values():
+            if not isinstance(value, dict):
+                assert np.asarray(value).dtype.kind in "biuf"
+    single.close()
+    envs.close()
+
+
+def test_achieved_is_there_at_each_end(server: str) -> None:
+    """NaN where nothing was achieved, as in MountainCar without the goal; Monitor wants a key always or never."""
+    env = gymnasium.make(identifier("MountainCar"), server=server)
+    env.reset(seed=1)
+    info: dict[str, Any] = {}
+    while not info:
+        *_, info = env.step(1)
+    assert np.isnan(info["achieved"])
+    envs = perturb.PerturbVectorEnv("MountainCar", 2, server=server)
+    envs.reset(seed=1)
+    infos: dict[str, Any] = {}
+    while "is_success" not in infos:
+        *_, infos = envs.step(np.ones(2, np.int64))
+    assert np.isnan(infos["achieved"]).all()
+    assert infos["_achieved"].all()
+
+
+def test_later_infos_count_where_both_tell() -> None:
+    mask, other = np.array([True, False, True]), np.array([False, True, True])
+    infos: dict[str, Any] = {
+        "a": np.array([1, 0, 3]),
+        "_a": mask,
+        "in": {"b": np.array([1, 0, 3]), "_b": mask},
+        "_in": mask,
+    }
+    later: dict[str, Any] = {
+        "a": np.array([0, 5, 6]),
+        "_a": other,
+        "in": {"b": np.array([0, 5, 6]), "_b": other},
+        "_in": other,
+        "c": np.array([0, 7, 8]),
+        "_c": other,
+    }
+    merge(infos, later)
+    for one, key in ((infos, "a"), (infos["in"], "b")):
+        assert one[key].tolist() == [1, 5, 6]
+        assert one[f"_{key}"].all()
+    assert infos["c"].tolist() == [0, 7, 8]
+    assert mask.tolist() == [True, False, True]

@@ -91,7 +91,7 @@ def test_seeds_may_be_numpys(kind: Any, server: str) -> None:
         (12, [(12, 12)]),
         (np.float32(0.5), [(0.5, 0.5)]),
         ((1, 2), [(1, 2)]),
-        ([3.0, 4.0], [(3, 4)]),
+        ("3..4", [(3, 4)]),
         ([(1, 2), (3, 4)], [(1, 2), (3, 4)]),
         (np.array([[5.0, 6.0], [8.0, 9.0]]), [(5, 6), (8, 9)]),
     ],
@@ -214,15 +214,14 @@ def test_observations_stay_as_they_are(server: str) -> None:
             copies.append(kept[-1].copy())
         assert all((a == b).all() for a, b in zip(kept, copies, strict=True))
         assert not any(np.shares_memory(a, b) for a in kept for b in kept if a is not b)
-        assert all(array.flags.writeable is copy for array in kept)
-        assert all(isinstance(array.base, np.ndarray) is not copy for array in kept)  # a view, unless it is a copy
+        assert all(array.flags.writeable for array in kept)
     env = make(server=server)
     assert env.reset()[0].flags.writeable
     assert env.step(0)[0].flags.writeable
 
 
-def test_changing_a_copy_does_not_change_what_a_mask_leaves_alone(server: str) -> None:
-    envs = make_vec(num_envs=2, copy=True, autoreset_mode=AutoresetMode.DISABLED, server=server)
+def test_changing_observations_does_not_change_what_a_mask_leaves_alone(server: str) -> None:
+    envs = make_vec(num_envs=2, autoreset_mode=AutoresetMode.DISABLED, server=server)
     observations, _ = envs.reset(seed=1)
     expected = observations[1].tolist()
     observations[:] = 99

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import tempfile
+import time
 from concurrent import futures
 from typing import TYPE_CHECKING, Any
 
 import grpc
+import numpy as np
 import pytest
 
 import perturb
@@ -16,6 +18,7 @@ from .conftest import messages
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+NAN, INF = float("nan"), float("inf")
 pb = messages()
 Answer = pb.SessionResponse
 
@@ -41,7 +44,7 @@ class FakeServer:
     def _session(self, requests: Iterator[Any], _: grpc.ServicerContext) -> Iterator[Any]:
         self.sessions += 1
         for answer, _request in zip(self.answers, requests, strict=False):
-            yield answer
+            yield from answer if isinstance(answer, list) else [answer]
 
     def end(self) -> None:
         self._server.stop(None).wait()
@@ -93,17 +96,18 @@ def test_a_server_that_keeps_to_the_protocol_is_understood(fake: FakeServer) -> 
     env.close()
 
 
-@pytest.mark.parametrize(("outcome", "told"), [({"achieved": 0.0}, {"achieved": 0.0}), ({}, {})])
-def test_what_an_episode_achieved_is_told_where_there_is_anything(
-    outcome: dict[str, float], told: dict[str, float], fake: FakeServer
-) -> None:
+@pytest.mark.parametrize(("outcome", "achieved"), [({"achieved": 0.5}, 0.5), ({}, NAN)])
+def test_what_an_episode_achieved_is_told_or_nan(outcome: dict[str, float], achieved: float, fake: FakeServer) -> None:
     fake.answers = [Answer(opened=opened()), Answer(stepped=ended(**outcome))] * 2
     env = perturb.PerturbEnv("CartPole", server=fake.address)
     env.reset()
-    assert env.step(0)[-1] == {"is_success": False, "diverged": False, **told}
+    info = env.step(0)[-1]
+    np.testing.assert_equal(info, {"is_success": False, "diverged": False, "achieved": achieved})
     envs = perturb.PerturbVectorEnv("CartPole", server=fake.address)
     envs.reset()
-    assert ("achieved" in envs.step([0])[-1]) == bool(told)
+    infos = envs.step([0])[-1]
+    np.testing.assert_equal(infos["achieved"], np.array([achieved]))
+    assert infos["_achieved"].all()
 
 
 def test_a_server_that_does_not_know_parameters_as_observations_is_refused(fake: FakeServer) -> None:
@@ -144,6 +148,57 @@ def test_arrays_of_a_wrong_length_are_refused(field: str, fake: FakeServer) -> N
     env = perturb.PerturbEnv("CartPole", server=fake.address)
     env.reset()
     with pytest.raises(perturb.ProtocolError, match="3 bytes"):
+        env.step(0)
+
+
+def floats(*numbers: float) -> bytes:
+    return np.array(numbers, "<f4").tobytes()
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"rewards": floats(NAN)}, "the reward NaN of slot 0; expected a finite number"),
+        ({"rewards": floats(INF)}, "the reward inf of slot 0"),
+        ({"observations": floats(0, 0, NAN, 0)}, "the number NaN in the observation of slot 0"),
+        ({"terminated": b"\7"}, "the flag 7 of terminated in slot 0; expected 0 or 1"),
+        ({"truncated": b"\2"}, "the flag 2 of truncated in slot 0"),
+        ({"terminated": b"\1"}, "0 ended episodes; expected 1, as many as are flagged"),
+        ({"ended": [pb.EpisodeEnd()], "final_observations": bytes(16)}, "slot 0, which is not flagged as ended"),
+    ],
+)
+def test_replies_that_cannot_be_believed_are_refused(fields: dict[str, Any], says: str, fake: FakeServer) -> None:
+    good = {"observations": bytes(16), "rewards": bytes(4), "terminated": bytes(1), "truncated": bytes(1)}
+    fake.answers = [Answer(opened=opened()), Answer(stepped=pb.Stepped(**{**good, **fields}))]
+    env = perturb.PerturbEnv("CartPole", server=fake.address)
+    env.reset()
+    with pytest.raises(perturb.ProtocolError, match=says):
+        env.step(0)
+
+
+def test_first_observations_that_are_not_finite_are_refused(fake: FakeServer) -> None:
+    wrong = opened()
+    wrong.observations = floats(0, NAN, 0, 0)
+    fake.answers = [Answer(opened=wrong)]
+    with pytest.raises(perturb.ProtocolError, match="the number NaN in the observation"):
+        perturb.PerturbEnv("CartPole", server=fake.address).reset()
+
+
+def test_a_second_reply_to_one_request_is_refused(fake: FakeServer) -> None:
+    other = stepped()
+    other.rewards = floats(7)
+    fake.answers = [
+        Answer(opened=opened()),
+        [Answer(stepped=stepped()), Answer(stepped=other)],
+        Answer(stepped=stepped()),
+    ]
+    env = perturb.PerturbEnv("CartPole", server=fake.address)
+    env.reset()
+    assert env.step(0)[1] == 0
+    time.sleep(0.5)  # the session is looked after meanwhile, and so the reply arrives
+    with pytest.raises(perturb.ProtocolError, match="a second reply to an earlier request"):
+        env.step(0)
+    with pytest.raises(perturb.OutOfOrderError, match="gone"):
         env.step(0)
 
 

@@ -22,7 +22,7 @@ EXPERIMENT = CELLS.parent
 @pytest.fixture(scope="module")
 def assessment(server: str) -> perturb.Assessment:
     """Give an agent's tests that sometimes succeed."""
-    return perturb.assess({"D": upright, "R": upright}, "CartPole", episodes=100, server=server, name="pushes")
+    return perturb.evaluate({"D": upright, "R": upright}, "CartPole", episodes=100, server=server, name="pushes")
 
 
 def rows(page: str, part: str) -> list[str]:
@@ -48,7 +48,7 @@ def test_beside_an_experiment_the_agent_stands_in_its_tables(
     assessment: perturb.Assessment, tmp_path: Path, server: str
 ) -> None:
     assessment.save(tmp_path / "saved")
-    other = perturb.assess(upright, "CartPole", episodes=20, server=server, name="other")
+    other = perturb.evaluate(upright, "CartPole", episodes=20, server=server, name="other")
     page = assessment.to_html(beside=[EXPERIMENT, other])
     assert "cells are done" in page
     assert "2 agents were trained elsewhere" in page
@@ -85,7 +85,7 @@ def test_what_cannot_be_reported_is_refused(assessment: perturb.Assessment, tmp_
 
 def test_the_same_policy_is_replayed_and_another_is_told(tmp_path: Path, server: str) -> None:
     sets: list[Any] = ["D", perturb.sets.grid("corners", {"length": [0.3, 0.9]}, base="R")]
-    assessment = perturb.assess(
+    assessment = perturb.evaluate(
         upright, "CartPole", versions=sets, episodes=30, seed=9, success="steps=90", server=server, name="pushes"
     )
     assessment.save(tmp_path / "saved")
@@ -101,7 +101,7 @@ def test_the_same_policy_is_replayed_and_another_is_told(tmp_path: Path, server:
     assert re.match(r"D, environment 0, episode 0: .*length was \d+, is \d+", audit.different[0])
     with pytest.raises(perturb.InvalidArgumentError, match="expected one policy"):
         loaded.audit({"D": upright}, server=server)
-    loaded = perturb.assess(perturb.load_policy(CART_POLE), "CartPole", episodes=5, server=server)
+    loaded = perturb.evaluate(perturb.load_policy(CART_POLE), "CartPole", episodes=5, server=server)
     with pytest.raises(perturb.PolicyError, match=r"recorded of \d{8}-[0-9a-f]{8}, this is function upright: give"):
         loaded.audit({"D": upright}, server=server)
 
@@ -109,7 +109,7 @@ def test_the_same_policy_is_replayed_and_another_is_told(tmp_path: Path, server:
 def test_perturbs_own_policies_are_replayed_by_both(tmp_path: Path, server: str) -> None:
     other = CELLS / "CartPole-ppo-ff-R-9bd6546b-s7/training"
     trained = {"D": perturb.load_policy(CART_POLE), "E": upright, "R": perturb.load_policy(other)}
-    assessment = perturb.assess(trained, "CartPole", episodes=20, server=server)
+    assessment = perturb.evaluate(trained, "CartPole", episodes=20, server=server)
     assert assessment.audit(trained, server=server) == perturb.Audit(180, ())
     swapped = {"D": trained["R"], "R": trained["D"], "E": upright}
     with pytest.raises(perturb.PolicyError, match="was trained on R, not on D"):
@@ -127,7 +127,7 @@ def test_perturbs_own_policies_are_replayed_by_both(tmp_path: Path, server: str)
 
 def test_worst_contexts_are_those_that_fail(server: str) -> None:
     sets: list[Any] = [perturb.sets.listed("poles", [{"length": length} for length in (0.05, 0.5, 1.0)]), "E"]
-    assessment = perturb.assess(upright, "CartPole", versions=sets, episodes=90, server=server)
+    assessment = perturb.evaluate(upright, "CartPole", versions=sets, episodes=90, server=server)
     worst = assessment.worst_contexts("poles")
     assert [context.episodes for context in worst] == [30, 30, 30]
     assert [context.success_percent for context in worst] == sorted(context.success_percent for context in worst)
@@ -194,7 +194,7 @@ def test_pictures_are_drawn_where_matplotlib_is(
     drawn = [cell for cell in assessment.success_by_parameters("DE", "length", "mass") if cell.episodes]
     assert len(axes.patches) == len(drawn)
     corners = perturb.sets.grid("corners", {"length": [0.3, 0.6, 0.9], "mass": "0.1..0.3/2"})
-    grid = perturb.assess(upright, "CartPole", versions=[corners], episodes=12, server=server)
+    grid = perturb.evaluate(upright, "CartPole", versions=[corners], episodes=12, server=server)
     axes = grid.plot_heatmap("corners", "length", "mass")
     assert axes.get_xlim() == pytest.approx((0.15, 1.05))
     assert len(axes.patches) == 6

@@ -120,10 +120,13 @@ def test_attributes_and_methods_are_those_of_each_environment(server: str) -> No
     envs.reset()
     assert envs.get_attr("observation_space", [0, 2]) == [envs.observation_space] * 2
     assert envs.get_attr("metadata")[0]["success"]["quantity"] == "steps"
+    assert envs.metadata["render_fps"] == 50, "VecVideoRecorder asks for it"
     with pytest.raises(AttributeError, match="length"):
         envs.get_attr("length")
-    with pytest.raises(AttributeError, match="set_options"):
+    with pytest.raises(perturb.AssignmentError, match=r"'length' cannot be assigned.* call set_parameters"):
         envs.set_attr("length", 1)
+    with pytest.raises(perturb.AssignmentError, match="'length' cannot be assigned"):
+        envs.length = 1
     (snapshot,) = envs.env_method("snapshot", indices=1)
     before = envs.step(np.ones(3, int))[0]
     (restored,) = envs.env_method("restore", snapshot, indices=[2])
@@ -158,12 +161,12 @@ def test_stable_baselines3s_own_evaluation_takes_it(server: str) -> None:
 def test_a_model_is_assessed_to_the_same_bytes_again_after_it_was_saved(tmp_path: Path, server: str) -> None:
     models = {"D": trained(server, 4096), "R": trained(server, 4096, "R")}
     before = torch.rand(1), torch.get_rng_state()
-    first = perturb.assess(models, "CartPole", episodes=200, seed=3, server=server)
+    first = perturb.evaluate(models, "CartPole", episodes=200, seed=3, server=server)
     assert torch.equal(torch.get_rng_state(), before[1]), "the caller's random numbers go on"
     for name, model in models.items():
         model.save(tmp_path / name)
     loaded = {name: stable_baselines3.PPO.load(tmp_path / name, device="cpu") for name in models}
-    again = perturb.assess(loaded, "CartPole", episodes=200, seed=3, server=server)
+    again = perturb.evaluate(loaded, "CartPole", episodes=200, seed=3, server=server)
     first.save(tmp_path / "first")
     again.save(tmp_path / "again")
     for name in models:
@@ -171,10 +174,14 @@ def test_a_model_is_assessed_to_the_same_bytes_again_after_it_was_saved(tmp_path
         assert (tmp_path / "first" / file).read_bytes() == (tmp_path / "again" / file).read_bytes()
     assert [result.scenario for result in first.results] == ["DD", "DR", "DE", "RD", "RR", "RE"]
     assert first.metrics["Extrapolation"] is not None
-    sampled = first["DD"].mean_return
-    mode = perturb.assess(models["D"], "CartPole", episodes=200, seed=3, deterministic=True, server=server)
-    assert mode["D"].mean_return > sampled, "what PPO takes for best is better than what it tries"
-    assert mode["D"].policy.startswith("PPO ")
+    mode = first["DD"]
+    assert mode.deterministic, "as in stable-baselines3's own evaluate_policy"
+    assert "actions are the mode" in str(first)
+    sampled = perturb.evaluate(models["D"], "CartPole", episodes=200, seed=3, deterministic=False, server=server)
+    assert mode.mean_return > sampled["D"].mean_return, "what PPO takes for best is better than what it tries"
+    assert sampled["D"].policy.startswith("PPO ")
+    assert "actions are sampled" in str(sampled)
+    assert perturb.Assessment.load(tmp_path / "first")["DD"].deterministic
 
 
 def test_a_models_vec_normalize_is_applied_and_left_alone(server: str) -> None:
@@ -183,22 +190,141 @@ def test_a_models_vec_normalize_is_applied_and_left_alone(server: str) -> None:
     envs = VecNormalize(make_vec_env("CartPole", 8, server=server, seed=1))
     model = stable_baselines3.PPO("MlpPolicy", envs, n_steps=128, seed=1, device="cpu").learn(8192)
     mean = envs.obs_rms.mean.copy()
-    own = perturb.assess(model, "CartPole", versions=("D",), episodes=100, server=server)
+    own = perturb.evaluate(model, "CartPole", versions=("D",), episodes=100, server=server)
     np.testing.assert_array_equal(envs.obs_rms.mean, mean)
-    given = perturb.assess(model, "CartPole", versions=("D",), episodes=100, normalizer=envs, server=server)
+    given = perturb.evaluate(model, "CartPole", versions=("D",), episodes=100, normalizer=envs, server=server)
     assert given.results == own.results
     envs.obs_rms.mean[:] += 1
-    other = perturb.assess(model, "CartPole", versions=("D",), episodes=100, server=server)
+    other = perturb.evaluate(model, "CartPole", versions=("D",), episodes=100, server=server)
     assert other["D"].mean_return != own["D"].mean_return
     assert other["D"].policy != own["D"].policy, "it acts otherwise"
     with pytest.raises(perturb.PolicyError, match="expected stable-baselines3's VecNormalize"):
-        perturb.assess(model, "CartPole", normalizer=7, server=server)
+        perturb.evaluate(model, "CartPole", normalizer=7, server=server)
     with pytest.raises(perturb.PolicyError, match="the model's observations are"):
-        perturb.assess(model, "Pendulum", server=server)
+        perturb.evaluate(model, "Pendulum", server=server)
     model.action_space = gymnasium.spaces.Discrete(3)
     with pytest.raises(perturb.PolicyError, match="the model's actions are"):
-        perturb.assess(model, "CartPole", server=server)
+        perturb.evaluate(model, "CartPole", server=server)
     envs.close()
+
+
+def off_policy(kind: str, normalised: bool, server: str, num_envs: int = 4) -> Any:
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    envs = make_vec_env("Pendulum" if kind == "SAC" else "CartPole", num_envs, version="R", server=server, seed=1)
+    under: Any = VecNormalize(envs) if normalised else envs
+    settings: dict[str, Any] = {"learning_starts": 10, "buffer_size": 1000, "seed": 1, "device": "cpu"}
+    return getattr(stable_baselines3, kind)("MlpPolicy", under, **settings).learn(300)
+
+
+@pytest.mark.parametrize("kind", ["PPO", "DQN", "SAC"])
+def test_a_model_that_lost_its_vec_normalize_is_refused(kind: str, server: str, tmp_path: Path) -> None:
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    if kind == "PPO":
+        envs = VecNormalize(make_vec_env("CartPole", 4, server=server, seed=1))
+        model = stable_baselines3.PPO("MlpPolicy", envs, n_steps=64, seed=1, device="cpu").learn(512)
+    else:
+        model = off_policy(kind, True, server)
+    name = "Pendulum" if kind == "SAC" else "CartPole"
+    settings: dict[str, Any] = {"versions": ("D",), "episodes": 20, "server": server}
+    own = perturb.evaluate(model, name, **settings)
+    model.save(tmp_path / "model")
+    model.get_vec_normalize_env().save(tmp_path / "normalize.pkl")
+    loaded = getattr(stable_baselines3, kind).load(tmp_path / "model", device="cpu")
+    with pytest.raises(perturb.PolicyError, match=r"was trained under a VecNormalize.*: give normalizer="):
+        perturb.evaluate(loaded, name, **settings)
+    for path in (tmp_path / "normalize.pkl", str(tmp_path / "normalize.pkl")):
+        assert perturb.evaluate(loaded, name, normalizer=path, **settings).results == own.results
+    assert perturb.evaluate(loaded, name, normalizer=False, **settings)["D"].policy != own["D"].policy
+    for wrong, says in [
+        (tmp_path / "nowhere.pkl", "cannot be read: No such file"),
+        (tmp_path / "model.zip", "is no saved VecNormalize"),
+        (VecNormalize(make_vec_env("Acrobot", 2, server=server)), r"observations of the shape \(6,\)"),
+    ]:
+        with pytest.raises(perturb.PolicyError, match=says):
+            perturb.evaluate(loaded, name, normalizer=wrong, **settings)
+
+
+@pytest.mark.parametrize("kind", ["PPO", "DQN", "SAC"])
+def test_a_model_without_vec_normalize_is_taken_after_loading(kind: str, server: str, tmp_path: Path) -> None:
+    model = trained(server, 1024) if kind == "PPO" else off_policy(kind, False, server)
+    name = "Pendulum" if kind == "SAC" else "CartPole"
+    model.save(tmp_path / "model")
+    loaded = getattr(stable_baselines3, kind).load(tmp_path / "model", device="cpu")
+    settings: dict[str, Any] = {"versions": ("D",), "episodes": 10, "server": server}
+    assert perturb.evaluate(loaded, name, **settings).results == perturb.evaluate(model, name, **settings).results
+
+
+def test_a_model_that_does_not_tell_its_vec_normalize_is_asked_for_it(server: str, tmp_path: Path) -> None:
+    off_policy("SAC", False, server, 1).save(tmp_path / "model")
+    loaded = stable_baselines3.SAC.load(tmp_path / "model", device="cpu")
+    settings: dict[str, Any] = {"versions": ("D",), "episodes": 5, "server": server}
+    with pytest.raises(perturb.PolicyError, match="does not tell whether it was trained under a VecNormalize"):
+        perturb.evaluate(loaded, "Pendulum", **settings)
+    assert perturb.evaluate(loaded, "Pendulum", normalizer=False, **settings)["D"].episodes == 5
+
+
+def test_parameters_change_while_a_model_learns(server: str) -> None:
+    from stable_baselines3.common.callbacks import ConvertCallback
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from perturb.sb3 import CurriculumCallback
+
+    envs = make_vec_env("CartPole", 4, server=server, seed=1, receipts=True)
+    seen: list[tuple[int, float]] = []
+
+    def note(local: dict[str, Any], _: dict[str, Any]) -> bool:
+        for info in local["infos"]:
+            if "parameters" in info:
+                seen.append((local["self"].num_timesteps, info["parameters"]["length"]))
+        return True
+
+    model = stable_baselines3.PPO("MlpPolicy", VecNormalize(envs), n_steps=64, seed=1, device="cpu")
+    schedule: Any = {0: {"length": 0.3}, 1024: {"length": "0.8..0.9"}}
+    model.learn(3072, callback=[CurriculumCallback(schedule), ConvertCallback(note)])
+    assert {length for steps, length in seen if 500 < steps <= 1024} == {0.3}
+    late = [length for steps, length in seen if steps > 2500]
+    assert len(late) > 3
+    assert all(0.8 <= length <= 0.9 for length in late)
+    seen.clear()
+    model.learn(
+        512, callback=[CurriculumCallback(lambda steps: {"length": 0.5} if steps else None), ConvertCallback(note)]
+    )
+    assert 0.5 not in {length for steps, length in seen if steps < 256}
+    with pytest.raises(perturb.UnknownNameError, match="lenght"):
+        model.learn(64, callback=CurriculumCallback({0: {"lenght": 1.0}}))
+    with pytest.raises(perturb.InvalidArgumentError, match="expected numbers of steps"):
+        CurriculumCallback({-1: {"length": 1.0}})
+    envs.close()
+
+
+def test_environments_methods_change_parameters_of_some(server: str) -> None:
+    envs = make_vec_env("CartPole", 3, version="R", server=server, receipts=True, seed=1)
+    envs.reset()
+    assert envs.env_method("set_parameters", {"length": 0.7}, indices=[0, 2]) == [None, None]
+    ended: dict[int, list[float]] = {slot: [] for slot in range(3)}
+    for _ in range(60):
+        for slot, info in enumerate(envs.step(np.zeros(3, int))[3]):
+            if "parameters" in info:
+                ended[slot].append(info["parameters"]["length"])
+    for slot in range(3):
+        assert ended[slot][0] != 0.7, "the running episode keeps its parameters"
+        assert all((length == 0.7) == (slot != 1) for length in ended[slot][1:])
+        assert len(ended[slot]) > 2
+    envs.close()
+
+
+def test_monitor_finds_what_was_achieved_at_each_end(server: str) -> None:
+    from stable_baselines3.common.monitor import Monitor
+
+    env = Monitor(perturb.PerturbEnv("MountainCar", server=server), info_keywords=("achieved", "is_success"))
+    env.reset(seed=1)
+    ended = False
+    while not ended:
+        *_, terminated, truncated, info = env.step(1)
+        ended = terminated or truncated
+    assert np.isnan(info["episode"]["achieved"])
 
 
 def test_a_recurrent_model_remembers(server: str) -> None:
@@ -207,18 +333,18 @@ def test_a_recurrent_model_remembers(server: str) -> None:
     model = contrib.RecurrentPPO("MlpLstmPolicy", envs, n_steps=64, seed=1, device="cpu").learn(512)
     envs.close()
     assert "sb3_contrib" in sys.modules
-    one = perturb.assess(model, "CartPole", versions=("D",), episodes=20, deterministic=True, server=server)
+    one = perturb.evaluate(model, "CartPole", versions=("D",), episodes=20, deterministic=True, server=server)
     seen: list[Any] = []
 
     def by_hand(observations: Any, memory: Any, starts: Any) -> Any:
         seen.append(starts.copy())
         return model.predict(observations, state=memory, episode_start=starts, deterministic=True)
 
-    two = perturb.assess(by_hand, "CartPole", versions=("D",), episodes=20, server=server)
+    two = perturb.evaluate(by_hand, "CartPole", versions=("D",), episodes=20, server=server)
     np.testing.assert_array_equal(one.columns()["length"], two.columns()["length"])
     assert seen[0].all()
     assert not seen[1].any()
-    forgets = perturb.assess(
+    forgets = perturb.evaluate(
         lambda observations: model.predict(observations, deterministic=True)[0],
         "CartPole",
         versions=("D",),
@@ -237,11 +363,11 @@ def test_a_torch_module_acts(server: str) -> None:
         with torch.no_grad():
             return module(torch.from_numpy(observations)).argmax(1).numpy()
 
-    one = perturb.assess(module, "CartPole", episodes=50, server=server)
+    one = perturb.evaluate(module, "CartPole", episodes=50, server=server)
     assert module.training, "it is left as it was"
-    two = perturb.assess(by_hand, "CartPole", episodes=50, server=server)
+    two = perturb.evaluate(by_hand, "CartPole", episodes=50, server=server)
     np.testing.assert_array_equal(one.columns()["length"], two.columns()["length"])
     assert one["D"].policy.startswith("Sequential ")
     with pytest.raises(perturb.PolicyError, match=r"gave the shape \(5, 3\); expected \(5, 2\)"):
-        perturb.assess(torch.nn.Linear(4, 3), "CartPole", episodes=5, server=server)
-    assert perturb.assess(torch.nn.Linear(3, 1), "Pendulum", episodes=5, server=server)["D"].episodes == 5
+        perturb.evaluate(torch.nn.Linear(4, 3), "CartPole", episodes=5, server=server)
+    assert perturb.evaluate(torch.nn.Linear(3, 1), "Pendulum", episodes=5, server=server)["D"].episodes == 5

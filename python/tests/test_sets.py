@@ -56,7 +56,7 @@ def test_a_policy_is_tested_on_them_as_the_program_tests_it(tmp_path: Path, serv
     own = ["--parameters", "length=0.8..1.2/3", "mass=1"]
     evaluated(PENDULUM, tmp_path / "records", server, "--episodes", "20", *own)
     points = perturb.sets.grid("parameters", {"length": "0.8..1.2/3", "mass": 1})
-    assessment = perturb.assess(
+    assessment = perturb.evaluate(
         perturb.load_policy(PENDULUM), "Pendulum", versions=[points], episodes=20, server=server
     )
     assert saved(assessment, tmp_path / "saved") == (tmp_path / "records").read_bytes()
@@ -94,6 +94,10 @@ def test_sampled_contexts_are_those_of_the_version_and_prefixes_of_more() -> Non
         (lambda: perturb.sets.drawn("a", {"length": 1}, base="x"), "base='x'"),  # type: ignore[arg-type]
         (lambda: perturb.sets.grid("a", {"length": "1..2"}), "expected points"),
         (lambda: perturb.sets.grid("a", {"length": []}), "expected a number, several"),
+        (lambda: perturb.sets.grid("a", {"length": (0.1, 0.2)}), "which may be an interval or two points"),
+        (lambda: perturb.sets.grid("a", {"length": "1,2"}), "may be one number or two"),
+        (lambda: perturb.sets.drawn("a", {"length": [0.1, 0.2]}), "may be an interval or two values"),  # type: ignore[list-item]
+        (lambda: perturb.sets.drawn("a", {"length": "0,1..0,2"}), "a decimal point in each number"),
         (lambda: perturb.sets.grid("a", {"length": "1..2/200", "mass": "1..2/200"}), "at most 16384"),
         (lambda: perturb.sets.listed("a", []), "at least one"),
         (lambda: perturb.sets.listed("a", [{"length": float("nan")}]), "finite"),

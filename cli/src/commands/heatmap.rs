@@ -170,7 +170,7 @@ fn test(
     options: &HeatmapOptions,
     stop: &StopFlag,
 ) -> Result<(Heatmap, Records)> {
-    let HeatmapOptions { parameters: [x, y], grid, episodes, .. } = options;
-    let mut display = Display::for_episodes(format!("testing over {x} and {y}"), (grid * grid) as u64 * episodes);
+    let [x, y] = &options.parameters;
+    let mut display = Display::for_episodes(format!("testing over {x} and {y}"), options.total_episodes()?);
     Ok(heatmap(servers, checkpoint, options, stop, &mut |episodes| display.episodes(episodes))?)
 }

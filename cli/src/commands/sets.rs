@@ -140,7 +140,7 @@ mod tests {
             let assignments = texts.iter().map(|text| text.parse().unwrap()).collect();
             normalize_set(set_of("own", Version::D, assignments).unwrap(), &cart_pole())
         };
-        assert_eq!(set(&["Length=0.5", "MASS=1,2"]).unwrap(), set(&["length=0.5", "mass=1,2"]).unwrap());
+        assert_eq!(set(&["Length=0.5", "MASS=1, 2"]).unwrap(), set(&["length=0.5", "mass=1, 2"]).unwrap());
         assert_eq!(set(&["Length=0.5..1"]).unwrap(), set(&["length=0.5..1"]).unwrap());
         let refused = set(&["lenght=1"]).unwrap_err().to_string();
         let words = "own: a parameter of CartPole is `lenght`, but must be one of force, length, mass";

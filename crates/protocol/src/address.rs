@@ -10,7 +10,7 @@ use crate::limits::MAX_SOCKET_PATH_BYTES;
 /// The address of a server.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub enum Address {
-    /// A Unix socket, written `unix:/path`.
+    /// A Unix socket, written `unix:/path`; a relative path is one of the working folder.
     Unix(PathBuf),
     /// A TCP port, written `host:port`, `http://host:port` or `tcp://host:port`, with TLS `https://host:port`. An IPv6 host
     /// is written in brackets.
@@ -101,10 +101,16 @@ fn parse(text: &str) -> Result<Address, String> {
 }
 
 fn parse_unix(path: &str) -> Result<Address, String> {
-    let path = path.strip_prefix("//").unwrap_or(path);
-    if !path.starts_with('/') {
-        return Err("the path of the socket must be absolute".into());
+    let path = match path.strip_prefix("//") {
+        Some(path) if path.starts_with('/') => path,
+        Some(_) => return Err("the path after unix:// must be absolute".into()),
+        None => path,
+    };
+    if path.is_empty() {
+        return Err("the path of the socket is missing".into());
     }
+    let path = std::path::absolute(path).map_err(|error| format!("the path of the socket is relative ({error})"))?;
+    let path = path.to_str().ok_or("the path of the working folder is not UTF-8")?;
     if path.len() > MAX_SOCKET_PATH_BYTES {
         return Err(format!(
             "the path of the socket has {} bytes, the most that Linux allows is {MAX_SOCKET_PATH_BYTES}",
@@ -166,6 +172,12 @@ mod tests {
     }
 
     #[test]
+    fn relative_path_of_a_socket_becomes_absolute() {
+        let expected = std::env::current_dir().unwrap().join("a/my.sock");
+        assert_eq!("unix:a/my.sock".parse(), Ok(Address::Unix(expected)));
+    }
+
+    #[test]
     fn start_command_has_an_address_to_listen_at() {
         for (text, expected) in [
             ("unix:/a/b", "unix:/a/b"),
@@ -185,8 +197,8 @@ mod tests {
     fn a_wrong_address_says_what_is_wrong() {
         for (text, part) in [
             ("", "empty"),
-            ("unix:relative", "absolute"),
-            ("unix:", "absolute"),
+            ("unix://relative", "absolute"),
+            ("unix:", "missing"),
             ("https://host", "port is missing"),
             ("ftp://host:1", "scheme `ftp`"),
             ("localhost", "port is missing"),

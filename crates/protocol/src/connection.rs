@@ -1,5 +1,6 @@
 //! Connects to a server: resolves its name, and checks that it takes sessions.
 
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io;
 use std::net::{IpAddr, SocketAddr};
 use std::time::Duration;
@@ -271,10 +272,10 @@ fn sorted(mut found: Vec<SocketAddr>, tls: Option<&str>) -> ResolvedAddresses {
 ///
 /// # Errors
 /// The error of each address.
-pub async fn connect_any(addresses: &[Address]) -> Result<Connection, Vec<ClientError>> {
+pub async fn connect_any(addresses: &[Address], timeouts: Timeouts) -> Result<Connection, Vec<ClientError>> {
     let mut errors = Vec::new();
     for (index, address) in addresses.iter().enumerate() {
-        match Connection::open(address).await {
+        match Connection::open_with(address, timeouts).await {
             Ok(connection) => return Ok(connection),
             Err(error) => {
                 if index + 1 < addresses.len() {
@@ -285,6 +286,27 @@ pub async fn connect_any(addresses: &[Address]) -> Result<Connection, Vec<Client
         }
     }
     Err(errors)
+}
+
+/// Connects to the server at `address`: if its name stands for several machines, to any of them that takes sessions.
+///
+/// # Errors
+/// [`ClientError::Connect`] with what is wrong with each machine, [`ClientError::Unsafe`].
+pub async fn connect(address: &Address, timeouts: Timeouts) -> Result<Connection, ClientError> {
+    let machines = resolve(address).await?.into_order(own_turn());
+    connect_any(&machines, timeouts).await.map_err(|errors| match ClientError::from_all(errors) {
+        ClientError::NoneConnects { reasons } => ClientError::Connect { address: address.clone(), reason: reasons },
+        error => error,
+    })
+}
+
+/// The turn of this process, from its id and its host's name: processes of one machine differ in the id, containers in the
+/// name.
+fn own_turn() -> usize {
+    let mut hasher = DefaultHasher::new(); // always with the same key
+    std::fs::read("/proc/sys/kernel/hostname").unwrap_or_default().hash(&mut hasher);
+    std::process::id().hash(&mut hasher);
+    hasher.finish() as usize
 }
 
 /// Asks a server for its health. A stopped or overloaded machine may accept connections and never answer.

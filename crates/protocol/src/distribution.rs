@@ -174,8 +174,23 @@ impl FromStr for Distribution {
             None => number(part).map(|value| Interval::new(value, value)),
         };
         let intervals: Option<Vec<Interval>> = text.split(',').map(interval).collect();
-        Self::union(&intervals.ok_or_else(|| DistributionError { got: format!("`{text}`"), expected })?)
+        let refuse = |expected| DistributionError { got: format!("`{text}`"), expected };
+        let made = Self::union(&intervals.ok_or_else(|| refuse(expected))?);
+        if made.is_err() && text.split("..").any(|end| decimal_comma(end.trim()).is_some()) {
+            return Err(refuse("a decimal point in each number, such as 0.5 or 0.5..1.1"));
+        }
+        made
     }
+}
+
+/// Returns the number that a reader with a decimal comma would see in `text`, such as 7.5 in `7,5`.
+pub fn decimal_comma(text: &str) -> Option<String> {
+    let (whole, fraction) = text.split_once(',')?;
+    let digits = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    let mantissa = fraction.split(['e', 'E']).next().unwrap_or_default();
+    let number = format!("{whole}.{fraction}");
+    let is_number = digits(whole.trim_start_matches(['+', '-'])) && digits(mantissa) && number.parse::<f64>().is_ok();
+    is_number.then_some(number)
 }
 
 impl From<&Distribution> for proto::Distribution {
@@ -257,6 +272,18 @@ mod tests {
             let b = of(other);
             assert_eq!((a.is_within(&b), a.overlaps(&b)), (within, overlaps), "{one} and {other}");
             assert_eq!(a.overlaps(&b), b.overlaps(&a), "{one} and {other}");
+        }
+    }
+
+    #[test]
+    fn decimal_commas_are_refused() {
+        for text in ["7,5", "7,5..8,5", "7..8,5", "0,5..1"] {
+            let error = text.parse::<Distribution>().unwrap_err().to_string();
+            assert!(error.contains("a decimal point in each number"), "{text}: {error}");
+        }
+        assert_eq!(decimal_comma("-7,25").as_deref(), Some("-7.25"));
+        for text in ["7, 5", "7.0,5", "7,5,3", "7,", ",5", "7", "a,5"] {
+            assert_eq!(decimal_comma(text), None, "{text}");
         }
     }
 

@@ -27,16 +27,18 @@ pub mod names;
 pub mod player;
 mod private_server;
 pub mod region;
+mod reply;
 mod stream;
 mod version;
 
 pub use adaptive_spin::AdaptiveSpin;
 pub use address::{Address, AddressError};
-pub use connection::{Connection, ResolvedAddresses, Timeouts, connect_any, resolve};
-pub use distribution::{Distribution, DistributionError, Interval};
+pub use connection::{Connection, ResolvedAddresses, Timeouts, connect, connect_any, resolve};
+pub use distribution::{Distribution, DistributionError, Interval, decimal_comma};
 pub use ended::EndedEpisode;
 pub use error::{ClientError, REPLY_TIMEOUT};
 pub use private_server::PrivateServer;
+pub use reply::{Malformed, check_observations, check_step};
 pub use stream::{Stream, TypedRequest};
 pub use version::{UnknownVersion, Version};
 

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use tempfile::TempDir;
 
-use crate::address::Address;
+use crate::address::{Address, AddressError};
 use crate::error::ClientError;
 
 const PROGRAM: &str = "perturb-server";
@@ -52,15 +52,21 @@ impl PrivateServer {
     pub fn start(workers: Option<usize>) -> Result<Self, ClientError> {
         let program = find_program()?;
         let system = |action| move |source| ClientError::System { action, source };
-        let directory = tempfile::Builder::new()
-            .prefix("perturb-")
-            .permissions(Permissions::from_mode(0o700))
-            .tempdir()
-            .map_err(system("create a private directory for the server's socket"))?;
+        let directory =
+            tempfile::Builder::new().prefix("perturb-").permissions(Permissions::from_mode(0o700)).tempdir().map_err(
+                system(
+                    "create a private directory for the server's socket (set TMPDIR to a folder that can be written)",
+                ),
+            )?;
         let path = directory.path().join("server.sock");
-        let address: Address = format!("unix:{}", path.display())
-            .parse()
-            .map_err(|error| ClientError::Start { program: program.clone(), reason: format!("{error}; set TMPDIR") })?;
+        let address: Address =
+            format!("unix:{}", path.display()).parse().map_err(|AddressError { reason, .. }| ClientError::Start {
+                program: program.clone(),
+                reason: format!(
+                    "{reason} ({}); set TMPDIR to a folder with a shorter path, such as /tmp",
+                    path.display()
+                ),
+            })?;
 
         let process = spawn(&program, &address, workers)?;
         Ok(Self { process, address, workers, directory })

@@ -3,9 +3,13 @@
 mod lease;
 
 use std::collections::VecDeque;
+use std::future::poll_fn;
+use std::pin::Pin;
+use std::task::Poll;
 use std::time::Duration;
 
 use tokio::sync::mpsc;
+use tokio_stream::Stream as _;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Status, Streaming};
 
@@ -90,6 +94,10 @@ pub struct Stream {
     raw: RawStream,
     /// Replies that came while a request could not be sent.
     arrived: VecDeque<SessionResponse>,
+    /// Number of requests whose replies were not taken.
+    unanswered: usize,
+    /// The end of the stream, or a reply that nobody requested, which came while no request was unanswered.
+    unrequested: Option<Result<Option<SessionResponse>, Status>>,
     spin: AdaptiveSpin,
     lease: Option<ClientLease>,
 }
@@ -133,7 +141,7 @@ impl Stream {
         let connection = connection.clone();
         let arrived = VecDeque::new();
         let spin = AdaptiveSpin::default();
-        let mut stream = Self { connection, raw, arrived, spin, lease: None };
+        let mut stream = Self { connection, raw, arrived, unanswered: 1, unrequested: None, spin, lease: None };
         let opened = stream.receive::<proto::Open>().await?;
         stream.lease = ClientLease::from_proto(&opened);
         Ok((stream, opened))
@@ -155,6 +163,7 @@ impl Stream {
     /// # Errors
     /// [`ClientError::Lost`].
     pub async fn send<A: TypedRequest>(&mut self, request: A) -> Result<(), ClientError> {
+        self.note_request().await;
         let message = SessionRequest { request: Some(request.into()) };
         if let Some(lease) = &mut self.lease {
             // If it is lost, it is sent again while the reply is waited for.
@@ -176,6 +185,7 @@ impl Stream {
         if self.lease.is_some() {
             return self.send(request).await;
         }
+        self.note_request().await;
         let message = SessionRequest { request: Some(request.into()) };
         let address = self.connection.address();
         let ended = || lost(address, A::NAME, &Status::unavailable("the stream has ended"));
@@ -191,6 +201,18 @@ impl Stream {
             let arrived = arrived.map_err(|status| lost(address, A::NAME, &status))?;
             self.arrived.push_back(arrived.ok_or_else(ended)?);
         }
+    }
+
+    /// Counts a request. Looks first for a reply that nobody requested, which a later request would take for its own.
+    async fn note_request(&mut self) {
+        if self.unanswered == 0 && self.unrequested.is_none() {
+            let replies = &mut self.raw.replies;
+            let came = poll_fn(|context| Poll::Ready(Pin::new(&mut *replies).poll_next(context))).await;
+            if let Poll::Ready(came) = came {
+                self.unrequested = Some(came.transpose());
+            }
+        }
+        self.unanswered += 1;
     }
 
     /// Ends a session with a lease, which the server would otherwise hold until the lease ends. Other sessions end when they are
@@ -211,6 +233,10 @@ impl Stream {
     /// [`ClientError::Refused`] with the server's sentence; then the session lives on. Otherwise the failures of a
     /// connection.
     pub async fn receive<A: TypedRequest>(&mut self) -> Result<A::Reply, ClientError> {
+        if let Some(Ok(Some(_))) = &self.unrequested {
+            return Err(self.mismatch::<A>("a second reply to an earlier request".into(), "one reply to each".into()));
+        }
+        self.unanswered = self.unanswered.saturating_sub(1);
         let message = match self.arrived.pop_front() {
             Some(arrived) => Some(arrived),
             None => self.message::<A>().await?,
@@ -234,9 +260,15 @@ impl Stream {
         let limit = self.connection.timeouts().reply;
         let mut taken_up = 0;
         loop {
-            let next = self.spin.until(self.raw.replies.message());
-            let next = tokio::time::timeout(limit, next).await;
-            let status = match next.map_err(|_| timed_out(self.connection.address(), A::NAME, limit))? {
+            let next = match self.unrequested.take() {
+                Some(ended) => ended,
+                None => {
+                    let next = self.spin.until(self.raw.replies.message());
+                    let next = tokio::time::timeout(limit, next).await;
+                    next.map_err(|_| timed_out(self.connection.address(), A::NAME, limit))?
+                }
+            };
+            let status = match next {
                 Ok(message) => {
                     self.lease.iter_mut().for_each(ClientLease::on_reply);
                     return Ok(message);

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use perturb_protocol::{Version, proto};
+use perturb_settings::ValueError;
 use perturb_settings::sets::{Context, TestSet};
 use perturb_text::Table;
 
@@ -30,6 +31,20 @@ pub struct HeatmapOptions {
     /// Values of other parameters, in place of the base's.
     #[serde(default, skip_serializing_if = "Context::is_empty")]
     pub fixed: Context,
+}
+
+impl HeatmapOptions {
+    /// Returns the number of episodes of all points together.
+    ///
+    /// # Errors
+    /// [`ValueError`] if the number is not below 2^64.
+    pub fn total_episodes(&self) -> Result<u64, ValueError> {
+        let total =
+            (self.grid as u64).checked_mul(self.grid as u64).and_then(|points| points.checked_mul(self.episodes));
+        let what = "the number of episodes at each point of a heatmap";
+        let expected = format!("so small that {} × {} points have fewer than 2^64 episodes", self.grid, self.grid);
+        total.ok_or_else(|| ValueError::new(what, self.episodes, expected))
+    }
 }
 
 /// What heatmaps have in common that stand beside each other.
@@ -236,6 +251,24 @@ pub fn heatmap_table(heatmap: &Heatmap) -> Table {
 mod tests {
     use super::*;
     use crate::fixture;
+
+    #[test]
+    fn total_episodes_never_wrap() {
+        let options = |grid, episodes| HeatmapOptions {
+            parameters: ["length".into(), "mass".into()],
+            base: Version::D,
+            grid,
+            episodes,
+            seed: 1,
+            fixed: Context::new(),
+        };
+        assert_eq!(options(10, 7).total_episodes(), Ok(700));
+        assert_eq!(options(2, u64::MAX / 4).total_episodes(), Ok(u64::MAX - 3));
+        for (grid, episodes) in [(2, 1 << 62), (2, u64::MAX), (usize::MAX, 1)] {
+            let error = options(grid, episodes).total_episodes().unwrap_err().to_string();
+            assert!(error.contains("fewer than 2^64 episodes"), "{error}");
+        }
+    }
 
     #[test]
     fn a_mean_is_over_policies_at_each_point_and_over_like_points_alone() {

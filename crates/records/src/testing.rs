@@ -89,7 +89,8 @@ impl Counting {
 
     /// Episodes that were counted, and how many there are to be.
     pub fn progress(&self) -> (u64, u64) {
-        (self.counted.len() as u64, self.quotas.iter().sum())
+        // Saturates: a wrapped sum would end a test of very many episodes before its first one.
+        (self.counted.len() as u64, self.quotas.iter().fold(0, |sum, &quota| sum.saturating_add(quota)))
     }
 
     /// Adds the episodes to `records`, which are of policies in `environment`.
@@ -235,6 +236,14 @@ mod tests {
             (Some(1), Some(1)),
             "nor is what is missing"
         );
+    }
+
+    #[test]
+    fn progress_of_too_many_episodes_saturates() {
+        let contexts = perturb_settings::sets::Contexts::Listed(vec![Context::new(); 2]);
+        let set = TestSet { name: "two".into(), version: Version::D, contexts };
+        let counting = Counting::new(set, Purpose::TestEnvironments, 1, u64::MAX, 1);
+        assert_eq!(counting.progress(), (0, u64::MAX), "the sum of the quotas is 2^64");
     }
 
     #[test]

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::str::FromStr;
 
 use perturb_protocol::limits::DEFAULT_MAX_ENVS;
-use perturb_protocol::{Distribution, DistributionError, Version, proto};
+use perturb_protocol::{Distribution, DistributionError, Version, decimal_comma, proto};
 use serde::{Deserialize, Serialize};
 
 use crate::value_error::{ValueError, require};
@@ -122,7 +122,8 @@ pub fn distinct(sets: &[TestSet]) -> Result<(), ValueError> {
 }
 
 /// A parameter's part of a set, as it is written: `length=0.3..0.4,0.8..0.9`, `mass=0.1`, or the points of a grid,
-/// `length=0.1..1.0/10` or `length=0.1,0.2,0.5`.
+/// `length=0.1..1.0/10` or `length=0.1,0.2,0.5`. Two whole numbers as in `force=7,5` are refused, because they may be a
+/// number with a decimal comma; `force=7, 5` has two values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Assignment {
     /// By its name in the catalogue.
@@ -156,6 +157,10 @@ impl Values {
     fn of(parameter: &str, text: &str) -> Result<Self, ValueError> {
         if let Some((range, count)) = text.split_once('/') {
             return grid_points(parameter, text, range, count);
+        }
+        if let Some(decimal) = decimal_comma(text) {
+            let expected = format!("{decimal} for one number, or `{}` for two", text.replace(',', ", "));
+            return Err(ValueError::new(parameter, format!("`{text}`, which may be one number or two"), expected));
         }
         let points: Option<Vec<f64>> = text.split(',').map(|value| value.trim().parse().ok()).collect();
         match points {
@@ -310,6 +315,25 @@ mod tests {
     }
 
     #[test]
+    fn decimal_commas_are_refused() {
+        for (text, number) in
+            [("7,5", "7.5"), ("0,25", "0.25"), ("-7,5", "-7.5"), ("7,5e2", "7.5e2"), ("10,20", "10.20")]
+        {
+            let error = set(&[&format!("force={text}")]).unwrap_err().to_string();
+            let part =
+                format!("force is `{text}`, which may be one number or two, but must be {number} for one number");
+            assert!(error.contains(&part), "{error}");
+        }
+        for text in ["7, 5", "7.0,5.0", "7,5,3", "0.1,5", "7,0.5", "1e3,2.5"] {
+            assert!(matches!(set(&[&format!("force={text}")]).unwrap().contexts, Contexts::Listed(_)), "{text}");
+        }
+        for text in ["7,5..8,5", "7..8,5", "0,5..1"] {
+            let error = set(&[&format!("force={text}")]).unwrap_err().to_string();
+            assert!(error.contains("a decimal point"), "{error}");
+        }
+    }
+
+    #[test]
     fn rows_of_a_file_are_contexts() {
         let set = set_of_csv("rows", Version::R, b"length,mass\n0.5, 0.1\n1,0.2\n").unwrap();
         assert_eq!(
@@ -334,7 +358,7 @@ mod tests {
         for (text, part) in [
             ("size=1", "`size`, but must be one of length"),
             ("length=1..3", "within 0.1 … 2 m"),
-            ("length=1,3", "is 3, but"),
+            ("length=1, 3", "is 3, but"),
         ] {
             let error = set(&[text]).unwrap().check(&environment).unwrap_err().to_string();
             assert!(error.contains(part), "{text}: {error}");

@@ -1,6 +1,5 @@
 //! Connections to one or several servers.
 
-use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io::ErrorKind;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -9,7 +8,9 @@ use tokio::runtime::{Builder, Runtime};
 use tokio::sync::oneshot;
 
 use perturb_protocol::names::EnvironmentName;
-use perturb_protocol::{Address, ClientError, Connection, PrivateServer, ResolvedAddresses, connect_any, resolve};
+use perturb_protocol::{
+    Address, ClientError, Connection, PrivateServer, ResolvedAddresses, Timeouts, connect, connect_any, resolve,
+};
 use perturb_settings::Common;
 
 use super::options::{ActorLocation, ServerWait};
@@ -117,7 +118,7 @@ impl Servers {
         let runtime = runtime()?;
         let connection = runtime.block_on(async {
             let (all, mut errors) = all_machines(addresses).await;
-            match connect_any(&all.into_order(turn)).await {
+            match connect_any(&all.into_order(turn), Timeouts::default()).await {
                 Ok(connection) => Ok(connection),
                 Err(others) => {
                     errors.extend(others);
@@ -145,7 +146,7 @@ impl Servers {
                 }
             }
             if connections.is_empty() {
-                match connect_any(&all.fallback).await {
+                match connect_any(&all.fallback, Timeouts::default()).await {
                     Ok(connection) => connections.push(connection),
                     Err(others) => errors.extend(others),
                 }
@@ -293,22 +294,5 @@ async fn all_machines(addresses: &[Address]) -> (ResolvedAddresses, Vec<ClientEr
 
 /// Connects to the server at `address`.
 async fn one(address: &Address) -> Result<Connection, ClientError> {
-    any_of(address, resolve(address).await?.into_order(own_turn())).await
-}
-
-/// Connects to one of the machines that `address` resolves to.
-async fn any_of(address: &Address, machines: Vec<Address>) -> Result<Connection, ClientError> {
-    connect_any(&machines).await.map_err(|errors| match ClientError::from_all(errors) {
-        ClientError::NoneConnects { reasons } => ClientError::Connect { address: address.clone(), reason: reasons },
-        error => error,
-    })
-}
-
-/// The turn of this process, from its id and its host's name: processes of one machine differ in the id, containers in the
-/// name.
-fn own_turn() -> usize {
-    let mut hasher = DefaultHasher::new(); // always with the same key
-    std::fs::read("/proc/sys/kernel/hostname").unwrap_or_default().hash(&mut hasher);
-    std::process::id().hash(&mut hasher);
-    hasher.finish() as usize
+    connect(address, Timeouts::default()).await
 }

@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use bytes::{Bytes, BytesMut};
-use perturb_protocol::{Address, ClientError, Connection, EndedEpisode, Stream, TypedRequest};
+use perturb_protocol::{Address, ClientError, Connection, EndedEpisode, Stream, TypedRequest, check_step};
 
 use super::options::{OpenOptions, open_request};
 use super::reply::StepReply;
@@ -57,10 +57,11 @@ impl ServerShard {
     /// Puts one server's reply in its place in the batch's.
     pub(super) fn store(&self, stepped: proto::Stepped, size: usize, reply: &mut StepReply) -> Result<(), ClientError> {
         let Range { start, end } = self.range;
+        check_step(&stepped, self.range.len(), size).map_err(|it| self.mismatch(it.got, it.expected))?;
         self.decode("observations", &stepped.observations, &mut reply.observations[start * size..end * size])?;
         self.decode("rewards", &stepped.rewards, &mut reply.rewards[start..end])?;
-        self.decode_flags("terminated", &stepped.terminated, &mut reply.terminated[start..end])?;
-        self.decode_flags("truncated", &stepped.truncated, &mut reply.truncated[start..end])?;
+        set_flags(&stepped.terminated, &mut reply.terminated[start..end]);
+        set_flags(&stepped.truncated, &mut reply.truncated[start..end]);
         let first = reply.final_observations.len();
         reply.final_observations.resize(first + stepped.ended.len() * size, 0.0);
         let finals = &mut reply.final_observations[first..];
@@ -81,17 +82,14 @@ impl ServerShard {
         self.stream.decode::<proto::Step>(field, bytes, out)
     }
 
-    fn decode_flags(&self, field: &'static str, bytes: &Bytes, out: &mut [bool]) -> Result<(), ClientError> {
-        if bytes.len() != out.len() {
-            return Err(self.mismatch(format!("{} bytes of {field}", bytes.len()), out.len().to_string()));
-        }
-        out.iter_mut().zip(bytes.iter()).for_each(|(out, byte)| *out = *byte != 0);
-        Ok(())
-    }
-
     fn mismatch(&self, got: String, expected: String) -> ClientError {
         self.stream.mismatch::<proto::Step>(got, expected)
     }
+}
+
+/// Copies flags that were checked.
+fn set_flags(bytes: &[u8], out: &mut [bool]) {
+    out.iter_mut().zip(bytes).for_each(|(out, byte)| *out = *byte != 0);
 }
 
 /// Checks that the server observes parameters if that was asked for. An older server leaves them out without an error.

@@ -65,8 +65,7 @@ pub fn heatmap(
     report: &mut dyn FnMut(u64),
 ) -> Result<(Heatmap, Records), HeatmapError> {
     let grid = options.grid.clamp(1, MOST_POINTS);
-    let points = (grid * grid) as u64;
-    let episodes = options.episodes.saturating_mul(points);
+    let episodes = HeatmapOptions { grid, ..options.clone() }.total_episodes().map_err(TestError::Value)?;
     let test = TestOptions { episodes, seed: options.seed, selects: false, success: None };
     let tester = Tester::new(servers, checkpoint, test)?;
     let axes = axes(tester.environment(), &options.parameters)?;

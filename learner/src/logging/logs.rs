@@ -102,11 +102,12 @@ impl Logs {
         self.monitor.write(episode).map_err(io("write", &self.directory.join(MONITOR)))
     }
 
-    /// Adds a line to `progress.csv`, and an event.
+    /// Adds a line to `progress.csv`, and an event. All episodes that ended before are in `monitor.csv` then.
     ///
     /// # Errors
     /// [`FileError`].
     pub fn progress(&mut self, progress: &Progress) -> files::Result<()> {
+        self.monitor.flush().map_err(io("write", &self.directory.join(MONITOR)))?;
         self.progress.write(progress).map_err(io("write", &self.directory.join(PROGRESS)))
     }
 
@@ -207,6 +208,28 @@ mod tests {
         let fields: Vec<&str> = text.strip_prefix(&kept).unwrap().trim_end().split(',').collect();
         assert_eq!(fields[..2], ["1.500000", "3"]);
         assert!((7.0..100.0).contains(&fields[2].parse::<f64>().unwrap()), "seconds go on: {}", fields[2]);
+    }
+
+    #[test]
+    fn monitor_has_whole_lines_while_a_run_goes_on() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut logs = start(directory.path());
+        assert_eq!(read(directory.path(), MONITOR).lines().count(), 2, "the head is there at once");
+        let mut seen = 0;
+        for length in 0..4000 {
+            logs.episode(&episode(length)).unwrap();
+            let text = read(directory.path(), MONITOR);
+            if text.len() != seen {
+                seen = text.len();
+                let last = text.strip_suffix('\n').expect("a whole line").lines().last().unwrap().to_owned();
+                assert_eq!(last.split(',').count(), 9, "{last}");
+            }
+        }
+        assert!(seen > 100_000, "lines are written long before the end");
+        logs.progress(&Progress::default()).unwrap();
+        let text = read(directory.path(), MONITOR);
+        assert_eq!(text.lines().count(), 2 + 4000, "each logged iteration has all episodes before it");
+        assert!(text.ends_with('\n'));
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! The log `monitor.csv`: a line for every episode.
 
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::Write;
 use std::path::Path;
 
 use perturb_checkpoint::EnvironmentSummary;
@@ -10,13 +10,21 @@ use super::Clock;
 use super::disk::sync;
 use crate::client::EndedEpisode;
 
+/// Number of buffered bytes at which lines are passed to the operating system without a flush.
+const MAX_BUFFERED_BYTES: usize = 64 * 1024;
+
 /// Writes stable-baselines3's Monitor format: a line of JSON after `#`, a header, and a line an episode with its return
 /// `r`, its length `l` and the seconds `t` since the start; then `success`, `terminated` (0 or 1), `episode_index`,
 /// `environment_index`, `trial_index`, `episode_in_trial`, a column for each parameter as it was requested, and
 /// `applied_…` for each quantity that was read back from the physics.
+///
+/// Only whole lines are passed to the operating system, so a program that reads the file while a training runs, or after the
+/// training was killed, never sees a part of a line.
 #[derive(Debug)]
 pub struct Monitor {
-    writer: csv::Writer<BufWriter<File>>,
+    file: File,
+    /// Whole lines that were not yet passed to the operating system.
+    lines: csv::Writer<Vec<u8>>,
     clock: Clock,
     /// Number of columns of applied values. Files of earlier programs have none.
     applied: usize,
@@ -28,9 +36,10 @@ impl Monitor {
     /// # Errors
     /// The operating system's.
     pub fn create(path: &Path, environment: &str, spec: &EnvironmentSummary, clock: Clock) -> std::io::Result<Self> {
-        let mut file = BufWriter::new(File::create(path)?);
-        writeln!(file, "#{}", serde_json::json!({ "t_start": clock.t_start(), "env_id": environment }))?;
-        let mut writer = csv::Writer::from_writer(file);
+        let file = File::create(path)?;
+        let mut head = Vec::new();
+        writeln!(head, "#{}", serde_json::json!({ "t_start": clock.t_start(), "env_id": environment }))?;
+        let mut lines = csv::Writer::from_writer(head);
         let columns = [
             "r",
             "l",
@@ -44,13 +53,15 @@ impl Monitor {
         ];
         let applied = spec.applied.iter().map(|name| format!("applied_{name}"));
         let of_environment = spec.parameters.iter().cloned().chain(applied);
-        writer.write_record(columns.into_iter().map(str::to_owned).chain(of_environment))?;
-        Ok(Self { writer, clock, applied: spec.applied.len() })
+        lines.write_record(columns.into_iter().map(str::to_owned).chain(of_environment))?;
+        let mut monitor = Self { file, lines, clock, applied: spec.applied.len() };
+        monitor.flush()?;
+        Ok(monitor)
     }
 
     /// Continues at the end of `file`.
     pub(super) fn resume(file: File, spec: &EnvironmentSummary, clock: Clock) -> Self {
-        Self { writer: csv::Writer::from_writer(BufWriter::new(file)), clock, applied: spec.applied.len() }
+        Self { file, lines: csv::Writer::from_writer(Vec::new()), clock, applied: spec.applied.len() }
     }
 
     /// Adds an episode.
@@ -76,7 +87,8 @@ impl Monitor {
             .iter()
             .chain(episode.receipt.applied.iter().take(self.applied))
             .map(f64::to_string);
-        Ok(self.writer.write_record(fixed.into_iter().chain(values))?)
+        self.lines.write_record(fixed.into_iter().chain(values))?;
+        if self.lines.get_ref().len() >= MAX_BUFFERED_BYTES { self.flush() } else { Ok(()) }
     }
 
     /// Passes buffered lines to the operating system.
@@ -84,13 +96,19 @@ impl Monitor {
     /// # Errors
     /// The operating system's.
     pub fn flush(&mut self) -> std::io::Result<()> {
-        self.writer.flush()
+        self.lines.flush()?;
+        let lines = std::mem::replace(&mut self.lines, csv::Writer::from_writer(Vec::new()));
+        let lines = lines.into_inner().map_err(|error| error.into_error())?;
+        if !lines.is_empty() {
+            self.file.write_all(&lines)?;
+        }
+        Ok(())
     }
 
     /// Flushes the file to the disk and returns its length.
     pub(super) fn sync(&mut self) -> std::io::Result<u64> {
         self.flush()?;
-        sync(self.writer.get_ref().get_ref())
+        sync(&self.file)
     }
 }
 

@@ -16,14 +16,12 @@ pub fn floats<'py>(py: Python<'py>, data: &[u8], n: usize) -> PyResult<Bound<'py
     Ok(PyArray1::from_vec(py, numbers(data, &[n])?))
 }
 
-/// float32 `[rows, columns]`, not to change.
+/// float32 `[rows, columns]`, to change.
 ///
 /// # Errors
 /// If there are more or fewer.
 pub fn rows<'py>(py: Python<'py>, data: &[u8], rows: usize, columns: usize) -> PyResult<Bound<'py, PyArray2<f32>>> {
-    let array = PyArray1::from_vec(py, numbers(data, &[rows, columns])?).reshape([rows, columns])?;
-    array.readwrite().make_nonwriteable();
-    Ok(array)
+    PyArray1::from_vec(py, numbers(data, &[rows, columns])?).reshape([rows, columns])
 }
 
 /// bool `[n]`, to change.
@@ -37,14 +35,12 @@ pub fn flags<'py>(py: Python<'py>, data: &[u8], n: usize) -> PyResult<Bound<'py,
     Ok(PyArray1::from_vec(py, data.iter().map(|&flag| flag != 0).collect()))
 }
 
-/// uint8 `[height, width, 3]`, not to change; the caller has compared the sizes.
+/// uint8 `[height, width, 3]`, to change; the caller has compared the sizes.
 ///
 /// # Errors
 /// NumPy's.
 pub fn picture<'py>(py: Python<'py>, data: &[u8], size: [usize; 3]) -> PyResult<Bound<'py, PyArray3<u8>>> {
-    let array = PyArray1::from_slice(py, data).reshape(size)?;
-    array.readwrite().make_nonwriteable();
-    Ok(array)
+    PyArray1::from_slice(py, data).reshape(size)
 }
 
 /// Little-endian float32 numbers, as many as an array of this shape has.

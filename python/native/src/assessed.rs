@@ -10,7 +10,7 @@ use pyo3::prelude::*;
 use crate::failure::{INVALID, failure};
 use crate::records::Records;
 
-/// What is known of a policy beside its records: the version that it was trained on, the steps of its training, the seed of
+/// Facts about a policy beside its records: the version that it was trained on, the steps of its training, the seed of
 /// its tests, their episodes, what it observed, and whether it was deterministic.
 type KnownOf = (Option<String>, Option<u64>, u64, u64, String, Option<bool>);
 
@@ -40,13 +40,13 @@ impl Assessment {
         self.0.write(&path, overwrite).map_err(refused)
     }
 
-    /// What reports call the agent.
+    /// The agent's name in reports.
     #[getter]
     fn agent(&self) -> &str {
         &self.0.agent
     }
 
-    /// Its policies, with their records.
+    /// Returns the policies with their records.
     fn policies(&self) -> Vec<(KnownOf, Records)> {
         let of = |policy: &AssessedPolicy| {
             let Known { trained_on, timesteps, seed, episodes, observe, deterministic } = policy.known.clone();

@@ -1,6 +1,6 @@
-//! What went wrong, as data: the package's errors, with their sentences, are Python's.
+//! Failures as data. The package turns them into errors with sentences.
 
-use perturb_protocol::ClientError;
+use perturb_protocol::{ClientError, Malformed};
 use pyo3::create_exception;
 use pyo3::exceptions::PyException;
 use pyo3::prelude::*;
@@ -40,8 +40,13 @@ pub fn failure(kind: &'static str, code: i32, words: impl Into<String>) -> PyErr
     Failure::new_err((kind, code, words.into()))
 }
 
-/// What the protocol's client says, for Python.
-pub fn of(error: &ClientError) -> PyErr {
+/// A reply whose content breaks the protocol.
+pub fn malformed(error: &Malformed) -> PyErr {
+    failure(MALFORMED, 0, format!("the server sent {error}"))
+}
+
+/// Converts an error of the protocol's client for Python.
+pub fn from_client(error: &ClientError) -> PyErr {
     match error {
         ClientError::Refused { code, message, .. } => failure(REFUSED, *code as i32, message),
         ClientError::Lost { code, reason, .. } => failure(LOST, *code as i32, reason),

@@ -5,28 +5,37 @@
 //!
 //! - `parameters`: what was drawn or given, by name;
 //! - `receipt`: which episode this is (`environment_index`, `trial_index`, `episode_index`), `applied`, the values read
-//!   back from the physics, by name, and `model_hash`;
+//!   back from the physics, by name, and `model_hash`, the 32 bytes of the model's SHA-256, zeros without a model: a number
+//!   as all others, because libraries that convert infos to other arrays cannot convert text;
 //! - `context_id`: the trial's index, which counts the draws of parameters.
 //!
-//! The info of an episode's last step has these too, `is_success` and `diverged`, and `achieved` unless there is nothing:
-//! the value of the quantity that the rule of success compares. Every step's has `reward_terms`, if they were asked for.
+//! The info of an episode's last step has these too, `is_success`, `diverged` and `achieved`, the value of the quantity that
+//! the rule of success compares, NaN where nothing was achieved. Every step's has `reward_terms`, if they were asked for.
 //! Nothing in them depends on the clock.
 //!
-//! Of a batch, each key holds an array `[N]`, and the key with an underscore before it a mask of the environments that have
-//! it, as `VectorEnv._add_info` of Gymnasium makes them. `parameters` and `receipt`, two dozen arrays, are made when
-//! somebody looks at them.
+//! In a batch's infos, each key holds an array `[N]`, and the key with an underscore before it a mask of the environments
+//! that have it, as `VectorEnv._add_info` of Gymnasium makes them. All dictionaries are plain ones.
 
 use std::sync::Arc;
 
 use bytes::Bytes;
 use numpy::{Element, PyArray1, PyArrayMethods, PyReadonlyArray1};
 use perturb_protocol::proto;
-use pyo3::intern;
 use pyo3::prelude::*;
-use pyo3::types::{PyDict, PyString, PyType};
+use pyo3::types::{PyDict, PyString};
 
 use crate::arrays;
-use crate::told::{Told, misfit};
+use crate::episode_table::{EpisodeTable, mismatched_episodes};
+
+/// Number of bytes of a SHA-256.
+const HASH_BYTES: usize = 32;
+
+/// Returns the bytes of a hash that is written in hexadecimal digits; zeros for another text.
+fn hash_bytes(text: &str) -> [u8; HASH_BYTES] {
+    let digits: Option<Vec<u8>> = text.chars().map(|digit| digit.to_digit(16).map(|digit| digit as u8)).collect();
+    let bytes = digits.map(|digits| digits.as_chunks::<2>().0.iter().map(|[high, low]| 16 * high + low).collect());
+    bytes.and_then(|bytes: Vec<u8>| bytes.try_into().ok()).unwrap_or_default()
+}
 
 /// A key, and that of the mask of the environments that have it.
 struct Label {
@@ -40,26 +49,26 @@ impl Label {
     }
 }
 
-/// What a session's infos call their values, made once.
+/// Keys of a session's infos, made once.
 pub struct Labels {
     /// N.
     num_envs: usize,
     parameters: Vec<Label>,
     applied: Vec<Label>,
     reward_terms: Vec<Label>,
-    known: Known,
-    /// SHA-256 of the model.
+    known: FixedLabels,
+    /// SHA-256 of the model, as text; empty without a model.
     model_hash: String,
-    /// `perturb.infos.Later`, a dictionary that is filled when somebody looks.
-    later: Py<PyType>,
+    /// The bytes of the hash; zeros without a model.
+    model_hash_bytes: [u8; HASH_BYTES],
 }
 
-macro_rules! known {
+macro_rules! fixed_labels {
     ($($name:ident),*) => {
         /// The keys that are the same for all environments.
-        struct Known { $($name: Label),* }
+        struct FixedLabels { $($name: Label),* }
 
-        impl Known {
+        impl FixedLabels {
             fn new(py: Python<'_>) -> Self {
                 Self { $($name: Label::new(py, stringify!($name))),* }
             }
@@ -67,42 +76,39 @@ macro_rules! known {
     };
 }
 
-known! {
+fixed_labels! {
     is_success, diverged, achieved, context_id, parameters, receipt, applied, environment_index, trial_index,
     episode_index, model_hash, reward_terms, final_obs, final_info
 }
 
 impl Labels {
-    /// Those of an environment of which there are N.
-    ///
-    /// # Errors
-    /// Python's, if the package is not whole.
-    pub fn new(py: Python<'_>, environment: &proto::Environment, num_envs: usize) -> PyResult<Self> {
-        Ok(Self {
+    /// Makes the keys of N environments.
+    pub fn new(py: Python<'_>, environment: &proto::Environment, num_envs: usize) -> Self {
+        Self {
             num_envs,
             parameters: environment.parameters.iter().map(|it| Label::new(py, &it.name)).collect(),
             applied: environment.applied.iter().map(|it| Label::new(py, &it.name)).collect(),
             reward_terms: environment.reward_terms.iter().map(|it| Label::new(py, &it.name)).collect(),
-            known: Known::new(py),
+            known: FixedLabels::new(py),
             model_hash: environment.model_hash.clone(),
-            later: py.import("perturb.infos")?.getattr("Later")?.cast_into()?.unbind(),
-        })
+            model_hash_bytes: hash_bytes(&environment.model_hash),
+        }
     }
 
     /// No episodes yet.
-    fn told(&self) -> Told {
-        Told::new(self.parameters.len(), self.applied.len())
+    fn episode_table(&self) -> EpisodeTable {
+        EpisodeTable::new(self.parameters.len(), self.applied.len())
     }
 }
 
-/// What began and ended in a request.
+/// Episodes that began and ended in a request.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Events {
     labels: Arc<Labels>,
     ended: Vec<proto::EpisodeEnd>,
     /// Their receipts, and those of the episodes that began; none if they were not asked for.
-    ended_told: Arc<Told>,
-    started_told: Arc<Told>,
+    ended_episodes: EpisodeTable,
+    started_episodes: EpisodeTable,
     final_observations: Vec<f32>,
     /// O.
     observation_size: usize,
@@ -119,8 +125,8 @@ impl Events {
         Self {
             labels: Arc::clone(labels),
             ended: Vec::new(),
-            ended_told: Arc::default(),
-            started_told: Arc::new(labels.told().with_messages(started)?),
+            ended_episodes: EpisodeTable::default(),
+            started_episodes: labels.episode_table().with_messages(started)?,
             final_observations: Vec::new(),
             observation_size: 0,
             reward_terms: Vec::new(),
@@ -128,7 +134,7 @@ impl Events {
         .checked()
     }
 
-    /// Those of a step; `None` if nothing began or ended, and no reward terms came.
+    /// Returns the episodes of a step; `None` if nothing began or ended, and no reward terms came.
     ///
     /// # Errors
     /// If they do not fit.
@@ -137,12 +143,12 @@ impl Events {
         if ended.is_empty() && started.is_empty() && reward_terms.is_empty() && receipt_episodes.is_empty() {
             return Ok(None);
         }
-        let [ended_told, started_told] = if receipt_episodes.is_empty() {
+        let [ended_episodes, started_episodes] = if receipt_episodes.is_empty() {
             let started = started.iter().map(|start| (start.slot, start.episode.as_ref(), start.receipt.as_ref()));
             let ended = ended.iter().map(|end| (end.slot, end.episode.as_ref(), end.receipt.as_ref()));
-            [labels.told().with_messages(ended)?, labels.told().with_messages(started)?]
+            [labels.episode_table().with_messages(ended)?, labels.episode_table().with_messages(started)?]
         } else {
-            labels.told().split(&receipt_episodes, &stepped.receipt_values, ended.len())?
+            labels.episode_table().split(&receipt_episodes, &stepped.receipt_values, ended.len())?
         };
         let terms = |bytes: &Bytes| match bytes.is_empty() {
             true => Ok(Vec::new()),
@@ -153,8 +159,8 @@ impl Events {
             final_observations: arrays::numbers(&final_observations, &[ended.len(), observation_size])?,
             reward_terms: terms(&reward_terms)?,
             ended,
-            ended_told: Arc::new(ended_told),
-            started_told: Arc::new(started_told),
+            ended_episodes,
+            started_episodes,
             observation_size,
         }
         .checked()
@@ -163,7 +169,7 @@ impl Events {
 
     /// The episodes that ended, with their receipts.
     pub fn ended(&self) -> impl Iterator<Item = proto::EpisodeEnd> {
-        let receipt = |index| self.ended_told.receipt(index, &self.labels.model_hash);
+        let receipt = |index| self.ended_episodes.receipt(index, &self.labels.model_hash);
         let whole = move |(index, end): (usize, &proto::EpisodeEnd)| proto::EpisodeEnd {
             receipt: end.receipt.clone().or_else(|| receipt(index)),
             ..end.clone()
@@ -172,10 +178,10 @@ impl Events {
     }
 
     fn checked(self) -> PyResult<Self> {
-        let told = || self.ended_told.episodes.iter().chain(&self.started_told.episodes);
-        let slots = self.ended.iter().map(|end| end.slot.into()).chain(told().map(|row| row[0]));
+        let rows = || self.ended_episodes.episodes.iter().chain(&self.started_episodes.episodes);
+        let slots = self.ended.iter().map(|end| end.slot.into()).chain(rows().map(|row| row[0]));
         if slots.max().is_some_and(|most| most >= self.labels.num_envs as u64) {
-            return Err(misfit());
+            return Err(mismatched_episodes());
         }
         Ok(self)
     }
@@ -196,26 +202,25 @@ impl Events {
         if let Some(end) = self.ended.first() {
             info.set_item(&known.is_success.key, end.success)?;
             info.set_item(&known.diverged.key, end.diverged)?;
-            if let Some(achieved) = end.achieved {
-                info.set_item(&known.achieved.key, achieved)?;
-            }
+            info.set_item(&known.achieved.key, end.achieved.unwrap_or(f64::NAN))?;
         }
         let values = |labels: &[Label], values: &[f64]| {
             let named = PyDict::new(py);
             labels.iter().zip(values).try_for_each(|(label, value)| named.set_item(&label.key, value))?;
             PyResult::Ok(named)
         };
-        for ([_, environment, trial, episode, _], row) in self.started_told.rows().chain(self.ended_told.rows()) {
+        for ([_, environment, trial, episode, _], row) in self.started_episodes.rows().chain(self.ended_episodes.rows())
+        {
             let (requested, applied) = row.split_at(self.labels.parameters.len());
-            let told = PyDict::new(py);
-            told.set_item(&known.environment_index.key, environment)?;
-            told.set_item(&known.trial_index.key, trial)?;
-            told.set_item(&known.episode_index.key, episode)?;
-            told.set_item(&known.applied.key, values(&self.labels.applied, applied)?)?;
-            told.set_item(&known.model_hash.key, &self.labels.model_hash)?;
+            let receipt = PyDict::new(py);
+            receipt.set_item(&known.environment_index.key, environment)?;
+            receipt.set_item(&known.trial_index.key, trial)?;
+            receipt.set_item(&known.episode_index.key, episode)?;
+            receipt.set_item(&known.applied.key, values(&self.labels.applied, applied)?)?;
+            receipt.set_item(&known.model_hash.key, PyArray1::from_slice(py, &self.labels.model_hash_bytes))?;
             info.set_item(&known.context_id.key, trial)?;
             info.set_item(&known.parameters.key, values(&self.labels.parameters, requested)?)?;
-            info.set_item(&known.receipt.key, told)?;
+            info.set_item(&known.receipt.key, receipt)?;
         }
         Ok(info)
     }
@@ -237,7 +242,7 @@ impl Events {
         moved.resize(n, false);
         if !same_step || self.ended.is_empty() {
             self.outcomes(&infos)?;
-            self.receipts(&infos, [&self.started_told, &self.ended_told])?;
+            self.receipts(&infos, [&self.started_episodes, &self.ended_episodes])?;
             self.terms(&infos, &moved)?;
             return Ok(infos);
         }
@@ -251,9 +256,9 @@ impl Events {
         set(&infos, &known.final_obs, PyArray1::from_vec(py, observations), &mask)?;
         set(&infos, &known.final_info, &finals, &mask)?;
         self.outcomes(&finals)?;
-        self.receipts(&finals, [&self.ended_told])?;
+        self.receipts(&finals, [&self.ended_episodes])?;
         self.terms(&finals, &over)?;
-        self.receipts(&infos, [&self.started_told])?;
+        self.receipts(&infos, [&self.started_episodes])?;
         self.terms(&infos, &moved)?;
         Ok(infos)
     }
@@ -274,33 +279,43 @@ impl Events {
         set(infos, &known.is_success, self.column(py, success), &mask)?;
         let diverged = slots().zip(self.ended.iter().map(|end| end.diverged));
         set(infos, &known.diverged, self.column(py, diverged), &mask)?;
-        let reached = || slots().zip(&self.ended).filter_map(|(slot, end)| Some((slot, end.achieved?)));
-        if reached().next().is_some() {
-            let (_, mask) = self.mask(py, reached().map(|(slot, _)| slot));
-            set(infos, &known.achieved, self.column(py, reached()), &mask)?;
-        }
-        Ok(())
+        let achieved = slots().zip(self.ended.iter().map(|end| end.achieved.unwrap_or(f64::NAN)));
+        set(infos, &known.achieved, self.column(py, achieved), &mask)
     }
 
-    fn receipts<const P: usize>(&self, infos: &Bound<'_, PyDict>, parts: [&Arc<Told>; P]) -> PyResult<()> {
-        let rows = || parts.iter().flat_map(|part| &part.episodes);
+    /// Adds the episodes that began or ended, with their parameters. The last of the `parts` counts for an environment that
+    /// is in two.
+    fn receipts<const P: usize>(&self, infos: &Bound<'_, PyDict>, parts: [&EpisodeTable; P]) -> PyResult<()> {
+        let rows = || parts.iter().flat_map(|part| part.rows());
         if rows().next().is_none() {
             return Ok(());
         }
-        let (py, known) = (infos.py(), &self.labels.known);
-        let slots = || rows().map(|row| row[0] as usize);
-        let (_, mask) = self.mask(py, slots());
-        let trials = slots().zip(rows().map(|row| row[2] as i64));
-        set(infos, &known.context_id, self.column(py, trials), &mask)?;
-        let receipts = Receipts {
-            labels: Arc::clone(&self.labels),
-            parts: parts.map(Arc::clone).into(),
-            mask: mask.clone().unbind(),
+        let (py, labels) = (infos.py(), &*self.labels);
+        let (known, slot) = (&labels.known, |row: &[u64; 5]| row[0] as usize);
+        let (_, mask) = self.mask(py, rows().map(|(row, _)| slot(&row)));
+        let count = |index: usize| self.column(py, rows().map(move |(row, _)| (row[0] as usize, row[index] as i64)));
+        let named = |labels: &[Label], first: usize| {
+            let named = PyDict::new(py);
+            for (i, label) in labels.iter().enumerate() {
+                let column = rows().map(|(row, values)| (slot(&row), values[first + i]));
+                set(&named, label, self.column(py, column), &mask)?;
+            }
+            PyResult::Ok(named)
         };
-        let receipts = Bound::new(py, receipts)?;
-        let later = |filled_by| self.labels.later.bind(py).call1((receipts.getattr(filled_by)?,));
-        set(infos, &known.parameters, later(intern!(py, "parameters"))?, &mask)?;
-        set(infos, &known.receipt, later(intern!(py, "receipt"))?, &mask)
+        set(infos, &known.context_id, count(2), &mask)?;
+        set(infos, &known.parameters, named(&labels.parameters, 0)?, &mask)?;
+        let receipt = PyDict::new(py);
+        for (index, label) in [(1, &known.environment_index), (2, &known.trial_index), (3, &known.episode_index)] {
+            set(&receipt, label, count(index), &mask)?;
+        }
+        set(&receipt, &known.applied, named(&labels.applied, labels.parameters.len())?, &mask)?;
+        let mut hashes = vec![0; labels.num_envs * HASH_BYTES];
+        rows().for_each(|(row, _)| {
+            hashes[slot(&row) * HASH_BYTES..][..HASH_BYTES].copy_from_slice(&labels.model_hash_bytes);
+        });
+        let hashes = PyArray1::from_vec(py, hashes).reshape([labels.num_envs, HASH_BYTES])?;
+        set(&receipt, &known.model_hash, hashes, &mask)?;
+        set(infos, &known.receipt, receipt, &mask)
     }
 
     fn terms(&self, infos: &Bound<'_, PyDict>, moved: &[bool]) -> PyResult<()> {
@@ -346,55 +361,4 @@ fn set<'py>(
 ) -> PyResult<()> {
     infos.set_item(&label.key, value)?;
     infos.set_item(&label.mask, mask)
-}
-
-/// What fills the dictionaries `parameters` and `receipt` of a batch.
-#[pyclass(frozen, module = "perturb._native")]
-struct Receipts {
-    labels: Arc<Labels>,
-    /// Of an environment that is in two of them the last counts.
-    parts: Vec<Arc<Told>>,
-    mask: Py<PyArray1<bool>>,
-}
-
-#[pymethods]
-impl Receipts {
-    /// Values that were drawn or given.
-    fn parameters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        self.values(py, &self.labels.parameters, 0)
-    }
-
-    /// Which episode it is, and the values that were read back.
-    fn receipt<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let (labels, mask) = (&*self.labels, self.mask.bind(py));
-        let (known, n, receipt) = (&labels.known, labels.num_envs, PyDict::new(py));
-        for (i, label) in [(1, &known.environment_index), (2, &known.trial_index), (3, &known.episode_index)] {
-            let mut column = vec![0_i64; n];
-            self.rows().for_each(|(row, _)| column[row[0] as usize] = row[i] as i64);
-            set(&receipt, label, PyArray1::from_vec(py, column), mask)?;
-        }
-        set(&receipt, &known.applied, self.values(py, &labels.applied, labels.parameters.len())?, mask)?;
-        let hash = PyString::new(py, &labels.model_hash).into_any().unbind();
-        let mut hashes: Vec<Py<PyAny>> = (0..n).map(|_| py.None()).collect();
-        self.rows().for_each(|(row, _)| hashes[row[0] as usize] = hash.clone_ref(py));
-        set(&receipt, &known.model_hash, PyArray1::from_vec(py, hashes), mask)?;
-        Ok(receipt)
-    }
-}
-
-impl Receipts {
-    fn rows(&self) -> impl Iterator<Item = ([u64; 5], &[f64])> {
-        self.parts.iter().flat_map(|part| part.rows())
-    }
-
-    /// Columns of values from the `first` on.
-    fn values<'py>(&self, py: Python<'py>, labels: &[Label], first: usize) -> PyResult<Bound<'py, PyDict>> {
-        let named = PyDict::new(py);
-        for (i, label) in labels.iter().enumerate() {
-            let mut column = vec![0.0_f64; self.labels.num_envs];
-            self.rows().for_each(|(row, values)| column[row[0] as usize] = values[first + i]);
-            set(&named, label, PyArray1::from_vec(py, column), self.mask.bind(py))?;
-        }
-        Ok(named)
-    }
 }

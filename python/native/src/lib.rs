@@ -1,9 +1,9 @@
 //! The Python package's native module, `perturb._native`: sessions of the protocol, as Python objects and NumPy arrays.
 //!
 //! - [`session`]: a session that waits for its replies without Python's lock, hears of signals, and survives forks.
-//! - [`line`]: the connection under it, which is driven by the thread that waits.
+//! - [`session_runtime`]: the connection under it, which is driven by the thread that waits.
 //! - [`requests`]: requests, made of what Python gives.
-//! - [`arrays`], [`infos`]: replies, as arrays and dictionaries; [`told`]: the episodes that these are made of.
+//! - [`arrays`], [`infos`]: replies, as arrays and dictionaries; [`episode_table`]: the episodes that these are made of.
 //! - [`policy`]: trained policies that act here, by the learner's arithmetic.
 //! - [`sets`], [`testing`], [`records`]: tests of whatever acts in Python, recorded as the program `perturb` records its own.
 //! - [`assessed`]: such tests as folders, and in reports.
@@ -16,18 +16,18 @@ use pyo3::prelude::*;
 
 mod arrays;
 mod assessed;
+mod episode_table;
 mod failure;
 mod infos;
-mod line;
 mod policy;
 mod records;
 mod requests;
 mod session;
+mod session_runtime;
 mod sets;
 mod testing;
-mod told;
 
-/// What the Python package stands on; `perturb/_native.pyi` has the types.
+/// The module `perturb._native`; `perturb/_native.pyi` has its types.
 #[pymodule]
 mod _native {
     #[pymodule_export]
@@ -46,10 +46,10 @@ mod _native {
     use super::sets::{heatmap_contexts, make_set, read_csv_set, read_sets};
     #[pymodule_export]
     use super::testing::Tests;
-    /// What the set of a heatmap is called.
+    /// Name of a heatmap's set.
     #[pymodule_export]
     const HEATMAP_SET: &str = perturb_records::Heatmap::SET;
-    /// The most points along a heatmap's axis.
+    /// Maximum number of points along a heatmap's axis.
     #[pymodule_export]
-    const MOST_POINTS: usize = perturb_records::MOST_POINTS;
+    const MAX_HEATMAP_POINTS: usize = perturb_records::MOST_POINTS;
 }

@@ -29,25 +29,30 @@ impl Policy {
         Ok(Self { checkpoint, id })
     }
 
+    /// Writes the checkpoint into a folder, which is created if it is not there. Its training cannot be resumed there.
+    fn save(&self, path: PathBuf) -> PyResult<()> {
+        self.checkpoint.save(&path, None).map_err(|error| refused(&error))
+    }
+
     /// In what it was trained.
     #[getter]
     fn environment(&self) -> &str {
         &self.checkpoint.state.config.common.environment
     }
 
-    /// Where parameters came from in training.
+    /// The version of the parameters in training.
     #[getter]
     fn version(&self) -> String {
         self.checkpoint.state.config.common.version.to_string()
     }
 
-    /// The same with the sets that replaced the version's.
+    /// The version in training, with the sets that replaced parts of it.
     #[getter]
     fn trained_on(&self) -> String {
         self.checkpoint.state.config.common.trained_on()
     }
 
-    /// What trained it, e.g. "ppo ff".
+    /// The method that trained it, e.g. "ppo ff".
     #[getter]
     fn method(&self) -> String {
         self.checkpoint.state.config.method().to_string()
@@ -77,7 +82,7 @@ impl Policy {
         self.checkpoint.state.config.common.observe.to_string()
     }
 
-    /// That of its training.
+    /// The seed of its training.
     #[getter]
     fn seed(&self) -> u64 {
         self.checkpoint.state.config.common.seed
@@ -121,7 +126,7 @@ impl Policy {
     }
 }
 
-/// ActorOutput in N environments, and remembers. It is for one thread at a time.
+/// Acts in N environments, and remembers. It is for one thread at a time.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Player(Mutex<Playing>);
 

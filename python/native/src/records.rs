@@ -59,7 +59,7 @@ impl Records {
         &self.0.about.policy
     }
 
-    /// What counted as a success.
+    /// The rule of success, as a sentence.
     #[getter]
     fn success(&self) -> Option<String> {
         self.0.about.success.as_ref().map(ToString::to_string)
@@ -101,7 +101,7 @@ impl Records {
         self.0.about.tests.iter().map(|test| to_python(&test.set)).collect()
     }
 
-    /// What decided about success, as it is typed; `None` if the server's word was taken.
+    /// The rule of success, as it is typed; `None` if the server decided.
     #[getter]
     fn rule(&self) -> Option<String> {
         let success = self.0.about.success.as_ref();
@@ -172,7 +172,7 @@ impl Records {
 }
 
 impl Records {
-    /// Where a parameter is among those of the environment.
+    /// Returns the place of a parameter among those of the environment.
     fn place(&self, parameter: &str) -> PyResult<usize> {
         let names: Vec<&str> = self.0.about.parameters.iter().map(|it| it.name.as_str()).collect();
         names.iter().position(|known| *known == parameter).ok_or_else(|| {

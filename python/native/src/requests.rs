@@ -13,7 +13,7 @@ use crate::failure::{INVALID, failure};
 /// Sets of parameters: by name, intervals from low to high.
 pub type Intervals = HashMap<String, Vec<(f64, f64)>>;
 
-/// The same for the protocol.
+/// Converts sets of parameters for the protocol.
 pub fn distributions(parameters: Intervals) -> HashMap<String, proto::Distribution> {
     let interval = |(low, high)| proto::Interval { low, high };
     let distribution =
@@ -44,7 +44,7 @@ pub fn autoreset_mode(name: &str) -> PyResult<proto::AutoresetMode> {
     }
 }
 
-/// What the actions of a session are.
+/// Shape and kind of a session's actions.
 pub struct Actions {
     /// N.
     pub num_envs: usize,
@@ -55,11 +55,11 @@ pub struct Actions {
 }
 
 impl Actions {
-    /// As the protocol has them: int32 `[N]`, or float32 `[N, A]`. The usual kinds of arrays of the right shape are
+    /// Encodes actions for the protocol: int32 `[N]`, or float32 `[N, A]`. The usual kinds of arrays of the right shape are
     /// read here; everything else, wrong actions too, is for `fallback`, which returns bytes.
     ///
     /// # Errors
-    /// What `fallback` raises.
+    /// The errors of `fallback`.
     pub fn encode(&self, actions: &Bound<'_, PyAny>, fallback: &Bound<'_, PyAny>) -> PyResult<Bytes> {
         let known = match self.size {
             None => self.choices(actions),

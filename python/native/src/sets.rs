@@ -1,4 +1,4 @@
-//! What policies are tested on, between Python and the study: versions, sets of parameters, grids, lists of contexts.
+//! Sets that policies are tested on, between Python and the crates: versions, drawn parameters, grids, lists of contexts.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
@@ -58,7 +58,7 @@ pub fn heatmap_contexts(
     Heatmap::contexts(&axes.map(axis), points.min(MOST_POINTS), &fixed)
 }
 
-/// As Python has it.
+/// Converts a set for Python.
 pub fn to_python(set: &TestSet) -> Set {
     let intervals = |values: &Distribution| values.intervals().iter().map(|it| (it.low, it.high)).collect();
     let drawn = set.drawn().iter().map(|(name, values)| (name.clone(), intervals(values))).collect();
@@ -69,7 +69,7 @@ pub fn to_python(set: &TestSet) -> Set {
     (set.name.clone(), set.version.to_string(), drawn, contexts)
 }
 
-/// As the study has it.
+/// Converts a set from Python.
 pub fn from_python((name, version, drawn, contexts): Set) -> PyResult<TestSet> {
     let version = parse(&version)?;
     let contexts = match contexts {

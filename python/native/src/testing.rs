@@ -28,7 +28,7 @@ pub struct Tests {
     success: Option<Rule>,
     policy: String,
     episodes_per_trial: u32,
-    /// What the first session opened, and what was recorded in it.
+    /// The environment that the first session opened, and the records.
     begun: Option<(Arc<proto::Environment>, perturb_records::Records)>,
     counting: Option<Counting>,
 }
@@ -105,7 +105,7 @@ impl Tests {
         counting.finish(environment, records).map_err(|error| failure(MALFORMED, 0, error.to_string()))
     }
 
-    /// What was recorded.
+    /// Returns the records.
     fn records(&self) -> PyResult<Records> {
         let Some((_, records)) = &self.begun else { return Err(failure(UNUSABLE, 0, "no test has begun")) };
         Ok(Records(records.clone()))

@@ -9,14 +9,16 @@ Importing this package registers its environments:
     envs = gymnasium.make_vec("perturb/CartPole-v1", num_envs=64, version="E")
 """
 
+import typing as _typing
+import warnings as _warnings
 from importlib.metadata import version as _version
 
 from . import sets
-from .assess import assess
 from .assessment import Assessment
 from .env import PerturbEnv
 from .environments import Environment, Parameter, environments
 from .errors import (
+    AssignmentError,
     InvalidArgumentError,
     NotAllowedError,
     OutOfOrderError,
@@ -32,10 +34,11 @@ from .errors import (
     ServerUnavailableError,
     UnknownNameError,
 )
+from .evaluation import evaluate
 from .policy import Actor, Policy, load_policy
 from .registration import register_all as _register_all
 from .requests import Version
-from .results import Audit, Cell, Context, Part, Result
+from .results import Audit, Bin, Bin2D, Context, Result
 from .vector import PerturbVectorEnv
 
 __version__ = _version("perturb")
@@ -43,15 +46,16 @@ __version__ = _version("perturb")
 __all__ = [
     "Actor",
     "Assessment",
+    "AssignmentError",
     "Audit",
-    "Cell",
+    "Bin",
+    "Bin2D",
     "Context",
     "Environment",
     "InvalidArgumentError",
     "NotAllowedError",
     "OutOfOrderError",
     "Parameter",
-    "Part",
     "PerturbEnv",
     "PerturbError",
     "PerturbVectorEnv",
@@ -68,10 +72,24 @@ __all__ = [
     "ServerUnavailableError",
     "UnknownNameError",
     "Version",
-    "assess",
     "environments",
+    "evaluate",
     "load_policy",
     "sets",
 ]
 
 _register_all()
+
+# Names of version 0.1, by which the same things are still found in version 0.2.
+_DEPRECATED = {"assess": "evaluate", "Part": "Bin", "Cell": "Bin2D"}
+
+
+if not _typing.TYPE_CHECKING:  # type checkers know the present names alone
+
+    def __getattr__(name: str) -> _typing.Any:
+        """Find a deprecated name, with a warning that names the new one."""
+        if name not in _DEPRECATED:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        new = _DEPRECATED[name]
+        _warnings.warn(f"perturb.{name} is now perturb.{new}; the old name goes in version 0.3", DeprecationWarning, 2)
+        return globals()[new]

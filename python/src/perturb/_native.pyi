@@ -10,7 +10,7 @@ class Failure(Exception):  # noqa: N818
     """Arguments: the kind of failure, a gRPC code or 0, and the other side's or the transport's words."""
 
 class Events:
-    """What began and ended in a request."""
+    """Episodes that began and ended in a request."""
 
     def single(self) -> dict[str, Any]:
         """Info of one environment by itself."""
@@ -19,7 +19,7 @@ class Events:
         """Infos of a batch."""
 
 class Opened:
-    """What opening a session gave."""
+    """The reply that opened a session."""
 
     @property
     def environment(self) -> str: ...
@@ -36,13 +36,16 @@ Stepped: TypeAlias = tuple[
 ]
 
 class Session:
-    """One stream to a server, which owns a batch of environments."""
+    """A stream to a server, which owns a batch of environments."""
 
     timeout: float
     @property
     def waits(self) -> bool: ...
     @property
     def ended(self) -> bool: ...
+    @property
+    def under_way(self) -> int: ...
+    def last_ended(self) -> NDArray[np.bool_]: ...
     def __init__(
         self,
         address: str,
@@ -76,17 +79,18 @@ class Session:
     def snapshot(self, mask: bytes) -> list[bytes]: ...
     def restore(self, mask: bytes, snapshots: Sequence[bytes]) -> NDArray[np.float32]: ...
     def render(self, slot: int, width: int, height: int) -> NDArray[np.uint8]: ...
-    def tend(self) -> None: ...
+    def poll_io(self) -> None: ...
     def close(self) -> None: ...
 
 def catalogue(address: str, timeout: float) -> str:
-    """What a server can run, as JSON."""
+    """Return a server's catalogue as JSON."""
 
 class Policy:
     """A checkpoint that was read."""
 
     @staticmethod
     def load(path: str) -> Policy: ...
+    def save(self, path: str) -> None: ...
     @property
     def id(self) -> str: ...
     @property
@@ -122,25 +126,26 @@ class Player:
         self, observations: NDArray[np.float32], rewards: NDArray[np.float32], starts: NDArray[np.bool_]
     ) -> None: ...
 
-# What is known of a policy: the version that it was trained on, steps of its training, the seed of its tests, their
-# episodes, what it observed, and whether it was deterministic.
-Known: TypeAlias = tuple[str | None, int | None, int, int, str, bool | None]
+# Facts about a policy: the version that it was trained on, steps of its training, the seed of its tests, their
+# episodes, # what it observed, and whether it was deterministic.
+PolicyMetadata: TypeAlias = tuple[str | None, int | None, int, int, str, bool | None]
 
 class Assessment:
     """The tests of an agent in one environment."""
 
-    def __init__(self, agent: str, policies: list[tuple[Known, Records]]) -> None: ...
+    def __init__(self, agent: str, policies: list[tuple[PolicyMetadata, Records]]) -> None: ...
     @staticmethod
     def read(path: str) -> Assessment: ...
     def write(self, path: str, overwrite: bool) -> None: ...
     @property
     def agent(self) -> str: ...
-    def policies(self) -> list[tuple[Known, Records]]: ...
+    def policies(self) -> list[tuple[PolicyMetadata, Records]]: ...
 
 def report_page(assessments: list[Assessment], beside: list[str]) -> str:
     """The report page, HTML."""
 
-# A set of a test: its name, its version, what is drawn in place of the version's, and the contexts if they are listed.
+# A set of a test: its name, its version, values that are drawn in place of the version's, and contexts if it has a
+# list.
 Set: TypeAlias = tuple[str, str, dict[str, list[tuple[float, float]]], list[dict[str, float]] | None]
 
 def make_set(name: str, version: str, values: list[tuple[str, str]]) -> Set:
@@ -153,7 +158,7 @@ def read_sets(path: str) -> list[Set]:
     """The sets of an experiment file."""
 
 HEATMAP_SET: str
-MOST_POINTS: int
+MAX_HEATMAP_POINTS: int
 
 def heatmap_contexts(
     axes: Sequence[tuple[str, float, float]], points: int, fixed: dict[str, float]

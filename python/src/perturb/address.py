@@ -5,14 +5,15 @@ from __future__ import annotations
 import ipaddress
 import re
 from dataclasses import dataclass
+from pathlib import Path
 
-from .catalogue import LONGEST_SOCKET_PATH
+from .catalogue import MAX_SOCKET_PATH_BYTES
 from .errors import InvalidArgumentError
 
 
 @dataclass(frozen=True)
 class Address:
-    """Where a server listens: `unix:/path`, `host:port`, or with TLS `https://host:port`."""
+    """Address of a server: `unix:/path`, `host:port`, or with TLS `https://host:port`."""
 
     target: str
 
@@ -35,11 +36,15 @@ def parse_address(text: str) -> Address:
         raise refuse("it is no text")
     if text.startswith("unix:"):
         path = text.removeprefix("unix:")
-        path = path.removeprefix("//")
-        if not path.startswith("/"):
-            raise refuse("the path of the socket must be absolute")
-        if len(path.encode()) > LONGEST_SOCKET_PATH:
-            raise refuse(f"the path of the socket is longer than the {LONGEST_SOCKET_PATH} bytes that Linux allows")
+        if path.startswith("//"):
+            path = path.removeprefix("//")
+            if not path.startswith("/"):
+                raise refuse("the path after unix:// must be absolute")
+        if not path:
+            raise refuse("the path of the socket is missing")
+        path = str(Path(path).absolute())  # a server's own words may be relative to the working folder
+        if len(path.encode()) > MAX_SOCKET_PATH_BYTES:
+            raise refuse(f"the path of the socket is longer than the {MAX_SOCKET_PATH_BYTES} bytes that Linux allows")
         return Address(f"unix:{path}")
     scheme = next((scheme for scheme in ("https://", "http://", "tcp://") if text.startswith(scheme)), "")
     rest = text.removeprefix(scheme)

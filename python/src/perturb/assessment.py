@@ -1,19 +1,22 @@
-"""What came of testing policies: records of every episode, and the figures that follow from them."""
+"""Assessments: records of every episode of tests, and the figures that follow from them."""
 
 from __future__ import annotations
 
 import html
 import os
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from . import _native, plots, requests
+from .contents import read_folder, write_folder
 from .errors import InvalidArgumentError, UnknownNameError
 from .policy import native
-from .results import Assessed, Audit, Cell, Context, Known, Part, Result
-from .tables import METRICS, as_html, tables, text
+from .results import Audit, Bin, Bin2D, Context, PolicyMetadata, PolicyRecords, Result
+from .tables import ACTIONS, METRICS, as_html, tables, text
+from .testing import replay
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,7 +33,7 @@ class Assessment:
         results: the figures of each test, in the order of training and test versions.
     """
 
-    def __init__(self, agent: str, assessed: Sequence[Assessed]) -> None:
+    def __init__(self, agent: str, assessed: Sequence[PolicyRecords]) -> None:
         self._assessed = tuple(assessed)
         self._native = native(_native.Assessment, agent, [(one.known.plain(), one.records) for one in assessed])
         self.agent = agent
@@ -39,10 +42,22 @@ class Assessment:
         self.success: str | None = first.success
         self.parameters: dict[str, str] = dict(first.parameters)
         self.results: tuple[Result, ...] = tuple(
-            Result(one.trained_on, tested_on, one.records.policy, *one.records.result(tested_on))
+            Result(
+                one.trained_on,
+                tested_on,
+                one.records.policy,
+                *one.records.result(tested_on),
+                deterministic=one.known.deterministic,
+            )
             for one in self._assessed
             for tested_on in one.records.sets
         )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what `save` writes."""
+        with tempfile.TemporaryDirectory(prefix="perturb-") as folder:
+            native(self._native.write, folder, False)
+            return _unpickled_assessment, (read_folder(folder),)
 
     def __getitem__(self, scenario: str) -> Result:
         """The figures of a scenario, such as `DR`; of a test, such as `R`, if it is not known what was trained on."""
@@ -69,7 +84,7 @@ class Assessment:
             method: dict(zip(METRICS, numbers, strict=True)) for method, numbers in _native.published(self.environment)
         }
 
-    def success_by_parameter(self, scenario: str, parameter: str) -> tuple[Part, ...]:
+    def success_by_parameter(self, scenario: str, parameter: str) -> tuple[Bin, ...]:
         """Success over a parameter in a test: in tenths of the range of its values, in the parameter's unit.
 
         Where a tenth of the range has no values, as between E's two intervals, a part ends and another begins. Nothing
@@ -82,7 +97,7 @@ class Assessment:
         result, records = self._find(scenario)
         parts = native(records.success_by_parameter, result.tested_on, parameter)
         return tuple(
-            Part(
+            Bin(
                 part_low,
                 part_high,
                 successes,
@@ -93,7 +108,7 @@ class Assessment:
             for part_low, part_high, successes, episodes, low, high in parts
         )
 
-    def success_by_parameters(self, scenario: str, x: str, y: str) -> tuple[Cell, ...]:
+    def success_by_parameters(self, scenario: str, x: str, y: str) -> tuple[Bin2D, ...]:
         """Success over two parameters in a test: in the parts of `success_by_parameter` of either, by y, then x.
 
         Nothing if one of them does not vary.
@@ -105,7 +120,7 @@ class Assessment:
         result, records = self._find(scenario)
         cells = native(records.success_by_parameters, result.tested_on, x, y)
         return tuple(
-            Cell(in_x, in_y, successes, episodes, 100 * successes / episodes if episodes else None)
+            Bin2D(in_x, in_y, successes, episodes, 100 * successes / episodes if episodes else None)
             for in_x, in_y, successes, episodes in cells
         )
 
@@ -149,8 +164,8 @@ class Assessment:
 
         Args:
             parameter: its name.
-            scenarios: at first all.
-            axes: of matplotlib, to draw on; at first new ones.
+            scenarios: names of scenarios; by default all.
+            axes: matplotlib's axes to draw on; by default new ones.
 
         Returns the axes. Needs matplotlib: `pip install perturb[plot]`.
 
@@ -169,7 +184,7 @@ class Assessment:
             scenario: such as `DE`.
             x: the parameter along x.
             y: the parameter along y.
-            axes: of matplotlib, to draw on; at first new ones.
+            axes: matplotlib's axes to draw on; by default new ones.
 
         Returns the axes. Needs matplotlib: `pip install perturb[plot]`.
 
@@ -237,7 +252,7 @@ class Assessment:
             InvalidArgumentError: if there is no assessment, or one that is damaged or of a later version of perturb.
         """
         read = native(_native.Assessment.read, os.fspath(folder))
-        assessment = Assessment(read.agent, [Assessed(Known(*known), records) for known, records in read.policies()])
+        assessment = _assessment(read)
         assessment._native = read  # which knows its folder's name
         return assessment
 
@@ -270,37 +285,52 @@ class Assessment:
         return page
 
     def audit(self, policy: Any, *, normalizer: Any = None, server: str | None = None, timeout: float = 60.0) -> Audit:
-        """Test the same policy again, in all recorded episodes, and compare everything that came of them.
+        """Test the same policy again in all recorded episodes, and compare all results.
 
-        For policies that only Python can load; `perturb audit` replays those of perturb, on any machine. What samples
-        with torch or NumPy gives the same again on the same kind of machine, with the same packages.
+        Use it for policies that only Python can load; `perturb audit` replays those of perturb, on any machine. A
+        policy that samples with torch or NumPy gives equal results on the same kind of machine with the same packages.
 
         Args:
             policy: what was tested: a policy, or a mapping of all by what they were trained on.
-            normalizer: as in `assess`.
-            server: likewise.
-            timeout: likewise.
+            normalizer: as in `evaluate`.
+            server: as in `evaluate`.
+            timeout: as in `evaluate`.
 
         Raises:
             PolicyError: for another policy than the recorded one, or one that fails.
             InvalidArgumentError: for a mapping with other keys than what was trained on.
-            ServerConnectionError, ServerTimeoutError, ServerStartError: likewise.
+            ServerConnectionError, ServerTimeoutError, ServerStartError: as in `evaluate`.
         """
-        from .assess import again  # which makes assessments
-
-        return again(self._assessed, self.agent, policy, normalizer, server, timeout)
+        return replay(self._assessed, self.agent, policy, normalizer, server, timeout)
 
     def _find(self, scenario: str) -> tuple[Result, _native.Records]:
         result = self[scenario]
         return result, next(one.records for one in self._assessed if one.trained_on == result.trained_on)
 
     def __str__(self) -> str:
-        return "\n\n".join([self._title(), *map(text, tables(self))])
+        return "\n\n".join([self._title(), *map(text, self._tables())])
 
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        return f"<p>{html.escape(self._title())}</p>{''.join(map(as_html, tables(self)))}"
+        return f"<p>{html.escape(self._title())}</p>{''.join(map(as_html, self._tables()))}"
+
+    def _tables(self) -> list[list[list[str]]]:
+        return tables(self.results, self.metrics, self.published)
 
     def _title(self) -> str:
-        return f"{self.environment}, a success is {self.success or 'what the server says'}"
+        how = {ACTIONS[result.deterministic] for result in self.results} - {""}
+        actions = f"; actions are {' or '.join(sorted(how))}" if how else ""
+        return f"{self.environment}, a success is {self.success or 'what the server says'}{actions}"
+
+
+def _unpickled_assessment(files: dict[str, bytes]) -> Assessment:
+    with tempfile.TemporaryDirectory(prefix="perturb-") as folder:
+        write_folder(folder, files)
+        return _assessment(native(_native.Assessment.read, folder))
+
+
+def _assessment(read: _native.Assessment) -> Assessment:
+    return Assessment(
+        read.agent, [PolicyRecords(PolicyMetadata(*known), records) for known, records in read.policies()]
+    )

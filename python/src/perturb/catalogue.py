@@ -10,6 +10,7 @@ import difflib
 import json
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from importlib import resources
 from typing import TYPE_CHECKING, Any
@@ -20,20 +21,20 @@ from gymnasium import spaces
 from .errors import InvalidArgumentError, ProtocolError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable
 
 Range = tuple[float, float]
 
-# What ids in Gymnasium begin with.
+# Namespace of the ids in Gymnasium.
 NAMESPACE = "perturb/"
 
 
 @dataclass(frozen=True)
 class Success:
-    """When an episode is a success: how what it achieved compares with a threshold."""
+    """The rule of success: a comparison of what an episode achieved with a threshold."""
 
     description: str
-    # What is compared, e.g. "steps", and its unit.
+    # The quantity that is compared, such as "steps", and its unit.
     quantity: str
     unit: str
     # "at_least" or "at_most".
@@ -53,10 +54,14 @@ class Description:
     observation: tuple[Range, ...]
     actions: int | tuple[Range, ...]
     control_timestep: float
-    # What follows the observation where parameters are observed.
+    # Ranges of the parameters that follow the observation if parameters are observed.
     parameter_observations: tuple[Range, ...] = field(default=(), compare=False)
     # The rule of this package's version; the server's, whose word is `is_success`, may be another.
     success: Success | None = field(default=None, compare=False)
+    # By name the least and the greatest value of each parameter of the physics that is accepted.
+    parameters: Mapping[str, Range] = field(default_factory=dict, compare=False)
+    # An episode is truncated after so many steps; None if that is not known.
+    step_limit: int | None = field(default=None, compare=False)
 
     @classmethod
     def read(cls, entry: Mapping[str, Any]) -> Description:
@@ -75,6 +80,8 @@ class Description:
             control_timestep=entry["control_timestep"],
             parameter_observations=ranges(seen["entry"] for seen in entry.get("parameter_observations", [])),
             success=None if success is None else Success(**success),
+            parameters={it["name"]: (it["low"], it["high"]) for it in entry.get("parameters", [])},
+            step_limit=entry.get("step_limit"),
         )
 
     def observing_parameters(self) -> Description:
@@ -87,7 +94,7 @@ class Description:
         return isinstance(self.actions, int)
 
     def metadata(self) -> dict[str, Any]:
-        """What Gymnasium wants to know of pictures, as many in a second as show real time; and the rule of success."""
+        """Gymnasium's metadata: modes of rendering, pictures per second of real time; and the rule of success."""
         pictures = {"render_modes": ["rgb_array"], "render_fps": 1 / self.control_timestep}
         return pictures if self.success is None else {**pictures, "success": asdict(self.success)}
 
@@ -124,10 +131,10 @@ CATALOGUE: dict[str, Description] = {
     description.name: description for description in map(Description.read, CATALOGUE_ENTRIES)
 }
 # Width and height of a picture: the least and the most, and unless told otherwise.
-LEAST_PIXELS, MOST_PIXELS = _LIMITS["picture_pixels"]
-USUAL_PIXELS: int = _LIMITS["usual_picture_pixels"]
+MIN_PIXELS, MAX_PIXELS = _LIMITS["picture_pixels"]
+DEFAULT_PIXELS: int = _LIMITS["usual_picture_pixels"]
 # The longest path that a Unix socket can have, in bytes.
-LONGEST_SOCKET_PATH: int = _LIMITS["longest_socket_path"]
+MAX_SOCKET_PATH_BYTES: int = _LIMITS["longest_socket_path"]
 
 
 def find(name: str) -> Description:

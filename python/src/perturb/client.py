@@ -1,4 +1,4 @@
-"""What a single environment and a batch have in common: settings, and the session that they are sent to."""
+"""Settings and session that a single environment and a batch have in common."""
 
 from __future__ import annotations
 
@@ -20,16 +20,25 @@ if TYPE_CHECKING:
 
     from ._native import Events, Opened
 
-# How long a reply may take unless told otherwise, s.
+# Default limit for a reply, s.
 TIMEOUT = 60.0
 
 
-class Begun(NamedTuple):
-    """What opening a session gave: observations [N, O] and the first episodes."""
+class OpenedSession(NamedTuple):
+    """The reply that opened a session: observations [N, O] and the first episodes."""
 
     opened: Opened
     observations: NDArray[np.float32]
     events: Events
+
+
+class ResetRequest(NamedTuple):
+    """A reset of M environments: a mask bool [N] or None for all; M seeds or none; parameters; exact states or none."""
+
+    mask: NDArray[np.bool_] | None
+    seeds: Sequence[int]
+    parameters: requests.Intervals
+    states: bytes
 
 
 class Client:
@@ -66,16 +75,14 @@ class Client:
         self.num_envs = requests.count(num_envs, "num_envs", 1)
         self._server = None if server is None else parse_address(server)
         if server is None:
-            local_server.find_program()  # better now than at the first reset
+            local_server.find_program()  # so that a missing program is reported now, not at the first reset
         self._timeout = requests.seconds(timeout, "timeout")
         self._single = single
         self._parameters = requests.distributions(parameters)
-        self._contexts = [] if contexts is None else requests.contexts(contexts)
-        if len(self._contexts) > self.num_envs:
-            raise InvalidArgumentError(
-                f"there are {len(self._contexts)} contexts for num_envs={self.num_envs}: each environment has one, so "
-                "give at least as many environments"
-            )
+        # Parameters of each environment that replace the batch's; empty if no environment has any.
+        self._own: list[requests.Intervals] = []
+        if contexts is not None:
+            self._set_contexts(requests.contexts(contexts))
         self._request: dict[str, Any] = {
             "environment": self.description.name,
             "version": requests.version(version),
@@ -86,16 +93,15 @@ class Client:
             "reward_terms": bool(reward_terms),
             "observe_parameters": observe_parameters,
         }
-        self._partly_changed = False
+        self._was_restored = False
         self._session: Session | None = None
         self._closed = False
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the session: a copy, here or in another process, has to be reset."""
-        if self._partly_changed:
+        if self._was_restored:
             raise OutOfOrderError(
-                "the environments do not all have the parameters that the batch was made with, which a copy would not "
-                "know: copy them before parameters are given to some, or a snapshot is restored"
+                "a snapshot was restored, whose parameters a copy would not know: copy environments before that"
             )
         return {**self.__dict__, "_session": None}
 
@@ -111,22 +117,22 @@ class Client:
             raise OutOfOrderError("call reset() first: no episode has begun")
         return self._session
 
-    def open(self, seeds: Sequence[int], generator: np.random.Generator) -> Begun | None:
+    def open(self, seeds: Sequence[int], generator: np.random.Generator) -> OpenedSession | None:
         """Open a session, unless one is open. Without seeds, which a reset is to give, the generator draws one.
 
-        Environment i then has context i modulo their number, if there are contexts.
+        Each environment then has the parameters that resets and contexts gave to it.
 
         Raises:
-            OutOfOrderError: if a session is gone whose environments did not all have the same parameters.
+            OutOfOrderError: if a session is gone in which a snapshot was restored.
         """
         self._require_not_closed()
         if self._session is not None:
             if self._session.usable():
                 return None
-            if self._partly_changed:
+            if self._was_restored:
                 raise OutOfOrderError(
-                    "the session is gone, and earlier resets gave parameters to some of its environments: "
-                    "make the environments anew, and give them again"
+                    "the session is gone, and a snapshot was restored in it, whose parameters are not known here: "
+                    "make the environments anew, and restore the snapshot again"
                 )
             self._session.close()
             self._session = None
@@ -140,48 +146,76 @@ class Client:
                     "run the perturb-server of the package's version, or leave it out"
                 )
             self.description.require_equal(catalogue.Description.read(json.loads(opened.environment)))
-            begun = Begun(opened, opened.observations, opened.events)
-            if self._contexts:
-                begun = self._give_contexts(session, opened, seed)
+            begun = OpenedSession(opened, opened.observations, opened.events)
+            if any(self._own):
+                begun = self._give_own(session, opened, seed)
         except BaseException:
             session.close()
             raise
         self._session = session
         return begun
 
-    def _give_contexts(self, session: Session, opened: Opened, seed: int) -> Begun:
-        count = len(self._contexts)
-        for place, context in enumerate(self._contexts):
-            mask = np.arange(self.num_envs) % count == place
-            values = {name: [(value, value)] for name, value in context.items()}
-            session.reset(mask.tobytes(), [seed] * int(mask.sum()), values, b"")
-        # The same episodes once more, all together.
-        return Begun(opened, *session.reset(b"", [seed] * self.num_envs, {}, b""))
+    def check_size(self) -> None:
+        """Open and close a session, so that the server refuses a batch that is too large for it."""
+        self.open([0], np.random.default_rng())
+        self.session.close()
+        self._session = None
 
-    def reset(
-        self,
-        mask: NDArray[np.bool_] | None,
-        seeds: Sequence[int],
-        parameters: requests.Intervals,
-        states: bytes,
-    ) -> tuple[NDArray[np.float32], Events]:
-        """Begin new episodes. Parameters stay, also if the session has to be opened again."""
-        done = self.session.reset(_bytes(mask), seeds, parameters, states)
-        if parameters and mask is not None and not mask.all():
-            self._partly_changed = True
-        else:
-            self._parameters |= parameters
-            self._contexts = [
-                {name: value for name, value in context.items() if name not in parameters} for context in self._contexts
-            ]
-        return done
+    def _set_contexts(self, contexts: Sequence[Mapping[str, float]]) -> None:
+        count = len(contexts)
+        if count > self.num_envs:
+            raise InvalidArgumentError(
+                f"there are {count} contexts for num_envs={self.num_envs}: each environment has one, so give at least "
+                "as many environments"
+            )
+        fixed = [{name: [(value, value)] for name, value in context.items()} for context in contexts]
+        self._own = [fixed[slot % count] for slot in range(self.num_envs)]
+
+    def _give_own(self, session: Session, opened: Opened, seed: int) -> OpenedSession:
+        """Give environments their own parameters: one request for all that have the same."""
+        slots: dict[Any, list[int]] = {}
+        for slot, own in enumerate(self._own):
+            if own:
+                slots.setdefault(requests.frozen(own), []).append(slot)
+        for alike in slots.values():
+            mask = np.zeros(self.num_envs, np.bool_)
+            mask[alike] = True
+            session.reset(mask.tobytes(), [seed] * len(alike), self._own[alike[0]], b"")
+        # Begin the same episodes once more, all together.
+        return OpenedSession(opened, *session.reset(b"", [seed] * self.num_envs, {}, b""))
+
+    def reset(self, groups: Sequence[ResetRequest]) -> tuple[NDArray[np.float32], list[Events]]:
+        """Begin new episodes: observations [N, O]. Parameters stay, also if the session has to be opened again."""
+        events = []
+        for mask, seeds, parameters, states in groups:
+            observations, begun = self.session.reset(_bytes(mask), seeds, parameters, states)
+            events.append(begun)
+            if parameters:
+                self._keep(mask, parameters)
+        return observations, events
+
+    def _keep(self, mask: NDArray[np.bool_] | None, parameters: requests.Intervals) -> None:
+        """Remember parameters that environments have from now on."""
+        if mask is None or mask.all():
+            self._parameters = {**self._parameters, **parameters}
+            self._own = [{name: it for name, it in own.items() if name not in parameters} for own in self._own]
+            return
+        self._own = self._own or [{} for _ in range(self.num_envs)]
+        for slot in np.flatnonzero(mask).tolist():
+            self._own[slot] = {**self._own[slot], **parameters}
+
+    def last_ended(self) -> NDArray[np.bool_]:
+        """Return which environments' episodes ended in the last step and were not reset since, [N]."""
+        if self._session is None or not self._session.usable():
+            return np.zeros(self.num_envs, np.bool_)
+        return self._session.last_ended()
 
     def snapshot(self, mask: NDArray[np.bool_] | None) -> list[bytes]:
         """Save the selected environments."""
         return self.session.snapshot(_bytes(mask))
 
     def restore(self, snapshots: Sequence[bytes], mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
-        """Bring saved environments back: observations [M, O]."""
+        """Bring saved environments back: observations [N, O], of other environments the last ones."""
         if not all(isinstance(snapshot, bytes) for snapshot in snapshots):
             raise InvalidArgumentError("a snapshot is not of the type bytes; expected what snapshot() returned")
         session = self.session
@@ -189,13 +223,13 @@ class Client:
             restored = session.restore(_bytes(mask), snapshots)
         except BaseException:
             # A refusal, after which the session is usable, has changed nothing.
-            self._partly_changed = self._partly_changed or not session.usable()
+            self._was_restored = self._was_restored or not session.usable()
             raise
-        self._partly_changed = True  # from here on nobody but the server knows the parameters
+        self._was_restored = True  # from here on nobody but the server knows the parameters
         return restored
 
     def render(self, slot: int) -> NDArray[np.uint8]:
-        """Draw an environment: a read-only array [height, width, 3]."""
+        """Draw an environment: an array [height, width, 3]."""
         if not self._drawn:
             raise OutOfOrderError("render() is for environments that were made with render_mode='rgb_array'")
         return self.session.render(slot, self._width, self._height)

@@ -11,19 +11,21 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from . import requests
-from .catalogue import USUAL_PIXELS
-from .client import TIMEOUT, Client
+from .attributes import CheckedAttributes
+from .catalogue import DEFAULT_PIXELS
+from .client import TIMEOUT, Client, ResetRequest
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from gymnasium import spaces
+    from gymnasium.envs.registration import EnvSpec
 
 OPTIONS = ("parameters", "state")
 
 
-class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
-    """One environment of a perturb-server.
+class PerturbEnv(CheckedAttributes, gymnasium.Env[NDArray[np.float32], Any]):
+    """A single environment of a perturb-server.
 
     Args:
         environment: a name of docs/environments.md, such as `CartPole`.
@@ -41,8 +43,8 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         reward_terms: whether every step's info has the terms of the reward.
         timeout: how long a reply may take, s.
         render_mode: `rgb_array` lets `render` draw; None.
-        width: of pictures, in pixels.
-        height: likewise.
+        width: width of pictures, in pixels.
+        height: height of pictures, in pixels.
 
     The connection is made by the first `reset`. Observations, float32 [O], and pictures are the caller's own to
     keep and to change.
@@ -50,6 +52,7 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012  (each environment adds its render_fps)
     action_space: spaces.Discrete | spaces.Box
+    _spec: EnvSpec | None = None
 
     def __init__(
         self,
@@ -65,9 +68,11 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         reward_terms: bool = False,
         timeout: float = TIMEOUT,
         render_mode: str | None = None,
-        width: int = USUAL_PIXELS,
-        height: int = USUAL_PIXELS,
+        width: int = DEFAULT_PIXELS,
+        height: int = DEFAULT_PIXELS,
+        **unknown: Any,
     ) -> None:
+        requests.no_unknown(unknown, SETTINGS)
         self._client = Client(
             environment=environment,
             version=version,
@@ -93,6 +98,30 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         self._encode = partial(
             requests.actions, description=self._client.description, shape=self.action_space.shape or ()
         )
+        self._description = self._client.description
+        # The parameters that act at the next reset.
+        self._next_parameters: requests.Intervals = {}
+        self._is_made = True
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The specification from which Gymnasium made the environment, with the server's step limit."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = requests.with_step_limit(spec, self._description)
+
+    def set_parameters(self, parameters: requests.Parameters) -> None:
+        """Change the physics from the next reset on.
+
+        Args:
+            parameters: as at `make`. Other parameters stay as they are.
+
+        Raises:
+            UnknownNameError, InvalidArgumentError: for wrong names and values; nothing has changed.
+        """
+        self._next_parameters |= requests.parameter_values(parameters, self._description)
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
@@ -100,8 +129,8 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         """Begin the next episode.
 
         Args:
-            seed: begins the seed's first episode; without it, the next episode of the seed before (at first a random
-                one).
+            seed: begins the seed's first episode; without it, the next episode of the last seed (at the first reset a
+                random seed).
             options: `parameters`, as at `make`, from now on; `state`, an exact initial state [S] for this episode.
 
         Raises:
@@ -111,17 +140,18 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         """
         seeds = [] if seed is None else [requests.seed(seed)]
         given = requests.options(options, OPTIONS)
-        parameters = requests.distributions(given.get("parameters"))
+        parameters = self._next_parameters | requests.distributions(given.get("parameters"))
         state = given.get("state")
         states = b"" if state is None else requests.states(state, 1, batched=False)
         super().reset(seed=seeds[0] if seeds else None)
 
         opened = self._client.open(seeds, self.np_random)
         if opened is None or seeds or parameters or states:
-            observations, events = self._client.reset(None, seeds, parameters, states)
+            observations, (events,) = self._client.reset([ResetRequest(None, seeds, parameters, states)])
         else:
             observations, events = opened.observations, opened.events
-        return observations[0].copy(), events.single()
+        self._next_parameters = {}
+        return observations[0], events.single()
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Advance by one step. Actions beyond the range of a Box are clipped by the environment.
@@ -133,7 +163,7 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         """
         observations, rewards, terminated, truncated, events = self._client.session.step(action, self._encode)
         info = {} if events is None else events.single()
-        return observations[0].copy(), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
+        return observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def snapshot(self) -> bytes:
         """Save the environment whole: physics, parameters, counters, random streams."""
@@ -145,7 +175,7 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         What follows is what followed the snapshot, byte for byte.
         """
         self._client.open([], self.np_random)
-        observation: NDArray[np.float32] = self._client.restore([snapshot], None)[0].copy()
+        observation: NDArray[np.float32] = self._client.restore([snapshot], None)[0]
         return observation
 
     def render(self) -> NDArray[np.uint8]:
@@ -156,8 +186,12 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
             RenderError: if the server cannot draw; it says what is missing.
             ServerConnectionError, ServerTimeoutError: and the environment is gone.
         """
-        return self._client.render(0).copy()
+        return self._client.render(0)
 
     def close(self) -> None:
         """Free the environment on the server."""
         self._client.close()
+
+
+# Names of the settings of single environments.
+SETTINGS = requests.settings(PerturbEnv.__init__)

@@ -46,7 +46,7 @@ class Environment:
     """An environment of the catalogue.
 
     Attributes:
-        name: as `assess` and the servers call it, such as `CartPole`.
+        name: as `evaluate` and the servers call it, such as `CartPole`.
         id: as `gymnasium.make` calls it, such as `perturb/CartPole-v1`.
         revision: raised by every change of dynamics, reward or observation.
         description: what it is.
@@ -55,6 +55,7 @@ class Environment:
         observation: names of an observation's entries, [O].
         parameters: by their names, in the order of receipts.
         success: the rule of success; None if there is none.
+        model_hash: SHA-256 of the model in hexadecimal digits; empty without a model.
     """
 
     name: str
@@ -66,6 +67,7 @@ class Environment:
     observation: tuple[str, ...]
     parameters: dict[str, Parameter]
     success: Success | None
+    model_hash: str = ""
 
     @property
     def observation_space(self) -> spaces.Box:
@@ -99,6 +101,7 @@ def _environment(entry: Mapping[str, Any]) -> Environment:
         observation=tuple(channel["name"] for channel in entry["observation"]),
         parameters=parameters,
         success=description.success,
+        model_hash=entry.get("model_hash", ""),
     )
 
 

@@ -11,6 +11,10 @@ class InvalidArgumentError(PerturbError, ValueError):
     """A value is wrong: a NaN action, an array of a wrong shape, a parameter outside its bounds."""
 
 
+class AssignmentError(PerturbError, AttributeError):
+    """An attribute cannot be assigned, because the assignment would change nothing; the message says what does."""
+
+
 class UnknownNameError(PerturbError, KeyError):
     """The server knows no environment, or no parameter, of this name."""
 

@@ -20,16 +20,17 @@ from pathlib import Path
 from typing import IO
 
 from .address import Address, parse_address
+from .catalogue import MAX_SOCKET_PATH_BYTES
 from .errors import PerturbError, ServerStartError
 
 PROGRAM = "perturb-server"
-# Overrides where the program is looked for.
+# Variable that names the program.
 VARIABLE = "PERTURB_SERVER"
-# Where wheels have it, if they do.
+# The program inside a wheel, if the wheel has it.
 BUNDLED = Path(__file__).with_name("_programs") / PROGRAM
-# How long a start may take, s.
+# Limit for the start of a server, s.
 START_LIMIT = 20.0
-# How long a server may take to end before it is killed, s.
+# Limit for the end of a server, after which it is killed, s.
 END_LIMIT = 5.0
 
 
@@ -65,9 +66,23 @@ class LocalServer:
     def __init__(self) -> None:
         program = find_program()
         self._owner = os.getpid()
-        directory = tempfile.mkdtemp(prefix="perturb-")  # only its owner may enter
         try:
-            self.address: Address = parse_address(f"unix:{directory}/server.sock")
+            directory = tempfile.mkdtemp(prefix="perturb-")  # only its owner may enter
+        except OSError as error:
+            raise ServerStartError(
+                f"the private server {program} did not start: there is no folder for its socket ({error}); "
+                "set TMPDIR to a folder that can be written"
+            ) from error
+        socket = f"{directory}/server.sock"
+        if len(socket.encode()) > MAX_SOCKET_PATH_BYTES:
+            shutil.rmtree(directory, ignore_errors=True)
+            raise ServerStartError(
+                f"the private server {program} did not start: the path of its socket, {socket}, is longer than the "
+                f"{MAX_SOCKET_PATH_BYTES} bytes that Linux allows; set TMPDIR to a folder with a shorter path, such as "
+                "/tmp"
+            )
+        try:
+            self.address: Address = parse_address(f"unix:{socket}")
             self.process = _spawn(program, self.address)
         except (PerturbError, OSError) as error:
             shutil.rmtree(directory, ignore_errors=True)

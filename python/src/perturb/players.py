@@ -1,4 +1,4 @@
-"""Whatever acts, as `assess` plays with it: perturb's policies, functions, stable-baselines3's models, torch's modules.
+"""Adapters through which `evaluate` plays perturb's policies, functions, stable-baselines3's and torch's models.
 
 None of those packages is imported: an object can only be theirs once somebody else has done so.
 """
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from .errors import PolicyError
+from .normalizers import find_normalizer
 from .policy import Policy, native
 
 if TYPE_CHECKING:
@@ -43,54 +44,59 @@ class Player(Protocol):
 
 
 @dataclass(frozen=True)
-class Tested:
-    """A policy that is to be tested."""
+class PolicyUnderTest:
+    """A policy, prepared for a test."""
 
-    # What records call it.
+    # The policy's name in records.
     name: str
-    # Makes a player of N environments in a test with a seed.
+    # Makes a player from the number of environments N and the seed of a test.
     player: Callable[[int, int], Player]
-    # What reports call the agent: the same for policies that were trained alike.
+    # The agent's name in reports, which is the same for policies that were trained alike.
     agent: str = ""
-    # perturb's own.
+    # The loaded policy, if it is perturb's own.
     loaded: Policy | None = None
     # Steps of its training, if known.
     timesteps: int | None = None
-    # Whether it takes the mode of its actions' distribution; None if that is its own business.
+    # Whether it takes the mode of its actions' distribution; None if that is not known.
     deterministic: bool | None = None
 
 
-def tested(policy: Any, description: Description, *, deterministic: bool, normalizer: Any, name: str | None) -> Tested:
-    """Understand what is to be tested.
+def prepare(
+    policy: Any, description: Description, *, deterministic: bool | None, normalizer: Any, name: str | None
+) -> PolicyUnderTest:
+    """Prepare a policy of any kind for a test.
+
+    `deterministic` is True, False, or None for the default of the policy's kind.
 
     Raises:
         PolicyError: for what is no policy, or none of this environment.
     """
     if isinstance(policy, Policy):
-        if deterministic or normalizer is not None or name is not None:
+        if deterministic or normalizer not in (None, False) or name is not None:
             raise PolicyError(
                 "a loaded policy samples its actions, normalises by itself and has its id for a name, as in `perturb "
                 "evaluate`: leave deterministic=, normalizer= and name= out"
             )
         loaded = policy._native
         player = lambda num_envs, seed: native(loaded.player, num_envs, seed, 0)  # noqa: E731
-        return Tested(policy.id, player, policy.method, policy, loaded.timesteps, False)
+        return PolicyUnderTest(policy.id, player, policy.method, policy, loaded.timesteps, False)
     if _is(policy, "stable_baselines3.common.base_class", "BaseAlgorithm"):
-        return _stable_baselines(policy, description, deterministic, normalizer, name)
+        # The mode is the default of stable-baselines3's evaluate_policy.
+        return _stable_baselines(policy, description, deterministic is not False, normalizer, name)
     if deterministic:
         raise PolicyError("deterministic=True is for stable-baselines3's models: let the policy itself choose so")
-    if normalizer is not None:
+    if normalizer not in (None, False):
         raise PolicyError("normalizer= is for stable-baselines3's models: let the policy itself normalise")
     if _is(policy, "torch.nn", "Module"):
         digest = _digest(_tensors(policy.state_dict()))
         player = lambda _num_envs, _seed: _Module(policy, description)  # noqa: E731
         called = type(policy).__name__
-        return Tested(name or f"{called} {digest}", player, name or called)
+        return PolicyUnderTest(name or f"{called} {digest}", player, name or called)
     if callable(policy):
         remembers = _remembers(policy)
         called = getattr(policy, "__qualname__", type(policy).__qualname__)
         named = name or f"function {called}"
-        return Tested(named, lambda _num_envs, _seed: _Function(policy, remembers), named)
+        return PolicyUnderTest(named, lambda _num_envs, _seed: _Function(policy, remembers), named)
     raise PolicyError(
         f"policy is {policy!r}; expected one of load_policy(), a function of a batch of observations, a "
         "stable-baselines3 model, a torch module, or a mapping of such by the versions that they were trained on"
@@ -151,10 +157,7 @@ class _Function:
 
 def _stable_baselines(
     model: Any, description: Description, deterministic: bool, normalizer: Any, name: str | None
-) -> Tested:
-    normalizer = model.get_vec_normalize_env() if normalizer is None else normalizer
-    if normalizer is not None and not callable(getattr(normalizer, "normalize_obs", None)):
-        raise PolicyError(f"normalizer is {normalizer!r}; expected stable-baselines3's VecNormalize")
+) -> PolicyUnderTest:
     for what, trained, served in [
         ("observations", model.observation_space, description.observation_space()),
         ("actions", model.action_space, description.action_space()),
@@ -162,6 +165,7 @@ def _stable_baselines(
         same = type(trained) is type(served) and trained.shape == served.shape
         if not same or getattr(trained, "n", None) != getattr(served, "n", None):
             raise PolicyError(f"the model's {what} are {trained}, those of {description.name} {served}")
+    normalizer = find_normalizer(model, normalizer, description)
     digest = _digest(itertools.chain(_tensors(model.policy.state_dict()), _statistics(normalizer)))
 
     def predict(observations: NDArray[np.float32], memory: Any, starts: NDArray[np.bool_]) -> Any:
@@ -169,7 +173,7 @@ def _stable_baselines(
         return model.predict(seen, state=memory, episode_start=starts, deterministic=deterministic)
 
     called, steps = type(model).__name__, getattr(model, "num_timesteps", None)
-    return Tested(
+    return PolicyUnderTest(
         name or f"{called} {digest}",
         lambda _num_envs, _seed: _Function(predict, True),
         name or called,

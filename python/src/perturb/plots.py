@@ -11,10 +11,10 @@ from .errors import InvalidArgumentError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from .results import Cell, Part
+    from .results import Bin, Bin2D
 
 
-def curves(lines: Mapping[str, Sequence[Part]], parameter: str, units: Mapping[str, str], title: str, axes: Any) -> Any:
+def curves(lines: Mapping[str, Sequence[Bin]], parameter: str, units: Mapping[str, str], title: str, axes: Any) -> Any:
     """Success, %, over the middles of a parameter's parts, with bands; a gap where parts do not touch."""
     axes = _axes(axes)
     drawn = {name: parts for name, parts in lines.items() if parts}
@@ -41,7 +41,7 @@ def curves(lines: Mapping[str, Sequence[Part]], parameter: str, units: Mapping[s
     return axes
 
 
-def heatmap(cells: Sequence[Cell], x: str, y: str, units: Mapping[str, str], title: str, axes: Any) -> Any:
+def heatmap(cells: Sequence[Bin2D], x: str, y: str, units: Mapping[str, str], title: str, axes: Any) -> Any:
     """Success, %, in the parts of two parameters, each drawn where it lies; white without episodes."""
     axes = _axes(axes)
     if not cells:

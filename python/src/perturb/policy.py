@@ -1,13 +1,15 @@
-"""Trained policies of perturb, as they act: by the learner's arithmetic, to the same bytes."""
+"""Trained policies of perturb, which act by the learner's arithmetic, to the same bytes."""
 
 from __future__ import annotations
 
 import os
+import tempfile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from . import _native, requests
+from .contents import read_folder, write_folder
 from .errors import InvalidArgumentError, OutOfOrderError, PerturbError, PolicyError, ProtocolError
 
 if TYPE_CHECKING:
@@ -58,6 +60,12 @@ class Policy:
         self.seed: int = loaded.seed
         self.observation_size: int = loaded.observation_size
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the whole checkpoint, so that a process on another machine has it, too."""
+        with tempfile.TemporaryDirectory(prefix="perturb-") as folder:
+            native(self._native.save, folder)
+            return _unpickled_policy, (read_folder(folder),)
+
     def __repr__(self) -> str:
         return f"<perturb policy {self.id}: {self.method} in {self.environment}, trained on {self.trained_on}>"
 
@@ -75,7 +83,13 @@ class Policy:
             raise InvalidArgumentError(
                 f"first_environment_index={first} with num_envs={count}: indices end at 2^32 - 1"
             )
-        return Actor(self, native(self._native.player, count, requests.seed(seed), first))
+        return Actor(self, count, requests.seed(seed), first)
+
+
+def _unpickled_policy(files: dict[str, bytes]) -> Policy:
+    with tempfile.TemporaryDirectory(prefix="perturb-") as folder:
+        write_folder(folder, files)
+        return load_policy(folder)
 
 
 class Actor:
@@ -87,13 +101,23 @@ class Actor:
             observations, rewards, terminated, truncated, infos = envs.step(actions)
             actions = actor(observations, starts=terminated | truncated, rewards=rewards)
 
-    with environments that are reset in the step that ends an episode (`autoreset_mode="SameStep"`).
+    with environments that are reset in the step that ends an episode (`autoreset_mode="SameStep"`). Pickles before its
+    first action.
     """
 
-    def __init__(self, policy: Policy, player: _native.Player) -> None:
+    def __init__(self, policy: Policy, num_envs: int, seed: int, first_environment_index: int) -> None:
         self._policy = policy
-        self._player = player
+        self._settings = (num_envs, seed, first_environment_index)
+        self._player: _native.Player = native(policy._native.player, *self._settings)
         self._begun = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self._begun:
+            raise PolicyError(
+                "an actor in the middle of its episodes cannot be pickled or copied: send its policy, and make an "
+                "actor there, policy.actor(num_envs=…, seed=…); or call reset() first, which begins its trials again"
+            )
+        return Actor, (self._policy, *self._settings)
 
     def __call__(
         self, observations: ArrayLike, starts: ArrayLike | None = None, rewards: ArrayLike | None = None
@@ -102,9 +126,9 @@ class Actor:
 
         Args:
             observations: [N, O], not normalised. The first call begins a trial in every environment.
-            starts: bool [N], where the observation is the first one of an episode; at first none. Where a trial ends
-                with the episode before, the policy forgets it.
-            rewards: [N], what the last actions brought, not normalised; for policies that see them (RL²).
+            starts: bool [N], true where the observation is the first one of an episode; by default nowhere. Where the
+                last episode ended a trial, the policy forgets the trial.
+            rewards: [N], rewards of the last actions, not normalised; for policies that see them (RL²).
 
         Raises:
             PolicyError: for other shapes, and if the policy gives numbers that are not finite.

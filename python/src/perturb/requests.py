@@ -1,36 +1,42 @@
-"""What users write, turned into what the protocol wants: versions, distributions, seeds, actions, states, masks.
+"""Conversion of users' values into the protocol's: versions, distributions, seeds, actions, states, masks.
 
-Only what would be lost or changed on the way is checked here: shapes, kinds of numbers. Values are for the server to
-judge, whose sentences are better.
+This module checks only what the conversion would lose or change: shapes and kinds of numbers. The server judges values,
+because its messages are better.
 """
 
 from __future__ import annotations
 
+import copy
+import difflib
+import inspect
 import math
 import numbers
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from .catalogue import LEAST_PIXELS, MOST_PIXELS
-from .errors import InvalidArgumentError
+from . import _native
+from .catalogue import MAX_PIXELS, MIN_PIXELS
+from .errors import InvalidArgumentError, UnknownNameError
 
 if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvSpec
     from numpy.typing import NDArray
 
     from .catalogue import Description
 
-# A value, an interval (low, high), or a union of intervals [(low, high), …].
-ParameterSet: TypeAlias = float | tuple[float, float] | Sequence[tuple[float, float]]
+# A value, an interval (low, high), or a union of intervals [(low, high), …]; or one of them as text: "0.7", "0.5..1.1",
+# "0.1..0.2,0.8..1.0", as in experiment files and options of the programs.
+ParameterSet: TypeAlias = float | str | tuple[float, float] | Sequence[tuple[float, float]]
 Parameters: TypeAlias = Mapping[str, ParameterSet]
 
-# The same by name, as the protocol has it.
+# Sets of values by name, in the protocol's form.
 Intervals: TypeAlias = dict[str, list[tuple[float, float]]]
 
-# Where parameters come from.
+# Names of the versions that parameters come from.
 Version: TypeAlias = Literal["D", "R", "E", "R+E"]
 VERSIONS: tuple[Version, ...] = get_args(Version)
 
@@ -75,6 +81,11 @@ def distributions(parameters: Parameters | None) -> Intervals:
     return {_name(name): _distribution(name, value) for name, value in parameters.items()}
 
 
+def frozen(intervals: Intervals) -> tuple[Any, ...]:
+    """Return what equal intervals have in common, as a key of dictionaries."""
+    return tuple(sorted((name, tuple(values)) for name, values in intervals.items()))
+
+
 def contexts(listed: Any) -> list[dict[str, float]]:
     """Values of parameters by name, in each context those that it has: at least one context."""
     if isinstance(listed, str | Mapping) or not isinstance(listed, Sequence):
@@ -101,12 +112,38 @@ def _name(name: Any) -> str:
     return name
 
 
+def parse_set(name: str, version: str, texts: Sequence[tuple[str, str]]) -> _native.Set:
+    """Understand values of parameters as experiment files and the programs' options write them.
+
+    Raises:
+        InvalidArgumentError: with what came and what is expected.
+    """
+    try:
+        return _native.make_set(name, version, list(texts))
+    except _native.Failure as failure:
+        raise InvalidArgumentError(failure.args[2]) from None
+
+
 def _distribution(name: str, value: ParameterSet) -> list[tuple[float, float]]:
+    if isinstance(value, str):
+        _, _, drawn, contexts = parse_set("parameters", "D", [(name, value)])
+        if contexts is not None:
+            raise InvalidArgumentError(
+                f"parameters[{name!r}] is {value!r}, which are points; expected a value or intervals, such as '0.7' or "
+                "'0.5..1.1': give points to perturb.sets.grid()"
+            )
+        return drawn[name]
     wrong = InvalidArgumentError(
         f"parameters[{name!r}] is {value!r}; expected a number, an interval (low, high), "
-        "or several intervals [(low, high), …]"
+        "several intervals [(low, high), …], or a text such as '0.5..1.1'"
     )
     numbers = _numbers(value, wrong)
+    if numbers.shape == (2,) and not isinstance(value, tuple):
+        raise InvalidArgumentError(
+            f"parameters[{name!r}] is {value!r}, which may be an interval or two values; write "
+            f"({numbers[0]:g}, {numbers[1]:g}) or '{numbers[0]:g}..{numbers[1]:g}' for the interval, and "
+            "perturb.sets.grid() for values"
+        )
     if numbers.ndim == 0:
         numbers = np.array([[numbers, numbers]])
     elif numbers.ndim == 1:
@@ -138,6 +175,72 @@ def seed(value: Any, name: str = "seed") -> int:
     return number
 
 
+def seeds(value: Any, num_envs: int) -> list[int | None]:
+    """Seeds of N environments: of one seed s the seeds s + i; of a list its own, None where an environment goes on."""
+    if value is None:
+        return [None] * num_envs
+    if not isinstance(value, Sequence | np.ndarray) or getattr(value, "ndim", 1) == 0:
+        first = seed(value)
+        return [seed(first + i) for i in range(num_envs)]
+    if len(value) != num_envs:
+        raise InvalidArgumentError(f"seed has {len(value)} numbers; expected one, or {num_envs}")
+    return [None if one is None else seed(one) for one in value]
+
+
+def step_limit(value: Any, description: Description) -> None:
+    """Refuse another step limit than the server's, which Gymnasium's `make_vec` passes on."""
+    if value not in (None, -1, description.step_limit):
+        raise InvalidArgumentError(
+            f"max_episode_steps={value!r}: a batch has the step limit of the server, {description.step_limit}; leave "
+            "it out, or make_vec(…, vectorization_mode='sync') wraps a TimeLimit around each environment"
+        )
+
+
+def with_step_limit(spec: EnvSpec | None, description: Description) -> EnvSpec | None:
+    """Return the specification with the server's step limit, which wrappers look for, unless it names another."""
+    if spec is None or spec.max_episode_steps is not None:
+        return spec
+    limited = copy.copy(spec)
+    limited.max_episode_steps = description.step_limit
+    return limited
+
+
+def settings(initialiser: Callable[..., None]) -> list[str]:
+    """Return the names of what an environment can be made with."""
+    parameters = inspect.signature(initialiser).parameters.values()
+    return [it.name for it in parameters if it.name != "self" and it.kind is not it.VAR_KEYWORD]
+
+
+def no_unknown(unknown: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Refuse settings that an environment does not have."""
+    if unknown:
+        name = next(iter(unknown))
+        meant = difflib.get_close_matches(name, known, n=1)
+        hint = f" (did you mean {meant[0]}=?)" if meant else ""
+        raise InvalidArgumentError(f"{name}= is no setting of environments{hint}; there are {', '.join(known)}")
+
+
+def parameter_values(parameters: Parameters, description: Description) -> Intervals:
+    """Sets that replace the version's, whose names and bounds are checked: they act only later.
+
+    Raises:
+        UnknownNameError: for a name that the environment's parameters do not have.
+        InvalidArgumentError: for what is no set of values, and for values out of bounds.
+    """
+    values = distributions(parameters)
+    for name, intervals in values.items():
+        if name not in description.parameters:
+            raise UnknownNameError(
+                f"{description.name} has no parameter {name!r}, only {', '.join(description.parameters)}"
+            )
+        low, high = description.parameters[name]
+        if not all(low <= least <= greatest <= high for least, greatest in intervals):
+            raise InvalidArgumentError(
+                f"parameters[{name!r}] is {parameters[name]!r}; expected values from {low:g} to {high:g}"
+            )
+    return values
+
+
 def count(value: Any, name: str, least: int) -> int:
     """An integer that fits into the protocol's uint32."""
     try:
@@ -155,8 +258,8 @@ def pixels(value: Any, name: str) -> int:
         number = operator.index(value)
     except TypeError:
         number = 0
-    if not LEAST_PIXELS <= number <= MOST_PIXELS:
-        raise InvalidArgumentError(f"{name}={value!r}; expected an integer from {LEAST_PIXELS} to {MOST_PIXELS}")
+    if not MIN_PIXELS <= number <= MAX_PIXELS:
+        raise InvalidArgumentError(f"{name}={value!r}; expected an integer from {MIN_PIXELS} to {MAX_PIXELS}")
     return number
 
 

@@ -1,4 +1,4 @@
-"""What came of testing policies, as data."""
+"""Results of tests of policies, as data."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Known:
-    """What is known of a policy beside its records."""
+class PolicyMetadata:
+    """Facts about a policy that its records do not have."""
 
-    # The version that it was trained on; None if that is not known, or is none.
+    # The version that the policy was trained on; None if it is not known, or if it was no version.
     trained_on: str | None
     # Steps of its training, of all environments together; None if not known.
     timesteps: int | None
-    # From which the seeds of its tests follow, and episodes of each test, as they were asked for.
+    # The seed from which the seeds of its tests follow, and the requested episodes of each test.
     seed: int
     episodes: int
     # `state` or `parameters`.
     observe: str
-    # Whether it took the mode of its actions' distribution; None if that was its own business.
+    # Whether the policy took the mode of its actions' distribution; None if that is not known.
     deterministic: bool | None
 
-    def plain(self) -> _native.Known:
-        """As the native module has it."""
+    def plain(self) -> _native.PolicyMetadata:
+        """Return the facts in the native module's form."""
         return (self.trained_on, self.timesteps, self.seed, self.episodes, self.observe, self.deterministic)
 
 
 @dataclass(frozen=True)
-class Assessed:
+class PolicyRecords:
     """The recorded tests of one policy."""
 
-    known: Known
+    known: PolicyMetadata
     records: _native.Records
 
     @property
     def trained_on(self) -> str | None:
-        """The version that it was trained on, if that is known."""
+        """The version that the policy was trained on, if it is known."""
         return self.known.trained_on
 
 
@@ -54,7 +54,7 @@ class Result:
     # The version that the policy was trained on, if that is known, and the set that it was tested on.
     trained_on: str | None
     tested_on: str
-    # What records call the policy.
+    # The policy's name in records.
     policy: str
     episodes: int
     success_percent: float
@@ -62,7 +62,7 @@ class Result:
     # Undiscounted, never normalised; its interval is a bootstrap's over episodes (percentiles of 1000 resamples, 95 %).
     mean_return: float
     return_interval: tuple[float, float]
-    # In steps.
+    # Mean length of episodes, in steps.
     mean_length: float
     # CVaR 10 %: the mean of the worst tenth of returns, rounded up (Rockafellar and Uryasev, 2000), and its interval.
     cvar_return: float
@@ -70,10 +70,12 @@ class Result:
     # The success rate in the worst tenth of contexts: parts of the parameter space of some 40 episodes each, chosen by
     # one half of the episodes and judged by the other. None where there are fewer than ten parts, as on D.
     worst_contexts_percent: float | None
+    # Whether actions were the mode of the policy's distribution, and not sampled; None if that is not known.
+    deterministic: bool | None = None
 
     @property
     def scenario(self) -> str:
-        """Training and test, such as `DR`; `D on parameters` of one's own set; the test alone if no more is known."""
+        """Training and test versions, such as `DR` or `D on corners`; the test alone if the training is not known."""
         if self.trained_on is None:
             return self.tested_on
         named = self.tested_on in requests.VERSIONS
@@ -81,7 +83,7 @@ class Result:
 
 
 @dataclass(frozen=True)
-class Part:
+class Bin:
     """Success in a part of a parameter's range, `low` to `high`. Rates are in %, None without episodes."""
 
     low: float
@@ -93,7 +95,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Cell:
+class Bin2D:
     """Success in a part of two parameters' ranges, each `(low, high)`. The rate is in %, None without episodes."""
 
     x: tuple[float, float]
@@ -107,7 +109,7 @@ class Cell:
 class Context:
     """Success in a context, or in a part of the parameter space. Rates are in %, the interval is Wilson's, 95 %."""
 
-    # By name the least and the greatest value of its episodes, equal in a context of a list; parameters that vary.
+    # Least and greatest value in its episodes of each parameter that varies, by name; equal in a context of a list.
     parameters: Mapping[str, tuple[float, float]]
     successes: int
     episodes: int
@@ -118,7 +120,7 @@ class Context:
 
 @dataclass(frozen=True)
 class Audit:
-    """What came of testing a policy again. `different` tells of each episode that came out otherwise, in a sentence."""
+    """Comparison of a repeated test with its records. `different` has a sentence for each episode that differs."""
 
     episodes: int
     different: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""A batch of environments as stable-baselines3 has them: one round trip a step, and nothing to be wrapped around it.
+"""A batch of environments as a stable-baselines3 VecEnv: one round trip a step, and no wrappers needed.
 
 from stable_baselines3 import PPO
 import perturb.sb3
@@ -8,15 +8,18 @@ model = PPO("MlpPolicy", perturb.sb3.make_vec_env("CartPole", 16, version="R", s
 
 from __future__ import annotations
 
+import operator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
+from .attributes import CheckedAttributes, refuse_assignment
 from .errors import InvalidArgumentError
 from .vector import PerturbVectorEnv
 
 try:
+    from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.monitor import Monitor
     from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 except ImportError as error:
@@ -25,13 +28,15 @@ except ImportError as error:
     ) from error
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-# What can be asked of each environment by its name.
-_METHODS = ("snapshot", "restore", "render")
-# What decides how environments are reset, which is stable-baselines3's own.
+    from .requests import Parameters
+
+# Methods that `env_method` calls, with their number of arguments.
+_METHODS = {"snapshot": 0, "restore": 1, "render": 0, "set_parameters": 1}
+# Settings that have one value for stable-baselines3.
 _FIXED = ("autoreset_mode", "copy")
 
 
@@ -41,7 +46,7 @@ def make_vec_env(environment: str, num_envs: int = 1, *, seed: int | None = None
     Args:
         environment: a name of docs/environments.md, such as `CartPole`.
         num_envs: N.
-        seed: environment i begins with the seed s + i; at first random ones.
+        seed: environment i begins with the seed s + i. By default seeds are random.
         **settings: those of `PerturbVectorEnv`, such as `version`, `parameters`, `contexts` and `server`, but for
             `autoreset_mode` and `copy`.
 
@@ -52,18 +57,19 @@ def make_vec_env(environment: str, num_envs: int = 1, *, seed: int | None = None
         if name in settings:
             raise InvalidArgumentError(f"{name}= is what stable-baselines3 needs it to be; leave it out")
     settings.setdefault("receipts", False)
-    # Arrays of their own: PyTorch warns of such as it must not write to.
-    batch = PerturbVectorEnv(environment, num_envs, autoreset_mode=AutoresetMode.SAME_STEP, copy=True, **settings)
+    batch = PerturbVectorEnv(environment, num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
     return PerturbVecEnv(batch, seed)
 
 
-class PerturbVecEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 is not there for every check
+class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-baselines3 is not there for every check
     """N environments of a session. `batch` is the session's PerturbVectorEnv.
 
     The info of an episode's last step has `terminal_observation` [O], `TimeLimit.truncated` (the step limit ended it,
     and not the task), `episode` with its undiscounted return `r` and its length `l`, as Monitor gives them but for the
     time, and `is_success`, `diverged`, `achieved`; with `receipts=True` also `parameters`, `receipt` and `context_id`.
     Other infos are empty, but for `reward_terms` on request. A reset's are `reset_infos`.
+
+    `env_method("set_parameters", {"length": 0.7})` changes the physics from each environment's next episode on.
     """
 
     def __init__(self, batch: PerturbVectorEnv, seed: int | None = None) -> None:
@@ -71,12 +77,16 @@ class PerturbVecEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 is not t
         self._returns = np.zeros(batch.num_envs, np.float64)
         self._lengths = np.zeros(batch.num_envs, np.int64)
         super().__init__(batch.num_envs, batch.single_observation_space, batch.single_action_space)
+        self.metadata = dict(batch.metadata)  # of which VecVideoRecorder wants render_fps
+        self._description = batch._description
+        self._is_made = True
         if seed is not None:
             self.seed(seed)
 
     def reset(self) -> NDArray[np.float32]:
         """Begin the next episodes: observations float32 [N, O].
 
+        stable-baselines3 calls it once, when a training begins: `env_method("set_parameters", …)` is what acts later.
         `seed(s)` before it begins with the seeds s + i. `set_options` before it gives the options of
         `PerturbEnv.reset`, `parameters` and `state`, to each environment: one dictionary for all, or a list of N. If
         those differ, environments are reset one by one after all of them, and without seeds begin the episode after the
@@ -109,11 +119,11 @@ class PerturbVecEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 is not t
         return observations
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """The first half of a step: the server computes, and nobody waits for it."""
+        """Send the actions of a step without waiting for its outcome."""
         self.batch.send(actions)
 
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], list[dict[str, Any]]]:
-        """The second: observations float32 [N, O], after an end the first of the next episode; rewards float32 [N]."""
+        """Receive a step: observations float32 [N, O], after an end the next episode's first; rewards float32 [N]."""
         observations, rewards, terminated, truncated, batched = self.batch.recv()
         dones = terminated | truncated
         self._returns += rewards
@@ -135,40 +145,44 @@ class PerturbVecEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 is not t
         self.batch.close()
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
-        """What all environments have in common, such as `metadata`, for each of those that are asked."""
+        """Return an attribute that all environments share, such as `metadata`, once for each selected environment."""
         spaces = {"observation_space": "single_observation_space", "action_space": "single_action_space"}
         value = getattr(self.batch, spaces.get(attr_name, attr_name))
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
-        """Refuse: environments have nothing that can be set but what `set_options` and a reset give them.
+        """Refuse: environments have nothing that can be assigned.
 
         Raises:
-            AttributeError: always.
+            AssignmentError: always, with what changes parameters.
         """
         del value, indices
-        raise AttributeError(
-            f"{attr_name!r} cannot be set: give parameters to set_options({{'parameters': …}}) and reset()"
-        )
+        raise refuse_assignment(attr_name, self._description)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call `snapshot`, `restore` (the same snapshot in each) or `render` of each environment that is asked.
+        """Call `snapshot`, `restore` (the same snapshot in each), `render` or `set_parameters` of each environment.
+
+        `set_parameters(parameters)` acts from each environment's next episode on.
 
         Raises:
             AttributeError: for another method.
         """
         slots = list(self._get_indices(indices))
-        if method_name not in _METHODS or method_kwargs or len(method_args) != (method_name == "restore"):
+        if method_name not in _METHODS or method_kwargs or len(method_args) != _METHODS[method_name]:
             raise AttributeError(
-                f"{method_name!r} cannot be called so; there are snapshot(), restore(snapshot), render()"
+                f"{method_name!r} cannot be called so; there are snapshot(), restore(snapshot), render(), "
+                "set_parameters(parameters)"
             )
         if method_name == "render":
             pictures = self.batch.render()
             return [pictures[slot] for slot in slots]
         mask = np.zeros(self.num_envs, np.bool_)
         mask[slots] = True
+        if method_name == "set_parameters":
+            self.batch.set_parameters(method_args[0], mask)
+            return [None for _ in slots]
         if method_name == "snapshot":
             saved = dict(zip(np.flatnonzero(mask).tolist(), self.batch.snapshot(mask), strict=True))
             return [saved[slot] for slot in slots]
@@ -178,7 +192,7 @@ class PerturbVecEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 is not t
         return [rows[slot].copy() for slot in slots]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: int | Iterable[int] | None = None) -> list[bool]:
-        """True of Monitor, whose `episode` infos have; nothing else is around an environment."""
+        """Return True for Monitor, because infos have its `episode`, and False for all other wrappers."""
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
@@ -186,8 +200,56 @@ class PerturbVecEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 is not t
         return list(self.batch.render())
 
 
+class CurriculumCallback(BaseCallback):  # type: ignore[misc]  # stable-baselines3 is not there for every check
+    """Changes the physics while a stable-baselines3 model learns, from each environment's next episode on.
+
+        schedule = {0: {"length": "0.4..0.6"}, 50_000: {"length": "0.2..0.8"}}
+        model.learn(100_000, callback=perturb.sb3.CurriculumCallback(schedule))
+
+    Args:
+        schedule: parameters by the number of steps of all environments from which on they count; or a function of that
+            number, which returns parameters, or None for those of before.
+        verbose: 1 prints each change.
+    """
+
+    def __init__(
+        self, schedule: Mapping[int, Parameters] | Callable[[int], Parameters | None], verbose: int = 0
+    ) -> None:
+        super().__init__(verbose)
+        if not callable(schedule) and min((operator.index(start) for start in schedule), default=0) < 0:
+            raise InvalidArgumentError(
+                f"schedule has the keys {list(schedule)}; expected numbers of steps from 0 on, such as 50_000"
+            )
+        self._schedule = schedule
+        self._current: Parameters | None = None
+
+    def _on_training_start(self) -> None:
+        self._current = None  # the environments may be others than those of an earlier training
+        self._update()
+
+    def _on_rollout_start(self) -> None:
+        self._update()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _update(self) -> None:
+        """Give the environments what the schedule says, if it says something else than before."""
+        if callable(self._schedule):
+            parameters = self._schedule(self.num_timesteps)
+        else:
+            started = [start for start in self._schedule if start <= self.num_timesteps]
+            parameters = self._schedule[max(started)] if started else None
+        if parameters is None or parameters == self._current:
+            return
+        self.training_env.env_method("set_parameters", parameters)
+        self._current = parameters
+        if self.verbose:
+            print(f"{self.num_timesteps} steps: parameters become {parameters}")
+
+
 def _of(infos: dict[str, Any], slot: int) -> dict[str, Any]:
-    """One environment's part of a batch's infos."""
+    """Return the info of one environment, taken from a batch's infos."""
     info: dict[str, Any] = {}
     for key, values in infos.items():
         if not key.startswith("_") and infos[f"_{key}"][slot]:

@@ -13,6 +13,7 @@ import contextlib
 import os
 import subprocess
 import threading
+import time
 import weakref
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -42,11 +43,13 @@ if TYPE_CHECKING:
 
 Reply = TypeVar("Reply")
 
-# How often a silent server is asked whether it lives, and how long it may take to answer, s. A very busy machine is no
-# reason to lose environments; the sockets of a server that ended are closed by its system at once.
+# Interval of keepalive pings to a silent server, and the limit for its answer, s. The limit is long because a busy
+# machine # is no reason to lose environments. The sockets of a server that ended are closed by its system at once.
 KEEPALIVE_INTERVAL, KEEPALIVE_LIMIT = 10.0, 20.0
-# How often a session that nobody waits in answers the server's question whether it lives, s.
-TEND_INTERVAL = 0.25
+# Interval at which idle sessions answer the server's keepalive pings, s.
+POLL_INTERVAL = 0.25
+# Pauses of this process that may explain a lost connection: from so many seconds on, for so many seconds afterwards.
+PAUSE_LIMIT, PAUSE_MEMORY = 2.0, 60.0
 # gRPC's codes of streams that a server ended.
 RESOURCE_EXHAUSTED, OUT_OF_RANGE, UNIMPLEMENTED, UNAUTHENTICATED = 8, 11, 12, 16
 
@@ -60,7 +63,7 @@ class Session:
     def __init__(
         self, server: Address | None, timeout: float, description: Description, num_envs: int, *, single: bool
     ) -> None:
-        _close_forgotten()
+        _close_unclosed()
         self._local: local_server.LocalServer | None = None
         if server is None:
             self._local = local_server.acquire()
@@ -79,11 +82,11 @@ class Session:
             None if isinstance(description.actions, int) else len(description.actions),
             single,
         )
-        self._parts: _Parts = (self._native, self._local, self._owner)
-        # Wherever Python happens to collect a forgotten session, also where a lock is held: so nothing but this.
-        self._forget = weakref.finalize(self, _forgotten.append, self._parts)
+        self._resources: _Resources = (self._native, self._local, self._owner)
+        # Python may collect a session anywhere, also while a lock is held, so the finalizer does nothing else.
+        self._forget = weakref.finalize(self, _unclosed.append, self._resources)
         self._forget.atexit = False  # _at_exit closes what is left
-        _keeper.keep(self)
+        _keepalive.add(self)
 
     @property
     def waits(self) -> bool:
@@ -142,34 +145,43 @@ class Session:
     def reset(
         self, mask: bytes, seeds: Sequence[int], parameters: Intervals, states: bytes
     ) -> tuple[NDArray[np.float32], _native.Events]:
-        """Begin new episodes: observations [M, O], and the episodes."""
+        """Begin new episodes: observations [N, O], of other environments the last ones, and the episodes."""
         return self._call("reset", self._native.reset, mask, seeds, parameters, states)
+
+    def last_ended(self) -> NDArray[np.bool_]:
+        """Return which environments' episodes ended in the last step and were not reset since, [N]."""
+        return self._native.last_ended()
+
+    @property
+    def under_way(self) -> int:
+        """The number of steps that were sent and not received."""
+        return self._native.under_way
 
     def snapshot(self, mask: bytes) -> list[bytes]:
         """Save environments."""
         return self._call("snapshot", self._native.snapshot, mask)
 
     def restore(self, mask: bytes, snapshots: Sequence[bytes]) -> NDArray[np.float32]:
-        """Bring saved environments back: observations [M, O]."""
+        """Bring saved environments back: observations [N, O], of other environments the last ones."""
         return self._call("restore", self._native.restore, mask, snapshots)
 
     def render(self, slot: int, width: int, height: int) -> NDArray[np.uint8]:
         """Draw an environment: [height, width, 3]."""
         return self._call("render", self._native.render, slot, width, height)
 
-    def tend(self) -> None:
-        """Answer the server's question whether this side lives; called by the keeper."""
-        self._native.tend()
+    def poll_io(self) -> None:
+        """Answer the server's keepalive pings; the keepalive thread calls it."""
+        self._native.poll_io()
 
     def close(self) -> None:
         """End the session; the server frees its environments."""
         self._lost = self._lost or "it was closed"
         self._close()
-        _close_forgotten()
+        _close_unclosed()
 
     def _close(self) -> None:
         if self._forget.detach() is not None:
-            _close(*self._parts)
+            _close(*self._resources)
 
     def _call(self, kind: str, call: Callable[..., Reply], *arguments: Any, **fields: Any) -> Reply:
         try:
@@ -178,7 +190,7 @@ class Session:
             raise self._failed(kind, error) from None
 
     def _failed(self, kind: str, error: BaseException) -> BaseException:
-        """What to raise in place of an error; nearly all cost the session."""
+        """Return the error to raise in place of the native module's. Nearly all errors end the session."""
         if not isinstance(error, _native.Failure):
             if not self._native.ended:
                 return error  # the actions' shape or kind: nothing was sent
@@ -244,11 +256,18 @@ class Session:
                 f"no server answers at {self.address}: {words}; "
                 f"start one with `perturb-server --listen {_listen(self.address)}`, or correct server="
             )
+        pause = _keepalive.longest_pause()
+        if pause >= PAUSE_LIMIT:
+            return ServerConnectionError(
+                f"{lost}: {words}. This process stood still for {pause:.0f} s (Ctrl-Z, a debugger, a suspended "
+                "computer, or code that holds Python's lock), and did not answer the server's keepalive pings "
+                "meanwhile; start the server with a longer --keepalive-seconds; reset() begins anew"
+            )
         return ServerConnectionError(f"{lost}: {words}; reset() begins anew when it runs again")
 
 
 def _listen(address: Address) -> str:
-    """What starts a server there, as flags; whom it lets in is its owner's to say."""
+    """Return the flags that start a server there."""
     text = str(address)
     if text.startswith("unix:"):
         return text
@@ -257,16 +276,16 @@ def _listen(address: Address) -> str:
     return f"tcp://{rest}{guards}"
 
 
-# What of a session has to be closed: the stream, the private server, the process that opened it.
-_Parts: TypeAlias = "tuple[_native.Session, local_server.LocalServer | None, int]"
-# Of sessions that nobody closed. The next session that is opened or closed closes them, or the keeper.
-_forgotten: collections.deque[_Parts] = collections.deque()
+# Resources of a session that have to be closed: the stream, the private server, and the process that opened it.
+_Resources: TypeAlias = "tuple[_native.Session, local_server.LocalServer | None, int]"
+# Resources of sessions that nobody closed. The next session that is opened or closed closes them, or the thread does.
+_unclosed: collections.deque[_Resources] = collections.deque()
 
 
-def _close_forgotten() -> None:
+def _close_unclosed() -> None:
     with contextlib.suppress(IndexError):  # another thread may be at it, too
         while True:
-            _close(*_forgotten.popleft())
+            _close(*_unclosed.popleft())
 
 
 def _close(native: _native.Session, local: local_server.LocalServer | None, owner: int) -> None:
@@ -277,19 +296,40 @@ def _close(native: _native.Session, local: local_server.LocalServer | None, owne
         local_server.release(local)
 
 
-class _Keeper:
-    """One thread that looks after the sessions that nobody waits in: a connection has no thread of its own."""
+def _now() -> float:
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+class _KeepaliveThread:
+    """A thread that answers pings for idle sessions, because a connection has no thread of its own."""
 
     def __init__(self) -> None:
         self._sessions: weakref.WeakSet[Session] = weakref.WeakSet()
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._ended = threading.Event()
+        # Time of the thread's last run, and length and end of the longest recent pause, s, by a clock that counts
+        # suspended time.
+        self._last_run = _now()
+        self._pause = (0.0, 0.0)
 
-    def keep(self, session: Session) -> None:
+    def longest_pause(self) -> float:
+        """Return for how long this process did not run, at the most, in the last minute, s."""
+        self._note_pause()
+        length, end = self._pause
+        return length if _now() - end < PAUSE_MEMORY else 0.0
+
+    def _note_pause(self) -> None:
+        now = _now()
+        length = now - self._last_run - POLL_INTERVAL
+        if self._thread is not None and (length >= self._pause[0] or now - self._pause[1] >= PAUSE_MEMORY):
+            self._pause = (length, now)
+
+    def add(self, session: Session) -> None:
         with self._lock:
             self._sessions.add(session)
             if self._thread is None:
+                self._last_run = _now()
                 self._thread = threading.Thread(target=self._run, name="perturb-keeper", daemon=True)
                 self._thread.start()
 
@@ -305,28 +345,30 @@ class _Keeper:
             return list(self._sessions)
 
     def _run(self) -> None:
-        while not self._ended.wait(TEND_INTERVAL):
+        while not self._ended.wait(POLL_INTERVAL):
+            self._note_pause()
+            self._last_run = _now()
             self._look()  # in a frame of its own: a sleeping keeper keeps no session alive
-            _close_forgotten()
+            _close_unclosed()
 
     def _look(self) -> None:
         for session in self.sessions():
-            session.tend()
+            session.poll_io()
 
 
-_keeper = _Keeper()
+_keepalive = _KeepaliveThread()
 
 
 def _after_fork_in_child() -> None:
-    global _keeper
-    _keeper = _Keeper()
+    global _keepalive
+    _keepalive = _KeepaliveThread()
 
 
 def _at_exit() -> None:
-    _keeper.end()
-    for session in _keeper.sessions():
+    _keepalive.end()
+    for session in _keepalive.sessions():
         session.close()
-    _close_forgotten()
+    _close_unclosed()
 
 
 os.register_at_fork(after_in_child=_after_fork_in_child)

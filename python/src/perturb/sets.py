@@ -1,8 +1,8 @@
-"""What policies are tested on beside D, R, E and R+E: sets of parameters, grids, lists, as in experiment files.
+"""Sets to test policies on beside D, R, E and R+E: drawn parameters, grids and lists, as in experiment files.
 
     corners = perturb.sets.grid("corners", {"length": [0.1, 1.0], "mass": "0.05..0.5/4"})
     long = perturb.sets.drawn("long_poles", {"length": (0.7, 0.8)}, base="R")
-    perturb.assess(policy, "CartPole", versions=["D", long, corners])
+    perturb.evaluate(policy, "CartPole", versions=["D", long, corners])
 
 Lists of contexts, of grids too, can also be trained on: `contexts=` of PerturbVectorEnv and `perturb.sb3.make_vec_env`.
 """
@@ -28,14 +28,15 @@ __all__ = ["Set", "drawn", "grid", "heatmap", "listed", "read", "read_csv", "sam
 
 @dataclass(frozen=True)
 class Set:
-    """What a policy is tested on. Made by the functions of this module.
+    """A set to test policies on. The functions of this module make sets.
 
     Attributes:
-        name: what results call it.
-        base: the version that parameters come from of which the set says nothing.
-        parameters: of a set that is drawn from, for each episode: by name the intervals [(low, high), …], a fixed value
-            as one of length 0.
-        contexts: of a grid or a list: values of parameters by name, each for equally many episodes; else None.
+        name: its name in results.
+        base: the version of the parameters that the set does not name.
+        parameters: the intervals [(low, high), …] from which parameters are drawn for each episode, by name; a fixed
+            value is an interval of length 0. Empty for grids and lists.
+        contexts: the contexts of a grid or a list, values of parameters by name, each with equally many episodes; else
+            None.
     """
 
     name: str
@@ -48,7 +49,7 @@ class Set:
         return self.name, self.base, {name: list(values) for name, values in self.parameters.items()}, contexts
 
 
-def drawn(name: str, parameters: Mapping[str, requests.ParameterSet | str], *, base: requests.Version = "D") -> Set:
+def drawn(name: str, parameters: Mapping[str, requests.ParameterSet], *, base: requests.Version = "D") -> Set:
     """Make a set whose parameters are drawn anew for each episode.
 
     Args:
@@ -136,7 +137,7 @@ def heatmap(
 
     Args:
         environment: its name.
-        x: the parameter along x; at first that of the environment's usual heatmap.
+        x: the parameter along x; by default that of the environment's usual heatmap.
         y: along y.
         points: along each axis, 2 … 100. Each point has equally many of a test's episodes, at least 1.
         base: where other parameters come from.
@@ -160,8 +161,8 @@ def heatmap(
     wrong = [name for name in axes if name in (fixed or {})]
     if axes[0] == axes[1] or wrong:
         raise InvalidArgumentError(f"{wrong[0] if wrong else axes[0]} is an axis, and cannot be something else, too")
-    if requests.count(points, "points", 2) > _native.MOST_POINTS:
-        raise InvalidArgumentError(f"points is {points}; expected 2 … {_native.MOST_POINTS}")
+    if requests.count(points, "points", 2) > _native.MAX_HEATMAP_POINTS:
+        raise InvalidArgumentError(f"points is {points}; expected 2 … {_native.MAX_HEATMAP_POINTS}")
     contexts = native(_native.heatmap_contexts, ranges, points, dict(fixed or {}))
     return listed(_native.HEATMAP_SET, contexts, base=base)
 
@@ -205,7 +206,7 @@ def contexts_of(
 def _made(name: str, base: str, texts: Mapping[str, str]) -> Set:
     if not texts:
         raise InvalidArgumentError(f"the set {name!r} names no parameter: it is a version")
-    return _set(native(_native.make_set, _name(name), requests.version(base, "base"), list(texts.items())))
+    return _set(requests.parse_set(_name(name), requests.version(base, "base"), list(texts.items())))
 
 
 def _set(made: _native.Set) -> Set:
@@ -238,6 +239,11 @@ def _drawn(name: str, values: Any) -> str:
 def _points(name: str, values: Any) -> str:
     if isinstance(values, str):
         return values
+    if isinstance(values, tuple) and len(values) == 2:
+        raise InvalidArgumentError(
+            f"the points of {name!r} are {values!r}, which may be an interval or two points; write {list(values)!r} "
+            "for two points, and '0.1..1.0/10' for ten from 0.1 to 1.0"
+        )
     numbers = np.asarray(values)
     if numbers.dtype.kind not in "iuf" or numbers.ndim > 1 or numbers.size == 0:
         raise InvalidArgumentError(
@@ -247,7 +253,7 @@ def _points(name: str, values: Any) -> str:
 
 
 def _values(parameters: Mapping[str, Sequence[tuple[float, float]]]) -> dict[str, float]:
-    """Of a grid of one point."""
+    """Return the values of a grid of one point."""
     wrong = [
         name for name, intervals in parameters.items() if len(intervals) != 1 or intervals[0][0] != intervals[0][1]
     ]

@@ -6,28 +6,36 @@ import html
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .assessment import Assessment
+    from collections.abc import Mapping, Sequence
+
+    from .results import Result
 
 METRICS = ("Default", "Interpolation", "Extrapolation")
+# Words for the choice of actions, by whether the policy was deterministic.
+ACTIONS = {True: "the mode", False: "sampled", None: ""}
 
 
-def tables(assessment: Assessment) -> list[list[list[str]]]:
-    """The tests' figures, and the three numbers beside the paper's, if there are any: rows of cells, first the head."""
-    known = any(result.trained_on is not None for result in assessment.results)
+def tables(
+    results: Sequence[Result],
+    metrics: Mapping[str, float | None],
+    published: Mapping[str, Mapping[str, tuple[float, float | None] | None]],
+) -> list[list[list[str]]]:
+    """Return tables as rows of cells, headings first: the tests' figures, and the three metrics beside the paper's."""
+    known = any(result.trained_on is not None for result in results)
     head = ["scenario" if known else "tested on", "episodes", "success, %", "95 %", "worst contexts, %"]
-    tests = [[*head, "return", "CVaR 10 %", "length", "policy"]]
-    for it in assessment.results:
+    tests = [[*head, "return", "CVaR 10 %", "length", "actions", "policy"]]
+    for it in results:
         low, high = it.success_interval
         worst = "" if it.worst_contexts_percent is None else f"{it.worst_contexts_percent:.1f}"
         figures = [it.scenario, str(it.episodes), f"{it.success_percent:.1f}", f"[{low:.1f}, {high:.1f}]", worst]
         numbers = [it.mean_return, it.cvar_return, it.mean_length]
-        tests.append([*figures, *(f"{number:.1f}" for number in numbers), it.policy])
-    metrics = assessment.metrics
-    if all(number is None for number in metrics.values()) or not assessment.published:
+        actions = ACTIONS[it.deterministic]
+        tests.append([*figures, *(f"{number:.1f}" for number in numbers), actions, it.policy])
+    if all(number is None for number in metrics.values()) or not published:
         return [tests]
     comparison = [["%", *METRICS]]
     comparison.append(["here", *("" if number is None else f"{number:.1f}" for number in metrics.values())])
-    comparison += [[f"paper: {method}", *map(_spread, its.values())] for method, its in assessment.published.items()]
+    comparison += [[f"paper: {method}", *map(_spread, its.values())] for method, its in published.items()]
     return [tests, comparison]
 
 
@@ -39,7 +47,7 @@ def _spread(number: tuple[float, float | None] | None) -> str:
 
 
 def text(table: list[list[str]]) -> str:
-    """Columns under each other, the first to the left."""
+    """Return the table as text, with the first column aligned to the left."""
     widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
     lines = (
         [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
@@ -49,7 +57,7 @@ def text(table: list[list[str]]) -> str:
 
 
 def as_html(table: list[list[str]]) -> str:
-    """For a page."""
+    """Return the table as HTML."""
 
     def row(cells: list[str], tag: str) -> str:
         return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"

@@ -12,18 +12,23 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from . import requests
-from .catalogue import USUAL_PIXELS
-from .client import TIMEOUT, Client
-from .errors import InvalidArgumentError
+from .attributes import CheckedAttributes
+from .catalogue import DEFAULT_PIXELS
+from .client import TIMEOUT, Client, ResetRequest
+from .infos import merge
 from .sets import Set, contexts_of
 
 if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvSpec
+
     from ._native import Stepped
 
 OPTIONS = ("parameters", "state", "reset_mask")
+# Beyond so many environments the server is asked whether it takes them before arrays are made for them.
+CHECKED_ENVIRONMENTS = 100_000
 
 
-class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
+class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
     """N environments of a perturb-server.
 
     Args:
@@ -34,7 +39,7 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         server: `unix:/path` or `host:port`; None starts a server of this process's own.
         parameters: replaces the version's set of the named parameters: a value, an interval `(low, high)`, or several
             `[(low, high), …]`.
-        autoreset_mode: Gymnasium's; what happens to environments whose episode has ended.
+        autoreset_mode: Gymnasium's mode, which decides what happens to environments whose episode has ended.
         first_environment_index: the index of the first environment. A batch that is split gives the same bytes as a
             whole one if each part has its place here, and seeds to match.
         episodes_per_trial: parameters are drawn anew after so many episodes.
@@ -42,19 +47,21 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
             -1 … 1 over the range of R and E.
         receipts: whether infos have parameters and receipt.
         reward_terms: whether every step's infos have the terms of the reward.
-        copy: False returns observations and pictures as they came, read-only arrays without a copy; True returns
-            copies, which can be changed and which PyTorch takes without a warning. Either way the next step leaves them
-            as they are.
+        copy: has no effect, and is accepted because Gymnasium's own vector environments have it. Observations and
+            pictures are always the caller's own to keep and to change.
         timeout: how long a reply may take, s.
         render_mode: `rgb_array` lets `render` draw; None.
-        width: of pictures, in pixels.
-        height: likewise.
-        contexts: a list of values of parameters by name: environment i has context i modulo their number in all its
-            episodes. At most N, or a grid or list of `perturb.sets`. Of parameters that a context does not name the
-            version and `parameters` decide; a reset's parameters replace those of contexts.
+        width: width of pictures, in pixels.
+        height: height of pictures, in pixels.
+        contexts: a list of at most N contexts, values of parameters by name, or a grid or list of `perturb.sets`.
+            Environment i has context i modulo their number in all its episodes. The version and `parameters` decide
+            about parameters that a context does not name. A reset's parameters replace those of contexts.
+        max_episode_steps: no other than the server's step limit; `make_vec` passes it on.
 
     The connection is made by the first `reset`. Rewards are float32 [N], flags bool [N].
     """
+
+    _spec: EnvSpec | None = None
 
     def __init__(
         self,
@@ -70,13 +77,16 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         observe: str = "state",
         receipts: bool = True,
         reward_terms: bool = False,
-        copy: bool = False,
+        copy: bool = False,  # noqa: ARG002  (Gymnasium's own have it)
         timeout: float = TIMEOUT,
         render_mode: str | None = None,
-        width: int = USUAL_PIXELS,
-        height: int = USUAL_PIXELS,
+        width: int = DEFAULT_PIXELS,
+        height: int = DEFAULT_PIXELS,
         contexts: Sequence[Mapping[str, float]] | Set | None = None,
+        max_episode_steps: int | None = None,
+        **unknown: Any,
     ) -> None:
+        requests.no_unknown(unknown, SETTINGS)
         if isinstance(contexts, Set):
             contexts = contexts_of(contexts, version, parameters)
         self._mode = requests.autoreset_mode(autoreset_mode)
@@ -100,7 +110,10 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
             contexts=contexts,
         )
         self.render_mode = render_mode
-        description = self._client.description
+        self._description = description = self._client.description
+        requests.step_limit(max_episode_steps, description)
+        if self._client.num_envs > CHECKED_ENVIRONMENTS:
+            self._client.check_size()
         self.num_envs = self._client.num_envs
         self.metadata = {**description.metadata(), "autoreset_mode": self._mode}
         self.single_observation_space = description.observation_space()
@@ -109,25 +122,36 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._encode = partial(requests.actions, description=description, shape=self.action_space.shape or ())
         self._reward_terms = reward_terms
-        self._copy = copy
-        # What was last returned: a masked reset or restore leaves the other environments as they are.
-        self._observations: NDArray[np.float32] | None = None
-        # Whose next step is an autoreset, in next-step mode: it has no reward, and no terms of one.
+        # By slot the parameters that act at its next episode.
+        self._next_parameters: dict[int, requests.Intervals] = {}
+        # In next-step mode: environments whose next step is an autoreset, which has no reward and no reward terms. Kept
+        # only if something depends on it.
         self._resetting = np.zeros(self.num_envs, dtype=np.bool_)
+        self._keeps_resetting = reward_terms
+        self._is_made = True
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The specification from which Gymnasium made the batch, with the server's step limit."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = requests.with_step_limit(spec, self._description)
 
     def reset(
         self,
         *,
-        seed: int | Sequence[int] | None = None,
+        seed: int | Sequence[int | None] | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begin the next episodes.
 
         Args:
-            seed: environment i begins the first episode of the seed s + i, or of the i-th of N seeds; without it, the
-                next episode of its seed before (at first a random one).
+            seed: environment i begins the first episode of the seed s + i, or of the i-th of N seeds; without it, or
+                where that is None, the next episode of its last seed (at the first reset a random seed).
             options: `parameters`, as at `make`, from now on; `state`, exact initial states [M, S] for this episode;
-                `reset_mask`, bool [N], which environments are reset, at first all.
+                `reset_mask`, bool [N], which environments are reset, by default all.
 
         Raises:
             InvalidArgumentError: and nothing has changed.
@@ -140,18 +164,79 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
             mask = requests.mask(given["reset_mask"], self.num_envs, "options['reset_mask']")
             self._client.session.require_usable()  # a new one would hold other episodes than the mask leaves alone
         selected = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
-        seeds = self._seeds(seed)
+        seeds = requests.seeds(seed, self.num_envs)
         parameters = requests.distributions(given.get("parameters"))
         state = given.get("state")
         states = b"" if state is None else requests.states(state, len(selected), batched=True)
-        super().reset(seed=seeds[0] if seeds else None)
+        first = next((one for one in seeds if one is not None), None)
+        super().reset(seed=first)
 
-        opened = self._client.open(seeds, self.np_random)
-        if opened is None or seeds or parameters or states:
-            rows, events = self._client.reset(mask, [seeds[i] for i in selected] if seeds else [], parameters, states)
+        opened = self._client.open([] if first is None else [first], self.np_random)
+        if mask is None:
+            self._resetting[:] = False
         else:
-            rows, events = opened.observations, opened.events
-        return self._merge(rows, mask), events.batch(None, False)
+            self._resetting &= ~mask
+        waiting = any(slot in self._next_parameters for slot in selected)
+        if opened is not None and first is None and not (parameters or states or waiting):
+            return opened.observations, opened.events.batch(None, False)
+        return self._begin(mask, selected, seeds, parameters, states)
+
+    def _begin(
+        self,
+        mask: NDArray[np.bool_] | None,
+        selected: Sequence[int],
+        seeds: Sequence[int | None],
+        parameters: requests.Intervals,
+        states: bytes,
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin the next episodes of the selected environments: one request for all that are reset alike."""
+        alike: dict[Any, list[int]] = {}
+        for place, slot in enumerate(selected):
+            own = self._next_parameters.get(slot)
+            alike.setdefault((seeds[slot] is None, own and requests.frozen(own)), []).append(place)
+        groups, row = [], len(states) // max(len(selected), 1)
+        for places in alike.values():
+            slots = [selected[place] for place in places]
+            own_mask = mask
+            if len(alike) > 1:
+                own_mask = np.zeros(self.num_envs, np.bool_)
+                own_mask[slots] = True
+            groups.append(
+                ResetRequest(
+                    own_mask,
+                    [one for one in (seeds[slot] for slot in slots) if one is not None],
+                    {**self._next_parameters.get(slots[0], {}), **parameters},
+                    b"".join(states[place * row : (place + 1) * row] for place in places),
+                )
+            )
+        observations, begun = self._client.reset(groups)
+        for slot in selected:
+            self._next_parameters.pop(slot, None)
+        infos = begun[0].batch(None, False)
+        for events in begun[1:]:
+            merge(infos, events.batch(None, False))
+        return observations, infos
+
+    def set_parameters(self, parameters: requests.Parameters, mask: NDArray[np.bool_] | None = None) -> None:
+        """Change the physics from the next episode of each environment on.
+
+        The running episode of an environment keeps its parameters. When the episode has ended, its environment is reset
+        once more, so one episode index is passed over. While several steps are under way, the change waits.
+
+        Args:
+            parameters: as at `make`. Other parameters stay as they are.
+            mask: bool [N], the environments; by default all.
+
+        Raises:
+            UnknownNameError, InvalidArgumentError: for wrong names and values; nothing has changed.
+        """
+        values = requests.parameter_values(parameters, self._description)
+        slots = range(self.num_envs) if mask is None else np.flatnonzero(requests.mask(mask, self.num_envs, "mask"))
+        for slot in slots:
+            self._next_parameters[int(slot)] = {**self._next_parameters.get(int(slot), {}), **values}
+        if not self._keeps_resetting and self._mode is AutoresetMode.NEXT_STEP:
+            self._keeps_resetting = True
+            self._resetting = self._client.last_ended()
 
     def step(
         self, actions: Any
@@ -166,7 +251,7 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         return self._outcome(self._client.session.step(actions, self._encode))
 
     def send(self, actions: Any) -> None:
-        """The first half of `step`: the server computes, and nobody waits for it.
+        """Send the actions of a step without waiting for its outcome, which `recv` returns.
 
         So several batches, each with a session of its own, can be under way together. The same batch can have up to 64
         steps under way, with actions that do not depend on what they lead to.
@@ -181,7 +266,7 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
     def recv(
         self,
     ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """The second half: what `step` returns, of the oldest step that was sent and not received.
+        """Receive the oldest step that was sent and not received, as `step` returns it.
 
         Until all are received, nothing but `send` and `recv` may be called.
 
@@ -193,11 +278,11 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         return self._outcome(self._client.session.recv())
 
     def snapshot(self, mask: NDArray[np.bool_] | None = None) -> list[bytes]:
-        """Save the environments that the mask [N] selects, at first all: M pieces of bytes, in order."""
+        """Save the M environments that the mask [N] selects, by default all, as M bytes objects in order."""
         return self._client.snapshot(None if mask is None else requests.mask(mask, self.num_envs, "mask"))
 
     def restore(self, snapshots: Sequence[bytes], mask: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-        """Bring saved environments back into the M slots that the mask [N] selects, at first all.
+        """Bring saved environments back into the M slots that the mask [N] selects, by default all.
 
         Returns the observations [N, O]: of restored environments those at which they were saved, of others the last.
         What follows is what followed the snapshot, byte for byte. All are restored, or none.
@@ -208,7 +293,8 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
             self._client.session.require_usable()
         self._client.open([], self.np_random)
         restored = self._client.restore(snapshots, selected)
-        return self._merge(restored, selected)
+        self._resetting &= False if selected is None else ~selected
+        return restored
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:
         """Draw the environments as they are now: of each, red, green and blue, uint8 [height, width, 3].
@@ -220,41 +306,13 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
             RenderError: if the server cannot draw; it says what is missing.
             ServerConnectionError, ServerTimeoutError: and the environments are gone.
         """
-        frames = (self._client.render(slot) for slot in range(self.num_envs))
-        return tuple(frame.copy() if self._copy else frame for frame in frames)
+        return tuple(self._client.render(slot) for slot in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002
         """Free the environments on the server."""
         # An environment whose settings were refused has no client. Older Gymnasiums close it all the same.
         if hasattr(self, "_client"):
             self._client.close()
-
-    def _seeds(self, seed: int | Sequence[int] | None) -> list[int]:
-        if seed is None:
-            return []
-        if not isinstance(seed, Sequence | np.ndarray) or getattr(seed, "ndim", 1) == 0:
-            first = requests.seed(seed)
-            return [requests.seed(first + i) for i in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise InvalidArgumentError(f"seed has {len(seed)} numbers; expected one, or {self.num_envs}")
-        return [requests.seed(value) for value in seed]
-
-    def _store(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
-        self._observations = observations
-        return observations.copy() if self._copy else observations
-
-    def _merge(self, rows: NDArray[np.float32], mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
-        """The observations [N, O] after M rows have changed."""
-        if mask is None:
-            self._resetting[:] = False
-            return self._store(rows)
-        self._resetting &= ~mask
-        if self._observations is None:
-            return self._store(rows)
-        merged = self._observations.copy()
-        merged[mask] = rows
-        merged.flags.writeable = False
-        return self._store(merged.view())
 
     def _outcome(
         self, stepped: Stepped
@@ -264,6 +322,28 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         if events is not None:
             moved = ~self._resetting if self._reward_terms else None
             infos = events.batch(moved, self._mode is AutoresetMode.SAME_STEP)
-        if self._reward_terms and self._mode is AutoresetMode.NEXT_STEP:
+        begun = self._resetting
+        if self._keeps_resetting and self._mode is AutoresetMode.NEXT_STEP:
             self._resetting = terminated | truncated
-        return self._store(observations), rewards, terminated, truncated, infos
+        if self._next_parameters and self._mode is not AutoresetMode.DISABLED:
+            if self._mode is AutoresetMode.SAME_STEP:
+                begun = terminated | truncated
+            observations = self._change_parameters(begun, observations, infos)
+        return observations, rewards, terminated, truncated, infos
+
+    def _change_parameters(
+        self, begun: NDArray[np.bool_], observations: NDArray[np.float32], infos: dict[str, Any]
+    ) -> NDArray[np.float32]:
+        """Reset those of the environments whose episodes began that are to have other parameters."""
+        slots = [slot for slot in np.flatnonzero(begun).tolist() if slot in self._next_parameters]
+        if not slots or self._client.session.under_way:
+            return observations
+        mask = np.zeros(self.num_envs, np.bool_)
+        mask[slots] = True
+        observations, later = self._begin(mask, slots, [None] * self.num_envs, {}, b"")
+        merge(infos, later)
+        return observations
+
+
+# Names of the settings of batches.
+SETTINGS = requests.settings(PerturbVectorEnv.__init__)

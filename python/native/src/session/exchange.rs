@@ -1,4 +1,4 @@
-//! Who has the stream: one thread of the process that opened it, which sends a request and waits for its reply.
+//! Exchange of requests and replies by one thread of the process that opened the stream.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -9,9 +9,9 @@ use pyo3::prelude::*;
 use super::Session;
 use crate::failure::{self, TIMED_OUT, UNUSABLE, failure};
 use crate::infos::Labels;
-use crate::line::{Broken, Line};
+use crate::session_runtime::{SessionRuntime, WaitError};
 
-/// How far a session is.
+/// State of a session.
 pub(super) enum State {
     New,
     Idle(Box<Open>),
@@ -20,11 +20,11 @@ pub(super) enum State {
     Ended,
 }
 
-/// An open session; the stream ends before the line that carries it.
+/// An open session. The stream is dropped before the runtime that drives it.
 pub(super) struct Open {
     pub(super) stream: Stream,
     pub(super) connection: Connection,
-    pub(super) line: Line,
+    pub(super) runtime: SessionRuntime,
     pub(super) labels: Arc<Labels>,
     /// Steps that were sent and not received.
     pub(super) under_way: usize,
@@ -54,11 +54,11 @@ impl Session {
     }
 
     /// The session, with at most so many steps under way, for this thread alone.
-    pub(super) fn take(&self, most_under_way: usize) -> PyResult<Box<Open>> {
+    pub(super) fn take(&self, max_under_way: usize) -> PyResult<Box<Open>> {
         self.require_own()?;
         let mut state = self.state();
         match std::mem::replace(&mut *state, State::Busy) {
-            State::Idle(open) if open.under_way <= most_under_way => Ok(open),
+            State::Idle(open) if open.under_way <= max_under_way => Ok(open),
             State::Idle(open) => {
                 let under_way = open.under_way;
                 *state = State::Idle(open);
@@ -81,7 +81,7 @@ impl Session {
         if self.closing.is_closed() {
             *state = State::Ended;
             drop(state);
-            open.farewell(py);
+            open.close(py);
         } else {
             *state = State::Idle(open);
         }
@@ -114,7 +114,7 @@ impl Session {
         A: TypedRequest + Send + 'static,
         A::Reply: Send,
     {
-        let Open { mut stream, connection, line, labels, under_way } = *open;
+        let Open { mut stream, connection, runtime, labels, under_way } = *open;
         let pending = Box::pin(async move {
             let reply = match request {
                 Some(request) => stream.ask(request).await,
@@ -122,28 +122,31 @@ impl Session {
             };
             (stream, reply)
         });
-        let (stream, reply) = match line.wait(py, pending, self.deadline(), &self.closing) {
+        let (stream, reply) = match runtime.wait(py, pending, self.deadline(), &self.closing) {
             Ok(come) => come,
             Err(broken) => {
                 // The reply to come would be taken for that to the next request.
                 drop(connection);
-                py.detach(|| line.tend());
+                py.detach(|| runtime.poll_io());
                 self.end();
                 return Err(explain(broken));
             }
         };
         match reply {
             Ok(reply) => {
-                self.put_back(py, Box::new(Open { stream, connection, line, labels: Arc::clone(&labels), under_way }));
+                self.put_back(
+                    py,
+                    Box::new(Open { stream, connection, runtime, labels: Arc::clone(&labels), under_way }),
+                );
                 Ok((labels, reply))
             }
             Err(error @ ClientError::Refused { .. }) => {
-                self.put_back(py, Box::new(Open { stream, connection, line, labels, under_way }));
-                Err(failure::of(&error))
+                self.put_back(py, Box::new(Open { stream, connection, runtime, labels, under_way }));
+                Err(failure::from_client(&error))
             }
             Err(error) => {
                 self.end();
-                Err(failure::of(&error))
+                Err(failure::from_client(&error))
             }
         }
     }
@@ -161,27 +164,27 @@ impl Drop for Session {
 
 impl Open {
     /// Tells the server, so that it frees the environments even where another process has the socket, too.
-    pub(super) fn farewell(self, py: Python<'_>) {
-        let Self { stream, connection, line, .. } = self;
+    pub(super) fn close(self, py: Python<'_>) {
+        let Self { stream, connection, runtime, .. } = self;
         drop((stream, connection));
-        py.detach(|| line.tend());
+        py.detach(|| runtime.poll_io());
     }
 }
 
 /// A session whose opening has not gone well yet: it ends with this.
-pub(super) struct Unopened<'a>(pub(super) &'a Session);
+pub(super) struct OpeningGuard<'a>(pub(super) &'a Session);
 
-impl Drop for Unopened<'_> {
+impl Drop for OpeningGuard<'_> {
     fn drop(&mut self) {
         self.0.end();
     }
 }
 
-pub(super) fn explain(broken: Broken) -> PyErr {
+pub(super) fn explain(broken: WaitError) -> PyErr {
     match broken {
-        Broken::Interrupted(error) => error,
-        Broken::Overdue => failure(TIMED_OUT, 0, ""),
-        Broken::Closed => failure(UNUSABLE, 0, "another thread closed the session"),
+        WaitError::Interrupted(error) => error,
+        WaitError::TimedOut => failure(TIMED_OUT, 0, ""),
+        WaitError::Closed => failure(UNUSABLE, 0, "another thread closed the session"),
     }
 }
 

@@ -14,22 +14,22 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use numpy::{PyArray1, PyArray2, PyArray3};
 use perturb_protocol::proto;
-use perturb_protocol::{Address, ClientError, Connection, Stream, Timeouts};
+use perturb_protocol::{Address, ClientError, Stream, Timeouts, check_observations, check_step, connect};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use crate::arrays;
-use crate::failure::{self, INVALID, MALFORMED, UNREACHABLE, UNUSABLE, failure};
+use crate::failure::{self, INVALID, MALFORMED, UNREACHABLE, UNUSABLE, failure, malformed};
 use crate::infos::{Events, Labels};
-use crate::line::{Closing, Line};
 use crate::requests::{self, Actions, Intervals};
-use exchange::{Open, State, Unopened, duration, explain, unpoisoned};
+use crate::session_runtime::{CloseSignal, SessionRuntime};
+use exchange::{Open, OpeningGuard, State, duration, explain, unpoisoned};
 
 pub use opened::Opened;
 
-/// The most steps that may be under way: their replies are kept until they are asked for.
-const MOST_UNDER_WAY: usize = 64;
-/// What a step gives: observations, rewards, both flags, and what began or ended.
+/// Maximum number of steps under way, whose replies are kept until they are received.
+const MAX_STEPS_UNDER_WAY: usize = 64;
+/// The outcome of a step: observations, rewards, both flags, and the episodes that began or ended.
 type Stepped<'py> = (
     Bound<'py, PyArray2<f32>>,
     Bound<'py, PyArray1<f32>>,
@@ -38,20 +38,31 @@ type Stepped<'py> = (
     Option<Events>,
 );
 
-/// One stream to a server, which owns a batch of environments.
+/// A stream to a server, which owns a batch of environments.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Session {
     address: Address,
     patience: Timeouts,
-    /// Of a reply; `None`: no limit.
+    /// Limit for a reply; `None` for no limit.
     timeout: Mutex<Option<Duration>>,
     actions: Actions,
     /// O.
     observation_size: usize,
     /// The process that made it.
     owner: u32,
-    closing: Arc<Closing>,
+    closing: Arc<CloseSignal>,
     state: Mutex<State>,
+    last: Mutex<LastStep>,
+}
+
+/// The state of a batch after the last reply, apart from the arrays that Python has, which are Python's to change.
+#[derive(Default)]
+struct LastStep {
+    /// float32 `[N, O]`. A reset or restoration of some environments leaves the others' observations as they are.
+    observations: Bytes,
+    /// `[N]` flags of episodes that ended and were not reset since; empty if there are none.
+    terminated: Bytes,
+    truncated: Bytes,
 }
 
 #[pymethods]
@@ -85,10 +96,11 @@ impl Session {
             owner: std::process::id(),
             closing: Arc::default(),
             state: Mutex::new(State::New),
+            last: Mutex::default(),
         })
     }
 
-    /// How long a reply may take, s.
+    /// Sets the limit for a reply, s.
     #[setter]
     fn set_timeout(&self, seconds: f64) {
         *unpoisoned(&self.timeout) = duration(seconds);
@@ -104,6 +116,25 @@ impl Session {
     #[getter]
     fn ended(&self) -> bool {
         self.require_own().is_err() || matches!(*self.state(), State::Ended)
+    }
+
+    /// Number of steps that were sent and not received.
+    #[getter]
+    fn under_way(&self) -> usize {
+        match &*self.state() {
+            State::Idle(open) => open.under_way,
+            _ => 0,
+        }
+    }
+
+    /// Returns which environments' episodes ended in the last step and were not reset since: bool `[N]`.
+    fn last_ended<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<bool>> {
+        let last = unpoisoned(&self.last);
+        let mut ended = vec![false; self.actions.num_envs];
+        for (ended, (terminated, truncated)) in ended.iter_mut().zip(last.terminated.iter().zip(&last.truncated)) {
+            *ended = *terminated != 0 || *truncated != 0;
+        }
+        PyArray1::from_vec(py, ended)
     }
 
     /// Connects, and creates the environments.
@@ -149,21 +180,27 @@ impl Session {
                 _ => return Err(failure(UNUSABLE, 0, "the session was opened before")),
             }
         }
-        let unopened = Unopened(self);
-        let line = Line::new().map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
+        let unopened = OpeningGuard(self);
+        let runtime = SessionRuntime::new().map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
         let (address, patience) = (self.address.clone(), self.patience);
         let opening = Box::pin(async move {
-            let connection = Connection::open_with(&address, patience).await?;
+            let connection = connect(&address, patience).await?;
             let (stream, opened) = Stream::open(&connection, request).await?;
             Ok((connection, stream, opened))
         });
-        let come: Result<_, ClientError> = line.wait(py, opening, self.deadline(), &self.closing).map_err(explain)?;
-        let (connection, stream, opened) = come.map_err(|error| failure::of(&error))?;
+        let come: Result<_, ClientError> =
+            runtime.wait(py, opening, self.deadline(), &self.closing).map_err(explain)?;
+        let (connection, stream, opened) = come.map_err(|error| failure::from_client(&error))?;
+        // An older server leaves parameters out of observations, which the package reports better.
+        if opened.observes_parameters == observe_parameters {
+            check_observations(&opened.observations, n, self.observation_size).map_err(|error| malformed(&error))?;
+        }
         let served = opened.environment.unwrap_or_default();
-        let labels = Arc::new(Labels::new(py, &served, n)?);
+        let labels = Arc::new(Labels::new(py, &served, n));
         let events = Events::begun(&labels, opened.started)?;
+        *unpoisoned(&self.last) = LastStep { observations: opened.observations.clone(), ..LastStep::default() };
         std::mem::forget(unopened);
-        self.put_back(py, Box::new(Open { stream, connection, line, labels, under_way: 0 }));
+        self.put_back(py, Box::new(Open { stream, connection, runtime, labels, under_way: 0 }));
         Ok(Opened {
             environment: perturb_protocol::catalogue::environment(&served).to_string(),
             observes_parameters: opened.observes_parameters,
@@ -190,22 +227,22 @@ impl Session {
     /// The first half of a step: sends the actions, and waits for nothing.
     fn send(&self, py: Python<'_>, actions: &Bound<'_, PyAny>, encode: &Bound<'_, PyAny>) -> PyResult<()> {
         let request = proto::Step { actions: self.actions.encode(actions, encode)? };
-        let mut open = self.take(MOST_UNDER_WAY - 1)?;
-        let Open { mut stream, connection, line, labels, under_way } = *open;
+        let mut open = self.take(MAX_STEPS_UNDER_WAY - 1)?;
+        let Open { mut stream, connection, runtime, labels, under_way } = *open;
         let sending = Box::pin(async move {
             let sent = stream.send_ahead(request).await;
             (stream, sent)
         });
-        match line.wait(py, sending, self.deadline(), &self.closing) {
+        match runtime.wait(py, sending, self.deadline(), &self.closing) {
             Ok((stream, Ok(()))) => {
-                py.detach(|| line.tend());
-                open = Box::new(Open { stream, connection, line, labels, under_way: under_way + 1 });
+                py.detach(|| runtime.poll_io());
+                open = Box::new(Open { stream, connection, runtime, labels, under_way: under_way + 1 });
                 self.put_back(py, open);
                 Ok(())
             }
             Ok((_, Err(error))) => {
                 self.end();
-                Err(failure::of(&error))
+                Err(failure::from_client(&error))
             }
             Err(broken) => {
                 self.end();
@@ -216,7 +253,7 @@ impl Session {
 
     /// The second half: the outcome of the oldest step that was sent.
     fn recv<'py>(&self, py: Python<'py>) -> PyResult<Stepped<'py>> {
-        let open = self.take(MOST_UNDER_WAY)?;
+        let open = self.take(MAX_STEPS_UNDER_WAY)?;
         if open.under_way == 0 {
             self.put_back(py, open);
             return Err(failure(UNUSABLE, 0, "no step is under way: send() first"));
@@ -225,7 +262,7 @@ impl Session {
         self.stepped(py, &labels, stepped)
     }
 
-    /// Begins new episodes: observations `[M, O]`, and the episodes.
+    /// Begins new episodes: observations `[N, O]`, of which those of other environments are the last ones, and the episodes.
     fn reset<'py>(
         &self,
         py: Python<'py>,
@@ -243,7 +280,8 @@ impl Session {
         };
         let open = self.take(0)?;
         let (labels, done) = self.ask(py, open, request)?;
-        let observations = arrays::rows(py, &done.observations, selected, self.observation_size)?;
+        check_observations(&done.observations, selected, self.observation_size).map_err(|error| malformed(&error))?;
+        let observations = self.merged(py, mask, &done.observations)?;
         Ok((observations, Events::begun(&labels, done.started)?))
     }
 
@@ -258,7 +296,7 @@ impl Session {
         Ok(saved.snapshots.iter().map(|snapshot| PyBytes::new(py, snapshot)).collect())
     }
 
-    /// Brings saved environments back: observations `[M, O]`.
+    /// Brings saved environments back: observations `[N, O]`, of which those of other environments are the last ones.
     fn restore<'py>(
         &self,
         py: Python<'py>,
@@ -268,7 +306,9 @@ impl Session {
         let snapshots = snapshots.into_iter().map(Bytes::from).collect();
         let open = self.take(0)?;
         let (_, restored) = self.ask(py, open, proto::Restore { mask: Bytes::copy_from_slice(mask), snapshots })?;
-        arrays::rows(py, &restored.observations, self.selected(mask), self.observation_size)
+        // Of an environment whose physics diverged, they may be any numbers.
+        arrays::numbers(&restored.observations, &[self.selected(mask), self.observation_size])?;
+        self.merged(py, mask, &restored.observations)
     }
 
     /// Draws an environment: uint8 `[height, width, 3]`.
@@ -286,14 +326,14 @@ impl Session {
     }
 
     /// Answers the server's questions whether this side lives, while nobody waits.
-    fn tend(&self, py: Python<'_>) {
+    fn poll_io(&self, py: Python<'_>) {
         if std::process::id() != self.owner {
             return;
         }
         // Locked and unlocked without Python's lock: who has that one may wait for this one.
         py.detach(|| {
             if let Ok(State::Idle(open)) = self.state.try_lock().as_deref() {
-                open.line.tend();
+                open.runtime.poll_io();
             }
         });
     }
@@ -310,14 +350,40 @@ impl Session {
         }
         if let State::Idle(open) = std::mem::replace(&mut *state, State::Ended) {
             drop(state);
-            open.farewell(py);
+            open.close(py);
         }
     }
 }
 
 impl Session {
+    /// The observations `[N, O]` after those of the environments that the mask selects, at first all, have become `rows`
+    /// `[M, O]`, whose length was checked.
+    fn merged<'py>(&self, py: Python<'py>, mask: &[u8], rows: &Bytes) -> PyResult<Bound<'py, PyArray2<f32>>> {
+        let mut last = unpoisoned(&self.last);
+        let width = 4 * self.observation_size;
+        if mask.is_empty() || width == 0 {
+            *last = LastStep { observations: rows.clone(), ..LastStep::default() };
+        } else {
+            let mut merged = last.observations.to_vec();
+            let selected = mask.iter().zip(merged.chunks_mut(width)).filter(|(selected, _)| **selected != 0);
+            selected.zip(rows.chunks(width)).for_each(|((_, old), new)| old.copy_from_slice(new));
+            let left = |flags: &Bytes| {
+                flags.iter().zip(mask).map(|(&flag, &selected)| if selected == 0 { flag } else { 0 }).collect()
+            };
+            let (terminated, truncated) = (left(&last.terminated), left(&last.truncated));
+            *last = LastStep { observations: merged.into(), terminated, truncated };
+        }
+        arrays::rows(py, &last.observations, self.actions.num_envs, self.observation_size)
+    }
+
     fn stepped<'py>(&self, py: Python<'py>, labels: &Arc<Labels>, stepped: proto::Stepped) -> PyResult<Stepped<'py>> {
         let n = self.actions.num_envs;
+        check_step(&stepped, n, self.observation_size).map_err(|error| malformed(&error))?;
+        *unpoisoned(&self.last) = LastStep {
+            observations: stepped.observations.clone(),
+            terminated: stepped.terminated.clone(),
+            truncated: stepped.truncated.clone(),
+        };
         Ok((
             arrays::rows(py, &stepped.observations, n, self.observation_size)?,
             arrays::floats(py, &stepped.rewards, n)?,
@@ -328,13 +394,13 @@ impl Session {
     }
 }
 
-/// What a server can run, as JSON.
+/// Returns a server's catalogue as JSON.
 #[pyfunction]
 pub fn catalogue(py: Python<'_>, address: &str, timeout: f64) -> PyResult<String> {
     let address = Address::from_str(address).map_err(|error| failure(INVALID, 0, error.to_string()))?;
-    let line = Line::new().map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
-    let asking = Box::pin(async move { Connection::open(&address).await?.catalogue().await });
+    let runtime = SessionRuntime::new().map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
+    let asking = Box::pin(async move { connect(&address, Timeouts::default()).await?.catalogue().await });
     let deadline = duration(timeout).and_then(|timeout| Instant::now().checked_add(timeout));
-    let come: Result<_, ClientError> = line.wait(py, asking, deadline, &Arc::default()).map_err(explain)?;
-    Ok(perturb_protocol::catalogue::to_json(&come.map_err(|error| failure::of(&error))?).to_string())
+    let come: Result<_, ClientError> = runtime.wait(py, asking, deadline, &Arc::default()).map_err(explain)?;
+    Ok(perturb_protocol::catalogue::to_json(&come.map_err(|error| failure::from_client(&error))?).to_string())
 }

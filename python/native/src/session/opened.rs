@@ -1,4 +1,4 @@
-//! What opening a session gave.
+//! The reply that opened a session.
 
 use std::sync::Arc;
 
@@ -10,10 +10,10 @@ use pyo3::prelude::*;
 use crate::arrays;
 use crate::infos::Events;
 
-/// What opening a session gave.
+/// The reply that opened a session.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Opened {
-    /// What was opened, as the catalogue has it in JSON.
+    /// The environment that was opened, as JSON of the catalogue.
     #[pyo3(get)]
     pub(super) environment: String,
     /// Whether observations have parameters at their end.
@@ -37,7 +37,7 @@ impl Opened {
 }
 
 impl Opened {
-    /// What was opened.
+    /// Returns the environment that was opened.
     pub fn served(&self) -> &Arc<proto::Environment> {
         &self.served
     }

@@ -13,42 +13,42 @@ use tokio::runtime::{Builder, Runtime};
 use tokio::sync::Notify;
 use tokio::task::yield_now;
 
-/// How often a waiting thread looks for signals, which Python answers between two of its instructions.
-const SLICE: Duration = Duration::from_millis(20);
-/// So often the connection gets a turn to write what a request, or a session's end, has for it: a task takes it up, and
-/// another one sends it.
-const TURNS: usize = 4;
+/// Interval at which a waiting thread checks for signals, which Python answers between two of its instructions.
+const SIGNAL_CHECK_INTERVAL: Duration = Duration::from_millis(20);
+/// Number of turns that the connection gets to write a request, or the end of a session: one task takes it up, and another
+/// one sends it.
+const POLL_YIELDS: usize = 4;
 
-/// Sessions have a runtime of their own, so that threads with a session each do not wait for each other; beyond so many
-/// they share, since each takes four file descriptors.
-const MOST_RUNTIMES: usize = 16;
+/// Maximum number of runtimes. Each session has its own, so that threads with a session each do not wait for each other.
+/// Further sessions share them, because each runtime takes four file descriptors.
+const MAX_RUNTIMES: usize = 16;
 
 /// Something to wait for, which owns what it needs.
 pub type Pending<T> = Pin<Box<dyn Future<Output = T> + Send>>;
 
 /// Why a wait ended without what it was for.
-pub enum Broken {
-    /// Python's: Ctrl-C, or what another signal's handler raised.
+pub enum WaitError {
+    /// A signal's handler raised an error, as for Ctrl-C.
     Interrupted(PyErr),
-    /// It took too long.
-    Overdue,
+    /// The deadline passed.
+    TimedOut,
     /// Another thread closed the session.
     Closed,
 }
 
 /// A session's end, which another thread may bring about.
 #[derive(Default)]
-pub struct Closing {
+pub struct CloseSignal {
     closed: AtomicBool,
-    told: Notify,
+    notify: Notify,
 }
 
-impl Closing {
+impl CloseSignal {
     /// Ends the wait that there is, or the next.
     pub fn close(&self) {
         self.closed.store(true, Ordering::Release);
-        self.told.notify_waiters();
-        self.told.notify_one();
+        self.notify.notify_waiters();
+        self.notify.notify_one();
     }
 
     /// Whether it has come.
@@ -57,7 +57,7 @@ impl Closing {
     }
 }
 
-/// What runs connections' tasks while somebody waits.
+/// A runtime that drives connections' tasks while a thread waits.
 struct Reactor {
     /// Empty once this is dropped.
     runtime: Option<Runtime>,
@@ -65,7 +65,7 @@ struct Reactor {
     owner: u32,
 }
 
-/// Those that are in use.
+/// Runtimes that are in use.
 static REACTORS: Mutex<Vec<Weak<Reactor>>> = Mutex::new(Vec::new());
 
 impl Reactor {
@@ -74,13 +74,13 @@ impl Reactor {
         Ok(Arc::new(Self { runtime: Some(runtime), owner: std::process::id() }))
     }
 
-    /// One for another session.
+    /// Returns a runtime for another session.
     fn find() -> io::Result<Arc<Self>> {
         // In a forked process it may be locked for ever.
         let Ok(mut reactors) = REACTORS.try_lock() else { return Self::new() };
         let own = std::process::id();
         let used: Vec<_> = reactors.iter().filter_map(Weak::upgrade).filter(|reactor| reactor.owner == own).collect();
-        if used.len() >= MOST_RUNTIMES
+        if used.len() >= MAX_RUNTIMES
             && let Some(least) = used.iter().min_by_key(|reactor| Arc::strong_count(reactor))
         {
             return Ok(Arc::clone(least));
@@ -103,13 +103,13 @@ impl Drop for Reactor {
     }
 }
 
-/// Where a session waits.
-pub struct Line {
+/// The runtime in which a session waits.
+pub struct SessionRuntime {
     reactor: Arc<Reactor>,
 }
 
-impl Line {
-    /// A line of this process.
+impl SessionRuntime {
+    /// Returns a runtime of this process.
     ///
     /// # Errors
     /// If the system has no more file descriptors.
@@ -120,47 +120,47 @@ impl Line {
     /// Waits, at most until the deadline, without Python's lock but for a look for signals now and then.
     ///
     /// # Errors
-    /// [`Broken`]; what was waited for is gone then.
+    /// [`WaitError`]; what was waited for is gone then.
     pub fn wait<T: Send>(
         &self,
         py: Python<'_>,
         mut pending: Pending<T>,
         deadline: Option<Instant>,
-        closing: &Arc<Closing>,
-    ) -> Result<T, Broken> {
-        let Some(runtime) = self.reactor.runtime.as_ref() else { return Err(Broken::Closed) };
+        closing: &Arc<CloseSignal>,
+    ) -> Result<T, WaitError> {
+        let Some(runtime) = self.reactor.runtime.as_ref() else { return Err(WaitError::Closed) };
         loop {
-            let slice = match deadline {
-                Some(deadline) => SLICE.min(deadline.saturating_duration_since(Instant::now())),
-                None => SLICE,
+            let wait = match deadline {
+                Some(deadline) => SIGNAL_CHECK_INTERVAL.min(deadline.saturating_duration_since(Instant::now())),
+                None => SIGNAL_CHECK_INTERVAL,
             };
             let come = py.detach(|| {
                 runtime.block_on(async {
                     tokio::select! {
                         biased;
                         come = &mut pending => Some(come),
-                        () = closing.told.notified() => None,
-                        () = tokio::time::sleep(slice) => None,
+                        () = closing.notify.notified() => None,
+                        () = tokio::time::sleep(wait) => None,
                     }
                 })
             });
             match come {
                 Some(come) => return Ok(come),
-                None if closing.is_closed() => return Err(Broken::Closed),
-                None => py.check_signals().map_err(Broken::Interrupted)?,
+                None if closing.is_closed() => return Err(WaitError::Closed),
+                None => py.check_signals().map_err(WaitError::Interrupted)?,
             }
             if deadline.is_some_and(|deadline| Instant::now() >= deadline) {
-                return Err(Broken::Overdue);
+                return Err(WaitError::TimedOut);
             }
         }
     }
 
     /// Lets the connection write what it has, and answer the server's questions whether this side lives. Not for who
     /// has Python's lock.
-    pub fn tend(&self) {
+    pub fn poll_io(&self) {
         if let Some(runtime) = &self.reactor.runtime {
             runtime.block_on(async {
-                for _ in 0..TURNS {
+                for _ in 0..POLL_YIELDS {
                     yield_now().await;
                 }
             });

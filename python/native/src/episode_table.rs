@@ -1,4 +1,4 @@
-//! Episodes with their receipts, as numbers in a row: what infos are made of, when somebody looks.
+//! A table of episodes with their receipts, from which infos are made.
 
 use perturb_protocol::proto;
 use pyo3::prelude::*;
@@ -7,8 +7,8 @@ use crate::failure::{MALFORMED, failure};
 
 /// Episodes with their receipts.
 #[derive(Default)]
-pub struct Told {
-    /// Where in the batch, which environment, trial and episode, and the episode's number in its trial.
+pub struct EpisodeTable {
+    /// Slot in the batch, indices of environment, trial and episode, and the episode's number in its trial.
     pub episodes: Vec<[u64; 5]>,
     /// `[m, P + Q]`: what was requested, then what was applied.
     values: Vec<f64>,
@@ -18,8 +18,8 @@ pub struct Told {
     width: usize,
 }
 
-impl Told {
-    /// None yet, of receipts with so many requested and applied values.
+impl EpisodeTable {
+    /// Makes an empty table for receipts with so many requested and applied values.
     pub fn new(requested: usize, applied: usize) -> Self {
         Self { requested, width: requested + applied, ..Self::default() }
     }
@@ -32,7 +32,7 @@ impl Told {
         for (slot, episode, receipt) in messages {
             let (Some(episode), Some(receipt)) = (episode, receipt) else { continue };
             if receipt.requested.len() != self.requested || receipt.applied.len() + self.requested != self.width {
-                return Err(misfit());
+                return Err(mismatched_episodes());
             }
             let proto::Episode { environment_index, trial_index, episode_index, episode_in_trial } = *episode;
             let numbers = [slot.into(), environment_index.into(), trial_index, episode_index, episode_in_trial.into()];
@@ -42,7 +42,7 @@ impl Told {
         Ok(self)
     }
 
-    /// The same of arrays, cut in two behind the first `ended`.
+    /// Reads arrays into two tables; the first has the first `ended` episodes.
     ///
     /// # Errors
     /// If they do not fit each other.
@@ -50,7 +50,7 @@ impl Told {
         let (words, numbers) = (episodes.as_chunks::<8>().0, values.as_chunks::<8>().0);
         let m = words.len() / 5;
         if episodes.len() != m * 40 || values.len() != m * self.width * 8 || m < ended {
-            return Err(misfit());
+            return Err(mismatched_episodes());
         }
         let part = |from: usize, to: usize| Self {
             episodes: words.as_chunks::<5>().0[from..to].iter().map(|row| row.map(u64::from_le_bytes)).collect(),
@@ -60,7 +60,7 @@ impl Told {
         Ok([part(0, ended), part(ended, m)])
     }
 
-    /// Which episodes there are, and of each its requested and applied values.
+    /// Returns the episodes, each with its requested and applied values.
     pub fn rows(&self) -> impl Iterator<Item = ([u64; 5], &[f64])> {
         self.episodes.iter().copied().zip(self.values.chunks(self.width.max(1)))
     }
@@ -76,7 +76,7 @@ impl Told {
 /// A message: its slot, and what it says.
 pub type Message<'a> = (u32, Option<&'a proto::Episode>, Option<&'a proto::Receipt>);
 
-/// What is wrong with a server's episodes.
-pub fn misfit() -> PyErr {
+/// The error for episodes that do not fit the batch.
+pub fn mismatched_episodes() -> PyErr {
     failure(MALFORMED, 0, "the server sent episodes that do not fit the batch, or receipts of other lengths")
 }

@@ -1,0 +1,51 @@
+"""Attributes of environments that cannot be assigned, because the assignment would change nothing."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from .errors import AssignmentError
+
+if TYPE_CHECKING:
+    from .catalogue import Description
+
+
+def refuse_assignment(name: str, description: Description) -> AssignmentError:
+    """Return the error for `env.length = 1.0`, with how to change a parameter."""
+    parameters = list(description.parameters)
+    if name in parameters:
+        example, what = name, f"the server has {description.name}'s physics, of which it is a parameter"
+    else:
+        example = (parameters or ["length"])[0]
+        what = (
+            "this environment has no such attribute, so nothing would change; parameters of "
+            f"{description.name}'s physics are {', '.join(parameters)}"
+        )
+    return AssignmentError(
+        f"{name!r} cannot be assigned: {what}; call set_parameters({{{example!r}: …}}), which acts at the next "
+        f"episode, or reset(options={{'parameters': {{{example!r}: …}}}}), or give parameters= where the "
+        "environment is made"
+    )
+
+
+class CheckedAttributes:
+    """Refuses assignments to attributes that do not exist once the object is made; subclasses may have their own."""
+
+    _description: Description
+    _is_made = False
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Assign an attribute that exists.
+
+        Raises:
+            AssignmentError: for a parameter's name, and for another public name that does not exist.
+        """
+        if self._is_made and not name.startswith("_"):
+            is_own = name in self.__dict__ or hasattr(type(self), name)
+            if name in self._description.parameters or not (is_own or self._allows_new_attributes()):
+                raise refuse_assignment(name, self._description)
+        super().__setattr__(name, value)
+
+    def _allows_new_attributes(self) -> bool:
+        """Whether the object's class is not of this package."""
+        return not type(self).__module__.startswith(f"{__package__}.")

@@ -1,0 +1,108 @@
+"""The VecNormalize under which a stable-baselines3 model was trained, without which it acts on other observations."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .errors import PolicyError
+
+if TYPE_CHECKING:
+    from .catalogue import Description
+
+# How far an observation may be from a fitted scale and shift, relative to the spread of its values: float32's rounding.
+AFFINE_TOLERANCE = 1e-3
+
+
+def find_normalizer(model: Any, given: Any, description: Description) -> Any:
+    """Return the VecNormalize of a model, or None if it has none.
+
+    Args:
+        model: of stable-baselines3.
+        given: a VecNormalize; the path of one that was saved; False for none; None for the model's own.
+        description: of the environment.
+
+    Raises:
+        PolicyError: for what is no VecNormalize, or one of other observations; if the model was trained under one, or
+            may have been, that it no longer has.
+    """
+    if given is False:
+        return None
+    normalizer = model.get_vec_normalize_env() if given is None else given
+    if isinstance(normalizer, str | os.PathLike):
+        normalizer = _read(Path(normalizer))
+    if normalizer is None:
+        _require_untouched(model)
+        return None
+    if not callable(getattr(normalizer, "normalize_obs", None)):
+        raise PolicyError(
+            f"normalizer is {normalizer!r}; expected stable-baselines3's VecNormalize, the path of a saved one, "
+            "or False"
+        )
+    mean: Any = getattr(getattr(normalizer, "obs_rms", None), "mean", ())
+    shape, expected = np.shape(mean), (len(description.observation),)
+    if getattr(normalizer, "norm_obs", True) and shape != expected:
+        raise PolicyError(
+            f"the normalizer is for observations of the shape {shape}, those of {description.name} have {expected}: "
+            "give the VecNormalize that the model was trained under"
+        )
+    return normalizer
+
+
+def _read(path: Path) -> Any:
+    """Read what `VecNormalize.save` wrote. As with stable-baselines3's own `load`, the file must be trusted."""
+    try:
+        with path.open("rb") as file:
+            return pickle.load(file)
+    except OSError as error:
+        raise PolicyError(f"normalizer={str(path)!r} cannot be read: {error.strerror or error}") from error
+    except Exception as error:
+        raise PolicyError(
+            f"normalizer={str(path)!r} is no saved VecNormalize ({error}); give what VecNormalize.save(path) wrote"
+        ) from error
+
+
+def _require_untouched(model: Any) -> None:
+    """Refuse a model that was trained under a VecNormalize, which a model that was loaded no longer has.
+
+    stable-baselines3 keeps the last original observations of such a model in `_last_original_obs`. Off-policy
+    algorithms keep them of every model. The last observations of one that was trained under VecNormalize are then the
+    original ones, scaled and shifted; of another model they are those of the next step.
+    """
+    original, last = getattr(model, "_last_original_obs", None), getattr(model, "_last_obs", None)
+    if original is None:
+        return
+    how = (
+        "give normalizer=, the VecNormalize or the path that VecNormalize.save() wrote; or normalizer=False if the "
+        "model takes observations as they are"
+    )
+    was_trained = f"this {type(model).__name__} model was trained under a VecNormalize, which it was loaded without"
+    if not hasattr(model, "replay_buffer"):  # an on-policy model
+        raise PolicyError(f"{was_trained}, so it would act on observations that it does not know: {how}")
+    if model.get_env() is not None:
+        return  # its environment, which was trained in or given to load(), has no VecNormalize
+    if last is None or np.shape(last) != np.shape(original) or len(original) < 3:
+        raise PolicyError(
+            f"this {type(model).__name__} model was loaded without its environment, and does not tell whether it was "
+            f"trained under a VecNormalize: {how}"
+        )
+    if not np.array_equal(last, original) and _is_affine(np.asarray(original, float), np.asarray(last, float)):
+        raise PolicyError(f"{was_trained}, so it would act on observations that it does not know: {how}")
+
+
+def _is_affine(original: np.ndarray[Any, Any], last: np.ndarray[Any, Any]) -> bool:
+    """Whether each column of `last` [N, O] is that of `original`, scaled and shifted; N is at least 3."""
+    for x, y in zip(original.T, last.T, strict=True):
+        spread = np.ptp(y)
+        if np.ptp(x) == 0 or spread == 0:
+            if np.ptp(x) != spread:  # equal numbers become equal ones
+                return False
+            continue
+        fitted = np.polyval(np.polyfit(x, y, 1), x)
+        if np.abs(fitted - y).max() > AFFINE_TOLERANCE * spread:
+            return False
+    return True

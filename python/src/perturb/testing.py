@@ -1,0 +1,202 @@
+"""Plays and records the tests of a policy, for the first time or again."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from . import _native, catalogue, players, requests
+from .catalogue import DEFAULT_PIXELS
+from .client import Client
+from .errors import InvalidArgumentError, PolicyError
+from .policy import Policy, native
+from .results import Audit, PolicyMetadata, PolicyRecords
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of a test."""
+
+    environment: str
+    sets: list[_native.Set]
+    episodes: int
+    seed: int | None
+    success: str | None
+    observe: str | None
+    deterministic: bool | None
+    server: str | None
+    timeout: float
+
+
+def replay(
+    recorded: Sequence[PolicyRecords], agent: str, policy: Any, normalizer: Any, server: str | None, timeout: float
+) -> Audit:
+    """Play all recorded tests again; see `Assessment.audit`."""
+    given = {trained: (one, own) for trained, one, own in policies(policy, None, normalizer)}
+    keys = [one.trained_on for one in recorded]
+    if not isinstance(policy, Mapping) and len(keys) == 1:
+        given = {keys[0]: given[None]}
+    if set(given) != set(keys):
+        expected = "one policy" if keys == [None] else f"a mapping with the keys {', '.join(map(repr, keys))}"
+        raise InvalidArgumentError(
+            f"the recorded tests are of other policies than those that are given; expected {expected}"
+        )
+    episodes, different = 0, []
+    for one in recorded:
+        known, records = one.known, one.records
+        acts, own_normalizer = given[one.trained_on]
+        name = agent if records.policy == agent and not isinstance(acts, Policy) else None
+        settings = Settings(
+            records.environment,
+            records.tests(),
+            known.episodes,
+            known.seed,
+            records.rule,
+            known.observe,
+            known.deterministic,
+            server,
+            timeout,
+        )
+        _, tested = play(acts, settings, known.trained_on, own_normalizer, name, records.policy)
+        episodes += len(records.columns()["seed"])
+        different += _differences(records.columns(), tested.records.columns())
+    return Audit(episodes, tuple(different))
+
+
+def _differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
+    """Return a sentence for each episode that differs."""
+    same: dict[str, Any] = {}
+    for name, values in before.items():
+        a, b = np.asarray(values), np.asarray(after[name])
+        same[name] = (a == b) | ((a != a) & (b != b)) if a.dtype.kind == "f" else a == b
+    wrong = np.flatnonzero(~np.logical_and.reduce(list(same.values())))
+    sentences = []
+    for row in wrong.tolist():
+        tested_on, *address = (before[name][row] for name in ("set", "environment_index", "episode_index"))
+        where = f"{tested_on}, environment {address[0]}, episode {address[1]}"
+        parts = [f"{name} was {before[name][row]}, is {after[name][row]}" for name in same if not same[name][row]]
+        sentences.append(f"{where}: {'; '.join(parts)}")
+    return sentences
+
+
+def play(
+    policy: Any,
+    settings: Settings,
+    trained_on: str | None,
+    normalizer: Any,
+    name: str | None,
+    expected: str | None = None,
+) -> tuple[str, PolicyRecords]:
+    """Test one policy, which records call as expected: what reports call the agent, and its records."""
+    environment, observe = settings.environment, settings.observe
+    description = catalogue.find(environment)
+    seen = observe or "state"
+    if isinstance(policy, Policy):
+        seen = _of_loaded(policy, environment, trained_on, observe)
+        trained_on = trained_on or (policy.version if policy.trained_on == policy.version else None)
+    fits = description.observing_parameters() if requests.observes_parameters(seen) else description
+    tested = players.prepare(policy, fits, deterministic=settings.deterministic, normalizer=normalizer, name=name)
+    if expected not in (None, tested.name):
+        raise PolicyError(
+            f"the tests were recorded of {expected}, this is {tested.name}: give the policy that was tested"
+        )
+    seed = requests.seed(
+        (1 if tested.loaded is None else tested.loaded.seed) if settings.seed is None else settings.seed
+    )
+    trials = 1 if tested.loaded is None else tested.loaded.episodes_per_trial
+    tests = native(_native.Tests, settings.sets, settings.episodes, seed, settings.success, tested.name, trials)
+    for place, one_set in enumerate(settings.sets):
+        client = {"environment": environment, "server": settings.server, "observe": seen, "timeout": settings.timeout}
+        _test(tests, place, one_set, tested, client, trials)
+    known = PolicyMetadata(trained_on, tested.timesteps, seed, settings.episodes, seen, tested.deterministic)
+    return tested.agent, PolicyRecords(known, tests.records())
+
+
+def policies(policy: Any, trained_on: str | None, normalizer: Any) -> list[tuple[str | None, Any, Any]]:
+    """Return each policy with the version that it was trained on, before it, and its normaliser after it."""
+    if not isinstance(policy, Mapping):
+        return [(None if trained_on is None else requests.version(trained_on, "trained_on"), policy, normalizer)]
+    if trained_on is not None:
+        raise InvalidArgumentError("trained_on= is said by the keys of a mapping of policies; leave it out")
+    if not policy:
+        raise InvalidArgumentError("policy is an empty mapping; expected policies by the versions they were trained on")
+    if normalizer is False:
+        normalizer = dict.fromkeys(policy, False)
+    normalizers = {} if normalizer is None else normalizer
+    if not isinstance(normalizers, Mapping) or set(normalizers) - set(policy):
+        raise InvalidArgumentError("normalizer must be a mapping with keys of the mapping of policies")
+    keys = {requests.version(key, "a key of the mapping of policies"): key for key in policy}
+    if len(keys) < len(policy):
+        raise InvalidArgumentError(f"the mapping of policies has a version twice: {', '.join(map(repr, policy))}")
+    in_order = [version for version in requests.VERSIONS if version in keys]
+    return [(version, policy[keys[version]], normalizers.get(keys[version])) for version in in_order]
+
+
+def _of_loaded(policy: Policy, environment: str, trained: str | None, observe: str | None) -> str:
+    """Return what a loaded policy observes.
+
+    Raises:
+        PolicyError: if it was trained in another environment, or does not fit the other settings.
+    """
+    if policy.environment != environment:
+        raise PolicyError(f"the policy {policy.id} was trained in {policy.environment}, not in {environment}")
+    if trained is not None and trained != policy.trained_on:
+        raise PolicyError(f"the policy {policy.id} was trained on {policy.trained_on}, not on {trained}")
+    if observe is not None and observe != policy.observe:
+        raise PolicyError(f"the policy {policy.id} observes {policy.observe!r}, not {observe!r}; leave observe= out")
+    return policy.observe
+
+
+def _test(
+    tests: _native.Tests,
+    place: int,
+    one_set: _native.Set,
+    tested: players.PolicyUnderTest,
+    settings: dict[str, Any],
+    episodes_per_trial: int,
+) -> None:
+    """Play one set's episodes."""
+    _, version, drawn, contexts = one_set
+    seed, num_envs = native(tests.plan, place)
+    client = Client(
+        **settings,
+        version=requests.version(version),
+        num_envs=num_envs,
+        parameters=drawn,
+        first_environment_index=0,
+        episodes_per_trial=episodes_per_trial,
+        autoreset_mode=AutoresetMode.SAME_STEP,
+        receipts=True,
+        reward_terms=False,
+        render_mode=None,
+        width=DEFAULT_PIXELS,
+        height=DEFAULT_PIXELS,
+        single=False,
+        contexts=contexts,
+    )
+    description = client.description
+    shape = (num_envs,) if description.discrete else (num_envs, *(description.action_space().shape or ()))
+    encode = partial(requests.actions, description=description, shape=shape)
+    try:
+        begun = client.open([seed], np.random.default_rng())
+        assert begun is not None
+        native(tests.opened, begun.opened, None if tested.loaded is None else tested.loaded._native)
+        observations = begun.observations
+        with players.seeded(seed) if tested.loaded is None else contextlib.nullcontext():
+            player = tested.player(num_envs, seed)
+            native(player.begin, observations)
+            done, wanted = 0, 1
+            while done < wanted:
+                stepped = client.session.step(native(player.act), encode)
+                observations, rewards, terminated, truncated, events = stepped
+                done, wanted = native(tests.take, events, terminated)
+                native(player.observe, observations, rewards, terminated | truncated)
+        native(tests.finish)
+    finally:
+        client.close()
