@@ -38,7 +38,7 @@ def run(*command: str) -> str:
 @pytest.mark.filterwarnings("ignore:We recommend")  # Pendulum's torque of ±2
 @pytest.mark.parametrize("version", ["D", "R", "E"])
 @pytest.mark.parametrize("name", list(CATALOGUE))
-def test_stable_baselines3s_checker_accepts_every_environment_and_version(name: str, version: str, server: str) -> None:
+def test_stable_baselines3s_checker_accepts_all_environments(name: str, version: str, server: str) -> None:
     from stable_baselines3.common.env_checker import check_env
 
     env = gymnasium.make(identifier(name), version=version, server=server)
@@ -62,9 +62,7 @@ def test_ppo_in_one_file_learns_cart_pole(server: str) -> None:
     assert returns[0] < 100, returns
 
 
-def test_the_report_has_an_agent_of_stable_baselines3_and_its_checkpoint_gives_the_same_bytes(
-    server: str, tmp_path: Path
-) -> None:
+def test_report_has_agent_and_checkpoint_gives_same_bytes(server: str, tmp_path: Path) -> None:
     from stable_baselines3 import PPO
 
     lines = [line for line in (EXAMPLES / "sb3_report.py").read_text().splitlines() if line]

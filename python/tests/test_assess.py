@@ -122,7 +122,7 @@ def same_episodes(a: perturb.Assessment, b: perturb.Assessment) -> None:
         np.testing.assert_array_equal(column, theirs[name], err_msg=name)
 
 
-def test_a_function_is_tested_in_the_same_episodes_as_a_checkpoint(server: str) -> None:
+def test_function_plays_same_episodes_as_checkpoint(server: str) -> None:
     policy = perturb.load_policy(CART_POLE)
     of_policy = perturb.evaluate(policy, "CartPole", episodes=120, seed=3, server=server).columns()
     assessment = perturb.evaluate(upright, "CartPole", episodes=120, seed=3, server=server)
@@ -161,7 +161,7 @@ def test_a_function_with_memory_is_told_where_episodes_begin(server: str) -> Non
     same_episodes(assessment, again)
 
 
-def test_random_functions_are_seeded_and_the_callers_numbers_go_on(server: str) -> None:
+def test_random_functions_are_seeded_and_state_is_restored(server: str) -> None:
     def guesses(observations: Any) -> Any:
         return np.random.randint(2, size=len(observations))
 

@@ -58,7 +58,7 @@ def test_what_r_and_e_draw_lies_in_their_sets(server: str) -> None:
 
 
 @pytest.mark.parametrize("again", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
-def test_a_copied_environment_plays_the_same_episodes_after_a_reset(again: Any, server: str) -> None:
+def test_copied_environment_plays_same_episodes(again: Any, server: str) -> None:
     env = gymnasium.make(identifier("CartPole"), version="R", server=server, environment_index=3)
     env.reset(seed=4, options={"parameters": {"length": 0.7}})
     env.step(1)

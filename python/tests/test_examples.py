@@ -41,7 +41,7 @@ def test_the_sweep_shows_which_poles_stay_up(server: str) -> None:
     assert steps[4] == 200
 
 
-def test_a_policy_that_the_server_plays_is_the_one_that_numpy_computes(server: str) -> None:
+def test_server_plays_the_policy_that_numpy_computes(server: str) -> None:
     output = run("act.py", "--server", server)
     assert output.startswith("200 steps of 8 environments, finished: True\n")
     assert int(re.findall(r"(\d+) episodes ended", output)[0]) >= 8

@@ -200,7 +200,7 @@ def test_what_is_no_perturb_server_is_said() -> None:
             silent.reset()
 
 
-def test_a_server_that_shuts_down_ends_sessions_with_its_sentence(start_server: Callable[..., Any]) -> None:
+def test_shutdown_ends_sessions_with_the_servers_sentence(start_server: Callable[..., Any]) -> None:
     running = start_server("--grace-seconds", "0")
     env = perturb.PerturbEnv("CartPole", server=running.address)
     env.reset()
@@ -210,7 +210,7 @@ def test_a_server_that_shuts_down_ends_sessions_with_its_sentence(start_server: 
         env.step(0)
 
 
-def test_a_session_that_nobody_uses_tells_the_server_that_it_lives(start_server: Callable[..., Any]) -> None:
+def test_idle_session_answers_keepalive_pings(start_server: Callable[..., Any]) -> None:
     env = perturb.PerturbEnv("CartPole", server=start_server("--keepalive-seconds", "1").address)
     env.reset(seed=1)
     time.sleep(5)
@@ -323,7 +323,7 @@ def private() -> local_server.LocalServer | None:
     return local_server._shared
 
 
-def test_the_private_server_is_shared_and_ends_with_its_last_environment() -> None:
+def test_private_server_ends_with_last_environment() -> None:
     one, other = perturb.PerturbEnv("CartPole"), perturb.PerturbVectorEnv("Pendulum", 3)
     assert private() is None, "nothing is started before a reset"
     one.reset(seed=1)
@@ -379,11 +379,11 @@ print("went on")
 """
 
 
-def test_an_environment_may_be_collected_while_another_asks_for_the_private_server() -> None:
+def test_collection_while_private_server_is_acquired() -> None:
     assert output_of("-c", FORGETTING) == ("went on\n", "")
 
 
-def test_a_process_that_ends_closes_its_sessions_before_its_server() -> None:
+def test_process_closes_sessions_before_its_server() -> None:
     """Otherwise the server would wait for them for its second of grace."""
     ending = """
 from pathlib import Path
@@ -437,7 +437,7 @@ sys.stdin.readline() if {wait} else None
 
 @pytest.mark.parametrize("fork", [False, True])
 @pytest.mark.parametrize("ending", ["exit", signal.SIGTERM, signal.SIGKILL])
-def test_the_private_server_ends_with_its_process_however_that_ends(ending: Any, fork: bool) -> None:
+def test_private_server_ends_with_its_process(ending: Any, fork: bool) -> None:
     """Also if a process that was forked from it lives on."""
     client = subprocess.Popen(
         [sys.executable, "-c", OWNING.format(wait=ending != "exit", fork=fork)],
@@ -527,7 +527,7 @@ def in_fork(function: Callable[[], Any]) -> Any:
 
 
 @pytest.mark.parametrize("own", [False, True])
-def test_an_environment_opens_its_session_in_the_process_that_uses_it(own: bool, server: str) -> None:
+def test_session_opens_in_the_process_that_uses_it(own: bool, server: str) -> None:
     address = None if own else server
     used, unused = (perturb.PerturbEnv("CartPole", server=address) for _ in range(2))
     used.reset(seed=1)

@@ -190,7 +190,7 @@ def test_who_has_what_is_asked_for_plays_as_at_an_open_socket(
         ),
     ],
 )
-def test_who_lacks_something_is_told_at_once_what_and_may_come_again_with_it(
+def test_missing_credentials_are_named_and_can_be_added(
     has: Files, says: str, guarded: str, have: Callable[[Files], None]
 ) -> None:
     have(has)
@@ -221,7 +221,7 @@ def test_a_server_that_is_not_to_be_trusted_is_not(
         perturb.PerturbEnv("CartPole", server=address).reset()
 
 
-def test_plain_and_encrypted_connections_that_meet_are_told_apart(
+def test_plain_client_and_tls_server_are_told_apart(
     guarded: str, start: Callable[[Files], str], have: Callable[[Files], None]
 ) -> None:
     have(ALL)

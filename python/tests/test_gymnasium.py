@@ -27,7 +27,7 @@ def equal(a: object, b: object) -> bool:
 @pytest.mark.filterwarnings("ignore")  # CartPole's unbounded observations, Pendulum's torque of ±2
 @pytest.mark.parametrize("version", ["D", "R", "E", "R+E"])
 @pytest.mark.parametrize("name", NAMES)
-def test_gymnasiums_checker_accepts_every_environment_and_version(name: str, version: str, server: str) -> None:
+def test_gymnasiums_checker_accepts_all_environments(name: str, version: str, server: str) -> None:
     env = gymnasium.make(identifier(name), version=version, server=server)
     check_env(env.unwrapped)
     env.close()
@@ -61,9 +61,7 @@ def run(envs: gymnasium.vector.VectorEnv[Any, Any, Any], steps: int) -> list[Any
 @pytest.mark.parametrize("receipts", [True, False])
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("name", ["CartPole", "Hopper"])
-def test_a_batch_gives_what_gymnasium_makes_of_single_environments(
-    name: str, mode: AutoresetMode, receipts: bool, server: str
-) -> None:
+def test_batch_equals_gymnasiums_vector_of_singles(name: str, mode: AutoresetMode, receipts: bool, server: str) -> None:
     """Observations, rewards, flags and infos, with their structure, types and masks."""
     n, steps = 5, 150
     settings: dict[str, Any] = {"version": "E", "server": server, "receipts": receipts, "reward_terms": True}
@@ -93,7 +91,7 @@ def test_a_batch_gives_what_gymnasium_makes_of_single_environments(
     theirs.close()
 
 
-def test_final_observations_and_infos_are_where_gymnasium_puts_them(server: str) -> None:
+def test_final_observations_and_infos_follow_gymnasium(server: str) -> None:
     envs = gymnasium.make_vec("perturb/CartPole-v1", num_envs=3, autoreset_mode="SameStep", server=server)
     envs.reset(seed=1)
     for _ in range(200):

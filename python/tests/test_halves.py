@@ -42,7 +42,7 @@ def test_halves_make_the_steps_that_whole_ones_make(mode: AutoresetMode, ahead: 
     assert halves.reset(seed=9)[0].tobytes() == whole.reset(seed=9)[0].tobytes()
 
 
-def test_a_step_that_was_sent_is_computed_before_anyone_waits_for_it(start_server: Callable[..., Any]) -> None:
+def test_sent_step_is_computed_before_anyone_waits(start_server: Callable[..., Any]) -> None:
     address = start_server("--workers", "1").address
     envs = [perturb.PerturbVectorEnv("HalfCheetah", 256, server=address) for _ in range(2)]
     actions = np.zeros((256, 6), dtype=np.float32)

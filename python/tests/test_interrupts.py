@@ -61,7 +61,7 @@ def test_an_interrupt_leaves_no_reply_behind(start_server: Callable[..., Any]) -
     envs.close()
 
 
-def test_a_second_interrupt_in_the_wake_of_the_first_costs_no_more(
+def test_second_interrupt_costs_no_more_than_first(
     start_server: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It may come before it is noted that the session is gone; a reset must open another one all the same."""
@@ -117,7 +117,7 @@ def test_ctrl_c_interrupts_a_step_at_once_and_the_process_ends(start_server: Cal
         assert (out, errors) == ("interrupted True\n", ""), errors
 
 
-def test_ctrl_c_again_and_again_never_hangs_and_no_reply_is_taken_for_another(start_server: Callable[..., Any]) -> None:
+def test_many_interrupts_never_hang_or_mix_replies(start_server: Callable[..., Any]) -> None:
     running = start_server("--max-sessions", "8")  # sessions that were left behind would fill it
     arguments = (running.address, str(running.process.pid), str(TIMES))
     out, errors = output_of("-m", "tests.interrupted", *arguments, seconds=SECONDS + TIMES)

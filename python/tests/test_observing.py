@@ -27,7 +27,7 @@ def seen(entry: dict[str, Any], applied: dict[str, Any]) -> list[np.float32]:
 
 @pytest.mark.filterwarnings("ignore")  # as without parameters
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry["name"])
-def test_parameters_follow_the_observation_and_the_space_has_them(entry: dict[str, Any], server: str) -> None:
+def test_observed_parameters_are_in_observation_and_space(entry: dict[str, Any], server: str) -> None:
     settings: dict[str, Any] = {"version": "E", "server": server}
     plain = gymnasium.make(identifier(entry["name"]), **settings)
     env = gymnasium.make(identifier(entry["name"]), observe="parameters", **settings)
@@ -46,7 +46,7 @@ def test_parameters_follow_the_observation_and_the_space_has_them(entry: dict[st
     plain.close()
 
 
-def test_a_batch_has_the_parameters_of_each_episode_also_at_its_end(server: str) -> None:
+def test_batch_has_parameters_of_each_episode_at_its_end(server: str) -> None:
     entry = ENTRIES[0]
     settings: dict[str, Any] = {"version": "R", "autoreset_mode": "SameStep", "server": server}
     envs = gymnasium.make_vec(identifier(entry["name"]), num_envs=4, observe="parameters", **settings)

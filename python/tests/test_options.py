@@ -50,7 +50,7 @@ def test_the_catalogue_is_the_servers(server: str) -> None:
             CATALOGUE[environment["name"]].require_equal(Description.read(environment))
 
 
-def test_an_environment_that_is_new_to_the_server_needs_nothing_here(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_environment_needs_no_change_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     success = {"description": "", "quantity": "steps", "unit": "1", "comparison": "at_most", "threshold": 9.0}
     toy = {
         "name": "Toy",
@@ -220,7 +220,7 @@ def test_observations_stay_as_they_are(server: str) -> None:
     assert env.step(0)[0].flags.writeable
 
 
-def test_changing_observations_does_not_change_what_a_mask_leaves_alone(server: str) -> None:
+def test_changed_observations_do_not_change_masked_resets(server: str) -> None:
     envs = make_vec(num_envs=2, autoreset_mode=AutoresetMode.DISABLED, server=server)
     observations, _ = envs.reset(seed=1)
     expected = observations[1].tolist()

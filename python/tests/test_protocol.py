@@ -110,7 +110,7 @@ def test_what_an_episode_achieved_is_told_or_nan(outcome: dict[str, float], achi
     assert infos["_achieved"].all()
 
 
-def test_a_server_that_does_not_know_parameters_as_observations_is_refused(fake: FakeServer) -> None:
+def test_server_without_observed_parameters_is_refused(fake: FakeServer) -> None:
     fake.answers = [Answer(opened=opened())]
     with pytest.raises(perturb.ProtocolError, match="does not know observe='parameters': it is older"):
         perturb.PerturbEnv("CartPole", server=fake.address, observe="parameters").reset()

@@ -35,7 +35,7 @@ def differ(a: Picture, b: Picture) -> bool:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_gymnasiums_checker_accepts_the_pictures_of_every_environment(name: str, server: str) -> None:
+def test_gymnasiums_checker_accepts_all_pictures(name: str, server: str) -> None:
     env = gymnasium.make(identifier(name), version="E", server=server, **SMALL)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -180,7 +180,7 @@ def test_drawing_out_of_order_is_refused(server: str) -> None:
         env.render()
 
 
-def test_without_opengl_the_classic_tasks_are_drawn_and_the_robots_say_what_is_missing(
+def test_without_opengl_only_classic_tasks_are_drawn(
     start_server: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nowhere.json")  # no driver, for the server

@@ -30,9 +30,7 @@ def rows(page: str, part: str) -> list[str]:
     return [row for row in re.findall(r"<tr[^>]*>.*?</tr>", page, re.DOTALL) if part in row]
 
 
-def test_a_page_has_the_agent_its_figures_and_nothing_of_an_experiment(
-    assessment: perturb.Assessment, tmp_path: Path
-) -> None:
+def test_page_of_agent_alone_has_no_experiment(assessment: perturb.Assessment, tmp_path: Path) -> None:
     page = assessment.to_html(tmp_path / "page.html")
     assert (tmp_path / "page.html").read_text("utf-8") == page
     assert page == assessment.to_html()
@@ -142,7 +140,7 @@ def test_worst_contexts_are_those_that_fail(server: str) -> None:
         assessment.worst_contexts("R")
 
 
-def test_bootstrap_intervals_are_as_wide_as_the_spread_of_episodes(assessment: perturb.Assessment) -> None:
+def test_bootstrap_intervals_match_spread_of_episodes(assessment: perturb.Assessment) -> None:
     assert assessment["DD"].return_interval == (200.0, 200.0), "all are alike"
     columns = assessment.columns()
     for scenario in ("DE", "RE"):

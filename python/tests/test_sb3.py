@@ -158,7 +158,7 @@ def test_stable_baselines3s_own_evaluation_takes_it(server: str) -> None:
     envs.close()
 
 
-def test_a_model_is_assessed_to_the_same_bytes_again_after_it_was_saved(tmp_path: Path, server: str) -> None:
+def test_saved_model_is_evaluated_to_same_bytes(tmp_path: Path, server: str) -> None:
     models = {"D": trained(server, 4096), "R": trained(server, 4096, "R")}
     before = torch.rand(1), torch.get_rng_state()
     first = perturb.evaluate(models, "CartPole", episodes=200, seed=3, server=server)
@@ -256,7 +256,7 @@ def test_a_model_without_vec_normalize_is_taken_after_loading(kind: str, server:
     assert perturb.evaluate(loaded, name, **settings).results == perturb.evaluate(model, name, **settings).results
 
 
-def test_a_model_that_does_not_tell_its_vec_normalize_is_asked_for_it(server: str, tmp_path: Path) -> None:
+def test_model_without_evidence_of_vec_normalize_is_refused(server: str, tmp_path: Path) -> None:
     off_policy("SAC", False, server, 1).save(tmp_path / "model")
     loaded = stable_baselines3.SAC.load(tmp_path / "model", device="cpu")
     settings: dict[str, Any] = {"versions": ("D",), "episodes": 5, "server": server}

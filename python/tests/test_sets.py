@@ -63,7 +63,7 @@ def test_a_policy_is_tested_on_them_as_the_program_tests_it(tmp_path: Path, serv
     assert assessment.results[0].episodes == 21, "equally many in each of three contexts"
 
 
-def test_sampled_contexts_are_those_of_the_version_and_prefixes_of_more() -> None:
+def test_sampled_contexts_are_prefixes_of_larger_samples() -> None:
     few, many = (perturb.sets.sampled("train", "CartPole", count, version="E", seed=3) for count in (5, 400))
     assert few.contexts is not None
     assert many.contexts is not None

@@ -72,4 +72,6 @@ def _licence() -> str:
     for file in metadata.files("gymnasium") or []:
         if file.name.upper().startswith("LICENSE"):
             return file.read_text(encoding="utf-8")
-    return "This model is a part of Gymnasium, which has the MIT licence: https://github.com/Farama-Foundation/Gymnasium\n"
+    return (
+        "This model is a part of Gymnasium, which has the MIT licence: https://github.com/Farama-Foundation/Gymnasium\n"
+    )
