@@ -51,7 +51,7 @@ POLL_INTERVAL = 0.25
 # Pauses of this process that may explain a lost connection: from so many seconds on, for so many seconds afterwards.
 PAUSE_LIMIT, PAUSE_MEMORY = 2.0, 60.0
 # gRPC's codes of streams that a server ended.
-RESOURCE_EXHAUSTED, OUT_OF_RANGE, UNIMPLEMENTED, UNAUTHENTICATED = 8, 11, 12, 16
+DEADLINE_EXCEEDED, RESOURCE_EXHAUSTED, OUT_OF_RANGE, UNIMPLEMENTED, UNAUTHENTICATED = 4, 8, 11, 12, 16
 
 
 class Session:
@@ -257,7 +257,7 @@ class Session:
                 f"start one with `perturb-server --listen {_listen(self.address)}`, or correct server="
             )
         pause = _keepalive.longest_pause()
-        if pause >= PAUSE_LIMIT:
+        if pause >= PAUSE_LIMIT and code != DEADLINE_EXCEEDED:  # an idle session has the server's own reason
             return ServerConnectionError(
                 f"{lost}: {words}. This process stood still for {pause:.0f} s (Ctrl-Z, a debugger, a suspended "
                 "computer, or code that holds Python's lock), and did not answer the server's keepalive pings "

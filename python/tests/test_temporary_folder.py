@@ -1,0 +1,31 @@
+"""The private server's socket needs a temporary folder; errors name the variable that chooses it."""
+
+from __future__ import annotations
+
+import tempfile
+from typing import TYPE_CHECKING
+
+import pytest
+
+import perturb
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def test_long_temporary_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / ("x" * 100)
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    with pytest.raises(
+        perturb.ServerStartError, match=r"longer than the 107 bytes.*; set TMPDIR to a folder"
+    ) as caught:
+        perturb.PerturbEnv("CartPole").reset()
+    assert "server=" not in str(caught.value)
+    assert list(folder.iterdir()) == []
+
+
+def test_missing_temporary_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
+    with pytest.raises(perturb.ServerStartError, match=r"there is no folder for its socket .*; set TMPDIR"):
+        perturb.PerturbEnv("CartPole").reset()
