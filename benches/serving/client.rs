@@ -150,7 +150,12 @@ impl ServerProcess {
 
     /// A server with more flags.
     pub(crate) fn with_flags(workers: usize, flags: &[&Path]) -> Result<Self, Failure> {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_perturb-server"));
+        Self::program(env!("CARGO_BIN_EXE_perturb-server").as_ref(), workers, flags)
+    }
+
+    /// Starts another program of the server.
+    pub(crate) fn program(program: &Path, workers: usize, flags: &[&Path]) -> Result<Self, Failure> {
+        let mut command = Command::new(program);
         command.args(["--log", "warn", "--workers", &workers.to_string()]).args(flags);
         Self::start(command, |socket| vec!["--listen".into(), format!("unix:{}", socket.display())])
     }

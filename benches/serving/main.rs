@@ -6,12 +6,14 @@
 //! - CartPole over TCP with TLS, against without ([`encrypted`]);
 //! - the round trip of one environment, and the memory of one Hopper;
 //! - CartPole, 8 environments in which the server acts with a policy, against computing the actions alone ([`acting`]);
+//! - this server against another program of it ([`compare`]);
 //! - pictures of each environment, 480 × 480 pixels, and the server's memory growth by them.
 //!
 //! Servers are separate processes: `perturb-server`, and this program with the argument `echo` and a socket.
 
 mod acting;
 mod client;
+mod compare;
 mod echo;
 mod encrypted;
 #[cfg(feature = "mujoco")]
@@ -36,6 +38,10 @@ fn main() -> Result<(), Failure> {
         && kind == "echo"
     {
         return runtime.block_on(echo::serve(socket.as_ref()));
+    }
+    if let Some(place) = arguments.iter().position(|argument| argument == "compare") {
+        let program = arguments.get(place + 1).ok_or("compare needs the path of another perturb-server")?;
+        return runtime.block_on(compare::compared(program.as_ref()));
     }
     // Cargo adds --bench; any other argument selects figures by a part of their name.
     let filter = arguments.iter().skip(1).find(|argument| !argument.starts_with('-'));

@@ -17,6 +17,7 @@ mod folder;
 mod following;
 mod groups;
 mod guarded;
+mod handler;
 mod leases;
 mod lifecycle;
 #[cfg(feature = "mujoco")]
