@@ -9,13 +9,13 @@ use std::{
     time::Duration,
 };
 
-/// Bounds of a [`Histogram`]: 1 µs, and each twice the one before, up to 8.4 s.
-pub const BOUNDS: usize = 24;
+/// The number of bounds of a [`Histogram`]: 1 µs, and each twice the one before, up to 8.4 s.
+pub const N_BOUNDS: usize = 24;
 
 /// How long something took, how often.
 pub struct Histogram {
     /// For each bound those that took at most so long and longer than the bound before; at last the longer ones.
-    counts: [AtomicU64; BOUNDS + 1],
+    counts: [AtomicU64; N_BOUNDS + 1],
     nanos: AtomicU64,
 }
 
@@ -30,13 +30,13 @@ impl Histogram {
     pub fn observe(&self, time: Duration) {
         let nanos = u64::try_from(time.as_nanos()).unwrap_or(u64::MAX);
         let place = nanos.div_ceil(1000).max(1).next_power_of_two().trailing_zeros() as usize;
-        self.counts[place.min(BOUNDS)].fetch_add(1, Ordering::Relaxed);
+        self.counts[place.min(N_BOUNDS)].fetch_add(1, Ordering::Relaxed);
         self.nanos.fetch_add(nanos, Ordering::Relaxed);
     }
 
     /// For each bound, in s, and at last for infinity, how many there are up to it and beyond the one before.
-    pub fn counts(&self) -> [(f64, u64); BOUNDS + 1] {
-        let bound = |place| if place < BOUNDS { (1u64 << place) as f64 / 1e6 } else { f64::INFINITY };
+    pub fn counts(&self) -> [(f64, u64); N_BOUNDS + 1] {
+        let bound = |place| if place < N_BOUNDS { (1u64 << place) as f64 / 1e6 } else { f64::INFINITY };
         array::from_fn(|place| (bound(place), self.counts[place].load(Ordering::Relaxed)))
     }
 
@@ -46,8 +46,8 @@ impl Histogram {
     }
 }
 
-/// Sizes of batches that are told apart, by the greatest of each class; at last the larger ones.
-const CLASSES: [(usize, &str); 5] =
+/// The classes of batch sizes: the maximum size of each, and its label in metrics.
+const BATCH_SIZE_CLASSES: [(usize, &str); 5] =
     [(1, "1"), (16, "2-16"), (256, "17-256"), (4096, "257-4096"), (usize::MAX, "4097+")];
 
 /// What happens in the environments of one kind.
@@ -57,18 +57,18 @@ pub struct Meter {
     pub steps: AtomicU64,
     /// Episodes that ended.
     pub episodes: AtomicU64,
-    times: [Histogram; CLASSES.len()],
+    times: [Histogram; BATCH_SIZE_CLASSES.len()],
 }
 
 impl Meter {
     /// How long a step of a batch of this size takes: of all its environments, from the request's check to its reply.
     pub fn times(&self, size: usize) -> &Histogram {
-        &self.times[CLASSES.iter().position(|(greatest, _)| size <= *greatest).unwrap_or_default()]
+        &self.times[BATCH_SIZE_CLASSES.iter().position(|(greatest, _)| size <= *greatest).unwrap_or_default()]
     }
 
     /// The same for each class of sizes.
     pub fn classes(&self) -> impl Iterator<Item = (&'static str, &Histogram)> {
-        CLASSES.iter().map(|(_, name)| *name).zip(&self.times)
+        BATCH_SIZE_CLASSES.iter().map(|(_, name)| *name).zip(&self.times)
     }
 }
 

@@ -29,7 +29,8 @@ struct Pair {
 
 impl Pair {
     async fn open(other: &Path, name: &str, batch: usize, workers: usize, number: usize) -> Result<Self, Failure> {
-        let start = |own| if own { ServerProcess::server(workers) } else { ServerProcess::program(other, workers, &[]) };
+        let start =
+            |own| if own { ServerProcess::server(workers) } else { ServerProcess::program(other, workers, &[]) };
         let own_first = number.is_multiple_of(2);
         let first = start(own_first)?;
         let first_client = Client::open(&first.socket, name, batch).await?;

@@ -16,7 +16,7 @@ const FIRST: u32 = 1;
 
 /// Limit of a snapshot in bytes. The largest has a distribution of 64 intervals for each of 32 parameters, of R and of E,
 /// 64 KiB, and the numbers of a state and an observation of 4096 entries, some 50 KiB.
-pub const MOST_SNAPSHOT_BYTES: usize = 128 << 10;
+pub const MAX_SNAPSHOT_BYTES: usize = 128 << 10;
 
 /// More episodes than any environment runs: a snapshot that claims more would let the counts overflow.
 const MAX_EPISODE: u64 = 1 << 63;
@@ -134,7 +134,7 @@ impl Saved {
         let refuse = |reason: String| Err(Error::Snapshot { reason });
         let unreadable = || refuse(format!("its {} bytes are not a snapshot", snapshot.len()));
         // A byte of it may claim a list, which takes more than twenty.
-        if snapshot.len() > MOST_SNAPSHOT_BYTES {
+        if snapshot.len() > MAX_SNAPSHOT_BYTES {
             return unreadable();
         }
         let Ok((mut saved, rest)) = postcard::take_from_bytes::<Saved>(snapshot) else { return unreadable() };

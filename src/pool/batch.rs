@@ -29,14 +29,15 @@ use std::{
 };
 use tokio::time::Instant;
 
-/// What one shard should cost, in µs: long enough to hide the queue, short enough that sessions take turns …
-const SHARD_COST: RangeInclusive<f64> = 20.0..=200.0;
-/// … and so many of each worker's share that workers end together.
-const SHARDS_A_WORKER: f64 = 32.0;
-/// What each worker's share should at least cost, in µs, for more than one to be set to work.
-const LEAST_SHARE: f64 = 10.0;
-/// So many environments are freed in less time than the transport notices, and no other thread is asked to.
-const FEW: usize = 64;
+/// The cost of one shard: long enough to hide the queue, short enough that sessions take turns.
+const SHARD_COST_US: RangeInclusive<f64> = 20.0..=200.0;
+/// The number of shards of each worker, if they are long enough, so that workers end together.
+const SHARDS_PER_WORKER: f64 = 32.0;
+/// The minimum cost of a worker's share for more than one worker to be used.
+const MIN_WORKER_SHARE_US: f64 = 10.0;
+/// Batches of at most this many environments are freed on the transport's thread, since that takes less time than it
+/// notices.
+const INLINE_DROP_MAX_ENVS: usize = 64;
 
 /// One environment's part of a reset: a new episode, or with a seed or distributions a new trial.
 #[derive(Debug, Clone, PartialEq)]
@@ -373,7 +374,7 @@ impl Batch {
     }
 
     fn refuse_ended(&self) -> Result<(), Error> {
-        const SHOWN: usize = 8;
+        const MAX_SHOWN_SLOTS: usize = 8;
         let mut ended: Vec<String> = Vec::new();
         for shard in &self.job.shards {
             ended.extend(lock(shard).ended_slots().map(|slot| slot.to_string()));
@@ -381,8 +382,8 @@ impl Batch {
         if ended.is_empty() {
             return Ok(());
         }
-        let more = ended.len().saturating_sub(SHOWN);
-        ended.truncate(SHOWN);
+        let more = ended.len().saturating_sub(MAX_SHOWN_SLOTS);
+        ended.truncate(MAX_SHOWN_SLOTS);
         let more = if more > 0 { format!(" and {more} more") } else { String::new() };
         Err(Error::Ended { slots: ended.join(", ") + &more })
     }
@@ -423,7 +424,7 @@ impl Drop for Batch {
     fn drop(&mut self) {
         self.job.abandoned.store(true, Ordering::Relaxed);
         let is_idle = Arc::strong_count(&self.job) == 1;
-        if self.size() <= FEW && (is_idle || self.farewell.is_none()) {
+        if self.size() <= INLINE_DROP_MAX_ENVS && (is_idle || self.farewell.is_none()) {
             if let Some(tell) = self.farewell.take() {
                 tell(draws(&self.job));
             }
@@ -486,7 +487,7 @@ fn cut(groups: &[SlotGroup], size: usize) -> Vec<Vec<SlotGroup>> {
 fn shard_size(spec: &EnvironmentSpec, batch: usize, workers: usize) -> usize {
     let by_workers = batch.div_ceil(workers);
     let share = spec.step_cost * by_workers as f64;
-    let cost = (share / SHARDS_A_WORKER).clamp(*SHARD_COST.start(), *SHARD_COST.end());
+    let cost = (share / SHARDS_PER_WORKER).clamp(*SHARD_COST_US.start(), *SHARD_COST_US.end());
     let by_cost = (cost / spec.step_cost).ceil() as usize;
-    if share >= LEAST_SHARE { by_cost.min(by_workers).max(1) } else { by_cost.max(1) }
+    if share >= MIN_WORKER_SHARE_US { by_cost.min(by_workers).max(1) } else { by_cost.max(1) }
 }

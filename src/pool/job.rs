@@ -12,16 +12,15 @@ use std::{
 };
 use tokio::sync::Notify;
 
-/// A job of at most so many µs is done by whoever asks. To have a worker do it takes longer, and no more than one would be
-/// set to it.
-pub(super) const TINY: f64 = 20.0;
-/// The same for a session that stepped last, too: to hand a job over and to be told of its end costs more, where all
-/// cores are awake, than a second worker saves, and no other session waits.
-pub(super) const TINY_ALONE: f64 = 80.0;
-/// One of at most so many µs is short, …
-const SHORT: f64 = 50.0;
-/// … and looked after so often before its session sleeps, about twice that time.
-const POLLS: usize = 50;
+/// Batches cheaper than this run on the session's thread, since a hand-over to a worker costs more.
+pub(super) const INLINE_MAX_US: f64 = 20.0;
+/// The same limit while no other session has stepped meanwhile. A hand-over costs more than a second worker saves, and no
+/// other session waits.
+pub(super) const INLINE_MAX_US_UNCONTENDED: f64 = 80.0;
+/// The session polls for the end of a job that is at most this expensive before it sleeps.
+const POLL_MAX_US: f64 = 50.0;
+/// The number of polls, which take about twice that time.
+const POLLS_BEFORE_WAIT: usize = 50;
 
 /// What a job does at a step's end.
 pub(super) enum Next {
@@ -87,7 +86,7 @@ impl Job {
             halted: AtomicBool::new(false),
             failed: AtomicBool::new(false),
             cost,
-            patience: if cost <= SHORT { POLLS } else { 0 },
+            patience: if cost <= POLL_MAX_US { POLLS_BEFORE_WAIT } else { 0 },
             permit,
             tally,
         }
@@ -95,7 +94,7 @@ impl Job {
 
     /// Whether workers step it, whoever else steps.
     pub(super) fn is_for_workers(&self) -> bool {
-        self.cost > TINY_ALONE
+        self.cost > INLINE_MAX_US_UNCONTENDED
     }
 
     /// Whether a worker panicked on it, now or earlier.

@@ -12,14 +12,14 @@ use std::{
     time::Duration,
 };
 
-/// The niceness of the thread, for which nobody waits.
-const NICENESS: i32 = 3;
+/// The niceness of the thread: nobody waits for it.
+const REAPER_NICENESS: i32 = 3;
 
 /// Frees what a session leaves behind, and says whether it could: thousands of environments take longer than the transport
 /// may be kept.
 pub(super) type Rest = Box<dyn FnMut() -> bool + Send>;
-/// How often it is looked whether what could not be freed can be.
-const AGAIN: Duration = Duration::from_millis(1);
+/// The interval at which a batch that was still in use is tried again.
+const REAP_INTERVAL: Duration = Duration::from_millis(1);
 
 /// The way to the thread that frees, until it is closed.
 pub(super) struct Reaper(Mutex<Option<mpsc::Sender<Rest>>>);
@@ -32,7 +32,7 @@ impl Reaper {
     pub(super) fn start() -> io::Result<(Self, JoinHandle<()>)> {
         let (rests, received) = mpsc::channel::<Rest>();
         let freeing = move || {
-            lower(NICENESS);
+            lower(REAPER_NICENESS);
             free(&received);
         };
         let thread = thread::Builder::new().name("free".into()).spawn(freeing)?;
@@ -58,7 +58,7 @@ fn free(received: &mpsc::Receiver<Rest>) {
     loop {
         let come = match left.is_empty() {
             true => received.recv().map_err(|_| RecvTimeoutError::Disconnected),
-            false => received.recv_timeout(AGAIN),
+            false => received.recv_timeout(REAP_INTERVAL),
         };
         match come {
             Ok(rest) => left.push(rest),

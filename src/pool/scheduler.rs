@@ -3,7 +3,7 @@
 use super::{
     Error,
     capacity::Capacity,
-    job::{Job, Next, TINY, TINY_ALONE},
+    job::{INLINE_MAX_US, INLINE_MAX_US_UNCONTENDED, Job, Next},
     reaper::Reaper,
     rollout::round::Round,
     sync::lock,
@@ -23,12 +23,12 @@ use std::{
 };
 use tokio::time::Instant;
 
-/// How often an idle worker offers its core before it sleeps. A sleeping worker costs the next request a wake-up, which
-/// is more than a step of many small environments.
+/// The number of times that an idle worker yields its core before it sleeps. To wake a worker takes longer than a step of
+/// many small environments.
 const YIELDS_BEFORE_SLEEP: usize = 100;
 
-/// The workers' niceness: the transport, which has little to do at a time, comes before them.
-const NICENESS: i32 = 1;
+/// The niceness of the workers: the transport, which has little to do at a time, comes before them.
+const WORKER_NICENESS: i32 = 1;
 
 /// Worker threads that step batches, and the count of environments they may hold.
 pub struct Pool {
@@ -145,7 +145,7 @@ struct Queue {
 impl Shared {
     /// Steps the environments of every shard here, if that is soon done; whether it was.
     pub(super) fn step_here(&self, job: &Job) -> bool {
-        let tiny = if self.moves(job) { TINY_ALONE } else { TINY };
+        let tiny = if self.moves(job) { INLINE_MAX_US_UNCONTENDED } else { INLINE_MAX_US };
         if job.cost > tiny {
             return false;
         }
@@ -250,7 +250,7 @@ impl Shared {
     }
 
     fn work(&self, worker: usize) {
-        lower(NICENESS);
+        lower(WORKER_NICENESS);
         while let Some(job) = self.pop() {
             if job.run_part(worker) {
                 self.conduct(&job);

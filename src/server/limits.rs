@@ -1,8 +1,8 @@
 //! How large requests may be.
 
-/// The most bytes of a request before a session is open: enough for thousands of groups, and little enough that all
+/// The maximum length of a request before a session is open: enough for thousands of groups, and little enough that all
 /// sessions may come so far.
-pub const MOST_BYTES_BEFORE_OPEN: usize = 64 << 10;
+pub const MAX_BYTES_BEFORE_OPEN: usize = 64 << 10;
 
 /// What a stream may send now.
 #[derive(Debug, Clone, Copy)]

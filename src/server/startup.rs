@@ -48,18 +48,19 @@ use tonic_health::{
 };
 use tower::{Layer, ServiceBuilder};
 
-/// What a stream's client may send before it is read: the actions of ten thousand robots.
-const STREAM_WINDOW: u32 = 1 << 20;
-/// One session whose requests pile up should not stall the others of its connection: room for 16 such.
-const CONNECTION_WINDOW: u32 = 16 * STREAM_WINDOW;
-/// Streams of a connection beside sessions: health, the catalogue, reflection.
-const OTHER_STREAMS: usize = 16;
-/// How long a call may take that is no stream.
-const UNARY_LIMIT: Duration = Duration::from_secs(10);
-/// The most bytes of a request outside streams of sessions: it is a name or nothing.
-const UNARY_BYTES: usize = 1 << 10;
-/// How long connections may take to notice the end.
-const FAREWELL: Duration = Duration::from_secs(1);
+/// The flow-control window of a stream: the actions of ten thousand robots.
+const STREAM_WINDOW_BYTES: u32 = 1 << 20;
+/// The flow-control window of a connection. A session whose requests pile up does not stall the others: there is room for
+/// 16 of them.
+const CONNECTION_WINDOW_BYTES: u32 = 16 * STREAM_WINDOW_BYTES;
+/// The streams of a connection beside its sessions: health, the catalogue, reflection.
+const MAX_OTHER_STREAMS: usize = 16;
+/// The timeout of calls that are not streams.
+const UNARY_TIMEOUT: Duration = Duration::from_secs(10);
+/// The maximum length of a request outside the streams of sessions: it is a name or nothing.
+const MAX_UNARY_BYTES: usize = 1 << 10;
+/// The time in which connections must close at the end of a shutdown.
+const CONNECTION_CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 /// The services whose health is told by name.
 const SERVICES: [&str; 2] = [PerturbServer::<Service>::NAME, EnvironmentServer::<dm_env_rpc::service::Service>::NAME];
 
@@ -160,7 +161,7 @@ impl State {
         let handshake = Duration::from_secs(config.handshake_seconds);
         let limits = Limits { bytes: config.max_message_bytes, handshake, idle: seconds(config.idle_seconds) };
         let of_a_peer = if config.max_peer_sessions > 0 { config.max_peer_sessions } else { usize::MAX };
-        let connections = Places::new(usize::MAX, of_a_peer.saturating_add(OTHER_STREAMS));
+        let connections = Places::new(usize::MAX, of_a_peer.saturating_add(MAX_OTHER_STREAMS));
         let (errors, access, leased) = (ErrorCounters::default(), Access::default(), lease::Numbers::default());
         let places = Places::new(config.max_sessions, of_a_peer);
         let sessions = Sessions::new(places.clone(), limits, drain, errors.clone(), access.clone(), leased.clone());
@@ -231,7 +232,7 @@ fn router<H: Health>(
 ) -> Result<Router, Error> {
     let auth = AuthLayer::new(tokens, state.errors.clone());
     let perturb = PerturbServer::new(service)
-        .max_decoding_message_size(UNARY_BYTES) // of all but sessions
+        .max_decoding_message_size(MAX_UNARY_BYTES) // of all but sessions
         .max_encoding_message_size(usize::MAX);
     let perturb = ServiceBuilder::new()
         .layer(auth.clone())
@@ -243,20 +244,20 @@ fn router<H: Health>(
         .service(EnvironmentServer::new(worlds).max_encoding_message_size(usize::MAX));
     let (reflection_v1, reflection_v1alpha) = (reflection().build_v1()?, reflection().build_v1alpha()?);
     let keepalive = Duration::from_secs(config.keepalive_seconds);
-    let streams = u32::try_from(config.max_sessions.saturating_add(OTHER_STREAMS)).unwrap_or(u32::MAX);
+    let streams = u32::try_from(config.max_sessions.saturating_add(MAX_OTHER_STREAMS)).unwrap_or(u32::MAX);
     Ok(Server::builder()
         .http2_keepalive_interval(Some(keepalive))
         .http2_keepalive_timeout(Some(keepalive))
-        .initial_stream_window_size(STREAM_WINDOW)
-        .initial_connection_window_size(CONNECTION_WINDOW)
+        .initial_stream_window_size(STREAM_WINDOW_BYTES)
+        .initial_connection_window_size(CONNECTION_WINDOW_BYTES)
         .max_concurrent_streams(streams)
-        .timeout(UNARY_LIMIT) // until an answer begins, which that of a stream does at once
+        .timeout(UNARY_TIMEOUT) // until an answer begins, which that of a stream does at once
         .add_service(perturb)
         .add_service(worlds)
         // Health is for everybody: whoever watches over servers need not be able to use them.
-        .add_service(health.max_decoding_message_size(UNARY_BYTES))
-        .add_service(auth.layer(reflection_v1.max_decoding_message_size(UNARY_BYTES)))
-        .add_service(auth.layer(reflection_v1alpha.max_decoding_message_size(UNARY_BYTES))))
+        .add_service(health.max_decoding_message_size(MAX_UNARY_BYTES))
+        .add_service(auth.layer(reflection_v1.max_decoding_message_size(MAX_UNARY_BYTES)))
+        .add_service(auth.layer(reflection_v1alpha.max_decoding_message_size(MAX_UNARY_BYTES))))
 }
 
 fn reflection() -> tonic_reflection::server::Builder<'static> {
@@ -326,7 +327,7 @@ async fn shut_down(
         tracing::info!(protocol, "requests: {counts}");
     }
     let farewell = async { while servers.join_next().await.is_some() {} };
-    if timeout(FAREWELL, farewell).await.is_err() {
+    if timeout(CONNECTION_CLOSE_TIMEOUT, farewell).await.is_err() {
         tracing::debug!("some connections did not close by themselves");
     }
 }

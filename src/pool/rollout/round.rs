@@ -17,12 +17,12 @@ use bytes::BytesMut;
 use perturb_policy::{CollectUntil, RemainingRollout, RolloutStep};
 use std::sync::Mutex;
 
-/// A round of about so many bytes ends: many gRPC libraries receive no more than 4 MiB.
-const MOST_BYTES: usize = 4_000_000;
-/// What an episode's end takes beside its receipt, in bytes; roughly.
-const END_BYTES: usize = 100;
-/// Room that is made beforehand where the number of steps is not known.
-const FIRST_ROOM: usize = 256;
+/// A reply ends at about this length: many gRPC libraries receive no more than 4 MiB.
+const MAX_REPLY_BYTES: usize = 4_000_000;
+/// The estimated length of an episode's end without its receipt.
+const EPISODE_END_BYTES: usize = 100;
+/// The steps that buffers are made for at first where the number of steps is not known.
+const INITIAL_CAPACITY_STEPS: usize = 256;
 
 /// What is to be played in a round.
 #[derive(Debug, Clone)]
@@ -164,7 +164,7 @@ impl Round {
                     }
                     return Ok(false);
                 }
-                if played.steps >= turn.most_steps || played.size() >= MOST_BYTES {
+                if played.steps >= turn.most_steps || played.size() >= MAX_REPLY_BYTES {
                     return Ok(false);
                 }
             }
@@ -191,9 +191,9 @@ impl Played {
         let step_bytes = n_envs * (4 * (spec.observation_size + spec.action.width() + 4) + 3);
         let steps = match play.task() {
             RemainingRollout::Steps(left) => turn.most_steps.min(*left),
-            RemainingRollout::Episodes(_) => turn.most_steps.min(FIRST_ROOM),
+            RemainingRollout::Episodes(_) => turn.most_steps.min(INITIAL_CAPACITY_STEPS),
         };
-        let steps = steps.min(MOST_BYTES / step_bytes + 1);
+        let steps = steps.min(MAX_REPLY_BYTES / step_bytes + 1);
         let room = |bytes: usize| BytesMut::with_capacity(steps * n_envs * bytes);
         self.observations = room(4 * spec.observation_size);
         self.actions = room(4 * spec.action.width());
@@ -242,5 +242,5 @@ impl Played {
 /// What an episode's end takes on the wire, roughly.
 fn end_bytes(end: &EpisodeEnd) -> usize {
     let receipt = end.receipt.as_ref();
-    END_BYTES + receipt.map_or(0, |r| 8 * (r.requested.len() + r.applied.len()) + r.model_hash.len())
+    EPISODE_END_BYTES + receipt.map_or(0, |r| 8 * (r.requested.len() + r.applied.len()) + r.model_hash.len())
 }

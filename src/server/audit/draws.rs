@@ -26,8 +26,8 @@ pub struct Draws {
     refused: Arc<AtomicU32>,
 }
 
-/// So many refusals of a session are written down: it may ask for ever.
-const MOST_REFUSED: u32 = 100;
+/// The ledger has at most this many refusals of a session: a client may ask for ever.
+const MAX_LOGGED_REFUSALS: u32 = 100;
 
 /// What was written down, until it is known whether it happens.
 #[derive(Default)]
@@ -163,7 +163,7 @@ impl Draws {
         let region = spec.region(distributions);
         let Err(reason) = role.check(spec, &region) else { return Ok(()) };
         if let Some(ledger) = &self.ledger
-            && self.refused.fetch_add(1, Ordering::Relaxed) < MOST_REFUSED
+            && self.refused.fetch_add(1, Ordering::Relaxed) < MAX_LOGGED_REFUSALS
         {
             ledger.note(LedgerEvent::Refused { who: self.who(spec), region: region.clone(), reason: reason.clone() });
         }

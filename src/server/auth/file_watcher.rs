@@ -7,8 +7,8 @@ use std::{
     time::Duration,
 };
 
-/// How often they are looked at.
-const PERIOD: Duration = Duration::from_millis(500);
+/// The interval at which the files are read.
+const POLL_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Looks at files, on a thread of its own, until it is dropped.
 pub struct Watch(#[expect(dead_code, reason = "its end is the thread's")] Sender<()>);
@@ -41,7 +41,7 @@ impl Watch {
         let look = move || {
             let mut taken: Contents = Ok(before);
             let mut last = taken.clone();
-            while ended.recv_timeout(PERIOD) == Err(RecvTimeoutError::Timeout) {
+            while ended.recv_timeout(POLL_INTERVAL) == Err(RecvTimeoutError::Timeout) {
                 let now = read(&paths);
                 if now != taken && now == last {
                     match now.as_ref().map_err(Clone::clone).and_then(|contents| renew(contents)) {

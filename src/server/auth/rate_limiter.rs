@@ -7,14 +7,14 @@ use std::{
 };
 use tokio::time::{Instant, sleep};
 
-/// Steps of so long can be made up for, s.
-const BURST: f64 = 1.0;
-/// The longest wait: clients give a reply a minute.
-const LONGEST: Duration = Duration::from_secs(30);
-/// What is rounded away is waited for, too.
-const SHORTEST: Duration = Duration::from_micros(1);
-/// How often a request that waits looks whether the rate is another one by now.
-const LOOK: Duration = Duration::from_millis(500);
+/// A token that was idle may catch up on the steps of this time, in seconds.
+const BURST_SECONDS: f64 = 1.0;
+/// A request that would wait longer is refused: clients give a reply a minute.
+const MAX_WAIT: Duration = Duration::from_secs(30);
+/// The minimum sleep; without it a wait that is rounded to zero would spin.
+const MIN_WAIT: Duration = Duration::from_micros(1);
+/// The interval at which a waiting request checks whether the rate has changed.
+const RECHECK_INTERVAL: Duration = Duration::from_millis(500);
 
 /// A token's rate, and where it stands.
 #[derive(Default)]
@@ -26,7 +26,7 @@ struct State {
     rate: Option<u32>,
     /// Steps so far.
     done: f64,
-    /// Those that the rate has allowed by `at`, at most [`BURST`] more than were done.
+    /// Those that the rate has allowed by `at`, at most [`BURST_SECONDS`] more than were done.
     allowed: f64,
     at: Option<Instant>,
     waited: Duration,
@@ -91,7 +91,7 @@ impl State {
     fn settle(&mut self, now: Instant) {
         let elapsed = self.at.map_or(Duration::ZERO, |at| now.saturating_duration_since(at)).as_secs_f64();
         self.allowed = match self.rate.map(f64::from) {
-            Some(rate) => (self.allowed + elapsed * rate).min(self.done + BURST * rate),
+            Some(rate) => (self.allowed + elapsed * rate).min(self.done + BURST_SECONDS * rate),
             None => self.done,
         };
         self.at = Some(now);
@@ -107,10 +107,10 @@ impl State {
         }
         // A rate is at least 1.
         let ahead = Duration::from_secs_f64(steps / f64::from(rate));
-        if ahead > LONGEST {
+        if ahead > MAX_WAIT {
             return Err(TooFast { rate, ahead });
         }
-        let wait = ahead.clamp(SHORTEST, LOOK);
+        let wait = ahead.clamp(MIN_WAIT, RECHECK_INTERVAL);
         self.waited += wait;
         Ok(Some(wait))
     }

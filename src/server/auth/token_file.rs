@@ -11,17 +11,17 @@ use std::{
 };
 use toml::Spanned;
 
-/// Fewer characters could be guessed.
-const SHORTEST: usize = 16;
-/// What an entry may have.
-const ENTRY: &str = "[[token]] with name = \"…\", sha256 = \"64 hexadecimal digits\" or token = \"…\", and if need be \
+/// The minimum length of a token; a shorter one could be guessed.
+const MIN_TOKEN_CHARS: usize = 16;
+/// The format of the file, as errors tell it.
+const EXPECTED_ENTRY: &str = "[[token]] with name = \"…\", sha256 = \"64 hexadecimal digits\" or token = \"…\", and if need be \
                      max_sessions = N, max_envs = N, \
                      max_steps_per_second = N, max_bytes = N and role = \"…\"; [[role]] with name, draws = [\"D\", \"R\", …] and \
                      never = […]; [[set]] with name, environment, version and parameters";
 
 /// Why a file of tokens is refused. Nothing of a token is in it.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("line {line}: {what}; expected {ENTRY}")]
+#[error("line {line}: {what}; expected {EXPECTED_ENTRY}")]
 pub struct Wrong {
     pub(super) line: usize,
     what: String,
@@ -185,8 +185,8 @@ fn digest(entry: &Entry) -> Result<[u8; 32], String> {
             }
             Ok(digest)
         }
-        (None, Some(token)) if token.len() < SHORTEST => {
-            Err(format!("the token of {name:?} has fewer than {SHORTEST} characters"))
+        (None, Some(token)) if token.len() < MIN_TOKEN_CHARS => {
+            Err(format!("the token of {name:?} has fewer than {MIN_TOKEN_CHARS} characters"))
         }
         (None, Some(token)) if !token.bytes().all(|byte| byte.is_ascii_graphic()) => {
             Err(format!("the token of {name:?} has characters that are no visible ones of ASCII"))

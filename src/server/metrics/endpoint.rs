@@ -16,21 +16,21 @@ use tokio::{
     time::{sleep, timeout},
 };
 
-/// Where the page is.
+/// The path of the page.
 pub const PATH: &str = "/metrics";
-/// Connections at a time; others wait to be accepted.
-const AT_A_TIME: usize = 16;
-/// How long a connection may be there, which asks once.
-const LIMIT: Duration = Duration::from_secs(5);
-/// How long to wait where the system has no room for another connection.
-const PAUSE: Duration = Duration::from_millis(200);
-/// The most bytes of a request's head.
-const HEAD: usize = 16 << 10;
-const FORMAT: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+/// The maximum number of connections; others wait to be accepted.
+const MAX_CONNECTIONS: usize = 16;
+/// The time in which a connection must send its request and take the reply.
+const CONNECTION_TIMEOUT: Duration = Duration::from_secs(5);
+/// The pause after the system refuses to accept a connection.
+const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(200);
+/// The maximum length of a request's head.
+const MAX_HEAD_BYTES: usize = 16 << 10;
+const CONTENT_TYPE_OPENMETRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
 /// Answers whoever connects, for ever.
 pub async fn serve(listener: Listener, sources: Arc<Sources>) {
-    let places = Arc::new(Semaphore::new(AT_A_TIME));
+    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     loop {
         let Ok(place) = Arc::clone(&places).acquire_owned().await else { return };
         let sources = Arc::clone(&sources);
@@ -50,7 +50,7 @@ pub async fn serve(listener: Listener, sources: Arc<Sources>) {
 
 async fn pause(error: &io::Error) {
     tracing::warn!(%error, "cannot accept a connection for metrics");
-    sleep(PAUSE).await;
+    sleep(ACCEPT_RETRY_DELAY).await;
 }
 
 /// One request, one answer.
@@ -60,15 +60,18 @@ async fn converse(stream: impl AsyncRead + AsyncWrite + Unpin, sources: Arc<Sour
         async move { Ok::<_, Infallible>(response) }
     });
     let mut http = http1::Builder::new();
-    http.timer(TokioTimer::new()).header_read_timeout(LIMIT).keep_alive(false).max_buf_size(HEAD);
+    http.timer(TokioTimer::new())
+        .header_read_timeout(CONNECTION_TIMEOUT)
+        .keep_alive(false)
+        .max_buf_size(MAX_HEAD_BYTES);
     // Whoever goes early or sends what is no HTTP gets nothing, and nobody else minds.
-    let _ = timeout(LIMIT, http.serve_connection(TokioIo::new(stream), answer)).await;
+    let _ = timeout(CONNECTION_TIMEOUT, http.serve_connection(TokioIo::new(stream), answer)).await;
 }
 
 fn answer(request: &Request<Incoming>, sources: &Arc<Sources>) -> Response<Full<Bytes>> {
     let (status, format, text) = match (request.uri().path(), request.method()) {
         (PATH, &Method::GET) => match page::page(sources) {
-            Ok(text) => (StatusCode::OK, FORMAT, text),
+            Ok(text) => (StatusCode::OK, CONTENT_TYPE_OPENMETRICS, text),
             Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, "text/plain", format!("{error}\n")),
         },
         (PATH, _) => (StatusCode::METHOD_NOT_ALLOWED, "text/plain", "ask with GET\n".into()),

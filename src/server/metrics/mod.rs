@@ -19,8 +19,8 @@ use crate::{meters::Histogram, pool::Pool};
 use std::{sync::Arc, time::Duration};
 use tokio::time::{Instant, sleep_until};
 
-/// How often it is looked how late the transport's thread wakes.
-const TICK: Duration = Duration::from_millis(100);
+/// The interval at which the wake-up delay of the transport's thread is measured.
+const LAG_CHECK_INTERVAL: Duration = Duration::from_millis(100);
 
 /// A protocol, and its requests by kind.
 pub type RequestCounts = (&'static str, Arc<Counts>);
@@ -55,7 +55,7 @@ impl Sources {
     /// Watches how late the thread wakes that runs this, for ever.
     pub async fn watch_lag(&self) {
         loop {
-            let due = Instant::now() + TICK;
+            let due = Instant::now() + LAG_CHECK_INTERVAL;
             sleep_until(due).await;
             self.lag.observe(due.elapsed());
         }

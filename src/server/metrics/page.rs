@@ -17,8 +17,8 @@ use tonic::Code;
 
 type Written = Result<(), fmt::Error>;
 type Labels<'a, const N: usize> = [(&'static str, &'a str); N];
-/// Of a metric that has no other.
-const NONE: Labels<'static, 0> = [];
+/// The labels of a metric without labels.
+const NO_LABELS: Labels<'static, 0> = [];
 
 /// The page of these numbers, as they are now.
 ///
@@ -67,9 +67,9 @@ impl Numbers {
             ("perturb_in_flight_bytes", "Bytes in flight now", budget.used()),
             ("perturb_in_flight_bytes_limit", "The most bytes in flight", budget.limit()),
         ] {
-            page.gauges(name, help, [(NONE, value as f64)])?;
+            page.gauges(name, help, [(NO_LABELS, value as f64)])?;
         }
-        let resumed = [(NONE, leases.resumed() as f64)];
+        let resumed = [(NO_LABELS, leases.resumed() as f64)];
         page.counters("perturb_sessions_resumed", "How often a session was taken up by another stream", resumed)
     }
 
@@ -107,10 +107,10 @@ impl Numbers {
         page.histograms("perturb_step_seconds", help, each)?;
         let Sources { pool, pictures, lag, .. } = &*self.0;
         let help = "How long a batch waits until a worker takes a part of it, each time";
-        page.histograms("perturb_queue_wait_seconds", help, [(NONE, pool.waits())])?;
+        page.histograms("perturb_queue_wait_seconds", help, [(NO_LABELS, pool.waits())])?;
         let help = "How late the thread wakes that talks to clients; 1 ms or 2 are the timer's own";
-        page.histograms("perturb_transport_lag_seconds", help, [(NONE, lag)])?;
-        page.histograms("perturb_picture_seconds", "How long a picture is drawn", [(NONE, &**pictures)])
+        page.histograms("perturb_transport_lag_seconds", help, [(NO_LABELS, lag)])?;
+        page.histograms("perturb_picture_seconds", "How long a picture is drawn", [(NO_LABELS, &**pictures)])
     }
 
     fn tokens(&self, page: &mut Page<'_>) -> Written {
@@ -131,7 +131,7 @@ impl Numbers {
 /// What the system says of the process, if it does.
 fn resources(page: &mut Page<'_>) -> Written {
     let Ok(resources) = process::resources() else { return Ok(()) };
-    page.counters("process_cpu_seconds", "Processor time", [(NONE, resources.cpu_seconds)])?;
+    page.counters("process_cpu_seconds", "Processor time", [(NO_LABELS, resources.cpu_seconds)])?;
     for (name, help, value) in [
         ("process_resident_memory_bytes", "Memory in use", resources.resident_bytes as f64),
         ("process_start_time_seconds", "When the process started, since 1970", resources.start_seconds),
@@ -143,7 +143,7 @@ fn resources(page: &mut Page<'_>) -> Written {
             resources.most_descriptors.map_or(f64::INFINITY, |n| n as f64),
         ),
     ] {
-        page.gauges(name, help, [(NONE, value)])?;
+        page.gauges(name, help, [(NO_LABELS, value)])?;
     }
     Ok(())
 }

@@ -8,18 +8,18 @@ use std::{
 };
 use tokio::{runtime::Handle, time::Instant};
 
-/// The most lines in …
-const MOST_LINES: u64 = 20;
-/// … this time; then one that says how many were left out.
+/// The access log has at most this many lines in a window. One more line says how many sessions were left out.
+const MAX_LINES_PER_WINDOW: u64 = 20;
+/// The length of a window.
 const WINDOW: Duration = Duration::from_secs(1);
 
-/// How a session ends whose client or connection is gone; …
+/// The ending of a session whose client or connection is gone.
 pub const GONE: &str = "gone";
-/// … one whose client has ended it; …
+/// The ending of a session that its client has closed.
 pub const CLOSED: &str = "closed";
-/// … one whose requests were not to be understood; …
+/// The ending of a session whose requests cannot be decoded.
 pub const BROKEN: &str = "broken";
-/// … one whose lease is over. The others end with the reason of a refusal.
+/// The ending of a session whose lease is over. All other endings are the reasons of errors.
 pub const LEASE_OVER: &str = "lease_over";
 
 /// What a session came to.
@@ -97,11 +97,11 @@ impl Access {
         let now = Instant::now();
         let (since, wanted) = state.window.get_or_insert((now, 0));
         // A window with lines left out ends when they are told.
-        if *wanted <= MOST_LINES && since.elapsed() >= WINDOW {
+        if *wanted <= MAX_LINES_PER_WINDOW && since.elapsed() >= WINDOW {
             (*since, *wanted) = (now, 0);
         }
         *wanted += 1;
-        if *wanted == MOST_LINES + 1
+        if *wanted == MAX_LINES_PER_WINDOW + 1
             && let Ok(runtime) = Handle::try_current()
         {
             let (access, end) = (self.clone(), *since + WINDOW);
@@ -110,12 +110,12 @@ impl Access {
                 access.tell_left_out();
             });
         }
-        *wanted <= MOST_LINES
+        *wanted <= MAX_LINES_PER_WINDOW
     }
 
     fn tell_left_out(&self) {
         let window = self.lock().window.take();
-        let left_out = window.map_or(0, |(_, wanted)| wanted.saturating_sub(MOST_LINES));
+        let left_out = window.map_or(0, |(_, wanted)| wanted.saturating_sub(MAX_LINES_PER_WINDOW));
         tracing::info!(target: "perturb::access", left_out, "more sessions ended than there are lines for");
     }
 

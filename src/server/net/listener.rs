@@ -21,10 +21,10 @@ use tokio::{
 };
 use tokio_rustls::server::TlsStream;
 
-/// How long to wait where the system has no room for another connection.
-const PAUSE: Duration = Duration::from_millis(200);
-/// The most connections that wait to be accepted.
-const BACKLOG: u32 = 1024;
+/// The pause after the system refuses to accept a connection.
+const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(200);
+/// The length of the system's queue of connections that are not accepted yet.
+const MAX_PENDING_CONNECTIONS: u32 = 1024;
 
 /// A bound address.
 pub enum Listener {
@@ -168,7 +168,7 @@ fn explain(address: &ListenAddress, flag: &str, error: &io::Error) -> String {
 /// Out of file descriptors, most likely: trying again at once would keep the thread from those it serves.
 async fn pause(error: &io::Error) {
     tracing::warn!(%error, "cannot accept a connection");
-    tokio::time::sleep(PAUSE).await;
+    tokio::time::sleep(ACCEPT_RETRY_DELAY).await;
 }
 
 /// Removes a socket's file when it is dropped, unless another server's has taken its place.
@@ -221,7 +221,7 @@ impl Listener {
                 let socket = socket.map_err(explain)?;
                 let file = SocketFile { path: path.clone(), identity: identity(path) };
                 std::fs::set_permissions(path, Permissions::from_mode(mode.bits())).map_err(explain)?;
-                Ok(Self::Unix(socket.listen(BACKLOG).map_err(explain)?, file))
+                Ok(Self::Unix(socket.listen(MAX_PENDING_CONNECTIONS).map_err(explain)?, file))
             }
         }
     }

@@ -19,8 +19,8 @@ use tokio::{
 };
 use tonic::transport::server::Connected;
 
-/// What a client of HTTP/2 sends first, in bytes.
-const PREFACE: usize = 24;
+/// The length of the preface that a client of HTTP/2 sends first.
+const PREFACE_BYTES: usize = 24;
 
 /// A connection, as its calls see it.
 #[derive(Clone)]
@@ -56,7 +56,7 @@ pub struct Guarded<S> {
 impl<S> Guarded<S> {
     /// Gives the client so long to begin.
     pub fn new(stream: S, peer: Peer, place: Place, limit: Duration) -> Self {
-        let preface = Some((PREFACE, Box::pin(sleep(limit))));
+        let preface = Some((PREFACE_BYTES, Box::pin(sleep(limit))));
         Self { stream, connection: Connection { peer, end: Arc::default() }, preface, _place: place }
     }
 

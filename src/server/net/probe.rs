@@ -9,8 +9,8 @@ use std::{
     time::Duration,
 };
 
-/// How long a server may take to answer.
-const LIMIT: Duration = Duration::from_secs(3);
+/// The time in which a server must answer.
+const PROBE_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// Why a server does not take sessions.
 #[derive(Debug, thiserror::Error)]
@@ -48,11 +48,11 @@ pub async fn probe(listen: &ListenAddress, certificate: Option<&Path>) -> Result
         };
     }
     let connecting = Connection::open_as(&address, Timeouts::default(), credentials);
-    let reason = match tokio::time::timeout(LIMIT, connecting).await {
+    let reason = match tokio::time::timeout(PROBE_TIMEOUT, connecting).await {
         Ok(Ok(_)) => return Ok(()),
         Ok(Err(ClientError::Connect { reason, .. } | ClientError::Unsafe { reason, .. })) => reason,
         Ok(Err(error)) => error.to_string(),
-        Err(_) => format!("it took more than {} s", LIMIT.as_secs()),
+        Err(_) => format!("it took more than {} s", PROBE_TIMEOUT.as_secs()),
     };
     Err(Error::NoAnswer { address, reason })
 }

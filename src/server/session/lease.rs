@@ -21,8 +21,8 @@ use subtle::ConstantTimeEq;
 use tokio::sync::{mpsc, oneshot};
 use tonic::Status;
 
-/// The most replies that are kept for a client which sends requests ahead.
-pub const MOST_KEPT: u32 = 64;
+/// The maximum number of stored replies, and so of unanswered requests, of a session with a lease.
+pub const MAX_STORED_REPLIES: u32 = 64;
 
 /// Why a session cannot be taken up.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

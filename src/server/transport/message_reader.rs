@@ -9,7 +9,7 @@ use super::{
 };
 use crate::server::{
     auth::Bearer,
-    limits::{Allowance, MOST_BYTES_BEFORE_OPEN},
+    limits::{Allowance, MAX_BYTES_BEFORE_OPEN},
     net::managed_io::Connection,
 };
 use bytes::{Buf, Bytes, BytesMut};
@@ -19,14 +19,14 @@ use std::time::Duration;
 use tokio::time::{Instant, timeout_at};
 use tonic::{Code, Status, body::Body};
 
-/// A frame's flag and its length.
-const HEADER: usize = 5;
-/// What a message may have before the budget is asked: as much as a session may send that is not open.
-const SMALL: usize = MOST_BYTES_BEFORE_OPEN;
-/// A message must come with so many bytes a second on average, after the time that a pause may take.
-const LEAST_RATE: usize = 64 << 10;
-/// A message of so many bytes is worth an allocation of its own.
-const LARGE: usize = 1 << 20;
+/// The length of a message's header: a flag and a length.
+const HEADER_BYTES: usize = 5;
+/// The bytes of a message that are not taken from the memory budget: as many as a session may send before it is open.
+const UNBUDGETED_BYTES: usize = MAX_BYTES_BEFORE_OPEN;
+/// The minimum average rate of a message, after the time that a pause may take.
+const MIN_BYTES_PER_SECOND: usize = 64 << 10;
+/// A message of at least this length gets an allocation of its own.
+const OWN_BUFFER_MIN_BYTES: usize = 1 << 20;
 
 /// What requests and replies are subject to on their way.
 #[derive(Clone)]
@@ -141,7 +141,7 @@ impl Frames {
     /// What ends the stream: the message is too large, or never ends, or what came is not gRPC.
     pub async fn next(&mut self, allowance: Allowance) -> Result<Option<Message>, Stop> {
         loop {
-            if self.message.is_none() && self.buffer.len() >= HEADER {
+            if self.message.is_none() && self.buffer.len() >= HEADER_BYTES {
                 self.message = Some(self.begin(allowance)?);
             }
             if let Some(whole) = self.taken() {
@@ -171,7 +171,8 @@ impl Frames {
             None => Ok(next.await),
             Some(limit) => {
                 let soon = Instant::now() + limit;
-                let unfinished = |_| Stop::Refused(Error::Unfinished { seconds: limit.as_secs(), rate: LEAST_RATE });
+                let unfinished =
+                    |_| Stop::Refused(Error::Unfinished { seconds: limit.as_secs(), rate: MIN_BYTES_PER_SECOND });
                 timeout_at(self.due.map_or(soon, |due| due.min(soon)), next).await.map_err(unfinished)
             }
         }
@@ -188,7 +189,7 @@ impl Frames {
         if length > allowance.bytes {
             return Err(Stop::Refused(Error::TooLarge { got: length, limit: allowance.bytes }));
         }
-        let longest = |limit| limit + Duration::from_secs((length / LEAST_RATE) as u64);
+        let longest = |limit| limit + Duration::from_secs((length / MIN_BYTES_PER_SECOND) as u64);
         self.due = self.transit.limit.map(|limit| Instant::now() + longest(limit));
         Ok(Begun::Wanted(length))
     }
@@ -197,7 +198,7 @@ impl Frames {
     fn taken(&mut self) -> Option<Message> {
         match &mut self.message {
             Some(Begun::Wanted(length)) if self.buffer.len() >= *length => {
-                let bytes = if *length < LARGE {
+                let bytes = if *length < OWN_BUFFER_MIN_BYTES {
                     self.buffer.split_to(*length).freeze()
                 } else {
                     // Its memory goes with it; a part would keep the whole.
@@ -224,7 +225,7 @@ impl Frames {
     /// Takes bytes that came, with their share of the budget.
     fn take(&mut self, data: &[u8], allowance: Allowance) {
         if let Some(Begun::Wanted(length)) = self.message {
-            let free = allowance.covered.max(SMALL);
+            let free = allowance.covered.max(UNBUDGETED_BYTES);
             let beyond = |bytes: usize| bytes.min(length).saturating_sub(free);
             let (before, after) = (beyond(self.buffer.len()), beyond(self.buffer.len() + data.len()));
             if let Err(refusal) = self.share.grow(after - before) {

@@ -12,19 +12,19 @@ use std::sync::Arc;
 use tokio::sync::Semaphore;
 use tonic::Status;
 
-/// A request of at most so many fields is decoded at once: that takes less than to hand it over.
-const FEW_FIELDS: usize = 1000;
-/// Requests that are decoded at a time by other threads.
-const AT_A_TIME: usize = 2;
-/// What those threads' niceness is raised to: the transport and physics come first.
-const NICENESS: i32 = 5;
-/// Most parts that a message has wherever their number does not follow from the environments'. Where fewer are legal the
-/// refusal that names them is to come from those who know.
-pub const MANY: usize = 1024;
-/// Bytes of numbers in a row that are counted in the time of a field.
-const NUMBERS_A_FIELD: usize = 64;
-/// Room for the counts of a message's fields, of which no list here has more.
-const MOST_FIELDS: usize = 8;
+/// Requests with at most this many fields are decoded on the transport's thread: a hand-over would take longer.
+const INLINE_DECODE_MAX_FIELDS: usize = 1000;
+/// The maximum number of requests that other threads decode at a time.
+const MAX_CONCURRENT_DECODES: usize = 2;
+/// The niceness of those threads: the transport and physics come first.
+const DECODER_NICENESS: i32 = 5;
+/// Limit for repeated fields whose length does not depend on the batch size. Deliberately loose: validation enforces
+/// tighter limits with better messages.
+pub const MAX_REPEATED: usize = 1024;
+/// The bytes of packed numbers that take as long to count as one field.
+const PACKED_BYTES_PER_FIELD: usize = 64;
+/// The maximum number of counted fields of a message.
+const MAX_COUNTED_FIELDS: usize = 8;
 
 /// A field whose entries are counted.
 pub struct Field {
@@ -48,9 +48,9 @@ pub enum Inside {
 pub enum Most {
     /// At most one.
     One,
-    /// At most [`MANY`].
+    /// At most [`MAX_REPEATED`].
     Many,
-    /// As many as there are environments, and no fewer than [`MANY`].
+    /// As many as there are environments, and no fewer than [`MAX_REPEATED`].
     Environments,
 }
 
@@ -58,8 +58,8 @@ impl Most {
     fn entries(&self, allowance: Allowance) -> usize {
         match self {
             Self::One => 1,
-            Self::Many => MANY,
-            Self::Environments => allowance.entries.max(MANY),
+            Self::Many => MAX_REPEATED,
+            Self::Environments => allowance.entries.max(MAX_REPEATED),
         }
     }
 }
@@ -75,7 +75,7 @@ pub struct Decoder(Arc<Semaphore>);
 
 impl Default for Decoder {
     fn default() -> Self {
-        Self(Arc::new(Semaphore::new(AT_A_TIME)))
+        Self(Arc::new(Semaphore::new(MAX_CONCURRENT_DECODES)))
     }
 }
 
@@ -85,7 +85,7 @@ pub fn decoded_at_once<T: Message + Default>(
     fields: &'static [Field],
     allowance: Allowance,
 ) -> Option<T> {
-    check(&bytes, fields, allowance, FEW_FIELDS).ok()?;
+    check(&bytes, fields, allowance, INLINE_DECODE_MAX_FIELDS).ok()?;
     decoded(bytes).ok()
 }
 
@@ -100,7 +100,7 @@ impl Decoder {
         fields: &'static [Field],
         allowance: Allowance,
     ) -> Result<Result<T, InvalidValue>, Status> {
-        match check(&bytes, fields, allowance, FEW_FIELDS) {
+        match check(&bytes, fields, allowance, INLINE_DECODE_MAX_FIELDS) {
             Ok(()) => return decoded(bytes).map(Ok),
             Err(Stop::Refused(refusal)) => return Ok(Err(refusal)),
             Err(Stop::Work) => {}
@@ -108,7 +108,7 @@ impl Decoder {
         let defect = || Status::internal("a request could not be decoded: a defect of the server");
         let _turn = self.0.acquire().await.map_err(|_| defect())?;
         let decoding = tokio::task::spawn_blocking(move || {
-            lower(NICENESS);
+            lower(DECODER_NICENESS);
             match check(&bytes, fields, allowance, usize::MAX) {
                 Err(Stop::Refused(refusal)) => Ok(Err(refusal)),
                 _ => decoded(bytes).map(Ok),
@@ -138,7 +138,7 @@ fn check(message: &[u8], fields: &[Field], allowance: Allowance, mut work: usize
 
 /// The same of a part of a message; whether it is well-formed.
 fn count(mut message: &[u8], fields: &[Field], allowance: Allowance, work: &mut usize) -> Result<bool, Stop> {
-    let mut counts = [0; MOST_FIELDS];
+    let mut counts = [0; MAX_COUNTED_FIELDS];
     while !message.is_empty() {
         *work = work.checked_sub(1).ok_or(Stop::Work)?;
         let Some(tag) = varint(&mut message) else { return Ok(false) };
@@ -159,7 +159,7 @@ fn count(mut message: &[u8], fields: &[Field], allowance: Allowance, work: &mut 
         };
         *counted += match field.inside {
             Numbers if tag & 7 == 2 => {
-                *work = work.checked_sub(part.len() / NUMBERS_A_FIELD).ok_or(Stop::Work)?;
+                *work = work.checked_sub(part.len() / PACKED_BYTES_PER_FIELD).ok_or(Stop::Work)?;
                 part.iter().filter(|byte| **byte < 0x80).count() // each number's last byte
             }
             _ => 1,
@@ -200,11 +200,11 @@ mod tests {
         server::api::perturb_v1::fields::SESSION_REQUEST,
     };
 
-    const ALLOWANCE: Allowance = Allowance { bytes: 0, entries: 2000, covered: 0 };
+    const LIMITS: Allowance = Allowance { bytes: 0, entries: 2000, covered: 0 };
 
     fn checked(request: impl Into<Request>, work: usize) -> Result<(), Stop> {
         let message = proto::SessionRequest { request: Some(request.into()) }.encode_to_vec();
-        check(&message, SESSION_REQUEST, ALLOWANCE, work)
+        check(&message, SESSION_REQUEST, LIMITS, work)
     }
 
     fn refused(request: impl Into<Request>) -> String {
@@ -220,7 +220,7 @@ mod tests {
         assert_eq!(checked(reset(vec![u64::MAX; 2000]), usize::MAX), Ok(()));
         assert!(refused(reset(vec![1; 2001])).contains("reset.seeds is there more than 2000 times"));
         let unpacked = [&[0x1A, 0xA2, 0x1F][..], &[0x10, 1].repeat(2001)].concat();
-        assert!(matches!(check(&unpacked, SESSION_REQUEST, ALLOWANCE, usize::MAX), Err(Stop::Refused(_))));
+        assert!(matches!(check(&unpacked, SESSION_REQUEST, LIMITS, usize::MAX), Err(Stop::Refused(_))));
         let policy = proto::Policy { hidden: vec![1; 1025], ..proto::Policy::default() };
         assert!(refused(proto::Act { policy: Some(policy), ..proto::Act::default() }).contains("act.policy.hidden"));
         let restore = proto::Restore { snapshots: vec![Bytes::new(); 2001], ..proto::Restore::default() };
@@ -242,16 +242,16 @@ mod tests {
     #[test]
     fn a_request_comes_once_in_a_message() {
         let twice = [0x12, 0].repeat(2);
-        assert!(matches!(check(&twice, SESSION_REQUEST, ALLOWANCE, usize::MAX), Err(Stop::Refused(_))));
+        assert!(matches!(check(&twice, SESSION_REQUEST, LIMITS, usize::MAX), Err(Stop::Refused(_))));
     }
 
     #[test]
     fn many_fields_are_not_counted_at_once_and_many_bytes_are() {
         let restore = |n| proto::Restore { snapshots: vec![Bytes::new(); n], ..proto::Restore::default() };
-        assert_eq!(checked(restore(FEW_FIELDS), FEW_FIELDS), Err(Stop::Work));
+        assert_eq!(checked(restore(INLINE_DECODE_MAX_FIELDS), INLINE_DECODE_MAX_FIELDS), Err(Stop::Work));
         let seeds = proto::Reset { seeds: vec![1; 1 << 20], ..proto::Reset::default() };
-        assert_eq!(checked(seeds, FEW_FIELDS), Err(Stop::Work));
-        assert_eq!(checked(proto::Step { actions: vec![0; 1 << 20].into() }, FEW_FIELDS), Ok(()));
+        assert_eq!(checked(seeds, INLINE_DECODE_MAX_FIELDS), Err(Stop::Work));
+        assert_eq!(checked(proto::Step { actions: vec![0; 1 << 20].into() }, INLINE_DECODE_MAX_FIELDS), Ok(()));
     }
 
     #[test]
@@ -261,10 +261,10 @@ mod tests {
         }
         .encode_to_vec();
         for length in 0..whole.len() {
-            assert_eq!(check(&whole[..length], SESSION_REQUEST, ALLOWANCE, usize::MAX), Ok(()));
+            assert_eq!(check(&whole[..length], SESSION_REQUEST, LIMITS, usize::MAX), Ok(()));
         }
         for message in [&[0xFF; 30][..], &[0x1A, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0x7F], &[0x0D, 1]] {
-            let _ = check(message, SESSION_REQUEST, ALLOWANCE, usize::MAX);
+            let _ = check(message, SESSION_REQUEST, LIMITS, usize::MAX);
         }
     }
 }

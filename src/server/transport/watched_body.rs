@@ -17,8 +17,8 @@ use tokio::{
 };
 use tonic::{Status, body::Body};
 
-/// How often a stalled stream is looked after within its time.
-const LOOKS: u32 = 4;
+/// The number of checks of an unread stream within its timeout.
+const CHECKS_PER_TIMEOUT: u32 = 4;
 
 /// How long a stream's client may leave its replies unread.
 #[derive(Debug, Clone, Copy)]
@@ -136,7 +136,7 @@ impl Replies {
 async fn watch(waiting: Weak<Waiting>, connection: Connection, patience: Patience) {
     let mut limit = Some(patience.rest.map_or(patience.first, |rest| rest.min(patience.first)));
     while let Some(looked_after) = limit {
-        sleep(looked_after / LOOKS).await;
+        sleep(looked_after / CHECKS_PER_TIMEOUT).await;
         let Some(waiting) = waiting.upgrade() else { return };
         let state = waiting.state();
         if let Some(passed) = state.passed(patience) {

@@ -15,7 +15,7 @@ use crate::{
     },
     server::{
         auth::Bearer,
-        limits::{Allowance, MOST_BYTES_BEFORE_OPEN},
+        limits::{Allowance, MAX_BYTES_BEFORE_OPEN},
         net::access_log::About,
         session::{
             self,
@@ -28,8 +28,8 @@ use crate::{
 };
 use std::sync::Arc;
 
-/// The most bytes of a request: a world is one environment, and mistakes deserve an answer.
-const MOST_BYTES: usize = 1 << 20;
+/// The maximum length of a request. A world is one environment; the rest is room for mistakes that deserve an answer.
+const MAX_REQUEST_BYTES: usize = 1 << 20;
 
 /// A client's stream. When it is dropped it leaves its world, and the worlds that it made go unless an agent is in them.
 pub(super) struct Agent {
@@ -162,7 +162,11 @@ impl SessionHandler for Agent {
     }
 
     fn allowance(&self) -> Allowance {
-        Allowance { bytes: if self.is_open() { MOST_BYTES } else { MOST_BYTES_BEFORE_OPEN }, entries: 1, covered: 0 }
+        Allowance {
+            bytes: if self.is_open() { MAX_REQUEST_BYTES } else { MAX_BYTES_BEFORE_OPEN },
+            entries: 1,
+            covered: 0,
+        }
     }
 
     /// Whether it keeps a world alive.

@@ -16,8 +16,8 @@ const EPISODES_PER_TRIAL: &str = "episodes_per_trial";
 const WORLD_NAME: &str = "world_name";
 const SHARED: &str = "shared";
 
-/// The longest name that may be asked for, in bytes.
-const LONGEST_NAME: usize = 64;
+/// The maximum length of a name that a client asks for.
+const MAX_NAME_BYTES: usize = 64;
 
 type Settings = BTreeMap<String, Tensor>;
 
@@ -85,9 +85,10 @@ pub(super) fn create(catalogue: &Catalogue, settings: &Settings) -> Result<(Batc
 fn ownership(settings: &Settings) -> Result<Ownership, Error> {
     let name = settings.get(WORLD_NAME).map(|tensor| tensors::text(&field(WORLD_NAME), tensor)).transpose()?;
     let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
-    if let Some(name) = name.filter(|name| name.is_empty() || name.len() > LONGEST_NAME || !name.bytes().all(is_plain))
+    if let Some(name) =
+        name.filter(|name| name.is_empty() || name.len() > MAX_NAME_BYTES || !name.bytes().all(is_plain))
     {
-        let expected = format!("1 to {LONGEST_NAME} letters, digits, -, _ or .");
+        let expected = format!("1 to {MAX_NAME_BYTES} letters, digits, -, _ or .");
         return Err(Error::value(field(WORLD_NAME), format!("{:?}", shorten(name)), expected));
     }
     let shared = settings.get(SHARED).map(|tensor| tensors::boolean(&field(SHARED), tensor)).transpose()?;

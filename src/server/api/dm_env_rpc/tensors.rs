@@ -5,7 +5,7 @@ use crate::proto::dm_env_rpc::v1::{DataType, Tensor, tensor::Payload};
 use std::fmt::Display;
 
 /// The most dimensions that a refusal repeats.
-const SHOWN_DIMENSIONS: usize = 8;
+const MAX_SHOWN_DIMENSIONS: usize = 8;
 
 /// A STRING scalar.
 ///
@@ -130,7 +130,7 @@ fn of(dtype: DataType, shape: &[usize]) -> String {
 
 fn shape_of(shape: &[i32]) -> String {
     match shape.len() {
-        0..=SHOWN_DIMENSIONS => format!("shape {shape:?}"),
+        0..=MAX_SHOWN_DIMENSIONS => format!("shape {shape:?}"),
         n => format!("a shape of {n} dimensions"),
     }
 }

@@ -11,16 +11,16 @@ use perturb_policy::{ActionKind, CollectUntil, Inputs, Normalisers, ObservationN
 use perturb_protocol::player::{DecodeError, player_state, read_floats};
 use rand_chacha::ChaCha8Rng;
 
-/// The most hidden layers of a policy …
-const MOST_LAYERS: usize = 8;
-/// … and the greatest width of each and of the LSTM.
-const GREATEST_WIDTH: u32 = 1024;
-/// The most numbers between the layers of a policy, in all environments together.
-const MOST_NUMBERS: usize = 1 << 25;
-/// A reply is cut when its steps cost about so many µs, so that a client is never left without an answer for long …
-const MOST_COST: f64 = 1e6;
-/// … where a policy computes so many weights in a µs.
-const WEIGHTS_A_MICROSECOND: f64 = 5000.0;
+/// The maximum number of hidden layers of a policy.
+const MAX_HIDDEN_LAYERS: usize = 8;
+/// The maximum width of a hidden layer and of the LSTM.
+const MAX_LAYER_WIDTH: u32 = 1024;
+/// The maximum number of activations of a policy, in all environments together.
+const MAX_ACTIVATIONS: usize = 1 << 25;
+/// A reply is cut when its steps cost about this time, so that a client is never left without an answer for long.
+const MAX_REPLY_COST_US: f64 = 1e6;
+/// The estimated number of weights that a policy computes with in a microsecond.
+const WEIGHTS_PER_US: f64 = 5000.0;
 
 /// Numbers of each kind in a batch.
 #[derive(Clone, Copy)]
@@ -84,12 +84,12 @@ pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Tur
         return Err(order("with weights while a task is unfinished", advice));
     }
     let spec = policy.as_ref().map(|policy| &policy.spec).or_else(|| batch.play().map(Play::spec));
-    let computed = spec.map_or(0.0, |spec| spec.n_weights() as f64 / WEIGHTS_A_MICROSECOND);
-    if computed * n_envs as f64 > MOST_COST {
+    let computed = spec.map_or(0.0, |spec| spec.n_weights() as f64 / WEIGHTS_PER_US);
+    if computed * n_envs as f64 > MAX_REPLY_COST_US {
         let got = format!("with {} weights in {n_envs} environments", spec.map_or(0, PolicySpec::n_weights));
         return Err(Error::value("act.policy", got, "fewer, so that a step takes less than about a second"));
     }
-    let affordable = (MOST_COST / ((settings.spec.step_cost + computed) * n_envs as f64)).max(1.0) as usize;
+    let affordable = (MAX_REPLY_COST_US / ((settings.spec.step_cost + computed) * n_envs as f64)).max(1.0) as usize;
     // Of a second, so that none waits long for the next.
     let allowed = rate.map_or(usize::MAX, |rate| (rate as usize / n_envs.max(1)).max(1));
     let affordable = affordable.min(allowed);
@@ -141,24 +141,28 @@ fn policy(policy: proto::Policy, given: &Bytes, sizes: Sizes, episodes_per_trial
 /// The shape of a policy whose inputs have `input_size` numbers.
 fn spec(policy: &proto::Policy, input_size: usize, sizes: Sizes) -> Result<PolicySpec, Error> {
     const FIELD: &str = "act.policy.hidden";
-    if policy.hidden.len() > MOST_LAYERS {
+    if policy.hidden.len() > MAX_HIDDEN_LAYERS {
         let got = format!("{} layers", policy.hidden.len());
-        return Err(Error::value(FIELD, got, format!("at most {MOST_LAYERS}")));
+        return Err(Error::value(FIELD, got, format!("at most {MAX_HIDDEN_LAYERS}")));
     }
-    let widths = 1..=GREATEST_WIDTH;
+    let widths = 1..=MAX_LAYER_WIDTH;
     if let Some(width) = policy.hidden.iter().find(|width| !widths.contains(width)) {
-        return Err(Error::value(FIELD, format!("with a width of {width}"), format!("widths of 1 … {GREATEST_WIDTH}")));
+        return Err(Error::value(
+            FIELD,
+            format!("with a width of {width}"),
+            format!("widths of 1 … {MAX_LAYER_WIDTH}"),
+        ));
     }
-    if policy.lstm > GREATEST_WIDTH {
-        let expected = format!("a width of 1 … {GREATEST_WIDTH}, or 0 for a feed-forward policy");
+    if policy.lstm > MAX_LAYER_WIDTH {
+        let expected = format!("a width of 1 … {MAX_LAYER_WIDTH}, or 0 for a feed-forward policy");
         return Err(Error::value("act.policy.lstm", policy.lstm, expected));
     }
     let hidden: Vec<usize> = policy.hidden.iter().map(|&width| width as usize).collect();
     let lstm = (policy.lstm > 0).then_some(policy.lstm as usize);
     let width = hidden.iter().sum::<usize>() + lstm.unwrap_or(0);
-    if width * sizes.envs > MOST_NUMBERS {
+    if width * sizes.envs > MAX_ACTIVATIONS {
         let got = format!("of widths whose sum is {width}, in {} environments", sizes.envs);
-        return Err(Error::value("act.policy", got, format!("a product of at most {MOST_NUMBERS}")));
+        return Err(Error::value("act.policy", got, format!("a product of at most {MAX_ACTIVATIONS}")));
     }
     Ok(PolicySpec { observation_size: input_size, action: sizes.action, hidden, lstm })
 }

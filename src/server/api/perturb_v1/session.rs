@@ -9,11 +9,11 @@ use crate::{
     server::{
         audit::{draws::Draws, ledger::Ledger},
         auth::{Bearer, Held},
-        limits::{Allowance, MOST_BYTES_BEFORE_OPEN},
+        limits::{Allowance, MAX_BYTES_BEFORE_OPEN},
         net::access_log::About,
         session::{
             handler::{Reply, SessionHandler, StreamHandover},
-            lease::{Leases, MOST_KEPT},
+            lease::{Leases, MAX_STORED_REPLIES},
         },
         transport::{
             budget::{Budget, Share},
@@ -24,8 +24,8 @@ use crate::{
 use bytes::Bytes;
 use std::sync::Arc;
 
-/// A step's bytes beside its actions.
-const LITTLE: usize = 32;
+/// The length of a step's request beside its actions.
+const STEP_OVERHEAD_BYTES: usize = 32;
 
 /// What all sessions of a server share.
 pub struct Shared {
@@ -70,11 +70,11 @@ impl Session {
             return Err(Error::AlreadyOpen);
         }
         let (autoreset_mode, unanswered) = (request.autoreset_mode, request.lease);
-        if unanswered > MOST_KEPT {
+        if unanswered > MAX_STORED_REPLIES {
             return Err(Error::value(
                 "open.lease",
                 unanswered,
-                format!("requests that wait at a time, 0 … {MOST_KEPT}"),
+                format!("requests that wait at a time, 0 … {MAX_STORED_REPLIES}"),
             ));
         }
         let most = self.shared.listing.max_batch_size as usize;
@@ -260,12 +260,12 @@ impl SessionHandler for Session {
         match &self.batch {
             None => {
                 let entries = self.shared.listing.max_batch_size as usize;
-                Allowance { bytes: MOST_BYTES_BEFORE_OPEN, entries, covered: 0 }
+                Allowance { bytes: MAX_BYTES_BEFORE_OPEN, entries, covered: 0 }
             }
             Some(batch) => Allowance {
                 bytes: sizes::most_of_a_request(batch),
                 entries: batch.size(),
-                covered: sizes::step_request(batch.settings(), batch.size()) + LITTLE,
+                covered: sizes::step_request(batch.settings(), batch.size()) + STEP_OVERHEAD_BYTES,
             },
         }
     }

@@ -7,15 +7,16 @@ use crate::{
     render::Size,
 };
 
-/// A request's bytes beside what it has for each environment: parameters, and mistakes that deserve an answer.
-const REST_OF_A_REQUEST: usize = 1 << 20;
-/// The most bytes of a number, tag included.
-const LONGEST_NUMBER: usize = 11;
-/// What an episode's end takes, and with a receipt, roughly: as it is computed and as it is sent.
-const END: usize = 300;
-const RECEIPT: usize = 500;
-/// A snapshot, roughly.
-const SNAPSHOT: usize = 2 << 10;
+/// Room in a request beside its bytes for each environment: parameters, and mistakes that deserve an answer.
+const REQUEST_OVERHEAD_BYTES: usize = 1 << 20;
+/// The maximum length of a number in the encoding, tag included.
+const MAX_VARINT_FIELD_BYTES: usize = 11;
+/// The estimated memory of an episode's end, as it is computed and as it is sent.
+const EPISODE_END_BYTES: usize = 300;
+/// The estimated memory of a receipt.
+const RECEIPT_BYTES: usize = 500;
+/// The estimated length of a snapshot.
+const SNAPSHOT_BYTES: usize = 2 << 10;
 
 /// Entries of an action.
 fn action_width(settings: &BatchSettings) -> usize {
@@ -32,9 +33,9 @@ pub fn most_of_a_request(batch: &Batch) -> usize {
     if settings.autoreset == Autoreset::SameStep {
         return usize::MAX;
     }
-    let reset = 1 + LONGEST_NUMBER + 8 * settings.spec.state.len();
-    let restore = 1 + 2 * LONGEST_NUMBER + env::MOST_SNAPSHOT_BYTES;
-    REST_OF_A_REQUEST.saturating_add(batch.size().saturating_mul(reset.max(restore)))
+    let reset = 1 + MAX_VARINT_FIELD_BYTES + 8 * settings.spec.state.len();
+    let restore = 1 + 2 * MAX_VARINT_FIELD_BYTES + env::MAX_SNAPSHOT_BYTES;
+    REQUEST_OVERHEAD_BYTES.saturating_add(batch.size().saturating_mul(reset.max(restore)))
 }
 
 /// A step's request.
@@ -46,14 +47,14 @@ pub fn step_request(settings: &BatchSettings, envs: usize) -> usize {
 /// of one that follows it, and three replies, one being computed, one that waits and one being sent.
 pub fn session(settings: &BatchSettings, envs: usize) -> usize {
     let numbers = 2 * settings.observation_size() + 1 + settings.spec.reward_terms.len();
-    let ends = if settings.receipts { 2 * RECEIPT } else { END };
+    let ends = if settings.receipts { 2 * RECEIPT_BYTES } else { EPISODE_END_BYTES };
     let reply = envs.saturating_mul(4 * numbers + 2 + ends);
     step_request(settings, envs).saturating_mul(2).saturating_add(reply.saturating_mul(3))
 }
 
 /// The snapshots of so many environments.
 pub fn snapshots(envs: usize) -> usize {
-    envs.saturating_mul(SNAPSHOT)
+    envs.saturating_mul(SNAPSHOT_BYTES)
 }
 
 /// Snapshots that were taken.
@@ -80,9 +81,9 @@ pub fn reply_to(turn: &Turn, batch: &Batch) -> usize {
     let settings = batch.settings();
     // Flags, values and the like beside observations and two times the action: as sampled, and as an input.
     let numbers = settings.observation_size() + 2 * action_width(settings) + 10;
-    let step = batch.size().saturating_mul(4 * numbers + RECEIPT);
-    step.saturating_mul(turn.most_steps).min(REPLY.saturating_add(step))
+    let step = batch.size().saturating_mul(4 * numbers + RECEIPT_BYTES);
+    step.saturating_mul(turn.most_steps).min(MAX_ROLLOUT_BYTES.saturating_add(step))
 }
 
-/// Where a turn's reply is cut, roughly.
-const REPLY: usize = 4_000_000;
+/// The approximate length at which a rollout's reply is cut.
+const MAX_ROLLOUT_BYTES: usize = 4_000_000;
