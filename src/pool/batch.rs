@@ -9,12 +9,12 @@ use super::{
     pipelined_step::Follow,
     rollout::{
         play::Play,
-        round::{Played, Round, Turn},
+        round::{Rollout, Round, Turn},
     },
     scheduler::{Pool, Shared},
     settings::{Autoreset, BatchSettings, SlotGroup},
     shard::{Command, Shard, SlotReset, put_actions},
-    step_result::{Gather, Stepped, collect},
+    step_result::{Gather, StepResult, collect},
     sync::lock,
 };
 use crate::{
@@ -132,7 +132,7 @@ impl Batch {
     ///
     /// # Errors
     /// [`Error::Ended`] in [`Autoreset::Disabled`], [`Error::Defect`].
-    pub async fn step(&mut self, actions: &[u8]) -> Result<Stepped, Error> {
+    pub async fn step(&mut self, actions: &[u8]) -> Result<StepResult, Error> {
         let start = match self.followed.take() {
             Some(start) => start,
             None => {
@@ -171,7 +171,7 @@ impl Batch {
     }
 
     /// What came of the step that has ended.
-    fn stepped(&mut self, start: Instant, end: Instant) -> Stepped {
+    fn stepped(&mut self, start: Instant, end: Instant) -> StepResult {
         self.observe(start, end);
         let reward_terms = self.settings.reward_terms;
         self.gather().stepped(reward_terms)
@@ -195,7 +195,7 @@ impl Batch {
     ///
     /// # Errors
     /// [`Error::Policy`] if numbers are not finite, [`Error::Defect`]; after both another policy must be given.
-    pub async fn act(&mut self, turn: Turn) -> Result<Played, Error> {
+    pub async fn act(&mut self, turn: Turn) -> Result<Rollout, Error> {
         self.ready().await?;
         let round = Box::new(Round::new(turn, self.play.take()));
         let number = self.ask();

@@ -30,11 +30,11 @@ pub use batch::{Batch, Farewell, ResetEntry};
 pub use follower::Follower;
 pub use rollout::{
     play::{Play, Policy, PolicyRole},
-    round::{EndedAt, Played, Turn},
+    round::{EndedAt, Rollout, Turn},
 };
 pub use scheduler::Pool;
 pub use settings::{Autoreset, BatchSettings, SlotGroup};
-pub use step_result::Stepped;
+pub use step_result::StepResult;
 
 use crate::env;
 

@@ -3,7 +3,7 @@
 
 use super::{
     shard::{Shard, put_actions},
-    step_result::{Gather, Stepped},
+    step_result::{Gather, StepResult},
 };
 use bytes::{Bytes, BytesMut};
 use std::sync::Mutex;
@@ -17,7 +17,7 @@ pub(super) struct Follow {
     /// The next step's actions.
     actions: Option<Bytes>,
     /// What came of the step whose end began the present one, until the session takes it, and when that was.
-    stepped: Option<(Stepped, Instant)>,
+    stepped: Option<(StepResult, Instant)>,
     /// When the last step ended that none followed.
     ended: Option<Instant>,
     buffer: BytesMut,
@@ -53,7 +53,7 @@ impl Follow {
     }
 
     /// What came of the last step, if another has begun since, and when.
-    pub(super) fn take(&mut self) -> Option<(Stepped, Instant)> {
+    pub(super) fn take(&mut self) -> Option<(StepResult, Instant)> {
         self.stepped.take()
     }
 

@@ -4,14 +4,14 @@ use crate::env::Episodes;
 
 /// The receipts of some episodes.
 #[derive(Debug, Default)]
-pub(super) struct Told {
+pub(super) struct ReceiptColumns {
     /// `[m, 5]`: slot of the batch, indices of environment, trial and episode, and the episode's number in its trial.
     pub(super) episodes: Vec<u64>,
     /// `[m, P + Q]`: what was requested, then what was applied.
     pub(super) values: Vec<f64>,
 }
 
-impl Told {
+impl ReceiptColumns {
     /// Forgets all.
     pub(super) fn clear(&mut self) {
         self.episodes.clear();

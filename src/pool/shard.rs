@@ -1,7 +1,7 @@
 //! A part of a batch: what one worker runs at a time.
 
 use super::{
-    receipts::Told,
+    receipts::ReceiptColumns,
     settings::{Autoreset, BatchSettings, SlotGroup},
     sync::lock,
 };
@@ -80,9 +80,9 @@ pub(super) struct Shard {
     /// Slot of the batch and what began there.
     pub(super) started: Vec<(u32, EpisodeStart)>,
     /// With receipts as arrays: those of `ended` …
-    pub(super) ended_told: Told,
+    pub(super) ended_told: ReceiptColumns,
     /// … and of what began in a step.
-    pub(super) started_told: Told,
+    pub(super) started_told: ReceiptColumns,
     pub(super) snapshots: Vec<Vec<u8>>,
     pub(super) failure: Option<env::Error>,
     terms: Vec<f64>,
@@ -127,8 +127,8 @@ impl Shard {
             final_observations: Vec::new(),
             ended: Vec::new(),
             started: Vec::new(),
-            ended_told: Told::default(),
-            started_told: Told::default(),
+            ended_told: ReceiptColumns::default(),
+            started_told: ReceiptColumns::default(),
             snapshots: Vec::new(),
             failure: None,
             terms: vec![0.0; spec.reward_terms.len()],

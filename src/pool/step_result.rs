@@ -2,7 +2,7 @@
 
 use super::{
     encode::{put, put_wide},
-    receipts::Told,
+    receipts::ReceiptColumns,
     shard::Shard,
     sync::lock,
 };
@@ -12,7 +12,7 @@ use std::sync::Mutex;
 
 /// The outcome of a step; arrays are little-endian, as on the wire.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Stepped {
+pub struct StepResult {
     /// f32 `[N, O]`
     pub observations: Bytes,
     /// f32 `[N]`
@@ -44,8 +44,8 @@ pub(super) struct Gather<'a> {
 
 impl Gather<'_> {
     /// Takes what the last step left in the shards, the reward's terms if they are wanted.
-    pub(super) fn stepped(mut self, reward_terms: bool) -> Stepped {
-        Stepped {
+    pub(super) fn stepped(mut self, reward_terms: bool) -> StepResult {
+        StepResult {
             observations: self.observations(),
             rewards: self.f32(|shard| &shard.rewards),
             terminated: self.u8(|shard| &shard.terminated),
@@ -72,8 +72,8 @@ impl Gather<'_> {
     }
 
     /// Of what ended in all shards, then of what began.
-    fn told<T: Copy>(&mut self, column: fn(&Told) -> &Vec<T>, encode: fn(T) -> [u8; 8]) -> Bytes {
-        let parts: [fn(&Shard) -> &Told; 2] = [|shard| &shard.ended_told, |shard| &shard.started_told];
+    fn told<T: Copy>(&mut self, column: fn(&ReceiptColumns) -> &Vec<T>, encode: fn(T) -> [u8; 8]) -> Bytes {
+        let parts: [fn(&Shard) -> &ReceiptColumns; 2] = [|shard| &shard.ended_told, |shard| &shard.started_told];
         for told in parts {
             for shard in self.shards {
                 put_wide(self.buffer, column(told(&lock(shard))), encode);

@@ -10,7 +10,7 @@ use crate::{
 use bytes::Bytes;
 use perturb::{
     env::{EnvironmentSpec, Version},
-    pool::{Autoreset, Batch, BatchSettings, Error, Pool, SlotGroup, Stepped},
+    pool::{Autoreset, Batch, BatchSettings, Error, Pool, SlotGroup, StepResult},
     proto::{AutoresetMode, Open, SessionResponse, Snapshot, session_request::Request},
     tasks,
 };
@@ -43,7 +43,7 @@ async fn poll_once<F: Future>(mut future: Pin<&mut F>) -> Poll<F::Output> {
 }
 
 /// Has a step begin and this one follow it; what came of the first, and whether it was under way before.
-async fn followed(batch: &mut Batch, first: &[u8], second: Bytes) -> (Result<Stepped, Error>, bool) {
+async fn followed(batch: &mut Batch, first: &[u8], second: Bytes) -> (Result<StepResult, Error>, bool) {
     let follower = batch.follower().unwrap();
     let mut stepping = pin!(batch.step(first));
     match poll_once(stepping.as_mut()).await {

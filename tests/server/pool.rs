@@ -4,7 +4,7 @@ use crate::common::{self, action_bytes, floats, observe, step};
 use bytes::Bytes;
 use perturb::{
     env::{Distribution, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings, Version},
-    pool::{Autoreset, Batch, BatchSettings, Error, Pool, ResetEntry, SlotGroup, Stepped},
+    pool::{Autoreset, Batch, BatchSettings, Error, Pool, ResetEntry, SlotGroup, StepResult},
 };
 use rstest::rstest;
 use std::{
@@ -71,7 +71,7 @@ impl Model {
         Self { models: (0..settings.size()).map(model).collect(), autoreset: settings.autoreset }
     }
 
-    fn step(&mut self, actions: &[u8]) -> Stepped {
+    fn step(&mut self, actions: &[u8]) -> StepResult {
         let (mut all, mut rewards, mut terms, mut last) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         let (mut terminated, mut truncated, mut ended, mut started) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         let width = actions.len() / self.models.len();
@@ -102,7 +102,7 @@ impl Model {
             }
             put(&mut all, &observe(e));
         }
-        Stepped {
+        StepResult {
             observations: all.into(),
             rewards: rewards.into(),
             terminated: terminated.into(),
@@ -111,7 +111,7 @@ impl Model {
             final_observations: last.into(),
             ended,
             started,
-            ..Stepped::default()
+            ..StepResult::default()
         }
     }
 
@@ -158,7 +158,7 @@ async fn a_batch_gives_the_bytes_of_its_environments_in_every_autoreset_mode() {
 }
 
 /// A CartPole batch of one, pushed to one side until it falls; the step at which it does and what it gave.
-async fn fall(pool: &Pool, mode: Autoreset) -> (Batch, Stepped) {
+async fn fall(pool: &Pool, mode: Autoreset) -> (Batch, StepResult) {
     let spec = common::catalogue().find("CartPole").unwrap();
     let (mut batch, _, _) = Batch::open(pool, batch_settings(spec, 1, mode)).await.unwrap();
     loop {
@@ -283,7 +283,7 @@ struct Seen {
 }
 
 /// Cuts a batch's outcome into those of its environments.
-fn cut(spec: &EnvironmentSpec, size: usize, stepped: &Stepped) -> Vec<Seen> {
+fn cut(spec: &EnvironmentSpec, size: usize, stepped: &StepResult) -> Vec<Seen> {
     let row = |bytes: &Bytes, i: usize, n: usize| bytes[4 * n * i..][..4 * n].to_vec();
     let o = spec.observation.len();
     let seen = |slot: usize| {
@@ -305,12 +305,12 @@ async fn bytes_do_not_depend_on_the_number_of_workers() {
     for spec in common::catalogue().specs() {
         // Several shards, also for the cheapest environment.
         let size = (100.0 / spec.step_cost).ceil() as usize;
-        let mut runs: Vec<Vec<Stepped>> = Vec::new();
+        let mut runs: Vec<Vec<StepResult>> = Vec::new();
         for workers in [1, 2, 4] {
             let pool = Pool::new(workers, size).unwrap();
             let settings = batch_settings(spec, size, Autoreset::SameStep);
             let (mut batch, first, started) = Batch::open(&pool, settings).await.unwrap();
-            let mut run = vec![Stepped { observations: first, started, ..Stepped::default() }];
+            let mut run = vec![StepResult { observations: first, started, ..StepResult::default() }];
             for t in 0..40 {
                 run.push(batch.step(&actions(spec, 100, size, t)).await.unwrap());
             }

@@ -4,7 +4,7 @@ use crate::common::{self, action_bytes, episodes, observe, play, start_line, ste
 use bytes::Bytes;
 use perturb::{
     env::{Distribution, EnvironmentSpec, Episodes, Error, Interval, Version},
-    pool::{self, Autoreset, Batch, BatchSettings, Pool, ResetEntry, SlotGroup, Stepped},
+    pool::{self, Autoreset, Batch, BatchSettings, Pool, ResetEntry, SlotGroup, StepResult},
 };
 use proptest::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -419,7 +419,7 @@ fn actions(spec: &EnvironmentSpec, size: usize, t: u64) -> Vec<u8> {
     (0..size as u64).flat_map(|slot| action_bytes(spec, slot, t)).collect()
 }
 
-async fn run(batch: &mut Batch, steps: std::ops::Range<u64>) -> Vec<Stepped> {
+async fn run(batch: &mut Batch, steps: std::ops::Range<u64>) -> Vec<StepResult> {
     let (spec, size) = (batch.settings().spec, batch.size());
     let mut all = Vec::new();
     for t in steps {

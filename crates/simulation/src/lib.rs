@@ -16,7 +16,7 @@ use perturb::proto::{self, perturb_server::PerturbServer};
 use perturb::server::api::perturb_v1::service::ENDPOINT;
 use perturb::server::error::{ErrorCounters, ErrorKind};
 use perturb::server::net::access_log::Access;
-use perturb::server::net::managed_io::Guarded;
+use perturb::server::net::managed_io::ManagedIo;
 use perturb::server::net::peer_limiter::{Peer, Places};
 use perturb::server::session::admission::{Limits, Sessions};
 use perturb::server::session::driver::Responses;
@@ -113,7 +113,7 @@ pub async fn serve(ledger: StepLog) -> turmoil::Result {
         let (stream, address) = listener.accept().await.ok()?;
         let peer = Peer::at(address.ip());
         let place = connections.take(Some(peer)).ok()?;
-        let guarded = Guarded::new(stream, peer, place, HANDSHAKE_TIMEOUT);
+        let guarded = ManagedIo::new(stream, peer, place, HANDSHAKE_TIMEOUT);
         Some((Ok::<_, io::Error>(guarded), (listener, connections)))
     });
     Server::builder()

@@ -53,13 +53,13 @@ pub struct Play {
     /// In a test.
     seed: Option<u64>,
     /// What the last step brought.
-    pub(in crate::pool) step: Gathered,
+    pub(in crate::pool) step: StepBuffers,
     spec: PolicySpec,
 }
 
 /// What a step of all environments brought; buffers are used again.
 #[derive(Default)]
-pub(in crate::pool) struct Gathered {
+pub(in crate::pool) struct StepBuffers {
     observations: Vec<f32>,
     rewards: Vec<f32>,
     pub(in crate::pool) terminated: Vec<bool>,
@@ -82,7 +82,7 @@ impl Play {
             PolicyRole::Testing { seed } => (Role::testing_in(seed, trials.into_iter()), Some(seed)),
         };
         let player = Player::new(&spec, inputs, n_envs, episodes_per_trial, normalisers, role);
-        let mut play = Self { player, task: RemainingRollout::Steps(0), seed, step: Gathered::default(), spec };
+        let mut play = Self { player, task: RemainingRollout::Steps(0), seed, step: StepBuffers::default(), spec };
         play.player.load(&weights)?;
         match state {
             Some(state) => play.player.restore(&state)?,
@@ -156,7 +156,7 @@ impl Play {
     }
 }
 
-impl Gathered {
+impl StepBuffers {
     fn gather_observations(&mut self, shards: &[Mutex<Shard>]) {
         self.observations.clear();
         shards.iter().for_each(|shard| self.observations.extend_from_slice(&lock(shard).observations));

@@ -41,7 +41,7 @@ pub struct Turn {
 
 /// What was played: T steps of N environments; arrays are little-endian, row-major `[T, N, …]`, as on the wire.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Played {
+pub struct Rollout {
     /// T.
     pub steps: usize,
     /// f32 `[T, N, I]`
@@ -104,18 +104,18 @@ pub(in crate::pool) struct Round {
     turn: Turn,
     play: Option<Box<Play>>,
     phase: Phase,
-    played: Played,
+    played: Rollout,
     error: Option<Error>,
 }
 
 impl Round {
     /// A round of the policy of before, if there is no new one.
     pub(in crate::pool) fn new(turn: Turn, play: Option<Box<Play>>) -> Self {
-        Self { turn, play, phase: Phase::Begin, played: Played::default(), error: None }
+        Self { turn, play, phase: Phase::Begin, played: Rollout::default(), error: None }
     }
 
     /// What came of it, with the policy at play unless it failed.
-    pub(in crate::pool) fn finish(self) -> Result<(Option<Box<Play>>, Played), Error> {
+    pub(in crate::pool) fn finish(self) -> Result<(Option<Box<Play>>, Rollout), Error> {
         self.error.map_or(Ok((self.play, self.played)), Err)
     }
 
@@ -178,7 +178,7 @@ impl Round {
     }
 }
 
-impl Played {
+impl Rollout {
     /// Makes room for what the round will bring, and notes what the policy remembers where a task `begins`.
     fn begin(&mut self, play: &Play, begins: bool, turn: &Turn) {
         if turn.only_ended {

@@ -31,9 +31,9 @@ const MAX_LOGGED_REFUSALS: u32 = 100;
 
 /// What was written down, until it is known whether it happens.
 #[derive(Default)]
-pub struct Begun(Vec<DrawStart>);
+pub struct PendingDraws(Vec<DrawStart>);
 
-impl Begun {
+impl PendingDraws {
     /// Nothing of it was drawn.
     fn withdrawn(self) -> Vec<DrawEnd> {
         self.0
@@ -61,9 +61,9 @@ impl Draws {
     ///
     /// # Errors
     /// [`Error::NotAllowed`], [`Error::NoLedger`]; so the others.
-    pub async fn open(&self, settings: &BatchSettings) -> Result<Begun, Error> {
+    pub async fn open(&self, settings: &BatchSettings) -> Result<PendingDraws, Error> {
         if self.is_free() {
-            return Ok(Begun::default());
+            return Ok(PendingDraws::default());
         }
         let begins = settings.groups.iter().map(|group| {
             let draw = Draw {
@@ -77,9 +77,9 @@ impl Draws {
     }
 
     /// Before environments are reset.
-    pub async fn reset(&self, batch: &Batch, entries: &[ResetEntry]) -> Result<Begun, Error> {
+    pub async fn reset(&self, batch: &Batch, entries: &[ResetEntry]) -> Result<PendingDraws, Error> {
         if self.is_free() {
-            return Ok(Begun::default());
+            return Ok(PendingDraws::default());
         }
         let (mut befores, mut nows) = (Vec::new(), Vec::new());
         for ResetEntry { slot, seed, distributions, .. } in entries {
@@ -96,16 +96,16 @@ impl Draws {
             nows.push((next, distributions.as_ref().map_or_else(same, |new| new.to_vec())));
         }
         if befores.is_empty() {
-            return Ok(Begun::default());
+            return Ok(PendingDraws::default());
         }
         let begins = nows.iter().map(|(draw, distributions)| (Next { draw: *draw, distributions }, 1));
         self.begin(batch.settings().spec, begins, befores).await
     }
 
     /// Before environments are restored.
-    pub async fn restore(&self, batch: &Batch, entries: &[(usize, Bytes)]) -> Result<Begun, Error> {
+    pub async fn restore(&self, batch: &Batch, entries: &[(usize, Bytes)]) -> Result<PendingDraws, Error> {
         if self.is_free() || entries.is_empty() {
-            return Ok(Begun::default());
+            return Ok(PendingDraws::default());
         }
         let spec = batch.settings().spec;
         let saved: Result<Vec<_>, env::Error> =
@@ -127,12 +127,12 @@ impl Draws {
     }
 
     /// After environments could not be made.
-    pub fn not_opened(&self, spec: &EnvironmentSpec, begun: Begun) {
+    pub fn not_opened(&self, spec: &EnvironmentSpec, begun: PendingDraws) {
         self.note(spec, Vec::new(), Vec::new(), begun.withdrawn());
     }
 
     /// After environments could not be restored: those of these slots go on as before.
-    pub fn not_restored(&self, batch: &Batch, slots: &[usize], begun: Begun) {
+    pub fn not_restored(&self, batch: &Batch, slots: &[usize], begun: PendingDraws) {
         let spec = batch.settings().spec;
         let befores: Vec<_> = slots.iter().map(|slot| (batch.draw(*slot), batch.distributions(*slot))).collect();
         let begins = befores.iter().map(|(draw, distributions)| (Next { draw: *draw, distributions }, 1));
@@ -181,16 +181,16 @@ impl Draws {
         spec: &EnvironmentSpec,
         begins: impl Iterator<Item = (Next<'a>, usize)> + Clone,
         ends: Vec<Draw>,
-    ) -> Result<Begun, Error> {
+    ) -> Result<PendingDraws, Error> {
         let mut last: Option<&[Distribution]> = None;
         for (Next { distributions, .. }, _) in begins.clone() {
             if last.replace(distributions) != Some(distributions) {
                 self.check(spec, distributions)?;
             }
         }
-        let Some(ledger) = &self.ledger else { return Ok(Begun::default()) };
+        let Some(ledger) = &self.ledger else { return Ok(PendingDraws::default()) };
         let (regions, begins) = gathered(spec, begins);
-        let begun = Begun(begins.clone());
+        let begun = PendingDraws(begins.clone());
         ledger.write(self.event(spec, regions, begins, ended(ends))).await?;
         Ok(begun)
     }

@@ -10,9 +10,9 @@ mod token_file;
 
 pub use error::Error;
 pub use layer::{AuthLayer, AuthService};
-pub use quota::Held;
+pub use quota::QuotaGuard;
 pub use role::Role;
-pub use token_file::{Wrong, new_token};
+pub use token_file::{TokenFileError, new_token};
 
 use super::net::{managed_io::Connection, peer_limiter::Peer};
 use crate::env::Catalogue;
@@ -27,7 +27,7 @@ use std::{
     time::Duration,
 };
 use subtle::ConstantTimeEq;
-use token_file::{Entry, Known, listed};
+use token_file::{Entry, ParsedToken, listed};
 use tokio::sync::Notify;
 use tonic::{body::Body, codegen::http};
 
@@ -56,7 +56,7 @@ struct Quotas {
 }
 
 /// What a token has, and what was done with it.
-pub struct Used {
+pub struct TokenUsage {
     /// What it is called.
     pub name: String,
     /// Sessions now.
@@ -93,9 +93,9 @@ impl Token {
         self.quotas.refusals.fetch_add(1, Ordering::Relaxed);
     }
 
-    fn used(&self) -> Used {
+    fn used(&self) -> TokenUsage {
         let Quotas { sessions, envs, bytes, pace, steps, refusals } = &*self.quotas;
-        Used {
+        TokenUsage {
             name: self.name.clone(),
             sessions: sessions.taken(),
             envs: envs.taken(),
@@ -154,7 +154,7 @@ impl Token {
     ///
     /// # Errors
     /// [`Error::QuotaExceeded`].
-    pub fn session(self: &Arc<Self>) -> Result<Held, Error> {
+    pub fn session(self: &Arc<Self>) -> Result<QuotaGuard, Error> {
         self.take(1, Kind::Sessions)
     }
 
@@ -162,17 +162,17 @@ impl Token {
     ///
     /// # Errors
     /// [`Error::QuotaExceeded`].
-    pub fn envs(self: &Arc<Self>, count: usize) -> Result<Held, Error> {
+    pub fn envs(self: &Arc<Self>, count: usize) -> Result<QuotaGuard, Error> {
         self.take(count, Kind::Environments)
     }
 
     /// No bytes of it in flight, to be grown.
-    pub fn no_bytes(self: &Arc<Self>) -> Held {
-        Held::nothing(Arc::clone(self), Kind::Bytes)
+    pub fn no_bytes(self: &Arc<Self>) -> QuotaGuard {
+        QuotaGuard::nothing(Arc::clone(self), Kind::Bytes)
     }
 
-    fn take(self: &Arc<Self>, count: usize, kind: Kind) -> Result<Held, Error> {
-        let mut held = Held::nothing(Arc::clone(self), kind);
+    fn take(self: &Arc<Self>, count: usize, kind: Kind) -> Result<QuotaGuard, Error> {
+        let mut held = QuotaGuard::nothing(Arc::clone(self), kind);
         held.grow(count)?;
         Ok(held)
     }
@@ -198,19 +198,19 @@ impl Tokens {
     }
 
     /// What each has and has done.
-    pub fn used(&self) -> Vec<Used> {
+    pub fn used(&self) -> Vec<TokenUsage> {
         self.good.read().unwrap_or_else(PoisonError::into_inner).iter().map(|token| token.used()).collect()
     }
 
     /// Takes the file's new text: tokens that stay, with the same role, keep what they have, others are revoked.
     ///
     /// # Errors
-    /// [`Wrong`]; then all stays as it is.
-    pub fn renew(&self, text: &str) -> Result<(), Wrong> {
+    /// [`TokenFileError`]; then all stays as it is.
+    pub fn renew(&self, text: &str) -> Result<(), TokenFileError> {
         let listed = listed(&self.catalogue, text)?;
         let mut tokens = self.good.write().unwrap_or_else(PoisonError::into_inner);
         let mut renewed = Vec::with_capacity(listed.len());
-        for Known { digest, entry, role } in listed {
+        for ParsedToken { digest, entry, role } in listed {
             let Entry { name, max_sessions, max_envs, max_steps_per_second, max_bytes, .. } = entry;
             // Another token of the same name has what was taken with the one before, too.
             let before = tokens.iter().find(|token| token.name == name);
@@ -267,7 +267,7 @@ mod tests {
 
     const SECRET: &str = "correct-horse-battery";
 
-    fn tokens_of(text: &str) -> Result<Tokens, Wrong> {
+    fn tokens_of(text: &str) -> Result<Tokens, TokenFileError> {
         let tokens = Tokens::new(crate::tasks::catalogue());
         tokens.renew(text).map(|()| tokens)
     }

@@ -54,13 +54,13 @@ impl Kind {
 }
 
 /// A part of a quota, until it is dropped.
-pub struct Held {
+pub struct QuotaGuard {
     token: Bearer,
     count: usize,
     kind: Kind,
 }
 
-impl Held {
+impl QuotaGuard {
     /// Nothing of it yet.
     pub(super) fn nothing(token: Bearer, kind: Kind) -> Self {
         Self { token, count: 0, kind }
@@ -94,7 +94,7 @@ impl Held {
     }
 }
 
-impl Drop for Held {
+impl Drop for QuotaGuard {
     fn drop(&mut self) {
         self.set(0);
     }

@@ -22,14 +22,14 @@ const EXPECTED_ENTRY: &str = "[[token]] with name = \"…\", sha256 = \"64 hexad
 /// Why a file of tokens is refused. Nothing of a token is in it.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}: {what}; expected {EXPECTED_ENTRY}")]
-pub struct Wrong {
+pub struct TokenFileError {
     pub(super) line: usize,
     what: String,
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Listed {
+struct TokenFile {
     #[serde(default)]
     token: Vec<Spanned<Entry>>,
     #[serde(default)]
@@ -71,7 +71,7 @@ struct SetEntry {
 }
 
 /// A token of the file.
-pub(super) struct Known {
+pub(super) struct ParsedToken {
     /// SHA-256 of the token.
     pub(super) digest: [u8; 32],
     pub(super) entry: Entry,
@@ -79,14 +79,14 @@ pub(super) struct Known {
 }
 
 /// The tokens of a file, whose sets are of these environments.
-pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<Known>, Wrong> {
+pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToken>, TokenFileError> {
     let line = |byte: usize| 1 + text.bytes().take(byte).filter(|byte| *byte == b'\n').count();
-    let Listed { token: entries, role: roles, set: sets } = toml::from_str(text).map_err(|error| {
+    let TokenFile { token: entries, role: roles, set: sets } = toml::from_str(text).map_err(|error| {
         // A parser's words may quote a token, but for those that are about keys.
         let words = error.message();
         let about_keys = ["unknown field", "missing field", "duplicate key"].iter().any(|kind| words.starts_with(kind));
         let what = if about_keys { words.lines().next().unwrap_or_default() } else { "this cannot be read" };
-        Wrong { line: line(error.span().map_or(0, |span| span.start)), what: what.into() }
+        TokenFileError { line: line(error.span().map_or(0, |span| span.start)), what: what.into() }
     })?;
     let mut known_sets: BTreeMap<String, Set> =
         Version::KNOWN.iter().map(|version| (version.to_string(), Set::Version(*version))).collect();
@@ -94,9 +94,9 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<Known>, Wr
         let line = line(set.span().start);
         let set = set.into_inner();
         let name = set.name.clone();
-        let own = own_set(catalogue, set).map_err(|what| Wrong { line, what })?;
+        let own = own_set(catalogue, set).map_err(|what| TokenFileError { line, what })?;
         if known_sets.insert(name.clone(), own).is_some() {
-            return Err(Wrong {
+            return Err(TokenFileError {
                 line,
                 what: format!("there are two sets called {name:?}, of which versions are some"),
             });
@@ -109,16 +109,16 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<Known>, Wr
         let find = |names: Vec<String>| names.iter().map(|name| found("set", name, &known_sets)).collect();
         let sets: Result<(Option<Vec<Set>>, Vec<Set>), String> =
             draws.map(find).transpose().and_then(|draws| Ok((draws, find(never)?)));
-        let (draws, never) = sets.map_err(|what| Wrong { line, what })?;
+        let (draws, never) = sets.map_err(|what| TokenFileError { line, what })?;
         if draws.is_none() && !never.is_empty() {
             // A hair beside the set would do.
-            return Err(Wrong {
+            return Err(TokenFileError {
                 line,
                 what: format!("the role {name:?} has never without draws: say what it may draw from"),
             });
         }
         if known_roles.insert(name.clone(), Arc::new(Role { name: name.clone(), draws, never })).is_some() {
-            return Err(Wrong { line, what: format!("there are two roles called {name:?}") });
+            return Err(TokenFileError { line, what: format!("there are two roles called {name:?}") });
         }
     }
     let (mut names, mut digests) = (BTreeSet::new(), BTreeSet::new());
@@ -126,16 +126,16 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<Known>, Wr
     for entry in entries {
         let line = line(entry.span().start);
         let entry = entry.into_inner();
-        let digest = digest(&entry).map_err(|what| Wrong { line, what })?;
+        let digest = digest(&entry).map_err(|what| TokenFileError { line, what })?;
         if !names.insert(entry.name.clone()) {
-            return Err(Wrong { line, what: format!("there are two tokens called {:?}", entry.name) });
+            return Err(TokenFileError { line, what: format!("there are two tokens called {:?}", entry.name) });
         }
         if !digests.insert(digest) {
-            return Err(Wrong { line, what: format!("the token of {:?} is another one's, too", entry.name) });
+            return Err(TokenFileError { line, what: format!("the token of {:?} is another one's, too", entry.name) });
         }
         let role = entry.role.as_ref().map(|role| found("role", role, &known_roles)).transpose();
-        let role = role.map_err(|what| Wrong { line, what })?;
-        listed.push(Known { digest, entry, role });
+        let role = role.map_err(|what| TokenFileError { line, what })?;
+        listed.push(ParsedToken { digest, entry, role });
     }
     Ok(listed)
 }

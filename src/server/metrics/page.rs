@@ -15,7 +15,7 @@ use std::{
 };
 use tonic::Code;
 
-type Written = Result<(), fmt::Error>;
+type EncodeResult = Result<(), fmt::Error>;
 type Labels<'a, const N: usize> = [(&'static str, &'a str); N];
 /// The labels of a metric without labels.
 const NO_LABELS: Labels<'static, 0> = [];
@@ -41,7 +41,7 @@ impl fmt::Debug for Numbers {
 }
 
 impl Collector for Numbers {
-    fn encode(&self, encoder: DescriptorEncoder<'_>) -> Written {
+    fn encode(&self, encoder: DescriptorEncoder<'_>) -> EncodeResult {
         let mut page = Page(encoder);
         let labels = [("version", env!("CARGO_PKG_VERSION")), ("commit", env!("PERTURB_COMMIT"))];
         page.gauges("perturb_build_info", "1, with the version and the commit that were built", [(labels, 1.0)])?;
@@ -55,7 +55,7 @@ impl Collector for Numbers {
 
 impl Numbers {
     /// What there is, and how much there may be.
-    fn places(&self, page: &mut Page<'_>) -> Written {
+    fn places(&self, page: &mut Page<'_>) -> EncodeResult {
         let Sources { pool, sessions, leases, connections, budget, .. } = &*self.0;
         for (name, help, value) in [
             ("perturb_sessions", "Sessions now", sessions.taken()),
@@ -73,7 +73,7 @@ impl Numbers {
         page.counters("perturb_sessions_resumed", "How often a session was taken up by another stream", resumed)
     }
 
-    fn requests(&self, page: &mut Page<'_>) -> Written {
+    fn requests(&self, page: &mut Page<'_>) -> EncodeResult {
         let Sources { requests, errors, access, .. } = &*self.0;
         let each = requests.iter().flat_map(|(protocol, counts)| {
             counts.iter().flat_map(move |(kind, count)| {
@@ -92,7 +92,7 @@ impl Numbers {
         page.counters("perturb_sessions_ended", "Sessions that ended", each)
     }
 
-    fn environments(&self, page: &mut Page<'_>) -> Written {
+    fn environments(&self, page: &mut Page<'_>) -> EncodeResult {
         let meters = self.0.pool.meters();
         let name = |name: &'static str| [("environment", name)];
         let each = meters.iter().map(|(of, meter)| (name(of), meter.steps.load(Ordering::Relaxed) as f64));
@@ -113,9 +113,9 @@ impl Numbers {
         page.histograms("perturb_picture_seconds", "How long a picture is drawn", [(NO_LABELS, &**pictures)])
     }
 
-    fn tokens(&self, page: &mut Page<'_>) -> Written {
+    fn tokens(&self, page: &mut Page<'_>) -> EncodeResult {
         let tokens = self.0.tokens.as_ref().map(|tokens| tokens.used()).unwrap_or_default();
-        let each = |number: fn(&crate::server::auth::Used) -> f64| {
+        let each = |number: fn(&crate::server::auth::TokenUsage) -> f64| {
             tokens.iter().map(move |used| ([("token", used.name.as_str())], number(used)))
         };
         page.gauges("perturb_token_sessions", "Sessions of a token now", each(|used| used.sessions as f64))?;
@@ -129,7 +129,7 @@ impl Numbers {
 }
 
 /// What the system says of the process, if it does.
-fn resources(page: &mut Page<'_>) -> Written {
+fn resources(page: &mut Page<'_>) -> EncodeResult {
     let Ok(resources) = process::resources() else { return Ok(()) };
     page.counters("process_cpu_seconds", "Processor time", [(NO_LABELS, resources.cpu_seconds)])?;
     for (name, help, value) in [
@@ -169,7 +169,7 @@ impl Page<'_> {
         name: &str,
         help: &str,
         each: impl IntoIterator<Item = (S, f64)>,
-    ) -> Written {
+    ) -> EncodeResult {
         self.series(name, help, MetricType::Gauge, each, |mut encoder, value| encoder.encode_gauge(&value))
     }
 
@@ -179,7 +179,7 @@ impl Page<'_> {
         name: &str,
         help: &str,
         each: impl IntoIterator<Item = (S, f64)>,
-    ) -> Written {
+    ) -> EncodeResult {
         let encode = |mut encoder: MetricEncoder<'_>, value| encoder.encode_counter::<NoLabelSet, _, f64>(&value, None);
         self.series(name, help, MetricType::Counter, each, encode)
     }
@@ -189,7 +189,7 @@ impl Page<'_> {
         name: &str,
         help: &str,
         each: impl IntoIterator<Item = (S, &'h Histogram)>,
-    ) -> Written {
+    ) -> EncodeResult {
         self.series(name, help, MetricType::Histogram, each, |mut encoder, times: &Histogram| {
             let counts = times.counts();
             let all = counts.iter().map(|(_, count)| count).sum();
@@ -203,8 +203,8 @@ impl Page<'_> {
         help: &str,
         kind: MetricType,
         each: impl IntoIterator<Item = (S, V)>,
-        encode: impl Fn(MetricEncoder<'_>, V) -> Written,
-    ) -> Written {
+        encode: impl Fn(MetricEncoder<'_>, V) -> EncodeResult,
+    ) -> EncodeResult {
         let mut metric = self.0.encode_descriptor(name, help, None, kind)?;
         each.into_iter().try_for_each(|(labels, value)| encode(metric.encode_family(&labels)?, value))
     }

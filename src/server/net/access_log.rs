@@ -34,7 +34,7 @@ pub struct About {
 }
 
 /// A session that ended.
-pub struct Ended<'a> {
+pub struct SessionRecord<'a> {
     /// Whom it was from; none where nobody knows.
     pub peer: Option<Peer>,
     /// What its token is called.
@@ -73,11 +73,12 @@ impl Access {
     }
 
     /// Adds a session's end.
-    pub fn ended(&self, ended: &Ended<'_>) {
+    pub fn ended(&self, ended: &SessionRecord<'_>) {
         if !self.has_room(ended.protocol, ended.ending) {
             return;
         }
-        let Ended { peer, token, protocol, about: About { environment, envs, steps }, time, resumed, ending } = ended;
+        let SessionRecord { peer, token, protocol, about: About { environment, envs, steps }, time, resumed, ending } =
+            ended;
         let (peer, seconds) = (peer.map(tracing::field::display), (time.as_secs_f64() * 1e3).round() / 1e3);
         tracing::info!(
             target: "perturb::access",

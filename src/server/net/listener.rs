@@ -1,7 +1,7 @@
 //! Binding addresses: TCP ports and Unix sockets.
 
 use super::{
-    managed_io::Guarded,
+    managed_io::ManagedIo,
     peer_limiter::{Peer, Place, Places},
     tls::Tls,
 };
@@ -45,8 +45,8 @@ pub struct Admission {
 
 impl Admission {
     /// The connection, if there is a place for it.
-    fn admit<S>(&self, stream: S, peer: Peer) -> Option<Guarded<S>> {
-        self.place(peer).map(|place| Guarded::new(stream, peer, place, self.handshake))
+    fn admit<S>(&self, stream: S, peer: Peer) -> Option<ManagedIo<S>> {
+        self.place(peer).map(|place| ManagedIo::new(stream, peer, place, self.handshake))
     }
 
     fn place(&self, peer: Peer) -> Option<Place> {
@@ -61,12 +61,12 @@ impl Admission {
         peer: Peer,
         place: Place,
         tls: Tls,
-    ) -> Option<Guarded<TlsStream<TcpStream>>> {
+    ) -> Option<ManagedIo<TlsStream<TcpStream>>> {
         let refused = |reason: &dyn ToString| {
             tracing::debug!(?peer, reason = reason.to_string(), "closed a connection in its handshake");
         };
         match timeout(self.handshake, tls.accept(stream)).await {
-            Ok(Ok(stream)) => return Some(Guarded::new(stream, peer, place, self.handshake)),
+            Ok(Ok(stream)) => return Some(ManagedIo::new(stream, peer, place, self.handshake)),
             Ok(Err(error)) => refused(&error),
             Err(late) => refused(&late),
         }
@@ -78,7 +78,7 @@ impl Admission {
 pub fn tcp_connections(
     listener: TcpListener,
     admission: Admission,
-) -> impl Stream<Item = io::Result<Guarded<TcpStream>>> {
+) -> impl Stream<Item = io::Result<ManagedIo<TcpStream>>> {
     stream::unfold((listener, admission), |(listener, admission)| async {
         let connection = loop {
             match listener.accept().await {
@@ -101,7 +101,7 @@ pub fn tls_connections(
     listener: TcpListener,
     admission: Admission,
     tls: Tls,
-) -> impl Stream<Item = io::Result<Guarded<TlsStream<TcpStream>>>> {
+) -> impl Stream<Item = io::Result<ManagedIo<TlsStream<TcpStream>>>> {
     stream::unfold((listener, admission, tls, JoinSet::new()), |(listener, admission, tls, mut shaking)| async {
         let connection = loop {
             tokio::select! {
@@ -127,7 +127,7 @@ pub fn unix_connections(
     listener: UnixListener,
     file: SocketFile,
     admission: Admission,
-) -> impl Stream<Item = io::Result<Guarded<UnixStream>>> {
+) -> impl Stream<Item = io::Result<ManagedIo<UnixStream>>> {
     stream::unfold((listener, file, admission), |(listener, file, admission)| async {
         let connection = loop {
             match listener.accept().await {

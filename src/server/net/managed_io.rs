@@ -45,7 +45,7 @@ impl Connection {
 }
 
 /// A connection's bytes. It fails if its client's first do not come in time, and once it is ended.
-pub struct Guarded<S> {
+pub struct ManagedIo<S> {
     stream: S,
     connection: Connection,
     /// The bytes of the preface that have not come, and until when they may.
@@ -53,7 +53,7 @@ pub struct Guarded<S> {
     _place: Place,
 }
 
-impl<S> Guarded<S> {
+impl<S> ManagedIo<S> {
     /// Gives the client so long to begin.
     pub fn new(stream: S, peer: Peer, place: Place, limit: Duration) -> Self {
         let preface = Some((PREFACE_BYTES, Box::pin(sleep(limit))));
@@ -67,14 +67,14 @@ impl<S> Guarded<S> {
     }
 }
 
-impl<S> Drop for Guarded<S> {
+impl<S> Drop for ManagedIo<S> {
     /// Nobody needs to be woken any more; the waker would keep the connection's memory as long as a call knows of it.
     fn drop(&mut self) {
         self.connection.end.waker.take();
     }
 }
 
-impl<S> Connected for Guarded<S> {
+impl<S> Connected for ManagedIo<S> {
     type ConnectInfo = Connection;
 
     fn connect_info(&self) -> Connection {
@@ -82,7 +82,7 @@ impl<S> Connected for Guarded<S> {
     }
 }
 
-impl<S: AsyncRead + Unpin> AsyncRead for Guarded<S> {
+impl<S: AsyncRead + Unpin> AsyncRead for ManagedIo<S> {
     fn poll_read(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
@@ -103,7 +103,7 @@ impl<S: AsyncRead + Unpin> AsyncRead for Guarded<S> {
     }
 }
 
-impl<S: AsyncWrite + Unpin> AsyncWrite for Guarded<S> {
+impl<S: AsyncWrite + Unpin> AsyncWrite for ManagedIo<S> {
     fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         self.check(context)?;
         Pin::new(&mut self.stream).poll_write(context, bytes)

@@ -5,7 +5,7 @@ use super::{
     lease::{Numbers, One},
 };
 use crate::server::{
-    auth::{self, Bearer, Held, Token},
+    auth::{self, Bearer, QuotaGuard, Token},
     error::{ErrorCounters, RequestError},
     net::{
         access_log::Access,
@@ -107,7 +107,7 @@ impl Sessions {
 /// What a stream was let in on.
 pub(super) enum Seat {
     /// A place of its own, with that of its token.
-    Own(#[expect(dead_code, reason = "held")] Place, #[expect(dead_code, reason = "held")] Option<Held>),
+    Own(#[expect(dead_code, reason = "held")] Place, #[expect(dead_code, reason = "held")] Option<QuotaGuard>),
     /// That it takes up a session; otherwise this is its refusal.
     Spare(#[expect(dead_code, reason = "held")] One, Error),
 }

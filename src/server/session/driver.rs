@@ -8,8 +8,8 @@ use super::{
     exchange::{Exchange, MOVED, refused, revoked},
     handler::{Reply, SessionHandler, StreamHandover},
     instrumented::Counts,
-    lease::{self, Arrived, Ask, Grant, Line, OutgoingResponse, Ticket},
-    replay_buffer::Kept,
+    lease::{self, Ask, Grant, Line, OutgoingResponse, ResumingStream, Ticket},
+    replay_buffer::ReplayBuffer,
 };
 use crate::server::{
     error::{ErrorKind, RequestError, status},
@@ -83,7 +83,7 @@ struct SessionDriver<H: SessionHandler> {
 /// A session's lease, and the replies that its client may not have received.
 struct Lease<R> {
     grant: Grant<R>,
-    stored: Kept<StoredReply<R>>,
+    stored: ReplayBuffer<StoredReply<R>>,
     /// The number of the last reply that was sent in the present stream.
     sent: u64,
 }
@@ -106,7 +106,7 @@ enum Attachment<R> {
     Ended,
 }
 
-type Resuming<R> = oneshot::Receiver<Arrived<R>>;
+type Resuming<R> = oneshot::Receiver<ResumingStream<R>>;
 
 impl<H: SessionHandler> SessionDriver<H> {
     async fn run(mut self, responses: Line<H::Response>) {
@@ -196,7 +196,7 @@ impl<H: SessionHandler> SessionDriver<H> {
             Some(StreamHandover::Lease(grant)) => {
                 // A request that was read ahead would be lost with its stream, and come again.
                 self.exchange.reads_ahead = false;
-                self.lease = Some(Lease { stored: Kept::new(grant.most), grant, sent: 0 });
+                self.lease = Some(Lease { stored: ReplayBuffer::new(grant.most), grant, sent: 0 });
                 None
             }
             Some(StreamHandover::Resume(ticket)) => Some(ticket),
@@ -210,7 +210,8 @@ impl<H: SessionHandler> SessionDriver<H> {
         let Some(ticket) = resumed else { return Ok(()) };
         self.exchange.ending = MOVED;
         // If the session has ended by now, the stream ends at once.
-        let _ = ticket.arrival.send(Arrived { requests: self.exchange.requests.leave(), line: responses.clone() });
+        let _ =
+            ticket.arrival.send(ResumingStream { requests: self.exchange.requests.leave(), line: responses.clone() });
         Err(Attachment::Ended)
     }
 
@@ -251,7 +252,7 @@ impl<H: SessionHandler> SessionDriver<H> {
                 arrived = arrival(&mut resuming) => {
                     resuming = None;
                     match arrived {
-                        Ok(Arrived { requests, line }) => {
+                        Ok(ResumingStream { requests, line }) => {
                             exchange.requests = requests;
                             exchange.resumed += 1;
                             exchange.ending = GONE;
@@ -376,7 +377,7 @@ async fn resume_request<R>(lease: &mut Option<Lease<R>>) -> Ask<R> {
 }
 
 /// Waits for a stream that is about to come, or for ever.
-async fn arrival<R>(resuming: &mut Option<Resuming<R>>) -> Result<Arrived<R>, oneshot::error::RecvError> {
+async fn arrival<R>(resuming: &mut Option<Resuming<R>>) -> Result<ResumingStream<R>, oneshot::error::RecvError> {
     match resuming {
         Some(resuming) => resuming.await,
         None => std::future::pending().await,

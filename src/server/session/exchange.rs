@@ -10,7 +10,7 @@ use crate::server::{
     auth::{self, Bearer},
     error::{RequestError, status},
     limits::Allowance,
-    net::access_log::{BROKEN, Ended, GONE},
+    net::access_log::{BROKEN, GONE, SessionRecord},
     shutdown::Phase,
     transport::{
         message_reader::{Frames, Message, Stop},
@@ -228,7 +228,7 @@ impl<H: SessionHandler> Drop for Exchange<H> {
             return;
         }
         self.charge_steps();
-        self.sessions.access.ended(&Ended {
+        self.sessions.access.ended(&SessionRecord {
             peer: self.requests.connection.as_ref().map(|connection| connection.peer),
             token: self.requests.bearer.as_ref().map(|bearer| bearer.name()),
             protocol: H::PROTOCOL,

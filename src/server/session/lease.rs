@@ -174,11 +174,11 @@ pub struct Ticket<R> {
     /// The number of the last reply that there is.
     pub last_reply: u64,
     /// Where the stream is to go.
-    pub arrival: oneshot::Sender<Arrived<R>>,
+    pub arrival: oneshot::Sender<ResumingStream<R>>,
 }
 
 /// A stream that came to take up a session.
-pub struct Arrived<R> {
+pub struct ResumingStream<R> {
     /// Its requests.
     pub requests: Frames,
     /// Where its replies go.

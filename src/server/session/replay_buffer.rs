@@ -4,13 +4,13 @@ use super::lease::Error;
 use std::collections::VecDeque;
 
 /// Replies 1, 2, 3, …, of which the last few are here.
-pub struct Kept<R> {
+pub struct ReplayBuffer<R> {
     last: u64,
     most: usize,
     replies: VecDeque<R>,
 }
 
-impl<R> Kept<R> {
+impl<R> ReplayBuffer<R> {
     /// None yet. Their client has at most so many requests without replies, at least 1.
     pub fn new(most: usize) -> Self {
         Self { last: 0, most, replies: VecDeque::new() }
@@ -78,7 +78,7 @@ mod tests {
 
     #[test]
     fn a_request_says_that_what_its_client_does_not_wait_for_was_received() {
-        let mut kept = Kept::new(1);
+        let mut kept = ReplayBuffer::new(1);
         kept.asked();
         kept.made('a');
         assert_eq!((kept.check(0), kept.check(1), kept.get_mut(1)), (Ok(()), Ok(()), Some(&mut 'a')));
@@ -100,7 +100,7 @@ mod tests {
             most in 1_usize..8,
             moves in prop::collection::vec(0_u8..3, 0..200),
         ) {
-            let mut kept = Kept::new(most);
+            let mut kept = ReplayBuffer::new(most);
             let (mut sent, mut received) = (0, 0);
             for what in moves {
                 match what {

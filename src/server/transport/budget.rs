@@ -2,7 +2,7 @@
 //! have a part.
 
 use super::Error;
-use crate::server::auth::{Bearer, Held, Token};
+use crate::server::auth::{Bearer, QuotaGuard, Token};
 use bytes::Bytes;
 use std::sync::{
     Arc, Mutex, PoisonError,
@@ -63,7 +63,7 @@ pub struct Share {
     state: Arc<State>,
     bytes: usize,
     /// As many, of those that the token may have.
-    held: Option<Held>,
+    held: Option<QuotaGuard>,
 }
 
 impl Share {
@@ -129,16 +129,16 @@ impl Outbox {
     /// is what `hold` makes. Bytes without shares are left as they are.
     pub fn send<H: Send + 'static>(&self, bytes: Bytes, hold: impl FnOnce() -> H) -> Bytes {
         let shares = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
-        if shares.is_empty() { bytes } else { Bytes::from_owner(Sent { bytes, _held: (shares, hold()) }) }
+        if shares.is_empty() { bytes } else { Bytes::from_owner(ReservedBytes { bytes, _held: (shares, hold()) }) }
     }
 }
 
-struct Sent<H> {
+struct ReservedBytes<H> {
     bytes: Bytes,
     _held: (Vec<Share>, H),
 }
 
-impl<H> AsRef<[u8]> for Sent<H> {
+impl<H> AsRef<[u8]> for ReservedBytes<H> {
     fn as_ref(&self) -> &[u8] {
         &self.bytes
     }

@@ -44,7 +44,7 @@ pub struct Frames {
     body: Body,
     /// What has come and not been taken.
     buffer: BytesMut,
-    message: Option<Begun>,
+    message: Option<PartialMessage>,
     /// When the message that has begun must have ended.
     due: Option<Instant>,
     /// Of the message that has begun.
@@ -59,7 +59,7 @@ pub struct Frames {
 }
 
 /// A message that has begun.
-enum Begun {
+enum PartialMessage {
     /// It has so many bytes.
     Wanted(usize),
     /// There was no room for it. So many of its bytes have not come yet, and are thrown away.
@@ -179,7 +179,7 @@ impl Frames {
     }
 
     /// Reads a frame's header.
-    fn begin(&mut self, allowance: Allowance) -> Result<Begun, Stop> {
+    fn begin(&mut self, allowance: Allowance) -> Result<PartialMessage, Stop> {
         match self.buffer.get_u8() {
             0 => {}
             1 => return Err(Status::internal("a message came compressed; send it as it is").into()),
@@ -191,13 +191,13 @@ impl Frames {
         }
         let longest = |limit| limit + Duration::from_secs((length / MIN_BYTES_PER_SECOND) as u64);
         self.due = self.transit.limit.map(|limit| Instant::now() + longest(limit));
-        Ok(Begun::Wanted(length))
+        Ok(PartialMessage::Wanted(length))
     }
 
     /// The message that has begun, if it is there.
     fn taken(&mut self) -> Option<Message> {
         match &mut self.message {
-            Some(Begun::Wanted(length)) if self.buffer.len() >= *length => {
+            Some(PartialMessage::Wanted(length)) if self.buffer.len() >= *length => {
                 let bytes = if *length < OWN_BUFFER_MIN_BYTES {
                     self.buffer.split_to(*length).freeze()
                 } else {
@@ -210,7 +210,7 @@ impl Frames {
                 self.message = None;
                 Some(Message::Whole(bytes, std::mem::replace(&mut self.share, self.transit.budget.nothing())))
             }
-            Some(Begun::Refused(left, refusal)) => {
+            Some(PartialMessage::Refused(left, refusal)) => {
                 let come = (*left).min(self.buffer.len());
                 self.buffer.advance(come);
                 *left -= come;
@@ -224,7 +224,7 @@ impl Frames {
 
     /// Takes bytes that came, with their share of the budget.
     fn take(&mut self, data: &[u8], allowance: Allowance) {
-        if let Some(Begun::Wanted(length)) = self.message {
+        if let Some(PartialMessage::Wanted(length)) = self.message {
             let free = allowance.covered.max(UNBUDGETED_BYTES);
             let beyond = |bytes: usize| bytes.min(length).saturating_sub(free);
             let (before, after) = (beyond(self.buffer.len()), beyond(self.buffer.len() + data.len()));
@@ -232,7 +232,7 @@ impl Frames {
                 self.share = self.transit.budget.nothing();
                 // What has come of it goes with its memory.
                 let come = std::mem::take(&mut self.buffer).len();
-                self.message = Some(Begun::Refused(length - come, refusal));
+                self.message = Some(PartialMessage::Refused(length - come, refusal));
             }
             if self.buffer.capacity() - self.buffer.len() < data.len() {
                 // By doubling, and not all that was announced: a client that announces much need not send it.

@@ -86,7 +86,7 @@ where
             let transit = Transit { budget: self.transit.budget.of(bearer.clone()), ..self.transit };
             let body = std::mem::take(request.body_mut());
             let frames = Frames::new(body, transit, connection.clone(), bearer, outbox.clone());
-            request.extensions_mut().insert(Kept(Arc::new(Mutex::new(Some(frames)))));
+            request.extensions_mut().insert(RawBody(Arc::new(Mutex::new(Some(frames)))));
         }
         let response = self.service.call(request);
         Box::pin(
@@ -97,14 +97,14 @@ where
 
 /// A request's frames, as an extension of the request, which must be one that could be cloned.
 #[derive(Clone)]
-struct Kept(Arc<Mutex<Option<Frames>>>);
+struct RawBody(Arc<Mutex<Option<Frames>>>);
 
 /// The messages of a request whose body was kept.
 ///
 /// # Errors
 /// Where it was not: a defect.
 pub fn messages<T>(request: &mut tonic::Request<T>) -> Result<Frames, Status> {
-    let kept = request.extensions_mut().remove::<Kept>();
+    let kept = request.extensions_mut().remove::<RawBody>();
     let frames = kept.and_then(|kept| kept.0.lock().unwrap_or_else(PoisonError::into_inner).take());
     frames.ok_or_else(|| Status::internal("the request's body is not there: a defect of the server"))
 }

@@ -33,11 +33,11 @@ pub struct Patience {
 pub struct Replies {
     body: Body,
     outbox: Outbox,
-    waiting: Arc<Waiting>,
+    waiting: Arc<ReadProgress>,
 }
 
 /// The replies that wait for the client to read.
-struct Waiting {
+struct ReadProgress {
     state: Mutex<State>,
     /// Who looks after them, up to their end: as long as that waits it holds what it needs of the connection.
     watch: OnceLock<AbortHandle>,
@@ -68,7 +68,7 @@ impl State {
     }
 }
 
-impl Waiting {
+impl ReadProgress {
     fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -97,23 +97,23 @@ impl Waiting {
     }
 }
 
-impl Drop for Waiting {
+impl Drop for ReadProgress {
     fn drop(&mut self) {
         self.watch.get().into_iter().for_each(AbortHandle::abort);
     }
 }
 
 /// A reply that waits, until it is dropped.
-struct Unread(Arc<Waiting>);
+struct UnreadGuard(Arc<ReadProgress>);
 
-impl Unread {
-    fn new(waiting: &Arc<Waiting>) -> Self {
+impl UnreadGuard {
+    fn new(waiting: &Arc<ReadProgress>) -> Self {
         waiting.change(|replies| replies + 1);
         Self(Arc::clone(waiting))
     }
 }
 
-impl Drop for Unread {
+impl Drop for UnreadGuard {
     fn drop(&mut self) {
         self.0.change(|replies| replies - 1);
     }
@@ -123,7 +123,7 @@ impl Replies {
     /// A body whose replies' shares are in the outbox. If its client's patience for them, if it has any, is over, its
     /// connection ends.
     pub fn new(body: Body, outbox: Outbox, connection: Option<Connection>, patience: Option<Patience>) -> Self {
-        let waiting = Arc::new(Waiting { state: Mutex::new(State::new()), watch: OnceLock::new() });
+        let waiting = Arc::new(ReadProgress { state: Mutex::new(State::new()), watch: OnceLock::new() });
         if let (Some(connection), Some(patience)) = (connection, patience) {
             let watch = tokio::spawn(watch(Arc::downgrade(&waiting), connection, patience));
             waiting.watch.get_or_init(|| watch.abort_handle());
@@ -133,7 +133,7 @@ impl Replies {
 }
 
 /// Ends the connection when its client has read nothing for too long.
-async fn watch(waiting: Weak<Waiting>, connection: Connection, patience: Patience) {
+async fn watch(waiting: Weak<ReadProgress>, connection: Connection, patience: Patience) {
     let mut limit = Some(patience.rest.map_or(patience.first, |rest| rest.min(patience.first)));
     while let Some(looked_after) = limit {
         sleep(looked_after / CHECKS_PER_TIMEOUT).await;
@@ -163,7 +163,7 @@ impl HttpBody for Replies {
         {
             waiting.hold();
         }
-        polled.map_ok(|frame| frame.map_data(|bytes| outbox.send(bytes, || Unread::new(waiting))))
+        polled.map_ok(|frame| frame.map_data(|bytes| outbox.send(bytes, || UnreadGuard::new(waiting))))
     }
 
     fn is_end_stream(&self) -> bool {

@@ -204,7 +204,7 @@ impl Client {
                 player.begin_trial(start.slot as usize, SEED, start.episode.unwrap().trial_index);
             }
         }
-        let mut played = Played { memory: wire(player.memory()).to_vec(), ..Played::default() };
+        let mut played = Rollout { memory: wire(player.memory()).to_vec(), ..Rollout::default() };
         while !task.is_done() {
             let actions = Bytes::copy_from_slice(player.act().unwrap());
             let stepped = session.ask(Step { actions: actions.clone() }).await;
@@ -240,7 +240,7 @@ fn ended(end: &perturb::proto::EpisodeEnd) -> SlotEnd {
 
 /// An [`Acted`] that grows.
 #[derive(Default)]
-struct Played {
+struct Rollout {
     steps: u32,
     ended: Vec<EndedAt>,
     arrays: [Vec<u8>; 9],
@@ -248,7 +248,7 @@ struct Played {
     last_values: Vec<u8>,
 }
 
-impl Played {
+impl Rollout {
     fn push(&mut self, player: &Player, actions: &[u8]) {
         let step = player.played();
         let flags = |flags: &[bool]| flags.iter().map(|&flag| u8::from(flag)).collect::<Bytes>();

@@ -6,7 +6,7 @@ use super::{
     properties,
     runner::Runner,
     settings, specs,
-    world::Joined,
+    world::JoinedWorld,
     worlds::{Caller, Worlds},
 };
 use crate::{
@@ -36,7 +36,7 @@ pub(super) struct Agent {
     worlds: Arc<Worlds>,
     caller: Caller,
     sessions: Sessions,
-    joined: Option<Joined>,
+    joined: Option<JoinedWorld>,
     about: About,
 }
 
@@ -65,14 +65,14 @@ impl Agent {
         settings::none("join_world", &request.settings)?;
         let (world, runner) = self.worlds.join(&self.caller, &request.world_name)?;
         // Before anything is awaited: if the client goes now, the world is left and not lost.
-        let joined = self.joined.insert(Joined { world, runner });
+        let joined = self.joined.insert(JoinedWorld { world, runner });
         self.about = About { environment: Some(joined.world.spec().name), envs: 1, ..self.about };
         joined.runner.settle().await;
         Ok(rpc::JoinWorldResponse { specs: Some(specs::of(joined.world.spec())) })
     }
 
     async fn step(&mut self, request: rpc::StepRequest) -> Result<rpc::StepResponse, Error> {
-        let Joined { world, runner } = self.joined("step")?;
+        let JoinedWorld { world, runner } = self.joined("step")?;
         specs::check_requested(&request.requested_observations)?;
         let outcome = if runner.is_running() {
             let actions = specs::actions(world.spec(), &request.actions)?;
@@ -88,7 +88,7 @@ impl Agent {
     }
 
     fn reset(&mut self, request: rpc::ResetRequest) -> Result<rpc::ResetResponse, Error> {
-        let Joined { world, runner } = self.joined("reset")?;
+        let JoinedWorld { world, runner } = self.joined("reset")?;
         world.change(settings::change(world.spec(), "reset", &request.settings)?)?;
         runner.stop();
         Ok(rpc::ResetResponse { specs: Some(specs::of(world.spec())) })
@@ -110,13 +110,13 @@ impl Agent {
     }
 
     fn leave(&mut self) {
-        if let Some(Joined { world, mut runner }) = self.joined.take() {
+        if let Some(JoinedWorld { world, mut runner }) = self.joined.take() {
             runner.stop();
             self.worlds.leave(&self.caller, &world, runner);
         }
     }
 
-    fn joined(&mut self, request: &'static str) -> Result<&mut Joined, Error> {
+    fn joined(&mut self, request: &'static str) -> Result<&mut JoinedWorld, Error> {
         self.joined.as_mut().ok_or(Error::NotJoined { request })
     }
 }

@@ -5,7 +5,7 @@ use super::{
     Error,
     settings::{self, Change},
     tensors,
-    world::Joined,
+    world::JoinedWorld,
 };
 use crate::{
     env::{Catalogue, Distribution, EpisodeId, Receipt, shorten},
@@ -46,7 +46,7 @@ struct Property {
 ///
 /// # Errors
 /// If it is of another extension or cannot be decoded, or for what the request is refused for.
-pub(super) fn answer(catalogue: &Catalogue, joined: Option<&Joined>, request: &Any) -> Result<Any, Error> {
+pub(super) fn answer(catalogue: &Catalogue, joined: Option<&JoinedWorld>, request: &Any) -> Result<Any, Error> {
     let name = request.type_url.rsplit('/').next().unwrap_or_default();
     if name != REQUEST {
         return Err(Error::UnknownExtension { name: shorten(name), known: REQUEST });
@@ -76,7 +76,7 @@ pub(super) fn answer(catalogue: &Catalogue, joined: Option<&Joined>, request: &A
 }
 
 /// All properties, in a fixed order: the server's, then those of the joined world.
-fn properties(catalogue: &Catalogue, joined: Option<&Joined>) -> Vec<Property> {
+fn properties(catalogue: &Catalogue, joined: Option<&JoinedWorld>) -> Vec<Property> {
     let names: Vec<_> = catalogue.names().map(String::from).collect();
     let n = names.len();
     let mut all = vec![
@@ -94,7 +94,7 @@ fn properties(catalogue: &Catalogue, joined: Option<&Joined>) -> Vec<Property> {
     all
 }
 
-fn of_world(joined: &Joined, episode: EpisodeId, receipt: Option<&Receipt>) -> Vec<Property> {
+fn of_world(joined: &JoinedWorld, episode: EpisodeId, receipt: Option<&Receipt>) -> Vec<Property> {
     let (spec, runner) = (joined.world.spec(), &joined.runner);
     let new = Property::new;
     let hash = receipt.map(|receipt| receipt.model_hash.clone()).unwrap_or_default();
@@ -147,7 +147,7 @@ fn list<'a>(properties: &'a [Property], key: &'a str) -> Result<impl Iterator<It
     Ok(properties.iter().filter(move |property| property.parent() == key))
 }
 
-fn write(joined: Option<&Joined>, property: &Property, request: &WritePropertyRequest) -> Result<(), Error> {
+fn write(joined: Option<&JoinedWorld>, property: &Property, request: &WritePropertyRequest) -> Result<(), Error> {
     // Only a joined world's can be written.
     let (Some(joined), true) = (joined, property.is_writable) else {
         return Err(property.forbidden("written"));

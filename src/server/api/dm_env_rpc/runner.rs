@@ -3,7 +3,7 @@
 use super::Error;
 use crate::{
     env::{Distribution, EnvironmentSpec, EpisodeStart, Settings, Version},
-    pool::{Batch, BatchSettings, Pool, ResetEntry, Stepped},
+    pool::{Batch, BatchSettings, Pool, ResetEntry, StepResult},
     proto::dm_env_rpc::v1::EnvironmentStateType as State,
     server::audit::draws::Draws,
 };
@@ -155,7 +155,7 @@ impl Runner {
     /// # Errors
     /// If the server has a defect.
     pub(super) async fn step(&mut self, actions: &[u8], interrupted: bool) -> Result<Outcome, Error> {
-        let Stepped { observations, rewards, terminated, truncated, ended, .. } = self.batch.step(actions).await?;
+        let StepResult { observations, rewards, terminated, truncated, ended, .. } = self.batch.step(actions).await?;
         let is_set = |flags: &Bytes| flags.first().is_some_and(|flag| *flag == 1);
         let truncated = is_set(&truncated);
         let state = state(is_set(&terminated), truncated || interrupted);

@@ -16,11 +16,11 @@ pub(super) struct World {
     name: String,
     spec: &'static EnvironmentSpec,
     draws: Draws,
-    wanted: Mutex<Wanted>,
+    wanted: Mutex<PendingChanges>,
 }
 
 /// What the next episode begins with.
-struct Wanted {
+struct PendingChanges {
     version: Version,
     /// One for each parameter.
     distributions: Vec<Distribution>,
@@ -32,7 +32,7 @@ struct Wanted {
 }
 
 /// A world and its agent's episodes in it.
-pub(super) struct Joined {
+pub(super) struct JoinedWorld {
     pub(super) world: Arc<World>,
     pub(super) runner: Runner,
 }
@@ -40,7 +40,7 @@ pub(super) struct Joined {
 impl World {
     /// The world of an environment that has just been made.
     pub(super) fn new(name: String, runner: &Runner) -> Self {
-        let wanted = Wanted {
+        let wanted = PendingChanges {
             version: runner.version(),
             distributions: runner.episodes().distributions.clone(),
             new_distributions: false,
@@ -110,7 +110,7 @@ impl World {
         std::mem::take(&mut self.lock().interruption)
     }
 
-    fn lock(&self) -> MutexGuard<'_, Wanted> {
+    fn lock(&self) -> MutexGuard<'_, PendingChanges> {
         self.wanted.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -8,7 +8,7 @@ use crate::{
     pool::Pool,
     server::{
         audit::{draws::Draws, ledger::Ledger},
-        auth::{Bearer, Held},
+        auth::{Bearer, QuotaGuard},
         id,
     },
 };
@@ -31,7 +31,7 @@ impl Caller {
     ///
     /// # Errors
     /// If it has as many as it may have.
-    pub(super) fn envs(&self, count: usize) -> Result<Option<Held>, Error> {
+    pub(super) fn envs(&self, count: usize) -> Result<Option<QuotaGuard>, Error> {
         Ok(self.bearer.as_ref().map(|bearer| bearer.envs(count)).transpose()?)
     }
 
@@ -69,7 +69,7 @@ struct Entry {
     /// None while an agent has it.
     runner: Option<Runner>,
     /// Of the environments that its maker's token may have.
-    _held: Option<Held>,
+    _held: Option<QuotaGuard>,
 }
 
 impl Worlds {
@@ -120,7 +120,7 @@ impl Worlds {
         maker: &Caller,
         runner: Runner,
         own: Ownership,
-        held: Option<Held>,
+        held: Option<QuotaGuard>,
     ) -> Result<String, Error> {
         let name = match own.name {
             Some(name) => name,

@@ -6,7 +6,7 @@ use crate::{
         self, Achievement, ActionSpace, Catalogue, Channel, Comparison, Distribution, EnvironmentSpec, EpisodeEnd,
         EpisodeId, EpisodeStart, Parameter, Receipt, Settings, Success, Version, resolve,
     },
-    pool::{Autoreset, Batch, BatchSettings, ResetEntry, SlotGroup, Stepped},
+    pool::{Autoreset, Batch, BatchSettings, ResetEntry, SlotGroup, StepResult},
     proto,
     render::Size,
 };
@@ -336,7 +336,7 @@ fn action_space(space: ActionSpace) -> proto::ActionSpace {
 }
 
 /// A step's outcome.
-pub fn stepped(stepped: Stepped) -> proto::Stepped {
+pub fn stepped(stepped: StepResult) -> proto::Stepped {
     proto::Stepped {
         observations: stepped.observations,
         rewards: stepped.rewards,

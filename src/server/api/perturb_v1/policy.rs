@@ -3,7 +3,7 @@
 use super::{Error, convert};
 use crate::{
     env::ActionSpace,
-    pool::{Autoreset, Batch, EndedAt, Play, Played, Policy, PolicyRole, Turn},
+    pool::{Autoreset, Batch, EndedAt, Play, Policy, PolicyRole, Rollout, Turn},
     proto,
 };
 use bytes::Bytes;
@@ -215,7 +215,7 @@ fn has_floats(field: &'static str, bytes: &Bytes, count: usize, shape: &str) -> 
 }
 
 /// What was played.
-pub fn acted(played: Played) -> proto::Acted {
+pub fn acted(played: Rollout) -> proto::Acted {
     proto::Acted {
         steps: played.steps as u32,
         observations: played.observations.freeze(),

@@ -8,7 +8,7 @@ use crate::{
     render::Renderer,
     server::{
         audit::{draws::Draws, ledger::Ledger},
-        auth::{Bearer, Held},
+        auth::{Bearer, QuotaGuard},
         limits::{Allowance, MAX_BYTES_BEFORE_OPEN},
         net::access_log::About,
         session::{
@@ -49,7 +49,7 @@ pub struct Session {
     batch: Option<Batch>,
     bearer: Option<Bearer>,
     /// Its environments, of those that its token may have.
-    held: Option<Held>,
+    held: Option<QuotaGuard>,
     draws: Draws,
     budget: Budget,
     /// What steps need.
