@@ -11,7 +11,7 @@ use bytes::Bytes;
 use perturb::config::{Config, ListenAddress};
 use perturb::proto::session_request::Request;
 use perturb::proto::{AutoresetMode, Open, Restore, SessionRequest, Step, Version};
-use perturb::server::{self, net::listener::Listener, security::Guards};
+use perturb::server::{self, net::listener::Listener, security::Security};
 use perturb::tasks;
 use prost::Message;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
@@ -128,7 +128,7 @@ fn socket() -> &'static Path {
             runtime.block_on(async {
                 let listener = Listener::bind(&address, config.socket_mode).await.expect("an address");
                 listening.send(()).expect("somebody waits");
-                let guards = Guards::default();
+                let guards = Security::default();
                 let forever = std::future::pending();
                 let served = server::run(vec![listener], None, &config, &guards, tasks::catalogue(), forever).await;
                 panic!("the server ended: {served:?}");

@@ -11,7 +11,7 @@ use perturb::{
         self,
         auth::new_token,
         net::{listener::Listener, probe::probe},
-        security::Guards,
+        security::Security,
     },
     tasks,
 };
@@ -250,7 +250,7 @@ fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
     raise_descriptors();
     // One thread for I/O: physics has threads of its own, and a hand-over between runtime threads doubles latency.
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    let guards = Guards::load(config, &environments.catalogue).map_err(Failure::setting)?;
+    let guards = Security::load(config, &environments.catalogue).map_err(Failure::setting)?;
     let result = runtime.block_on(async {
         // Before the addresses are told: who reads them may send a signal at once.
         let shutdown = shutdown(config.exit_with_stdin)?;

@@ -71,11 +71,11 @@ pub struct Batch {
     /// The policy that plays, until somebody else changes the environments.
     play: Option<Box<Play>>,
     /// Who is told when it is freed.
-    farewell: Option<Farewell>,
+    farewell: Option<DropHook>,
 }
 
 /// Who is told where environments drew from, when they are freed.
-pub type Farewell = Box<dyn FnOnce(Vec<Draw>) + Send + Sync>;
+pub type DropHook = Box<dyn FnOnce(Vec<Draw>) + Send + Sync>;
 
 impl Batch {
     /// Makes the environments, on the pool's workers, and begins their first episodes. Returns the batch with its first
@@ -312,7 +312,7 @@ impl Batch {
     }
 
     /// Tells where its environments drew from, and how far they came, in order of slots, when they are freed.
-    pub fn when_freed(&mut self, tell: Farewell) {
+    pub fn when_freed(&mut self, tell: DropHook) {
         self.farewell = Some(tell);
     }
 

@@ -26,7 +26,7 @@ mod shard;
 mod step_result;
 mod sync;
 
-pub use batch::{Batch, Farewell, ResetEntry};
+pub use batch::{Batch, DropHook, ResetEntry};
 pub use follower::Follower;
 pub use rollout::{
     play::{Play, Policy, PolicyRole},

@@ -17,12 +17,12 @@ const REAPER_NICENESS: i32 = 3;
 
 /// Frees what a session leaves behind, and says whether it could: thousands of environments take longer than the transport
 /// may be kept.
-pub(super) type Rest = Box<dyn FnMut() -> bool + Send>;
+pub(super) type DeferredDrop = Box<dyn FnMut() -> bool + Send>;
 /// The interval at which a batch that was still in use is tried again.
 const REAP_INTERVAL: Duration = Duration::from_millis(1);
 
 /// The way to the thread that frees, until it is closed.
-pub(super) struct Reaper(Mutex<Option<mpsc::Sender<Rest>>>);
+pub(super) struct Reaper(Mutex<Option<mpsc::Sender<DeferredDrop>>>);
 
 impl Reaper {
     /// Starts the thread.
@@ -30,7 +30,7 @@ impl Reaper {
     /// # Errors
     /// If the operating system starts no thread.
     pub(super) fn start() -> io::Result<(Self, JoinHandle<()>)> {
-        let (rests, received) = mpsc::channel::<Rest>();
+        let (rests, received) = mpsc::channel::<DeferredDrop>();
         let freeing = move || {
             lower(REAPER_NICENESS);
             free(&received);
@@ -40,7 +40,7 @@ impl Reaper {
     }
 
     /// Frees what a session leaves behind, elsewhere.
-    pub(super) fn free(&self, rest: Rest) {
+    pub(super) fn free(&self, rest: DeferredDrop) {
         if let Some(rests) = &*lock(&self.0) {
             let _ = rests.send(rest); // its thread ends only with the pool
         }
@@ -53,8 +53,8 @@ impl Reaper {
 }
 
 /// Frees what comes, as soon as it can be, until the pool ends.
-fn free(received: &mpsc::Receiver<Rest>) {
-    let mut left: Vec<Rest> = Vec::new();
+fn free(received: &mpsc::Receiver<DeferredDrop>) {
+    let mut left: Vec<DeferredDrop> = Vec::new();
     loop {
         let come = match left.is_empty() {
             true => received.recv().map_err(|_| RecvTimeoutError::Disconnected),

@@ -6,7 +6,7 @@ pub const MAX_BYTES_BEFORE_OPEN: usize = 64 << 10;
 
 /// What a stream may send now.
 #[derive(Debug, Clone, Copy)]
-pub struct Allowance {
+pub struct RequestLimits {
     /// The most bytes of a message.
     pub bytes: usize,
     /// The most entries of fields that have one for each environment.

@@ -16,7 +16,7 @@ use std::{io, path::PathBuf};
 
 /// What keeps strangers out and writes down what others do; by default nothing does.
 #[derive(Default)]
-pub struct Guards {
+pub struct Security {
     /// What callers must show.
     pub tokens: Option<Tokens>,
     /// How TCP connections are encrypted.
@@ -27,7 +27,7 @@ pub struct Guards {
     watches: Vec<Watch>,
 }
 
-impl Guards {
+impl Security {
     /// Those of the settings of a server of these environments: its files are read, and again when they change.
     ///
     /// # Errors

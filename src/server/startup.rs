@@ -13,19 +13,19 @@ use super::{
     error::ErrorCounters,
     metrics::{self, RequestCounts, Sources},
     net::{
-        access_log::Access,
+        access_log::AccessLog,
         capacity_health,
-        listener::{self, Admission, Listener},
-        peer_limiter::Places,
+        listener::{self, ConnectionLimits, Listener},
+        peer_limiter::PeerLimiter,
         tls::Tls,
     },
-    security::Guards,
+    security::Security,
     session::{
         admission::{Limits, Sessions},
         lease::{self, Leases},
     },
     shutdown::{Controller, Drain, Phase},
-    transport::{budget::Budget, message_reader::Transit, raw_body::RawBodyLayer},
+    transport::{budget::Budget, message_reader::StreamLimits, raw_body::RawBodyLayer},
 };
 use crate::{
     config::Config,
@@ -92,7 +92,7 @@ pub async fn run(
     listeners: Vec<Listener>,
     metrics: Option<Listener>,
     config: &Config,
-    guards: &Guards,
+    guards: &Security,
     catalogue: Catalogue,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
@@ -142,14 +142,14 @@ pub fn listing(catalogue: &Catalogue, config: &Config) -> Result<proto::ListEnvi
 struct State {
     pool: Arc<Pool>,
     catalogue: Arc<Catalogue>,
-    places: Places,
-    admission: Admission,
-    transit: Transit,
+    places: PeerLimiter,
+    admission: ConnectionLimits,
+    transit: StreamLimits,
     sessions: Sessions,
     leases: Leases<proto::SessionResponse>,
     leased: lease::Numbers,
     errors: ErrorCounters,
-    access: Access,
+    access: AccessLog,
 }
 
 impl State {
@@ -161,16 +161,16 @@ impl State {
         let handshake = Duration::from_secs(config.handshake_seconds);
         let limits = Limits { bytes: config.max_message_bytes, handshake, idle: seconds(config.idle_seconds) };
         let of_a_peer = if config.max_peer_sessions > 0 { config.max_peer_sessions } else { usize::MAX };
-        let connections = Places::new(usize::MAX, of_a_peer.saturating_add(MAX_OTHER_STREAMS));
-        let (errors, access, leased) = (ErrorCounters::default(), Access::default(), lease::Numbers::default());
-        let places = Places::new(config.max_sessions, of_a_peer);
+        let connections = PeerLimiter::new(usize::MAX, of_a_peer.saturating_add(MAX_OTHER_STREAMS));
+        let (errors, access, leased) = (ErrorCounters::default(), AccessLog::default(), lease::Numbers::default());
+        let places = PeerLimiter::new(config.max_sessions, of_a_peer);
         let sessions = Sessions::new(places.clone(), limits, drain, errors.clone(), access.clone(), leased.clone());
         Ok(Self {
             pool,
             catalogue: Arc::new(catalogue),
             places,
-            admission: Admission { places: connections, handshake },
-            transit: Transit {
+            admission: ConnectionLimits { places: connections, handshake },
+            transit: StreamLimits {
                 budget: Budget::new(config.max_memory),
                 limit: seconds(config.stall_seconds),
                 handshake,
@@ -184,7 +184,7 @@ impl State {
     }
 
     /// The service of `perturb.v1`.
-    fn service(&self, listing: proto::ListEnvironmentsResponse, renderer: Renderer, guards: &Guards) -> Service {
+    fn service(&self, listing: proto::ListEnvironmentsResponse, renderer: Renderer, guards: &Security) -> Service {
         let shared = Shared {
             pool: Arc::clone(&self.pool),
             catalogue: Arc::clone(&self.catalogue),
@@ -197,13 +197,13 @@ impl State {
     }
 
     /// The service of `dm_env_rpc.v1`.
-    fn worlds(&self, guards: &Guards) -> dm_env_rpc::service::Service {
+    fn worlds(&self, guards: &Security) -> dm_env_rpc::service::Service {
         let (pool, catalogue) = (Arc::clone(&self.pool), Arc::clone(&self.catalogue));
         dm_env_rpc::service::Service::new(pool, catalogue, self.sessions.clone(), guards.ledger.clone())
     }
 
     /// Where the metrics' numbers are.
-    fn sources(&self, requests: [RequestCounts; 2], guards: &Guards, pictures: Arc<Histogram>) -> Sources {
+    fn sources(&self, requests: [RequestCounts; 2], guards: &Security, pictures: Arc<Histogram>) -> Sources {
         requests.iter().for_each(|(protocol, _)| self.access.tell_of(protocol));
         Sources {
             pool: Arc::clone(&self.pool),
@@ -279,7 +279,7 @@ fn watch(listener: Listener, sources: &Arc<Sources>) -> JoinSet<()> {
 fn serve(
     listeners: Vec<Listener>,
     router: &Router,
-    admission: &Admission,
+    admission: &ConnectionLimits,
     tls: Option<&Tls>,
     drain: &Drain,
 ) -> JoinSet<Result<(), tonic::transport::Error>> {

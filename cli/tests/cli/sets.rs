@@ -8,7 +8,7 @@ use std::thread::{self, JoinHandle};
 use perturb::config::{Arguments, Config};
 use perturb::env::{Action, Catalogue, Environment, EnvironmentSpec, Error, Stream, Transition};
 use perturb::scene::Scene;
-use perturb::server::{net::listener::Listener, security::Guards};
+use perturb::server::{net::listener::Listener, security::Security};
 use perturb::tasks::cart_pole;
 use perturb_experiment::{CellResult, CellState, Folder, Plan};
 use perturb_records::{FILE, Records};
@@ -313,7 +313,7 @@ impl InThread {
                 let listener = Listener::bind(&any, config.socket_mode).await.expect("a free port");
                 tell.send(listener.address().expect("bound").to_string()).expect("heard");
                 let stop = async { drop(end.await) };
-                let guards = Guards::default();
+                let guards = Security::default();
                 perturb::server::run(vec![listener], None, &config, &guards, catalogue, stop).await.expect("served");
             });
         });

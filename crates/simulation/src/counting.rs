@@ -3,8 +3,8 @@
 use bytes::Bytes;
 use perturb::proto::{self, session_request::Request, session_response::Response};
 use perturb::server::api::perturb_v1::{Error, fields::SESSION_REQUEST};
-use perturb::server::limits::Allowance;
-use perturb::server::net::access_log::About;
+use perturb::server::limits::RequestLimits;
+use perturb::server::net::access_log::SessionStats;
 use perturb::server::session::handler::{Reply, SessionHandler, StreamHandover};
 use perturb::server::session::lease::Leases;
 use perturb::server::transport::precheck::Field;
@@ -77,16 +77,16 @@ impl SessionHandler for CountingSession {
         }
     }
 
-    fn allowance(&self) -> Allowance {
-        Allowance { bytes: MAX_BYTES, entries: 1, covered: 0 }
+    fn allowance(&self) -> RequestLimits {
+        RequestLimits { bytes: MAX_BYTES, entries: 1, covered: 0 }
     }
 
     fn is_open(&self) -> bool {
         self.is_open
     }
 
-    fn about(&self) -> About {
-        About { steps: self.steps, ..About::default() }
+    fn about(&self) -> SessionStats {
+        SessionStats { steps: self.steps, ..SessionStats::default() }
     }
 
     async fn answer(&mut self, request: Self::Request) -> Result<CountingReply, Error> {

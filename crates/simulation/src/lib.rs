@@ -15,16 +15,16 @@ use futures_util::stream;
 use perturb::proto::{self, perturb_server::PerturbServer};
 use perturb::server::api::perturb_v1::service::ENDPOINT;
 use perturb::server::error::{ErrorCounters, ErrorKind};
-use perturb::server::net::access_log::Access;
+use perturb::server::net::access_log::AccessLog;
 use perturb::server::net::managed_io::ManagedIo;
-use perturb::server::net::peer_limiter::{Peer, Places};
+use perturb::server::net::peer_limiter::{Peer, PeerLimiter};
 use perturb::server::session::admission::{Limits, Sessions};
 use perturb::server::session::driver::Responses;
 use perturb::server::session::instrumented::Counts;
 use perturb::server::session::lease::{Leases, Numbers};
 use perturb::server::shutdown::Controller;
 use perturb::server::transport::budget::Budget;
-use perturb::server::transport::message_reader::Transit;
+use perturb::server::transport::message_reader::StreamLimits;
 use perturb::server::transport::raw_body::{self, RawBodyService};
 use perturb_protocol::{Address, ClientError, Connection, Timeouts};
 use tonic::transport::Server;
@@ -55,13 +55,13 @@ pub struct StepLog {
     /// Numbers of the steps, in the order of the server.
     done: Arc<Mutex<Vec<u64>>>,
     numbers: Numbers,
-    places: Places,
+    places: PeerLimiter,
     counters: ErrorCounters,
 }
 
 impl Default for StepLog {
     fn default() -> Self {
-        let places = Places::new(MAX_SESSIONS, MAX_SESSIONS);
+        let places = PeerLimiter::new(MAX_SESSIONS, MAX_SESSIONS);
         Self { done: Arc::default(), numbers: Numbers::default(), places, counters: ErrorCounters::default() }
     }
 }
@@ -103,12 +103,12 @@ pub async fn serve(ledger: StepLog) -> turmoil::Result {
     let places = ledger.places.clone();
     let numbers = ledger.numbers.clone();
     let counters = ledger.counters.clone();
-    let sessions = Sessions::new(places, limits, drain, counters, Access::default(), numbers.clone());
+    let sessions = Sessions::new(places, limits, drain, counters, AccessLog::default(), numbers.clone());
     let counts = Counts::new::<CountingSession>();
     let service = CountingService { sessions, leases: Leases::new(LEASE, numbers), ledger, counts };
-    let transit = Transit { budget, limit: Some(LEASE), handshake: HANDSHAKE_TIMEOUT };
+    let transit = StreamLimits { budget, limit: Some(LEASE), handshake: HANDSHAKE_TIMEOUT };
     let listener = turmoil::net::TcpListener::bind((Ipv4Addr::UNSPECIFIED, PORT)).await?;
-    let connections = Places::new(usize::MAX, usize::MAX);
+    let connections = PeerLimiter::new(usize::MAX, usize::MAX);
     let incoming = stream::unfold((listener, connections), |(listener, connections)| async {
         let (stream, address) = listener.accept().await.ok()?;
         let peer = Peer::at(address.ip());

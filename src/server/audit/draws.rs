@@ -18,7 +18,7 @@ use std::sync::{
 
 /// Of one session, or one world.
 #[derive(Clone)]
-pub struct Draws {
+pub struct DrawAuditor {
     bearer: Option<Bearer>,
     ledger: Option<Ledger>,
     session: u64,
@@ -50,7 +50,7 @@ struct Next<'a> {
     distributions: &'a [Distribution],
 }
 
-impl Draws {
+impl DrawAuditor {
     /// Of a new session with this token.
     pub fn new(bearer: Option<Bearer>, ledger: Option<Ledger>) -> Self {
         let session = ledger.as_ref().map_or(0, Ledger::session);

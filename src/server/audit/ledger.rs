@@ -18,12 +18,12 @@ use std::{
 use tokio::sync::oneshot;
 
 /// A line to be written, and who waits until it is.
-type Line = (LedgerEvent, Option<oneshot::Sender<Result<(), String>>>);
+type WriteRequest = (LedgerEvent, Option<oneshot::Sender<Result<(), String>>>);
 
 /// A server's ledger. A thread of its own writes it.
 #[derive(Clone)]
 pub struct Ledger {
-    lines: Sender<Line>,
+    lines: Sender<WriteRequest>,
     sessions: Arc<AtomicU64>,
 }
 
@@ -42,7 +42,7 @@ impl Ledger {
         if there.chain.lines() == 0 && there.unfinished > 0 {
             return Err(io::Error::other("that is no ledger, and not empty: give another name"));
         }
-        let mut book = Book {
+        let mut book = LedgerWriter {
             file,
             path: path.to_owned(),
             bytes: there.bytes,
@@ -105,7 +105,7 @@ impl Ledger {
 }
 
 /// The file, as far as it is whole.
-struct Book {
+struct LedgerWriter {
     file: File,
     path: PathBuf,
     bytes: u64,
@@ -113,12 +113,12 @@ struct Book {
     /// Whether there may be more in the file.
     is_torn: bool,
     /// What nobody waits for and could not be written yet.
-    kept: Vec<Line>,
+    kept: Vec<WriteRequest>,
 }
 
-impl Book {
+impl LedgerWriter {
     /// Writes what comes, whatever has come meanwhile at once.
-    fn keep(mut self, received: &Receiver<Line>) {
+    fn keep(mut self, received: &Receiver<WriteRequest>) {
         while let Ok(first) = received.recv() {
             let mut lines = std::mem::take(&mut self.kept);
             lines.push(first);

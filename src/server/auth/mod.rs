@@ -17,7 +17,7 @@ pub use token_file::{TokenFileError, new_token};
 use super::net::{managed_io::Connection, peer_limiter::Peer};
 use crate::env::Catalogue;
 use quota::{Kind, Quota};
-use rate_limiter::{Pace, TooFast};
+use rate_limiter::{RateLimiter, TooFast};
 use sha2::{Digest, Sha256};
 use std::{
     sync::{
@@ -50,7 +50,7 @@ struct Quotas {
     sessions: Quota,
     envs: Quota,
     bytes: Quota,
-    pace: Pace,
+    pace: RateLimiter,
     steps: AtomicU64,
     refusals: AtomicU64,
 }

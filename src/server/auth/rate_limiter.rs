@@ -18,7 +18,7 @@ const RECHECK_INTERVAL: Duration = Duration::from_millis(500);
 
 /// A token's rate, and where it stands.
 #[derive(Default)]
-pub(super) struct Pace(Mutex<State>);
+pub(super) struct RateLimiter(Mutex<State>);
 
 #[derive(Default)]
 struct State {
@@ -39,7 +39,7 @@ pub(super) struct TooFast {
     pub(super) ahead: Duration,
 }
 
-impl Pace {
+impl RateLimiter {
     /// From now on so many steps a second.
     pub(super) fn bound(&self, rate: Option<u32>) {
         self.lock().bound(rate, Instant::now());

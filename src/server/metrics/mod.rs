@@ -11,7 +11,7 @@ pub mod process;
 use super::{
     auth::Tokens,
     error::ErrorCounters,
-    net::{access_log::Access, peer_limiter::Places},
+    net::{access_log::AccessLog, peer_limiter::PeerLimiter},
     session::{instrumented::Counts, lease::Numbers},
     transport::budget::Budget,
 };
@@ -30,11 +30,11 @@ pub struct Sources {
     /// Environments, and what happens in them.
     pub pool: Arc<Pool>,
     /// Those of sessions.
-    pub sessions: Places,
+    pub sessions: PeerLimiter,
     /// Which of them have leases.
     pub leases: Numbers,
     /// Those of connections.
-    pub connections: Places,
+    pub connections: PeerLimiter,
     /// Bytes in flight.
     pub budget: Budget,
     /// Requests of each protocol.
@@ -42,7 +42,7 @@ pub struct Sources {
     /// Why requests were refused.
     pub errors: ErrorCounters,
     /// How sessions ended.
-    pub access: Access,
+    pub access: AccessLog,
     /// Whose sessions there are.
     pub tokens: Option<Tokens>,
     /// How long pictures were drawn.

@@ -24,7 +24,7 @@ pub const LEASE_OVER: &str = "lease_over";
 
 /// What a session came to.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct About {
+pub struct SessionStats {
     /// What it was opened with.
     pub environment: Option<&'static str>,
     /// How many environments it was opened with.
@@ -42,7 +42,7 @@ pub struct SessionRecord<'a> {
     /// By which protocol it came.
     pub protocol: &'static str,
     /// What it came to.
-    pub about: About,
+    pub about: SessionStats,
     /// How long it was.
     pub time: Duration,
     /// How often another stream took it up; none: never.
@@ -53,7 +53,7 @@ pub struct SessionRecord<'a> {
 
 /// The log, and how many sessions ended how.
 #[derive(Clone, Default)]
-pub struct Access(Arc<Mutex<State>>);
+pub struct AccessLog(Arc<Mutex<State>>);
 
 #[derive(Default)]
 struct State {
@@ -63,7 +63,7 @@ struct State {
     window: Option<(Instant, u64)>,
 }
 
-impl Access {
+impl AccessLog {
     /// Has [`endings`](Self::endings) tell of sessions of this protocol before the first one ends.
     pub fn tell_of(&self, protocol: &'static str) {
         let mut state = self.lock();
@@ -77,8 +77,15 @@ impl Access {
         if !self.has_room(ended.protocol, ended.ending) {
             return;
         }
-        let SessionRecord { peer, token, protocol, about: About { environment, envs, steps }, time, resumed, ending } =
-            ended;
+        let SessionRecord {
+            peer,
+            token,
+            protocol,
+            about: SessionStats { environment, envs, steps },
+            time,
+            resumed,
+            ending,
+        } = ended;
         let (peer, seconds) = (peer.map(tracing::field::display), (time.as_secs_f64() * 1e3).round() / 1e3);
         tracing::info!(
             target: "perturb::access",

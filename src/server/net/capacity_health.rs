@@ -1,6 +1,6 @@
 //! Whether there is room for another session, as health tells it to load balancers.
 
-use super::peer_limiter::Places;
+use super::peer_limiter::PeerLimiter;
 use crate::pool::Pool;
 use tonic_health::{ServingStatus, server::HealthReporter};
 
@@ -8,7 +8,7 @@ use tonic_health::{ServingStatus, server::HealthReporter};
 pub const NEW_SESSIONS: &str = "perturb.v1.Perturb.NewSessions";
 
 /// Keeps the health of [`NEW_SESSIONS`], for ever.
-pub async fn watch(health: &HealthReporter, sessions: &Places, pool: &Pool) {
+pub async fn watch(health: &HealthReporter, sessions: &PeerLimiter, pool: &Pool) {
     let mut told = None;
     loop {
         let full = sessions.taken() >= sessions.limit() || pool.environments() >= pool.limit();

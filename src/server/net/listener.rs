@@ -2,7 +2,7 @@
 
 use super::{
     managed_io::ManagedIo,
-    peer_limiter::{Peer, Place, Places},
+    peer_limiter::{Peer, PeerLimiter, PeerPermit},
     tls::Tls,
 };
 use crate::config::{ListenAddress, SocketMode};
@@ -36,20 +36,20 @@ pub enum Listener {
 
 /// What connections are subject to.
 #[derive(Clone)]
-pub struct Admission {
+pub struct ConnectionLimits {
     /// Places for them.
-    pub places: Places,
+    pub places: PeerLimiter,
     /// How long a client may take to begin.
     pub handshake: Duration,
 }
 
-impl Admission {
+impl ConnectionLimits {
     /// The connection, if there is a place for it.
     fn admit<S>(&self, stream: S, peer: Peer) -> Option<ManagedIo<S>> {
         self.place(peer).map(|place| ManagedIo::new(stream, peer, place, self.handshake))
     }
 
-    fn place(&self, peer: Peer) -> Option<Place> {
+    fn place(&self, peer: Peer) -> Option<PeerPermit> {
         let full = |full| tracing::debug!(?peer, ?full, "closed a connection for which there is no place");
         self.places.take(Some(peer)).map_err(full).ok()
     }
@@ -59,7 +59,7 @@ impl Admission {
         self,
         stream: TcpStream,
         peer: Peer,
-        place: Place,
+        place: PeerPermit,
         tls: Tls,
     ) -> Option<ManagedIo<TlsStream<TcpStream>>> {
         let refused = |reason: &dyn ToString| {
@@ -77,7 +77,7 @@ impl Admission {
 /// Connections as they come, without Nagle's delay: a step is one small message each way.
 pub fn tcp_connections(
     listener: TcpListener,
-    admission: Admission,
+    admission: ConnectionLimits,
 ) -> impl Stream<Item = io::Result<ManagedIo<TcpStream>>> {
     stream::unfold((listener, admission), |(listener, admission)| async {
         let connection = loop {
@@ -99,7 +99,7 @@ pub fn tcp_connections(
 /// Connections whose clients have shaken hands, in whatever order they are done with it: none waits for another.
 pub fn tls_connections(
     listener: TcpListener,
-    admission: Admission,
+    admission: ConnectionLimits,
     tls: Tls,
 ) -> impl Stream<Item = io::Result<ManagedIo<TlsStream<TcpStream>>>> {
     stream::unfold((listener, admission, tls, JoinSet::new()), |(listener, admission, tls, mut shaking)| async {
@@ -126,7 +126,7 @@ pub fn tls_connections(
 pub fn unix_connections(
     listener: UnixListener,
     file: SocketFile,
-    admission: Admission,
+    admission: ConnectionLimits,
 ) -> impl Stream<Item = io::Result<ManagedIo<UnixStream>>> {
     stream::unfold((listener, file, admission), |(listener, file, admission)| async {
         let connection = loop {

@@ -1,6 +1,6 @@
 //! A connection's bytes: the time that it has to begin, and how it is ended.
 
-use super::peer_limiter::{Peer, Place};
+use super::peer_limiter::{Peer, PeerPermit};
 use futures_util::task::AtomicWaker;
 use std::{
     future::Future,
@@ -50,12 +50,12 @@ pub struct ManagedIo<S> {
     connection: Connection,
     /// The bytes of the preface that have not come, and until when they may.
     preface: Option<(usize, Pin<Box<Sleep>>)>,
-    _place: Place,
+    _place: PeerPermit,
 }
 
 impl<S> ManagedIo<S> {
     /// Gives the client so long to begin.
-    pub fn new(stream: S, peer: Peer, place: Place, limit: Duration) -> Self {
+    pub fn new(stream: S, peer: Peer, place: PeerPermit, limit: Duration) -> Self {
         let preface = Some((PREFACE_BYTES, Box::pin(sleep(limit))));
         Self { stream, connection: Connection { peer, end: Arc::default() }, preface, _place: place }
     }

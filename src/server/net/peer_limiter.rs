@@ -39,7 +39,7 @@ impl fmt::Display for Peer {
 
 /// Places, of which there are so many in all and for each peer.
 #[derive(Clone)]
-pub struct Places(Arc<State>);
+pub struct PeerLimiter(Arc<State>);
 
 struct State {
     all: usize,
@@ -51,7 +51,7 @@ struct State {
 
 /// Why there is no place.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Full {
+pub enum LimitReached {
     /// All are taken.
     All(usize),
     /// The peer has as many as it may.
@@ -59,12 +59,12 @@ pub enum Full {
 }
 
 /// A place, until it is dropped.
-pub struct Place {
-    places: Places,
+pub struct PeerPermit {
+    places: PeerLimiter,
     peer: Option<Peer>,
 }
 
-impl Places {
+impl PeerLimiter {
     /// So many in all, and for each peer.
     pub fn new(all: usize, each: usize) -> Self {
         Self(Arc::new(State { all, each, taken: Mutex::default(), changed: Notify::new() }))
@@ -73,23 +73,23 @@ impl Places {
     /// A place for a peer. One that is not known has no quota of its own.
     ///
     /// # Errors
-    /// [`Full`].
-    pub fn take(&self, peer: Option<Peer>) -> Result<Place, Full> {
+    /// [`LimitReached`].
+    pub fn take(&self, peer: Option<Peer>) -> Result<PeerPermit, LimitReached> {
         let mut taken = self.lock();
         let (all, by_peer) = &mut *taken;
         if *all >= self.0.all {
-            return Err(Full::All(self.0.all));
+            return Err(LimitReached::All(self.0.all));
         }
         if let Some(peer) = peer {
             let its = by_peer.entry(peer).or_default();
             if *its >= self.0.each {
-                return Err(Full::Peer(self.0.each));
+                return Err(LimitReached::Peer(self.0.each));
             }
             *its += 1;
         }
         *all += 1;
         self.0.changed.notify_one();
-        Ok(Place { places: self.clone(), peer })
+        Ok(PeerPermit { places: self.clone(), peer })
     }
 
     /// How many are taken.
@@ -112,7 +112,7 @@ impl Places {
     }
 }
 
-impl Drop for Place {
+impl Drop for PeerPermit {
     fn drop(&mut self) {
         let mut taken = self.places.lock();
         let (all, by_peer) = &mut *taken;
@@ -146,11 +146,11 @@ mod tests {
     #[test]
     fn a_peer_takes_its_own_places_and_no_more() {
         let [one, other] = [1, 2].map(|user| Some(Peer::User(Some(user))));
-        let places = Places::new(4, 2);
+        let places = PeerLimiter::new(4, 2);
         let [first, _second] = [places.take(one), places.take(one)].map(Result::unwrap);
-        assert_eq!(places.take(one).err(), Some(Full::Peer(2)));
+        assert_eq!(places.take(one).err(), Some(LimitReached::Peer(2)));
         let _others = [places.take(other), places.take(None)].map(Result::unwrap);
-        assert_eq!(places.take(other).err(), Some(Full::All(4)));
+        assert_eq!(places.take(other).err(), Some(LimitReached::All(4)));
         drop(first);
         assert!(places.take(one).is_ok());
         assert!(places.take(one).is_ok(), "that place was given back");

@@ -2,29 +2,29 @@
 
 use super::{
     Error,
-    lease::{Numbers, One},
+    lease::{CountGuard, Numbers},
 };
 use crate::server::{
     auth::{self, Bearer, QuotaGuard, Token},
     error::{ErrorCounters, RequestError},
     net::{
-        access_log::Access,
-        peer_limiter::{Full, Place, Places},
+        access_log::AccessLog,
+        peer_limiter::{LimitReached, PeerLimiter, PeerPermit},
     },
     shutdown::{Drain, Phase},
-    transport::{message_reader::Frames, precheck::Decoder},
+    transport::{message_reader::MessageReader, precheck::Decoder},
 };
 use std::time::Duration;
 
 /// What all sessions of the server are subject to: their number, how long they may be silent, and the shutdown.
 #[derive(Clone)]
 pub struct Sessions {
-    places: Places,
+    places: PeerLimiter,
     pub(super) limits: Limits,
     pub(super) decoder: Decoder,
     pub(super) drain: Drain,
     counters: ErrorCounters,
-    pub(super) access: Access,
+    pub(super) access: AccessLog,
     leases: Numbers,
 }
 
@@ -42,11 +42,11 @@ pub struct Limits {
 impl Sessions {
     /// Sessions for which there are these places. What is refused and how they end is counted.
     pub fn new(
-        places: Places,
+        places: PeerLimiter,
         limits: Limits,
         drain: Drain,
         counters: ErrorCounters,
-        access: Access,
+        access: AccessLog,
         leases: Numbers,
     ) -> Self {
         Self { places, limits, decoder: Decoder::default(), drain, counters, access, leases }
@@ -59,7 +59,7 @@ impl Sessions {
 
     /// Lets a stream in, or says why not. One that finds the server full may still take up a session if its protocol has
     /// leases.
-    pub(super) fn admit(&self, requests: &Frames, has_leases: bool) -> Result<Seat, Error> {
+    pub(super) fn admit(&self, requests: &MessageReader, has_leases: bool) -> Result<Admission, Error> {
         match self.take_place(requests) {
             Err(refusal) if has_leases => self.admit_to_resume(refusal),
             seat => seat,
@@ -72,13 +72,13 @@ impl Sessions {
     }
 
     /// Lets a stream in for which there is no place, if it might be one that takes up a session, which has a place.
-    fn admit_to_resume(&self, refusal: Error) -> Result<Seat, Error> {
+    fn admit_to_resume(&self, refusal: Error) -> Result<Admission, Error> {
         let is_full = matches!(
             refusal,
             Error::SessionsFull { .. } | Error::PeerFull { .. } | Error::Auth(auth::Error::QuotaExceeded { .. })
         );
         match self.leases.spare().filter(|_| is_full) {
-            Some(spare) => Ok(Seat::Spare(spare, refusal)),
+            Some(spare) => Ok(Admission::Spare(spare, refusal)),
             None => Err(refusal),
         }
     }
@@ -91,23 +91,23 @@ impl Sessions {
         }
     }
 
-    fn take_place(&self, requests: &Frames) -> Result<Seat, Error> {
+    fn take_place(&self, requests: &MessageReader) -> Result<Admission, Error> {
         if self.phase() != Phase::Running {
             return Err(Error::Draining);
         }
         let place = self.places.take(requests.connection.as_ref().map(|connection| connection.peer));
         let place = place.map_err(|full| match full {
-            Full::All(limit) => Error::SessionsFull { limit },
-            Full::Peer(limit) => Error::PeerFull { limit },
+            LimitReached::All(limit) => Error::SessionsFull { limit },
+            LimitReached::Peer(limit) => Error::PeerFull { limit },
         })?;
-        Ok(Seat::Own(place, requests.bearer.as_ref().map(Token::session).transpose()?))
+        Ok(Admission::Own(place, requests.bearer.as_ref().map(Token::session).transpose()?))
     }
 }
 
 /// What a stream was let in on.
-pub(super) enum Seat {
+pub(super) enum Admission {
     /// A place of its own, with that of its token.
-    Own(#[expect(dead_code, reason = "held")] Place, #[expect(dead_code, reason = "held")] Option<QuotaGuard>),
+    Own(#[expect(dead_code, reason = "held")] PeerPermit, #[expect(dead_code, reason = "held")] Option<QuotaGuard>),
     /// That it takes up a session; otherwise this is its refusal.
-    Spare(#[expect(dead_code, reason = "held")] One, Error),
+    Spare(#[expect(dead_code, reason = "held")] CountGuard, Error),
 }

@@ -8,15 +8,15 @@ use super::{
     exchange::{Exchange, MOVED, refused, revoked},
     handler::{Reply, SessionHandler, StreamHandover},
     instrumented::Counts,
-    lease::{self, Ask, Grant, Line, OutgoingResponse, ResumingStream, Ticket},
+    lease::{self, LeaseGuard, OutgoingResponse, ResponseSender, ResumeAccepted, ResumeRequest, ResumingStream},
     replay_buffer::ReplayBuffer,
 };
 use crate::server::{
     error::{ErrorKind, RequestError, status},
     net::access_log::{CLOSED, GONE, LEASE_OVER},
     transport::{
-        budget::Share,
-        message_reader::{Frames, Message, Stop},
+        budget::MemoryReservation,
+        message_reader::{Message, MessageReader, Stop},
     },
 };
 use futures_util::{Stream, stream};
@@ -51,7 +51,7 @@ impl Sessions {
     /// If the server is shutting down or has no room for another session, or its token may have no more.
     pub fn begin<H: SessionHandler>(
         &self,
-        requests: Frames,
+        requests: MessageReader,
         handler: H,
         counts: &Arc<Counts>,
     ) -> Result<Responses<H::Response>, Status> {
@@ -82,7 +82,7 @@ struct SessionDriver<H: SessionHandler> {
 
 /// A session's lease, and the replies that its client may not have received.
 struct Lease<R> {
-    grant: Grant<R>,
+    grant: LeaseGuard<R>,
     stored: ReplayBuffer<StoredReply<R>>,
     /// The number of the last reply that was sent in the present stream.
     sent: u64,
@@ -91,15 +91,15 @@ struct Lease<R> {
 struct StoredReply<R> {
     response: R,
     /// The memory for it. A reply without is dropped when it is sent.
-    memory: Option<Share>,
+    memory: Option<MemoryReservation>,
     /// The memory that the handler took for it, until it is sent for the first time.
-    outgoing: Option<Share>,
+    outgoing: Option<MemoryReservation>,
 }
 
 /// Whether a session has a stream.
 enum Attachment<R> {
     /// The session has the stream that takes these responses.
-    Attached(Line<R>),
+    Attached(ResponseSender<R>),
     /// The session has none. One may be about to come.
     Detached(Option<Resuming<R>>),
     /// The session has ended.
@@ -109,7 +109,7 @@ enum Attachment<R> {
 type Resuming<R> = oneshot::Receiver<ResumingStream<R>>;
 
 impl<H: SessionHandler> SessionDriver<H> {
-    async fn run(mut self, responses: Line<H::Response>) {
+    async fn run(mut self, responses: ResponseSender<H::Response>) {
         let mut attachment = Attachment::Attached(responses);
         loop {
             attachment = match attachment {
@@ -121,7 +121,7 @@ impl<H: SessionHandler> SessionDriver<H> {
     }
 
     /// Answers a stream's requests, until it is lost, or another takes its place, or the session ends.
-    async fn attached(&mut self, responses: &Line<H::Response>) -> Attachment<H::Response> {
+    async fn attached(&mut self, responses: &ResponseSender<H::Response>) -> Attachment<H::Response> {
         let mut closed = pin!(responses.closed());
         loop {
             while self.lease.as_ref().is_some_and(|lease| lease.sent < lease.stored.last()) {
@@ -160,7 +160,7 @@ impl<H: SessionHandler> SessionDriver<H> {
     async fn respond(
         &mut self,
         message: Message,
-        responses: &Line<H::Response>,
+        responses: &ResponseSender<H::Response>,
         closed: Pin<&mut impl Future<Output = ()>>,
     ) -> Result<(), Attachment<H::Response>> {
         if let Some(lease) = &mut self.lease {
@@ -189,7 +189,7 @@ impl<H: SessionHandler> SessionDriver<H> {
     async fn deliver(
         &mut self,
         reply: Reply<H::Response>,
-        responses: &Line<H::Response>,
+        responses: &ResponseSender<H::Response>,
     ) -> Result<(), Attachment<H::Response>> {
         let Reply { response, memory, handover } = reply;
         let resumed = match handover {
@@ -218,7 +218,7 @@ impl<H: SessionHandler> SessionDriver<H> {
     /// Waits until the stream takes another response.
     async fn slot<'r>(
         &mut self,
-        responses: &'r Line<H::Response>,
+        responses: &'r ResponseSender<H::Response>,
     ) -> Result<mpsc::Permit<'r, Result<OutgoingResponse<H::Response>, Status>>, Attachment<H::Response>> {
         let bearer = self.exchange.requests.bearer.clone();
         loop {
@@ -276,12 +276,16 @@ impl<H: SessionHandler> SessionDriver<H> {
         }
     }
 
-    fn accept_resume(&mut self, ask: Ask<H::Response>) -> Option<Resuming<H::Response>> {
+    fn accept_resume(&mut self, ask: ResumeRequest<H::Response>) -> Option<Resuming<H::Response>> {
         self.lease.as_mut().and_then(|lease| lease.accept_resume(ask))
     }
 
     /// Ends the stream, because another takes its place.
-    fn supersede(&mut self, responses: &Line<H::Response>, resuming: Resuming<H::Response>) -> Attachment<H::Response> {
+    fn supersede(
+        &mut self,
+        responses: &ResponseSender<H::Response>,
+        resuming: Resuming<H::Response>,
+    ) -> Attachment<H::Response> {
         end_stream(responses, status(&lease::Error::TakenUp));
         self.detach(Some(resuming))
     }
@@ -295,7 +299,7 @@ impl<H: SessionHandler> SessionDriver<H> {
     }
 
     /// Ends a stream that cannot go on. The session of a lease ends only if the server wants it.
-    fn stopped(&mut self, responses: &Line<H::Response>, stop: Stop<H::Error>) -> Attachment<H::Response> {
+    fn stopped(&mut self, responses: &ResponseSender<H::Response>, stop: Stop<H::Error>) -> Attachment<H::Response> {
         match (stop, self.lease.is_some()) {
             (Stop::Cancelled, _) => self.detach(None),
             (Stop::Broken(status), true) => {
@@ -323,7 +327,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         }
         let Reply { response, memory: outgoing, .. } = exchange.finish(answer);
         let (budget, bytes) = (exchange.requests.budget().clone(), response.encoded_len() + REPLY_OVERHEAD_BYTES);
-        let held: usize = stored.replies().map(|reply| reply.memory.as_ref().map_or(0, Share::bytes)).sum();
+        let held: usize = stored.replies().map(|reply| reply.memory.as_ref().map_or(0, MemoryReservation::bytes)).sum();
         let mut memory = budget.take(bytes);
         if memory.is_err() || held + bytes > MAX_STORED_BYTES {
             stored.clear();
@@ -346,20 +350,20 @@ impl<R: Clone> Lease<R> {
     }
 
     /// Answers a stream that asks for the session. Returns where it will come, if it may.
-    fn accept_resume(&mut self, Ask { last_reply, answer }: Ask<R>) -> Option<Resuming<R>> {
+    fn accept_resume(&mut self, ResumeRequest { last_reply, answer }: ResumeRequest<R>) -> Option<Resuming<R>> {
         if let Err(error) = self.stored.check(last_reply) {
             let _ = answer.send(Err(error)); // a stream that is gone does not hear it
             return None;
         }
         let (arrival, resuming) = oneshot::channel();
-        answer.send(Ok(Ticket { last_reply: self.stored.last(), arrival })).ok()?;
+        answer.send(Ok(ResumeAccepted { last_reply: self.stored.last(), arrival })).ok()?;
         self.sent = last_reply;
         Some(resuming)
     }
 }
 
 /// Ends a stream with this status, as soon as it takes it.
-fn end_stream<R: Send + 'static>(responses: &Line<R>, status: Status) {
+fn end_stream<R: Send + 'static>(responses: &ResponseSender<R>, status: Status) {
     if let Err(TrySendError::Full(status)) = responses.try_send(Err(status)) {
         let responses = responses.clone();
         tokio::spawn(async move { responses.send(status).await });
@@ -367,7 +371,7 @@ fn end_stream<R: Send + 'static>(responses: &Line<R>, status: Status) {
 }
 
 /// Waits for a stream that asks for the session; for ever without a lease.
-async fn resume_request<R>(lease: &mut Option<Lease<R>>) -> Ask<R> {
+async fn resume_request<R>(lease: &mut Option<Lease<R>>) -> ResumeRequest<R> {
     if let Some(lease) = lease
         && let Some(ask) = lease.grant.asks.recv().await
     {

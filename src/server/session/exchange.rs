@@ -2,18 +2,18 @@
 
 use super::{
     Error,
-    admission::{Limits, Seat, Sessions},
+    admission::{Admission, Limits, Sessions},
     handler::{Reply, SessionHandler},
     instrumented::Counts,
 };
 use crate::server::{
     auth::{self, Bearer},
     error::{RequestError, status},
-    limits::Allowance,
+    limits::RequestLimits,
     net::access_log::{BROKEN, GONE, SessionRecord},
     shutdown::Phase,
     transport::{
-        message_reader::{Frames, Message, Stop},
+        message_reader::{Message, MessageReader, Stop},
         precheck::decoded_at_once,
     },
 };
@@ -27,7 +27,7 @@ pub(super) const MOVED: &str = "moved";
 
 /// A session's handler, and the requests of the stream that the session has now.
 pub(super) struct Exchange<H: SessionHandler> {
-    pub(super) requests: Frames,
+    pub(super) requests: MessageReader,
     /// The request that came while the one before it was being answered.
     ahead: Option<Result<Option<Message>, Stop>>,
     /// Whether the present request was read ahead. Its step may have begun then.
@@ -51,11 +51,17 @@ pub(super) struct Exchange<H: SessionHandler> {
     pub(super) ending: &'static str,
     /// How often another stream resumed the session.
     pub(super) resumed: u32,
-    seat: Seat,
+    seat: Admission,
 }
 
 impl<H: SessionHandler> Exchange<H> {
-    pub(super) fn new(requests: Frames, handler: H, counts: Arc<Counts>, sessions: Sessions, seat: Seat) -> Self {
+    pub(super) fn new(
+        requests: MessageReader,
+        handler: H,
+        counts: Arc<Counts>,
+        sessions: Sessions,
+        seat: Admission,
+    ) -> Self {
         let start = Instant::now();
         Self {
             requests,
@@ -116,7 +122,7 @@ impl<H: SessionHandler> Exchange<H> {
         message: Message,
     ) -> Result<Result<Reply<H::Response>, H::Error>, Stop<H::Error>> {
         match (self.respond(message).await?, &self.seat) {
-            (Err(error), Seat::Spare(..)) => Err(Stop::Refused(error)),
+            (Err(error), Admission::Spare(..)) => Err(Stop::Refused(error)),
             (answer, _) => Ok(answer),
         }
     }
@@ -147,7 +153,7 @@ impl<H: SessionHandler> Exchange<H> {
             Ok(request) => request,
             Err(error) => return Ok(self.undecoded(error)),
         };
-        if let Seat::Spare(_, refusal) = &self.seat
+        if let Admission::Spare(_, refusal) = &self.seat
             && !H::RESUMES.is_some_and(|resumes| resumes(&request))
         {
             return Err(refused(refusal.clone()));
@@ -196,9 +202,9 @@ impl<H: SessionHandler> Exchange<H> {
         self.ending = error.kind().reason();
     }
 
-    fn allowance(&self) -> Allowance {
+    fn allowance(&self) -> RequestLimits {
         let allowance = self.handler.allowance();
-        Allowance { bytes: allowance.bytes.min(self.sessions.limits.bytes), ..allowance }
+        RequestLimits { bytes: allowance.bytes.min(self.sessions.limits.bytes), ..allowance }
     }
 
     fn count(&self, error: &impl RequestError) {
@@ -242,10 +248,10 @@ impl<H: SessionHandler> Drop for Exchange<H> {
 
 /// Reads the request that comes while another is answered, and offers it to the pool.
 async fn read_ahead<H: SessionHandler>(
-    requests: &mut Frames,
+    requests: &mut MessageReader,
     ahead: &mut Option<Result<Option<Message>, Stop>>,
     offer: Option<impl FnOnce(H::Request)>,
-    allowance: Allowance,
+    allowance: RequestLimits,
 ) -> Infallible {
     if let Some(offer) = offer.filter(|_| ahead.is_none()) {
         let came = requests.next(allowance).await;

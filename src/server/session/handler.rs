@@ -2,22 +2,22 @@
 
 use super::{
     Error,
-    lease::{Grant, Ticket},
+    lease::{LeaseGuard, ResumeAccepted},
 };
 use crate::server::{
     error::RequestError,
-    limits::Allowance,
-    net::access_log::About,
-    transport::{budget::Share, precheck::Field},
+    limits::RequestLimits,
+    net::access_log::SessionStats,
+    transport::{budget::MemoryReservation, precheck::Field},
 };
 use std::future::Future;
 
 /// What a response does to the stream that it is sent in.
 pub enum StreamHandover<R> {
     /// The session has a lease from now on, and outlives the stream.
-    Lease(Grant<R>),
+    Lease(LeaseGuard<R>),
     /// The stream goes on with the session that it resumes.
-    Resume(Ticket<R>),
+    Resume(ResumeAccepted<R>),
 }
 
 /// The answer to a request.
@@ -25,7 +25,7 @@ pub struct Reply<R> {
     /// The response.
     pub response: R,
     /// The memory that the response takes until it is sent, if it is not part of what the session holds anyway.
-    pub memory: Option<Share>,
+    pub memory: Option<MemoryReservation>,
     /// What the response does to its stream.
     pub handover: Option<StreamHandover<R>>,
 }
@@ -58,13 +58,13 @@ pub trait SessionHandler: Send + 'static {
     fn kind(request: &Self::Request) -> &'static str;
 
     /// How large the next request may be.
-    fn allowance(&self) -> Allowance;
+    fn allowance(&self) -> RequestLimits;
 
     /// Whether the session holds something that a shutdown should wait for.
     fn is_open(&self) -> bool;
 
     /// What the session has done so far.
-    fn about(&self) -> About;
+    fn about(&self) -> SessionStats;
 
     /// Answers a request.
     ///

@@ -8,7 +8,7 @@ use crate::server::{
     auth::Bearer,
     error::{ErrorKind, RequestError},
     id::{Id, NoRandomness, random},
-    transport::{budget::Share, message_reader::Frames},
+    transport::{budget::MemoryReservation, message_reader::MessageReader},
 };
 use std::{
     sync::{
@@ -77,11 +77,11 @@ pub struct OutgoingResponse<R> {
     /// The response.
     pub response: R,
     /// The memory that it takes until it is sent.
-    pub memory: Option<Share>,
+    pub memory: Option<MemoryReservation>,
 }
 
 /// Sends responses to a stream, or the status that ends it.
-pub type Line<R> = mpsc::Sender<Result<OutgoingResponse<R>, Status>>;
+pub type ResponseSender<R> = mpsc::Sender<Result<OutgoingResponse<R>, Status>>;
 
 /// The leases of a server, of sessions with these responses.
 pub struct Leases<R>(Arc<State<R>>);
@@ -102,7 +102,7 @@ struct State<R> {
 struct Lease<R> {
     name: Id,
     bearer: Option<Bearer>,
-    asks: mpsc::Sender<Ask<R>>,
+    asks: mpsc::Sender<ResumeRequest<R>>,
 }
 
 /// How many leases there are.
@@ -134,43 +134,43 @@ impl Numbers {
     }
 
     /// A session that has no stream, until it is dropped.
-    pub fn detach(&self) -> One {
+    pub fn detach(&self) -> CountGuard {
         self.0.detached.fetch_add(1, Ordering::Relaxed);
-        One { numbers: self.clone(), of: |counts| &counts.detached }
+        CountGuard { numbers: self.clone(), of: |counts| &counts.detached }
     }
 
     /// Room for a stream that may do nothing but take up a session, where there is none for another session: there is as
     /// much as there are leases.
-    pub fn spare(&self) -> Option<One> {
+    pub fn spare(&self) -> Option<CountGuard> {
         let held = self.0.held.load(Ordering::Relaxed);
         let taken = |spares: usize| (spares < held).then_some(spares + 1);
         self.0.spares.fetch_update(Ordering::Relaxed, Ordering::Relaxed, taken).ok()?;
-        Some(One { numbers: self.clone(), of: |counts| &counts.spares })
+        Some(CountGuard { numbers: self.clone(), of: |counts| &counts.spares })
     }
 }
 
 /// One of something that is counted, until it is dropped.
-pub struct One {
+pub struct CountGuard {
     numbers: Numbers,
     of: fn(&Counts) -> &AtomicUsize,
 }
 
-impl Drop for One {
+impl Drop for CountGuard {
     fn drop(&mut self) {
         (self.of)(&self.numbers.0).fetch_sub(1, Ordering::Relaxed);
     }
 }
 
 /// A stream asks for a session.
-pub struct Ask<R> {
+pub struct ResumeRequest<R> {
     /// The number of the last reply that its client received.
     pub last_reply: u64,
     /// Whoever runs the session answers here.
-    pub answer: oneshot::Sender<Result<Ticket<R>, Error>>,
+    pub answer: oneshot::Sender<Result<ResumeAccepted<R>, Error>>,
 }
 
 /// A session that is about to go on in the stream which asked for it.
-pub struct Ticket<R> {
+pub struct ResumeAccepted<R> {
     /// The number of the last reply that there is.
     pub last_reply: u64,
     /// Where the stream is to go.
@@ -180,20 +180,20 @@ pub struct Ticket<R> {
 /// A stream that came to take up a session.
 pub struct ResumingStream<R> {
     /// Its requests.
-    pub requests: Frames,
+    pub requests: MessageReader,
     /// Where its replies go.
-    pub line: Line<R>,
+    pub line: ResponseSender<R>,
 }
 
 /// A lease that was given, and holds until it is dropped.
-pub struct Grant<R> {
+pub struct LeaseGuard<R> {
     leases: Leases<R>,
     /// What the session is named by.
     pub name: Id,
     /// The most requests of its client that wait.
     pub most: usize,
     /// Streams that ask for it.
-    pub asks: mpsc::Receiver<Ask<R>>,
+    pub asks: mpsc::Receiver<ResumeRequest<R>>,
 }
 
 impl<R> Leases<R> {
@@ -206,7 +206,7 @@ impl<R> Leases<R> {
     ///
     /// # Errors
     /// [`NoRandomness`].
-    pub fn give(&self, bearer: Option<Bearer>, most: usize) -> Result<Option<Grant<R>>, NoRandomness> {
+    pub fn give(&self, bearer: Option<Bearer>, most: usize) -> Result<Option<LeaseGuard<R>>, NoRandomness> {
         if self.0.time.is_zero() {
             return Ok(None);
         }
@@ -215,21 +215,21 @@ impl<R> Leases<R> {
         let (sender, asks) = mpsc::channel(1);
         self.lock().push(Lease { name, bearer, asks: sender });
         self.0.numbers.0.held.fetch_add(1, Ordering::Relaxed);
-        Ok(Some(Grant { leases: self.clone(), name, most, asks }))
+        Ok(Some(LeaseGuard { leases: self.clone(), name, most, asks }))
     }
 
     /// Asks for the session of this name, for a client that received replies up to a number.
     ///
     /// # Errors
     /// [`Error`].
-    pub async fn ask(&self, name: &[u8], bearer: Option<&Bearer>, last_reply: u64) -> Result<Ticket<R>, Error> {
+    pub async fn ask(&self, name: &[u8], bearer: Option<&Bearer>, last_reply: u64) -> Result<ResumeAccepted<R>, Error> {
         let (answer, answered) = oneshot::channel();
         let asks = self.find(name, bearer)?;
-        asks.send(Ask { last_reply, answer }).await.map_err(|_| Error::Unknown)?;
+        asks.send(ResumeRequest { last_reply, answer }).await.map_err(|_| Error::Unknown)?;
         answered.await.map_err(|_| Error::Unknown)?
     }
 
-    fn find(&self, name: &[u8], bearer: Option<&Bearer>) -> Result<mpsc::Sender<Ask<R>>, Error> {
+    fn find(&self, name: &[u8], bearer: Option<&Bearer>) -> Result<mpsc::Sender<ResumeRequest<R>>, Error> {
         let leases = self.lock();
         // All of them are looked at, each in a time that does not depend on the name.
         let found = leases
@@ -248,7 +248,7 @@ impl<R> Leases<R> {
     }
 }
 
-impl<R> Grant<R> {
+impl<R> LeaseGuard<R> {
     /// How long it holds without a stream.
     pub fn time(&self) -> Duration {
         self.leases.0.time
@@ -260,7 +260,7 @@ impl<R> Grant<R> {
     }
 }
 
-impl<R> Drop for Grant<R> {
+impl<R> Drop for LeaseGuard<R> {
     fn drop(&mut self) {
         self.leases.lock().retain(|lease| lease.name != self.name);
         self.numbers().0.held.fetch_sub(1, Ordering::Relaxed);

@@ -43,15 +43,15 @@ impl Budget {
     }
 
     /// Nothing yet, to be grown.
-    pub fn nothing(&self) -> Share {
-        Share { state: Arc::clone(&self.state), bytes: 0, held: self.bearer.as_ref().map(Token::no_bytes) }
+    pub fn nothing(&self) -> MemoryReservation {
+        MemoryReservation { state: Arc::clone(&self.state), bytes: 0, held: self.bearer.as_ref().map(Token::no_bytes) }
     }
 
     /// So many bytes, until the share is dropped.
     ///
     /// # Errors
     /// [`Error::MemoryFull`], [`Error::Auth`].
-    pub fn take(&self, bytes: usize) -> Result<Share, Error> {
+    pub fn take(&self, bytes: usize) -> Result<MemoryReservation, Error> {
         let mut share = self.nothing();
         share.grow(bytes)?;
         Ok(share)
@@ -59,14 +59,14 @@ impl Budget {
 }
 
 /// A part of the budget.
-pub struct Share {
+pub struct MemoryReservation {
     state: Arc<State>,
     bytes: usize,
     /// As many, of those that the token may have.
     held: Option<QuotaGuard>,
 }
 
-impl Share {
+impl MemoryReservation {
     /// How many they are.
     pub fn bytes(&self) -> usize {
         self.bytes
@@ -108,7 +108,7 @@ impl Share {
     }
 }
 
-impl Drop for Share {
+impl Drop for MemoryReservation {
     fn drop(&mut self) {
         self.state.used.fetch_sub(self.bytes, Ordering::Relaxed);
     }
@@ -117,11 +117,11 @@ impl Drop for Share {
 /// Shares of replies on their way to the wire: whoever makes a reply puts its share here, and the transport takes it along
 /// with the bytes.
 #[derive(Clone, Default)]
-pub struct Outbox(Arc<Mutex<Vec<Share>>>);
+pub struct PendingReservations(Arc<Mutex<Vec<MemoryReservation>>>);
 
-impl Outbox {
+impl PendingReservations {
     /// Adds a reply's share.
-    pub fn put(&self, share: Share) {
+    pub fn put(&self, share: MemoryReservation) {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).push(share);
     }
 
@@ -135,7 +135,7 @@ impl Outbox {
 
 struct ReservedBytes<H> {
     bytes: Bytes,
-    _held: (Vec<Share>, H),
+    _held: (Vec<MemoryReservation>, H),
 }
 
 impl<H> AsRef<[u8]> for ReservedBytes<H> {
@@ -167,7 +167,7 @@ mod tests {
 
     #[test]
     fn a_share_is_held_until_the_last_of_its_bytes_is_dropped() {
-        let (budget, outbox) = (Budget::new(10), Outbox::default());
+        let (budget, outbox) = (Budget::new(10), PendingReservations::default());
         outbox.put(budget.take(10).unwrap());
         let mut sent = outbox.send(Bytes::from_static(b"reply"), || ());
         let rest = sent.split_off(2);

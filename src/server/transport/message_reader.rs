@@ -5,11 +5,11 @@
 
 use super::{
     Error,
-    budget::{Budget, Outbox, Share},
+    budget::{Budget, MemoryReservation, PendingReservations},
 };
 use crate::server::{
     auth::Bearer,
-    limits::{Allowance, MAX_BYTES_BEFORE_OPEN},
+    limits::{MAX_BYTES_BEFORE_OPEN, RequestLimits},
     net::managed_io::Connection,
 };
 use bytes::{Buf, Bytes, BytesMut};
@@ -30,7 +30,7 @@ const OWN_BUFFER_MIN_BYTES: usize = 1 << 20;
 
 /// What requests and replies are subject to on their way.
 #[derive(Clone)]
-pub struct Transit {
+pub struct StreamLimits {
     /// What they take their bytes from.
     pub budget: Budget,
     /// How long a client may leave a message unfinished, or a reply unread.
@@ -40,7 +40,7 @@ pub struct Transit {
 }
 
 /// The messages of a request's body, as they come.
-pub struct Frames {
+pub struct MessageReader {
     body: Body,
     /// What has come and not been taken.
     buffer: BytesMut,
@@ -48,14 +48,14 @@ pub struct Frames {
     /// When the message that has begun must have ended.
     due: Option<Instant>,
     /// Of the message that has begun.
-    share: Share,
-    transit: Transit,
+    share: MemoryReservation,
+    transit: StreamLimits,
     /// Whom they are from.
     pub connection: Option<Connection>,
     /// The token that came with them.
     pub bearer: Option<Bearer>,
     /// Where the shares of their replies go.
-    pub outbox: Outbox,
+    pub outbox: PendingReservations,
 }
 
 /// A message that has begun.
@@ -69,7 +69,7 @@ enum PartialMessage {
 /// A message.
 pub enum Message {
     /// Its bytes, with their share of the budget.
-    Whole(Bytes, Share),
+    Whole(Bytes, MemoryReservation),
     /// The budget has no room for it.
     Refused(Error),
 }
@@ -101,14 +101,14 @@ impl<E> From<Status> for Stop<E> {
     }
 }
 
-impl Frames {
+impl MessageReader {
     /// The messages of this body.
     pub fn new(
         body: Body,
-        transit: Transit,
+        transit: StreamLimits,
         connection: Option<Connection>,
         bearer: Option<Bearer>,
-        outbox: Outbox,
+        outbox: PendingReservations,
     ) -> Self {
         Self {
             body,
@@ -131,7 +131,7 @@ impl Frames {
     /// Their place, when they go elsewhere: nothing comes there any more.
     pub fn leave(&mut self) -> Self {
         let (connection, bearer) = (self.connection.clone(), self.bearer.clone());
-        let left = Self::new(Body::empty(), self.transit.clone(), connection, bearer, Outbox::default());
+        let left = Self::new(Body::empty(), self.transit.clone(), connection, bearer, PendingReservations::default());
         std::mem::replace(self, left)
     }
 
@@ -139,7 +139,7 @@ impl Frames {
     ///
     /// # Errors
     /// What ends the stream: the message is too large, or never ends, or what came is not gRPC.
-    pub async fn next(&mut self, allowance: Allowance) -> Result<Option<Message>, Stop> {
+    pub async fn next(&mut self, allowance: RequestLimits) -> Result<Option<Message>, Stop> {
         loop {
             if self.message.is_none() && self.buffer.len() >= HEADER_BYTES {
                 self.message = Some(self.begin(allowance)?);
@@ -179,7 +179,7 @@ impl Frames {
     }
 
     /// Reads a frame's header.
-    fn begin(&mut self, allowance: Allowance) -> Result<PartialMessage, Stop> {
+    fn begin(&mut self, allowance: RequestLimits) -> Result<PartialMessage, Stop> {
         match self.buffer.get_u8() {
             0 => {}
             1 => return Err(Status::internal("a message came compressed; send it as it is").into()),
@@ -223,7 +223,7 @@ impl Frames {
     }
 
     /// Takes bytes that came, with their share of the budget.
-    fn take(&mut self, data: &[u8], allowance: Allowance) {
+    fn take(&mut self, data: &[u8], allowance: RequestLimits) {
         if let Some(PartialMessage::Wanted(length)) = self.message {
             let free = allowance.covered.max(UNBUDGETED_BYTES);
             let beyond = |bytes: usize| bytes.min(length).saturating_sub(free);

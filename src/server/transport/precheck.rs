@@ -4,7 +4,7 @@
 use self::Inside::{Fields, Numbers};
 use crate::{
     priority::lower,
-    server::{error::InvalidValue, limits::Allowance},
+    server::{error::InvalidValue, limits::RequestLimits},
 };
 use bytes::Bytes;
 use prost::Message;
@@ -55,7 +55,7 @@ pub enum Most {
 }
 
 impl Most {
-    fn entries(&self, allowance: Allowance) -> usize {
+    fn entries(&self, allowance: RequestLimits) -> usize {
         match self {
             Self::One => 1,
             Self::Many => MAX_REPEATED,
@@ -83,7 +83,7 @@ impl Default for Decoder {
 pub fn decoded_at_once<T: Message + Default>(
     bytes: Bytes,
     fields: &'static [Field],
-    allowance: Allowance,
+    allowance: RequestLimits,
 ) -> Option<T> {
     check(&bytes, fields, allowance, INLINE_DECODE_MAX_FIELDS).ok()?;
     decoded(bytes).ok()
@@ -98,7 +98,7 @@ impl Decoder {
         &self,
         bytes: Bytes,
         fields: &'static [Field],
-        allowance: Allowance,
+        allowance: RequestLimits,
     ) -> Result<Result<T, InvalidValue>, Status> {
         match check(&bytes, fields, allowance, INLINE_DECODE_MAX_FIELDS) {
             Ok(()) => return decoded(bytes).map(Ok),
@@ -132,12 +132,12 @@ enum Stop {
 
 /// Counts a message's fields and entries, at most `work` of them. What is not well-formed ends the count, as it ends the
 /// decoding.
-fn check(message: &[u8], fields: &[Field], allowance: Allowance, mut work: usize) -> Result<(), Stop> {
+fn check(message: &[u8], fields: &[Field], allowance: RequestLimits, mut work: usize) -> Result<(), Stop> {
     count(message, fields, allowance, &mut work).map(|_| ())
 }
 
 /// The same of a part of a message; whether it is well-formed.
-fn count(mut message: &[u8], fields: &[Field], allowance: Allowance, work: &mut usize) -> Result<bool, Stop> {
+fn count(mut message: &[u8], fields: &[Field], allowance: RequestLimits, work: &mut usize) -> Result<bool, Stop> {
     let mut counts = [0; MAX_COUNTED_FIELDS];
     while !message.is_empty() {
         *work = work.checked_sub(1).ok_or(Stop::Work)?;
@@ -200,7 +200,7 @@ mod tests {
         server::api::perturb_v1::fields::SESSION_REQUEST,
     };
 
-    const LIMITS: Allowance = Allowance { bytes: 0, entries: 2000, covered: 0 };
+    const LIMITS: RequestLimits = RequestLimits { bytes: 0, entries: 2000, covered: 0 };
 
     fn checked(request: impl Into<Request>, work: usize) -> Result<(), Stop> {
         let message = proto::SessionRequest { request: Some(request.into()) }.encode_to_vec();

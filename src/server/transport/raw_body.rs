@@ -1,9 +1,9 @@
 //! The bodies of streams, kept from tonic: it would decode their messages itself.
 
 use super::{
-    budget::Outbox,
-    message_reader::{Frames, Transit},
-    watched_body::{Patience, Replies},
+    budget::PendingReservations,
+    message_reader::{MessageReader, StreamLimits},
+    watched_body::{ReadTimeouts, WatchedBody},
 };
 use crate::server::{auth::Bearer, net::managed_io::Connection};
 use std::{
@@ -26,19 +26,19 @@ use tower::Layer;
 pub struct RawBodyService<S> {
     service: S,
     path: &'static str,
-    transit: Transit,
+    transit: StreamLimits,
 }
 
 /// Puts [`RawBodyService`] around a service.
 #[derive(Clone)]
 pub struct RawBodyLayer {
     path: &'static str,
-    transit: Transit,
+    transit: StreamLimits,
 }
 
 impl RawBodyLayer {
     /// Keeps the bodies of calls of this path.
-    pub fn new(path: &'static str, transit: Transit) -> Self {
+    pub fn new(path: &'static str, transit: StreamLimits) -> Self {
         Self { path, transit }
     }
 }
@@ -53,7 +53,7 @@ impl<S> Layer<S> for RawBodyLayer {
 
 impl<S> RawBodyService<S> {
     /// Keeps the bodies of calls of this path.
-    pub fn new(service: S, path: &'static str, transit: Transit) -> Self {
+    pub fn new(service: S, path: &'static str, transit: StreamLimits) -> Self {
         Self { service, path, transit }
     }
 }
@@ -76,34 +76,34 @@ where
     }
 
     fn call(&mut self, mut request: http::Request<Body>) -> Self::Future {
-        let outbox = Outbox::default();
+        let outbox = PendingReservations::default();
         let connection = request.extensions().get::<Connection>().cloned();
         let is_stream = request.uri().path() == self.path;
         // What is no stream is one small reply.
-        let patience = is_stream.then_some(Patience { first: self.transit.handshake, rest: self.transit.limit });
+        let patience = is_stream.then_some(ReadTimeouts { first: self.transit.handshake, rest: self.transit.limit });
         if is_stream {
             let bearer = request.extensions_mut().remove::<Bearer>();
-            let transit = Transit { budget: self.transit.budget.of(bearer.clone()), ..self.transit };
+            let transit = StreamLimits { budget: self.transit.budget.of(bearer.clone()), ..self.transit };
             let body = std::mem::take(request.body_mut());
-            let frames = Frames::new(body, transit, connection.clone(), bearer, outbox.clone());
+            let frames = MessageReader::new(body, transit, connection.clone(), bearer, outbox.clone());
             request.extensions_mut().insert(RawBody(Arc::new(Mutex::new(Some(frames)))));
         }
         let response = self.service.call(request);
-        Box::pin(
-            async move { Ok(response.await?.map(|body| Body::new(Replies::new(body, outbox, connection, patience)))) },
-        )
+        Box::pin(async move {
+            Ok(response.await?.map(|body| Body::new(WatchedBody::new(body, outbox, connection, patience))))
+        })
     }
 }
 
 /// A request's frames, as an extension of the request, which must be one that could be cloned.
 #[derive(Clone)]
-struct RawBody(Arc<Mutex<Option<Frames>>>);
+struct RawBody(Arc<Mutex<Option<MessageReader>>>);
 
 /// The messages of a request whose body was kept.
 ///
 /// # Errors
 /// Where it was not: a defect.
-pub fn messages<T>(request: &mut tonic::Request<T>) -> Result<Frames, Status> {
+pub fn messages<T>(request: &mut tonic::Request<T>) -> Result<MessageReader, Status> {
     let kept = request.extensions_mut().remove::<RawBody>();
     let frames = kept.and_then(|kept| kept.0.lock().unwrap_or_else(PoisonError::into_inner).take());
     frames.ok_or_else(|| Status::internal("the request's body is not there: a defect of the server"))

@@ -1,7 +1,7 @@
 //! Replies on their way to the wire: their shares of the budget go with their bytes, and a client that does not read
 //! loses its connection.
 
-use super::budget::Outbox;
+use super::budget::PendingReservations;
 use crate::server::net::managed_io::Connection;
 use bytes::Bytes;
 use http_body::{Body as HttpBody, Frame, SizeHint};
@@ -22,7 +22,7 @@ const CHECKS_PER_TIMEOUT: u32 = 4;
 
 /// How long a stream's client may leave its replies unread.
 #[derive(Debug, Clone, Copy)]
-pub struct Patience {
+pub struct ReadTimeouts {
     /// The first of them.
     pub first: Duration,
     /// Any other; none: for ever.
@@ -30,9 +30,9 @@ pub struct Patience {
 }
 
 /// A response's body.
-pub struct Replies {
+pub struct WatchedBody {
     body: Body,
-    outbox: Outbox,
+    outbox: PendingReservations,
     waiting: Arc<ReadProgress>,
 }
 
@@ -60,7 +60,7 @@ impl State {
     }
 
     /// The limit that the client has passed.
-    fn passed(&self, patience: Patience) -> Option<Duration> {
+    fn passed(&self, patience: ReadTimeouts) -> Option<Duration> {
         let held = self.held.map_or(Duration::ZERO, |since| since.elapsed());
         let unread = if self.unread == 0 { Duration::ZERO } else { self.since.elapsed() };
         let first = Some(patience.first).filter(|&limit| self.is_first && held > limit);
@@ -119,10 +119,15 @@ impl Drop for UnreadGuard {
     }
 }
 
-impl Replies {
+impl WatchedBody {
     /// A body whose replies' shares are in the outbox. If its client's patience for them, if it has any, is over, its
     /// connection ends.
-    pub fn new(body: Body, outbox: Outbox, connection: Option<Connection>, patience: Option<Patience>) -> Self {
+    pub fn new(
+        body: Body,
+        outbox: PendingReservations,
+        connection: Option<Connection>,
+        patience: Option<ReadTimeouts>,
+    ) -> Self {
         let waiting = Arc::new(ReadProgress { state: Mutex::new(State::new()), watch: OnceLock::new() });
         if let (Some(connection), Some(patience)) = (connection, patience) {
             let watch = tokio::spawn(watch(Arc::downgrade(&waiting), connection, patience));
@@ -133,7 +138,7 @@ impl Replies {
 }
 
 /// Ends the connection when its client has read nothing for too long.
-async fn watch(waiting: Weak<ReadProgress>, connection: Connection, patience: Patience) {
+async fn watch(waiting: Weak<ReadProgress>, connection: Connection, patience: ReadTimeouts) {
     let mut limit = Some(patience.rest.map_or(patience.first, |rest| rest.min(patience.first)));
     while let Some(looked_after) = limit {
         sleep(looked_after / CHECKS_PER_TIMEOUT).await;
@@ -150,7 +155,7 @@ async fn watch(waiting: Weak<ReadProgress>, connection: Connection, patience: Pa
     }
 }
 
-impl HttpBody for Replies {
+impl HttpBody for WatchedBody {
     type Data = Bytes;
     type Error = Status;
 

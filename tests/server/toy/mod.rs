@@ -9,7 +9,7 @@ use crate::{
 use perturb::{
     config::{Arguments, Config},
     proto::{Comparison, Open, Release, Reset, Version},
-    server::{net::listener::Listener, run, security::Guards},
+    server::{net::listener::Listener, run, security::Security},
     tasks,
 };
 use std::{
@@ -38,7 +38,7 @@ impl InThread {
                 tell.send(listener.address().unwrap().to_string()).unwrap();
                 let catalogue = tasks::catalogue().with(&ball::SPEC).unwrap();
                 let end = async { drop(end.await) };
-                run(vec![listener], None, &config, &Guards::default(), catalogue, end).await.unwrap();
+                run(vec![listener], None, &config, &Security::default(), catalogue, end).await.unwrap();
             });
         });
         Self { address: address.await.unwrap(), shutdown: Some(shutdown), thread: Some(thread) }

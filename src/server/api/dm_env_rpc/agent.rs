@@ -15,8 +15,8 @@ use crate::{
     },
     server::{
         auth::Bearer,
-        limits::{Allowance, MAX_BYTES_BEFORE_OPEN},
-        net::access_log::About,
+        limits::{MAX_BYTES_BEFORE_OPEN, RequestLimits},
+        net::access_log::SessionStats,
         session::{
             self,
             admission::Sessions,
@@ -37,14 +37,14 @@ pub(super) struct Agent {
     caller: Caller,
     sessions: Sessions,
     joined: Option<JoinedWorld>,
-    about: About,
+    about: SessionStats,
 }
 
 impl Agent {
     /// A stream that has joined no world.
     pub(super) fn new(worlds: Arc<Worlds>, bearer: Option<Bearer>, sessions: Sessions) -> Self {
         let caller = worlds.caller(bearer);
-        Self { worlds, caller, sessions, joined: None, about: About::default() }
+        Self { worlds, caller, sessions, joined: None, about: SessionStats::default() }
     }
 
     async fn create_world(&mut self, request: rpc::CreateWorldRequest) -> Result<rpc::CreateWorldResponse, Error> {
@@ -66,7 +66,7 @@ impl Agent {
         let (world, runner) = self.worlds.join(&self.caller, &request.world_name)?;
         // Before anything is awaited: if the client goes now, the world is left and not lost.
         let joined = self.joined.insert(JoinedWorld { world, runner });
-        self.about = About { environment: Some(joined.world.spec().name), envs: 1, ..self.about };
+        self.about = SessionStats { environment: Some(joined.world.spec().name), envs: 1, ..self.about };
         joined.runner.settle().await;
         Ok(rpc::JoinWorldResponse { specs: Some(specs::of(joined.world.spec())) })
     }
@@ -161,8 +161,8 @@ impl SessionHandler for Agent {
         }
     }
 
-    fn allowance(&self) -> Allowance {
-        Allowance {
+    fn allowance(&self) -> RequestLimits {
+        RequestLimits {
             bytes: if self.is_open() { MAX_REQUEST_BYTES } else { MAX_BYTES_BEFORE_OPEN },
             entries: 1,
             covered: 0,
@@ -174,7 +174,7 @@ impl SessionHandler for Agent {
         self.joined.is_some() || self.worlds.are_made_by(&self.caller)
     }
 
-    fn about(&self) -> About {
+    fn about(&self) -> SessionStats {
         self.about
     }
 

@@ -5,7 +5,7 @@ use crate::{
     env::{Distribution, EnvironmentSpec, EpisodeStart, Settings, Version},
     pool::{Batch, BatchSettings, Pool, ResetEntry, StepResult},
     proto::dm_env_rpc::v1::EnvironmentStateType as State,
-    server::audit::draws::Draws,
+    server::audit::draws::DrawAuditor,
 };
 use bytes::Bytes;
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use std::sync::Arc;
 /// An environment and where its episode stands.
 pub(super) struct Runner {
     batch: Batch,
-    draws: Draws,
+    draws: DrawAuditor,
     phase: Phase,
     /// The first observation of the episode that was begun last, f32 `[O]`.
     first: Bytes,
@@ -69,7 +69,7 @@ impl Runner {
         pool: &Pool,
         settings: BatchSettings,
         version: Version,
-        draws: Draws,
+        draws: DrawAuditor,
     ) -> Result<Self, Error> {
         let (begun, spec) = (draws.open(&settings).await?, settings.spec);
         let opened = Batch::open(pool, settings).await;
@@ -85,7 +85,7 @@ impl Runner {
     }
 
     /// What it may draw from.
-    pub(super) fn draws(&self) -> &Draws {
+    pub(super) fn draws(&self) -> &DrawAuditor {
         &self.draws
     }
 

@@ -7,7 +7,7 @@ use super::{
 };
 use crate::{
     env::{Distribution, EnvironmentSpec, Version, resolve},
-    server::audit::draws::Draws,
+    server::audit::draws::DrawAuditor,
 };
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -15,7 +15,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 pub(super) struct World {
     name: String,
     spec: &'static EnvironmentSpec,
-    draws: Draws,
+    draws: DrawAuditor,
     wanted: Mutex<PendingChanges>,
 }
 

@@ -7,7 +7,7 @@ use crate::{
     env::{Catalogue, shorten},
     pool::Pool,
     server::{
-        audit::{draws::Draws, ledger::Ledger},
+        audit::{draws::DrawAuditor, ledger::Ledger},
         auth::{Bearer, QuotaGuard},
         id,
     },
@@ -79,8 +79,8 @@ impl Worlds {
     }
 
     /// What a new world of a stream draws from.
-    pub(super) fn draws(&self, maker: &Caller) -> Draws {
-        Draws::new(maker.bearer.clone(), self.ledger.clone())
+    pub(super) fn draws(&self, maker: &Caller) -> DrawAuditor {
+        DrawAuditor::new(maker.bearer.clone(), self.ledger.clone())
     }
 
     /// Where worlds' environments run.

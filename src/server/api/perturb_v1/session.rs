@@ -7,16 +7,16 @@ use crate::{
     proto::{self, session_request::Request, session_response::Response},
     render::Renderer,
     server::{
-        audit::{draws::Draws, ledger::Ledger},
+        audit::{draws::DrawAuditor, ledger::Ledger},
         auth::{Bearer, QuotaGuard},
-        limits::{Allowance, MAX_BYTES_BEFORE_OPEN},
-        net::access_log::About,
+        limits::{MAX_BYTES_BEFORE_OPEN, RequestLimits},
+        net::access_log::SessionStats,
         session::{
             handler::{Reply, SessionHandler, StreamHandover},
             lease::{Leases, MAX_STORED_REPLIES},
         },
         transport::{
-            budget::{Budget, Share},
+            budget::{Budget, MemoryReservation},
             precheck::Field,
         },
     },
@@ -50,18 +50,18 @@ pub struct Session {
     bearer: Option<Bearer>,
     /// Its environments, of those that its token may have.
     held: Option<QuotaGuard>,
-    draws: Draws,
+    draws: DrawAuditor,
     budget: Budget,
     /// What steps need.
-    kept: Option<Share>,
+    kept: Option<MemoryReservation>,
     /// What the policy needs that plays.
-    playing: Option<Share>,
+    playing: Option<MemoryReservation>,
 }
 
 impl Session {
     /// A session that is not open yet, whose replies' bytes are taken from the budget.
     pub fn new(shared: Arc<Shared>, bearer: Option<Bearer>, budget: Budget) -> Self {
-        let draws = Draws::new(bearer.clone(), shared.ledger.clone());
+        let draws = DrawAuditor::new(bearer.clone(), shared.ledger.clone());
         Self { shared, batch: None, bearer, held: None, draws, budget, kept: None, playing: None }
     }
 
@@ -256,13 +256,13 @@ impl SessionHandler for Session {
         }
     }
 
-    fn allowance(&self) -> Allowance {
+    fn allowance(&self) -> RequestLimits {
         match &self.batch {
             None => {
                 let entries = self.shared.listing.max_batch_size as usize;
-                Allowance { bytes: MAX_BYTES_BEFORE_OPEN, entries, covered: 0 }
+                RequestLimits { bytes: MAX_BYTES_BEFORE_OPEN, entries, covered: 0 }
             }
-            Some(batch) => Allowance {
+            Some(batch) => RequestLimits {
                 bytes: sizes::most_of_a_request(batch),
                 entries: batch.size(),
                 covered: sizes::step_request(batch.settings(), batch.size()) + STEP_OVERHEAD_BYTES,
@@ -274,8 +274,8 @@ impl SessionHandler for Session {
         self.batch.is_some()
     }
 
-    fn about(&self) -> About {
-        self.batch.as_ref().map_or_else(About::default, |batch| About {
+    fn about(&self) -> SessionStats {
+        self.batch.as_ref().map_or_else(SessionStats::default, |batch| SessionStats {
             environment: Some(batch.settings().spec.name),
             envs: batch.settings().size(),
             steps: batch.steps(),
