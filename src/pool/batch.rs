@@ -4,17 +4,17 @@ use super::{
     Error,
     capacity::Permit,
     encode::put,
-    follower::Follower,
+    follower::StepQueue,
     job::Job,
-    pipelined_step::Follow,
+    pipelined_step::PipelinedStep,
     rollout::{
-        play::Play,
-        round::{Rollout, Round, Turn},
+        play::PolicyRunner,
+        round::{Rollout, RolloutRequest, RolloutTask},
     },
-    scheduler::{Pool, Shared},
+    scheduler::{Pool, Scheduler},
     settings::{Autoreset, BatchSettings, SlotGroup},
     shard::{Command, Shard, SlotReset, put_actions},
-    step_result::{Gather, StepResult, collect},
+    step_result::{ShardOutputs, StepResult, collect},
     sync::lock,
 };
 use crate::{
@@ -59,7 +59,7 @@ pub struct Batch {
     size: usize,
     shard_size: usize,
     job: Arc<Job>,
-    workers: Arc<Shared>,
+    workers: Arc<Scheduler>,
     n_workers: usize,
     buffer: BytesMut,
     /// Requests that workers were asked for.
@@ -69,7 +69,7 @@ pub struct Batch {
     /// When the next request, a step that followed, began.
     followed: Option<Instant>,
     /// The policy that plays, until somebody else changes the environments.
-    play: Option<Box<Play>>,
+    play: Option<Box<PolicyRunner>>,
     /// Who is told when it is freed.
     farewell: Option<DropHook>,
 }
@@ -183,10 +183,10 @@ impl Batch {
 
     /// Where the step is left that follows the next one; none where a step needs to know what came of the one before, and
     /// where the session's own thread may take it.
-    pub fn follower(&self) -> Option<Follower> {
+    pub fn follower(&self) -> Option<StepQueue> {
         let (job, spec, size) = (Arc::clone(&self.job), self.settings.spec, self.size);
         let follows = self.settings.autoreset != Autoreset::Disabled && job.is_for_workers();
-        follows.then_some(Follower { job, spec, size })
+        follows.then_some(StepQueue { job, spec, size })
     }
 
     /// Has a policy play. Without a new one, that of before goes on; without a new task, with what is left of its own.
@@ -195,9 +195,9 @@ impl Batch {
     ///
     /// # Errors
     /// [`Error::Policy`] if numbers are not finite, [`Error::Defect`]; after both another policy must be given.
-    pub async fn act(&mut self, turn: Turn) -> Result<Rollout, Error> {
+    pub async fn act(&mut self, turn: RolloutRequest) -> Result<Rollout, Error> {
         self.ready().await?;
-        let round = Box::new(Round::new(turn, self.play.take()));
+        let round = Box::new(RolloutTask::new(turn, self.play.take()));
         let number = self.ask();
         let round = self.workers.play(&self.job, round, number).await;
         self.under_way = false;
@@ -207,7 +207,7 @@ impl Batch {
     }
 
     /// The policy that plays.
-    pub fn play(&self) -> Option<&Play> {
+    pub fn play(&self) -> Option<&PolicyRunner> {
         self.play.as_deref()
     }
 
@@ -415,8 +415,8 @@ impl Batch {
         self.buffer.split().freeze()
     }
 
-    fn gather(&mut self) -> Gather<'_> {
-        Gather { shards: &self.job.shards, buffer: &mut self.buffer }
+    fn gather(&mut self) -> ShardOutputs<'_> {
+        ShardOutputs { shards: &self.job.shards, buffer: &mut self.buffer }
     }
 }
 
@@ -457,7 +457,7 @@ fn job(
     owned: (Arc<Permit>, Arc<Tally>),
     size: usize,
 ) -> Arc<Job> {
-    let (cost, follow) = (settings.spec.step_cost * size as f64, Follow::new(settings.reward_terms));
+    let (cost, follow) = (settings.spec.step_cost * size as f64, PipelinedStep::new(settings.reward_terms));
     Arc::new(Job::new(shards, workers, owned, cost, follow))
 }
 

@@ -6,7 +6,7 @@ use bytes::Bytes;
 use std::sync::Arc;
 
 /// Where the actions are left of the step that follows the one under way.
-pub struct Follower {
+pub struct StepQueue {
     pub(super) job: Arc<Job>,
     /// The environments'.
     pub spec: &'static EnvironmentSpec,
@@ -14,7 +14,7 @@ pub struct Follower {
     pub size: usize,
 }
 
-impl Follower {
+impl StepQueue {
     /// Has the step that is under way, if one is, be followed by one with these actions, which were checked. The batch's
     /// next request must then be that step.
     pub fn follow(&self, actions: Bytes) {

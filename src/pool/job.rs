@@ -1,6 +1,8 @@
 //! A batch's shards, and the request of it that is under way.
 
-use super::{Error, capacity::Permit, pipelined_step::Follow, rollout::round::Round, shard::Shard, sync::lock};
+use super::{
+    Error, capacity::Permit, pipelined_step::PipelinedStep, rollout::round::RolloutTask, shard::Shard, sync::lock,
+};
 use crate::meters::Tally;
 use std::{
     ops::Range,
@@ -23,7 +25,7 @@ const POLL_MAX_US: f64 = 50.0;
 const POLLS_BEFORE_WAIT: usize = 50;
 
 /// What a job does at a step's end.
-pub(super) enum Next {
+pub(super) enum Continuation {
     Nothing,
     /// Another step of the round.
     Step,
@@ -40,9 +42,9 @@ pub(super) struct Job {
     /// Parts that have not finished.
     left: AtomicUsize,
     /// What decides between two steps whether and how there is another, while a policy plays.
-    round: Mutex<Option<Box<Round>>>,
+    round: Mutex<Option<Box<RolloutTask>>>,
     /// What is to be done after a step without a round.
-    pub(super) follow: Mutex<Follow>,
+    pub(super) follow: Mutex<PipelinedStep>,
     /// The part that is to run next is the beginning of the round, not a shard.
     begins: AtomicBool,
     /// Requests that have ended, of those that workers were asked for.
@@ -69,7 +71,7 @@ impl Job {
         workers: usize,
         (permit, tally): (Arc<Permit>, Arc<Tally>),
         cost: f64,
-        follow: Follow,
+        follow: PipelinedStep,
     ) -> Self {
         let bound = |worker: usize| worker * shards.len() / workers;
         let range = |worker: usize| (bound(worker)..bound(worker + 1), AtomicUsize::new(0));
@@ -128,7 +130,7 @@ impl Job {
     }
 
     /// Makes the beginning of a round ready to be taken.
-    pub(super) fn prepare_round(&self, round: Box<Round>) {
+    pub(super) fn prepare_round(&self, round: Box<RolloutTask>) {
         *lock(&self.round) = Some(round);
         self.halted.store(false, Ordering::Relaxed);
         self.begins.store(true, Ordering::Relaxed);
@@ -136,7 +138,7 @@ impl Job {
     }
 
     /// The round, when it has ended or will never be run.
-    pub(super) fn take_round(&self) -> Option<Box<Round>> {
+    pub(super) fn take_round(&self) -> Option<Box<RolloutTask>> {
         lock(&self.round).take()
     }
 
@@ -157,10 +159,10 @@ impl Job {
     }
 
     /// Whether a step is to follow, and which. None is if the pool is `closing`.
-    pub(super) fn conduct(&self, closing: bool) -> Next {
+    pub(super) fn conduct(&self, closing: bool) -> Continuation {
         if self.failed() || self.abandoned.load(Ordering::Relaxed) {
             lock(&self.follow).stop();
-            return Next::Nothing;
+            return Continuation::Nothing;
         }
         let mut round = lock(&self.round);
         let Some(round) = round.as_mut() else {
@@ -169,21 +171,21 @@ impl Job {
             if closing {
                 follow.stop();
             }
-            return self.unless_it_panics(Next::Request, || follow.go_on(&self.shards));
+            return self.unless_it_panics(Continuation::Request, || follow.go_on(&self.shards));
         };
         let halted = closing || self.halted.load(Ordering::Relaxed);
-        self.unless_it_panics(Next::Step, || round.conduct(&self.shards, halted))
+        self.unless_it_panics(Continuation::Step, || round.conduct(&self.shards, halted))
     }
 
     /// `next` if there is to be one.
-    fn unless_it_panics(&self, next: Next, is_wanted: impl FnOnce() -> bool) -> Next {
+    fn unless_it_panics(&self, next: Continuation, is_wanted: impl FnOnce() -> bool) -> Continuation {
         match catch_unwind(AssertUnwindSafe(is_wanted)) {
             Ok(true) => next,
-            Ok(false) => Next::Nothing,
+            Ok(false) => Continuation::Nothing,
             Err(_) => {
                 tracing::error!("a worker panicked between two steps; the batch is lost");
                 self.failed.store(true, Ordering::Relaxed);
-                Next::Nothing
+                Continuation::Nothing
             }
         }
     }

@@ -27,10 +27,10 @@ mod step_result;
 mod sync;
 
 pub use batch::{Batch, DropHook, ResetEntry};
-pub use follower::Follower;
+pub use follower::StepQueue;
 pub use rollout::{
-    play::{Play, Policy, PolicyRole},
-    round::{EndedAt, Rollout, Turn},
+    play::{Policy, PolicyRole, PolicyRunner},
+    round::{EndedAt, Rollout, RolloutRequest},
 };
 pub use scheduler::Pool;
 pub use settings::{Autoreset, BatchSettings, SlotGroup};

@@ -3,7 +3,7 @@
 
 use super::{
     shard::{Shard, put_actions},
-    step_result::{Gather, StepResult},
+    step_result::{ShardOutputs, StepResult},
 };
 use bytes::{Bytes, BytesMut};
 use std::sync::Mutex;
@@ -11,7 +11,7 @@ use tokio::time::Instant;
 
 /// What follows the step of a job that is under way.
 #[derive(Default)]
-pub(super) struct Follow {
+pub(super) struct PipelinedStep {
     /// A step is under way, and its worker will look here at its end.
     is_under_way: bool,
     /// The next step's actions.
@@ -24,7 +24,7 @@ pub(super) struct Follow {
     reward_terms: bool,
 }
 
-impl Follow {
+impl PipelinedStep {
     /// Of a job whose steps tell of the reward's terms, or not.
     pub(super) fn new(reward_terms: bool) -> Self {
         Self { reward_terms, ..Self::default() }
@@ -41,7 +41,7 @@ impl Follow {
             (self.is_under_way, self.ended) = (false, Some(Instant::now()));
             return false;
         };
-        let stepped = Gather { shards, buffer: &mut self.buffer }.stepped(self.reward_terms);
+        let stepped = ShardOutputs { shards, buffer: &mut self.buffer }.stepped(self.reward_terms);
         put_actions(shards, &actions);
         self.stepped = Some((stepped, Instant::now()));
         true

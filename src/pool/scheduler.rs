@@ -3,9 +3,9 @@
 use super::{
     Error,
     capacity::Capacity,
-    job::{INLINE_MAX_US, INLINE_MAX_US_UNCONTENDED, Job, Next},
+    job::{Continuation, INLINE_MAX_US, INLINE_MAX_US_UNCONTENDED, Job},
     reaper::Reaper,
-    rollout::round::Round,
+    rollout::round::RolloutTask,
     sync::lock,
 };
 use crate::{
@@ -32,7 +32,7 @@ const WORKER_NICENESS: i32 = 1;
 
 /// Worker threads that step batches, and the count of environments they may hold.
 pub struct Pool {
-    shared: Arc<Shared>,
+    shared: Arc<Scheduler>,
     threads: Vec<JoinHandle<()>>,
 }
 
@@ -43,7 +43,7 @@ impl Pool {
     /// If the operating system starts no thread.
     pub fn new(workers: usize, max_environments: usize) -> io::Result<Self> {
         let (reaper, freeing) = Reaper::start()?;
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(Scheduler {
             reaper,
             capacity: Arc::new(Capacity::new(max_environments)),
             queue: Mutex::new(Queue { jobs: VecDeque::with_capacity(1024), sleeping: 0, closed: false }),
@@ -99,7 +99,7 @@ impl Pool {
         &self.shared.waits
     }
 
-    pub(super) fn queue(&self) -> Arc<Shared> {
+    pub(super) fn queue(&self) -> Arc<Scheduler> {
         Arc::clone(&self.shared)
     }
 }
@@ -118,7 +118,7 @@ impl Drop for Pool {
 }
 
 /// What the workers and the batches share.
-pub(super) struct Shared {
+pub(super) struct Scheduler {
     pub(super) reaper: Reaper,
     pub(super) capacity: Arc<Capacity>,
     queue: Mutex<Queue>,
@@ -142,7 +142,7 @@ struct Queue {
     closed: bool,
 }
 
-impl Shared {
+impl Scheduler {
     /// Steps the environments of every shard here, if that is soon done; whether it was.
     pub(super) fn step_here(&self, job: &Job) -> bool {
         let tiny = if self.moves(job) { INLINE_MAX_US_UNCONTENDED } else { INLINE_MAX_US };
@@ -173,7 +173,12 @@ impl Shared {
     }
 
     /// Runs a round on the workers: its beginning, and whatever steps it wants. Gives it back at its end.
-    pub(super) async fn play(&self, job: &Arc<Job>, round: Box<Round>, number: u64) -> Result<Box<Round>, Error> {
+    pub(super) async fn play(
+        &self,
+        job: &Arc<Job>,
+        round: Box<RolloutTask>,
+        number: u64,
+    ) -> Result<Box<RolloutTask>, Error> {
         self.moves(job);
         job.prepare_round(round);
         self.push(job, 1, 1);
@@ -262,7 +267,7 @@ impl Shared {
     fn conduct(&self, job: &Arc<Job>) {
         loop {
             let next = job.conduct(self.closing.load(Ordering::Relaxed));
-            if matches!(next, Next::Nothing) {
+            if matches!(next, Continuation::Nothing) {
                 return job.tell();
             }
             job.prepare();
@@ -273,7 +278,7 @@ impl Shared {
             if !is_own {
                 self.push(job, shards, shards - 1);
             }
-            if matches!(next, Next::Request) {
+            if matches!(next, Continuation::Request) {
                 self.moves(job);
                 job.tell();
             }

@@ -37,12 +37,12 @@ pub struct StepResult {
 }
 
 /// Shards and the buffer that arrays are cut off.
-pub(super) struct Gather<'a> {
+pub(super) struct ShardOutputs<'a> {
     pub(super) shards: &'a [Mutex<Shard>],
     pub(super) buffer: &'a mut BytesMut,
 }
 
-impl Gather<'_> {
+impl ShardOutputs<'_> {
     /// Takes what the last step left in the shards, the reward's terms if they are wanted.
     pub(super) fn stepped(mut self, reward_terms: bool) -> StepResult {
         StepResult {

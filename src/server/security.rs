@@ -4,7 +4,7 @@ use super::{
     audit::ledger::Ledger,
     auth::{
         Tokens,
-        file_watcher::{self, Watch},
+        file_watcher::{self, FileWatcher},
     },
     net::tls::Tls,
 };
@@ -24,7 +24,7 @@ pub struct Security {
     /// Has what is drawn.
     pub ledger: Option<Ledger>,
     /// Has the files read again when they change.
-    watches: Vec<Watch>,
+    watches: Vec<FileWatcher>,
 }
 
 impl Security {
@@ -61,7 +61,7 @@ impl Security {
         if tokens.count() == 0 {
             tracing::warn!("{} has no token: nobody can call by TCP", path.display());
         }
-        self.watches.push(Watch::start("tokens", vec![path], before, renew)?);
+        self.watches.push(FileWatcher::start("tokens", vec![path], before, renew)?);
         Ok(tokens)
     }
 
@@ -73,7 +73,7 @@ impl Security {
         let tls = Tls::new(files, &before).map_err(wrong)?;
         let renewed = tls.clone();
         let renew = move |contents: &[Vec<u8>]| renewed.renew(contents);
-        self.watches.push(Watch::start("the files of TLS", paths, before, renew)?);
+        self.watches.push(FileWatcher::start("the files of TLS", paths, before, renew)?);
         Ok(tls)
     }
 }

@@ -6,7 +6,7 @@ use super::{
         perturb_v1::{
             convert,
             service::{ENDPOINT, Service},
-            session::Shared,
+            session::ServerContext,
         },
     },
     auth::{AuthLayer, Tokens},
@@ -21,7 +21,7 @@ use super::{
     },
     security::Security,
     session::{
-        admission::{Limits, Sessions},
+        admission::{SessionLimits, Sessions},
         lease::{self, Leases},
     },
     shutdown::{Controller, Drain, Phase},
@@ -147,7 +147,7 @@ struct State {
     transit: StreamLimits,
     sessions: Sessions,
     leases: Leases<proto::SessionResponse>,
-    leased: lease::Numbers,
+    leased: lease::LeaseCounters,
     errors: ErrorCounters,
     access: AccessLog,
 }
@@ -159,10 +159,11 @@ impl State {
         catalogue.names().for_each(|name| _ = pool.meter(name));
         let seconds = |count: u64| (count > 0).then(|| Duration::from_secs(count));
         let handshake = Duration::from_secs(config.handshake_seconds);
-        let limits = Limits { bytes: config.max_message_bytes, handshake, idle: seconds(config.idle_seconds) };
+        let limits = SessionLimits { bytes: config.max_message_bytes, handshake, idle: seconds(config.idle_seconds) };
         let of_a_peer = if config.max_peer_sessions > 0 { config.max_peer_sessions } else { usize::MAX };
         let connections = PeerLimiter::new(usize::MAX, of_a_peer.saturating_add(MAX_OTHER_STREAMS));
-        let (errors, access, leased) = (ErrorCounters::default(), AccessLog::default(), lease::Numbers::default());
+        let (errors, access, leased) =
+            (ErrorCounters::default(), AccessLog::default(), lease::LeaseCounters::default());
         let places = PeerLimiter::new(config.max_sessions, of_a_peer);
         let sessions = Sessions::new(places.clone(), limits, drain, errors.clone(), access.clone(), leased.clone());
         Ok(Self {
@@ -185,7 +186,7 @@ impl State {
 
     /// The service of `perturb.v1`.
     fn service(&self, listing: proto::ListEnvironmentsResponse, renderer: Renderer, guards: &Security) -> Service {
-        let shared = Shared {
+        let shared = ServerContext {
             pool: Arc::clone(&self.pool),
             catalogue: Arc::clone(&self.catalogue),
             listing,

@@ -8,10 +8,10 @@ use perturb::{
     render::Renderer,
     server::{
         self,
-        api::perturb_v1::session::{Session as Handler, Shared},
+        api::perturb_v1::session::{ServerContext, Session as Handler},
         session::{
             handler::SessionHandler,
-            lease::{Leases, Numbers},
+            lease::{LeaseCounters, Leases},
         },
         transport::budget::Budget,
     },
@@ -22,13 +22,13 @@ use std::{sync::Arc, time::Duration};
 fn handler() -> Handler {
     let catalogue = tasks::catalogue();
     let listing = server::listing(&catalogue, &Config::default()).unwrap();
-    let shared = Shared {
+    let shared = ServerContext {
         pool: Arc::new(Pool::new(2, 100).unwrap()),
         catalogue: Arc::new(catalogue),
         listing,
         renderer: Renderer::new(),
         ledger: None,
-        leases: Leases::new(Duration::ZERO, Numbers::default()),
+        leases: Leases::new(Duration::ZERO, LeaseCounters::default()),
     };
     Handler::new(Arc::new(shared), None, Budget::new(1 << 30))
 }

@@ -18,10 +18,10 @@ use perturb::server::error::{ErrorCounters, ErrorKind};
 use perturb::server::net::access_log::AccessLog;
 use perturb::server::net::managed_io::ManagedIo;
 use perturb::server::net::peer_limiter::{Peer, PeerLimiter};
-use perturb::server::session::admission::{Limits, Sessions};
+use perturb::server::session::admission::{SessionLimits, Sessions};
 use perturb::server::session::driver::Responses;
-use perturb::server::session::instrumented::Counts;
-use perturb::server::session::lease::{Leases, Numbers};
+use perturb::server::session::instrumented::RequestCounters;
+use perturb::server::session::lease::{LeaseCounters, Leases};
 use perturb::server::shutdown::Controller;
 use perturb::server::transport::budget::Budget;
 use perturb::server::transport::message_reader::StreamLimits;
@@ -54,7 +54,7 @@ const MAX_BYTES: usize = 1 << 20;
 pub struct StepLog {
     /// Numbers of the steps, in the order of the server.
     done: Arc<Mutex<Vec<u64>>>,
-    numbers: Numbers,
+    numbers: LeaseCounters,
     places: PeerLimiter,
     counters: ErrorCounters,
 }
@@ -62,7 +62,7 @@ pub struct StepLog {
 impl Default for StepLog {
     fn default() -> Self {
         let places = PeerLimiter::new(MAX_SESSIONS, MAX_SESSIONS);
-        Self { done: Arc::default(), numbers: Numbers::default(), places, counters: ErrorCounters::default() }
+        Self { done: Arc::default(), numbers: LeaseCounters::default(), places, counters: ErrorCounters::default() }
     }
 }
 
@@ -99,12 +99,12 @@ impl StepLog {
 pub async fn serve(ledger: StepLog) -> turmoil::Result {
     let (_controller, drain) = Controller::new();
     let budget = Budget::new(MAX_BYTES);
-    let limits = Limits { bytes: MAX_BYTES, handshake: HANDSHAKE_TIMEOUT, idle: None };
+    let limits = SessionLimits { bytes: MAX_BYTES, handshake: HANDSHAKE_TIMEOUT, idle: None };
     let places = ledger.places.clone();
     let numbers = ledger.numbers.clone();
     let counters = ledger.counters.clone();
     let sessions = Sessions::new(places, limits, drain, counters, AccessLog::default(), numbers.clone());
-    let counts = Counts::new::<CountingSession>();
+    let counts = RequestCounters::new::<CountingSession>();
     let service = CountingService { sessions, leases: Leases::new(LEASE, numbers), ledger, counts };
     let transit = StreamLimits { budget, limit: Some(LEASE), handshake: HANDSHAKE_TIMEOUT };
     let listener = turmoil::net::TcpListener::bind((Ipv4Addr::UNSPECIFIED, PORT)).await?;
@@ -152,7 +152,7 @@ struct CountingService {
     sessions: Sessions,
     leases: Leases<proto::SessionResponse>,
     ledger: StepLog,
-    counts: Arc<Counts>,
+    counts: Arc<RequestCounters>,
 }
 
 #[tonic::async_trait]

@@ -47,7 +47,7 @@ pub enum PolicyRole {
 }
 
 /// A policy at play, between two steps.
-pub struct Play {
+pub struct PolicyRunner {
     player: Player,
     pub(in crate::pool) task: RemainingRollout,
     /// In a test.
@@ -70,7 +70,7 @@ pub(in crate::pool) struct StepBuffers {
     pub(in crate::pool) ends: Vec<(u32, EpisodeEnd)>,
 }
 
-impl Play {
+impl PolicyRunner {
     /// Has the policy begin in the environments of `shards`, at the start of a trial or from its saved state.
     pub(in crate::pool) fn begin(policy: Policy, shards: &[Mutex<Shard>]) -> Result<Self, Error> {
         let Policy { spec, inputs, normalisers, role, state, weights, episodes_per_trial } = policy;

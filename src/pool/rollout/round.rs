@@ -3,7 +3,7 @@
 //! The worker that ends a step's last shard has the round take what came of it, choose the next actions and give them to
 //! the shards; then the job goes to the queue's tail, as that of any other step. The session is woken at the round's end.
 
-use super::play::{Play, Policy};
+use super::play::{Policy, PolicyRunner};
 use crate::{
     env::EpisodeEnd,
     pool::{
@@ -26,7 +26,7 @@ const INITIAL_CAPACITY_STEPS: usize = 256;
 
 /// What is to be played in a round.
 #[derive(Debug, Clone)]
-pub struct Turn {
+pub struct RolloutRequest {
     /// Whose turn it is now; none: the policy of before goes on.
     pub policy: Option<Policy>,
     /// New weights of the policy of before, `[P]`, finite; none: those that it has.
@@ -100,22 +100,22 @@ enum Phase {
 }
 
 /// The steps of one reply.
-pub(in crate::pool) struct Round {
-    turn: Turn,
-    play: Option<Box<Play>>,
+pub(in crate::pool) struct RolloutTask {
+    turn: RolloutRequest,
+    play: Option<Box<PolicyRunner>>,
     phase: Phase,
     played: Rollout,
     error: Option<Error>,
 }
 
-impl Round {
+impl RolloutTask {
     /// A round of the policy of before, if there is no new one.
-    pub(in crate::pool) fn new(turn: Turn, play: Option<Box<Play>>) -> Self {
+    pub(in crate::pool) fn new(turn: RolloutRequest, play: Option<Box<PolicyRunner>>) -> Self {
         Self { turn, play, phase: Phase::Begin, played: Rollout::default(), error: None }
     }
 
     /// What came of it, with the policy at play unless it failed.
-    pub(in crate::pool) fn finish(self) -> Result<(Option<Box<Play>>, Rollout), Error> {
+    pub(in crate::pool) fn finish(self) -> Result<(Option<Box<PolicyRunner>>, Rollout), Error> {
         self.error.map_or(Ok((self.play, self.played)), Err)
     }
 
@@ -134,7 +134,7 @@ impl Round {
     fn advance(&mut self, shards: &[Mutex<Shard>]) -> Result<bool, Error> {
         let Self { turn, play, phase, played, .. } = self;
         if let Some(policy) = turn.policy.take() {
-            *play = Some(Box::new(Play::begin(policy, shards)?));
+            *play = Some(Box::new(PolicyRunner::begin(policy, shards)?));
         }
         let play = play.as_mut().ok_or(Error::Defect)?;
         match phase {
@@ -180,7 +180,7 @@ impl Round {
 
 impl Rollout {
     /// Makes room for what the round will bring, and notes what the policy remembers where a task `begins`.
-    fn begin(&mut self, play: &Play, begins: bool, turn: &Turn) {
+    fn begin(&mut self, play: &PolicyRunner, begins: bool, turn: &RolloutRequest) {
         if turn.only_ended {
             return;
         }
@@ -206,11 +206,11 @@ impl Rollout {
     }
 
     /// Takes over what a step brought.
-    fn take(&mut self, play: &mut Play, only_ended: bool) {
+    fn take(&mut self, play: &mut PolicyRunner, only_ended: bool) {
         if !only_ended {
             self.push(play.player().played());
         }
-        let Play { task, step, .. } = play;
+        let PolicyRunner { task, step, .. } = play;
         for (slot, end) in step.ends.drain(..).filter(|(slot, _)| task.counts(*slot as usize)) {
             self.ended_bytes += end_bytes(&end);
             let (terminated, truncated) = (step.terminated[slot as usize], step.truncated[slot as usize]);

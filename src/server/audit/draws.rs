@@ -45,7 +45,7 @@ impl PendingDraws {
 
 /// An environment that begins to draw.
 #[derive(Clone, Copy)]
-struct Next<'a> {
+struct NextDraw<'a> {
     draw: Draw,
     distributions: &'a [Distribution],
 }
@@ -71,7 +71,7 @@ impl DrawAuditor {
                 environment_index: group.episodes.environment_index,
                 episode_index: 0,
             };
-            (Next { draw, distributions: &group.episodes.distributions }, group.size)
+            (NextDraw { draw, distributions: &group.episodes.distributions }, group.size)
         });
         self.begin(settings.spec, begins, Vec::new()).await
     }
@@ -98,7 +98,7 @@ impl DrawAuditor {
         if befores.is_empty() {
             return Ok(PendingDraws::default());
         }
-        let begins = nows.iter().map(|(draw, distributions)| (Next { draw: *draw, distributions }, 1));
+        let begins = nows.iter().map(|(draw, distributions)| (NextDraw { draw: *draw, distributions }, 1));
         self.begin(batch.settings().spec, begins, befores).await
     }
 
@@ -122,7 +122,7 @@ impl DrawAuditor {
             nows.push((saved.draw, saved.distributions));
         }
         let befores = entries.iter().map(|(slot, _)| batch.draw(*slot)).collect();
-        let begins = nows.iter().map(|(draw, distributions)| (Next { draw: *draw, distributions }, 1));
+        let begins = nows.iter().map(|(draw, distributions)| (NextDraw { draw: *draw, distributions }, 1));
         self.begin(spec, begins, befores).await
     }
 
@@ -135,7 +135,7 @@ impl DrawAuditor {
     pub fn not_restored(&self, batch: &Batch, slots: &[usize], begun: PendingDraws) {
         let spec = batch.settings().spec;
         let befores: Vec<_> = slots.iter().map(|slot| (batch.draw(*slot), batch.distributions(*slot))).collect();
-        let begins = befores.iter().map(|(draw, distributions)| (Next { draw: *draw, distributions }, 1));
+        let begins = befores.iter().map(|(draw, distributions)| (NextDraw { draw: *draw, distributions }, 1));
         let (regions, begins) = gathered(spec, begins);
         self.note(spec, regions, begins, begun.withdrawn());
     }
@@ -179,11 +179,11 @@ impl DrawAuditor {
     async fn begin<'a>(
         &self,
         spec: &EnvironmentSpec,
-        begins: impl Iterator<Item = (Next<'a>, usize)> + Clone,
+        begins: impl Iterator<Item = (NextDraw<'a>, usize)> + Clone,
         ends: Vec<Draw>,
     ) -> Result<PendingDraws, Error> {
         let mut last: Option<&[Distribution]> = None;
-        for (Next { distributions, .. }, _) in begins.clone() {
+        for (NextDraw { distributions, .. }, _) in begins.clone() {
             if last.replace(distributions) != Some(distributions) {
                 self.check(spec, distributions)?;
             }
@@ -224,11 +224,11 @@ impl DrawAuditor {
 /// What begins, neighbours that draw alike as one, and the regions that they draw from.
 fn gathered<'a>(
     spec: &EnvironmentSpec,
-    begins: impl Iterator<Item = (Next<'a>, usize)>,
+    begins: impl Iterator<Item = (NextDraw<'a>, usize)>,
 ) -> (Vec<Region>, Vec<DrawStart>) {
     let mut last: Option<&[Distribution]> = None;
     let (mut regions, mut gathered): (Vec<Region>, Vec<DrawStart>) = (Vec::new(), Vec::new());
-    for (Next { draw, distributions }, count) in begins {
+    for (NextDraw { draw, distributions }, count) in begins {
         if last.replace(distributions) != Some(distributions) {
             regions.push(spec.region(distributions));
         }

@@ -11,7 +11,7 @@ use std::{
 const POLL_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Looks at files, on a thread of its own, until it is dropped.
-pub struct Watch(#[expect(dead_code, reason = "its end is the thread's")] Sender<()>);
+pub struct FileWatcher(#[expect(dead_code, reason = "its end is the thread's")] Sender<()>);
 
 /// What is in the files, in their order, or why they cannot be read.
 pub type Contents = Result<Vec<Vec<u8>>, String>;
@@ -25,7 +25,7 @@ pub fn read(paths: &[PathBuf]) -> Contents {
     paths.iter().map(|path| read(path)).collect()
 }
 
-impl Watch {
+impl FileWatcher {
     /// Calls `renew` with what is in the files, which were read before, when it has changed and stays so for a moment:
     /// whoever writes them may not be done. If it refuses, that is logged, and the next change is waited for.
     ///

@@ -16,7 +16,7 @@ pub use token_file::{TokenFileError, new_token};
 
 use super::net::{managed_io::Connection, peer_limiter::Peer};
 use crate::env::Catalogue;
-use quota::{Kind, Quota};
+use quota::{Quota, QuotaKind};
 use rate_limiter::{RateLimiter, TooFast};
 use sha2::{Digest, Sha256};
 use std::{
@@ -155,7 +155,7 @@ impl Token {
     /// # Errors
     /// [`Error::QuotaExceeded`].
     pub fn session(self: &Arc<Self>) -> Result<QuotaGuard, Error> {
-        self.take(1, Kind::Sessions)
+        self.take(1, QuotaKind::Sessions)
     }
 
     /// So many environments of it.
@@ -163,15 +163,15 @@ impl Token {
     /// # Errors
     /// [`Error::QuotaExceeded`].
     pub fn envs(self: &Arc<Self>, count: usize) -> Result<QuotaGuard, Error> {
-        self.take(count, Kind::Environments)
+        self.take(count, QuotaKind::Environments)
     }
 
     /// No bytes of it in flight, to be grown.
     pub fn no_bytes(self: &Arc<Self>) -> QuotaGuard {
-        QuotaGuard::nothing(Arc::clone(self), Kind::Bytes)
+        QuotaGuard::nothing(Arc::clone(self), QuotaKind::Bytes)
     }
 
-    fn take(self: &Arc<Self>, count: usize, kind: Kind) -> Result<QuotaGuard, Error> {
+    fn take(self: &Arc<Self>, count: usize, kind: QuotaKind) -> Result<QuotaGuard, Error> {
         let mut held = QuotaGuard::nothing(Arc::clone(self), kind);
         held.grow(count)?;
         Ok(held)

@@ -29,13 +29,13 @@ impl Quota {
 
 /// What there are quotas of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(super) enum QuotaKind {
     Sessions,
     Environments,
     Bytes,
 }
 
-impl Kind {
+impl QuotaKind {
     fn of(self, token: &Token) -> &Quota {
         match self {
             Self::Sessions => &token.quotas.sessions,
@@ -57,12 +57,12 @@ impl Kind {
 pub struct QuotaGuard {
     token: Bearer,
     count: usize,
-    kind: Kind,
+    kind: QuotaKind,
 }
 
 impl QuotaGuard {
     /// Nothing of it yet.
-    pub(super) fn nothing(token: Bearer, kind: Kind) -> Self {
+    pub(super) fn nothing(token: Bearer, kind: QuotaKind) -> Self {
         Self { token, count: 0, kind }
     }
 

@@ -12,7 +12,7 @@ use super::{
     auth::Tokens,
     error::ErrorCounters,
     net::{access_log::AccessLog, peer_limiter::PeerLimiter},
-    session::{instrumented::Counts, lease::Numbers},
+    session::{instrumented::RequestCounters, lease::LeaseCounters},
     transport::budget::Budget,
 };
 use crate::{meters::Histogram, pool::Pool};
@@ -23,7 +23,7 @@ use tokio::time::{Instant, sleep_until};
 const LAG_CHECK_INTERVAL: Duration = Duration::from_millis(100);
 
 /// A protocol, and its requests by kind.
-pub type RequestCounts = (&'static str, Arc<Counts>);
+pub type RequestCounts = (&'static str, Arc<RequestCounters>);
 
 /// Where the numbers are, which others count.
 pub struct Sources {
@@ -32,7 +32,7 @@ pub struct Sources {
     /// Those of sessions.
     pub sessions: PeerLimiter,
     /// Which of them have leases.
-    pub leases: Numbers,
+    pub leases: LeaseCounters,
     /// Those of connections.
     pub connections: PeerLimiter,
     /// Bytes in flight.

@@ -26,21 +26,21 @@ const NO_LABELS: Labels<'static, 0> = [];
 /// A defect: memory takes all text.
 pub fn page(sources: &Arc<Sources>) -> Result<String, fmt::Error> {
     let mut registry = Registry::default();
-    registry.register_collector(Box::new(Numbers(Arc::clone(sources))));
+    registry.register_collector(Box::new(MetricsCollector(Arc::clone(sources))));
     let mut text = String::new();
     text::encode(&mut text, &registry)?;
     Ok(text)
 }
 
-struct Numbers(Arc<Sources>);
+struct MetricsCollector(Arc<Sources>);
 
-impl fmt::Debug for Numbers {
+impl fmt::Debug for MetricsCollector {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("Numbers")
+        f.write_str("MetricsCollector")
     }
 }
 
-impl Collector for Numbers {
+impl Collector for MetricsCollector {
     fn encode(&self, encoder: DescriptorEncoder<'_>) -> EncodeResult {
         let mut page = Page(encoder);
         let labels = [("version", env!("CARGO_PKG_VERSION")), ("commit", env!("PERTURB_COMMIT"))];
@@ -53,7 +53,7 @@ impl Collector for Numbers {
     }
 }
 
-impl Numbers {
+impl MetricsCollector {
     /// What there is, and how much there may be.
     fn places(&self, page: &mut Page<'_>) -> EncodeResult {
         let Sources { pool, sessions, leases, connections, budget, .. } = &*self.0;

@@ -2,7 +2,7 @@
 
 use super::{
     Error,
-    lease::{CountGuard, Numbers},
+    lease::{CountGuard, LeaseCounters},
 };
 use crate::server::{
     auth::{self, Bearer, QuotaGuard, Token},
@@ -20,17 +20,17 @@ use std::time::Duration;
 #[derive(Clone)]
 pub struct Sessions {
     places: PeerLimiter,
-    pub(super) limits: Limits,
+    pub(super) limits: SessionLimits,
     pub(super) decoder: Decoder,
     pub(super) drain: Drain,
     counters: ErrorCounters,
     pub(super) access: AccessLog,
-    leases: Numbers,
+    leases: LeaseCounters,
 }
 
 /// What a session may do.
 #[derive(Debug, Clone, Copy)]
-pub struct Limits {
+pub struct SessionLimits {
     /// The most bytes of a request.
     pub bytes: usize,
     /// How long it may be silent before it is open.
@@ -43,11 +43,11 @@ impl Sessions {
     /// Sessions for which there are these places. What is refused and how they end is counted.
     pub fn new(
         places: PeerLimiter,
-        limits: Limits,
+        limits: SessionLimits,
         drain: Drain,
         counters: ErrorCounters,
         access: AccessLog,
-        leases: Numbers,
+        leases: LeaseCounters,
     ) -> Self {
         Self { places, limits, decoder: Decoder::default(), drain, counters, access, leases }
     }

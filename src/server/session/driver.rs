@@ -7,7 +7,7 @@ use super::{
     admission::Sessions,
     exchange::{Exchange, MOVED, refused, revoked},
     handler::{Reply, SessionHandler, StreamHandover},
-    instrumented::Counts,
+    instrumented::RequestCounters,
     lease::{self, LeaseGuard, OutgoingResponse, ResponseSender, ResumeAccepted, ResumeRequest, ResumingStream},
     replay_buffer::ReplayBuffer,
 };
@@ -16,7 +16,7 @@ use crate::server::{
     net::access_log::{CLOSED, GONE, LEASE_OVER},
     transport::{
         budget::MemoryReservation,
-        message_reader::{Message, MessageReader, Stop},
+        message_reader::{Message, MessageReader, StreamStop},
     },
 };
 use futures_util::{Stream, stream};
@@ -53,7 +53,7 @@ impl Sessions {
         &self,
         requests: MessageReader,
         handler: H,
-        counts: &Arc<Counts>,
+        counts: &Arc<RequestCounters>,
     ) -> Result<Responses<H::Response>, Status> {
         let seat = self.admit(&requests, H::RESUMES.is_some()).map_err(|error| {
             self.count(&error, requests.bearer.as_ref());
@@ -299,10 +299,14 @@ impl<H: SessionHandler> SessionDriver<H> {
     }
 
     /// Ends a stream that cannot go on. The session of a lease ends only if the server wants it.
-    fn stopped(&mut self, responses: &ResponseSender<H::Response>, stop: Stop<H::Error>) -> Attachment<H::Response> {
+    fn stopped(
+        &mut self,
+        responses: &ResponseSender<H::Response>,
+        stop: StreamStop<H::Error>,
+    ) -> Attachment<H::Response> {
         match (stop, self.lease.is_some()) {
-            (Stop::Cancelled, _) => self.detach(None),
-            (Stop::Broken(status), true) => {
+            (StreamStop::Cancelled, _) => self.detach(None),
+            (StreamStop::Broken(status), true) => {
                 end_stream(responses, status);
                 self.detach(None)
             }

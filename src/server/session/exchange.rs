@@ -2,9 +2,9 @@
 
 use super::{
     Error,
-    admission::{Admission, Limits, Sessions},
+    admission::{Admission, SessionLimits, Sessions},
     handler::{Reply, SessionHandler},
-    instrumented::Counts,
+    instrumented::RequestCounters,
 };
 use crate::server::{
     auth::{self, Bearer},
@@ -13,7 +13,7 @@ use crate::server::{
     net::access_log::{BROKEN, GONE, SessionRecord},
     shutdown::Phase,
     transport::{
-        message_reader::{Message, MessageReader, Stop},
+        message_reader::{Message, MessageReader, StreamStop},
         precheck::decoded_at_once,
     },
 };
@@ -29,13 +29,13 @@ pub(super) const MOVED: &str = "moved";
 pub(super) struct Exchange<H: SessionHandler> {
     pub(super) requests: MessageReader,
     /// The request that came while the one before it was being answered.
-    ahead: Option<Result<Option<Message>, Stop>>,
+    ahead: Option<Result<Option<Message>, StreamStop>>,
     /// Whether the present request was read ahead. Its step may have begun then.
     came_ahead: bool,
     /// Whether requests may be read before the previous one is answered.
     pub(super) reads_ahead: bool,
     handler: H,
-    counts: Arc<Counts>,
+    counts: Arc<RequestCounters>,
     /// The session counts as running as long as it holds this.
     pub(super) sessions: Sessions,
     start: Instant,
@@ -58,7 +58,7 @@ impl<H: SessionHandler> Exchange<H> {
     pub(super) fn new(
         requests: MessageReader,
         handler: H,
-        counts: Arc<Counts>,
+        counts: Arc<RequestCounters>,
         sessions: Sessions,
         seat: Admission,
     ) -> Self {
@@ -84,8 +84,8 @@ impl<H: SessionHandler> Exchange<H> {
 
     /// Returns the next request, or `None` at the client's end. If the future is dropped, the next call goes on where it
     /// was: nothing is lost.
-    pub(super) async fn request(&mut self) -> Result<Option<Message>, Stop<H::Error>> {
-        let Limits { handshake, idle, .. } = self.sessions.limits;
+    pub(super) async fn request(&mut self) -> Result<Option<Message>, StreamStop<H::Error>> {
+        let SessionLimits { handshake, idle, .. } = self.sessions.limits;
         let allowance = self.allowance();
         let bearer = self.requests.bearer.clone();
         self.was_open = self.handler.is_open();
@@ -120,14 +120,17 @@ impl<H: SessionHandler> Exchange<H> {
     pub(super) async fn answer(
         &mut self,
         message: Message,
-    ) -> Result<Result<Reply<H::Response>, H::Error>, Stop<H::Error>> {
+    ) -> Result<Result<Reply<H::Response>, H::Error>, StreamStop<H::Error>> {
         match (self.respond(message).await?, &self.seat) {
-            (Err(error), Admission::Spare(..)) => Err(Stop::Refused(error)),
+            (Err(error), Admission::Spare(..)) => Err(StreamStop::Refused(error)),
             (answer, _) => Ok(answer),
         }
     }
 
-    async fn respond(&mut self, message: Message) -> Result<Result<Reply<H::Response>, H::Error>, Stop<H::Error>> {
+    async fn respond(
+        &mut self,
+        message: Message,
+    ) -> Result<Result<Reply<H::Response>, H::Error>, StreamStop<H::Error>> {
         if self.sessions.phase() != Phase::Running && !self.handler.is_open() {
             return Err(refused(Error::Draining));
         }
@@ -182,17 +185,17 @@ impl<H: SessionHandler> Exchange<H> {
     }
 
     /// Notes why the session ends. Returns the status that its stream ends with, if its client still listens.
-    pub(super) fn end(&mut self, stop: Stop<H::Error>) -> Option<Status> {
+    pub(super) fn end(&mut self, stop: StreamStop<H::Error>) -> Option<Status> {
         match stop {
-            Stop::Refused(error) => {
+            StreamStop::Refused(error) => {
                 self.end_by(&error);
                 Some(status(&error))
             }
-            Stop::Broken(status) => {
+            StreamStop::Broken(status) => {
                 self.ending = BROKEN;
                 Some(status)
             }
-            Stop::Cancelled => None,
+            StreamStop::Cancelled => None,
         }
     }
 
@@ -249,7 +252,7 @@ impl<H: SessionHandler> Drop for Exchange<H> {
 /// Reads the request that comes while another is answered, and offers it to the pool.
 async fn read_ahead<H: SessionHandler>(
     requests: &mut MessageReader,
-    ahead: &mut Option<Result<Option<Message>, Stop>>,
+    ahead: &mut Option<Result<Option<Message>, StreamStop>>,
     offer: Option<impl FnOnce(H::Request)>,
     allowance: RequestLimits,
 ) -> Infallible {
@@ -266,8 +269,8 @@ async fn read_ahead<H: SessionHandler>(
 }
 
 /// Ends a session with this error.
-pub(super) fn refused<E: From<Error>>(error: impl Into<Error>) -> Stop<E> {
-    Stop::Refused(error.into().into())
+pub(super) fn refused<E: From<Error>>(error: impl Into<Error>) -> StreamStop<E> {
+    StreamStop::Refused(error.into().into())
 }
 
 /// Resolves when the token is revoked, if there is one.

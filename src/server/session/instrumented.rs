@@ -13,7 +13,7 @@ use tracing::Instrument;
 
 /// Requests of one kind since the server began.
 #[derive(Default)]
-pub struct Count {
+pub struct RequestCount {
     /// Requests that were answered, the refused ones included.
     pub answered: AtomicU64,
     /// Requests that were refused.
@@ -21,16 +21,16 @@ pub struct Count {
 }
 
 /// The requests of a protocol, by kind.
-pub struct Counts(Vec<(&'static str, Count)>);
+pub struct RequestCounters(Vec<(&'static str, RequestCount)>);
 
-impl Counts {
+impl RequestCounters {
     /// Counters of a handler's kinds, all of them 0.
     pub fn new<H: SessionHandler>() -> Arc<Self> {
-        Arc::new(Self(H::KINDS.iter().map(|kind| (*kind, Count::default())).collect()))
+        Arc::new(Self(H::KINDS.iter().map(|kind| (*kind, RequestCount::default())).collect()))
     }
 
     /// Every kind with its count.
-    pub fn iter(&self) -> impl Iterator<Item = &(&'static str, Count)> {
+    pub fn iter(&self) -> impl Iterator<Item = &(&'static str, RequestCount)> {
         self.0.iter()
     }
 
@@ -63,7 +63,7 @@ impl Counts {
     }
 }
 
-impl fmt::Display for Counts {
+impl fmt::Display for RequestCounters {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (i, (kind, count)) in self.iter().enumerate() {
             let [answered, refused] = [&count.answered, &count.refused].map(|count| count.load(Ordering::Relaxed));

@@ -94,7 +94,7 @@ impl<R> Clone for Leases<R> {
 
 struct State<R> {
     time: Duration,
-    numbers: Numbers,
+    numbers: LeaseCounters,
     leases: Mutex<Vec<Lease<R>>>,
 }
 
@@ -107,17 +107,17 @@ struct Lease<R> {
 
 /// How many leases there are.
 #[derive(Clone, Default)]
-pub struct Numbers(Arc<Counts>);
+pub struct LeaseCounters(Arc<LeaseCounts>);
 
 #[derive(Default)]
-struct Counts {
+struct LeaseCounts {
     held: AtomicUsize,
     detached: AtomicUsize,
     resumed: AtomicU64,
     spares: AtomicUsize,
 }
 
-impl Numbers {
+impl LeaseCounters {
     /// Sessions without a stream now.
     pub fn detached(&self) -> usize {
         self.0.detached.load(Ordering::Relaxed)
@@ -151,8 +151,8 @@ impl Numbers {
 
 /// One of something that is counted, until it is dropped.
 pub struct CountGuard {
-    numbers: Numbers,
-    of: fn(&Counts) -> &AtomicUsize,
+    numbers: LeaseCounters,
+    of: fn(&LeaseCounts) -> &AtomicUsize,
 }
 
 impl Drop for CountGuard {
@@ -198,7 +198,7 @@ pub struct LeaseGuard<R> {
 
 impl<R> Leases<R> {
     /// None yet; they hold so long without a stream.
-    pub fn new(time: Duration, numbers: Numbers) -> Self {
+    pub fn new(time: Duration, numbers: LeaseCounters) -> Self {
         Self(Arc::new(State { time, numbers, leases: Mutex::default() }))
     }
 
@@ -255,7 +255,7 @@ impl<R> LeaseGuard<R> {
     }
 
     /// How many leases there are.
-    pub fn numbers(&self) -> &Numbers {
+    pub fn numbers(&self) -> &LeaseCounters {
         &self.leases.0.numbers
     }
 }

@@ -75,7 +75,7 @@ pub enum Message {
 }
 
 /// Why a stream ends before its client's end.
-pub enum Stop<E = Error> {
+pub enum StreamStop<E = Error> {
     /// The server wants no more of it.
     Refused(E),
     /// What came is not to be understood, the connection broke, or the server has a defect.
@@ -84,18 +84,18 @@ pub enum Stop<E = Error> {
     Cancelled,
 }
 
-impl<E> Stop<E> {
+impl<E> StreamStop<E> {
     /// The same with another error.
-    pub fn map<F>(self, error: impl FnOnce(E) -> F) -> Stop<F> {
+    pub fn map<F>(self, error: impl FnOnce(E) -> F) -> StreamStop<F> {
         match self {
-            Self::Refused(refused) => Stop::Refused(error(refused)),
-            Self::Broken(status) => Stop::Broken(status),
-            Self::Cancelled => Stop::Cancelled,
+            Self::Refused(refused) => StreamStop::Refused(error(refused)),
+            Self::Broken(status) => StreamStop::Broken(status),
+            Self::Cancelled => StreamStop::Cancelled,
         }
     }
 }
 
-impl<E> From<Status> for Stop<E> {
+impl<E> From<Status> for StreamStop<E> {
     fn from(status: Status) -> Self {
         Self::Broken(status)
     }
@@ -139,7 +139,7 @@ impl MessageReader {
     ///
     /// # Errors
     /// What ends the stream: the message is too large, or never ends, or what came is not gRPC.
-    pub async fn next(&mut self, allowance: RequestLimits) -> Result<Option<Message>, Stop> {
+    pub async fn next(&mut self, allowance: RequestLimits) -> Result<Option<Message>, StreamStop> {
         loop {
             if self.message.is_none() && self.buffer.len() >= HEADER_BYTES {
                 self.message = Some(self.begin(allowance)?);
@@ -153,9 +153,9 @@ impl MessageReader {
                         self.take(&data, allowance);
                     }
                 }
-                Some(Err(status)) if status.code() == Code::Cancelled => return Err(Stop::Cancelled),
+                Some(Err(status)) if status.code() == Code::Cancelled => return Err(StreamStop::Cancelled),
                 // The body of a connection that said nothing for too long ends as if its client had ended it.
-                None if !self.body.is_end_stream() => return Err(Stop::Cancelled),
+                None if !self.body.is_end_stream() => return Err(StreamStop::Cancelled),
                 Some(Err(status)) => return Err(status.into()),
                 None if self.buffer.is_empty() && self.message.is_none() => return Ok(None),
                 None => return Err(Status::internal("the stream ended within a message").into()),
@@ -165,21 +165,21 @@ impl MessageReader {
 
     /// The next frame of HTTP's; within a message it must come in time, and not so late that the message would take for
     /// ever.
-    async fn frame(&mut self) -> Result<Option<Result<http_body::Frame<Bytes>, Status>>, Stop> {
+    async fn frame(&mut self) -> Result<Option<Result<http_body::Frame<Bytes>, Status>>, StreamStop> {
         let next = self.body.frame();
         match self.transit.limit.filter(|_| self.message.is_some()) {
             None => Ok(next.await),
             Some(limit) => {
                 let soon = Instant::now() + limit;
                 let unfinished =
-                    |_| Stop::Refused(Error::Unfinished { seconds: limit.as_secs(), rate: MIN_BYTES_PER_SECOND });
+                    |_| StreamStop::Refused(Error::Unfinished { seconds: limit.as_secs(), rate: MIN_BYTES_PER_SECOND });
                 timeout_at(self.due.map_or(soon, |due| due.min(soon)), next).await.map_err(unfinished)
             }
         }
     }
 
     /// Reads a frame's header.
-    fn begin(&mut self, allowance: RequestLimits) -> Result<PartialMessage, Stop> {
+    fn begin(&mut self, allowance: RequestLimits) -> Result<PartialMessage, StreamStop> {
         match self.buffer.get_u8() {
             0 => {}
             1 => return Err(Status::internal("a message came compressed; send it as it is").into()),
@@ -187,7 +187,7 @@ impl MessageReader {
         }
         let length = self.buffer.get_u32() as usize;
         if length > allowance.bytes {
-            return Err(Stop::Refused(Error::TooLarge { got: length, limit: allowance.bytes }));
+            return Err(StreamStop::Refused(Error::TooLarge { got: length, limit: allowance.bytes }));
         }
         let longest = |limit| limit + Duration::from_secs((length / MIN_BYTES_PER_SECOND) as u64);
         self.due = self.transit.limit.map(|limit| Instant::now() + longest(limit));

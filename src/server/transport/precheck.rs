@@ -1,7 +1,7 @@
 //! Requests from their bytes. The encoding lets two bytes stand for an entry of a hundred, so entries are counted before
 //! anything is made of them, and what has many fields is decoded by other threads than the transport's.
 
-use self::Inside::{Fields, Numbers};
+use self::FieldKind::{Fields, Numbers};
 use crate::{
     priority::lower,
     server::{error::InvalidValue, limits::RequestLimits},
@@ -30,12 +30,12 @@ const MAX_COUNTED_FIELDS: usize = 8;
 pub struct Field {
     number: u64,
     name: &'static str,
-    most: Most,
-    inside: Inside,
+    most: Cardinality,
+    inside: FieldKind,
 }
 
 /// What a field's entries are.
-pub enum Inside {
+pub enum FieldKind {
     /// Messages.
     Fields(&'static [Field]),
     /// Numbers, which may stand in a row.
@@ -45,7 +45,7 @@ pub enum Inside {
 }
 
 /// How many entries a field may have.
-pub enum Most {
+pub enum Cardinality {
     /// At most one.
     One,
     /// At most [`MAX_REPEATED`].
@@ -54,7 +54,7 @@ pub enum Most {
     Environments,
 }
 
-impl Most {
+impl Cardinality {
     fn entries(&self, allowance: RequestLimits) -> usize {
         match self {
             Self::One => 1,
@@ -65,7 +65,7 @@ impl Most {
 }
 
 /// A field that is counted.
-pub const fn field(number: u64, name: &'static str, most: Most, inside: Inside) -> Field {
+pub const fn field(number: u64, name: &'static str, most: Cardinality, inside: FieldKind) -> Field {
     Field { number, name, most, inside }
 }
 
@@ -102,15 +102,15 @@ impl Decoder {
     ) -> Result<Result<T, InvalidValue>, Status> {
         match check(&bytes, fields, allowance, INLINE_DECODE_MAX_FIELDS) {
             Ok(()) => return decoded(bytes).map(Ok),
-            Err(Stop::Refused(refusal)) => return Ok(Err(refusal)),
-            Err(Stop::Work) => {}
+            Err(PrecheckError::Refused(refusal)) => return Ok(Err(refusal)),
+            Err(PrecheckError::Work) => {}
         }
         let defect = || Status::internal("a request could not be decoded: a defect of the server");
         let _turn = self.0.acquire().await.map_err(|_| defect())?;
         let decoding = tokio::task::spawn_blocking(move || {
             lower(DECODER_NICENESS);
             match check(&bytes, fields, allowance, usize::MAX) {
-                Err(Stop::Refused(refusal)) => Ok(Err(refusal)),
+                Err(PrecheckError::Refused(refusal)) => Ok(Err(refusal)),
                 _ => decoded(bytes).map(Ok),
             }
         });
@@ -124,7 +124,7 @@ fn decoded<T: Message + Default>(bytes: Bytes) -> Result<T, Status> {
 
 /// Why a message was not looked through.
 #[derive(Debug, PartialEq)]
-enum Stop {
+enum PrecheckError {
     /// It has more fields than were to be looked at.
     Work,
     Refused(InvalidValue),
@@ -132,15 +132,20 @@ enum Stop {
 
 /// Counts a message's fields and entries, at most `work` of them. What is not well-formed ends the count, as it ends the
 /// decoding.
-fn check(message: &[u8], fields: &[Field], allowance: RequestLimits, mut work: usize) -> Result<(), Stop> {
+fn check(message: &[u8], fields: &[Field], allowance: RequestLimits, mut work: usize) -> Result<(), PrecheckError> {
     count(message, fields, allowance, &mut work).map(|_| ())
 }
 
 /// The same of a part of a message; whether it is well-formed.
-fn count(mut message: &[u8], fields: &[Field], allowance: RequestLimits, work: &mut usize) -> Result<bool, Stop> {
+fn count(
+    mut message: &[u8],
+    fields: &[Field],
+    allowance: RequestLimits,
+    work: &mut usize,
+) -> Result<bool, PrecheckError> {
     let mut counts = [0; MAX_COUNTED_FIELDS];
     while !message.is_empty() {
-        *work = work.checked_sub(1).ok_or(Stop::Work)?;
+        *work = work.checked_sub(1).ok_or(PrecheckError::Work)?;
         let Some(tag) = varint(&mut message) else { return Ok(false) };
         let part = match tag & 7 {
             0 => varint(&mut message).map(|_| &[][..]),
@@ -150,7 +155,7 @@ fn count(mut message: &[u8], fields: &[Field], allowance: RequestLimits, work: &
             // Groups of fields, which are no part of this version of the encoding.
             kind => {
                 let got = format!("with a field of the encoding's kind {kind}");
-                return Err(Stop::Refused(InvalidValue::new("request", got, "kinds 0, 1, 2 and 5")));
+                return Err(PrecheckError::Refused(InvalidValue::new("request", got, "kinds 0, 1, 2 and 5")));
             }
         };
         let Some(part) = part else { return Ok(false) };
@@ -159,7 +164,7 @@ fn count(mut message: &[u8], fields: &[Field], allowance: RequestLimits, work: &
         };
         *counted += match field.inside {
             Numbers if tag & 7 == 2 => {
-                *work = work.checked_sub(part.len() / PACKED_BYTES_PER_FIELD).ok_or(Stop::Work)?;
+                *work = work.checked_sub(part.len() / PACKED_BYTES_PER_FIELD).ok_or(PrecheckError::Work)?;
                 part.iter().filter(|byte| **byte < 0x80).count() // each number's last byte
             }
             _ => 1,
@@ -167,7 +172,7 @@ fn count(mut message: &[u8], fields: &[Field], allowance: RequestLimits, work: &
         let most = field.most.entries(allowance);
         if *counted > most {
             let got = format!("there more than {most} times");
-            return Err(Stop::Refused(InvalidValue::new(field.name, got, "no more than can be needed")));
+            return Err(PrecheckError::Refused(InvalidValue::new(field.name, got, "no more than can be needed")));
         }
         if let Fields(fields) = field.inside
             && !count(part, fields, allowance, work)?
@@ -202,14 +207,14 @@ mod tests {
 
     const LIMITS: RequestLimits = RequestLimits { bytes: 0, entries: 2000, covered: 0 };
 
-    fn checked(request: impl Into<Request>, work: usize) -> Result<(), Stop> {
+    fn checked(request: impl Into<Request>, work: usize) -> Result<(), PrecheckError> {
         let message = proto::SessionRequest { request: Some(request.into()) }.encode_to_vec();
         check(&message, SESSION_REQUEST, LIMITS, work)
     }
 
     fn refused(request: impl Into<Request>) -> String {
         match checked(request, usize::MAX) {
-            Err(Stop::Refused(refusal)) => refusal.to_string(),
+            Err(PrecheckError::Refused(refusal)) => refusal.to_string(),
             other => panic!("{other:?}"),
         }
     }
@@ -220,7 +225,7 @@ mod tests {
         assert_eq!(checked(reset(vec![u64::MAX; 2000]), usize::MAX), Ok(()));
         assert!(refused(reset(vec![1; 2001])).contains("reset.seeds is there more than 2000 times"));
         let unpacked = [&[0x1A, 0xA2, 0x1F][..], &[0x10, 1].repeat(2001)].concat();
-        assert!(matches!(check(&unpacked, SESSION_REQUEST, LIMITS, usize::MAX), Err(Stop::Refused(_))));
+        assert!(matches!(check(&unpacked, SESSION_REQUEST, LIMITS, usize::MAX), Err(PrecheckError::Refused(_))));
         let policy = proto::Policy { hidden: vec![1; 1025], ..proto::Policy::default() };
         assert!(refused(proto::Act { policy: Some(policy), ..proto::Act::default() }).contains("act.policy.hidden"));
         let restore = proto::Restore { snapshots: vec![Bytes::new(); 2001], ..proto::Restore::default() };
@@ -242,15 +247,15 @@ mod tests {
     #[test]
     fn a_request_comes_once_in_a_message() {
         let twice = [0x12, 0].repeat(2);
-        assert!(matches!(check(&twice, SESSION_REQUEST, LIMITS, usize::MAX), Err(Stop::Refused(_))));
+        assert!(matches!(check(&twice, SESSION_REQUEST, LIMITS, usize::MAX), Err(PrecheckError::Refused(_))));
     }
 
     #[test]
     fn many_fields_are_not_counted_at_once_and_many_bytes_are() {
         let restore = |n| proto::Restore { snapshots: vec![Bytes::new(); n], ..proto::Restore::default() };
-        assert_eq!(checked(restore(INLINE_DECODE_MAX_FIELDS), INLINE_DECODE_MAX_FIELDS), Err(Stop::Work));
+        assert_eq!(checked(restore(INLINE_DECODE_MAX_FIELDS), INLINE_DECODE_MAX_FIELDS), Err(PrecheckError::Work));
         let seeds = proto::Reset { seeds: vec![1; 1 << 20], ..proto::Reset::default() };
-        assert_eq!(checked(seeds, INLINE_DECODE_MAX_FIELDS), Err(Stop::Work));
+        assert_eq!(checked(seeds, INLINE_DECODE_MAX_FIELDS), Err(PrecheckError::Work));
         assert_eq!(checked(proto::Step { actions: vec![0; 1 << 20].into() }, INLINE_DECODE_MAX_FIELDS), Ok(()));
     }
 

@@ -7,7 +7,7 @@ use crate::common::{
 };
 use perturb::{
     env::Version,
-    pool::{Autoreset, Batch, BatchSettings, Policy, PolicyRole, Pool, SlotGroup, Turn},
+    pool::{Autoreset, Batch, BatchSettings, Policy, PolicyRole, Pool, RolloutRequest, SlotGroup},
     proto::{act::Task as Asked, session_response::Response},
     tasks,
 };
@@ -39,7 +39,7 @@ async fn mountain_cars(pool: &Pool, size: usize) -> Batch {
 }
 
 /// Steps without number, of which only the ends of episodes are recorded: seconds, until these are a reply's size.
-fn endless(size: usize) -> Turn {
+fn endless(size: usize) -> RolloutRequest {
     let spec = PolicySpec::feed_forward(2, ActionKind::Discrete { n: 3 });
     let policy = Policy {
         inputs: Inputs::new(2, spec.action, size, false),
@@ -51,7 +51,7 @@ fn endless(size: usize) -> Turn {
         episodes_per_trial: 1,
     };
     let task = Some(CollectUntil::Steps(usize::MAX));
-    Turn { policy: Some(policy), weights: None, task, most_steps: usize::MAX, only_ended: true }
+    RolloutRequest { policy: Some(policy), weights: None, task, most_steps: usize::MAX, only_ended: true }
 }
 
 fn poll<F: Future>(future: &mut Pin<Box<F>>) -> Poll<F::Output> {
@@ -86,7 +86,7 @@ async fn a_play_that_nobody_waits_for_ends_and_the_batch_goes_on(#[values(4, 200
     batch.settle().await;
     assert!(batch.play().is_none());
     batch.step(&vec![0; 4 * size]).await.unwrap();
-    let short = Turn { task: Some(CollectUntil::Steps(3)), ..endless(size) };
+    let short = RolloutRequest { task: Some(CollectUntil::Steps(3)), ..endless(size) };
     assert_eq!(batch.act(short).await.unwrap().steps, 3);
 }
 

@@ -1,20 +1,22 @@
 //! The fields of requests whose entries are counted before anything is made of them.
 
 use crate::server::transport::precheck::{
-    Field,
-    Inside::{Fields, Numbers, Opaque},
-    Most, field,
+    Cardinality, Field,
+    FieldKind::{Fields, Numbers, Opaque},
+    field,
 };
 
-const SETTINGS_FIRST: &[Field] = &[field(1, "settings", Most::Many, Opaque)];
-const SETTINGS_SECOND: &[Field] = &[field(2, "settings", Most::Many, Opaque)];
-const AGENT_STEP: &[Field] =
-    &[field(1, "step.actions", Most::Many, Opaque), field(2, "step.requested_observations", Most::Many, Numbers)];
+const SETTINGS_FIRST: &[Field] = &[field(1, "settings", Cardinality::Many, Opaque)];
+const SETTINGS_SECOND: &[Field] = &[field(2, "settings", Cardinality::Many, Opaque)];
+const AGENT_STEP: &[Field] = &[
+    field(1, "step.actions", Cardinality::Many, Opaque),
+    field(2, "step.requested_observations", Cardinality::Many, Numbers),
+];
 /// Those of `dm_env_rpc.v1.EnvironmentRequest`.
 pub const ENVIRONMENT_REQUEST: &[Field] = &[
-    field(1, "create_world", Most::One, Fields(SETTINGS_FIRST)),
-    field(2, "join_world", Most::One, Fields(SETTINGS_SECOND)),
-    field(3, "step", Most::One, Fields(AGENT_STEP)),
-    field(4, "reset", Most::One, Fields(SETTINGS_FIRST)),
-    field(5, "reset_world", Most::One, Fields(SETTINGS_SECOND)),
+    field(1, "create_world", Cardinality::One, Fields(SETTINGS_FIRST)),
+    field(2, "join_world", Cardinality::One, Fields(SETTINGS_SECOND)),
+    field(3, "step", Cardinality::One, Fields(AGENT_STEP)),
+    field(4, "reset", Cardinality::One, Fields(SETTINGS_FIRST)),
+    field(5, "reset_world", Cardinality::One, Fields(SETTINGS_SECOND)),
 ];

@@ -7,7 +7,7 @@ use crate::{
     proto::dm_env_rpc::v1::{EnvironmentRequest, EnvironmentResponse, environment_server::Environment},
     server::{
         audit::ledger::Ledger,
-        session::{admission::Sessions, driver::Responses, instrumented::Counts},
+        session::{admission::Sessions, driver::Responses, instrumented::RequestCounters},
         transport::raw_body,
     },
 };
@@ -22,17 +22,21 @@ pub const ENDPOINT: &str = "/dm_env_rpc.v1.Environment/Process";
 pub struct Service {
     worlds: Arc<Worlds>,
     sessions: Sessions,
-    counts: Arc<Counts>,
+    counts: Arc<RequestCounters>,
 }
 
 impl Service {
     /// A service over a pool, without worlds, whose draws the ledger has.
     pub fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>, sessions: Sessions, ledger: Option<Ledger>) -> Self {
-        Self { worlds: Arc::new(Worlds::new(pool, catalogue, ledger)), sessions, counts: Counts::new::<Agent>() }
+        Self {
+            worlds: Arc::new(Worlds::new(pool, catalogue, ledger)),
+            sessions,
+            counts: RequestCounters::new::<Agent>(),
+        }
     }
 
     /// The requests so far.
-    pub fn counts(&self) -> Arc<Counts> {
+    pub fn counts(&self) -> Arc<RequestCounters> {
         Arc::clone(&self.counts)
     }
 }

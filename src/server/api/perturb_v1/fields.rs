@@ -1,30 +1,30 @@
 //! The fields of requests whose entries are counted before anything is made of them.
 
 use crate::server::transport::precheck::{
-    Field,
-    Inside::{Fields, Numbers, Opaque},
-    Most, field,
+    Cardinality, Field,
+    FieldKind::{Fields, Numbers, Opaque},
+    field,
 };
 
-const DISTRIBUTION: &[Field] = &[field(1, "intervals", Most::Many, Opaque)];
-const PARAMETER: &[Field] = &[field(2, "a distribution", Most::One, Fields(DISTRIBUTION))];
-const GROUP: &[Field] = &[field(3, "open.groups.parameters", Most::Many, Fields(PARAMETER))];
+const DISTRIBUTION: &[Field] = &[field(1, "intervals", Cardinality::Many, Opaque)];
+const PARAMETER: &[Field] = &[field(2, "a distribution", Cardinality::One, Fields(DISTRIBUTION))];
+const GROUP: &[Field] = &[field(3, "open.groups.parameters", Cardinality::Many, Fields(PARAMETER))];
 const OPEN: &[Field] = &[
-    field(3, "open.parameters", Most::Many, Fields(PARAMETER)),
-    field(11, "open.groups", Most::Environments, Fields(GROUP)),
+    field(3, "open.parameters", Cardinality::Many, Fields(PARAMETER)),
+    field(11, "open.groups", Cardinality::Environments, Fields(GROUP)),
 ];
 const RESET: &[Field] = &[
-    field(2, "reset.seeds", Most::Environments, Numbers),
-    field(3, "reset.parameters", Most::Many, Fields(PARAMETER)),
+    field(2, "reset.seeds", Cardinality::Environments, Numbers),
+    field(3, "reset.parameters", Cardinality::Many, Fields(PARAMETER)),
 ];
-const RESTORE: &[Field] = &[field(2, "restore.snapshots", Most::Environments, Opaque)];
-const POLICY: &[Field] = &[field(1, "act.policy.hidden", Most::Many, Numbers)];
-const ACT: &[Field] = &[field(1, "act.policy", Most::One, Fields(POLICY))];
+const RESTORE: &[Field] = &[field(2, "restore.snapshots", Cardinality::Environments, Opaque)];
+const POLICY: &[Field] = &[field(1, "act.policy.hidden", Cardinality::Many, Numbers)];
+const ACT: &[Field] = &[field(1, "act.policy", Cardinality::One, Fields(POLICY))];
 /// Those of `perturb.v1.SessionRequest`.
 pub const SESSION_REQUEST: &[Field] = &[
-    field(1, "open", Most::One, Fields(OPEN)),
-    field(2, "step", Most::One, Opaque),
-    field(3, "reset", Most::One, Fields(RESET)),
-    field(5, "restore", Most::One, Fields(RESTORE)),
-    field(8, "act", Most::One, Fields(ACT)),
+    field(1, "open", Cardinality::One, Fields(OPEN)),
+    field(2, "step", Cardinality::One, Opaque),
+    field(3, "reset", Cardinality::One, Fields(RESET)),
+    field(5, "restore", Cardinality::One, Fields(RESTORE)),
+    field(8, "act", Cardinality::One, Fields(ACT)),
 ];

@@ -3,7 +3,7 @@
 use super::{Error, convert};
 use crate::{
     env::ActionSpace,
-    pool::{Autoreset, Batch, EndedAt, Play, Policy, PolicyRole, Rollout, Turn},
+    pool::{Autoreset, Batch, EndedAt, Policy, PolicyRole, PolicyRunner, Rollout, RolloutRequest},
     proto,
 };
 use bytes::Bytes;
@@ -36,7 +36,7 @@ struct Sizes {
 
 /// Checks an `act` against the batch and the policy at play, of a client whose environments may take so many steps a
 /// second, if that is bounded.
-pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Turn, Error> {
+pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<RolloutRequest, Error> {
     let (settings, n_envs) = (batch.settings(), batch.size());
     let order = |when: &'static str, advice| Error::Order { request: "act", when: when.into(), advice };
     if settings.autoreset != Autoreset::SameStep {
@@ -83,7 +83,7 @@ pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Tur
         let advice = "finish it by requests without weights, or send another policy";
         return Err(order("with weights while a task is unfinished", advice));
     }
-    let spec = policy.as_ref().map(|policy| &policy.spec).or_else(|| batch.play().map(Play::spec));
+    let spec = policy.as_ref().map(|policy| &policy.spec).or_else(|| batch.play().map(PolicyRunner::spec));
     let computed = spec.map_or(0.0, |spec| spec.n_weights() as f64 / WEIGHTS_PER_US);
     if computed * n_envs as f64 > MAX_REPLY_COST_US {
         let got = format!("with {} weights in {n_envs} environments", spec.map_or(0, PolicySpec::n_weights));
@@ -94,7 +94,7 @@ pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Tur
     let allowed = rate.map_or(usize::MAX, |rate| (rate as usize / n_envs.max(1)).max(1));
     let affordable = affordable.min(allowed);
     let most_steps = if most_steps == 0 { affordable } else { affordable.min(most_steps as usize) };
-    Ok(Turn { policy, weights: given_weights, task, most_steps, only_ended })
+    Ok(RolloutRequest { policy, weights: given_weights, task, most_steps, only_ended })
 }
 
 fn task(task: Option<proto::act::Task>) -> Result<Option<CollectUntil>, Error> {

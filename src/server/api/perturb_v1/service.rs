@@ -1,10 +1,10 @@
 //! The gRPC service of `perturb.v1`: one short method for each call.
 
-use super::session::{Session, Shared};
+use super::session::{ServerContext, Session};
 use crate::{
     proto::{self, perturb_server::Perturb},
     server::{
-        session::{admission::Sessions, driver::Responses, instrumented::Counts},
+        session::{admission::Sessions, driver::Responses, instrumented::RequestCounters},
         transport::raw_body,
     },
 };
@@ -17,19 +17,19 @@ pub const ENDPOINT: &str = "/perturb.v1.Perturb/Session";
 /// Serves the catalogue and sessions.
 #[derive(Clone)]
 pub struct Service {
-    shared: Arc<Shared>,
+    shared: Arc<ServerContext>,
     sessions: Sessions,
-    counts: Arc<Counts>,
+    counts: Arc<RequestCounters>,
 }
 
 impl Service {
     /// A service of sessions that share this.
-    pub fn new(shared: Shared, sessions: Sessions) -> Self {
-        Self { shared: Arc::new(shared), sessions, counts: Counts::new::<Session>() }
+    pub fn new(shared: ServerContext, sessions: Sessions) -> Self {
+        Self { shared: Arc::new(shared), sessions, counts: RequestCounters::new::<Session>() }
     }
 
     /// The requests so far.
-    pub fn counts(&self) -> Arc<Counts> {
+    pub fn counts(&self) -> Arc<RequestCounters> {
         Arc::clone(&self.counts)
     }
 }

@@ -28,7 +28,7 @@ use std::sync::Arc;
 const STEP_OVERHEAD_BYTES: usize = 32;
 
 /// What all sessions of a server share.
-pub struct Shared {
+pub struct ServerContext {
     /// Where environments run.
     pub pool: Arc<Pool>,
     /// Which there are.
@@ -45,7 +45,7 @@ pub struct Shared {
 
 /// A client's session. Dropping it frees its environments.
 pub struct Session {
-    shared: Arc<Shared>,
+    shared: Arc<ServerContext>,
     batch: Option<Batch>,
     bearer: Option<Bearer>,
     /// Its environments, of those that its token may have.
@@ -60,7 +60,7 @@ pub struct Session {
 
 impl Session {
     /// A session that is not open yet, whose replies' bytes are taken from the budget.
-    pub fn new(shared: Arc<Shared>, bearer: Option<Bearer>, budget: Budget) -> Self {
+    pub fn new(shared: Arc<ServerContext>, bearer: Option<Bearer>, budget: Budget) -> Self {
         let draws = DrawAuditor::new(bearer.clone(), shared.ledger.clone());
         Self { shared, batch: None, bearer, held: None, draws, budget, kept: None, playing: None }
     }

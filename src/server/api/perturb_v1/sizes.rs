@@ -2,7 +2,7 @@
 
 use crate::{
     env::{self, ActionSpace},
-    pool::{Autoreset, Batch, BatchSettings, Turn},
+    pool::{Autoreset, Batch, BatchSettings, RolloutRequest},
     proto,
     render::Size,
 };
@@ -77,7 +77,7 @@ pub fn policy(request: &proto::Act, envs: usize) -> usize {
 }
 
 /// The most of a turn's reply.
-pub fn reply_to(turn: &Turn, batch: &Batch) -> usize {
+pub fn reply_to(turn: &RolloutRequest, batch: &Batch) -> usize {
     let settings = batch.settings();
     // Flags, values and the like beside observations and two times the action: as sampled, and as an input.
     let numbers = settings.observation_size() + 2 * action_width(settings) + 10;
