@@ -39,10 +39,10 @@ const MIN_WORKER_SHARE_US: f64 = 10.0;
 /// notices.
 const INLINE_DROP_MAX_ENVS: usize = 64;
 
-/// One environment's part of a reset: a new episode, or with a seed or distributions a new trial.
+/// The reset of one environment: a new episode, or with a seed or distributions a new trial.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ResetEntry {
-    /// Where in the batch.
+    /// The slot in the batch.
     pub slot: usize,
     /// A new seed.
     pub seed: Option<u64>,
@@ -62,19 +62,19 @@ pub struct Batch {
     workers: Arc<Scheduler>,
     n_workers: usize,
     buffer: BytesMut,
-    /// Requests that workers were asked for.
+    /// The number of requests that were handed to the workers.
     asked: u64,
-    /// A request has been handed to the workers and its end not been waited for.
+    /// Whether a request was handed to the workers and its end not been waited for.
     under_way: bool,
-    /// When the next request, a step that followed, began.
+    /// The time at which the next request began, if that is a pipelined step.
     followed: Option<Instant>,
     /// The policy that plays, until somebody else changes the environments.
     play: Option<Box<PolicyRunner>>,
-    /// Who is told when it is freed.
+    /// The hook for the end of the batch.
     farewell: Option<DropHook>,
 }
 
-/// Who is told where environments drew from, when they are freed.
+/// A hook that gets the draws of all environments when they are freed.
 pub type DropHook = Box<dyn FnOnce(Vec<Draw>) + Send + Sync>;
 
 impl Batch {
@@ -112,7 +112,7 @@ impl Batch {
         Ok((batch, observations, started))
     }
 
-    /// What the batch was opened with.
+    /// The settings of the batch.
     pub fn settings(&self) -> &BatchSettings {
         &self.settings
     }
@@ -170,7 +170,7 @@ impl Batch {
         }
     }
 
-    /// What came of the step that has ended.
+    /// The result of the step that has ended.
     fn stepped(&mut self, start: Instant, end: Instant) -> StepResult {
         self.observe(start, end);
         let reward_terms = self.settings.reward_terms;
@@ -181,16 +181,16 @@ impl Batch {
         self.job.tally.meter.times(self.size).observe(end.saturating_duration_since(start));
     }
 
-    /// Where the step is left that follows the next one; none where a step needs to know what came of the one before, and
-    /// where the session's own thread may take it.
+    /// Returns the queue for the step after the next one, or `None` if a step must know the result of the one before, or if
+    /// the session's own thread may take it.
     pub fn follower(&self) -> Option<StepQueue> {
         let (job, spec, size) = (Arc::clone(&self.job), self.settings.spec, self.size);
         let follows = self.settings.autoreset != Autoreset::Disabled && job.is_for_workers();
         follows.then_some(StepQueue { job, spec, size })
     }
 
-    /// Has a policy play. Without a new one, that of before goes on; without a new task, with what is left of its own.
-    /// The caller has checked that there is one, that the task before is done where another begins, that the mode is
+    /// Has a policy play. Without a new policy the previous one continues, without a new task it continues its own. The caller
+    /// has checked that there is a policy, that the previous task is done if another begins, that the mode is
     /// [`Autoreset::SameStep`], and that policy and weights fit.
     ///
     /// # Errors
@@ -306,19 +306,18 @@ impl Batch {
         lock(&self.job.shards[slot / self.shard_size]).distributions(slot).to_vec()
     }
 
-    /// Where a slot draws from, and how far it is.
+    /// The address of a slot's draws: seed, environment and episode.
     pub fn draw(&self, slot: usize) -> Draw {
         lock(&self.job.shards[slot / self.shard_size]).draw(slot)
     }
 
-    /// Tells where its environments drew from, and how far they came, in order of slots, when they are freed.
+    /// Sets the hook that gets the draws of all environments, in order of slots, when they are freed.
     pub fn when_freed(&mut self, tell: DropHook) {
         self.farewell = Some(tell);
     }
 
-    /// Waits for the end of a request whose future was dropped before it was ready. To be called before the next one,
-    /// then; the workers still run it, and another would mix with it, and maybe a step that follows. A policy that plays
-    /// ends with its present step.
+    /// Waits for a request whose future was dropped early. Call it before the next request: workers may still be running the
+    /// old one and a step queued behind it. A policy that plays ends with its present step.
     pub async fn settle(&mut self) {
         // Whether any of it failed the next request will tell.
         if self.under_way {
@@ -336,7 +335,7 @@ impl Batch {
         }
     }
 
-    /// What a picture of a slot shows; none where its physics diverged. Little is read, between two requests: no worker
+    /// Returns the scene of a slot, or `None` where its physics diverged. Little is read, between two requests, so no worker
     /// is asked.
     ///
     /// # Errors
@@ -348,7 +347,7 @@ impl Batch {
         Ok(lock(&self.job.shards[slot / self.shard_size]).scene(slot))
     }
 
-    /// Before a request that is not the step which followed: nothing is under way, and nothing has failed.
+    /// Waits until no request runs, before one that is not a pipelined step, and checks that nothing has failed.
     async fn ready(&mut self) -> Result<(), Error> {
         self.settle().await;
         self.job.result()
@@ -361,7 +360,7 @@ impl Batch {
         result
     }
 
-    /// The number of the request that the workers are asked for now.
+    /// Counts a request that is handed to the workers now.
     fn ask(&mut self) -> u64 {
         self.under_way = true;
         self.asked += 1;
@@ -388,7 +387,7 @@ impl Batch {
         Err(Error::Ended { slots: ended.join(", ") + &more })
     }
 
-    /// One list for each shard, by the slot that `slot_of` reads from an entry.
+    /// Splits entries into a list for each shard, by the slot that `slot_of` reads from an entry.
     fn split<T>(&self, entries: Vec<T>, slot_of: impl Fn(&T) -> usize) -> Vec<Vec<T>> {
         let mut lists: Vec<Vec<T>> = self.job.shards.iter().map(|_| Vec::new()).collect();
         for entry in entries {
@@ -444,12 +443,12 @@ impl Drop for Batch {
     }
 }
 
-/// Where all environments of a job draw from.
+/// The draws of all environments of a job.
 fn draws(job: &Job) -> Vec<Draw> {
     job.shards.iter().flat_map(|shard| lock(shard).draws().collect::<Vec<_>>()).collect()
 }
 
-/// The job of a batch of `size` environments.
+/// Makes the job of a batch of `size` environments.
 fn job(
     settings: &BatchSettings,
     shards: Vec<Mutex<Shard>>,

@@ -1,4 +1,4 @@
-//! How many environments there may be, and are.
+//! The pool's budget of environments.
 
 use super::Error;
 use std::sync::{
@@ -7,16 +7,16 @@ use std::sync::{
 };
 use tokio::sync::Notify;
 
-/// The pool's budget of environments.
+/// The number of environments in use, with its limit.
 pub(super) struct Capacity {
     used: AtomicUsize,
     limit: usize,
-    /// Told whenever `used` has changed.
+    /// Notified whenever `used` has changed.
     changed: Notify,
 }
 
 impl Capacity {
-    /// Of at most so many environments, none of which is in use.
+    /// A budget of at most `limit` environments.
     pub(super) fn new(limit: usize) -> Self {
         Self { used: AtomicUsize::new(0), limit, changed: Notify::new() }
     }
@@ -31,7 +31,7 @@ impl Capacity {
         self.limit
     }
 
-    /// Waits until the number of environments in use has changed since this was last waited for, by one caller.
+    /// Waits until the number of environments in use has changed since the last call, for one caller.
     pub(super) async fn changed(&self) {
         self.changed.notified().await;
     }
@@ -62,7 +62,7 @@ pub(super) struct Permit {
 }
 
 impl Permit {
-    /// Gives back so many environments, which must not be more than there are.
+    /// Gives back environments of the permit, not more than it has.
     pub(super) fn give_back(&self, count: usize) {
         self.count.fetch_sub(count, Ordering::Relaxed);
         self.capacity.give_back(count);

@@ -1,4 +1,4 @@
-//! Numbers as they are on the wire: little-endian, without gaps.
+//! Arrays as they are on the wire: little-endian, without gaps.
 
 use bytes::BytesMut;
 

@@ -16,56 +16,56 @@ use tokio::sync::Notify;
 
 /// Batches cheaper than this run on the session's thread, since a hand-over to a worker costs more.
 pub(super) const INLINE_MAX_US: f64 = 20.0;
-/// The same limit while no other session has stepped meanwhile. A hand-over costs more than a second worker saves, and no
-/// other session waits.
+/// This limit applies instead while no other session has stepped meanwhile. A hand-over costs more than a second worker
+/// saves, and no other session waits.
 pub(super) const INLINE_MAX_US_UNCONTENDED: f64 = 80.0;
 /// The session polls for the end of a job that is at most this expensive before it sleeps.
 const POLL_MAX_US: f64 = 50.0;
 /// The number of polls, which take about twice that time.
 const POLLS_BEFORE_WAIT: usize = 50;
 
-/// What a job does at a step's end.
+/// The continuation of a job at a step's end.
 pub(super) enum Continuation {
     Nothing,
-    /// Another step of the round.
+    /// Another step of the rollout.
     Step,
-    /// The step that follows: another request.
+    /// The pipelined step, which is another request.
     Request,
 }
 
 /// A batch's shards and the state of its current request. A batch has at most one request under way, and one that follows.
 pub(super) struct Job {
     pub(super) shards: Vec<Mutex<Shard>>,
-    /// For each worker the shards that it takes first, and the next of them. A worker that meets the same environments
-    /// again finds them in its core's cache; one that is done helps the others.
+    /// For each worker the range of shards that it takes first, and the next of them. A worker that meets the same
+    /// environments again finds them in its core's cache. A worker that is done helps the others.
     ranges: Vec<(Range<usize>, AtomicUsize)>,
-    /// Parts that have not finished.
+    /// The number of parts that have not finished.
     left: AtomicUsize,
-    /// What decides between two steps whether and how there is another, while a policy plays.
+    /// The rollout of the policy that plays, if one plays.
     round: Mutex<Option<Box<RolloutTask>>>,
-    /// What is to be done after a step without a round.
+    /// The pipelined step that may follow a step, while no policy plays.
     pub(super) follow: Mutex<PipelinedStep>,
-    /// The part that is to run next is the beginning of the round, not a shard.
+    /// Whether the next part is the beginning of the rollout and not a shard.
     begins: AtomicBool,
-    /// Requests that have ended, of those that workers were asked for.
+    /// The number of requests that have ended, of those that were handed to the workers.
     pub(super) ended: AtomicU64,
-    /// Told whenever one has.
+    /// Notified whenever a request has ended.
     pub(super) done: Notify,
-    /// The session is gone: what has not run need not.
+    /// Whether the session is gone, so that shards that have not run need not.
     pub(super) abandoned: AtomicBool,
-    /// Nobody waits for the round any more: it ends with its present step.
+    /// Whether nobody waits for the rollout any more, so that it ends with its present step.
     pub(super) halted: AtomicBool,
     failed: AtomicBool,
-    /// What a step of all environments takes, µs.
+    /// The cost of a step of all environments, µs.
     pub(super) cost: f64,
-    /// How often the session looks whether a request is done before it sleeps until then.
+    /// The number of times that the session polls for the end of a request before it sleeps.
     pub(super) patience: usize,
     pub(super) permit: Arc<Permit>,
     pub(super) tally: Arc<Tally>,
 }
 
 impl Job {
-    /// A job of these shards for so many workers. One that takes about `cost` µs and is short is worth waiting for awake.
+    /// A job of these shards, for this number of workers, whose steps take about `cost` µs.
     pub(super) fn new(
         shards: Vec<Mutex<Shard>>,
         workers: usize,
@@ -94,7 +94,7 @@ impl Job {
         }
     }
 
-    /// Whether workers step it, whoever else steps.
+    /// Whether workers step the batch even if no other session steps.
     pub(super) fn is_for_workers(&self) -> bool {
         self.cost > INLINE_MAX_US_UNCONTENDED
     }
@@ -116,7 +116,7 @@ impl Job {
         self.left.store(self.shards.len(), Ordering::Relaxed);
     }
 
-    /// A shard that nobody has taken: the worker's own first. The caller has it from the queue, so there is one.
+    /// Claims a shard that nobody has taken, first of the worker's own. The caller has a part from the queue, so there is one.
     fn claim(&self, worker: usize) -> usize {
         loop {
             for i in 0..self.ranges.len() {
@@ -129,7 +129,7 @@ impl Job {
         }
     }
 
-    /// Makes the beginning of a round ready to be taken.
+    /// Makes the beginning of a rollout ready to be taken.
     pub(super) fn prepare_round(&self, round: Box<RolloutTask>) {
         *lock(&self.round) = Some(round);
         self.halted.store(false, Ordering::Relaxed);
@@ -137,12 +137,12 @@ impl Job {
         self.left.store(1, Ordering::Relaxed);
     }
 
-    /// The round, when it has ended or will never be run.
+    /// Takes the rollout, when it has ended or will never be run.
     pub(super) fn take_round(&self) -> Option<Box<RolloutTask>> {
         lock(&self.round).take()
     }
 
-    /// Runs a part that the caller has from the queue; whether it was the last.
+    /// Runs a part that the caller has from the queue. Returns whether it was the last.
     pub(super) fn run_part(&self, worker: usize) -> bool {
         // The beginning of a round is its job's only part.
         if self.begins.swap(false, Ordering::Relaxed) {
@@ -152,13 +152,13 @@ impl Job {
         self.run(self.claim(worker))
     }
 
-    /// A request has ended.
+    /// Notifies the session that a request has ended.
     pub(super) fn tell(&self) {
         self.ended.fetch_add(1, Ordering::Release);
         self.done.notify_one();
     }
 
-    /// Whether a step is to follow, and which. None is if the pool is `closing`.
+    /// Returns whether a step follows, and which. No step follows if the pool is `closing`.
     pub(super) fn conduct(&self, closing: bool) -> Continuation {
         if self.failed() || self.abandoned.load(Ordering::Relaxed) {
             lock(&self.follow).stop();
@@ -177,7 +177,7 @@ impl Job {
         self.unless_it_panics(Continuation::Step, || round.conduct(&self.shards, halted))
     }
 
-    /// `next` if there is to be one.
+    /// Returns `next` if it is wanted, and marks the job as failed if the question panics.
     fn unless_it_panics(&self, next: Continuation, is_wanted: impl FnOnce() -> bool) -> Continuation {
         match catch_unwind(AssertUnwindSafe(is_wanted)) {
             Ok(true) => next,
@@ -190,7 +190,7 @@ impl Job {
         }
     }
 
-    /// Runs a shard; whether it was the last.
+    /// Runs a shard. Returns whether it was the last.
     pub(super) fn run(&self, index: usize) -> bool {
         if !self.abandoned.load(Ordering::Relaxed) {
             let run = AssertUnwindSafe(|| lock(&self.shards[index]).run());

@@ -65,7 +65,7 @@ pub enum Error {
         /// The first few, separated by commas.
         slots: String,
     },
-    /// What a policy is computed of, or computes, is not finite.
+    /// An input or an output of a policy is not finite.
     #[error("the policy's play has ended: {0}; hand over another policy")]
     Policy(#[from] perturb_policy::Error),
     /// A worker panicked: a defect of the server. The batch is lost.

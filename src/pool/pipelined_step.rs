@@ -1,5 +1,5 @@
-//! The step that was asked for while another was under way: it begins as soon as that ends, while the session, which has
-//! to tell of the first, is still being woken.
+//! A pipelined step is requested while another is under way. It begins as soon as that ends, while the session, which has
+//! to answer the first, is still being woken.
 
 use super::{
     shard::{Shard, put_actions},
@@ -9,33 +9,34 @@ use bytes::{Bytes, BytesMut};
 use std::sync::Mutex;
 use tokio::time::Instant;
 
-/// What follows the step of a job that is under way.
+/// The pipelined step of a job.
 #[derive(Default)]
 pub(super) struct PipelinedStep {
     /// A step is under way, and its worker will look here at its end.
     is_under_way: bool,
     /// The next step's actions.
     actions: Option<Bytes>,
-    /// What came of the step whose end began the present one, until the session takes it, and when that was.
+    /// Result and completion time of the step before the running one, until the session collects it.
     stepped: Option<(StepResult, Instant)>,
-    /// When the last step ended that none followed.
+    /// The time at which the last step ended that no other followed.
     ended: Option<Instant>,
     buffer: BytesMut,
     reward_terms: bool,
 }
 
 impl PipelinedStep {
-    /// Of a job whose steps tell of the reward's terms, or not.
+    /// No pipelined step, of a job whose steps report the reward's terms or not.
     pub(super) fn new(reward_terms: bool) -> Self {
         Self { reward_terms, ..Self::default() }
     }
 
-    /// A step begins.
+    /// Notes that a step begins.
     pub(super) fn begin(&mut self) {
         self.is_under_way = true;
     }
 
-    /// At the end of a step: takes what came of it and gives the shards their next actions, if there are some.
+    /// At the end of a step: if another is queued, keeps the result and gives the shards their next actions. Returns whether
+    /// one was queued.
     pub(super) fn go_on(&mut self, shards: &[Mutex<Shard>]) -> bool {
         let Some(actions) = self.actions.take() else {
             (self.is_under_way, self.ended) = (false, Some(Instant::now()));
@@ -47,17 +48,17 @@ impl PipelinedStep {
         true
     }
 
-    /// Nothing is to follow the step that is under way.
+    /// Drops the queued step.
     pub(super) fn stop(&mut self) {
         (self.is_under_way, self.actions) = (false, None);
     }
 
-    /// What came of the last step, if another has begun since, and when.
+    /// Takes result and completion time of the last step, if another has begun since.
     pub(super) fn take(&mut self) -> Option<(StepResult, Instant)> {
         self.stepped.take()
     }
 
-    /// When the last step ended, if no other followed.
+    /// The time at which the last step ended, if no other followed.
     pub(super) fn ended(&self) -> Option<Instant> {
         self.ended
     }

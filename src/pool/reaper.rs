@@ -15,8 +15,8 @@ use std::{
 /// The niceness of the thread: nobody waits for it.
 const REAPER_NICENESS: i32 = 3;
 
-/// Frees what a session leaves behind, and says whether it could: thousands of environments take longer than the transport
-/// may be kept.
+/// Frees what a session leaves behind, and returns whether it could. It runs on the reaper's thread, since thousands of
+/// environments take longer than the transport may be kept.
 pub(super) type DeferredDrop = Box<dyn FnMut() -> bool + Send>;
 /// The interval at which a batch that was still in use is tried again.
 const REAP_INTERVAL: Duration = Duration::from_millis(1);
@@ -52,7 +52,7 @@ impl Reaper {
     }
 }
 
-/// Frees what comes, as soon as it can be, until the pool ends.
+/// Frees what comes, as soon as it can be freed, until the pool ends.
 fn free(received: &mpsc::Receiver<DeferredDrop>) {
     let mut left: Vec<DeferredDrop> = Vec::new();
     loop {

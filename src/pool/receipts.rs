@@ -2,7 +2,7 @@
 
 use crate::env::Episodes;
 
-/// The receipts of some episodes.
+/// The receipts of some episodes, as columns.
 #[derive(Debug, Default)]
 pub(super) struct ReceiptColumns {
     /// `[m, 5]`: slot of the batch, indices of environment, trial and episode, and the episode's number in its trial.
@@ -12,7 +12,7 @@ pub(super) struct ReceiptColumns {
 }
 
 impl ReceiptColumns {
-    /// Forgets all.
+    /// Removes all receipts.
     pub(super) fn clear(&mut self) {
         self.episodes.clear();
         self.values.clear();

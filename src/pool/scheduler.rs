@@ -84,17 +84,17 @@ impl Pool {
         self.shared.capacity.changed().await;
     }
 
-    /// Where what happens in environments of this name is counted.
+    /// The counters of the environments of this name.
     pub fn meter(&self, environment: &'static str) -> Arc<Meter> {
         Arc::clone(lock(&self.shared.meters).entry(environment).or_default())
     }
 
-    /// What happened in the environments of each kind that has a meter, by name.
+    /// The counters of all environments that have some, by name.
     pub fn meters(&self) -> BTreeMap<&'static str, Arc<Meter>> {
         lock(&self.shared.meters).clone()
     }
 
-    /// How long batches with something to do wait for a worker to take a part of it, each time.
+    /// The times that batches waited for a worker to take a part.
     pub fn waits(&self) -> &Histogram {
         &self.shared.waits
     }
@@ -117,33 +117,33 @@ impl Drop for Pool {
     }
 }
 
-/// What the workers and the batches share.
+/// The queue of the workers, which the batches share.
 pub(super) struct Scheduler {
     pub(super) reaper: Reaper,
     pub(super) capacity: Arc<Capacity>,
     queue: Mutex<Queue>,
-    /// Jobs in the queue, to be looked at without its lock.
+    /// The number of jobs in the queue, readable without its lock.
     waiting: AtomicUsize,
     ready: Condvar,
-    /// The pool ends: rounds end with their present step.
+    /// Whether the pool ends, so that rollouts end with their present step.
     closing: AtomicBool,
-    /// Whose environments moved last; only to be compared.
+    /// The job that stepped last; only to be compared.
     last: AtomicPtr<Job>,
     meters: Mutex<BTreeMap<&'static str, Arc<Meter>>>,
     waits: Histogram,
 }
 
 struct Queue {
-    /// Jobs with the number of their parts, shards or a round's beginning, that nobody has taken, which is never 0, and
-    /// since when they are at this place.
+    /// FIFO of jobs, each with its number of unclaimed parts (at least 1), which are shards or the beginning of a rollout, and
+    /// the time at which it was enqueued.
     jobs: VecDeque<(Arc<Job>, usize, Instant)>,
-    /// Workers that wait for `ready`.
+    /// The number of workers that wait for `ready`.
     sleeping: usize,
     closed: bool,
 }
 
 impl Scheduler {
-    /// Steps the environments of every shard here, if that is soon done; whether it was.
+    /// Steps the environments of every shard on this thread, if that is cheap. Returns whether it did.
     pub(super) fn step_here(&self, job: &Job) -> bool {
         let tiny = if self.moves(job) { INLINE_MAX_US_UNCONTENDED } else { INLINE_MAX_US };
         if job.cost > tiny {
@@ -172,7 +172,7 @@ impl Scheduler {
         self.push(job, shards, shards); // its lock publishes the job's counters
     }
 
-    /// Runs a round on the workers: its beginning, and whatever steps it wants. Gives it back at its end.
+    /// Runs a rollout on the workers, its beginning and its steps, and returns it at its end.
     pub(super) async fn play(
         &self,
         job: &Arc<Job>,
@@ -186,7 +186,7 @@ impl Scheduler {
         job.take_round().ok_or(Error::Defect)
     }
 
-    /// Takes note that a job's environments move, and says whether they were the last that did.
+    /// Notes that a job steps. Returns whether it was also the last one that did.
     fn moves(&self, job: &Job) -> bool {
         let job = std::ptr::from_ref(job).cast_mut();
         self.last.swap(job, Ordering::Relaxed) == job
@@ -209,7 +209,7 @@ impl Scheduler {
         job.result()
     }
 
-    /// Puts a job of so many parts at the queue's tail, and wakes no more than `helpers` workers for them.
+    /// Puts a job with this number of parts at the queue's tail, and wakes at most `helpers` workers.
     fn push(&self, job: &Arc<Job>, parts: usize, helpers: usize) {
         let now = Instant::now();
         let mut queue = lock(&self.queue);
@@ -263,7 +263,8 @@ impl Scheduler {
         }
     }
 
-    /// A job's last part has ended: its session is told, and another step begins if a round wants one or one follows.
+    /// At the end of a job's last part: notifies its session, and begins another step if a rollout or a pipelined step wants
+    /// one.
     fn conduct(&self, job: &Arc<Job>) {
         loop {
             let next = job.conduct(self.closing.load(Ordering::Relaxed));

@@ -1,15 +1,15 @@
-//! What a batch is opened with.
+//! The settings of a batch.
 
 use crate::env::{EnvironmentSpec, Settings};
 
-/// What a batch is opened with.
+/// The settings of a batch.
 #[derive(Debug, Clone)]
 pub struct BatchSettings {
     /// The environment.
     pub spec: &'static EnvironmentSpec,
-    /// Its slots, at least one group.
+    /// The slots, at least one group.
     pub groups: Vec<SlotGroup>,
-    /// What happens to ended episodes.
+    /// The autoreset mode.
     pub autoreset: Autoreset,
     /// Whether episodes carry receipts.
     pub receipts: bool,
@@ -24,7 +24,7 @@ pub struct BatchSettings {
 /// Successive slots with settings of their own.
 #[derive(Debug, Clone)]
 pub struct SlotGroup {
-    /// How many, at least 1.
+    /// The number of slots, at least 1.
     pub size: usize,
     /// Fixes all randomness; `environment_index` is that of the group's first slot, and its last slot's fits a u32.
     pub episodes: Settings,
@@ -50,7 +50,7 @@ impl BatchSettings {
     }
 }
 
-/// What happens to an environment whose episode has ended (Gymnasium's three modes).
+/// The autoreset mode of an environment whose episode has ended (Gymnasium's three modes).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Autoreset {
     /// The next step ignores its action and resets.

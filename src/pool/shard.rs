@@ -14,7 +14,7 @@ use crate::{
 use bytes::Bytes;
 use std::sync::{Arc, Mutex};
 
-/// What a shard is asked to do. Slots are counted within the shard.
+/// A command for a shard. Slots are counted within the shard.
 pub(super) enum Command {
     Open,
     Step,
@@ -28,7 +28,7 @@ pub(super) enum Command {
     RollBack,
 }
 
-/// One environment's part of a reset.
+/// The reset of one environment.
 pub(super) struct SlotReset {
     pub(super) slot: usize,
     pub(super) seed: Option<u64>,
@@ -75,13 +75,13 @@ pub(super) struct Shard {
     pub(super) reward_terms: Vec<f32>,
     /// `[k, O]`
     pub(super) final_observations: Vec<f32>,
-    /// `[k]`: slot of the batch and what ended there.
+    /// `[k]`: slot of the batch and the episode that ended there.
     pub(super) ended: Vec<(u32, EpisodeEnd)>,
-    /// Slot of the batch and what began there.
+    /// Slot of the batch and the episode that began there.
     pub(super) started: Vec<(u32, EpisodeStart)>,
-    /// With receipts as arrays: those of `ended` …
+    /// The receipts of `ended`, if receipts are arrays.
     pub(super) ended_told: ReceiptColumns,
-    /// … and of what began in a step.
+    /// The receipts of the episodes that began in a step, if receipts are arrays.
     pub(super) started_told: ReceiptColumns,
     pub(super) snapshots: Vec<Vec<u8>>,
     pub(super) failure: Option<env::Error>,
@@ -158,17 +158,17 @@ impl Shard {
         &self.slots[slot - self.first_slot].settings().distributions
     }
 
-    /// Where a slot of the batch draws from.
+    /// The draws of a slot of the batch.
     pub(super) fn draw(&self, slot: usize) -> Draw {
         self.slots[slot - self.first_slot].draw()
     }
 
-    /// Where each environment draws from.
+    /// The draws of each environment.
     pub(super) fn draws(&self) -> impl Iterator<Item = Draw> {
         self.slots.iter().map(Episodes::draw)
     }
 
-    /// What a picture of a slot of the batch shows.
+    /// The scene of a slot of the batch.
     pub(super) fn scene(&self, slot: usize) -> Option<Scene> {
         self.slots[slot - self.first_slot].scene()
     }

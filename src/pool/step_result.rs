@@ -1,4 +1,4 @@
-//! What came of a step, out of the shards.
+//! The result of a step, gathered from the shards.
 
 use super::{
     encode::{put, put_wide},
@@ -71,7 +71,7 @@ impl ShardOutputs<'_> {
         self.buffer.split().freeze()
     }
 
-    /// Of what ended in all shards, then of what began.
+    /// Gathers receipts of the episodes that ended in all shards, then of those that began.
     fn told<T: Copy>(&mut self, column: fn(&ReceiptColumns) -> &Vec<T>, encode: fn(T) -> [u8; 8]) -> Bytes {
         let parts: [fn(&Shard) -> &ReceiptColumns; 2] = [|shard| &shard.ended_told, |shard| &shard.started_told];
         for told in parts {
@@ -90,7 +90,7 @@ impl ShardOutputs<'_> {
     }
 }
 
-/// One list of those of all shards.
+/// Gathers the lists of all shards into one.
 pub(super) fn collect<T>(shards: &[Mutex<Shard>], field: impl Fn(&mut Shard) -> &mut Vec<T>) -> Vec<T> {
     let mut all = Vec::new();
     for shard in shards {

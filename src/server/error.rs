@@ -30,9 +30,9 @@ pub fn status(error: &impl RequestError) -> Status {
 pub struct InvalidValue {
     /// The field, by its path in the protocol; of dm_env_rpc the setting, action or property.
     pub field: Cow<'static, str>,
-    /// What came.
+    /// The value that came.
     pub got: String,
-    /// What would be right, and what to do.
+    /// The values that are right, and what to do.
     pub expected: String,
 }
 
@@ -59,8 +59,7 @@ impl ErrorCounters {
         self.0[kind as usize].fetch_add(1, Ordering::Relaxed);
     }
 
-    /// How often each class happened, those that never did among them: who watches a counter sees its first event by
-    /// the 0 before.
+    /// The count of each class. Classes that never happened have a 0, so that a rate shows their first event.
     pub fn counts(&self) -> impl Iterator<Item = (ErrorKind, u64)> {
         ErrorKind::ALL.iter().zip(&*self.0).map(|(kind, count)| (*kind, count.load(Ordering::Relaxed)))
     }

@@ -1,10 +1,10 @@
-//! How large requests may be.
+//! Size limits of requests.
 
 /// The maximum length of a request before a session is open: enough for thousands of groups, and little enough that all
 /// sessions may come so far.
 pub const MAX_BYTES_BEFORE_OPEN: usize = 64 << 10;
 
-/// What a stream may send now.
+/// The size limits of the next request of a stream.
 #[derive(Debug, Clone, Copy)]
 pub struct RequestLimits {
     /// The most bytes of a message.

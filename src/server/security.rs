@@ -1,4 +1,4 @@
-//! What keeps strangers out, and what is written down of those who came in, of the files that the settings name.
+//! Tokens, TLS and the ledger, loaded from the files that the configuration names.
 
 use super::{
     audit::ledger::Ledger,
@@ -14,21 +14,21 @@ use crate::{
 };
 use std::{io, path::PathBuf};
 
-/// What keeps strangers out and writes down what others do; by default nothing does.
+/// The tokens, TLS and the ledger of a server; by default there is none of them.
 #[derive(Default)]
 pub struct Security {
-    /// What callers must show.
+    /// The tokens that callers must show.
     pub tokens: Option<Tokens>,
-    /// How TCP connections are encrypted.
+    /// The TLS settings of TCP connections.
     pub tls: Option<Tls>,
-    /// Has what is drawn.
+    /// The ledger of all draws.
     pub ledger: Option<Ledger>,
-    /// Has the files read again when they change.
+    /// The threads that read the files again when they change.
     watches: Vec<FileWatcher>,
 }
 
 impl Security {
-    /// Those of the settings of a server of these environments: its files are read, and again when they change.
+    /// Loads the files that the configuration of a server of these environments names, and loads them again when they change.
     ///
     /// # Errors
     /// If a file is wrong: it is named, with what was expected.

@@ -2,7 +2,7 @@
 
 use tokio::sync::watch;
 
-/// How far the shutdown is.
+/// The phase of the shutdown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Phase {
     /// Serving.
@@ -53,7 +53,7 @@ impl Drain {
         Self { _session: Some(self.sessions.subscribe()), ..self.clone() }
     }
 
-    /// How far the shutdown is.
+    /// The phase of the shutdown.
     pub fn phase(&self) -> Phase {
         *self.phase.borrow()
     }

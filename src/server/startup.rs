@@ -1,4 +1,4 @@
-//! How the server begins and how it ends.
+//! Startup and shutdown of the server.
 
 use super::{
     api::{
@@ -203,7 +203,7 @@ impl State {
         dm_env_rpc::service::Service::new(pool, catalogue, self.sessions.clone(), guards.ledger.clone())
     }
 
-    /// Where the metrics' numbers are.
+    /// The counters that the metrics read.
     fn sources(&self, requests: [RequestCounts; 2], guards: &Security, pictures: Arc<Histogram>) -> Sources {
         requests.iter().for_each(|(protocol, _)| self.access.tell_of(protocol));
         Sources {

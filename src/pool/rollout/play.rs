@@ -14,18 +14,18 @@ use perturb_policy::{
 use rand_chacha::ChaCha8Rng;
 use std::sync::Mutex;
 
-/// A policy that is yet to play, all of whose parts fit each other and the batch.
+/// A policy that has not played yet. Its parts fit each other and the batch.
 #[derive(Debug, Clone)]
 pub struct Policy {
-    /// Its shape.
+    /// The shape of the networks.
     pub spec: PolicySpec,
-    /// Its inputs, fresh.
+    /// The inputs, at their start.
     pub inputs: Inputs,
-    /// What numbers are normalised with.
+    /// The normalisers of observations and rewards.
     pub normalisers: Normalisers,
-    /// Where its actions' randomness comes from.
+    /// The random streams of the actions.
     pub role: PolicyRole,
-    /// What it goes on from, in training; none: a trial begins in every environment.
+    /// The state that it continues from, in training. Without one a trial begins in every environment.
     pub state: Option<PlayerState>,
     /// All weights in a row, `[P]`, finite.
     pub weights: Vec<f32>,
@@ -33,11 +33,11 @@ pub struct Policy {
     pub episodes_per_trial: u32,
 }
 
-/// Where actions' randomness comes from, and whether statistics run.
+/// The random streams of the actions, and whether running statistics are updated.
 #[derive(Debug, Clone)]
 #[allow(clippy::large_enum_variant)] // a policy has one
 pub enum PolicyRole {
-    /// One stream; statistics run.
+    /// A single stream; statistics are updated.
     Training(ChaCha8Rng),
     /// A stream of each trial; statistics are frozen.
     Testing {
@@ -52,12 +52,12 @@ pub struct PolicyRunner {
     pub(in crate::pool) task: RemainingRollout,
     /// In a test.
     seed: Option<u64>,
-    /// What the last step brought.
+    /// The outputs of the last step.
     pub(in crate::pool) step: StepBuffers,
     spec: PolicySpec,
 }
 
-/// What a step of all environments brought; buffers are used again.
+/// The outputs of a step of all environments; buffers are used again.
 #[derive(Default)]
 pub(in crate::pool) struct StepBuffers {
     observations: Vec<f32>,
@@ -66,7 +66,7 @@ pub(in crate::pool) struct StepBuffers {
     pub(in crate::pool) truncated: Vec<bool>,
     final_observations: Vec<f32>,
     ended: Vec<SlotEnd>,
-    /// The same with all that is known of them.
+    /// The ends of those episodes, with their slots.
     pub(in crate::pool) ends: Vec<(u32, EpisodeEnd)>,
 }
 
@@ -99,12 +99,12 @@ impl PolicyRunner {
         &self.spec
     }
 
-    /// What plays.
+    /// The player of the policy.
     pub fn player(&self) -> &Player {
         &self.player
     }
 
-    /// What is played.
+    /// The task that the policy plays.
     pub fn task(&self) -> &RemainingRollout {
         &self.task
     }
@@ -142,7 +142,7 @@ impl PolicyRunner {
         Ok(actions)
     }
 
-    /// Takes what came of the actions.
+    /// Takes the outcome of the actions from the shards.
     pub(in crate::pool) fn observe(&mut self, shards: &[Mutex<Shard>]) -> Result<(), Error> {
         let Self { player, task, step, .. } = self;
         step.gather(shards);

@@ -1,7 +1,7 @@
-//! A round: the steps of one reply that a policy plays, without a session in between.
+//! A rollout: the steps of one reply, which a policy plays without a session in between.
 //!
-//! The worker that ends a step's last shard has the round take what came of it, choose the next actions and give them to
-//! the shards; then the job goes to the queue's tail, as that of any other step. The session is woken at the round's end.
+//! The worker that ends a step's last shard has the rollout take the outcome, choose the next actions and give them to the
+//! shards. Then the job goes to the queue's tail, like that of any other step. The session is woken at the rollout's end.
 
 use super::play::{Policy, PolicyRunner};
 use crate::{
@@ -24,22 +24,22 @@ const EPISODE_END_BYTES: usize = 100;
 /// The steps that buffers are made for at first where the number of steps is not known.
 const INITIAL_CAPACITY_STEPS: usize = 256;
 
-/// What is to be played in a round.
+/// The parameters of one rollout.
 #[derive(Debug, Clone)]
 pub struct RolloutRequest {
-    /// Whose turn it is now; none: the policy of before goes on.
+    /// The policy to play; if `None`, the previous one continues.
     pub policy: Option<Policy>,
-    /// New weights of the policy of before, `[P]`, finite; none: those that it has.
+    /// New weights of the previous policy, `[P]`, finite; if `None`, it keeps its own.
     pub weights: Option<Vec<f32>>,
-    /// A new task; none: what is left of the one before.
+    /// A new task; if `None`, the previous one continues.
     pub task: Option<CollectUntil>,
-    /// The most steps, at least 1.
+    /// The maximum number of steps, at least 1.
     pub most_steps: usize,
     /// Records nothing but the episodes that ended.
     pub only_ended: bool,
 }
 
-/// What was played: T steps of N environments; arrays are little-endian, row-major `[T, N, …]`, as on the wire.
+/// A rollout of T steps of N environments. Arrays are little-endian, row-major `[T, N, …]`, as on the wire.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Rollout {
     /// T.
@@ -68,20 +68,20 @@ pub struct Rollout {
     pub finished: bool,
     /// f32 `[N]`: V of the present observations, when finished.
     pub last_values: BytesMut,
-    /// f32 `[N, S]`: what the policy remembered at the task's beginning, if it began in this round.
+    /// f32 `[N, S]`: the memory of the policy at the task's beginning, if it began in this rollout.
     pub memory: BytesMut,
-    /// Of `ended`, roughly.
+    /// The estimated length of `ended`.
     ended_bytes: usize,
 }
 
 /// An episode that ended.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EndedAt {
-    /// In which of the round's steps.
+    /// The step of the rollout.
     pub step: usize,
-    /// In which slot.
+    /// The slot.
     pub slot: u32,
-    /// What ended.
+    /// The episode that ended.
     pub end: EpisodeEnd,
     /// Whether the task ended it.
     pub terminated: bool,
@@ -89,9 +89,9 @@ pub struct EndedAt {
     pub truncated: bool,
 }
 
-/// What a round waits for.
+/// The event that a rollout waits for.
 enum Phase {
-    /// Its turn.
+    /// The first worker that takes it.
     Begin,
     /// All environments to be reset.
     Reset,
@@ -99,7 +99,7 @@ enum Phase {
     Step,
 }
 
-/// The steps of one reply.
+/// The state of a rollout.
 pub(in crate::pool) struct RolloutTask {
     turn: RolloutRequest,
     play: Option<Box<PolicyRunner>>,
@@ -109,18 +109,18 @@ pub(in crate::pool) struct RolloutTask {
 }
 
 impl RolloutTask {
-    /// A round of the policy of before, if there is no new one.
+    /// A rollout of the previous policy, if the request has no new one.
     pub(in crate::pool) fn new(turn: RolloutRequest, play: Option<Box<PolicyRunner>>) -> Self {
         Self { turn, play, phase: Phase::Begin, played: Rollout::default(), error: None }
     }
 
-    /// What came of it, with the policy at play unless it failed.
+    /// Returns the rollout, with the policy unless it failed.
     pub(in crate::pool) fn finish(self) -> Result<(Option<Box<PolicyRunner>>, Rollout), Error> {
         self.error.map_or(Ok((self.play, self.played)), Err)
     }
 
-    /// Takes what the shards did last and tells them what to do next; false at the round's end. It ends in any case when
-    /// it is `halted`.
+    /// Takes what the shards did last and tells them what to do next. Returns false at the rollout's end, which comes in any
+    /// case when it is `halted`.
     pub(in crate::pool) fn conduct(&mut self, shards: &[Mutex<Shard>], halted: bool) -> bool {
         match self.advance(shards) {
             Ok(goes_on) => goes_on && !halted,
@@ -179,7 +179,7 @@ impl RolloutTask {
 }
 
 impl Rollout {
-    /// Makes room for what the round will bring, and notes what the policy remembers where a task `begins`.
+    /// Allocates the arrays, and records the memory of the policy where a task `begins`.
     fn begin(&mut self, play: &PolicyRunner, begins: bool, turn: &RolloutRequest) {
         if turn.only_ended {
             return;
@@ -205,7 +205,7 @@ impl Rollout {
         }
     }
 
-    /// Takes over what a step brought.
+    /// Appends the outputs of a step.
     fn take(&mut self, play: &mut PolicyRunner, only_ended: bool) {
         if !only_ended {
             self.push(play.player().played());
@@ -230,7 +230,7 @@ impl Rollout {
         put(&mut self.truncation_values, step.truncation_values);
     }
 
-    /// In bytes, roughly, with another step.
+    /// The estimated length in bytes, with another step.
     fn size(&self) -> usize {
         let arrays = [&self.observations, &self.actions, &self.log_probs, &self.values, &self.rewards];
         let others = [&self.truncation_values, &self.starts, &self.terminated, &self.truncated];
@@ -239,7 +239,7 @@ impl Rollout {
     }
 }
 
-/// What an episode's end takes on the wire, roughly.
+/// The estimated length of an episode's end on the wire.
 fn end_bytes(end: &EpisodeEnd) -> usize {
     let receipt = end.receipt.as_ref();
     EPISODE_END_BYTES + receipt.map_or(0, |r| 8 * (r.requested.len() + r.applied.len()) + r.model_hash.len())

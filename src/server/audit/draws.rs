@@ -1,4 +1,4 @@
-//! What a session draws from: whether its token's role allows it, and that it stands in the ledger before it happens.
+//! The audit of what a session draws from: its token's role must allow it, and the ledger has it before it happens.
 
 use super::{Error, ledger::Ledger};
 use crate::{
@@ -16,20 +16,20 @@ use std::sync::{
     atomic::{AtomicU32, Ordering},
 };
 
-/// Of one session, or one world.
+/// Checks and records what one session, or one world, draws from.
 #[derive(Clone)]
 pub struct DrawAuditor {
     bearer: Option<Bearer>,
     ledger: Option<Ledger>,
     session: u64,
-    /// What was refused so far.
+    /// The number of refusals so far.
     refused: Arc<AtomicU32>,
 }
 
 /// The ledger has at most this many refusals of a session: a client may ask for ever.
 const MAX_LOGGED_REFUSALS: u32 = 100;
 
-/// What was written down, until it is known whether it happens.
+/// Draws that are in the ledger and of which it is not known yet whether they happen.
 #[derive(Default)]
 pub struct PendingDraws(Vec<DrawStart>);
 
@@ -51,7 +51,7 @@ struct NextDraw<'a> {
 }
 
 impl DrawAuditor {
-    /// Of a new session with this token.
+    /// The audit of a new session with this token.
     pub fn new(bearer: Option<Bearer>, ledger: Option<Ledger>) -> Self {
         let session = ledger.as_ref().map_or(0, Ledger::session);
         Self { bearer, ledger, session, refused: Arc::default() }
@@ -170,7 +170,7 @@ impl DrawAuditor {
         Err(Error::NotAllowed { role: role.name().into(), environment: spec.name, region: region.to_string(), reason })
     }
 
-    /// Whether nothing is asked or written.
+    /// Whether nothing needs to be checked or recorded.
     fn is_free(&self) -> bool {
         self.ledger.is_none() && self.bearer.as_ref().is_none_or(|bearer| bearer.role().is_none())
     }
@@ -221,7 +221,7 @@ impl DrawAuditor {
     }
 }
 
-/// What begins, neighbours that draw alike as one, and the regions that they draw from.
+/// Groups the environments that begin, neighbours with equal draws as one, and returns the regions that they draw from.
 fn gathered<'a>(
     spec: &EnvironmentSpec,
     begins: impl Iterator<Item = (NextDraw<'a>, usize)>,
@@ -247,7 +247,7 @@ fn gathered<'a>(
     (regions, gathered)
 }
 
-/// What ends, likewise.
+/// Groups the environments that end likewise.
 fn ended(draws: impl IntoIterator<Item = Draw>) -> Vec<DrawEnd> {
     let mut ended: Vec<DrawEnd> = Vec::new();
     for Draw { seed, environment_index: index, episode_index } in draws {

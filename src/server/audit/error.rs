@@ -25,12 +25,12 @@ pub enum Error {
         role: String,
         /// The environment.
         environment: &'static str,
-        /// What was to be drawn from.
+        /// The region that was to be drawn from.
         region: String,
         /// Why not.
         reason: String,
     },
-    /// What would be drawn cannot be written down.
+    /// The ledger cannot be written.
     #[error("this server writes down what is drawn, and cannot: {reason}; try again later, or tell who runs it")]
     NoLedger {
         /// Why not.

@@ -17,7 +17,7 @@ use std::{
 };
 use tokio::sync::oneshot;
 
-/// A line to be written, and who waits until it is.
+/// A line to be written, and the sender that tells its waiter when it is on the disk.
 type WriteRequest = (LedgerEvent, Option<oneshot::Sender<Result<(), String>>>);
 
 /// A server's ledger. A thread of its own writes it.
@@ -104,7 +104,7 @@ impl Ledger {
     }
 }
 
-/// The file, as far as it is whole.
+/// The state of the ledger's thread: the file, as far as it is whole.
 struct LedgerWriter {
     file: File,
     path: PathBuf,
@@ -112,7 +112,7 @@ struct LedgerWriter {
     chain: Chain,
     /// Whether there may be more in the file.
     is_torn: bool,
-    /// What nobody waits for and could not be written yet.
+    /// Lines without a waiter that could not be written yet.
     kept: Vec<WriteRequest>,
 }
 

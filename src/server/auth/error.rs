@@ -18,7 +18,7 @@ pub enum Error {
     /// The session's token was taken out of the file of tokens.
     #[error("the token {name:?} was revoked, or has another role now; ask who runs this server")]
     RevokedToken {
-        /// What it is called.
+        /// The token's name.
         name: String,
     },
     /// A token has all that it may have.
@@ -26,11 +26,11 @@ pub enum Error {
         "the token {name:?} may have {limit} {what} here, and {wanted} more would be too many; ask for less, or close"
     )]
     QuotaExceeded {
-        /// What it is called.
+        /// The token's name.
         name: String,
-        /// What was asked for.
+        /// The amount that was requested.
         wanted: usize,
-        /// The most there may be.
+        /// The quota.
         limit: usize,
         /// Sessions, environments or bytes in flight.
         what: &'static str,
@@ -41,11 +41,11 @@ pub enum Error {
          fewer environments at a time or in fewer sessions, or try again later"
     )]
     TooFast {
-        /// What it is called.
+        /// The token's name.
         name: String,
         /// The most steps a second.
         rate: u32,
-        /// How long until it may step again.
+        /// The time until its environments may step again.
         seconds: u64,
     },
 }

@@ -10,10 +10,10 @@ use std::{
 /// The interval at which the files are read.
 const POLL_INTERVAL: Duration = Duration::from_millis(500);
 
-/// Looks at files, on a thread of its own, until it is dropped.
+/// Watches files, on a thread of its own, until it is dropped.
 pub struct FileWatcher(#[expect(dead_code, reason = "its end is the thread's")] Sender<()>);
 
-/// What is in the files, in their order, or why they cannot be read.
+/// The contents of the files, in their order, or why they cannot be read.
 pub type Contents = Result<Vec<Vec<u8>>, String>;
 
 /// Reads files.

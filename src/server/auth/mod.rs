@@ -1,4 +1,4 @@
-//! Who may call: tokens, of which a file has names, digests, quotas and roles, and the gate that asks for them.
+//! Authentication: tokens with their names, digests, quotas and roles, from a file, and the layer that asks for them.
 
 mod error;
 pub mod file_watcher;
@@ -31,20 +31,20 @@ use token_file::{Entry, ParsedToken, listed};
 use tokio::sync::Notify;
 use tonic::{body::Body, codegen::http};
 
-/// What a client shows, and what whoever shows it may have.
+/// A token that clients show, with its role and quotas.
 pub struct Token {
     name: String,
     /// SHA-256 of the token.
     digest: [u8; 32],
     role: Option<Arc<Role>>,
     revoked: AtomicBool,
-    /// Wakes who waits for that.
+    /// Wakes the tasks that wait for the revocation.
     told: Notify,
-    /// Of all tokens that have had its name.
+    /// The quotas of all tokens that have had this name.
     quotas: Arc<Quotas>,
 }
 
-/// What a token may have and do, and what it did.
+/// A token's quotas, and counters of what was done with it.
 #[derive(Default)]
 struct Quotas {
     sessions: Quota,
@@ -55,9 +55,9 @@ struct Quotas {
     refusals: AtomicU64,
 }
 
-/// What a token has, and what was done with it.
+/// A snapshot of a token's usage.
 pub struct TokenUsage {
-    /// What it is called.
+    /// The token's name.
     pub name: String,
     /// Sessions now.
     pub sessions: usize,
@@ -67,9 +67,9 @@ pub struct TokenUsage {
     pub bytes: usize,
     /// Steps of an environment so far.
     pub steps: u64,
-    /// How long its requests waited for its rate so far.
+    /// The time that its requests waited for its rate so far.
     pub waited: Duration,
-    /// What was refused so far.
+    /// The number of refusals so far.
     pub refusals: u64,
 }
 
@@ -77,18 +77,18 @@ pub struct TokenUsage {
 pub type Bearer = Arc<Token>;
 
 impl Token {
-    /// What it is called.
+    /// The token's name.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Counts steps of its environments, which are all known only when they were done.
+    /// Charges steps after they ran, because their number is unknown before.
     pub fn stepped(&self, steps: u64) {
         self.quotas.steps.fetch_add(steps, Ordering::Relaxed);
         self.quotas.pace.add(steps);
     }
 
-    /// Counts something that was refused to it.
+    /// Counts a refusal.
     pub fn refused(&self) {
         self.quotas.refusals.fetch_add(1, Ordering::Relaxed);
     }
@@ -124,7 +124,7 @@ impl Token {
         })
     }
 
-    /// What it may draw from; none: from anything.
+    /// The role, which says what may be drawn from; `None` allows anything.
     pub fn role(&self) -> Option<&Role> {
         self.role.as_deref()
     }
@@ -150,7 +150,7 @@ impl Token {
         self.told.notify_waiters();
     }
 
-    /// A session of it.
+    /// Takes a session out of the quota.
     ///
     /// # Errors
     /// [`Error::QuotaExceeded`].
@@ -158,7 +158,7 @@ impl Token {
         self.take(1, QuotaKind::Sessions)
     }
 
-    /// So many environments of it.
+    /// Takes environments out of the quota.
     ///
     /// # Errors
     /// [`Error::QuotaExceeded`].
@@ -166,7 +166,7 @@ impl Token {
         self.take(count, QuotaKind::Environments)
     }
 
-    /// No bytes of it in flight, to be grown.
+    /// An empty part of the quota of bytes in flight, to be grown.
     pub fn no_bytes(self: &Arc<Self>) -> QuotaGuard {
         QuotaGuard::nothing(Arc::clone(self), QuotaKind::Bytes)
     }
@@ -187,17 +187,17 @@ pub struct Tokens {
 }
 
 impl Tokens {
-    /// None yet, on a server of these environments.
+    /// An empty set of tokens, on a server of these environments.
     pub fn new(catalogue: Catalogue) -> Self {
         Self { good: Arc::default(), catalogue: Arc::new(catalogue) }
     }
 
-    /// How many there are.
+    /// The number of tokens.
     pub fn count(&self) -> usize {
         self.good.read().unwrap_or_else(PoisonError::into_inner).len()
     }
 
-    /// What each has and has done.
+    /// The usage of each token.
     pub fn used(&self) -> Vec<TokenUsage> {
         self.good.read().unwrap_or_else(PoisonError::into_inner).iter().map(|token| token.used()).collect()
     }
@@ -240,7 +240,7 @@ impl Tokens {
         tokens.iter().fold(None, |found, token| if fits(token) { Some(token) } else { found }).cloned()
     }
 
-    /// Whose call it is; none for one by a Unix socket, which needs no token.
+    /// Returns the token of a call, or `None` for a call by a Unix socket, which needs no token.
     ///
     /// # Errors
     /// [`Error::NoToken`] or [`Error::WrongToken`].

@@ -1,9 +1,9 @@
-//! What a token may have at a time.
+//! Limits on what a token may hold at a time.
 
 use super::{Bearer, Error, Token};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// So many of something, of which a token may have no more than a limit.
+/// A count with a limit.
 #[derive(Default)]
 pub(super) struct Quota {
     taken: AtomicUsize,
@@ -27,7 +27,7 @@ impl Quota {
     }
 }
 
-/// What there are quotas of.
+/// The resources that have quotas.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum QuotaKind {
     Sessions,

@@ -1,5 +1,6 @@
-//! How fast a token's environments may step. Who is ahead of that waits with the next request, while nothing is held but
-//! the request itself; what was not used can be made up for within a second.
+//! The rate limit for the steps of a token's environments. Steps are charged after they ran. A client that is ahead of the
+//! rate waits with its next request, while nothing is held but the request itself. Steps that were not used can be made up
+//! for within a second.
 
 use std::{
     sync::{Mutex, MutexGuard, PoisonError},
@@ -16,7 +17,7 @@ const MIN_WAIT: Duration = Duration::from_micros(1);
 /// The interval at which a waiting request checks whether the rate has changed.
 const RECHECK_INTERVAL: Duration = Duration::from_millis(500);
 
-/// A token's rate, and where it stands.
+/// A token's rate, and the steps that it has allowed and seen.
 #[derive(Default)]
 pub(super) struct RateLimiter(Mutex<State>);
 
@@ -26,13 +27,13 @@ struct State {
     rate: Option<u32>,
     /// Steps so far.
     done: f64,
-    /// Those that the rate has allowed by `at`, at most [`BURST_SECONDS`] more than were done.
+    /// The steps that the rate has allowed by `at`, at most [`BURST_SECONDS`] more than were done.
     allowed: f64,
     at: Option<Instant>,
     waited: Duration,
 }
 
-/// What was done is so far ahead of the rate that nobody should wait for it.
+/// The error of a client that is so far ahead of the rate that it should not wait.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct TooFast {
     pub(super) rate: u32,
@@ -50,7 +51,7 @@ impl RateLimiter {
         self.lock().rate
     }
 
-    /// How long requests waited so far.
+    /// The time that requests waited so far.
     pub(super) fn waited(&self) -> Duration {
         self.lock().waited
     }
@@ -97,7 +98,8 @@ impl State {
         self.at = Some(now);
     }
 
-    /// How long the holder of this ticket, which is none at first, is to wait before this is asked again; none: no more.
+    /// Returns how long to sleep before calling again, or `None` when the caller may proceed. Pass an empty `ticket` on the
+    /// first call.
     fn wait(&mut self, ticket: &mut Option<f64>, now: Instant) -> Result<Option<Duration>, TooFast> {
         self.settle(now);
         let Some(rate) = self.rate else { return Ok(None) };

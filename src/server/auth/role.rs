@@ -1,10 +1,10 @@
-//! What a token may draw parameters from.
+//! Roles: the parameter values that a token may draw from.
 
 use crate::env::{EnvironmentSpec, Version};
 use perturb_protocol::region::Region;
 use std::fmt;
 
-/// What the sessions of some tokens may draw from.
+/// The parameter values that the sessions of some tokens may draw from.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Role {
     pub(super) name: String,
@@ -19,7 +19,7 @@ pub struct Role {
 pub(super) enum Set {
     /// A version of every environment.
     Version(Version),
-    /// One of the file's own.
+    /// A set of the file's own.
     Own { name: String, environment: &'static str, region: Region },
 }
 
@@ -43,7 +43,7 @@ impl fmt::Display for Set {
 }
 
 impl Role {
-    /// What it is called.
+    /// The role's name.
     pub fn name(&self) -> &str {
         &self.name
     }

@@ -1,4 +1,4 @@
-//! HTTP, for whoever scrapes: one page, small requests, few connections at a time.
+//! The HTTP endpoint for scrapers: one page, small requests, few connections at a time.
 
 use super::{Sources, page};
 use crate::server::net::listener::Listener;
@@ -53,7 +53,7 @@ async fn pause(error: &io::Error) {
     sleep(ACCEPT_RETRY_DELAY).await;
 }
 
-/// One request, one answer.
+/// Answers the one request of a connection.
 async fn converse(stream: impl AsyncRead + AsyncWrite + Unpin, sources: Arc<Sources>) {
     let answer = service_fn(|request| {
         let response = answer(&request, &sources);

@@ -1,8 +1,8 @@
-//! What the server says of itself: numbers, in the text format of OpenMetrics, which Prometheus scrapes.
+//! The server's metrics, in the text format of OpenMetrics, which Prometheus scrapes.
 //!
-//! - [`endpoint`]: HTTP, for whoever scrapes.
+//! - [`endpoint`]: the HTTP endpoint for scrapers.
 //! - [`page`]: the metrics, each with its name, labels and sentence.
-//! - [`process`]: what the system says of the process.
+//! - [`process`]: resources of the process, as the system tells them.
 
 pub mod endpoint;
 pub mod page;
@@ -25,15 +25,15 @@ const LAG_CHECK_INTERVAL: Duration = Duration::from_millis(100);
 /// A protocol, and its requests by kind.
 pub type RequestCounts = (&'static str, Arc<RequestCounters>);
 
-/// Where the numbers are, which others count.
+/// The counters of the other layers, which the page reads.
 pub struct Sources {
     /// Environments, and what happens in them.
     pub pool: Arc<Pool>,
-    /// Those of sessions.
+    /// The limiter of sessions.
     pub sessions: PeerLimiter,
-    /// Which of them have leases.
+    /// The counters of leases.
     pub leases: LeaseCounters,
-    /// Those of connections.
+    /// The limiter of connections.
     pub connections: PeerLimiter,
     /// Bytes in flight.
     pub budget: Budget,
@@ -41,13 +41,13 @@ pub struct Sources {
     pub requests: [RequestCounts; 2],
     /// Why requests were refused.
     pub errors: ErrorCounters,
-    /// How sessions ended.
+    /// The counts of ended sessions.
     pub access: AccessLog,
-    /// Whose sessions there are.
+    /// The tokens, if the server asks for some.
     pub tokens: Option<Tokens>,
-    /// How long pictures were drawn.
+    /// The drawing times of pictures.
     pub pictures: Arc<Histogram>,
-    /// How late the transport's thread wakes.
+    /// The wake-up delays of the transport's thread.
     pub lag: Histogram,
 }
 

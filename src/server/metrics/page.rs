@@ -54,7 +54,7 @@ impl Collector for MetricsCollector {
 }
 
 impl MetricsCollector {
-    /// What there is, and how much there may be.
+    /// Writes what is in use, and the limits.
     fn places(&self, page: &mut Page<'_>) -> EncodeResult {
         let Sources { pool, sessions, leases, connections, budget, .. } = &*self.0;
         for (name, help, value) in [
@@ -128,7 +128,7 @@ impl MetricsCollector {
     }
 }
 
-/// What the system says of the process, if it does.
+/// Writes the resources of the process, if the system tells them.
 fn resources(page: &mut Page<'_>) -> EncodeResult {
     let Ok(resources) = process::resources() else { return Ok(()) };
     page.counters("process_cpu_seconds", "Processor time", [(NO_LABELS, resources.cpu_seconds)])?;
@@ -160,7 +160,7 @@ fn written(code: Code) -> String {
     text
 }
 
-/// What is written on.
+/// The page that is being written.
 struct Page<'a>(DescriptorEncoder<'a>);
 
 impl Page<'_> {

@@ -1,4 +1,4 @@
-//! What the system says of the process.
+//! Resources of the process, as the system tells them.
 
 use rustix::{
     param::{clock_ticks_per_second, page_size},
@@ -12,9 +12,9 @@ pub struct Resources {
     pub cpu_seconds: f64,
     /// Memory in use, bytes.
     pub resident_bytes: u64,
-    /// When it started, s since 1970.
+    /// The start of the process, s since 1970.
     pub start_seconds: f64,
-    /// Its threads.
+    /// The number of threads.
     pub threads: i64,
     /// File descriptors in use.
     pub descriptors: usize,

@@ -22,12 +22,12 @@ pub const BROKEN: &str = "broken";
 /// The ending of a session whose lease is over. All other endings are the reasons of errors.
 pub const LEASE_OVER: &str = "lease_over";
 
-/// What a session came to.
+/// The environment of a session, and how far it came.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct SessionStats {
-    /// What it was opened with.
+    /// The environment that the session was opened with.
     pub environment: Option<&'static str>,
-    /// How many environments it was opened with.
+    /// The number of environments that it was opened with.
     pub envs: usize,
     /// Steps of an environment.
     pub steps: u64,
@@ -35,19 +35,19 @@ pub struct SessionStats {
 
 /// A session that ended.
 pub struct SessionRecord<'a> {
-    /// Whom it was from; none where nobody knows.
+    /// The peer of the session, if it is known.
     pub peer: Option<Peer>,
-    /// What its token is called.
+    /// The name of the session's token.
     pub token: Option<&'a str>,
-    /// By which protocol it came.
+    /// The protocol of the session.
     pub protocol: &'static str,
-    /// What it came to.
+    /// The environment, and the steps that were taken.
     pub about: SessionStats,
-    /// How long it was.
+    /// The duration of the session.
     pub time: Duration,
-    /// How often another stream took it up; none: never.
+    /// The number of streams that resumed it; `None` if there were none.
     pub resumed: Option<u32>,
-    /// How it ended: a word of few.
+    /// The ending: one of a few words.
     pub ending: &'static str,
 }
 
@@ -59,7 +59,7 @@ pub struct AccessLog(Arc<Mutex<State>>);
 struct State {
     /// By protocol and ending.
     endings: BTreeMap<(&'static str, &'static str), u64>,
-    /// The window's beginning, and the lines that it wanted.
+    /// The window's beginning, and the number of sessions that ended in it.
     window: Option<(Instant, u64)>,
 }
 
@@ -93,12 +93,12 @@ impl AccessLog {
         );
     }
 
-    /// How many sessions ended, by protocol and ending.
+    /// The counts of ended sessions, by protocol and ending.
     pub fn endings(&self) -> Vec<((&'static str, &'static str), u64)> {
         self.lock().endings.iter().map(|(key, count)| (*key, *count)).collect()
     }
 
-    /// Counts one; whether there is to be a line.
+    /// Counts a session. Returns whether it gets a line.
     fn has_room(&self, protocol: &'static str, ending: &'static str) -> bool {
         let mut state = self.lock();
         *state.endings.entry((protocol, ending)).or_default() += 1;

@@ -1,4 +1,4 @@
-//! Whether there is room for another session, as health tells it to load balancers.
+//! The health service tells load balancers whether there is room for another session.
 
 use super::peer_limiter::PeerLimiter;
 use crate::pool::Pool;

@@ -34,12 +34,12 @@ pub enum Listener {
     Unix(UnixListener, SocketFile),
 }
 
-/// What connections are subject to.
+/// The limits for connections.
 #[derive(Clone)]
 pub struct ConnectionLimits {
-    /// Places for them.
+    /// The limiter of connections.
     pub places: PeerLimiter,
-    /// How long a client may take to begin.
+    /// The time in which a client must begin.
     pub handshake: Duration,
 }
 
@@ -54,7 +54,7 @@ impl ConnectionLimits {
         self.places.take(Some(peer)).map_err(full).ok()
     }
 
-    /// The connection, if its client shakes hands in time.
+    /// The connection, if its client finishes the handshake in time.
     async fn shake(
         self,
         stream: TcpStream,
@@ -96,7 +96,7 @@ pub fn tcp_connections(
     })
 }
 
-/// Connections whose clients have shaken hands, in whatever order they are done with it: none waits for another.
+/// Connections whose clients have finished the handshake, in the order in which they finish: none waits for another.
 pub fn tls_connections(
     listener: TcpListener,
     admission: ConnectionLimits,
@@ -178,7 +178,7 @@ pub struct SocketFile {
     identity: Option<(u64, u64)>,
 }
 
-/// Which file is at a path.
+/// The device and the number of the file at a path.
 fn identity(path: &Path) -> Option<(u64, u64)> {
     std::fs::symlink_metadata(path).ok().map(|file| (file.dev(), file.ino()))
 }
@@ -202,7 +202,7 @@ impl Listener {
         Self::bind_as(address, "--listen", mode).await
     }
 
-    /// The same of an address that another flag gives.
+    /// Binds an address that another flag gives.
     ///
     /// # Errors
     /// As [`Listener::bind`].

@@ -25,7 +25,7 @@ const PREFACE_BYTES: usize = 24;
 /// A connection, as its calls see it.
 #[derive(Clone)]
 pub struct Connection {
-    /// Whom it is from.
+    /// The peer of the connection.
     pub peer: Peer,
     end: Arc<End>,
 }
@@ -44,7 +44,7 @@ impl Connection {
     }
 }
 
-/// A connection's bytes. It fails if its client's first do not come in time, and once it is ended.
+/// The I/O of a connection. It fails if the client's preface does not come in time, and once the connection is ended.
 pub struct ManagedIo<S> {
     stream: S,
     connection: Connection,

@@ -1,4 +1,4 @@
-//! Who is at the other end of a connection, and places by peer.
+//! Peers, and limits on what each may have at a time.
 
 use std::{
     collections::BTreeMap,
@@ -8,7 +8,7 @@ use std::{
 };
 use tokio::sync::Notify;
 
-/// Whom a connection is from.
+/// The other end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Peer {
     /// A machine, or a network of them that one may have for itself.
@@ -18,7 +18,7 @@ pub enum Peer {
 }
 
 impl Peer {
-    /// Whoever has this address: of IPv6 its network of 64 bits, which is the least that a machine is given.
+    /// The peer with this address. An IPv6 address stands for its network of 64 bits, the least that a machine is given.
     pub fn at(address: IpAddr) -> Self {
         Self::Machine(match address.to_canonical() {
             IpAddr::V6(address) => Ipv6Addr::from_bits(address.to_bits() & !u128::from(u64::MAX)).into(),
@@ -37,7 +37,7 @@ impl fmt::Display for Peer {
     }
 }
 
-/// Places, of which there are so many in all and for each peer.
+/// A concurrency limiter, with a limit in all and one for each peer.
 #[derive(Clone)]
 pub struct PeerLimiter(Arc<State>);
 
@@ -49,28 +49,28 @@ struct State {
     changed: Notify,
 }
 
-/// Why there is no place.
+/// Why there is no permit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LimitReached {
-    /// All are taken.
+    /// All permits are in use.
     All(usize),
     /// The peer has as many as it may.
     Peer(usize),
 }
 
-/// A place, until it is dropped.
+/// A permit, until it is dropped.
 pub struct PeerPermit {
     places: PeerLimiter,
     peer: Option<Peer>,
 }
 
 impl PeerLimiter {
-    /// So many in all, and for each peer.
+    /// A limiter with a limit in all, and one for each peer.
     pub fn new(all: usize, each: usize) -> Self {
         Self(Arc::new(State { all, each, taken: Mutex::default(), changed: Notify::new() }))
     }
 
-    /// A place for a peer. One that is not known has no quota of its own.
+    /// Takes a permit for a peer. An unknown peer has no limit of its own.
     ///
     /// # Errors
     /// [`LimitReached`].
@@ -92,17 +92,17 @@ impl PeerLimiter {
         Ok(PeerPermit { places: self.clone(), peer })
     }
 
-    /// How many are taken.
+    /// The number of permits in use.
     pub fn taken(&self) -> usize {
         self.lock().0
     }
 
-    /// How many there are.
+    /// The limit in all.
     pub fn limit(&self) -> usize {
         self.0.all
     }
 
-    /// Waits until some were taken or given back since this was last waited for, by one caller.
+    /// Waits until the number in use has changed since the last call, for one caller.
     pub async fn changed(&self) {
         self.0.changed.notified().await;
     }

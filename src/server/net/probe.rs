@@ -16,7 +16,7 @@ const PROBE_TIMEOUT: Duration = Duration::from_secs(3);
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// It cannot be reached by the address at which it listens.
+    /// The server cannot be reached by the address at which it listens.
     #[error(transparent)]
     Address(#[from] AddressError),
     /// The working directory, which a socket's path begins with, is gone.
@@ -25,9 +25,9 @@ pub enum Error {
     /// Nobody answers, or not as a server that takes sessions does.
     #[error("no server answers at {address}: {reason}")]
     NoAnswer {
-        /// Where.
+        /// The address.
         address: Address,
-        /// What is wrong.
+        /// The cause.
         reason: String,
     },
 }
@@ -57,7 +57,7 @@ pub async fn probe(listen: &ListenAddress, certificate: Option<&Path>) -> Result
     Err(Error::NoAnswer { address, reason })
 }
 
-/// Where a server can be reached that listens at `listen`.
+/// The address by which a server can be reached that listens at `listen`.
 fn reachable(listen: &ListenAddress) -> Result<Address, Error> {
     match *listen {
         ListenAddress::Unix(ref path) => Ok(Address::Unix(path::absolute(path)?)),

@@ -62,7 +62,7 @@ fn certificates(path: &std::path::Path, pem: &[u8]) -> Result<Vec<CertificateDer
     Ok(all)
 }
 
-/// How connections are encrypted from now on.
+/// The TLS settings of the connections to come.
 #[derive(Clone)]
 pub struct Tls {
     files: Arc<TlsFiles>,

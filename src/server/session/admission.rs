@@ -1,4 +1,4 @@
-//! Who may have a session: places of the server, of a peer and of a token, and the shutdown.
+//! Admission of sessions: limits of the server, of a peer and of a token, and the shutdown.
 
 use super::{
     Error,
@@ -16,7 +16,7 @@ use crate::server::{
 };
 use std::time::Duration;
 
-/// What all sessions of the server are subject to: their number, how long they may be silent, and the shutdown.
+/// The sessions of a server: their limits, and the shutdown.
 #[derive(Clone)]
 pub struct Sessions {
     places: PeerLimiter,
@@ -28,19 +28,19 @@ pub struct Sessions {
     leases: LeaseCounters,
 }
 
-/// What a session may do.
+/// The limits of one session.
 #[derive(Debug, Clone, Copy)]
 pub struct SessionLimits {
     /// The most bytes of a request.
     pub bytes: usize,
-    /// How long it may be silent before it is open.
+    /// The time that the session may be silent before it is open.
     pub handshake: Duration,
-    /// How long it may be silent when it is open; none: for ever.
+    /// The time that an open session may be silent; `None` for no limit.
     pub idle: Option<Duration>,
 }
 
 impl Sessions {
-    /// Sessions for which there are these places. What is refused and how they end is counted.
+    /// The sessions that this limiter admits. Errors and endings are counted.
     pub fn new(
         places: PeerLimiter,
         limits: SessionLimits,
@@ -52,13 +52,12 @@ impl Sessions {
         Self { places, limits, decoder: Decoder::default(), drain, counters, access, leases }
     }
 
-    /// How far the shutdown is.
+    /// The phase of the shutdown.
     pub fn phase(&self) -> Phase {
         self.drain.phase()
     }
 
-    /// Lets a stream in, or says why not. One that finds the server full may still take up a session if its protocol has
-    /// leases.
+    /// Admits a stream. One that finds the server full may still resume a session if its protocol has leases.
     pub(super) fn admit(&self, requests: &MessageReader, has_leases: bool) -> Result<Admission, Error> {
         match self.take_place(requests) {
             Err(refusal) if has_leases => self.admit_to_resume(refusal),
@@ -66,12 +65,12 @@ impl Sessions {
         }
     }
 
-    /// What a new session is subject to. It counts as running as long as it holds this.
+    /// A view for a new session, which counts as running as long as it holds this.
     pub(super) fn enter(&self) -> Self {
         Self { drain: self.drain.enter(), ..self.clone() }
     }
 
-    /// Lets a stream in for which there is no place, if it might be one that takes up a session, which has a place.
+    /// Admits a stream above the session limits if it may be resuming a leased session, which already holds a permit.
     fn admit_to_resume(&self, refusal: Error) -> Result<Admission, Error> {
         let is_full = matches!(
             refusal,
@@ -104,10 +103,10 @@ impl Sessions {
     }
 }
 
-/// What a stream was let in on.
+/// The way in which a stream was admitted.
 pub(super) enum Admission {
-    /// A place of its own, with that of its token.
+    /// Admitted with a permit of its own, and one of its token.
     Own(#[expect(dead_code, reason = "held")] PeerPermit, #[expect(dead_code, reason = "held")] Option<QuotaGuard>),
-    /// That it takes up a session; otherwise this is its refusal.
+    /// Admitted although the server is full. If its first request does not resume a session, it ends with this error.
     Spare(#[expect(dead_code, reason = "held")] CountGuard, Error),
 }

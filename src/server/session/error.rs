@@ -1,4 +1,4 @@
-//! Why a stream is not let in, or ends.
+//! Why a stream is not admitted, or ends.
 
 use super::lease;
 use crate::server::{
@@ -30,7 +30,7 @@ pub enum Error {
         /// The most there may be.
         limit: usize,
     },
-    /// One peer has all the sessions that it may have.
+    /// A peer has all the sessions that it may have.
     #[error("all of the {limit} sessions that one machine or user may have here are in use; close one")]
     PeerFull {
         /// The most there may be.

@@ -1,4 +1,4 @@
-//! One request and its answer: what stands between a stream and the handler of its session.
+//! The exchange of requests and replies between a stream and the handler of its session.
 
 use super::{
     Error,
@@ -47,9 +47,9 @@ pub(super) struct Exchange<H: SessionHandler> {
     /// The session's steps that its token has been charged for.
     charged: u64,
     awake: AdaptiveSpin,
-    /// How the session ends, if nothing else happens.
+    /// The ending of the session, if nothing else happens.
     pub(super) ending: &'static str,
-    /// How often another stream resumed the session.
+    /// The number of streams that resumed the session.
     pub(super) resumed: u32,
     seat: Admission,
 }

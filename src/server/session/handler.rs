@@ -1,4 +1,4 @@
-//! What answers the requests of a session, whatever its protocol and its transport: a request in, a reply out.
+//! Handlers answer the requests of a session, whatever its protocol and its transport: a request in, a reply out.
 
 use super::{
     Error,
@@ -12,7 +12,7 @@ use crate::server::{
 };
 use std::future::Future;
 
-/// What a response does to the stream that it is sent in.
+/// The effect of a response on the stream that it is sent in.
 pub enum StreamHandover<R> {
     /// The session has a lease from now on, and outlives the stream.
     Lease(LeaseGuard<R>),
@@ -26,7 +26,7 @@ pub struct Reply<R> {
     pub response: R,
     /// The memory that the response takes until it is sent, if it is not part of what the session holds anyway.
     pub memory: Option<MemoryReservation>,
-    /// What the response does to its stream.
+    /// The effect of the response on its stream, if it has one.
     pub handover: Option<StreamHandover<R>>,
 }
 
@@ -57,13 +57,13 @@ pub trait SessionHandler: Send + 'static {
     /// The kind of a request, one of [`KINDS`](Self::KINDS).
     fn kind(request: &Self::Request) -> &'static str;
 
-    /// How large the next request may be.
+    /// The size limits of the next request.
     fn allowance(&self) -> RequestLimits;
 
     /// Whether the session holds something that a shutdown should wait for.
     fn is_open(&self) -> bool;
 
-    /// What the session has done so far.
+    /// The environment of the session, and its steps so far.
     fn about(&self) -> SessionStats;
 
     /// Answers a request.

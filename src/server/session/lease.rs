@@ -28,7 +28,7 @@ pub const MAX_STORED_REPLIES: u32 = 64;
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// Nobody has this lease.
+    /// No session has this lease.
     #[error("no session here has the lease that came: it is over, or its session has ended; open another session")]
     Unknown,
     /// The session belongs to another token.
@@ -39,7 +39,7 @@ pub enum Error {
         "last_reply is {got}, but {last} is the last that there is; opened is 0, and each response after it one more"
     )]
     NoReply {
-        /// What came.
+        /// The number that came.
         got: u64,
         /// The last one.
         last: u64,
@@ -50,12 +50,12 @@ pub enum Error {
          wait, or there was no memory for them; open another session"
     )]
     Forgotten {
-        /// What came.
+        /// The number that came.
         got: u64,
         /// The least that can be gone on from.
         first: u64,
     },
-    /// Its session goes on elsewhere.
+    /// Another stream has resumed the session.
     #[error("another stream has taken up this session by its lease; go on there")]
     TakenUp,
 }
@@ -98,14 +98,14 @@ struct State<R> {
     leases: Mutex<Vec<Lease<R>>>,
 }
 
-/// One that holds.
+/// A lease that is held.
 struct Lease<R> {
     name: Id,
     bearer: Option<Bearer>,
     asks: mpsc::Sender<ResumeRequest<R>>,
 }
 
-/// How many leases there are.
+/// Counters of leases.
 #[derive(Clone, Default)]
 pub struct LeaseCounters(Arc<LeaseCounts>);
 
@@ -123,24 +123,23 @@ impl LeaseCounters {
         self.0.detached.load(Ordering::Relaxed)
     }
 
-    /// How often a session was taken up so far.
+    /// The number of times that a session was resumed so far.
     pub fn resumed(&self) -> u64 {
         self.0.resumed.load(Ordering::Relaxed)
     }
 
-    /// Adds one to those.
+    /// Counts a session that was resumed.
     pub fn add_resumed(&self) {
         self.0.resumed.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// A session that has no stream, until it is dropped.
+    /// Counts a session that has no stream, until the guard is dropped.
     pub fn detach(&self) -> CountGuard {
         self.0.detached.fetch_add(1, Ordering::Relaxed);
         CountGuard { numbers: self.clone(), of: |counts| &counts.detached }
     }
 
-    /// Room for a stream that may do nothing but take up a session, where there is none for another session: there is as
-    /// much as there are leases.
+    /// Admits one stream over the limit for resuming only. There are at most as many as leases.
     pub fn spare(&self) -> Option<CountGuard> {
         let held = self.0.held.load(Ordering::Relaxed);
         let taken = |spares: usize| (spares < held).then_some(spares + 1);
@@ -149,7 +148,7 @@ impl LeaseCounters {
     }
 }
 
-/// One of something that is counted, until it is dropped.
+/// Counts one until it is dropped.
 pub struct CountGuard {
     numbers: LeaseCounters,
     of: fn(&LeaseCounts) -> &AtomicUsize,
@@ -161,48 +160,48 @@ impl Drop for CountGuard {
     }
 }
 
-/// A stream asks for a session.
+/// A stream's request to resume a session.
 pub struct ResumeRequest<R> {
     /// The number of the last reply that its client received.
     pub last_reply: u64,
-    /// Whoever runs the session answers here.
+    /// The sender for the answer of the session.
     pub answer: oneshot::Sender<Result<ResumeAccepted<R>, Error>>,
 }
 
-/// A session that is about to go on in the stream which asked for it.
+/// The positive answer to a stream that resumes a session.
 pub struct ResumeAccepted<R> {
     /// The number of the last reply that there is.
     pub last_reply: u64,
-    /// Where the stream is to go.
+    /// The sender that takes the stream to the session.
     pub arrival: oneshot::Sender<ResumingStream<R>>,
 }
 
-/// A stream that came to take up a session.
+/// A stream that resumes a session.
 pub struct ResumingStream<R> {
-    /// Its requests.
+    /// The requests of the stream.
     pub requests: MessageReader,
-    /// Where its replies go.
+    /// The sender of its responses.
     pub line: ResponseSender<R>,
 }
 
-/// A lease that was given, and holds until it is dropped.
+/// A session's lease, until it is dropped.
 pub struct LeaseGuard<R> {
     leases: Leases<R>,
-    /// What the session is named by.
+    /// The name of the session.
     pub name: Id,
-    /// The most requests of its client that wait.
+    /// The maximum number of unanswered requests of its client.
     pub most: usize,
-    /// Streams that ask for it.
+    /// The streams that ask to resume the session.
     pub asks: mpsc::Receiver<ResumeRequest<R>>,
 }
 
 impl<R> Leases<R> {
-    /// None yet; they hold so long without a stream.
+    /// No leases yet. Each holds for `time` without a stream.
     pub fn new(time: Duration, numbers: LeaseCounters) -> Self {
         Self(Arc::new(State { time, numbers, leases: Mutex::default() }))
     }
 
-    /// Gives a session a lease, unless they hold no time.
+    /// Grants a session a lease, unless leases are switched off.
     ///
     /// # Errors
     /// [`NoRandomness`].
@@ -218,7 +217,7 @@ impl<R> Leases<R> {
         Ok(Some(LeaseGuard { leases: self.clone(), name, most, asks }))
     }
 
-    /// Asks for the session of this name, for a client that received replies up to a number.
+    /// Asks to resume the session of this name, for a client that received replies up to a number.
     ///
     /// # Errors
     /// [`Error`].
@@ -249,12 +248,12 @@ impl<R> Leases<R> {
 }
 
 impl<R> LeaseGuard<R> {
-    /// How long it holds without a stream.
+    /// The time that the lease holds without a stream.
     pub fn time(&self) -> Duration {
         self.leases.0.time
     }
 
-    /// How many leases there are.
+    /// Counters of leases.
     pub fn numbers(&self) -> &LeaseCounters {
         &self.leases.0.numbers
     }

@@ -3,7 +3,7 @@
 use super::lease::Error;
 use std::collections::VecDeque;
 
-/// Replies 1, 2, 3, …, of which the last few are here.
+/// The replies 1, 2, 3, …, of which the last few are stored.
 pub struct ReplayBuffer<R> {
     last: u64,
     most: usize,
@@ -11,44 +11,44 @@ pub struct ReplayBuffer<R> {
 }
 
 impl<R> ReplayBuffer<R> {
-    /// None yet. Their client has at most so many requests without replies, at least 1.
+    /// An empty buffer. The client has at most `most` unanswered requests, at least 1.
     pub fn new(most: usize) -> Self {
         Self { last: 0, most, replies: VecDeque::new() }
     }
 
-    /// The number of the last one.
+    /// The number of the last reply.
     pub fn last(&self) -> u64 {
         self.last
     }
 
-    /// A request came: it waits for a reply, with others so many, and those before them were received.
+    /// Records a request. At most `most` are unanswered, so the client has received all earlier replies, which are dropped.
     pub fn asked(&mut self) {
         let received = (self.replies.len() + 1).saturating_sub(self.most);
         self.replies.drain(..received);
     }
 
-    /// The next reply.
+    /// Stores the next reply.
     pub fn made(&mut self, reply: R) {
         self.last += 1;
         self.replies.push_back(reply);
     }
 
-    /// Those that are here.
+    /// The stored replies.
     pub fn replies(&self) -> impl Iterator<Item = &R> {
         self.replies.iter()
     }
 
-    /// The same, to be changed.
+    /// The stored replies, to be changed.
     pub fn replies_mut(&mut self) -> impl Iterator<Item = &mut R> {
         self.replies.iter_mut()
     }
 
-    /// Lets go of all of them.
+    /// Drops all stored replies.
     pub fn clear(&mut self) {
         self.replies.clear();
     }
 
-    /// Whether all replies after this number are here.
+    /// Checks that all replies after this number are stored.
     ///
     /// # Errors
     /// [`Error::NoReply`], [`Error::Forgotten`].
@@ -63,7 +63,7 @@ impl<R> ReplayBuffer<R> {
         Ok(())
     }
 
-    /// The reply of this number, if it is here.
+    /// The reply of this number, if it is stored.
     pub fn get_mut(&mut self, number: u64) -> Option<&mut R> {
         let behind = usize::try_from(self.last.checked_sub(number)?).ok()?;
         let place = self.replies.len().checked_sub(behind + 1)?;

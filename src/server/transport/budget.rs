@@ -1,5 +1,5 @@
-//! The bytes in flight: one budget for requests, replies, pictures and policies, over all sessions, of which a token may
-//! have a part.
+//! The memory budget for bytes in flight: requests, replies, pictures and policies of all sessions. A token may have a
+//! quota of it.
 
 use super::Error;
 use crate::server::auth::{Bearer, QuotaGuard, Token};
@@ -9,7 +9,7 @@ use std::sync::{
     atomic::{AtomicUsize, Ordering},
 };
 
-/// The server's bytes, as who has a token may take of them.
+/// A handle to the memory budget. Reservations made through it also count against the token's quota.
 #[derive(Clone)]
 pub struct Budget {
     state: Arc<State>,
@@ -22,12 +22,12 @@ struct State {
 }
 
 impl Budget {
-    /// Of so many bytes, which are nobody's.
+    /// A budget of `limit` bytes, without a token.
     pub fn new(limit: usize) -> Self {
         Self { state: Arc::new(State { used: AtomicUsize::new(0), limit }), bearer: None }
     }
 
-    /// The same bytes, of which this token, if there is one, takes no more than it may.
+    /// A handle to the same budget, whose reservations also count against this token's quota.
     pub fn of(&self, bearer: Option<Bearer>) -> Self {
         Self { state: Arc::clone(&self.state), bearer }
     }
@@ -42,12 +42,12 @@ impl Budget {
         self.state.limit
     }
 
-    /// Nothing yet, to be grown.
+    /// An empty reservation, to be grown.
     pub fn nothing(&self) -> MemoryReservation {
         MemoryReservation { state: Arc::clone(&self.state), bytes: 0, held: self.bearer.as_ref().map(Token::no_bytes) }
     }
 
-    /// So many bytes, until the share is dropped.
+    /// Reserves bytes, until the reservation is dropped.
     ///
     /// # Errors
     /// [`Error::MemoryFull`], [`Error::Auth`].
@@ -58,21 +58,21 @@ impl Budget {
     }
 }
 
-/// A part of the budget.
+/// A part of the memory budget.
 pub struct MemoryReservation {
     state: Arc<State>,
     bytes: usize,
-    /// As many, of those that the token may have.
+    /// The token's quota for these bytes.
     held: Option<QuotaGuard>,
 }
 
 impl MemoryReservation {
-    /// How many they are.
+    /// The reserved bytes.
     pub fn bytes(&self) -> usize {
         self.bytes
     }
 
-    /// Takes so many bytes more.
+    /// Reserves more bytes.
     ///
     /// # Errors
     /// [`Error::MemoryFull`], [`Error::Auth`]; then it is as before.
@@ -97,7 +97,7 @@ impl MemoryReservation {
         }
     }
 
-    /// Makes it as large as what was made in the end, which may be more than was expected.
+    /// Changes the size to what was made in the end, which may be more than was expected.
     pub fn set(&mut self, bytes: usize) {
         if let Some(held) = &mut self.held {
             held.set(bytes);
@@ -114,19 +114,18 @@ impl Drop for MemoryReservation {
     }
 }
 
-/// Shares of replies on their way to the wire: whoever makes a reply puts its share here, and the transport takes it along
-/// with the bytes.
+/// Reservations of replies that are about to be sent. The transport attaches them to the bytes of the replies.
 #[derive(Clone, Default)]
 pub struct PendingReservations(Arc<Mutex<Vec<MemoryReservation>>>);
 
 impl PendingReservations {
-    /// Adds a reply's share.
+    /// Adds the reservation of a reply.
     pub fn put(&self, share: MemoryReservation) {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).push(share);
     }
 
-    /// The bytes with the shares that are theirs, which are held until the last of the bytes is written or dropped, and so
-    /// is what `hold` makes. Bytes without shares are left as they are.
+    /// Attaches the reservations, and what `hold` makes, to the bytes of a reply. They are held until the last of the bytes is
+    /// written or dropped. Without reservations the bytes are returned as they are.
     pub fn send<H: Send + 'static>(&self, bytes: Bytes, hold: impl FnOnce() -> H) -> Bytes {
         let shares = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
         if shares.is_empty() { bytes } else { Bytes::from_owner(ReservedBytes { bytes, _held: (shares, hold()) }) }

@@ -21,7 +21,7 @@ pub enum Error {
          a time, read the replies that wait, or try again later"
     )]
     MemoryFull {
-        /// What was asked for.
+        /// The bytes that were requested.
         wanted: usize,
         /// In use.
         used: usize,
@@ -42,7 +42,7 @@ pub enum Error {
     /// A message is larger than its stream may send now.
     #[error("a message of {got} bytes came; at most {limit} are read here now")]
     TooLarge {
-        /// Its length in bytes.
+        /// The length in bytes.
         got: usize,
         /// The most there may be.
         limit: usize,

@@ -28,47 +28,47 @@ const MIN_BYTES_PER_SECOND: usize = 64 << 10;
 /// A message of at least this length gets an allocation of its own.
 const OWN_BUFFER_MIN_BYTES: usize = 1 << 20;
 
-/// What requests and replies are subject to on their way.
+/// The memory budget and the timeouts of a stream.
 #[derive(Clone)]
 pub struct StreamLimits {
-    /// What they take their bytes from.
+    /// The memory budget of the stream.
     pub budget: Budget,
-    /// How long a client may leave a message unfinished, or a reply unread.
+    /// The time that a client may leave a message unfinished, or a reply unread.
     pub limit: Option<Duration>,
-    /// How long it may leave the first reply unread.
+    /// The time that a client may leave the first reply unread.
     pub handshake: Duration,
 }
 
 /// The messages of a request's body, as they come.
 pub struct MessageReader {
     body: Body,
-    /// What has come and not been taken.
+    /// Bytes that came and were not returned yet.
     buffer: BytesMut,
     message: Option<PartialMessage>,
-    /// When the message that has begun must have ended.
+    /// The deadline of the partly read message.
     due: Option<Instant>,
-    /// Of the message that has begun.
+    /// The reservation of the partly read message.
     share: MemoryReservation,
     transit: StreamLimits,
-    /// Whom they are from.
+    /// The connection of the stream.
     pub connection: Option<Connection>,
     /// The token that came with them.
     pub bearer: Option<Bearer>,
-    /// Where the shares of their replies go.
+    /// The reservations of the stream's replies.
     pub outbox: PendingReservations,
 }
 
-/// A message that has begun.
+/// A partly read message.
 enum PartialMessage {
-    /// It has so many bytes.
+    /// The length of the message.
     Wanted(usize),
-    /// There was no room for it. So many of its bytes have not come yet, and are thrown away.
+    /// The budget has no room for it. The bytes of it that have not come yet, this many, are thrown away.
     Refused(usize, Error),
 }
 
 /// A message.
 pub enum Message {
-    /// Its bytes, with their share of the budget.
+    /// The bytes of the message, with their reservation.
     Whole(Bytes, MemoryReservation),
     /// The budget has no room for it.
     Refused(Error),
@@ -78,14 +78,14 @@ pub enum Message {
 pub enum StreamStop<E = Error> {
     /// The server wants no more of it.
     Refused(E),
-    /// What came is not to be understood, the connection broke, or the server has a defect.
+    /// The bytes cannot be decoded, the connection broke, or the server has a defect.
     Broken(Status),
     /// The client wants no more of it, or something in between, or nothing comes from there any more.
     Cancelled,
 }
 
 impl<E> StreamStop<E> {
-    /// The same with another error.
+    /// Changes the error.
     pub fn map<F>(self, error: impl FnOnce(E) -> F) -> StreamStop<F> {
         match self {
             Self::Refused(refused) => StreamStop::Refused(error(refused)),
@@ -123,12 +123,12 @@ impl MessageReader {
         }
     }
 
-    /// What they take their bytes from.
+    /// The memory budget of the stream.
     pub fn budget(&self) -> &Budget {
         &self.transit.budget
     }
 
-    /// Their place, when they go elsewhere: nothing comes there any more.
+    /// Moves the reader out and leaves an exhausted one behind.
     pub fn leave(&mut self) -> Self {
         let (connection, bearer) = (self.connection.clone(), self.bearer.clone());
         let left = Self::new(Body::empty(), self.transit.clone(), connection, bearer, PendingReservations::default());
@@ -163,8 +163,7 @@ impl MessageReader {
         }
     }
 
-    /// The next frame of HTTP's; within a message it must come in time, and not so late that the message would take for
-    /// ever.
+    /// The next HTTP/2 frame. Within a message it must come in time, and the message must keep its minimum rate.
     async fn frame(&mut self) -> Result<Option<Result<http_body::Frame<Bytes>, Status>>, StreamStop> {
         let next = self.body.frame();
         match self.transit.limit.filter(|_| self.message.is_some()) {
@@ -194,7 +193,7 @@ impl MessageReader {
         Ok(PartialMessage::Wanted(length))
     }
 
-    /// The message that has begun, if it is there.
+    /// Returns the partly read message, if it is complete.
     fn taken(&mut self) -> Option<Message> {
         match &mut self.message {
             Some(PartialMessage::Wanted(length)) if self.buffer.len() >= *length => {
@@ -222,7 +221,7 @@ impl MessageReader {
         }
     }
 
-    /// Takes bytes that came, with their share of the budget.
+    /// Appends bytes that came, and reserves memory for them.
     fn take(&mut self, data: &[u8], allowance: RequestLimits) {
         if let Some(PartialMessage::Wanted(length)) = self.message {
             let free = allowance.covered.max(UNBUDGETED_BYTES);

@@ -34,7 +34,7 @@ pub struct Field {
     inside: FieldKind,
 }
 
-/// What a field's entries are.
+/// The type of a field's entries.
 pub enum FieldKind {
     /// Messages.
     Fields(&'static [Field]),
@@ -44,13 +44,13 @@ pub enum FieldKind {
     Opaque,
 }
 
-/// How many entries a field may have.
+/// The maximum number of entries of a field.
 pub enum Cardinality {
     /// At most one.
     One,
     /// At most [`MAX_REPEATED`].
     Many,
-    /// As many as there are environments, and no fewer than [`MAX_REPEATED`].
+    /// At most as many as there are environments, and no fewer than [`MAX_REPEATED`].
     Environments,
 }
 
@@ -122,10 +122,10 @@ fn decoded<T: Message + Default>(bytes: Bytes) -> Result<T, Status> {
     T::decode(bytes).map_err(|error| Status::internal(error.to_string()))
 }
 
-/// Why a message was not looked through.
+/// Why the count of a message stopped.
 #[derive(Debug, PartialEq)]
 enum PrecheckError {
-    /// It has more fields than were to be looked at.
+    /// The message has more fields than should be counted here.
     Work,
     Refused(InvalidValue),
 }
@@ -136,7 +136,7 @@ fn check(message: &[u8], fields: &[Field], allowance: RequestLimits, mut work: u
     count(message, fields, allowance, &mut work).map(|_| ())
 }
 
-/// The same of a part of a message; whether it is well-formed.
+/// Counts the fields of a part of a message. Returns whether the part is well-formed.
 fn count(
     mut message: &[u8],
     fields: &[Field],

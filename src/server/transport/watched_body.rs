@@ -20,12 +20,12 @@ use tonic::{Status, body::Body};
 /// The number of checks of an unread stream within its timeout.
 const CHECKS_PER_TIMEOUT: u32 = 4;
 
-/// How long a stream's client may leave its replies unread.
+/// The time that a stream's client may leave its replies unread.
 #[derive(Debug, Clone, Copy)]
 pub struct ReadTimeouts {
-    /// The first of them.
+    /// The first reply.
     pub first: Duration,
-    /// Any other; none: for ever.
+    /// Any later reply; `None` for no limit.
     pub rest: Option<Duration>,
 }
 
@@ -36,21 +36,21 @@ pub struct WatchedBody {
     waiting: Arc<ReadProgress>,
 }
 
-/// The replies that wait for the client to read.
+/// The progress of the client with the replies.
 struct ReadProgress {
     state: Mutex<State>,
-    /// Who looks after them, up to their end: as long as that waits it holds what it needs of the connection.
+    /// The task that checks the timeouts. It is aborted with the body, because it holds on to the connection.
     watch: OnceLock<AbortHandle>,
 }
 
 struct State {
-    /// The replies with shares, and since when the client has read none of them to its end.
+    /// Number of unread replies that hold reservations.
     unread: usize,
     since: Instant,
-    /// Since when a reply waits for the client to let any of it come. The session is not asked for more meanwhile, so that
-    /// none of its own limits would end it.
+    /// The time since which a reply waits for the flow control of the client. The session is not asked for more meanwhile,
+    /// so none of its own limits would end it.
     held: Option<Instant>,
-    /// It has let none come yet.
+    /// No reply has been taken yet.
     is_first: bool,
 }
 
@@ -59,7 +59,7 @@ impl State {
         Self { unread: 0, since: Instant::now(), held: None, is_first: true }
     }
 
-    /// The limit that the client has passed.
+    /// The timeout that the client has exceeded, if any.
     fn passed(&self, patience: ReadTimeouts) -> Option<Duration> {
         let held = self.held.map_or(Duration::ZERO, |since| since.elapsed());
         let unread = if self.unread == 0 { Duration::ZERO } else { self.since.elapsed() };
@@ -73,7 +73,7 @@ impl ReadProgress {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// One with a share more, or one less.
+    /// Changes the number of unread replies.
     fn change(&self, change: impl FnOnce(usize) -> usize) {
         let mut state = self.state();
         let (before, after) = (state.unread, change(state.unread));
@@ -83,7 +83,7 @@ impl ReadProgress {
         }
     }
 
-    /// The transport asks for a reply: what it had is on its way.
+    /// Notes that the transport asks for a reply: the one before is on its way.
     fn asked(&self) {
         let mut state = self.state();
         if state.held.take().is_some() {
@@ -91,7 +91,7 @@ impl ReadProgress {
         }
     }
 
-    /// The transport has one.
+    /// Notes that the transport has a reply.
     fn hold(&self) {
         self.state().held = Some(Instant::now());
     }
@@ -103,7 +103,7 @@ impl Drop for ReadProgress {
     }
 }
 
-/// A reply that waits, until it is dropped.
+/// An unread reply, until it is dropped.
 struct UnreadGuard(Arc<ReadProgress>);
 
 impl UnreadGuard {
@@ -120,8 +120,8 @@ impl Drop for UnreadGuard {
 }
 
 impl WatchedBody {
-    /// A body whose replies' shares are in the outbox. If its client's patience for them, if it has any, is over, its
-    /// connection ends.
+    /// Wraps a response body and attaches queued reservations to its bytes. Closes the connection when the client leaves data
+    /// unread longer than `patience`.
     pub fn new(
         body: Body,
         outbox: PendingReservations,

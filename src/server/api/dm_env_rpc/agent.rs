@@ -1,4 +1,4 @@
-//! One stream: the legal order of its requests, each answered once.
+//! The handler of one stream: the legal order of its requests, each answered once.
 
 use super::{
     Error,
@@ -31,7 +31,7 @@ use std::sync::Arc;
 /// The maximum length of a request. A world is one environment; the rest is room for mistakes that deserve an answer.
 const MAX_REQUEST_BYTES: usize = 1 << 20;
 
-/// A client's stream. When it is dropped it leaves its world, and the worlds that it made go unless an agent is in them.
+/// A client's stream. When it is dropped, it leaves its world. The worlds that it made go unless an agent is in them.
 pub(super) struct Agent {
     worlds: Arc<Worlds>,
     caller: Caller,

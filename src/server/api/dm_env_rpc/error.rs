@@ -18,7 +18,7 @@ pub enum Error {
     /// The stream's transport refuses it.
     #[error(transparent)]
     Session(#[from] session::Error),
-    /// It may not be sampled.
+    /// The token may not draw from there, or the ledger cannot be written.
     #[error(transparent)]
     Audit(#[from] audit::Error),
     /// The environments refuse it.
@@ -36,11 +36,11 @@ pub enum Error {
     /// Nothing has this name.
     #[error("{what} {name} is unknown; {known}")]
     Unknown {
-        /// What was looked for: a world, a setting, an action, …
+        /// The kind of thing: a world, a setting, an action, …
         what: &'static str,
-        /// Its name or number, as it came.
+        /// The unknown name or number.
         name: String,
-        /// What there is.
+        /// The names that are known.
         known: String,
     },
     /// A request of agents on a stream that is none.
@@ -60,7 +60,7 @@ pub enum Error {
     Occupied {
         /// The world.
         world: String,
-        /// What was asked for.
+        /// The request.
         request: &'static str,
     },
     /// A world of others.
@@ -71,7 +71,7 @@ pub enum Error {
     NotYours {
         /// The world.
         world: String,
-        /// What was asked for.
+        /// The request.
         request: &'static str,
     },
     /// The name that was asked for is another world's.
@@ -85,7 +85,7 @@ pub enum Error {
     Forbidden {
         /// The property.
         key: String,
-        /// What was asked for, as a participle.
+        /// The access that was requested, as a participle.
         access: &'static str,
     },
     /// An extension that this server does not have.

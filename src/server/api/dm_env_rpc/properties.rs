@@ -35,9 +35,9 @@ const SEED: &str = "seed";
 struct Property {
     key: String,
     description: String,
-    /// None if it only holds others.
+    /// The value; `None` if the property only holds others.
     value: Option<Tensor>,
-    /// What may be written.
+    /// The way to write the property, if it can be written.
     range: Option<(f64, f64)>,
     is_writable: bool,
 }

@@ -22,20 +22,20 @@ pub(super) struct Runner {
     version: Version,
 }
 
-/// Where the episode stands.
+/// The state of the episode.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Phase {
-    /// It has begun, and nobody has seen it: the first episode of a new world.
+    /// The first episode of a new world has begun, and no agent has seen it.
     Unseen,
-    /// It runs.
+    /// The episode runs.
     Running,
-    /// It has ended or was broken off.
+    /// The episode has ended or was interrupted.
     Over,
 }
 
-/// What an agent may observe after a step.
+/// The outcome of a step, as an agent may observe it.
 pub(super) struct Outcome {
-    /// Where the agent's sequence stands.
+    /// The state of the agent's sequence.
     pub(super) state: State,
     /// f32 `[O]`, little-endian.
     pub(super) observation: Bytes,
@@ -49,7 +49,7 @@ pub(super) struct Outcome {
     pub(super) diverged: bool,
 }
 
-/// What begins with the next episode.
+/// Changes that take effect with the next episode.
 #[derive(Clone)]
 pub(super) struct Changes {
     /// The version in force.
@@ -79,17 +79,17 @@ impl Runner {
         Ok(Self { batch, draws, phase: Phase::Unseen, first, start: only(started), seed, version })
     }
 
-    /// What its episodes were fixed by when it was made.
+    /// The settings of the episodes when the world was made.
     pub(super) fn episodes(&self) -> &Settings {
         &self.batch.settings().groups[0].episodes
     }
 
-    /// What it may draw from.
+    /// The checks and records of what the world draws from.
     pub(super) fn draws(&self) -> &DrawAuditor {
         &self.draws
     }
 
-    /// Its environment.
+    /// The environment.
     pub(super) fn spec(&self) -> &'static EnvironmentSpec {
         self.batch.settings().spec
     }
@@ -114,7 +114,7 @@ impl Runner {
         self.phase == Phase::Running
     }
 
-    /// Breaks a running episode off: the next step begins another.
+    /// Interrupts a running episode: the next step begins another.
     pub(super) fn stop(&mut self) {
         if self.is_running() {
             self.phase = Phase::Over;

@@ -21,7 +21,7 @@ const MAX_NAME_BYTES: usize = 64;
 
 type Settings = BTreeMap<String, Tensor>;
 
-/// Whose a world is.
+/// The name of a world, and who may reset and destroy it.
 pub(super) struct Ownership {
     /// The name that was asked for.
     pub(super) name: Option<String>,
@@ -29,7 +29,7 @@ pub(super) struct Ownership {
     pub(super) shared: bool,
 }
 
-/// What a reset, or a written property, changes from the next episode on.
+/// Changes by a reset or a written property, from the next episode on.
 #[derive(Default)]
 pub(super) struct Change {
     /// All parameters get this version's distributions, then those named below theirs.
@@ -137,7 +137,7 @@ fn version(settings: &Settings) -> Result<Option<Version>, Error> {
     settings.get(VERSION).map(read).transpose()
 }
 
-/// Those of the settings that are the environment's parameters.
+/// Returns the settings that are the environment's parameters.
 fn parameters(spec: &EnvironmentSpec, settings: &Settings) -> Result<Vec<(&'static str, Distribution)>, Error> {
     let given = spec.parameters.iter().filter_map(|p| Some((p.name, settings.get(p.name)?)));
     given.map(|(name, tensor)| Ok((name, Distribution::fixed(tensors::number(&field(name), tensor)?)))).collect()

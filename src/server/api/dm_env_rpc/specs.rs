@@ -21,7 +21,7 @@ const TRUNCATED: u64 = 3;
 const SUCCESS: u64 = 4;
 const DIVERGED: u64 = 5;
 
-/// What an agent of this environment can do and see.
+/// The actions and observations of an environment.
 ///
 /// There is no `discount`: clients make it of the state, as they should, and must not get one with a first step.
 pub(super) fn of(spec: &EnvironmentSpec) -> ActionObservationSpecs {

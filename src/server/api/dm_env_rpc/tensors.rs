@@ -1,10 +1,10 @@
-//! What a tensor must be: type, shape, number of elements, bounds. Nothing is converted.
+//! Checks of tensors: type, shape, number of elements, bounds. Nothing is converted.
 
 use super::Error;
 use crate::proto::dm_env_rpc::v1::{DataType, Tensor, tensor::Payload};
 use std::fmt::Display;
 
-/// The most dimensions that a refusal repeats.
+/// The maximum number of dimensions that an error repeats.
 const MAX_SHOWN_DIMENSIONS: usize = 8;
 
 /// A STRING scalar.
@@ -135,7 +135,7 @@ fn shape_of(shape: &[i32]) -> String {
     }
 }
 
-/// What its elements are, and how many; none without a payload.
+/// Returns the type and the number of the elements, or `None` without a payload.
 pub(super) fn dtype_and_count(tensor: &Tensor) -> Option<(DataType, usize)> {
     Some(match tensor.payload.as_ref()? {
         Payload::Floats(x) => (DataType::Float, x.array.len()),

@@ -1,4 +1,4 @@
-//! What requests of any stream may change about a world. The physics follows when the next episode begins.
+//! The state of a world that requests of any stream may change. The physics follows when the next episode begins.
 
 use super::{
     Error,
@@ -19,10 +19,10 @@ pub(super) struct World {
     wanted: Mutex<PendingChanges>,
 }
 
-/// What the next episode begins with.
+/// The settings that the next episode begins with.
 struct PendingChanges {
     version: Version,
-    /// One for each parameter.
+    /// The distribution of each parameter.
     distributions: Vec<Distribution>,
     /// Whether they are other than the running episode's.
     new_distributions: bool,
@@ -50,12 +50,12 @@ impl World {
         Self { name, spec: runner.spec(), draws: runner.draws().clone(), wanted: Mutex::new(wanted) }
     }
 
-    /// Its name, unique on the server.
+    /// The name, unique on the server among the worlds of one token.
     pub(super) fn name(&self) -> &str {
         &self.name
     }
 
-    /// Its environment.
+    /// The environment.
     pub(super) fn spec(&self) -> &'static EnvironmentSpec {
         self.spec
     }
@@ -81,7 +81,7 @@ impl World {
         Ok(())
     }
 
-    /// What the episode that begins now is to begin with.
+    /// Takes the settings for the episode that begins now.
     pub(super) fn take_changes(&self) -> Changes {
         let mut wanted = self.lock();
         wanted.interruption = false;

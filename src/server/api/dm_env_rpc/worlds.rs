@@ -17,7 +17,7 @@ use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
 
-/// Tells streams apart.
+/// The number of a stream.
 type StreamId = u64;
 
 /// A stream.
@@ -27,7 +27,7 @@ pub(super) struct Caller {
 }
 
 impl Caller {
-    /// So many environments of its token.
+    /// Takes environments out of the quota of the stream's token.
     ///
     /// # Errors
     /// If it has as many as it may have.
@@ -35,7 +35,7 @@ impl Caller {
         Ok(self.bearer.as_ref().map(|bearer| bearer.envs(count)).transpose()?)
     }
 
-    /// What it calls so.
+    /// The key of the world that the stream calls by this name.
     fn key(&self, name: &str) -> Key {
         (self.bearer.as_ref().map(|bearer| bearer.name().to_owned()), name.to_owned())
     }
@@ -66,9 +66,9 @@ struct Entry {
     agent: Option<StreamId>,
     /// Whether every stream may reset and destroy it.
     shared: bool,
-    /// None while an agent has it.
+    /// The episodes; `None` while an agent has them.
     runner: Option<Runner>,
-    /// Of the environments that its maker's token may have.
+    /// The world's part of its maker's quota of environments.
     _held: Option<QuotaGuard>,
 }
 
@@ -78,12 +78,12 @@ impl Worlds {
         Self { pool, catalogue, ledger, registry: Mutex::default() }
     }
 
-    /// What a new world of a stream draws from.
+    /// The checks and records of what a new world of a stream draws from.
     pub(super) fn draws(&self, maker: &Caller) -> DrawAuditor {
         DrawAuditor::new(maker.bearer.clone(), self.ledger.clone())
     }
 
-    /// Where worlds' environments run.
+    /// The pool that runs the environments of all worlds.
     pub(super) fn pool(&self) -> &Pool {
         &self.pool
     }
@@ -224,7 +224,7 @@ impl Registry {
     }
 }
 
-/// One that nobody guesses.
+/// A name that nobody guesses.
 fn random_name(environment: &str) -> Result<String, Error> {
     Ok(format!("{environment}-{:032x}", u128::from_ne_bytes(id::random()?)))
 }

@@ -19,7 +19,7 @@ pub enum Error {
     /// The session's transport refuses it.
     #[error(transparent)]
     Session(#[from] session::Error),
-    /// It may not be sampled.
+    /// The token may not draw from there, or the ledger cannot be written.
     #[error(transparent)]
     Audit(#[from] audit::Error),
     /// The environments refuse it.
@@ -54,9 +54,9 @@ pub enum Error {
     Order {
         /// The request.
         request: &'static str,
-        /// When it came.
+        /// The state in which the request came.
         when: Cow<'static, str>,
-        /// What to do.
+        /// The advice to the client.
         advice: &'static str,
     },
 }

@@ -20,7 +20,7 @@ const RESET: &[Field] = &[
 const RESTORE: &[Field] = &[field(2, "restore.snapshots", Cardinality::Environments, Opaque)];
 const POLICY: &[Field] = &[field(1, "act.policy.hidden", Cardinality::Many, Numbers)];
 const ACT: &[Field] = &[field(1, "act.policy", Cardinality::One, Fields(POLICY))];
-/// Those of `perturb.v1.SessionRequest`.
+/// The counted fields of `perturb.v1.SessionRequest`.
 pub const SESSION_REQUEST: &[Field] = &[
     field(1, "open", Cardinality::One, Fields(OPEN)),
     field(2, "step", Cardinality::One, Opaque),

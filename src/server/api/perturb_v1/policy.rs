@@ -29,7 +29,7 @@ struct Sizes {
     envs: usize,
     /// O.
     observation: usize,
-    /// How many of these are parameters.
+    /// The number of entries of an observation that are parameters.
     parameters: usize,
     action: ActionKind,
 }
@@ -172,7 +172,7 @@ fn weights(given: &Bytes, spec: &PolicySpec) -> Result<Vec<f32>, Error> {
     read_floats("weights", given).map_err(within("act"))
 }
 
-/// What is there of it.
+/// Reads an optional message.
 fn read<'a, M, T: TryFrom<&'a M, Error = DecodeError>>(
     field: &'static str,
     given: &'a Option<M>,
@@ -214,7 +214,7 @@ fn has_floats(field: &'static str, bytes: &Bytes, count: usize, shape: &str) -> 
     if bytes.len() == 4 * count { Ok(()) } else { Err(Error::value(field, got(), expected())) }
 }
 
-/// What was played.
+/// The response of a rollout.
 pub fn acted(played: Rollout) -> proto::Acted {
     proto::Acted {
         steps: played.steps as u32,
@@ -238,7 +238,7 @@ fn ended_at(EndedAt { step, slot, end, terminated, truncated }: EndedAt) -> prot
     proto::EndedAt { step: step as u32, end: Some(convert::ended((slot, end))), terminated, truncated }
 }
 
-/// What stands beside the weights of the policy that plays.
+/// The state of the policy that plays, without its weights.
 pub fn saved(batch: &Batch) -> Result<proto::PlayerSaved, Error> {
     let order = |when: &'static str, advice| Err(Error::Order { request: "save_player", when: when.into(), advice });
     let Some(play) = batch.play() else {

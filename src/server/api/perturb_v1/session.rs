@@ -1,4 +1,4 @@
-//! One session: the legal order of its requests, each answered once.
+//! The handler of one session: the legal order of its requests, each answered once.
 
 use super::{Error, convert, fields::SESSION_REQUEST, policy, sizes};
 use crate::{
@@ -27,17 +27,17 @@ use std::sync::Arc;
 /// The length of a step's request beside its actions.
 const STEP_OVERHEAD_BYTES: usize = 32;
 
-/// What all sessions of a server share.
+/// The parts of a server that all its sessions share.
 pub struct ServerContext {
-    /// Where environments run.
+    /// The pool that runs the environments.
     pub pool: Arc<Pool>,
-    /// Which there are.
+    /// The environments that can be opened.
     pub catalogue: Arc<Catalogue>,
-    /// The same, as the protocol tells it.
+    /// The catalogue as a message.
     pub listing: proto::ListEnvironmentsResponse,
-    /// What draws them.
+    /// The renderer of pictures.
     pub renderer: Renderer,
-    /// Has what is drawn.
+    /// The ledger of all draws, if there is one.
     pub ledger: Option<Ledger>,
     /// Sessions that outlive their streams.
     pub leases: Leases<proto::SessionResponse>,
@@ -48,13 +48,13 @@ pub struct Session {
     shared: Arc<ServerContext>,
     batch: Option<Batch>,
     bearer: Option<Bearer>,
-    /// Its environments, of those that its token may have.
+    /// The session's part of its token's quota of environments.
     held: Option<QuotaGuard>,
     draws: DrawAuditor,
     budget: Budget,
-    /// What steps need.
+    /// Memory for the requests and replies of steps.
     kept: Option<MemoryReservation>,
-    /// What the policy needs that plays.
+    /// Memory for the policy that plays.
     playing: Option<MemoryReservation>,
 }
 

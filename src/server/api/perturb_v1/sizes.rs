@@ -1,4 +1,4 @@
-//! How many bytes requests and replies have, before they are made: what a batch can need, and what the budget is asked for.
+//! Upper bounds of the lengths of requests and replies. The memory budget is asked for them before they are made.
 
 use crate::{
     env::{self, ActionSpace},
@@ -43,8 +43,8 @@ pub fn step_request(settings: &BatchSettings, envs: usize) -> usize {
     envs.saturating_mul(4 * action_width(settings))
 }
 
-/// What a session holds as long as it is open, so that no step is refused for what others hold: the requests of a step and
-/// of one that follows it, and three replies, one being computed, one that waits and one being sent.
+/// The memory that a session holds as long as it is open, so that no step is refused because of other sessions: the
+/// requests of a step and of the next one, and three replies, one being computed, one that waits and one being sent.
 pub fn session(settings: &BatchSettings, envs: usize) -> usize {
     let numbers = 2 * settings.observation_size() + 1 + settings.spec.reward_terms.len();
     let ends = if settings.receipts { 2 * RECEIPT_BYTES } else { EPISODE_END_BYTES };
@@ -67,8 +67,8 @@ pub fn picture(size: Size) -> usize {
     3 * usize::from(size.width) * usize::from(size.height)
 }
 
-/// What the server keeps of a policy that plays: its weights as they came and as they are computed with, and what it
-/// computes in each environment.
+/// The memory of a policy that plays: its weights as they came and as they are used, and its activations in each
+/// environment.
 pub fn policy(request: &proto::Act, envs: usize) -> usize {
     let widths = request.policy.as_ref().map_or(0, |policy| {
         policy.hidden.iter().chain([&policy.lstm]).map(|&width| width as usize).fold(0, usize::saturating_add)
