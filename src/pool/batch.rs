@@ -3,17 +3,17 @@
 use super::{
     Error,
     capacity::Permit,
-    encode::put,
-    follower::StepQueue,
+    encode::push_f32,
     job::Job,
     pipelined_step::PipelinedStep,
     rollout::{
-        play::PolicyRunner,
-        round::{Rollout, RolloutRequest, RolloutTask},
+        policy_runner::PolicyRunner,
+        task::{Rollout, RolloutRequest, RolloutTask},
     },
     scheduler::{Pool, Scheduler},
     settings::{Autoreset, BatchSettings, SlotGroup},
-    shard::{Command, Shard, SlotReset, put_actions},
+    shard::{Command, Shard, SlotReset, set_actions},
+    step_queue::StepQueue,
     step_result::{ShardOutputs, StepResult, collect},
     sync::lock,
 };
@@ -63,15 +63,15 @@ pub struct Batch {
     n_workers: usize,
     buffer: BytesMut,
     /// The number of requests that were handed to the workers.
-    asked: u64,
+    n_requests: u64,
     /// Whether a request was handed to the workers and its end not been waited for.
     under_way: bool,
     /// The time at which the next request began, if that is a pipelined step.
-    followed: Option<Instant>,
+    pipelined_since: Option<Instant>,
     /// The policy that plays, until somebody else changes the environments.
-    play: Option<Box<PolicyRunner>>,
+    runner: Option<Box<PolicyRunner>>,
     /// The hook for the end of the batch.
-    farewell: Option<DropHook>,
+    drop_hook: Option<DropHook>,
 }
 
 /// A hook that gets the draws of all environments when they are freed.
@@ -99,11 +99,11 @@ impl Batch {
             workers,
             n_workers: pool.workers(),
             buffer: BytesMut::new(),
-            asked: 0,
+            n_requests: 0,
             under_way: false,
-            followed: None,
-            play: None,
-            farewell: None,
+            pipelined_since: None,
+            runner: None,
+            drop_hook: None,
         };
         batch.run().await?;
         batch.check_failures()?;
@@ -133,7 +133,7 @@ impl Batch {
     /// # Errors
     /// [`Error::Ended`] in [`Autoreset::Disabled`], [`Error::Defect`].
     pub async fn step(&mut self, actions: &[u8]) -> Result<StepResult, Error> {
-        let start = match self.followed.take() {
+        let start = match self.pipelined_since.take() {
             Some(start) => start,
             None => {
                 self.ready().await?;
@@ -141,40 +141,40 @@ impl Batch {
                     self.refuse_ended()?;
                 }
                 let start = Instant::now();
-                self.play = None;
-                put_actions(&self.job.shards, actions);
-                if self.workers.step_here(&self.job) {
+                self.runner = None;
+                set_actions(&self.job.shards, actions);
+                if self.workers.step_inline(&self.job) {
                     self.job.result()?;
-                    return Ok(self.stepped(start, Instant::now()));
+                    return Ok(self.step_result(start, Instant::now()));
                 }
                 self.workers.begin_step(&self.job);
                 start
             }
         };
-        let number = self.ask();
+        let number = self.next_request();
         let ended = self.workers.wait(&self.job, number).await;
         self.under_way = false;
         // The worker has gathered what came of it if another step followed at once.
-        let (followed, end) = {
-            let mut follow = lock(&self.job.follow);
-            (follow.take(), follow.ended())
+        let (pipelined_since, end) = {
+            let mut pipelined = lock(&self.job.pipelined);
+            (pipelined.take_result(), pipelined.ended_at())
         };
-        self.followed = followed.as_ref().map(|(_, begun)| *begun);
+        self.pipelined_since = pipelined_since.as_ref().map(|(_, begun)| *begun);
         ended?;
-        match followed {
+        match pipelined_since {
             Some((stepped, end)) => {
                 self.observe(start, end);
                 Ok(stepped)
             }
-            None => Ok(self.stepped(start, end.unwrap_or_else(Instant::now))),
+            None => Ok(self.step_result(start, end.unwrap_or_else(Instant::now))),
         }
     }
 
     /// The result of the step that has ended.
-    fn stepped(&mut self, start: Instant, end: Instant) -> StepResult {
+    fn step_result(&mut self, start: Instant, end: Instant) -> StepResult {
         self.observe(start, end);
         let reward_terms = self.settings.reward_terms;
-        self.gather().stepped(reward_terms)
+        self.gather().step_result(reward_terms)
     }
 
     fn observe(&self, start: Instant, end: Instant) {
@@ -183,9 +183,9 @@ impl Batch {
 
     /// Returns the queue for the step after the next one, or `None` if a step must know the result of the one before, or if
     /// the session's own thread may take it.
-    pub fn follower(&self) -> Option<StepQueue> {
+    pub fn step_queue(&self) -> Option<StepQueue> {
         let (job, spec, size) = (Arc::clone(&self.job), self.settings.spec, self.size);
-        let follows = self.settings.autoreset != Autoreset::Disabled && job.is_for_workers();
+        let follows = self.settings.autoreset != Autoreset::Disabled && job.needs_workers();
         follows.then_some(StepQueue { job, spec, size })
     }
 
@@ -197,18 +197,18 @@ impl Batch {
     /// [`Error::Policy`] if numbers are not finite, [`Error::Defect`]; after both another policy must be given.
     pub async fn act(&mut self, turn: RolloutRequest) -> Result<Rollout, Error> {
         self.ready().await?;
-        let round = Box::new(RolloutTask::new(turn, self.play.take()));
-        let number = self.ask();
-        let round = self.workers.play(&self.job, round, number).await;
+        let task = Box::new(RolloutTask::new(turn, self.runner.take()));
+        let number = self.next_request();
+        let task = self.workers.run_rollout(&self.job, task, number).await;
         self.under_way = false;
-        let (play, played) = round?.finish()?;
-        self.play = play;
+        let (runner, played) = task?.finish()?;
+        self.runner = runner;
         Ok(played)
     }
 
     /// The policy that plays.
-    pub fn play(&self) -> Option<&PolicyRunner> {
-        self.play.as_deref()
+    pub fn policy_runner(&self) -> Option<&PolicyRunner> {
+        self.runner.as_deref()
     }
 
     /// Frees environments, in order of slots; at least one stays. The others are numbered anew and keep everything else.
@@ -217,14 +217,15 @@ impl Batch {
     /// [`Error::Defect`].
     pub async fn release(&mut self, slots: &[usize]) -> Result<(), Error> {
         self.ready().await?;
-        self.play = None;
-        let mut leaves = vec![false; self.size];
-        slots.iter().for_each(|&slot| leaves[slot] = true);
+        self.runner = None;
+        let mut is_released = vec![false; self.size];
+        slots.iter().for_each(|&slot| is_released[slot] = true);
         let mut all = self.job.shards.iter().flat_map(|shard| lock(shard).take_slots()).collect::<Vec<Episodes>>();
         let mut slot = 0..;
-        let gone: Vec<Episodes> = all.extract_if(.., |_| slot.next().is_some_and(|slot: usize| leaves[slot])).collect();
+        let gone: Vec<Episodes> =
+            all.extract_if(.., |_| slot.next().is_some_and(|slot: usize| is_released[slot])).collect();
         let mut gone = Some(gone);
-        self.workers.reaper.free(Box::new(move || {
+        self.workers.reaper.drop_later(Box::new(move || {
             drop(gone.take());
             true
         }));
@@ -234,12 +235,12 @@ impl Batch {
         for first in (0..self.size).step_by(self.shard_size) {
             let part: Vec<Episodes> = all.drain(..self.shard_size.min(all.len())).collect();
             let size = part.len();
-            shards.push(Mutex::new(Shard::of(&self.settings, part, (first, size))));
+            shards.push(Mutex::new(Shard::with_environments(&self.settings, part, (first, size))));
         }
         let owned = (Arc::clone(&self.job.permit), Arc::clone(&self.job.tally));
-        self.job.permit.give_back(slots.len());
+        self.job.permit.release(slots.len());
         self.job = job(&self.settings, shards, self.n_workers, owned, self.size);
-        self.asked = 0;
+        self.n_requests = 0;
         Ok(())
     }
 
@@ -261,7 +262,7 @@ impl Batch {
             };
             Command::Reset(entries.into_iter().map(local).collect())
         });
-        self.play = None;
+        self.runner = None;
         self.run().await?;
         Ok((self.observations(&slots), collect(&self.job.shards, |shard| &mut shard.started)))
     }
@@ -297,7 +298,7 @@ impl Batch {
             self.check_failures()?;
             return Err(refused);
         }
-        self.play = None;
+        self.runner = None;
         Ok(self.observations(&slots))
     }
 
@@ -312,24 +313,24 @@ impl Batch {
     }
 
     /// Sets the hook that gets the draws of all environments, in order of slots, when they are freed.
-    pub fn when_freed(&mut self, tell: DropHook) {
-        self.farewell = Some(tell);
+    pub fn when_freed(&mut self, hook: DropHook) {
+        self.drop_hook = Some(hook);
     }
 
     /// Waits for a request whose future was dropped early. Call it before the next request: workers may still be running the
     /// old one and a step queued behind it. A policy that plays ends with its present step.
-    pub async fn settle(&mut self) {
+    pub async fn finish_abandoned(&mut self) {
         // Whether any of it failed the next request will tell.
         if self.under_way {
-            self.job.halted.store(true, Ordering::Relaxed);
-            lock(&self.job.follow).stop();
-            let _ = self.workers.wait(&self.job, self.asked).await;
-            self.job.take_round();
+            self.job.is_halted.store(true, Ordering::Relaxed);
+            lock(&self.job.pipelined).stop();
+            let _ = self.workers.wait(&self.job, self.n_requests).await;
+            self.job.take_rollout();
             self.under_way = false;
-            self.followed = lock(&self.job.follow).take().map(|(_, begun)| begun);
+            self.pipelined_since = lock(&self.job.pipelined).take_result().map(|(_, begun)| begun);
         }
-        if self.followed.take().is_some() {
-            let number = self.ask();
+        if self.pipelined_since.take().is_some() {
+            let number = self.next_request();
             let _ = self.workers.wait(&self.job, number).await;
             self.under_way = false;
         }
@@ -349,22 +350,22 @@ impl Batch {
 
     /// Waits until no request runs, before one that is not a pipelined step, and checks that nothing has failed.
     async fn ready(&mut self) -> Result<(), Error> {
-        self.settle().await;
+        self.finish_abandoned().await;
         self.job.result()
     }
 
     async fn run(&mut self) -> Result<(), Error> {
-        let number = self.ask();
+        let number = self.next_request();
         let result = self.workers.run(&self.job, number).await;
         self.under_way = false;
         result
     }
 
     /// Counts a request that is handed to the workers now.
-    fn ask(&mut self) -> u64 {
+    fn next_request(&mut self) -> u64 {
         self.under_way = true;
-        self.asked += 1;
-        self.asked
+        self.n_requests += 1;
+        self.n_requests
     }
 
     fn check_failures(&self) -> Result<(), Error> {
@@ -409,7 +410,7 @@ impl Batch {
         let n = self.settings.observation_size();
         for &slot in slots {
             let shard = lock(&self.job.shards[slot / self.shard_size]);
-            put(&mut self.buffer, &shard.observations[(slot - shard.first_slot) * n..][..n]);
+            push_f32(&mut self.buffer, &shard.observations[(slot - shard.first_slot) * n..][..n]);
         }
         self.buffer.split().freeze()
     }
@@ -423,20 +424,20 @@ impl Drop for Batch {
     fn drop(&mut self) {
         self.job.abandoned.store(true, Ordering::Relaxed);
         let is_idle = Arc::strong_count(&self.job) == 1;
-        if self.size() <= INLINE_DROP_MAX_ENVS && (is_idle || self.farewell.is_none()) {
-            if let Some(tell) = self.farewell.take() {
-                tell(draws(&self.job));
+        if self.size() <= INLINE_DROP_MAX_ENVS && (is_idle || self.drop_hook.is_none()) {
+            if let Some(hook) = self.drop_hook.take() {
+                hook(draws(&self.job));
             }
             return; // freed here, so that there is room at once
         }
         // Who holds the job last frees the environments: neither this thread, which lets it go now, nor a worker.
-        let mut rest = Some((Arc::clone(&self.job), self.play.take(), self.farewell.take()));
-        self.workers.reaper.free(Box::new(move || {
-            let is_alone = rest.as_ref().is_none_or(|(job, ..)| Arc::strong_count(job) == 1);
-            if let Some((job, _, farewell)) = rest.take_if(|_| is_alone)
-                && let Some(tell) = farewell
+        let mut deferred = Some((Arc::clone(&self.job), self.runner.take(), self.drop_hook.take()));
+        self.workers.reaper.drop_later(Box::new(move || {
+            let is_alone = deferred.as_ref().is_none_or(|(job, ..)| Arc::strong_count(job) == 1);
+            if let Some((job, _, drop_hook)) = deferred.take_if(|_| is_alone)
+                && let Some(hook) = drop_hook
             {
-                tell(draws(&job));
+                hook(draws(&job));
             }
             is_alone
         }));
@@ -456,25 +457,25 @@ fn job(
     owned: (Arc<Permit>, Arc<Tally>),
     size: usize,
 ) -> Arc<Job> {
-    let (cost, follow) = (settings.spec.step_cost * size as f64, PipelinedStep::new(settings.reward_terms));
-    Arc::new(Job::new(shards, workers, owned, cost, follow))
+    let (cost, pipelined) = (settings.spec.step_cost * size as f64, PipelinedStep::new(settings.reward_terms));
+    Arc::new(Job::new(shards, workers, owned, cost, pipelined))
 }
 
 /// Cuts groups into parts of `size` slots, the last of which may have fewer.
 fn cut(groups: &[SlotGroup], size: usize) -> Vec<Vec<SlotGroup>> {
-    let (mut parts, mut part, mut room) = (Vec::new(), Vec::new(), size);
+    let (mut parts, mut part, mut free_slots) = (Vec::new(), Vec::new(), size);
     for group in groups {
-        let mut rest = group.clone();
-        while rest.size > 0 {
-            let taken = rest.size.min(room);
-            part.push(SlotGroup { size: taken, ..rest.clone() });
-            rest.size -= taken;
+        let mut deferred = group.clone();
+        while deferred.size > 0 {
+            let taken = deferred.size.min(free_slots);
+            part.push(SlotGroup { size: taken, ..deferred.clone() });
+            deferred.size -= taken;
             // Of an empty rest the index is never used, and may be one too many.
-            rest.episodes.environment_index = rest.episodes.environment_index.wrapping_add(taken as u32);
-            room -= taken;
-            if room == 0 {
+            deferred.episodes.environment_index = deferred.episodes.environment_index.wrapping_add(taken as u32);
+            free_slots -= taken;
+            if free_slots == 0 {
                 parts.push(std::mem::take(&mut part));
-                room = size;
+                free_slots = size;
             }
         }
     }

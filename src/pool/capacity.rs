@@ -49,7 +49,7 @@ impl Capacity {
         }
     }
 
-    fn give_back(&self, environments: usize) {
+    fn release(&self, environments: usize) {
         self.used.fetch_sub(environments, Ordering::Relaxed);
         self.changed.notify_one();
     }
@@ -63,14 +63,14 @@ pub(super) struct Permit {
 
 impl Permit {
     /// Gives back environments of the permit, not more than it has.
-    pub(super) fn give_back(&self, count: usize) {
+    pub(super) fn release(&self, count: usize) {
         self.count.fetch_sub(count, Ordering::Relaxed);
-        self.capacity.give_back(count);
+        self.capacity.release(count);
     }
 }
 
 impl Drop for Permit {
     fn drop(&mut self) {
-        self.capacity.give_back(*self.count.get_mut());
+        self.capacity.release(*self.count.get_mut());
     }
 }

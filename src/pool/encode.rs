@@ -3,7 +3,7 @@
 use bytes::BytesMut;
 
 /// Appends f32.
-pub(super) fn put(buffer: &mut BytesMut, values: &[f32]) {
+pub(super) fn push_f32(buffer: &mut BytesMut, values: &[f32]) {
     let start = buffer.len();
     buffer.resize(start + 4 * values.len(), 0);
     let words = buffer[start..].as_chunks_mut::<4>().0;
@@ -11,7 +11,7 @@ pub(super) fn put(buffer: &mut BytesMut, values: &[f32]) {
 }
 
 /// Appends numbers of 64 bits.
-pub(super) fn put_wide<T: Copy>(buffer: &mut BytesMut, values: &[T], encode: impl Fn(T) -> [u8; 8]) {
+pub(super) fn push_wide<T: Copy>(buffer: &mut BytesMut, values: &[T], encode: impl Fn(T) -> [u8; 8]) {
     let start = buffer.len();
     buffer.resize(start + 8 * values.len(), 0);
     let words = buffer[start..].as_chunks_mut::<8>().0;
@@ -19,7 +19,7 @@ pub(super) fn put_wide<T: Copy>(buffer: &mut BytesMut, values: &[T], encode: imp
 }
 
 /// Appends u8, 0 or 1.
-pub(super) fn put_flags(buffer: &mut BytesMut, flags: &[bool]) {
+pub(super) fn push_flags(buffer: &mut BytesMut, flags: &[bool]) {
     let start = buffer.len();
     buffer.resize(start + flags.len(), 0);
     buffer[start..].iter_mut().zip(flags).for_each(|(to, from)| *to = (*from).into());

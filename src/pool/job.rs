@@ -1,7 +1,7 @@
 //! A batch's shards, and the request of it that is under way.
 
 use super::{
-    Error, capacity::Permit, pipelined_step::PipelinedStep, rollout::round::RolloutTask, shard::Shard, sync::lock,
+    Error, capacity::Permit, pipelined_step::PipelinedStep, rollout::task::RolloutTask, shard::Shard, sync::lock,
 };
 use crate::meters::Tally;
 use std::{
@@ -40,13 +40,13 @@ pub(super) struct Job {
     /// environments again finds them in its core's cache. A worker that is done helps the others.
     ranges: Vec<(Range<usize>, AtomicUsize)>,
     /// The number of parts that have not finished.
-    left: AtomicUsize,
+    remaining: AtomicUsize,
     /// The rollout of the policy that plays, if one plays.
-    round: Mutex<Option<Box<RolloutTask>>>,
+    rollout: Mutex<Option<Box<RolloutTask>>>,
     /// The pipelined step that may follow a step, while no policy plays.
-    pub(super) follow: Mutex<PipelinedStep>,
+    pub(super) pipelined: Mutex<PipelinedStep>,
     /// Whether the next part is the beginning of the rollout and not a shard.
-    begins: AtomicBool,
+    begins_rollout: AtomicBool,
     /// The number of requests that have ended, of those that were handed to the workers.
     pub(super) ended: AtomicU64,
     /// Notified whenever a request has ended.
@@ -54,12 +54,12 @@ pub(super) struct Job {
     /// Whether the session is gone, so that shards that have not run need not.
     pub(super) abandoned: AtomicBool,
     /// Whether nobody waits for the rollout any more, so that it ends with its present step.
-    pub(super) halted: AtomicBool,
+    pub(super) is_halted: AtomicBool,
     failed: AtomicBool,
     /// The cost of a step of all environments, µs.
     pub(super) cost: f64,
     /// The number of times that the session polls for the end of a request before it sleeps.
-    pub(super) patience: usize,
+    pub(super) polls: usize,
     pub(super) permit: Arc<Permit>,
     pub(super) tally: Arc<Tally>,
 }
@@ -71,31 +71,31 @@ impl Job {
         workers: usize,
         (permit, tally): (Arc<Permit>, Arc<Tally>),
         cost: f64,
-        follow: PipelinedStep,
+        pipelined: PipelinedStep,
     ) -> Self {
         let bound = |worker: usize| worker * shards.len() / workers;
         let range = |worker: usize| (bound(worker)..bound(worker + 1), AtomicUsize::new(0));
         Self {
             ranges: (0..workers).map(range).collect(),
             shards,
-            left: AtomicUsize::new(0),
-            round: Mutex::new(None),
-            follow: Mutex::new(follow),
-            begins: AtomicBool::new(false),
+            remaining: AtomicUsize::new(0),
+            rollout: Mutex::new(None),
+            pipelined: Mutex::new(pipelined),
+            begins_rollout: AtomicBool::new(false),
             ended: AtomicU64::new(0),
             done: Notify::new(),
             abandoned: AtomicBool::new(false),
-            halted: AtomicBool::new(false),
+            is_halted: AtomicBool::new(false),
             failed: AtomicBool::new(false),
             cost,
-            patience: if cost <= POLL_MAX_US { POLLS_BEFORE_WAIT } else { 0 },
+            polls: if cost <= POLL_MAX_US { POLLS_BEFORE_WAIT } else { 0 },
             permit,
             tally,
         }
     }
 
     /// Whether workers step the batch even if no other session steps.
-    pub(super) fn is_for_workers(&self) -> bool {
+    pub(super) fn needs_workers(&self) -> bool {
         self.cost > INLINE_MAX_US_UNCONTENDED
     }
 
@@ -113,7 +113,7 @@ impl Job {
         for (range, next) in &self.ranges {
             next.store(range.start, Ordering::Relaxed);
         }
-        self.left.store(self.shards.len(), Ordering::Relaxed);
+        self.remaining.store(self.shards.len(), Ordering::Relaxed);
     }
 
     /// Claims a shard that nobody has taken, first of the worker's own. The caller has a part from the queue, so there is one.
@@ -130,55 +130,55 @@ impl Job {
     }
 
     /// Makes the beginning of a rollout ready to be taken.
-    pub(super) fn prepare_round(&self, round: Box<RolloutTask>) {
-        *lock(&self.round) = Some(round);
-        self.halted.store(false, Ordering::Relaxed);
-        self.begins.store(true, Ordering::Relaxed);
-        self.left.store(1, Ordering::Relaxed);
+    pub(super) fn prepare_rollout(&self, rollout: Box<RolloutTask>) {
+        *lock(&self.rollout) = Some(rollout);
+        self.is_halted.store(false, Ordering::Relaxed);
+        self.begins_rollout.store(true, Ordering::Relaxed);
+        self.remaining.store(1, Ordering::Relaxed);
     }
 
     /// Takes the rollout, when it has ended or will never be run.
-    pub(super) fn take_round(&self) -> Option<Box<RolloutTask>> {
-        lock(&self.round).take()
+    pub(super) fn take_rollout(&self) -> Option<Box<RolloutTask>> {
+        lock(&self.rollout).take()
     }
 
     /// Runs a part that the caller has from the queue. Returns whether it was the last.
     pub(super) fn run_part(&self, worker: usize) -> bool {
         // The beginning of a round is its job's only part.
-        if self.begins.swap(false, Ordering::Relaxed) {
-            self.left.store(0, Ordering::Release);
+        if self.begins_rollout.swap(false, Ordering::Relaxed) {
+            self.remaining.store(0, Ordering::Release);
             return true;
         }
         self.run(self.claim(worker))
     }
 
     /// Notifies the session that a request has ended.
-    pub(super) fn tell(&self) {
+    pub(super) fn notify_done(&self) {
         self.ended.fetch_add(1, Ordering::Release);
         self.done.notify_one();
     }
 
     /// Returns whether a step follows, and which. No step follows if the pool is `closing`.
-    pub(super) fn conduct(&self, closing: bool) -> Continuation {
+    pub(super) fn after_step(&self, closing: bool) -> Continuation {
         if self.failed() || self.abandoned.load(Ordering::Relaxed) {
-            lock(&self.follow).stop();
+            lock(&self.pipelined).stop();
             return Continuation::Nothing;
         }
-        let mut round = lock(&self.round);
-        let Some(round) = round.as_mut() else {
-            drop(round);
-            let mut follow = lock(&self.follow);
+        let mut rollout = lock(&self.rollout);
+        let Some(rollout) = rollout.as_mut() else {
+            drop(rollout);
+            let mut pipelined = lock(&self.pipelined);
             if closing {
-                follow.stop();
+                pipelined.stop();
             }
-            return self.unless_it_panics(Continuation::Request, || follow.go_on(&self.shards));
+            return self.catch_panic(Continuation::Request, || pipelined.after_step(&self.shards));
         };
-        let halted = closing || self.halted.load(Ordering::Relaxed);
-        self.unless_it_panics(Continuation::Step, || round.conduct(&self.shards, halted))
+        let is_halted = closing || self.is_halted.load(Ordering::Relaxed);
+        self.catch_panic(Continuation::Step, || rollout.after_step(&self.shards, is_halted))
     }
 
     /// Returns `next` if it is wanted, and marks the job as failed if the question panics.
-    fn unless_it_panics(&self, next: Continuation, is_wanted: impl FnOnce() -> bool) -> Continuation {
+    fn catch_panic(&self, next: Continuation, is_wanted: impl FnOnce() -> bool) -> Continuation {
         match catch_unwind(AssertUnwindSafe(is_wanted)) {
             Ok(true) => next,
             Ok(false) => Continuation::Nothing,
@@ -203,6 +203,6 @@ impl Job {
             }
         }
         // Release: who sees 0 sees what every shard wrote.
-        self.left.fetch_sub(1, Ordering::AcqRel) == 1
+        self.remaining.fetch_sub(1, Ordering::AcqRel) == 1
     }
 }

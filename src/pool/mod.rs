@@ -9,12 +9,11 @@
 //! gathers the outputs, and puts the batch back, before the session is woken.
 //!
 //! Where a policy plays, the last shard's worker gathers them itself, computes the next actions and puts the batch back
-//! into the queue; only the end of such a round wakes the session.
+//! into the queue; only the end of such a rollout wakes the session.
 
 mod batch;
 mod capacity;
 mod encode;
-mod follower;
 mod job;
 mod pipelined_step;
 mod reaper;
@@ -23,17 +22,18 @@ mod rollout;
 mod scheduler;
 mod settings;
 mod shard;
+mod step_queue;
 mod step_result;
 mod sync;
 
 pub use batch::{Batch, DropHook, ResetEntry};
-pub use follower::StepQueue;
 pub use rollout::{
-    play::{Policy, PolicyRole, PolicyRunner},
-    round::{EndedAt, Rollout, RolloutRequest},
+    policy_runner::{Policy, PolicyRole, PolicyRunner},
+    task::{EndedAt, Rollout, RolloutRequest},
 };
 pub use scheduler::Pool;
 pub use settings::{Autoreset, BatchSettings, SlotGroup};
+pub use step_queue::StepQueue;
 pub use step_result::StepResult;
 
 use crate::env;

@@ -2,7 +2,7 @@
 //! to answer the first, is still being woken.
 
 use super::{
-    shard::{Shard, put_actions},
+    shard::{Shard, set_actions},
     step_result::{ShardOutputs, StepResult},
 };
 use bytes::{Bytes, BytesMut};
@@ -17,7 +17,7 @@ pub(super) struct PipelinedStep {
     /// The next step's actions.
     actions: Option<Bytes>,
     /// Result and completion time of the step before the running one, until the session collects it.
-    stepped: Option<(StepResult, Instant)>,
+    result: Option<(StepResult, Instant)>,
     /// The time at which the last step ended that no other followed.
     ended: Option<Instant>,
     buffer: BytesMut,
@@ -37,14 +37,14 @@ impl PipelinedStep {
 
     /// At the end of a step: if another is queued, keeps the result and gives the shards their next actions. Returns whether
     /// one was queued.
-    pub(super) fn go_on(&mut self, shards: &[Mutex<Shard>]) -> bool {
+    pub(super) fn after_step(&mut self, shards: &[Mutex<Shard>]) -> bool {
         let Some(actions) = self.actions.take() else {
             (self.is_under_way, self.ended) = (false, Some(Instant::now()));
             return false;
         };
-        let stepped = ShardOutputs { shards, buffer: &mut self.buffer }.stepped(self.reward_terms);
-        put_actions(shards, &actions);
-        self.stepped = Some((stepped, Instant::now()));
+        let result = ShardOutputs { shards, buffer: &mut self.buffer }.step_result(self.reward_terms);
+        set_actions(shards, &actions);
+        self.result = Some((result, Instant::now()));
         true
     }
 
@@ -54,18 +54,18 @@ impl PipelinedStep {
     }
 
     /// Takes result and completion time of the last step, if another has begun since.
-    pub(super) fn take(&mut self) -> Option<(StepResult, Instant)> {
-        self.stepped.take()
+    pub(super) fn take_result(&mut self) -> Option<(StepResult, Instant)> {
+        self.result.take()
     }
 
     /// The time at which the last step ended, if no other followed.
-    pub(super) fn ended(&self) -> Option<Instant> {
+    pub(super) fn ended_at(&self) -> Option<Instant> {
         self.ended
     }
 
     /// Keeps the actions of the step that is to follow, if one can.
     pub(super) fn offer(&mut self, actions: Bytes) {
-        if self.is_under_way && self.stepped.is_none() {
+        if self.is_under_way && self.result.is_none() {
             self.actions = Some(actions);
         }
     }

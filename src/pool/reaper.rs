@@ -30,19 +30,19 @@ impl Reaper {
     /// # Errors
     /// If the operating system starts no thread.
     pub(super) fn start() -> io::Result<(Self, JoinHandle<()>)> {
-        let (rests, received) = mpsc::channel::<DeferredDrop>();
+        let (drops, received) = mpsc::channel::<DeferredDrop>();
         let freeing = move || {
             lower(REAPER_NICENESS);
-            free(&received);
+            reap(&received);
         };
         let thread = thread::Builder::new().name("free".into()).spawn(freeing)?;
-        Ok((Self(Mutex::new(Some(rests))), thread))
+        Ok((Self(Mutex::new(Some(drops))), thread))
     }
 
     /// Frees what a session leaves behind, elsewhere.
-    pub(super) fn free(&self, rest: DeferredDrop) {
-        if let Some(rests) = &*lock(&self.0) {
-            let _ = rests.send(rest); // its thread ends only with the pool
+    pub(super) fn drop_later(&self, deferred: DeferredDrop) {
+        if let Some(drops) = &*lock(&self.0) {
+            let _ = drops.send(deferred); // its thread ends only with the pool
         }
     }
 
@@ -53,18 +53,18 @@ impl Reaper {
 }
 
 /// Frees what comes, as soon as it can be freed, until the pool ends.
-fn free(received: &mpsc::Receiver<DeferredDrop>) {
+fn reap(received: &mpsc::Receiver<DeferredDrop>) {
     let mut left: Vec<DeferredDrop> = Vec::new();
     loop {
-        let come = match left.is_empty() {
+        let next = match left.is_empty() {
             true => received.recv().map_err(|_| RecvTimeoutError::Disconnected),
             false => received.recv_timeout(REAP_INTERVAL),
         };
-        match come {
-            Ok(rest) => left.push(rest),
+        match next {
+            Ok(deferred) => left.push(deferred),
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => return,
         }
-        left.retain_mut(|rest| !rest());
+        left.retain_mut(|deferred| !deferred());
     }
 }

@@ -5,7 +5,7 @@ use super::{
     capacity::Capacity,
     job::{Continuation, INLINE_MAX_US, INLINE_MAX_US_UNCONTENDED, Job},
     reaper::Reaper,
-    rollout::round::RolloutTask,
+    rollout::task::RolloutTask,
     sync::lock,
 };
 use crate::{
@@ -50,7 +50,7 @@ impl Pool {
             waiting: AtomicUsize::new(0),
             ready: Condvar::new(),
             closing: AtomicBool::new(false),
-            last: AtomicPtr::default(),
+            last_stepped: AtomicPtr::default(),
             meters: Mutex::default(),
             waits: Histogram::default(),
         });
@@ -128,7 +128,7 @@ pub(super) struct Scheduler {
     /// Whether the pool ends, so that rollouts end with their present step.
     closing: AtomicBool,
     /// The job that stepped last; only to be compared.
-    last: AtomicPtr<Job>,
+    last_stepped: AtomicPtr<Job>,
     meters: Mutex<BTreeMap<&'static str, Arc<Meter>>>,
     waits: Histogram,
 }
@@ -144,8 +144,8 @@ struct Queue {
 
 impl Scheduler {
     /// Steps the environments of every shard on this thread, if that is cheap. Returns whether it did.
-    pub(super) fn step_here(&self, job: &Job) -> bool {
-        let tiny = if self.moves(job) { INLINE_MAX_US_UNCONTENDED } else { INLINE_MAX_US };
+    pub(super) fn step_inline(&self, job: &Job) -> bool {
+        let tiny = if self.mark_last_stepped(job) { INLINE_MAX_US_UNCONTENDED } else { INLINE_MAX_US };
         if job.cost > tiny {
             return false;
         }
@@ -156,7 +156,7 @@ impl Scheduler {
 
     /// Has the workers step the environments of every shard. Another step may follow.
     pub(super) fn begin_step(&self, job: &Arc<Job>) {
-        lock(&job.follow).begin();
+        lock(&job.pipelined).begin();
         self.begin(job);
     }
 
@@ -173,30 +173,30 @@ impl Scheduler {
     }
 
     /// Runs a rollout on the workers, its beginning and its steps, and returns it at its end.
-    pub(super) async fn play(
+    pub(super) async fn run_rollout(
         &self,
         job: &Arc<Job>,
-        round: Box<RolloutTask>,
+        rollout: Box<RolloutTask>,
         number: u64,
     ) -> Result<Box<RolloutTask>, Error> {
-        self.moves(job);
-        job.prepare_round(round);
+        self.mark_last_stepped(job);
+        job.prepare_rollout(rollout);
         self.push(job, 1, 1);
         self.wait(job, number).await?;
-        job.take_round().ok_or(Error::Defect)
+        job.take_rollout().ok_or(Error::Defect)
     }
 
     /// Notes that a job steps. Returns whether it was also the last one that did.
-    fn moves(&self, job: &Job) -> bool {
+    fn mark_last_stepped(&self, job: &Job) -> bool {
         let job = std::ptr::from_ref(job).cast_mut();
-        self.last.swap(job, Ordering::Relaxed) == job
+        self.last_stepped.swap(job, Ordering::Relaxed) == job
     }
 
     /// Waits until a job's first `number` requests that workers were asked for have ended.
     pub(super) async fn wait(&self, job: &Arc<Job>, number: u64) -> Result<(), Error> {
         let has_ended = || job.ended.load(Ordering::Acquire) >= number;
         // A job that is nearly done is worth more polls than a sleep: being woken costs more than many steps.
-        for _ in 0..job.patience {
+        for _ in 0..job.polls {
             if has_ended() {
                 break;
             }
@@ -258,18 +258,18 @@ impl Scheduler {
         lower(WORKER_NICENESS);
         while let Some(job) = self.pop() {
             if job.run_part(worker) {
-                self.conduct(&job);
+                self.after_step(&job);
             }
         }
     }
 
     /// At the end of a job's last part: notifies its session, and begins another step if a rollout or a pipelined step wants
     /// one.
-    fn conduct(&self, job: &Arc<Job>) {
+    fn after_step(&self, job: &Arc<Job>) {
         loop {
-            let next = job.conduct(self.closing.load(Ordering::Relaxed));
+            let next = job.after_step(self.closing.load(Ordering::Relaxed));
             if matches!(next, Continuation::Nothing) {
-                return job.tell();
+                return job.notify_done();
             }
             job.prepare();
             let shards = job.shards.len();
@@ -280,8 +280,8 @@ impl Scheduler {
                 self.push(job, shards, shards - 1);
             }
             if matches!(next, Continuation::Request) {
-                self.moves(job);
-                job.tell();
+                self.mark_last_stepped(job);
+                job.notify_done();
             }
             if !is_own {
                 return;

@@ -38,7 +38,7 @@ pub(super) struct SlotReset {
 
 impl SlotReset {
     /// The next episode.
-    pub(super) fn next(slot: usize) -> Self {
+    pub(super) fn next_episode(slot: usize) -> Self {
         Self { slot, seed: None, distributions: None, state: None }
     }
 }
@@ -80,9 +80,9 @@ pub(super) struct Shard {
     /// Slot of the batch and the episode that began there.
     pub(super) started: Vec<(u32, EpisodeStart)>,
     /// The receipts of `ended`, if receipts are arrays.
-    pub(super) ended_told: ReceiptColumns,
+    pub(super) ended_receipts: ReceiptColumns,
     /// The receipts of the episodes that began in a step, if receipts are arrays.
-    pub(super) started_told: ReceiptColumns,
+    pub(super) started_receipts: ReceiptColumns,
     pub(super) snapshots: Vec<Vec<u8>>,
     pub(super) failure: Option<env::Error>,
     terms: Vec<f64>,
@@ -92,12 +92,16 @@ impl Shard {
     /// A shard of slots from `first_slot` on, whose environments are yet to be made by [`Command::Open`].
     pub(super) fn new(settings: &BatchSettings, groups: Vec<SlotGroup>, first_slot: usize) -> Self {
         let size = groups.iter().map(|group| group.size).sum();
-        Self { groups, command: Command::Open, ..Self::of(settings, Vec::new(), (first_slot, size)) }
+        Self { groups, command: Command::Open, ..Self::with_environments(settings, Vec::new(), (first_slot, size)) }
     }
 
     /// A shard of `size` slots from `first_slot` on with these environments; its outputs are unknown yet but for the
     /// observations.
-    pub(super) fn of(settings: &BatchSettings, slots: Vec<Episodes>, (first_slot, size): (usize, usize)) -> Self {
+    pub(super) fn with_environments(
+        settings: &BatchSettings,
+        slots: Vec<Episodes>,
+        (first_slot, size): (usize, usize),
+    ) -> Self {
         let BatchSettings { spec, autoreset, receipts, receipt_arrays, observe_parameters, .. } = *settings;
         let observation_size = settings.observation_size();
         let (choices, vectors) = match spec.action {
@@ -127,8 +131,8 @@ impl Shard {
             final_observations: Vec::new(),
             ended: Vec::new(),
             started: Vec::new(),
-            ended_told: ReceiptColumns::default(),
-            started_told: ReceiptColumns::default(),
+            ended_receipts: ReceiptColumns::default(),
+            started_receipts: ReceiptColumns::default(),
             snapshots: Vec::new(),
             failure: None,
             terms: vec![0.0; spec.reward_terms.len()],
@@ -177,8 +181,8 @@ impl Shard {
     pub(super) fn run(&mut self) -> (usize, usize) {
         self.ended.clear();
         self.started.clear();
-        self.ended_told.clear();
-        self.started_told.clear();
+        self.ended_receipts.clear();
+        self.started_receipts.clear();
         self.final_observations.clear();
         self.snapshots.clear();
         self.failure = None;
@@ -187,7 +191,7 @@ impl Shard {
             Command::Step => steps = self.step(),
             Command::Open => self.open(),
             Command::Reset(resets) => resets.iter().for_each(|reset| self.reset(reset)),
-            Command::ResetAll => (0..self.size).for_each(|slot| self.reset(&SlotReset::next(slot))),
+            Command::ResetAll => (0..self.size).for_each(|slot| self.reset(&SlotReset::next_episode(slot))),
             Command::Snapshot(slots) => self.snapshots.extend(slots.iter().map(|&slot| self.slots[slot].snapshot())),
             Command::Restore(entries) => self.restore(&entries),
             Command::RollBack => self.roll_back(),
@@ -261,7 +265,7 @@ impl Shard {
         let as_message = self.receipts && !self.receipt_arrays;
         self.ended.push(((self.first_slot + slot) as u32, self.slots[slot].finished(as_message)));
         if self.receipts && self.receipt_arrays {
-            self.ended_told.push(self.first_slot + slot, &self.slots[slot]);
+            self.ended_receipts.push(self.first_slot + slot, &self.slots[slot]);
         }
         if self.autoreset == Autoreset::SameStep {
             self.slots[slot].begin(None);
@@ -306,7 +310,7 @@ impl Shard {
 
     fn note_start_in_step(&mut self, slot: usize) {
         if self.receipts && self.receipt_arrays {
-            self.started_told.push(self.first_slot + slot, &self.slots[slot]);
+            self.started_receipts.push(self.first_slot + slot, &self.slots[slot]);
         } else {
             self.note_start(slot);
         }
@@ -326,7 +330,7 @@ impl Shard {
 }
 
 /// Gives every shard its part of a batch's actions, i32 `[N]` or f32 `[N, A]`.
-pub(super) fn put_actions(shards: &[Mutex<Shard>], actions: &[u8]) {
+pub(super) fn set_actions(shards: &[Mutex<Shard>], actions: &[u8]) {
     let mut words = actions.as_chunks::<4>().0.iter();
     for shard in shards {
         let mut shard = lock(shard);

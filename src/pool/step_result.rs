@@ -1,7 +1,7 @@
 //! The result of a step, gathered from the shards.
 
 use super::{
-    encode::{put, put_wide},
+    encode::{push_f32, push_wide},
     receipts::ReceiptColumns,
     shard::Shard,
     sync::lock,
@@ -44,7 +44,7 @@ pub(super) struct ShardOutputs<'a> {
 
 impl ShardOutputs<'_> {
     /// Takes what the last step left in the shards, the reward's terms if they are wanted.
-    pub(super) fn stepped(mut self, reward_terms: bool) -> StepResult {
+    pub(super) fn step_result(mut self, reward_terms: bool) -> StepResult {
         StepResult {
             observations: self.observations(),
             rewards: self.f32(|shard| &shard.rewards),
@@ -54,8 +54,8 @@ impl ShardOutputs<'_> {
             final_observations: self.f32(|shard| &shard.final_observations),
             ended: collect(self.shards, |shard| &mut shard.ended),
             started: collect(self.shards, |shard| &mut shard.started),
-            receipt_episodes: self.told(|told| &told.episodes, u64::to_le_bytes),
-            receipt_values: self.told(|told| &told.values, f64::to_le_bytes),
+            receipt_episodes: self.receipts(|receipts| &receipts.episodes, u64::to_le_bytes),
+            receipt_values: self.receipts(|receipts| &receipts.values, f64::to_le_bytes),
         }
     }
 
@@ -66,17 +66,18 @@ impl ShardOutputs<'_> {
 
     fn f32(&mut self, field: impl Fn(&Shard) -> &Vec<f32>) -> Bytes {
         for shard in self.shards {
-            put(self.buffer, field(&lock(shard)));
+            push_f32(self.buffer, field(&lock(shard)));
         }
         self.buffer.split().freeze()
     }
 
     /// Gathers receipts of the episodes that ended in all shards, then of those that began.
-    fn told<T: Copy>(&mut self, column: fn(&ReceiptColumns) -> &Vec<T>, encode: fn(T) -> [u8; 8]) -> Bytes {
-        let parts: [fn(&Shard) -> &ReceiptColumns; 2] = [|shard| &shard.ended_told, |shard| &shard.started_told];
-        for told in parts {
+    fn receipts<T: Copy>(&mut self, column: fn(&ReceiptColumns) -> &Vec<T>, encode: fn(T) -> [u8; 8]) -> Bytes {
+        let parts: [fn(&Shard) -> &ReceiptColumns; 2] =
+            [|shard| &shard.ended_receipts, |shard| &shard.started_receipts];
+        for receipts in parts {
             for shard in self.shards {
-                put_wide(self.buffer, column(told(&lock(shard))), encode);
+                push_wide(self.buffer, column(receipts(&lock(shard))), encode);
             }
         }
         self.buffer.split().freeze()

@@ -51,17 +51,17 @@ impl Security {
         let wrong = |reason: String| io::Error::other(format!("{reason}; correct --tokens"));
         let before = file_watcher::read(std::slice::from_ref(&path)).map_err(wrong)?;
         let tokens = Tokens::new(catalogue.clone());
-        let renewed = tokens.clone();
+        let reloaded = tokens.clone();
         let name = path.display().to_string();
-        let renew = move |contents: &[Vec<u8>]| {
+        let reload = move |contents: &[Vec<u8>]| {
             let text = contents.first().map(|text| String::from_utf8_lossy(text)).unwrap_or_default();
-            renewed.renew(&text).map_err(|wrong| format!("{name}, {wrong}"))
+            reloaded.reload(&text).map_err(|wrong| format!("{name}, {wrong}"))
         };
-        renew(&before).map_err(wrong)?;
+        reload(&before).map_err(wrong)?;
         if tokens.count() == 0 {
             tracing::warn!("{} has no token: nobody can call by TCP", path.display());
         }
-        self.watches.push(FileWatcher::start("tokens", vec![path], before, renew)?);
+        self.watches.push(FileWatcher::start("tokens", vec![path], before, reload)?);
         Ok(tokens)
     }
 
@@ -71,9 +71,9 @@ impl Security {
         let paths = files.paths();
         let before = file_watcher::read(&paths).map_err(wrong)?;
         let tls = Tls::new(files, &before).map_err(wrong)?;
-        let renewed = tls.clone();
-        let renew = move |contents: &[Vec<u8>]| renewed.renew(contents);
-        self.watches.push(FileWatcher::start("the files of TLS", paths, before, renew)?);
+        let reloaded = tls.clone();
+        let reload = move |contents: &[Vec<u8>]| reloaded.reload(contents);
+        self.watches.push(FileWatcher::start("the files of TLS", paths, before, reload)?);
         Ok(tls)
     }
 }

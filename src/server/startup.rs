@@ -113,7 +113,7 @@ pub async fn run(
     let mut servers = serve(listeners, &router, &state.admission, guards.tls.as_ref(), &drain);
     tokio::select! {
         () = shutdown => {}
-        () = capacity_health::watch(&health, &state.places, &state.pool) => {}
+        () = capacity_health::report_capacity(&health, &state.limiter, &state.pool) => {}
         // A listener ends by itself only if it fails.
         Some(ended) = servers.join_next() => return Ok(ended.map_err(io::Error::other)??),
     }
@@ -142,7 +142,7 @@ pub fn listing(catalogue: &Catalogue, config: &Config) -> Result<proto::ListEnvi
 struct State {
     pool: Arc<Pool>,
     catalogue: Arc<Catalogue>,
-    places: PeerLimiter,
+    limiter: PeerLimiter,
     admission: ConnectionLimits,
     transit: StreamLimits,
     sessions: Sessions,
@@ -164,13 +164,13 @@ impl State {
         let connections = PeerLimiter::new(usize::MAX, of_a_peer.saturating_add(MAX_OTHER_STREAMS));
         let (errors, access, leased) =
             (ErrorCounters::default(), AccessLog::default(), lease::LeaseCounters::default());
-        let places = PeerLimiter::new(config.max_sessions, of_a_peer);
-        let sessions = Sessions::new(places.clone(), limits, drain, errors.clone(), access.clone(), leased.clone());
+        let limiter = PeerLimiter::new(config.max_sessions, of_a_peer);
+        let sessions = Sessions::new(limiter.clone(), limits, drain, errors.clone(), access.clone(), leased.clone());
         Ok(Self {
             pool,
             catalogue: Arc::new(catalogue),
-            places,
-            admission: ConnectionLimits { places: connections, handshake },
+            limiter,
+            admission: ConnectionLimits { limiter: connections, handshake },
             transit: StreamLimits {
                 budget: Budget::new(config.max_memory),
                 limit: seconds(config.stall_seconds),
@@ -205,12 +205,12 @@ impl State {
 
     /// The counters that the metrics read.
     fn sources(&self, requests: [RequestCounts; 2], guards: &Security, pictures: Arc<Histogram>) -> Sources {
-        requests.iter().for_each(|(protocol, _)| self.access.tell_of(protocol));
+        requests.iter().for_each(|(protocol, _)| self.access.register_protocol(protocol));
         Sources {
             pool: Arc::clone(&self.pool),
-            sessions: self.places.clone(),
+            sessions: self.limiter.clone(),
             leases: self.leased.clone(),
-            connections: self.admission.places.clone(),
+            connections: self.admission.limiter.clone(),
             budget: self.transit.budget.clone(),
             requests,
             errors: self.errors.clone(),

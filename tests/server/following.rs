@@ -44,12 +44,12 @@ async fn poll_once<F: Future>(mut future: Pin<&mut F>) -> Poll<F::Output> {
 
 /// Has a step begin and this one follow it; what came of the first, and whether it was under way before.
 async fn followed(batch: &mut Batch, first: &[u8], second: Bytes) -> (Result<StepResult, Error>, bool) {
-    let follower = batch.follower().unwrap();
+    let queue = batch.step_queue().unwrap();
     let mut stepping = pin!(batch.step(first));
     match poll_once(stepping.as_mut()).await {
         Poll::Ready(stepped) => (stepped, false),
         Poll::Pending => {
-            follower.follow(second);
+            queue.enqueue(second);
             (stepping.await, true)
         }
     }
@@ -102,10 +102,10 @@ async fn a_batch_with_a_step_that_follows_settles_and_can_be_dropped() {
     let first = actions(spec, 50);
     for t in 0..10 {
         let before = batch.steps();
-        let follower = batch.follower().unwrap();
+        let queue = batch.step_queue().unwrap();
         let _ = poll_once(pin!(batch.step(&actions(spec, t)))).await;
-        follower.follow(actions(spec, t));
-        batch.settle().await;
+        queue.enqueue(actions(spec, t));
+        batch.finish_abandoned().await;
         for _ in 0..(batch.steps() - before) / N as u64 {
             twin.step(&actions(spec, t)).await.unwrap();
         }
@@ -121,10 +121,10 @@ async fn a_batch_with_a_step_that_follows_settles_and_can_be_dropped() {
     }
     assert!(saved == twin.snapshot((0..N).collect()).await.unwrap());
 
-    let follower = batch.follower().unwrap();
+    let queue = batch.step_queue().unwrap();
     let _ = poll_once(pin!(batch.step(&first))).await;
-    follower.follow(first);
-    drop((batch, follower));
+    queue.enqueue(first);
+    drop((batch, queue));
     wait_until(|| pool.environments() == N).await;
 }
 
@@ -154,7 +154,7 @@ async fn a_step_that_fails_after_another_takes_its_batch_with_it_and_no_worker()
 async fn where_a_step_needs_to_know_what_came_of_the_one_before_none_follows() {
     let pool = Pool::new(1, N).unwrap();
     let (batch, ..) = Batch::open(&pool, acrobots(Autoreset::Disabled)).await.unwrap();
-    assert!(batch.follower().is_none());
+    assert!(batch.step_queue().is_none());
 }
 
 /// The responses to all of these requests, each sent after the response to the one before, or all at once.

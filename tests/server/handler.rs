@@ -49,7 +49,7 @@ async fn handler_without_grpc_gives_the_responses_of_a_server() {
     ];
     for request in requests {
         let reply = handler.answer(SessionRequest { request: Some(request.clone()) }).await;
-        let own = reply.map_or_else(Handler::refusal, |reply| reply.response);
+        let own = reply.map_or_else(Handler::error_response, |reply| reply.response);
         let served = SessionResponse { response: Some(session.answer(request).await) };
         assert_eq!(own, served);
     }

@@ -543,8 +543,8 @@ async fn a_batch_whose_step_nobody_waits_for_settles_and_goes_on_after_it() {
     for t in 0..20 {
         let (forgotten, next) = (actions(spec, 0, N, 2 * t), actions(spec, 0, N, 2 * t + 1));
         in_mid_step += u32::from(poll_once(pin!(batch.step(&forgotten))).await.is_pending());
-        batch.settle().await;
-        batch.settle().await;
+        batch.finish_abandoned().await;
+        batch.finish_abandoned().await;
         twin.step(&forgotten).await.unwrap();
         assert!(batch.step(&next).await.unwrap() == twin.step(&next).await.unwrap(), "step {t}");
     }

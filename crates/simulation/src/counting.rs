@@ -27,7 +27,7 @@ impl CountingSession {
 
     fn open(&mut self, open: &proto::Open) -> Result<CountingReply, Error> {
         self.is_open = true;
-        let grant = self.leases.give(None, open.lease as usize)?;
+        let grant = self.leases.grant(None, open.lease as usize)?;
         let (lease, time) = grant.as_ref().map(|grant| (grant.name.to_vec(), grant.time())).unwrap_or_default();
         let lease_seconds = time.as_secs() as u32;
         let opened = proto::Opened { lease: lease.into(), lease_seconds, ..Default::default() };
@@ -45,7 +45,7 @@ impl CountingSession {
     }
 
     async fn resume(&mut self, resume: &proto::Resume) -> Result<CountingReply, Error> {
-        let ticket = self.leases.ask(&resume.lease, None, resume.last_reply).await?;
+        let ticket = self.leases.resume(&resume.lease, None, resume.last_reply).await?;
         let resumed = proto::Resumed { last_reply: ticket.last_reply };
         Ok(Reply { handover: Some(StreamHandover::Resume(ticket)), ..reply(Response::Resumed(resumed)) })
     }
@@ -77,7 +77,7 @@ impl SessionHandler for CountingSession {
         }
     }
 
-    fn allowance(&self) -> RequestLimits {
+    fn request_limits(&self) -> RequestLimits {
         RequestLimits { bytes: MAX_BYTES, entries: 1, covered: 0 }
     }
 
@@ -85,7 +85,7 @@ impl SessionHandler for CountingSession {
         self.is_open
     }
 
-    fn about(&self) -> SessionStats {
+    fn stats(&self) -> SessionStats {
         SessionStats { steps: self.steps, ..SessionStats::default() }
     }
 
@@ -103,7 +103,7 @@ impl SessionHandler for CountingSession {
         None::<fn(Self::Request)>
     }
 
-    fn refusal(error: Error) -> Self::Response {
+    fn error_response(error: Error) -> Self::Response {
         proto::SessionResponse { response: Some(Response::Error(error.into())) }
     }
 }

@@ -55,14 +55,14 @@ pub struct StepLog {
     /// Numbers of the steps, in the order of the server.
     done: Arc<Mutex<Vec<u64>>>,
     numbers: LeaseCounters,
-    places: PeerLimiter,
+    limiter: PeerLimiter,
     counters: ErrorCounters,
 }
 
 impl Default for StepLog {
     fn default() -> Self {
-        let places = PeerLimiter::new(MAX_SESSIONS, MAX_SESSIONS);
-        Self { done: Arc::default(), numbers: LeaseCounters::default(), places, counters: ErrorCounters::default() }
+        let limiter = PeerLimiter::new(MAX_SESSIONS, MAX_SESSIONS);
+        Self { done: Arc::default(), numbers: LeaseCounters::default(), limiter, counters: ErrorCounters::default() }
     }
 }
 
@@ -84,7 +84,7 @@ impl StepLog {
 
     /// Tells whether no session is left, with or without a stream.
     pub fn is_idle(&self) -> bool {
-        self.places.taken() == 0 && self.numbers.detached() == 0
+        self.limiter.in_use() == 0 && self.numbers.detached() == 0
     }
 
     fn add(&self, step: u64) {
@@ -100,10 +100,10 @@ pub async fn serve(ledger: StepLog) -> turmoil::Result {
     let (_controller, drain) = Controller::new();
     let budget = Budget::new(MAX_BYTES);
     let limits = SessionLimits { bytes: MAX_BYTES, handshake: HANDSHAKE_TIMEOUT, idle: None };
-    let places = ledger.places.clone();
+    let limiter = ledger.limiter.clone();
     let numbers = ledger.numbers.clone();
     let counters = ledger.counters.clone();
-    let sessions = Sessions::new(places, limits, drain, counters, AccessLog::default(), numbers.clone());
+    let sessions = Sessions::new(limiter, limits, drain, counters, AccessLog::default(), numbers.clone());
     let counts = RequestCounters::new::<CountingSession>();
     let service = CountingService { sessions, leases: Leases::new(LEASE, numbers), ledger, counts };
     let transit = StreamLimits { budget, limit: Some(LEASE), handshake: HANDSHAKE_TIMEOUT };
@@ -112,7 +112,7 @@ pub async fn serve(ledger: StepLog) -> turmoil::Result {
     let incoming = stream::unfold((listener, connections), |(listener, connections)| async {
         let (stream, address) = listener.accept().await.ok()?;
         let peer = Peer::at(address.ip());
-        let place = connections.take(Some(peer)).ok()?;
+        let place = connections.acquire(Some(peer)).ok()?;
         let guarded = ManagedIo::new(stream, peer, place, HANDSHAKE_TIMEOUT);
         Some((Ok::<_, io::Error>(guarded), (listener, connections)))
     });

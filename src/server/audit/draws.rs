@@ -35,7 +35,7 @@ pub struct PendingDraws(Vec<DrawStart>);
 
 impl PendingDraws {
     /// Nothing of it was drawn.
-    fn withdrawn(self) -> Vec<DrawEnd> {
+    fn withdraw(self) -> Vec<DrawEnd> {
         self.0
             .into_iter()
             .map(|DrawStart { seed, index, count, .. }| DrawEnd { seed, index, count, episode: None })
@@ -81,7 +81,7 @@ impl DrawAuditor {
         if self.is_free() {
             return Ok(PendingDraws::default());
         }
-        let (mut befores, mut nows) = (Vec::new(), Vec::new());
+        let (mut previous, mut starts) = (Vec::new(), Vec::new());
         for ResetEntry { slot, seed, distributions, .. } in entries {
             if seed.is_none() && distributions.is_none() {
                 continue; // it goes on as before
@@ -91,15 +91,15 @@ impl DrawAuditor {
                 Some(seed) => Draw { seed, episode_index: 0, ..before },
                 None => Draw { episode_index: before.episode_index + 1, ..before },
             };
-            befores.push(before);
+            previous.push(before);
             let same = || batch.distributions(*slot);
-            nows.push((next, distributions.as_ref().map_or_else(same, |new| new.to_vec())));
+            starts.push((next, distributions.as_ref().map_or_else(same, |new| new.to_vec())));
         }
-        if befores.is_empty() {
+        if previous.is_empty() {
             return Ok(PendingDraws::default());
         }
-        let begins = nows.iter().map(|(draw, distributions)| (NextDraw { draw: *draw, distributions }, 1));
-        self.begin(batch.settings().spec, begins, befores).await
+        let begins = starts.iter().map(|(draw, distributions)| (NextDraw { draw: *draw, distributions }, 1));
+        self.begin(batch.settings().spec, begins, previous).await
     }
 
     /// Before environments are restored.
@@ -110,49 +110,49 @@ impl DrawAuditor {
         let spec = batch.settings().spec;
         let saved: Result<Vec<_>, env::Error> =
             entries.iter().map(|(_, snapshot)| saved_draw(spec, snapshot)).collect();
-        let mut nows = Vec::new();
+        let mut starts = Vec::new();
         for saved in saved? {
             let boxes = saved.distributions.chunks(spec.parameters.len().max(1));
             let are_drawn =
                 |of_box: &[Distribution]| of_box.iter().zip(&saved.values).all(|(set, value)| set.contains(*value));
             if !boxes.clone().any(are_drawn) {
                 // A client wrote them into the snapshot: they hold until the trial ends.
-                nows.push((saved.draw, saved.values.iter().copied().map(Distribution::fixed).collect()));
+                starts.push((saved.draw, saved.values.iter().copied().map(Distribution::fixed).collect()));
             }
-            nows.push((saved.draw, saved.distributions));
+            starts.push((saved.draw, saved.distributions));
         }
-        let befores = entries.iter().map(|(slot, _)| batch.draw(*slot)).collect();
-        let begins = nows.iter().map(|(draw, distributions)| (NextDraw { draw: *draw, distributions }, 1));
-        self.begin(spec, begins, befores).await
+        let previous = entries.iter().map(|(slot, _)| batch.draw(*slot)).collect();
+        let begins = starts.iter().map(|(draw, distributions)| (NextDraw { draw: *draw, distributions }, 1));
+        self.begin(spec, begins, previous).await
     }
 
     /// After environments could not be made.
-    pub fn not_opened(&self, spec: &EnvironmentSpec, begun: PendingDraws) {
-        self.note(spec, Vec::new(), Vec::new(), begun.withdrawn());
+    pub fn open_failed(&self, spec: &EnvironmentSpec, begun: PendingDraws) {
+        self.note(spec, Vec::new(), Vec::new(), begun.withdraw());
     }
 
     /// After environments could not be restored: those of these slots go on as before.
-    pub fn not_restored(&self, batch: &Batch, slots: &[usize], begun: PendingDraws) {
+    pub fn restore_failed(&self, batch: &Batch, slots: &[usize], begun: PendingDraws) {
         let spec = batch.settings().spec;
-        let befores: Vec<_> = slots.iter().map(|slot| (batch.draw(*slot), batch.distributions(*slot))).collect();
-        let begins = befores.iter().map(|(draw, distributions)| (NextDraw { draw: *draw, distributions }, 1));
-        let (regions, begins) = gathered(spec, begins);
-        self.note(spec, regions, begins, begun.withdrawn());
+        let previous: Vec<_> = slots.iter().map(|slot| (batch.draw(*slot), batch.distributions(*slot))).collect();
+        let begins = previous.iter().map(|(draw, distributions)| (NextDraw { draw: *draw, distributions }, 1));
+        let (regions, begins) = group_begins(spec, begins);
+        self.note(spec, regions, begins, begun.withdraw());
     }
 
     /// Before environments are freed that a session gives back.
     pub fn release(&self, batch: &Batch, slots: &[usize]) {
         if self.ledger.is_some() {
-            let befores = slots.iter().map(|slot| batch.draw(*slot));
-            self.note(batch.settings().spec, Vec::new(), Vec::new(), ended(befores));
+            let previous = slots.iter().map(|slot| batch.draw(*slot));
+            self.note(batch.settings().spec, Vec::new(), Vec::new(), group_ends(previous));
         }
     }
 
     /// Has a batch's end written down.
-    pub fn follow(&self, batch: &mut Batch) {
+    pub fn record_drop(&self, batch: &mut Batch) {
         if self.ledger.is_some() {
             let (own, spec) = (self.clone(), batch.settings().spec);
-            let tell = move |befores: Vec<Draw>| own.note(spec, Vec::new(), Vec::new(), ended(befores));
+            let tell = move |previous: Vec<Draw>| own.note(spec, Vec::new(), Vec::new(), group_ends(previous));
             batch.when_freed(Box::new(tell));
         }
     }
@@ -165,7 +165,11 @@ impl DrawAuditor {
         if let Some(ledger) = &self.ledger
             && self.refused.fetch_add(1, Ordering::Relaxed) < MAX_LOGGED_REFUSALS
         {
-            ledger.note(LedgerEvent::Refused { who: self.who(spec), region: region.clone(), reason: reason.clone() });
+            ledger.write_later(LedgerEvent::Refused {
+                who: self.who(spec),
+                region: region.clone(),
+                reason: reason.clone(),
+            });
         }
         Err(Error::NotAllowed { role: role.name().into(), environment: spec.name, region: region.to_string(), reason })
     }
@@ -189,15 +193,15 @@ impl DrawAuditor {
             }
         }
         let Some(ledger) = &self.ledger else { return Ok(PendingDraws::default()) };
-        let (regions, begins) = gathered(spec, begins);
+        let (regions, begins) = group_begins(spec, begins);
         let begun = PendingDraws(begins.clone());
-        ledger.write(self.event(spec, regions, begins, ended(ends))).await?;
+        ledger.write(self.event(spec, regions, begins, group_ends(ends))).await?;
         Ok(begun)
     }
 
     fn note(&self, spec: &EnvironmentSpec, regions: Vec<Region>, begins: Vec<DrawStart>, ends: Vec<DrawEnd>) {
         if let Some(ledger) = &self.ledger {
-            ledger.note(self.event(spec, regions, begins, ends));
+            ledger.write_later(self.event(spec, regions, begins, ends));
         }
     }
 
@@ -222,42 +226,42 @@ impl DrawAuditor {
 }
 
 /// Groups the environments that begin, neighbours with equal draws as one, and returns the regions that they draw from.
-fn gathered<'a>(
+fn group_begins<'a>(
     spec: &EnvironmentSpec,
     begins: impl Iterator<Item = (NextDraw<'a>, usize)>,
 ) -> (Vec<Region>, Vec<DrawStart>) {
     let mut last: Option<&[Distribution]> = None;
-    let (mut regions, mut gathered): (Vec<Region>, Vec<DrawStart>) = (Vec::new(), Vec::new());
+    let (mut regions, mut group_begins): (Vec<Region>, Vec<DrawStart>) = (Vec::new(), Vec::new());
     for (NextDraw { draw, distributions }, count) in begins {
         if last.replace(distributions) != Some(distributions) {
             regions.push(spec.region(distributions));
         }
         let Draw { seed, environment_index: index, episode_index: episode } = draw;
         let region = regions.len() as u32 - 1;
-        match gathered.last_mut() {
+        match group_begins.last_mut() {
             Some(last)
                 if (last.seed, last.region, last.episode) == (seed, region, episode)
                     && last.index.wrapping_add(last.count) == index =>
             {
                 last.count += count as u32;
             }
-            _ => gathered.push(DrawStart { seed, index, count: count as u32, region, episode }),
+            _ => group_begins.push(DrawStart { seed, index, count: count as u32, region, episode }),
         }
     }
-    (regions, gathered)
+    (regions, group_begins)
 }
 
 /// Groups the environments that end likewise.
-fn ended(draws: impl IntoIterator<Item = Draw>) -> Vec<DrawEnd> {
-    let mut ended: Vec<DrawEnd> = Vec::new();
+fn group_ends(draws: impl IntoIterator<Item = Draw>) -> Vec<DrawEnd> {
+    let mut group_ends: Vec<DrawEnd> = Vec::new();
     for Draw { seed, environment_index: index, episode_index } in draws {
         let episode = Some(episode_index);
-        match ended.last_mut() {
+        match group_ends.last_mut() {
             Some(last) if (last.seed, last.episode, last.index.wrapping_add(last.count)) == (seed, episode, index) => {
                 last.count += 1;
             }
-            _ => ended.push(DrawEnd { seed, index, count: 1, episode }),
+            _ => group_ends.push(DrawEnd { seed, index, count: 1, episode }),
         }
     }
-    ended
+    group_ends
 }

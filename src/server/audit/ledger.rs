@@ -42,21 +42,21 @@ impl Ledger {
         if there.chain.lines() == 0 && there.unfinished > 0 {
             return Err(io::Error::other("that is no ledger, and not empty: give another name"));
         }
-        let mut book = LedgerWriter {
+        let mut writer = LedgerWriter {
             file,
             path: path.to_owned(),
             bytes: there.bytes,
             chain: there.chain,
-            kept: Vec::new(),
+            pending: Vec::new(),
             is_torn: true,
         };
         let (version, commit) = (env!("CARGO_PKG_VERSION").into(), env!("PERTURB_COMMIT").into());
         let began = LedgerEvent::Began { version, commit, unfinished: there.unfinished };
-        book.write([&began]).map_err(io::Error::other)?;
+        writer.write([&began]).map_err(io::Error::other)?;
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
         File::open(folder)?.sync_all()?; // the name of a new file, too
         let (lines, received) = channel();
-        std::thread::Builder::new().name("ledger".into()).spawn(move || book.keep(&received))?;
+        std::thread::Builder::new().name("ledger".into()).spawn(move || writer.run(&received))?;
         Ok(Self { lines, sessions: Arc::default() })
     }
 
@@ -92,7 +92,7 @@ impl Ledger {
     }
 
     /// Has a line written, sooner or later.
-    pub fn note(&self, event: LedgerEvent) {
+    pub fn write_later(&self, event: LedgerEvent) {
         let _ = self.lines.send((event, None));
     }
 
@@ -113,14 +113,14 @@ struct LedgerWriter {
     /// Whether there may be more in the file.
     is_torn: bool,
     /// Lines without a waiter that could not be written yet.
-    kept: Vec<WriteRequest>,
+    pending: Vec<WriteRequest>,
 }
 
 impl LedgerWriter {
     /// Writes what comes, whatever has come meanwhile at once.
-    fn keep(mut self, received: &Receiver<WriteRequest>) {
+    fn run(mut self, received: &Receiver<WriteRequest>) {
         while let Ok(first) = received.recv() {
-            let mut lines = std::mem::take(&mut self.kept);
+            let mut lines = std::mem::take(&mut self.pending);
             lines.push(first);
             lines.extend(received.try_iter());
             let written = self.write(lines.iter().map(|(event, _)| event));
@@ -134,7 +134,7 @@ impl LedgerWriter {
             for (event, done) in lines {
                 match done {
                     Some(done) => drop(done.send(written.clone())),
-                    None if written.is_err() => self.kept.push((event, None)),
+                    None if written.is_err() => self.pending.push((event, None)),
                     None => {}
                 }
             }

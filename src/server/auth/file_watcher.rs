@@ -26,7 +26,7 @@ pub fn read(paths: &[PathBuf]) -> Contents {
 }
 
 impl FileWatcher {
-    /// Calls `renew` with what is in the files, which were read before, when it has changed and stays so for a moment:
+    /// Calls `reload` with what is in the files, which were read before, when it has changed and stays so for a moment:
     /// whoever writes them may not be done. If it refuses, that is logged, and the next change is waited for.
     ///
     /// # Errors
@@ -35,7 +35,7 @@ impl FileWatcher {
         what: &'static str,
         paths: Vec<PathBuf>,
         before: Vec<Vec<u8>>,
-        mut renew: impl FnMut(&[Vec<u8>]) -> Result<(), String> + Send + 'static,
+        mut reload: impl FnMut(&[Vec<u8>]) -> Result<(), String> + Send + 'static,
     ) -> io::Result<Self> {
         let (end, ended) = channel::<()>();
         let look = move || {
@@ -44,7 +44,7 @@ impl FileWatcher {
             while ended.recv_timeout(POLL_INTERVAL) == Err(RecvTimeoutError::Timeout) {
                 let now = read(&paths);
                 if now != taken && now == last {
-                    match now.as_ref().map_err(Clone::clone).and_then(|contents| renew(contents)) {
+                    match now.as_ref().map_err(Clone::clone).and_then(|contents| reload(contents)) {
                         Ok(()) => tracing::info!("read {what} again"),
                         Err(reason) => tracing::error!("{what} changed, and those of before stay in force: {reason}"),
                     }

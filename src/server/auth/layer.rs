@@ -66,7 +66,7 @@ where
     }
 
     fn call(&mut self, mut request: http::Request<Body>) -> Self::Future {
-        match self.tokens.as_ref().map(|tokens| tokens.admit(&request)).transpose() {
+        match self.tokens.as_ref().map(|tokens| tokens.authenticate(&request)).transpose() {
             Ok(bearer) => {
                 if let Some(bearer) = bearer.flatten() {
                     request.extensions_mut().insert(bearer);

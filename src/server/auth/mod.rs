@@ -39,7 +39,7 @@ pub struct Token {
     role: Option<Arc<Role>>,
     revoked: AtomicBool,
     /// Wakes the tasks that wait for the revocation.
-    told: Notify,
+    revoked_notify: Notify,
     /// The quotas of all tokens that have had this name.
     quotas: Arc<Quotas>,
 }
@@ -50,7 +50,7 @@ struct Quotas {
     sessions: Quota,
     envs: Quota,
     bytes: Quota,
-    pace: RateLimiter,
+    rate_limiter: RateLimiter,
     steps: AtomicU64,
     refusals: AtomicU64,
 }
@@ -83,41 +83,41 @@ impl Token {
     }
 
     /// Charges steps after they ran, because their number is unknown before.
-    pub fn stepped(&self, steps: u64) {
+    pub fn charge_steps(&self, steps: u64) {
         self.quotas.steps.fetch_add(steps, Ordering::Relaxed);
-        self.quotas.pace.add(steps);
+        self.quotas.rate_limiter.charge(steps);
     }
 
     /// Counts a refusal.
-    pub fn refused(&self) {
+    pub fn count_error(&self) {
         self.quotas.refusals.fetch_add(1, Ordering::Relaxed);
     }
 
-    fn used(&self) -> TokenUsage {
-        let Quotas { sessions, envs, bytes, pace, steps, refusals } = &*self.quotas;
+    fn usage(&self) -> TokenUsage {
+        let Quotas { sessions, envs, bytes, rate_limiter, steps, refusals } = &*self.quotas;
         TokenUsage {
             name: self.name.clone(),
             sessions: sessions.taken(),
             envs: envs.taken(),
             bytes: bytes.taken(),
             steps: steps.load(Ordering::Relaxed),
-            waited: pace.waited(),
+            waited: rate_limiter.waited(),
             refusals: refusals.load(Ordering::Relaxed),
         }
     }
 
     /// The most steps a second that its environments may take together; none: as many as there can be.
     pub fn rate(&self) -> Option<u32> {
-        self.quotas.pace.rate()
+        self.quotas.rate_limiter.rate()
     }
 
     /// Waits until its environments may step again.
     ///
     /// # Errors
     /// [`Error::TooFast`], at once, if that would be too long.
-    pub async fn turn(&self) -> Result<(), Error> {
-        let turn = self.quotas.pace.turn().await;
-        turn.map_err(|TooFast { rate, ahead }| Error::TooFast {
+    pub async fn acquire_steps(&self) -> Result<(), Error> {
+        let acquired = self.quotas.rate_limiter.acquire().await;
+        acquired.map_err(|TooFast { rate, ahead }| Error::TooFast {
             name: self.name.clone(),
             rate,
             seconds: ahead.as_secs(),
@@ -137,17 +137,17 @@ impl Token {
     /// Waits until it is in the file no more, or with another role, and gives the refusal of what comes then.
     pub async fn revoked(&self) -> Error {
         loop {
-            let told = self.told.notified();
+            let notified = self.revoked_notify.notified();
             if self.is_revoked() {
                 return Error::RevokedToken { name: self.name.clone() };
             }
-            told.await;
+            notified.await;
         }
     }
 
     fn revoke(&self) {
         self.revoked.store(true, Ordering::Release);
-        self.told.notify_waiters();
+        self.revoked_notify.notify_waiters();
     }
 
     /// Takes a session out of the quota.
@@ -167,12 +167,12 @@ impl Token {
     }
 
     /// An empty part of the quota of bytes in flight, to be grown.
-    pub fn no_bytes(self: &Arc<Self>) -> QuotaGuard {
-        QuotaGuard::nothing(Arc::clone(self), QuotaKind::Bytes)
+    pub fn reserve_bytes(self: &Arc<Self>) -> QuotaGuard {
+        QuotaGuard::empty(Arc::clone(self), QuotaKind::Bytes)
     }
 
     fn take(self: &Arc<Self>, count: usize, kind: QuotaKind) -> Result<QuotaGuard, Error> {
-        let mut held = QuotaGuard::nothing(Arc::clone(self), kind);
+        let mut held = QuotaGuard::empty(Arc::clone(self), kind);
         held.grow(count)?;
         Ok(held)
     }
@@ -198,15 +198,15 @@ impl Tokens {
     }
 
     /// The usage of each token.
-    pub fn used(&self) -> Vec<TokenUsage> {
-        self.good.read().unwrap_or_else(PoisonError::into_inner).iter().map(|token| token.used()).collect()
+    pub fn usage(&self) -> Vec<TokenUsage> {
+        self.good.read().unwrap_or_else(PoisonError::into_inner).iter().map(|token| token.usage()).collect()
     }
 
     /// Takes the file's new text: tokens that stay, with the same role, keep what they have, others are revoked.
     ///
     /// # Errors
     /// [`TokenFileError`]; then all stays as it is.
-    pub fn renew(&self, text: &str) -> Result<(), TokenFileError> {
+    pub fn reload(&self, text: &str) -> Result<(), TokenFileError> {
         let listed = listed(&self.catalogue, text)?;
         let mut tokens = self.good.write().unwrap_or_else(PoisonError::into_inner);
         let mut renewed = Vec::with_capacity(listed.len());
@@ -215,15 +215,20 @@ impl Tokens {
             // Another token of the same name has what was taken with the one before, too.
             let before = tokens.iter().find(|token| token.name == name);
             let quotas = before.map_or_else(Default::default, |token| Arc::clone(&token.quotas));
-            quotas.sessions.bound(max_sessions);
-            quotas.envs.bound(max_envs);
-            quotas.bytes.bound(max_bytes);
-            quotas.pace.bound(max_steps_per_second);
+            quotas.sessions.set_limit(max_sessions);
+            quotas.envs.set_limit(max_envs);
+            quotas.bytes.set_limit(max_bytes);
+            quotas.rate_limiter.set_rate(max_steps_per_second);
             renewed.push(match before.filter(|token| token.digest == digest && token.role == role) {
                 Some(token) => Arc::clone(token),
-                None => {
-                    Arc::new(Token { name, digest, role, revoked: AtomicBool::new(false), told: Notify::new(), quotas })
-                }
+                None => Arc::new(Token {
+                    name,
+                    digest,
+                    role,
+                    revoked: AtomicBool::new(false),
+                    revoked_notify: Notify::new(),
+                    quotas,
+                }),
             });
         }
         let gone = |token: &&Bearer| !renewed.iter().any(|kept| Arc::ptr_eq(kept, token));
@@ -244,7 +249,7 @@ impl Tokens {
     ///
     /// # Errors
     /// [`Error::NoToken`] or [`Error::WrongToken`].
-    fn admit(&self, request: &http::Request<Body>) -> Result<Option<Bearer>, Error> {
+    fn authenticate(&self, request: &http::Request<Body>) -> Result<Option<Bearer>, Error> {
         let peer = request.extensions().get::<Connection>().map(|connection| connection.peer);
         if matches!(peer, Some(Peer::User(_))) {
             return Ok(None);
@@ -269,7 +274,7 @@ mod tests {
 
     fn tokens_of(text: &str) -> Result<Tokens, TokenFileError> {
         let tokens = Tokens::new(crate::tasks::catalogue());
-        tokens.renew(text).map(|()| tokens)
+        tokens.reload(text).map(|()| tokens)
     }
 
     fn file(token: &str, more: &str) -> String {
@@ -298,7 +303,7 @@ mod tests {
     #[case::short(&file("correct-horse", ""), 1, "fewer than 16")]
     #[case::spaces(&file("correct horse battery", ""), 1, "visible")]
     #[case::no_number(&file(SECRET, "max_envs = \"correct-horse-battery\""), 4, "cannot be read")]
-    #[case::nothing(&file(SECRET, "max_envs = 0"), 1, "leave the token out")]
+    #[case::empty(&file(SECRET, "max_envs = 0"), 1, "leave the token out")]
     #[case::no_bytes(&file(SECRET, "max_bytes = 0"), 1, "leave the token out")]
     #[case::no_steps(&file(SECRET, "max_steps_per_second = 0"), 1, "leave the token out")]
     #[case::too_many_steps(&file(SECRET, "max_steps_per_second = 5000000000"), 4, "cannot be read")]
@@ -318,21 +323,21 @@ mod tests {
         let ann = tokens.find(SECRET.as_bytes()).unwrap();
         let mut held = ann.envs(6).unwrap();
         assert!(ann.envs(3).is_err());
-        held.give_back(1);
+        held.release(1);
         assert!(ann.envs(3).is_ok());
-        assert!(tokens.renew("[[token]]").is_err());
+        assert!(tokens.reload("[[token]]").is_err());
         assert!(tokens.find(SECRET.as_bytes()).is_some() && !ann.is_revoked());
-        tokens.renew(&file(SECRET, "max_envs = 10")).unwrap();
+        tokens.reload(&file(SECRET, "max_envs = 10")).unwrap();
         assert!(!ann.is_revoked() && ann.envs(6).is_err() && ann.envs(5).is_ok(), "what it has is remembered");
         let first = ann.session().unwrap();
         assert!(ann.session().is_ok(), "that quota is gone");
         let renewed = file("another-horse-battery", "max_envs = 10");
-        tokens.renew(&renewed).unwrap();
+        tokens.reload(&renewed).unwrap();
         let new = tokens.find(b"another-horse-battery").unwrap();
         assert!(ann.is_revoked() && new.envs(6).is_err() && new.envs(5).is_ok(), "the quota is the name's");
-        tokens.renew("").unwrap();
+        tokens.reload("").unwrap();
         assert!(new.is_revoked() && tokens.find(SECRET.as_bytes()).is_none());
         drop((first, held));
-        assert_eq!((ann.used().envs, ann.used().sessions), (0, 0));
+        assert_eq!((ann.usage().envs, ann.usage().sessions), (0, 0));
     }
 }

@@ -11,7 +11,7 @@ pub(super) struct Quota {
 }
 
 impl Quota {
-    pub(super) fn bound(&self, limit: Option<usize>) {
+    pub(super) fn set_limit(&self, limit: Option<usize>) {
         self.limit.store(limit.unwrap_or(usize::MAX), Ordering::Relaxed);
     }
 
@@ -36,7 +36,7 @@ pub(super) enum QuotaKind {
 }
 
 impl QuotaKind {
-    fn of(self, token: &Token) -> &Quota {
+    fn quota(self, token: &Token) -> &Quota {
         match self {
             Self::Sessions => &token.quotas.sessions,
             Self::Environments => &token.quotas.envs,
@@ -44,7 +44,7 @@ impl QuotaKind {
         }
     }
 
-    fn what(self) -> &'static str {
+    fn label(self) -> &'static str {
         match self {
             Self::Sessions => "sessions",
             Self::Environments => "environments",
@@ -62,7 +62,7 @@ pub struct QuotaGuard {
 
 impl QuotaGuard {
     /// Nothing of it yet.
-    pub(super) fn nothing(token: Bearer, kind: QuotaKind) -> Self {
+    pub(super) fn empty(token: Bearer, kind: QuotaKind) -> Self {
         Self { token, count: 0, kind }
     }
 
@@ -71,11 +71,11 @@ impl QuotaGuard {
     /// # Errors
     /// [`Error::QuotaExceeded`]; then it is as before.
     pub fn grow(&mut self, count: usize) -> Result<(), Error> {
-        self.kind.of(&self.token).take(count).map_err(|limit| Error::QuotaExceeded {
+        self.kind.quota(&self.token).take(count).map_err(|limit| Error::QuotaExceeded {
             name: self.token.name.clone(),
             wanted: count,
             limit,
-            what: self.kind.what(),
+            what: self.kind.label(),
         })?;
         self.count += count;
         Ok(())
@@ -83,13 +83,13 @@ impl QuotaGuard {
 
     /// Makes it so many, which may be more than the quota.
     pub fn set(&mut self, count: usize) {
-        let taken = &self.kind.of(&self.token).taken;
+        let taken = &self.kind.quota(&self.token).taken;
         taken.fetch_add(count, Ordering::Relaxed);
         taken.fetch_sub(std::mem::replace(&mut self.count, count), Ordering::Relaxed);
     }
 
     /// Gives some of it back.
-    pub fn give_back(&mut self, count: usize) {
+    pub fn release(&mut self, count: usize) {
         self.set(self.count.saturating_sub(count));
     }
 }

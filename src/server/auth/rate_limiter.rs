@@ -42,8 +42,8 @@ pub(super) struct TooFast {
 
 impl RateLimiter {
     /// From now on so many steps a second.
-    pub(super) fn bound(&self, rate: Option<u32>) {
-        self.lock().bound(rate, Instant::now());
+    pub(super) fn set_rate(&self, rate: Option<u32>) {
+        self.lock().set_rate(rate, Instant::now());
     }
 
     /// The most steps a second.
@@ -57,7 +57,7 @@ impl RateLimiter {
     }
 
     /// Counts steps that were done.
-    pub(super) fn add(&self, steps: u64) {
+    pub(super) fn charge(&self, steps: u64) {
         self.lock().done += steps as f64;
     }
 
@@ -65,7 +65,7 @@ impl RateLimiter {
     ///
     /// # Errors
     /// [`TooFast`], at once, if that takes more than half a minute.
-    pub(super) async fn turn(&self) -> Result<(), TooFast> {
+    pub(super) async fn acquire(&self) -> Result<(), TooFast> {
         let mut ticket = None;
         while let Some(wait) = self.wait(&mut ticket)? {
             sleep(wait).await;
@@ -83,13 +83,13 @@ impl RateLimiter {
 }
 
 impl State {
-    fn bound(&mut self, rate: Option<u32>, now: Instant) {
-        self.settle(now);
+    fn set_rate(&mut self, rate: Option<u32>, now: Instant) {
+        self.refill(now);
         self.rate = rate;
     }
 
     /// Allows what the time since the last call allows.
-    fn settle(&mut self, now: Instant) {
+    fn refill(&mut self, now: Instant) {
         let elapsed = self.at.map_or(Duration::ZERO, |at| now.saturating_duration_since(at)).as_secs_f64();
         self.allowed = match self.rate.map(f64::from) {
             Some(rate) => (self.allowed + elapsed * rate).min(self.done + BURST_SECONDS * rate),
@@ -101,7 +101,7 @@ impl State {
     /// Returns how long to sleep before calling again, or `None` when the caller may proceed. Pass an empty `ticket` on the
     /// first call.
     fn wait(&mut self, ticket: &mut Option<f64>, now: Instant) -> Result<Option<Duration>, TooFast> {
-        self.settle(now);
+        self.refill(now);
         let Some(rate) = self.rate else { return Ok(None) };
         let steps = *ticket.get_or_insert(self.done) - self.allowed;
         if steps <= 0.0 {
@@ -133,8 +133,8 @@ mod tests {
             Self { state: State::default(), now: Instant::now() }
         }
 
-        fn bound(&mut self, rate: u32) {
-            self.state.bound(Some(rate), self.now);
+        fn set_rate(&mut self, rate: u32) {
+            self.state.set_rate(Some(rate), self.now);
         }
 
         /// How long the next turn takes, s.
@@ -157,7 +157,7 @@ mod tests {
         let mut clocked = Clocked::new();
         clocked.state.done += 1e6;
         assert_eq!(clocked.turn(), Ok(0.0), "there is no rate");
-        clocked.bound(100);
+        clocked.set_rate(100);
         assert_eq!(clocked.turn(), Ok(0.0), "what was before is forgotten");
         clocked.state.done += 250.0;
         assert!(is_about(clocked.turn().unwrap(), 2.5));
@@ -173,7 +173,7 @@ mod tests {
     fn those_who_wait_go_one_after_the_other_at_the_rate() {
         const ROUNDS: usize = 50;
         let mut clocked = Clocked::new();
-        clocked.bound(1000);
+        clocked.set_rate(1000);
         let start = clocked.now;
         // When each asks next, with which ticket, and how often it had its turn.
         let mut sessions = [(start, None, 0); 4];
@@ -200,7 +200,7 @@ mod tests {
     #[test]
     fn who_is_half_a_minute_ahead_is_refused() {
         let mut clocked = Clocked::new();
-        clocked.bound(10);
+        clocked.set_rate(10);
         clocked.state.done += 400.0;
         assert_eq!(clocked.turn(), Err(TooFast { rate: 10, ahead: Duration::from_secs(40) }));
         clocked.now += Duration::from_secs(20);
@@ -210,12 +210,12 @@ mod tests {
     #[test]
     fn another_rate_counts_for_those_who_wait_already() {
         let mut clocked = Clocked::new();
-        clocked.bound(10);
+        clocked.set_rate(10);
         clocked.state.done += 200.0;
         let mut ticket = None;
         let wait = clocked.state.wait(&mut ticket, clocked.now).unwrap().unwrap();
         clocked.now += wait;
-        clocked.bound(1000);
+        clocked.set_rate(1000);
         let wait = clocked.state.wait(&mut ticket, clocked.now).unwrap().unwrap();
         assert!(is_about(wait.as_secs_f64(), 0.195), "{wait:?}");
     }
@@ -223,11 +223,11 @@ mod tests {
     #[test]
     fn who_waits_while_the_rate_is_lowered_is_refused_like_those_who_come() {
         let mut clocked = Clocked::new();
-        clocked.bound(1000);
+        clocked.set_rate(1000);
         clocked.state.done += 20_000.0;
         let mut ticket = None;
         assert!(clocked.state.wait(&mut ticket, clocked.now).is_ok_and(|wait| wait.is_some()));
-        clocked.bound(100);
+        clocked.set_rate(100);
         let refused = clocked.state.wait(&mut ticket, clocked.now);
         assert!(refused.is_err_and(|error| error.rate == 100), "some 200 s are half a minute at most for nobody");
     }

@@ -45,7 +45,7 @@ impl Collector for MetricsCollector {
         let mut page = Page(encoder);
         let labels = [("version", env!("CARGO_PKG_VERSION")), ("commit", env!("PERTURB_COMMIT"))];
         page.gauges("perturb_build_info", "1, with the version and the commit that were built", [(labels, 1.0)])?;
-        self.places(&mut page)?;
+        self.capacity(&mut page)?;
         self.requests(&mut page)?;
         self.environments(&mut page)?;
         self.tokens(&mut page)?;
@@ -55,13 +55,13 @@ impl Collector for MetricsCollector {
 
 impl MetricsCollector {
     /// Writes what is in use, and the limits.
-    fn places(&self, page: &mut Page<'_>) -> EncodeResult {
+    fn capacity(&self, page: &mut Page<'_>) -> EncodeResult {
         let Sources { pool, sessions, leases, connections, budget, .. } = &*self.0;
         for (name, help, value) in [
-            ("perturb_sessions", "Sessions now", sessions.taken()),
+            ("perturb_sessions", "Sessions now", sessions.in_use()),
             ("perturb_sessions_limit", "The most sessions at a time", sessions.limit()),
             ("perturb_sessions_detached", "Sessions now that have a lease and no stream", leases.detached()),
-            ("perturb_connections", "Connections now", connections.taken()),
+            ("perturb_connections", "Connections now", connections.in_use()),
             ("perturb_environments", "Environments now", pool.environments()),
             ("perturb_environments_limit", "The most environments", pool.limit()),
             ("perturb_in_flight_bytes", "Bytes in flight now", budget.used()),
@@ -114,7 +114,7 @@ impl MetricsCollector {
     }
 
     fn tokens(&self, page: &mut Page<'_>) -> EncodeResult {
-        let tokens = self.0.tokens.as_ref().map(|tokens| tokens.used()).unwrap_or_default();
+        let tokens = self.0.tokens.as_ref().map(|tokens| tokens.usage()).unwrap_or_default();
         let each = |number: fn(&crate::server::auth::TokenUsage) -> f64| {
             tokens.iter().map(move |used| ([("token", used.name.as_str())], number(used)))
         };

@@ -42,7 +42,7 @@ pub struct SessionRecord<'a> {
     /// The protocol of the session.
     pub protocol: &'static str,
     /// The environment, and the steps that were taken.
-    pub about: SessionStats,
+    pub stats: SessionStats,
     /// The duration of the session.
     pub time: Duration,
     /// The number of streams that resumed it; `None` if there were none.
@@ -65,7 +65,7 @@ struct State {
 
 impl AccessLog {
     /// Has [`endings`](Self::endings) tell of sessions of this protocol before the first one ends.
-    pub fn tell_of(&self, protocol: &'static str) {
+    pub fn register_protocol(&self, protocol: &'static str) {
         let mut state = self.lock();
         for ending in [GONE, CLOSED, BROKEN, LEASE_OVER] {
             state.endings.entry((protocol, ending)).or_default();
@@ -73,15 +73,15 @@ impl AccessLog {
     }
 
     /// Adds a session's end.
-    pub fn ended(&self, ended: &SessionRecord<'_>) {
-        if !self.has_room(ended.protocol, ended.ending) {
+    pub fn record(&self, ended: &SessionRecord<'_>) {
+        if !self.count(ended.protocol, ended.ending) {
             return;
         }
         let SessionRecord {
             peer,
             token,
             protocol,
-            about: SessionStats { environment, envs, steps },
+            stats: SessionStats { environment, envs, steps },
             time,
             resumed,
             ending,
@@ -99,7 +99,7 @@ impl AccessLog {
     }
 
     /// Counts a session. Returns whether it gets a line.
-    fn has_room(&self, protocol: &'static str, ending: &'static str) -> bool {
+    fn count(&self, protocol: &'static str, ending: &'static str) -> bool {
         let mut state = self.lock();
         *state.endings.entry((protocol, ending)).or_default() += 1;
         let now = Instant::now();
@@ -115,13 +115,13 @@ impl AccessLog {
             let (access, end) = (self.clone(), *since + WINDOW);
             runtime.spawn(async move {
                 tokio::time::sleep_until(end).await;
-                access.tell_left_out();
+                access.log_left_out();
             });
         }
         *wanted <= MAX_LINES_PER_WINDOW
     }
 
-    fn tell_left_out(&self) {
+    fn log_left_out(&self) {
         let window = self.lock().window.take();
         let left_out = window.map_or(0, |(_, wanted)| wanted.saturating_sub(MAX_LINES_PER_WINDOW));
         tracing::info!(target: "perturb::access", left_out, "more sessions ended than there are lines for");

@@ -8,10 +8,10 @@ use tonic_health::{ServingStatus, server::HealthReporter};
 pub const NEW_SESSIONS: &str = "perturb.v1.Perturb.NewSessions";
 
 /// Keeps the health of [`NEW_SESSIONS`], for ever.
-pub async fn watch(health: &HealthReporter, sessions: &PeerLimiter, pool: &Pool) {
+pub async fn report_capacity(health: &HealthReporter, sessions: &PeerLimiter, pool: &Pool) {
     let mut told = None;
     loop {
-        let full = sessions.taken() >= sessions.limit() || pool.environments() >= pool.limit();
+        let full = sessions.in_use() >= sessions.limit() || pool.environments() >= pool.limit();
         let status = if full { ServingStatus::NotServing } else { ServingStatus::Serving };
         if told.replace(full) != Some(full) {
             health.set_service_status(NEW_SESSIONS, status).await;

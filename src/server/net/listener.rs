@@ -38,7 +38,7 @@ pub enum Listener {
 #[derive(Clone)]
 pub struct ConnectionLimits {
     /// The limiter of connections.
-    pub places: PeerLimiter,
+    pub limiter: PeerLimiter,
     /// The time in which a client must begin.
     pub handshake: Duration,
 }
@@ -46,27 +46,27 @@ pub struct ConnectionLimits {
 impl ConnectionLimits {
     /// The connection, if there is a place for it.
     fn admit<S>(&self, stream: S, peer: Peer) -> Option<ManagedIo<S>> {
-        self.place(peer).map(|place| ManagedIo::new(stream, peer, place, self.handshake))
+        self.acquire(peer).map(|permit| ManagedIo::new(stream, peer, permit, self.handshake))
     }
 
-    fn place(&self, peer: Peer) -> Option<PeerPermit> {
+    fn acquire(&self, peer: Peer) -> Option<PeerPermit> {
         let full = |full| tracing::debug!(?peer, ?full, "closed a connection for which there is no place");
-        self.places.take(Some(peer)).map_err(full).ok()
+        self.limiter.acquire(Some(peer)).map_err(full).ok()
     }
 
     /// The connection, if its client finishes the handshake in time.
-    async fn shake(
+    async fn handshake(
         self,
         stream: TcpStream,
         peer: Peer,
-        place: PeerPermit,
+        permit: PeerPermit,
         tls: Tls,
     ) -> Option<ManagedIo<TlsStream<TcpStream>>> {
         let refused = |reason: &dyn ToString| {
             tracing::debug!(?peer, reason = reason.to_string(), "closed a connection in its handshake");
         };
         match timeout(self.handshake, tls.accept(stream)).await {
-            Ok(Ok(stream)) => return Some(ManagedIo::new(stream, peer, place, self.handshake)),
+            Ok(Ok(stream)) => return Some(ManagedIo::new(stream, peer, permit, self.handshake)),
             Ok(Err(error)) => refused(&error),
             Err(late) => refused(&late),
         }
@@ -77,48 +77,48 @@ impl ConnectionLimits {
 /// Connections as they come, without Nagle's delay: a step is one small message each way.
 pub fn tcp_connections(
     listener: TcpListener,
-    admission: ConnectionLimits,
+    limits: ConnectionLimits,
 ) -> impl Stream<Item = io::Result<ManagedIo<TcpStream>>> {
-    stream::unfold((listener, admission), |(listener, admission)| async {
+    stream::unfold((listener, limits), |(listener, limits)| async {
         let connection = loop {
             match listener.accept().await {
                 Ok((connection, address)) => {
                     // It fails for connections that are gone already.
                     let _ = connection.set_nodelay(true);
-                    if let Some(connection) = admission.admit(connection, Peer::at(address.ip())) {
+                    if let Some(connection) = limits.admit(connection, Peer::at(address.ip())) {
                         break connection;
                     }
                 }
                 Err(error) => pause(&error).await,
             }
         };
-        Some((Ok(connection), (listener, admission)))
+        Some((Ok(connection), (listener, limits)))
     })
 }
 
 /// Connections whose clients have finished the handshake, in the order in which they finish: none waits for another.
 pub fn tls_connections(
     listener: TcpListener,
-    admission: ConnectionLimits,
+    limits: ConnectionLimits,
     tls: Tls,
 ) -> impl Stream<Item = io::Result<ManagedIo<TlsStream<TcpStream>>>> {
-    stream::unfold((listener, admission, tls, JoinSet::new()), |(listener, admission, tls, mut shaking)| async {
+    stream::unfold((listener, limits, tls, JoinSet::new()), |(listener, limits, tls, mut handshakes)| async {
         let connection = loop {
             tokio::select! {
                 accepted = listener.accept() => match accepted {
                     Ok((connection, address)) => {
                         let _ = connection.set_nodelay(true);
                         let peer = Peer::at(address.ip());
-                        if let Some(place) = admission.place(peer) {
-                            shaking.spawn(admission.clone().shake(connection, peer, place, tls.clone()));
+                        if let Some(permit) = limits.acquire(peer) {
+                            handshakes.spawn(limits.clone().handshake(connection, peer, permit, tls.clone()));
                         }
                     }
                     Err(error) => pause(&error).await,
                 },
-                Some(done) = shaking.join_next() => if let Ok(Some(connection)) = done { break connection },
+                Some(done) = handshakes.join_next() => if let Ok(Some(connection)) = done { break connection },
             }
         };
-        Some((Ok(connection), (listener, admission, tls, shaking)))
+        Some((Ok(connection), (listener, limits, tls, handshakes)))
     })
 }
 
@@ -126,21 +126,21 @@ pub fn tls_connections(
 pub fn unix_connections(
     listener: UnixListener,
     file: SocketFile,
-    admission: ConnectionLimits,
+    limits: ConnectionLimits,
 ) -> impl Stream<Item = io::Result<ManagedIo<UnixStream>>> {
-    stream::unfold((listener, file, admission), |(listener, file, admission)| async {
+    stream::unfold((listener, file, limits), |(listener, file, limits)| async {
         let connection = loop {
             match listener.accept().await {
                 Ok((connection, _)) => {
                     let user = connection.peer_cred().ok().map(|credentials| credentials.uid());
-                    if let Some(connection) = admission.admit(connection, Peer::User(user)) {
+                    if let Some(connection) = limits.admit(connection, Peer::User(user)) {
                         break connection;
                     }
                 }
                 Err(error) => pause(&error).await,
             }
         };
-        Some((Ok(connection), (listener, file, admission)))
+        Some((Ok(connection), (listener, file, limits)))
     })
 }
 

@@ -27,20 +27,20 @@ const PREFACE_BYTES: usize = 24;
 pub struct Connection {
     /// The peer of the connection.
     pub peer: Peer,
-    end: Arc<End>,
+    kill_switch: Arc<KillSwitch>,
 }
 
 #[derive(Default)]
-struct End {
-    came: AtomicBool,
+struct KillSwitch {
+    requested: AtomicBool,
     waker: AtomicWaker,
 }
 
 impl Connection {
     /// Ends it, with all its calls.
-    pub fn end(&self) {
-        self.end.came.store(true, Ordering::Release);
-        self.end.waker.wake();
+    pub fn close(&self) {
+        self.kill_switch.requested.store(true, Ordering::Release);
+        self.kill_switch.waker.wake();
     }
 }
 
@@ -50,19 +50,19 @@ pub struct ManagedIo<S> {
     connection: Connection,
     /// The bytes of the preface that have not come, and until when they may.
     preface: Option<(usize, Pin<Box<Sleep>>)>,
-    _place: PeerPermit,
+    _permit: PeerPermit,
 }
 
 impl<S> ManagedIo<S> {
     /// Gives the client so long to begin.
-    pub fn new(stream: S, peer: Peer, place: PeerPermit, limit: Duration) -> Self {
+    pub fn new(stream: S, peer: Peer, permit: PeerPermit, limit: Duration) -> Self {
         let preface = Some((PREFACE_BYTES, Box::pin(sleep(limit))));
-        Self { stream, connection: Connection { peer, end: Arc::default() }, preface, _place: place }
+        Self { stream, connection: Connection { peer, kill_switch: Arc::default() }, preface, _permit: permit }
     }
 
     fn check(&self, context: &Context<'_>) -> io::Result<()> {
-        self.connection.end.waker.register(context.waker());
-        let ended = self.connection.end.came.load(Ordering::Acquire);
+        self.connection.kill_switch.waker.register(context.waker());
+        let ended = self.connection.kill_switch.requested.load(Ordering::Acquire);
         if ended { Err(ErrorKind::ConnectionAborted.into()) } else { Ok(()) }
     }
 }
@@ -70,7 +70,7 @@ impl<S> ManagedIo<S> {
 impl<S> Drop for ManagedIo<S> {
     /// Nobody needs to be woken any more; the waker would keep the connection's memory as long as a call knows of it.
     fn drop(&mut self) {
-        self.connection.end.waker.take();
+        self.connection.kill_switch.waker.take();
     }
 }
 

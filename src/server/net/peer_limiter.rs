@@ -42,10 +42,10 @@ impl fmt::Display for Peer {
 pub struct PeerLimiter(Arc<State>);
 
 struct State {
-    all: usize,
-    each: usize,
-    taken: Mutex<(usize, BTreeMap<Peer, usize>)>,
-    /// Told whenever `taken` has changed.
+    max_total: usize,
+    max_per_peer: usize,
+    in_use: Mutex<(usize, BTreeMap<Peer, usize>)>,
+    /// Notified whenever `in_use` has changed.
     changed: Notify,
 }
 
@@ -60,46 +60,46 @@ pub enum LimitReached {
 
 /// A permit, until it is dropped.
 pub struct PeerPermit {
-    places: PeerLimiter,
+    limiter: PeerLimiter,
     peer: Option<Peer>,
 }
 
 impl PeerLimiter {
     /// A limiter with a limit in all, and one for each peer.
-    pub fn new(all: usize, each: usize) -> Self {
-        Self(Arc::new(State { all, each, taken: Mutex::default(), changed: Notify::new() }))
+    pub fn new(max_total: usize, max_per_peer: usize) -> Self {
+        Self(Arc::new(State { max_total, max_per_peer, in_use: Mutex::default(), changed: Notify::new() }))
     }
 
     /// Takes a permit for a peer. An unknown peer has no limit of its own.
     ///
     /// # Errors
     /// [`LimitReached`].
-    pub fn take(&self, peer: Option<Peer>) -> Result<PeerPermit, LimitReached> {
-        let mut taken = self.lock();
-        let (all, by_peer) = &mut *taken;
-        if *all >= self.0.all {
-            return Err(LimitReached::All(self.0.all));
+    pub fn acquire(&self, peer: Option<Peer>) -> Result<PeerPermit, LimitReached> {
+        let mut in_use = self.lock();
+        let (total, by_peer) = &mut *in_use;
+        if *total >= self.0.max_total {
+            return Err(LimitReached::All(self.0.max_total));
         }
         if let Some(peer) = peer {
-            let its = by_peer.entry(peer).or_default();
-            if *its >= self.0.each {
-                return Err(LimitReached::Peer(self.0.each));
+            let count = by_peer.entry(peer).or_default();
+            if *count >= self.0.max_per_peer {
+                return Err(LimitReached::Peer(self.0.max_per_peer));
             }
-            *its += 1;
+            *count += 1;
         }
-        *all += 1;
+        *total += 1;
         self.0.changed.notify_one();
-        Ok(PeerPermit { places: self.clone(), peer })
+        Ok(PeerPermit { limiter: self.clone(), peer })
     }
 
     /// The number of permits in use.
-    pub fn taken(&self) -> usize {
+    pub fn in_use(&self) -> usize {
         self.lock().0
     }
 
     /// The limit in all.
     pub fn limit(&self) -> usize {
-        self.0.all
+        self.0.max_total
     }
 
     /// Waits until the number in use has changed since the last call, for one caller.
@@ -108,21 +108,21 @@ impl PeerLimiter {
     }
 
     fn lock(&self) -> MutexGuard<'_, (usize, BTreeMap<Peer, usize>)> {
-        self.0.taken.lock().unwrap_or_else(PoisonError::into_inner)
+        self.0.in_use.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl Drop for PeerPermit {
     fn drop(&mut self) {
-        let mut taken = self.places.lock();
-        let (all, by_peer) = &mut *taken;
-        *all -= 1;
-        self.places.0.changed.notify_one();
+        let mut in_use = self.limiter.lock();
+        let (total, by_peer) = &mut *in_use;
+        *total -= 1;
+        self.limiter.0.changed.notify_one();
         if let Some(peer) = self.peer
-            && let Some(its) = by_peer.get_mut(&peer)
+            && let Some(count) = by_peer.get_mut(&peer)
         {
-            *its -= 1;
-            if *its == 0 {
+            *count -= 1;
+            if *count == 0 {
                 by_peer.remove(&peer);
             }
         }
@@ -146,13 +146,13 @@ mod tests {
     #[test]
     fn a_peer_takes_its_own_places_and_no_more() {
         let [one, other] = [1, 2].map(|user| Some(Peer::User(Some(user))));
-        let places = PeerLimiter::new(4, 2);
-        let [first, _second] = [places.take(one), places.take(one)].map(Result::unwrap);
-        assert_eq!(places.take(one).err(), Some(LimitReached::Peer(2)));
-        let _others = [places.take(other), places.take(None)].map(Result::unwrap);
-        assert_eq!(places.take(other).err(), Some(LimitReached::All(4)));
+        let limiter = PeerLimiter::new(4, 2);
+        let [first, _second] = [limiter.acquire(one), limiter.acquire(one)].map(Result::unwrap);
+        assert_eq!(limiter.acquire(one).err(), Some(LimitReached::Peer(2)));
+        let _others = [limiter.acquire(other), limiter.acquire(None)].map(Result::unwrap);
+        assert_eq!(limiter.acquire(other).err(), Some(LimitReached::All(4)));
         drop(first);
-        assert!(places.take(one).is_ok());
-        assert!(places.take(one).is_ok(), "that place was given back");
+        assert!(limiter.acquire(one).is_ok());
+        assert!(limiter.acquire(one).is_ok(), "that place was given back");
     }
 }

@@ -83,7 +83,7 @@ impl Tls {
     ///
     /// # Errors
     /// What is wrong with which of them; then all stays as it is.
-    pub fn renew(&self, contents: &[Vec<u8>]) -> Result<(), String> {
+    pub fn reload(&self, contents: &[Vec<u8>]) -> Result<(), String> {
         let config = Arc::new(configured(&self.files, contents)?);
         *self.config.write().unwrap_or_else(PoisonError::into_inner) = config;
         Ok(())

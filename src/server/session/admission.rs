@@ -19,7 +19,7 @@ use std::time::Duration;
 /// The sessions of a server: their limits, and the shutdown.
 #[derive(Clone)]
 pub struct Sessions {
-    places: PeerLimiter,
+    limiter: PeerLimiter,
     pub(super) limits: SessionLimits,
     pub(super) decoder: Decoder,
     pub(super) drain: Drain,
@@ -42,14 +42,14 @@ pub struct SessionLimits {
 impl Sessions {
     /// The sessions that this limiter admits. Errors and endings are counted.
     pub fn new(
-        places: PeerLimiter,
+        limiter: PeerLimiter,
         limits: SessionLimits,
         drain: Drain,
         counters: ErrorCounters,
         access: AccessLog,
         leases: LeaseCounters,
     ) -> Self {
-        Self { places, limits, decoder: Decoder::default(), drain, counters, access, leases }
+        Self { limiter, limits, decoder: Decoder::default(), drain, counters, access, leases }
     }
 
     /// The phase of the shutdown.
@@ -59,9 +59,9 @@ impl Sessions {
 
     /// Admits a stream. One that finds the server full may still resume a session if its protocol has leases.
     pub(super) fn admit(&self, requests: &MessageReader, has_leases: bool) -> Result<Admission, Error> {
-        match self.take_place(requests) {
+        match self.acquire_permits(requests) {
             Err(refusal) if has_leases => self.admit_to_resume(refusal),
-            seat => seat,
+            admission => admission,
         }
     }
 
@@ -76,8 +76,8 @@ impl Sessions {
             refusal,
             Error::SessionsFull { .. } | Error::PeerFull { .. } | Error::Auth(auth::Error::QuotaExceeded { .. })
         );
-        match self.leases.spare().filter(|_| is_full) {
-            Some(spare) => Ok(Admission::Spare(spare, refusal)),
+        match self.leases.admit_resuming().filter(|_| is_full) {
+            Some(guard) => Ok(Admission::ResumeOnly(guard, refusal)),
             None => Err(refusal),
         }
     }
@@ -86,20 +86,20 @@ impl Sessions {
     pub(super) fn count(&self, error: &impl RequestError, bearer: Option<&Bearer>) {
         self.counters.count(error.kind());
         if let Some(bearer) = bearer {
-            bearer.refused();
+            bearer.count_error();
         }
     }
 
-    fn take_place(&self, requests: &MessageReader) -> Result<Admission, Error> {
+    fn acquire_permits(&self, requests: &MessageReader) -> Result<Admission, Error> {
         if self.phase() != Phase::Running {
             return Err(Error::Draining);
         }
-        let place = self.places.take(requests.connection.as_ref().map(|connection| connection.peer));
-        let place = place.map_err(|full| match full {
+        let permit = self.limiter.acquire(requests.connection.as_ref().map(|connection| connection.peer));
+        let permit = permit.map_err(|full| match full {
             LimitReached::All(limit) => Error::SessionsFull { limit },
             LimitReached::Peer(limit) => Error::PeerFull { limit },
         })?;
-        Ok(Admission::Own(place, requests.bearer.as_ref().map(Token::session).transpose()?))
+        Ok(Admission::Own(permit, requests.bearer.as_ref().map(Token::session).transpose()?))
     }
 }
 
@@ -108,5 +108,5 @@ pub(super) enum Admission {
     /// Admitted with a permit of its own, and one of its token.
     Own(#[expect(dead_code, reason = "held")] PeerPermit, #[expect(dead_code, reason = "held")] Option<QuotaGuard>),
     /// Admitted although the server is full. If its first request does not resume a session, it ends with this error.
-    Spare(#[expect(dead_code, reason = "held")] CountGuard, Error),
+    ResumeOnly(#[expect(dead_code, reason = "held")] CountGuard, Error),
 }

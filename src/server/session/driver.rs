@@ -55,18 +55,18 @@ impl Sessions {
         handler: H,
         counts: &Arc<RequestCounters>,
     ) -> Result<Responses<H::Response>, Status> {
-        let seat = self.admit(&requests, H::RESUMES.is_some()).map_err(|error| {
+        let admission = self.admit(&requests, H::RESUMES.is_some()).map_err(|error| {
             self.count(&error, requests.bearer.as_ref());
             status(&error)
         })?;
         let (responses, mut received) = mpsc::channel::<Result<OutgoingResponse<H::Response>, Status>>(1);
         let outbox = requests.outbox.clone();
-        let exchange = Exchange::new(requests, handler, Arc::clone(counts), self.enter(), seat);
+        let exchange = Exchange::new(requests, handler, Arc::clone(counts), self.enter(), admission);
         tokio::spawn(SessionDriver { exchange, lease: None }.run(responses));
         let stream = stream::poll_fn(move |context| {
             received.poll_recv(context).map(|response| {
                 Some(response?.map(|OutgoingResponse { response, memory }| {
-                    memory.into_iter().for_each(|share| outbox.put(share));
+                    memory.into_iter().for_each(|share| outbox.push(share));
                     response
                 }))
             })
@@ -164,7 +164,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         closed: Pin<&mut impl Future<Output = ()>>,
     ) -> Result<(), Attachment<H::Response>> {
         if let Some(lease) = &mut self.lease {
-            lease.stored.asked();
+            lease.stored.on_request();
             match self.exchange.answer(message).await {
                 Ok(answer) => self.store_reply(answer),
                 Err(stop) => return Err(self.stopped(responses, stop)),
@@ -196,7 +196,7 @@ impl<H: SessionHandler> SessionDriver<H> {
             Some(StreamHandover::Lease(grant)) => {
                 // A request that was read ahead would be lost with its stream, and come again.
                 self.exchange.reads_ahead = false;
-                self.lease = Some(Lease { stored: ReplayBuffer::new(grant.most), grant, sent: 0 });
+                self.lease = Some(Lease { stored: ReplayBuffer::new(grant.max_unanswered), grant, sent: 0 });
                 None
             }
             Some(StreamHandover::Resume(ticket)) => Some(ticket),
@@ -210,8 +210,9 @@ impl<H: SessionHandler> SessionDriver<H> {
         let Some(ticket) = resumed else { return Ok(()) };
         self.exchange.ending = MOVED;
         // If the session has ended by now, the stream ends at once.
-        let _ =
-            ticket.arrival.send(ResumingStream { requests: self.exchange.requests.leave(), line: responses.clone() });
+        let _ = ticket
+            .stream
+            .send(ResumingStream { requests: self.exchange.requests.detach(), responses: responses.clone() });
         Err(Attachment::Ended)
     }
 
@@ -241,7 +242,7 @@ impl<H: SessionHandler> SessionDriver<H> {
     async fn detached(&mut self, mut resuming: Option<Resuming<H::Response>>) -> Attachment<H::Response> {
         let Self { exchange, lease } = self;
         let Some(lease) = lease else { return Attachment::Ended };
-        let _counted = lease.grant.numbers().detach();
+        let _counted = lease.grant.counters().detach();
         let over = Instant::now() + lease.grant.time();
         let bearer = exchange.requests.bearer.clone();
         loop {
@@ -252,17 +253,17 @@ impl<H: SessionHandler> SessionDriver<H> {
                 arrived = arrival(&mut resuming) => {
                     resuming = None;
                     match arrived {
-                        Ok(ResumingStream { requests, line }) => {
+                        Ok(ResumingStream { requests, responses }) => {
                             exchange.requests = requests;
                             exchange.resumed += 1;
                             exchange.ending = GONE;
-                            lease.grant.numbers().add_resumed();
-                            return Attachment::Attached(line);
+                            lease.grant.counters().add_resumed();
+                            return Attachment::Attached(responses);
                         }
                         Err(_) => continue, // that stream was lost, too
                     }
                 }
-                Some(ask) = lease.grant.asks.recv() => {
+                Some(ask) = lease.grant.resume_requests.recv() => {
                     resuming = lease.accept_resume(ask).or(resuming);
                     continue;
                 }
@@ -293,7 +294,7 @@ impl<H: SessionHandler> SessionDriver<H> {
     /// Leaves the stream. Without a lease the session ends.
     fn detach(&mut self, resuming: Option<Resuming<H::Response>>) -> Attachment<H::Response> {
         let Some(lease) = &mut self.lease else { return Attachment::Ended };
-        drop(self.exchange.requests.leave());
+        drop(self.exchange.requests.detach());
         lease.stored.replies_mut().for_each(|reply| reply.outgoing = None);
         Attachment::Detached(resuming)
     }
@@ -332,12 +333,12 @@ impl<H: SessionHandler> SessionDriver<H> {
         let Reply { response, memory: outgoing, .. } = exchange.finish(answer);
         let (budget, bytes) = (exchange.requests.budget().clone(), response.encoded_len() + REPLY_OVERHEAD_BYTES);
         let held: usize = stored.replies().map(|reply| reply.memory.as_ref().map_or(0, MemoryReservation::bytes)).sum();
-        let mut memory = budget.take(bytes);
+        let mut memory = budget.reserve(bytes);
         if memory.is_err() || held + bytes > MAX_STORED_BYTES {
             stored.clear();
-            memory = memory.or_else(|_| budget.take(bytes));
+            memory = memory.or_else(|_| budget.reserve(bytes));
         }
-        stored.made(StoredReply { response, memory: memory.ok(), outgoing });
+        stored.push_reply(StoredReply { response, memory: memory.ok(), outgoing });
     }
 }
 
@@ -360,7 +361,7 @@ impl<R: Clone> Lease<R> {
             return None;
         }
         let (arrival, resuming) = oneshot::channel();
-        answer.send(Ok(ResumeAccepted { last_reply: self.stored.last(), arrival })).ok()?;
+        answer.send(Ok(ResumeAccepted { last_reply: self.stored.last(), stream: arrival })).ok()?;
         self.sent = last_reply;
         Some(resuming)
     }
@@ -377,7 +378,7 @@ fn end_stream<R: Send + 'static>(responses: &ResponseSender<R>, status: Status) 
 /// Waits for a stream that asks for the session; for ever without a lease.
 async fn resume_request<R>(lease: &mut Option<Lease<R>>) -> ResumeRequest<R> {
     if let Some(lease) = lease
-        && let Some(ask) = lease.grant.asks.recv().await
+        && let Some(ask) = lease.grant.resume_requests.recv().await
     {
         return ask;
     }

@@ -51,7 +51,7 @@ pub(super) struct Exchange<H: SessionHandler> {
     pub(super) ending: &'static str,
     /// The number of streams that resumed the session.
     pub(super) resumed: u32,
-    seat: Admission,
+    admission: Admission,
 }
 
 impl<H: SessionHandler> Exchange<H> {
@@ -60,7 +60,7 @@ impl<H: SessionHandler> Exchange<H> {
         handler: H,
         counts: Arc<RequestCounters>,
         sessions: Sessions,
-        seat: Admission,
+        admission: Admission,
     ) -> Self {
         let start = Instant::now();
         Self {
@@ -78,7 +78,7 @@ impl<H: SessionHandler> Exchange<H> {
             awake: AdaptiveSpin::default(),
             ending: GONE,
             resumed: 0,
-            seat,
+            admission,
         }
     }
 
@@ -86,7 +86,7 @@ impl<H: SessionHandler> Exchange<H> {
     /// was: nothing is lost.
     pub(super) async fn request(&mut self) -> Result<Option<Message>, StreamStop<H::Error>> {
         let SessionLimits { handshake, idle, .. } = self.sessions.limits;
-        let allowance = self.allowance();
+        let limits = self.request_limits();
         let bearer = self.requests.bearer.clone();
         self.was_open = self.handler.is_open();
         let Self { requests, ahead, came_ahead, awake, .. } = self;
@@ -94,7 +94,7 @@ impl<H: SessionHandler> Exchange<H> {
         let next = async {
             match ahead.take() {
                 Some(request) => request,
-                None => awake.until(requests.next(allowance)).await,
+                None => awake.until(requests.next(limits)).await,
             }
         };
         let limit = if self.was_open { idle } else { Some(idle.map_or(handshake, |idle| idle.min(handshake))) };
@@ -121,8 +121,8 @@ impl<H: SessionHandler> Exchange<H> {
         &mut self,
         message: Message,
     ) -> Result<Result<Reply<H::Response>, H::Error>, StreamStop<H::Error>> {
-        match (self.respond(message).await?, &self.seat) {
-            (Err(error), Admission::Spare(..)) => Err(StreamStop::Refused(error)),
+        match (self.respond(message).await?, &self.admission) {
+            (Err(error), Admission::ResumeOnly(..)) => Err(StreamStop::Refused(error)),
             (answer, _) => Ok(answer),
         }
     }
@@ -152,23 +152,23 @@ impl<H: SessionHandler> Exchange<H> {
             () = self.sessions.drain.closed() => return Err(refused(Error::Draining)),
             error = revoked(bearer.as_ref()) => return Err(refused(error)),
         }
-        let request = match self.sessions.decoder.decode(request, H::FIELDS, self.allowance()).await? {
+        let request = match self.sessions.decoder.decode(request, H::FIELDS, self.request_limits()).await? {
             Ok(request) => request,
             Err(error) => return Ok(self.undecoded(error)),
         };
-        if let Admission::Spare(_, refusal) = &self.seat
+        if let Admission::ResumeOnly(_, refusal) = &self.admission
             && !H::RESUMES.is_some_and(|resumes| resumes(&request))
         {
             return Err(refused(refusal.clone()));
         }
         let offer = if self.reads_ahead { self.handler.pipeline(&request) } else { None };
-        let allowance = self.allowance();
+        let limits = self.request_limits();
         let Self { handler, counts, requests, ahead, .. } = self;
         tokio::select! {
             biased; // the answer is mostly there at once
             answer = counts.answer(handler, request) => Ok(answer),
             error = revoked(bearer.as_ref()) => Err(refused(error)),
-            never = read_ahead::<H>(requests, ahead, offer, allowance) => match never {},
+            never = read_ahead::<H>(requests, ahead, offer, limits) => match never {},
         }
     }
 
@@ -180,7 +180,7 @@ impl<H: SessionHandler> Exchange<H> {
         }
         answer.unwrap_or_else(|error| {
             self.count(&error);
-            Reply::new(H::refusal(error))
+            Reply::new(H::error_response(error))
         })
     }
 
@@ -205,9 +205,9 @@ impl<H: SessionHandler> Exchange<H> {
         self.ending = error.kind().reason();
     }
 
-    fn allowance(&self) -> RequestLimits {
-        let allowance = self.handler.allowance();
-        RequestLimits { bytes: allowance.bytes.min(self.sessions.limits.bytes), ..allowance }
+    fn request_limits(&self) -> RequestLimits {
+        let limits = self.handler.request_limits();
+        RequestLimits { bytes: limits.bytes.min(self.sessions.limits.bytes), ..limits }
     }
 
     fn count(&self, error: &impl RequestError) {
@@ -224,8 +224,8 @@ impl<H: SessionHandler> Exchange<H> {
     /// Charges the token for the steps since the last call.
     fn charge_steps(&mut self) {
         if let Some(bearer) = &self.requests.bearer {
-            let steps = self.handler.about().steps;
-            bearer.stepped(steps.saturating_sub(self.charged));
+            let steps = self.handler.stats().steps;
+            bearer.charge_steps(steps.saturating_sub(self.charged));
             self.charged = steps;
         }
     }
@@ -237,11 +237,11 @@ impl<H: SessionHandler> Drop for Exchange<H> {
             return;
         }
         self.charge_steps();
-        self.sessions.access.ended(&SessionRecord {
+        self.sessions.access.record(&SessionRecord {
             peer: self.requests.connection.as_ref().map(|connection| connection.peer),
             token: self.requests.bearer.as_ref().map(|bearer| bearer.name()),
             protocol: H::PROTOCOL,
-            about: self.handler.about(),
+            stats: self.handler.stats(),
             time: self.start.elapsed(),
             resumed: (self.resumed > 0).then_some(self.resumed),
             ending: self.ending,
@@ -254,12 +254,12 @@ async fn read_ahead<H: SessionHandler>(
     requests: &mut MessageReader,
     ahead: &mut Option<Result<Option<Message>, StreamStop>>,
     offer: Option<impl FnOnce(H::Request)>,
-    allowance: RequestLimits,
+    limits: RequestLimits,
 ) -> Infallible {
     if let Some(offer) = offer.filter(|_| ahead.is_none()) {
-        let came = requests.next(allowance).await;
+        let came = requests.next(limits).await;
         if let Ok(Some(Message::Whole(bytes, _))) = &came
-            && let Some(request) = decoded_at_once(bytes.clone(), H::FIELDS, allowance)
+            && let Some(request) = decoded_at_once(bytes.clone(), H::FIELDS, limits)
         {
             offer(request);
         }
@@ -284,7 +284,7 @@ pub(super) async fn revoked(bearer: Option<&Bearer>) -> auth::Error {
 /// Resolves when the token, if there is one, lets its environments step.
 async fn wait_for_rate(bearer: Option<&Bearer>) -> Result<(), auth::Error> {
     match bearer {
-        Some(bearer) => bearer.turn().await,
+        Some(bearer) => bearer.acquire_steps().await,
         None => Ok(()),
     }
 }

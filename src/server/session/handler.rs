@@ -58,13 +58,13 @@ pub trait SessionHandler: Send + 'static {
     fn kind(request: &Self::Request) -> &'static str;
 
     /// The size limits of the next request.
-    fn allowance(&self) -> RequestLimits;
+    fn request_limits(&self) -> RequestLimits;
 
     /// Whether the session holds something that a shutdown should wait for.
     fn is_open(&self) -> bool;
 
     /// The environment of the session, and its steps so far.
-    fn about(&self) -> SessionStats;
+    fn stats(&self) -> SessionStats;
 
     /// Answers a request.
     ///
@@ -80,5 +80,5 @@ pub trait SessionHandler: Send + 'static {
     fn pipeline(&self, request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<Self>>;
 
     /// The response to a request that is refused.
-    fn refusal(error: Self::Error) -> Self::Response;
+    fn error_response(error: Self::Error) -> Self::Response;
 }

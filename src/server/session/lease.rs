@@ -94,7 +94,7 @@ impl<R> Clone for Leases<R> {
 
 struct State<R> {
     time: Duration,
-    numbers: LeaseCounters,
+    counters: LeaseCounters,
     leases: Mutex<Vec<Lease<R>>>,
 }
 
@@ -102,7 +102,7 @@ struct State<R> {
 struct Lease<R> {
     name: Id,
     bearer: Option<Bearer>,
-    asks: mpsc::Sender<ResumeRequest<R>>,
+    resume_requests: mpsc::Sender<ResumeRequest<R>>,
 }
 
 /// Counters of leases.
@@ -136,27 +136,27 @@ impl LeaseCounters {
     /// Counts a session that has no stream, until the guard is dropped.
     pub fn detach(&self) -> CountGuard {
         self.0.detached.fetch_add(1, Ordering::Relaxed);
-        CountGuard { numbers: self.clone(), of: |counts| &counts.detached }
+        CountGuard { counters: self.clone(), counter: |counts| &counts.detached }
     }
 
     /// Admits one stream over the limit for resuming only. There are at most as many as leases.
-    pub fn spare(&self) -> Option<CountGuard> {
+    pub fn admit_resuming(&self) -> Option<CountGuard> {
         let held = self.0.held.load(Ordering::Relaxed);
         let taken = |spares: usize| (spares < held).then_some(spares + 1);
         self.0.spares.fetch_update(Ordering::Relaxed, Ordering::Relaxed, taken).ok()?;
-        Some(CountGuard { numbers: self.clone(), of: |counts| &counts.spares })
+        Some(CountGuard { counters: self.clone(), counter: |counts| &counts.spares })
     }
 }
 
 /// Counts one until it is dropped.
 pub struct CountGuard {
-    numbers: LeaseCounters,
-    of: fn(&LeaseCounts) -> &AtomicUsize,
+    counters: LeaseCounters,
+    counter: fn(&LeaseCounts) -> &AtomicUsize,
 }
 
 impl Drop for CountGuard {
     fn drop(&mut self) {
-        (self.of)(&self.numbers.0).fetch_sub(1, Ordering::Relaxed);
+        (self.counter)(&self.counters.0).fetch_sub(1, Ordering::Relaxed);
     }
 }
 
@@ -173,7 +173,7 @@ pub struct ResumeAccepted<R> {
     /// The number of the last reply that there is.
     pub last_reply: u64,
     /// The sender that takes the stream to the session.
-    pub arrival: oneshot::Sender<ResumingStream<R>>,
+    pub stream: oneshot::Sender<ResumingStream<R>>,
 }
 
 /// A stream that resumes a session.
@@ -181,7 +181,7 @@ pub struct ResumingStream<R> {
     /// The requests of the stream.
     pub requests: MessageReader,
     /// The sender of its responses.
-    pub line: ResponseSender<R>,
+    pub responses: ResponseSender<R>,
 }
 
 /// A session's lease, until it is dropped.
@@ -190,41 +190,46 @@ pub struct LeaseGuard<R> {
     /// The name of the session.
     pub name: Id,
     /// The maximum number of unanswered requests of its client.
-    pub most: usize,
+    pub max_unanswered: usize,
     /// The streams that ask to resume the session.
-    pub asks: mpsc::Receiver<ResumeRequest<R>>,
+    pub resume_requests: mpsc::Receiver<ResumeRequest<R>>,
 }
 
 impl<R> Leases<R> {
     /// No leases yet. Each holds for `time` without a stream.
-    pub fn new(time: Duration, numbers: LeaseCounters) -> Self {
-        Self(Arc::new(State { time, numbers, leases: Mutex::default() }))
+    pub fn new(time: Duration, counters: LeaseCounters) -> Self {
+        Self(Arc::new(State { time, counters, leases: Mutex::default() }))
     }
 
     /// Grants a session a lease, unless leases are switched off.
     ///
     /// # Errors
     /// [`NoRandomness`].
-    pub fn give(&self, bearer: Option<Bearer>, most: usize) -> Result<Option<LeaseGuard<R>>, NoRandomness> {
+    pub fn grant(&self, bearer: Option<Bearer>, max_unanswered: usize) -> Result<Option<LeaseGuard<R>>, NoRandomness> {
         if self.0.time.is_zero() {
             return Ok(None);
         }
         let name = random()?;
         // One at a time is answered.
-        let (sender, asks) = mpsc::channel(1);
-        self.lock().push(Lease { name, bearer, asks: sender });
-        self.0.numbers.0.held.fetch_add(1, Ordering::Relaxed);
-        Ok(Some(LeaseGuard { leases: self.clone(), name, most, asks }))
+        let (sender, resume_requests) = mpsc::channel(1);
+        self.lock().push(Lease { name, bearer, resume_requests: sender });
+        self.0.counters.0.held.fetch_add(1, Ordering::Relaxed);
+        Ok(Some(LeaseGuard { leases: self.clone(), name, max_unanswered, resume_requests }))
     }
 
     /// Asks to resume the session of this name, for a client that received replies up to a number.
     ///
     /// # Errors
     /// [`Error`].
-    pub async fn ask(&self, name: &[u8], bearer: Option<&Bearer>, last_reply: u64) -> Result<ResumeAccepted<R>, Error> {
+    pub async fn resume(
+        &self,
+        name: &[u8],
+        bearer: Option<&Bearer>,
+        last_reply: u64,
+    ) -> Result<ResumeAccepted<R>, Error> {
         let (answer, answered) = oneshot::channel();
-        let asks = self.find(name, bearer)?;
-        asks.send(ResumeRequest { last_reply, answer }).await.map_err(|_| Error::Unknown)?;
+        let resume_requests = self.find(name, bearer)?;
+        resume_requests.send(ResumeRequest { last_reply, answer }).await.map_err(|_| Error::Unknown)?;
         answered.await.map_err(|_| Error::Unknown)?
     }
 
@@ -234,12 +239,12 @@ impl<R> Leases<R> {
         let found = leases
             .iter()
             .fold(None, |found, lease| if lease.name[..].ct_eq(name).into() { Some(lease) } else { found });
-        let Lease { bearer: own, asks, .. } = found.ok_or(Error::Unknown)?;
+        let Lease { bearer: own, resume_requests, .. } = found.ok_or(Error::Unknown)?;
         // A name that has another token now has lost its sessions.
         if own.as_ref().map(|own| own.name()) != bearer.map(|bearer| bearer.name()) {
             return Err(Error::OtherToken);
         }
-        Ok(asks.clone())
+        Ok(resume_requests.clone())
     }
 
     fn lock(&self) -> MutexGuard<'_, Vec<Lease<R>>> {
@@ -254,14 +259,14 @@ impl<R> LeaseGuard<R> {
     }
 
     /// Counters of leases.
-    pub fn numbers(&self) -> &LeaseCounters {
-        &self.leases.0.numbers
+    pub fn counters(&self) -> &LeaseCounters {
+        &self.leases.0.counters
     }
 }
 
 impl<R> Drop for LeaseGuard<R> {
     fn drop(&mut self) {
         self.leases.lock().retain(|lease| lease.name != self.name);
-        self.numbers().0.held.fetch_sub(1, Ordering::Relaxed);
+        self.counters().0.held.fetch_sub(1, Ordering::Relaxed);
     }
 }

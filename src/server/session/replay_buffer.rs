@@ -6,14 +6,14 @@ use std::collections::VecDeque;
 /// The replies 1, 2, 3, …, of which the last few are stored.
 pub struct ReplayBuffer<R> {
     last: u64,
-    most: usize,
+    max_unanswered: usize,
     replies: VecDeque<R>,
 }
 
 impl<R> ReplayBuffer<R> {
-    /// An empty buffer. The client has at most `most` unanswered requests, at least 1.
-    pub fn new(most: usize) -> Self {
-        Self { last: 0, most, replies: VecDeque::new() }
+    /// An empty buffer. The client has at most `max_unanswered` unanswered requests, at least 1.
+    pub fn new(max_unanswered: usize) -> Self {
+        Self { last: 0, max_unanswered, replies: VecDeque::new() }
     }
 
     /// The number of the last reply.
@@ -21,14 +21,14 @@ impl<R> ReplayBuffer<R> {
         self.last
     }
 
-    /// Records a request. At most `most` are unanswered, so the client has received all earlier replies, which are dropped.
-    pub fn asked(&mut self) {
-        let received = (self.replies.len() + 1).saturating_sub(self.most);
+    /// Records a request. At most `max_unanswered` are unanswered, so the client has received all earlier replies, which are dropped.
+    pub fn on_request(&mut self) {
+        let received = (self.replies.len() + 1).saturating_sub(self.max_unanswered);
         self.replies.drain(..received);
     }
 
     /// Stores the next reply.
-    pub fn made(&mut self, reply: R) {
+    pub fn push_reply(&mut self, reply: R) {
         self.last += 1;
         self.replies.push_back(reply);
     }
@@ -79,14 +79,14 @@ mod tests {
     #[test]
     fn a_request_says_that_what_its_client_does_not_wait_for_was_received() {
         let mut kept = ReplayBuffer::new(1);
-        kept.asked();
-        kept.made('a');
+        kept.on_request();
+        kept.push_reply('a');
         assert_eq!((kept.check(0), kept.check(1), kept.get_mut(1)), (Ok(()), Ok(()), Some(&mut 'a')));
         assert_eq!(kept.check(2), Err(Error::NoReply { got: 2, last: 1 }));
-        kept.asked();
+        kept.on_request();
         assert_eq!(kept.check(0), Err(Error::Forgotten { got: 0, first: 1 }));
         assert_eq!((kept.check(1), kept.get_mut(1)), (Ok(()), None), "that one was received, and is not wanted");
-        kept.made('b');
+        kept.push_reply('b');
         assert_eq!([1, 2, 3].map(|number| kept.get_mut(number).copied()), [None, Some('b'), None]);
         kept.clear();
         assert_eq!((kept.check(1), kept.check(2)), (Err(Error::Forgotten { got: 1, first: 2 }), Ok(())));
@@ -97,17 +97,17 @@ mod tests {
         /// never holds more.
         #[test]
         fn nothing_that_was_not_received_is_let_go_and_no_more_is_held(
-            most in 1_usize..8,
+            max_unanswered in 1_usize..8,
             moves in prop::collection::vec(0_u8..3, 0..200),
         ) {
-            let mut kept = ReplayBuffer::new(most);
+            let mut kept = ReplayBuffer::new(max_unanswered);
             let (mut sent, mut received) = (0, 0);
             for what in moves {
                 match what {
-                    0 if sent - received < most as u64 => sent += 1,
+                    0 if sent - received < max_unanswered as u64 => sent += 1,
                     1 if kept.last() < sent => {
-                        kept.asked();
-                        kept.made(kept.last() + 1);
+                        kept.on_request();
+                        kept.push_reply(kept.last() + 1);
                     }
                     2 if received < kept.last() => received += 1,
                     _ => {}
@@ -118,7 +118,7 @@ mod tests {
                 }
                 let last = kept.last();
                 prop_assert_eq!(kept.get_mut(last + 1), None);
-                prop_assert!(kept.replies.len() <= most);
+                prop_assert!(kept.replies.len() <= max_unanswered);
                 prop_assert!(kept.check(kept.last() + 1).is_err());
             }
         }

@@ -28,7 +28,7 @@ impl Budget {
     }
 
     /// A handle to the same budget, whose reservations also count against this token's quota.
-    pub fn of(&self, bearer: Option<Bearer>) -> Self {
+    pub fn for_token(&self, bearer: Option<Bearer>) -> Self {
         Self { state: Arc::clone(&self.state), bearer }
     }
 
@@ -43,16 +43,20 @@ impl Budget {
     }
 
     /// An empty reservation, to be grown.
-    pub fn nothing(&self) -> MemoryReservation {
-        MemoryReservation { state: Arc::clone(&self.state), bytes: 0, held: self.bearer.as_ref().map(Token::no_bytes) }
+    pub fn empty(&self) -> MemoryReservation {
+        MemoryReservation {
+            state: Arc::clone(&self.state),
+            bytes: 0,
+            held: self.bearer.as_ref().map(Token::reserve_bytes),
+        }
     }
 
     /// Reserves bytes, until the reservation is dropped.
     ///
     /// # Errors
     /// [`Error::MemoryFull`], [`Error::Auth`].
-    pub fn take(&self, bytes: usize) -> Result<MemoryReservation, Error> {
-        let mut share = self.nothing();
+    pub fn reserve(&self, bytes: usize) -> Result<MemoryReservation, Error> {
+        let mut share = self.empty();
         share.grow(bytes)?;
         Ok(share)
     }
@@ -90,7 +94,7 @@ impl MemoryReservation {
             }
             Err(used) => {
                 if let Some(held) = &mut self.held {
-                    held.give_back(bytes);
+                    held.release(bytes);
                 }
                 Err(Error::MemoryFull { wanted: bytes, used, limit: *limit })
             }
@@ -98,7 +102,7 @@ impl MemoryReservation {
     }
 
     /// Changes the size to what was made in the end, which may be more than was expected.
-    pub fn set(&mut self, bytes: usize) {
+    pub fn resize(&mut self, bytes: usize) {
         if let Some(held) = &mut self.held {
             held.set(bytes);
         }
@@ -120,13 +124,13 @@ pub struct PendingReservations(Arc<Mutex<Vec<MemoryReservation>>>);
 
 impl PendingReservations {
     /// Adds the reservation of a reply.
-    pub fn put(&self, share: MemoryReservation) {
+    pub fn push(&self, share: MemoryReservation) {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).push(share);
     }
 
     /// Attaches the reservations, and what `hold` makes, to the bytes of a reply. They are held until the last of the bytes is
     /// written or dropped. Without reservations the bytes are returned as they are.
-    pub fn send<H: Send + 'static>(&self, bytes: Bytes, hold: impl FnOnce() -> H) -> Bytes {
+    pub fn attach<H: Send + 'static>(&self, bytes: Bytes, hold: impl FnOnce() -> H) -> Bytes {
         let shares = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
         if shares.is_empty() { bytes } else { Bytes::from_owner(ReservedBytes { bytes, _held: (shares, hold()) }) }
     }
@@ -150,31 +154,31 @@ mod tests {
     #[test]
     fn what_does_not_fit_is_refused_and_what_is_dropped_is_free_again() {
         let budget = Budget::new(100);
-        let mut first = budget.take(60).unwrap();
-        assert_eq!(budget.take(41).err(), Some(Error::MemoryFull { wanted: 41, used: 60, limit: 100 }));
+        let mut first = budget.reserve(60).unwrap();
+        assert_eq!(budget.reserve(41).err(), Some(Error::MemoryFull { wanted: 41, used: 60, limit: 100 }));
         first.grow(40).unwrap();
-        assert!(first.grow(1).is_err() && budget.take(usize::MAX).is_err());
-        first.set(150);
-        assert!(budget.take(1).is_err() && budget.take(0).is_ok());
-        first.set(10);
-        let second = budget.take(90).unwrap();
+        assert!(first.grow(1).is_err() && budget.reserve(usize::MAX).is_err());
+        first.resize(150);
+        assert!(budget.reserve(1).is_err() && budget.reserve(0).is_ok());
+        first.resize(10);
+        let second = budget.reserve(90).unwrap();
         drop(first);
-        assert!(budget.take(11).is_err());
+        assert!(budget.reserve(11).is_err());
         drop(second);
-        assert!(budget.take(100).is_ok());
+        assert!(budget.reserve(100).is_ok());
     }
 
     #[test]
     fn a_share_is_held_until_the_last_of_its_bytes_is_dropped() {
         let (budget, outbox) = (Budget::new(10), PendingReservations::default());
-        outbox.put(budget.take(10).unwrap());
-        let mut sent = outbox.send(Bytes::from_static(b"reply"), || ());
+        outbox.push(budget.reserve(10).unwrap());
+        let mut sent = outbox.attach(Bytes::from_static(b"reply"), || ());
         let rest = sent.split_off(2);
         drop(sent);
-        assert!(budget.take(1).is_err());
+        assert!(budget.reserve(1).is_err());
         assert_eq!(rest, "ply");
         drop(rest);
-        assert!(budget.take(10).is_ok());
-        assert_eq!(outbox.send(Bytes::from_static(b"small"), || ()), "small");
+        assert!(budget.reserve(10).is_ok());
+        assert_eq!(outbox.attach(Bytes::from_static(b"small"), || ()), "small");
     }
 }

@@ -115,7 +115,7 @@ impl MessageReader {
             buffer: BytesMut::new(),
             message: None,
             due: None,
-            share: transit.budget.nothing(),
+            share: transit.budget.empty(),
             transit,
             connection,
             bearer,
@@ -129,7 +129,7 @@ impl MessageReader {
     }
 
     /// Moves the reader out and leaves an exhausted one behind.
-    pub fn leave(&mut self) -> Self {
+    pub fn detach(&mut self) -> Self {
         let (connection, bearer) = (self.connection.clone(), self.bearer.clone());
         let left = Self::new(Body::empty(), self.transit.clone(), connection, bearer, PendingReservations::default());
         std::mem::replace(self, left)
@@ -139,18 +139,18 @@ impl MessageReader {
     ///
     /// # Errors
     /// What ends the stream: the message is too large, or never ends, or what came is not gRPC.
-    pub async fn next(&mut self, allowance: RequestLimits) -> Result<Option<Message>, StreamStop> {
+    pub async fn next(&mut self, limits: RequestLimits) -> Result<Option<Message>, StreamStop> {
         loop {
             if self.message.is_none() && self.buffer.len() >= HEADER_BYTES {
-                self.message = Some(self.begin(allowance)?);
+                self.message = Some(self.begin(limits)?);
             }
-            if let Some(whole) = self.taken() {
+            if let Some(whole) = self.complete() {
                 return Ok(Some(whole));
             }
             match self.frame().await? {
                 Some(Ok(frame)) => {
                     if let Ok(data) = frame.into_data() {
-                        self.take(&data, allowance);
+                        self.push_data(&data, limits);
                     }
                 }
                 Some(Err(status)) if status.code() == Code::Cancelled => return Err(StreamStop::Cancelled),
@@ -178,15 +178,15 @@ impl MessageReader {
     }
 
     /// Reads a frame's header.
-    fn begin(&mut self, allowance: RequestLimits) -> Result<PartialMessage, StreamStop> {
+    fn begin(&mut self, limits: RequestLimits) -> Result<PartialMessage, StreamStop> {
         match self.buffer.get_u8() {
             0 => {}
             1 => return Err(Status::internal("a message came compressed; send it as it is").into()),
             flag => return Err(Status::internal(format!("a frame began with {flag}; expected 0: is it gRPC?")).into()),
         }
         let length = self.buffer.get_u32() as usize;
-        if length > allowance.bytes {
-            return Err(StreamStop::Refused(Error::TooLarge { got: length, limit: allowance.bytes }));
+        if length > limits.bytes {
+            return Err(StreamStop::Refused(Error::TooLarge { got: length, limit: limits.bytes }));
         }
         let longest = |limit| limit + Duration::from_secs((length / MIN_BYTES_PER_SECOND) as u64);
         self.due = self.transit.limit.map(|limit| Instant::now() + longest(limit));
@@ -194,7 +194,7 @@ impl MessageReader {
     }
 
     /// Returns the partly read message, if it is complete.
-    fn taken(&mut self) -> Option<Message> {
+    fn complete(&mut self) -> Option<Message> {
         match &mut self.message {
             Some(PartialMessage::Wanted(length)) if self.buffer.len() >= *length => {
                 let bytes = if *length < OWN_BUFFER_MIN_BYTES {
@@ -207,7 +207,7 @@ impl MessageReader {
                     whole.freeze()
                 };
                 self.message = None;
-                Some(Message::Whole(bytes, std::mem::replace(&mut self.share, self.transit.budget.nothing())))
+                Some(Message::Whole(bytes, std::mem::replace(&mut self.share, self.transit.budget.empty())))
             }
             Some(PartialMessage::Refused(left, refusal)) => {
                 let come = (*left).min(self.buffer.len());
@@ -222,13 +222,13 @@ impl MessageReader {
     }
 
     /// Appends bytes that came, and reserves memory for them.
-    fn take(&mut self, data: &[u8], allowance: RequestLimits) {
+    fn push_data(&mut self, data: &[u8], limits: RequestLimits) {
         if let Some(PartialMessage::Wanted(length)) = self.message {
-            let free = allowance.covered.max(UNBUDGETED_BYTES);
+            let free = limits.covered.max(UNBUDGETED_BYTES);
             let beyond = |bytes: usize| bytes.min(length).saturating_sub(free);
             let (before, after) = (beyond(self.buffer.len()), beyond(self.buffer.len() + data.len()));
             if let Err(refusal) = self.share.grow(after - before) {
-                self.share = self.transit.budget.nothing();
+                self.share = self.transit.budget.empty();
                 // What has come of it goes with its memory.
                 let come = std::mem::take(&mut self.buffer).len();
                 self.message = Some(PartialMessage::Refused(length - come, refusal));

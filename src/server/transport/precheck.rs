@@ -55,11 +55,11 @@ pub enum Cardinality {
 }
 
 impl Cardinality {
-    fn entries(&self, allowance: RequestLimits) -> usize {
+    fn entries(&self, limits: RequestLimits) -> usize {
         match self {
             Self::One => 1,
             Self::Many => MAX_REPEATED,
-            Self::Environments => allowance.entries.max(MAX_REPEATED),
+            Self::Environments => limits.entries.max(MAX_REPEATED),
         }
     }
 }
@@ -83,9 +83,9 @@ impl Default for Decoder {
 pub fn decoded_at_once<T: Message + Default>(
     bytes: Bytes,
     fields: &'static [Field],
-    allowance: RequestLimits,
+    limits: RequestLimits,
 ) -> Option<T> {
-    check(&bytes, fields, allowance, INLINE_DECODE_MAX_FIELDS).ok()?;
+    check(&bytes, fields, limits, INLINE_DECODE_MAX_FIELDS).ok()?;
     decoded(bytes).ok()
 }
 
@@ -98,9 +98,9 @@ impl Decoder {
         &self,
         bytes: Bytes,
         fields: &'static [Field],
-        allowance: RequestLimits,
+        limits: RequestLimits,
     ) -> Result<Result<T, InvalidValue>, Status> {
-        match check(&bytes, fields, allowance, INLINE_DECODE_MAX_FIELDS) {
+        match check(&bytes, fields, limits, INLINE_DECODE_MAX_FIELDS) {
             Ok(()) => return decoded(bytes).map(Ok),
             Err(PrecheckError::Refused(refusal)) => return Ok(Err(refusal)),
             Err(PrecheckError::Work) => {}
@@ -109,7 +109,7 @@ impl Decoder {
         let _turn = self.0.acquire().await.map_err(|_| defect())?;
         let decoding = tokio::task::spawn_blocking(move || {
             lower(DECODER_NICENESS);
-            match check(&bytes, fields, allowance, usize::MAX) {
+            match check(&bytes, fields, limits, usize::MAX) {
                 Err(PrecheckError::Refused(refusal)) => Ok(Err(refusal)),
                 _ => decoded(bytes).map(Ok),
             }
@@ -132,17 +132,12 @@ enum PrecheckError {
 
 /// Counts a message's fields and entries, at most `work` of them. What is not well-formed ends the count, as it ends the
 /// decoding.
-fn check(message: &[u8], fields: &[Field], allowance: RequestLimits, mut work: usize) -> Result<(), PrecheckError> {
-    count(message, fields, allowance, &mut work).map(|_| ())
+fn check(message: &[u8], fields: &[Field], limits: RequestLimits, mut work: usize) -> Result<(), PrecheckError> {
+    count(message, fields, limits, &mut work).map(|_| ())
 }
 
 /// Counts the fields of a part of a message. Returns whether the part is well-formed.
-fn count(
-    mut message: &[u8],
-    fields: &[Field],
-    allowance: RequestLimits,
-    work: &mut usize,
-) -> Result<bool, PrecheckError> {
+fn count(mut message: &[u8], fields: &[Field], limits: RequestLimits, work: &mut usize) -> Result<bool, PrecheckError> {
     let mut counts = [0; MAX_COUNTED_FIELDS];
     while !message.is_empty() {
         *work = work.checked_sub(1).ok_or(PrecheckError::Work)?;
@@ -169,13 +164,13 @@ fn count(
             }
             _ => 1,
         };
-        let most = field.most.entries(allowance);
+        let most = field.most.entries(limits);
         if *counted > most {
             let got = format!("there more than {most} times");
             return Err(PrecheckError::Refused(InvalidValue::new(field.name, got, "no more than can be needed")));
         }
         if let Fields(fields) = field.inside
-            && !count(part, fields, allowance, work)?
+            && !count(part, fields, limits, work)?
         {
             return Ok(false);
         }

@@ -80,17 +80,17 @@ where
         let connection = request.extensions().get::<Connection>().cloned();
         let is_stream = request.uri().path() == self.path;
         // What is no stream is one small reply.
-        let patience = is_stream.then_some(ReadTimeouts { first: self.transit.handshake, rest: self.transit.limit });
+        let timeouts = is_stream.then_some(ReadTimeouts { first: self.transit.handshake, rest: self.transit.limit });
         if is_stream {
             let bearer = request.extensions_mut().remove::<Bearer>();
-            let transit = StreamLimits { budget: self.transit.budget.of(bearer.clone()), ..self.transit };
+            let transit = StreamLimits { budget: self.transit.budget.for_token(bearer.clone()), ..self.transit };
             let body = std::mem::take(request.body_mut());
-            let frames = MessageReader::new(body, transit, connection.clone(), bearer, outbox.clone());
-            request.extensions_mut().insert(RawBody(Arc::new(Mutex::new(Some(frames)))));
+            let reader = MessageReader::new(body, transit, connection.clone(), bearer, outbox.clone());
+            request.extensions_mut().insert(RawBody(Arc::new(Mutex::new(Some(reader)))));
         }
         let response = self.service.call(request);
         Box::pin(async move {
-            Ok(response.await?.map(|body| Body::new(WatchedBody::new(body, outbox, connection, patience))))
+            Ok(response.await?.map(|body| Body::new(WatchedBody::new(body, outbox, connection, timeouts))))
         })
     }
 }
@@ -105,6 +105,6 @@ struct RawBody(Arc<Mutex<Option<MessageReader>>>);
 /// Where it was not: a defect.
 pub fn messages<T>(request: &mut tonic::Request<T>) -> Result<MessageReader, Status> {
     let kept = request.extensions_mut().remove::<RawBody>();
-    let frames = kept.and_then(|kept| kept.0.lock().unwrap_or_else(PoisonError::into_inner).take());
-    frames.ok_or_else(|| Status::internal("the request's body is not there: a defect of the server"))
+    let reader = kept.and_then(|kept| kept.0.lock().unwrap_or_else(PoisonError::into_inner).take());
+    reader.ok_or_else(|| Status::internal("the request's body is not there: a defect of the server"))
 }

@@ -33,7 +33,7 @@ pub struct ReadTimeouts {
 pub struct WatchedBody {
     body: Body,
     outbox: PendingReservations,
-    waiting: Arc<ReadProgress>,
+    progress: Arc<ReadProgress>,
 }
 
 /// The progress of the client with the replies.
@@ -46,25 +46,25 @@ struct ReadProgress {
 struct State {
     /// Number of unread replies that hold reservations.
     unread: usize,
-    since: Instant,
+    unread_since: Instant,
     /// The time since which a reply waits for the flow control of the client. The session is not asked for more meanwhile,
     /// so none of its own limits would end it.
-    held: Option<Instant>,
+    held_since: Option<Instant>,
     /// No reply has been taken yet.
     is_first: bool,
 }
 
 impl State {
     fn new() -> Self {
-        Self { unread: 0, since: Instant::now(), held: None, is_first: true }
+        Self { unread: 0, unread_since: Instant::now(), held_since: None, is_first: true }
     }
 
     /// The timeout that the client has exceeded, if any.
-    fn passed(&self, patience: ReadTimeouts) -> Option<Duration> {
-        let held = self.held.map_or(Duration::ZERO, |since| since.elapsed());
-        let unread = if self.unread == 0 { Duration::ZERO } else { self.since.elapsed() };
-        let first = Some(patience.first).filter(|&limit| self.is_first && held > limit);
-        first.or(patience.rest.filter(|&limit| held.max(unread) > limit))
+    fn exceeded(&self, timeouts: ReadTimeouts) -> Option<Duration> {
+        let held_since = self.held_since.map_or(Duration::ZERO, |unread_since| unread_since.elapsed());
+        let unread = if self.unread == 0 { Duration::ZERO } else { self.unread_since.elapsed() };
+        let first = Some(timeouts.first).filter(|&limit| self.is_first && held_since > limit);
+        first.or(timeouts.rest.filter(|&limit| held_since.max(unread) > limit))
     }
 }
 
@@ -79,21 +79,21 @@ impl ReadProgress {
         let (before, after) = (state.unread, change(state.unread));
         state.unread = after;
         if before == 0 || after < before {
-            state.since = Instant::now();
+            state.unread_since = Instant::now();
         }
     }
 
     /// Notes that the transport asks for a reply: the one before is on its way.
-    fn asked(&self) {
+    fn on_poll(&self) {
         let mut state = self.state();
-        if state.held.take().is_some() {
+        if state.held_since.take().is_some() {
             state.is_first = false;
         }
     }
 
     /// Notes that the transport has a reply.
-    fn hold(&self) {
-        self.state().held = Some(Instant::now());
+    fn on_frame(&self) {
+        self.state().held_since = Some(Instant::now());
     }
 }
 
@@ -107,9 +107,9 @@ impl Drop for ReadProgress {
 struct UnreadGuard(Arc<ReadProgress>);
 
 impl UnreadGuard {
-    fn new(waiting: &Arc<ReadProgress>) -> Self {
-        waiting.change(|replies| replies + 1);
-        Self(Arc::clone(waiting))
+    fn new(progress: &Arc<ReadProgress>) -> Self {
+        progress.change(|replies| replies + 1);
+        Self(Arc::clone(progress))
     }
 }
 
@@ -121,36 +121,36 @@ impl Drop for UnreadGuard {
 
 impl WatchedBody {
     /// Wraps a response body and attaches queued reservations to its bytes. Closes the connection when the client leaves data
-    /// unread longer than `patience`.
+    /// unread longer than `timeouts`.
     pub fn new(
         body: Body,
         outbox: PendingReservations,
         connection: Option<Connection>,
-        patience: Option<ReadTimeouts>,
+        timeouts: Option<ReadTimeouts>,
     ) -> Self {
-        let waiting = Arc::new(ReadProgress { state: Mutex::new(State::new()), watch: OnceLock::new() });
-        if let (Some(connection), Some(patience)) = (connection, patience) {
-            let watch = tokio::spawn(watch(Arc::downgrade(&waiting), connection, patience));
-            waiting.watch.get_or_init(|| watch.abort_handle());
+        let progress = Arc::new(ReadProgress { state: Mutex::new(State::new()), watch: OnceLock::new() });
+        if let (Some(connection), Some(timeouts)) = (connection, timeouts) {
+            let watch = tokio::spawn(watch(Arc::downgrade(&progress), connection, timeouts));
+            progress.watch.get_or_init(|| watch.abort_handle());
         }
-        Self { body, outbox, waiting }
+        Self { body, outbox, progress }
     }
 }
 
 /// Ends the connection when its client has read nothing for too long.
-async fn watch(waiting: Weak<ReadProgress>, connection: Connection, patience: ReadTimeouts) {
-    let mut limit = Some(patience.rest.map_or(patience.first, |rest| rest.min(patience.first)));
+async fn watch(progress: Weak<ReadProgress>, connection: Connection, timeouts: ReadTimeouts) {
+    let mut limit = Some(timeouts.rest.map_or(timeouts.first, |rest| rest.min(timeouts.first)));
     while let Some(looked_after) = limit {
         sleep(looked_after / CHECKS_PER_TIMEOUT).await;
-        let Some(waiting) = waiting.upgrade() else { return };
-        let state = waiting.state();
-        if let Some(passed) = state.passed(patience) {
-            let seconds = passed.as_secs();
+        let Some(progress) = progress.upgrade() else { return };
+        let state = progress.state();
+        if let Some(exceeded) = state.exceeded(timeouts) {
+            let seconds = exceeded.as_secs();
             tracing::warn!(peer = ?connection.peer, seconds, "ended a connection that did not read its replies");
-            return connection.end();
+            return connection.close();
         }
         if !state.is_first {
-            limit = patience.rest;
+            limit = timeouts.rest;
         }
     }
 }
@@ -160,15 +160,15 @@ impl HttpBody for WatchedBody {
     type Error = Status;
 
     fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-        let Self { body, outbox, waiting } = &mut *self;
-        waiting.asked();
+        let Self { body, outbox, progress } = &mut *self;
+        progress.on_poll();
         let polled = Pin::new(body).poll_frame(context);
         if let Poll::Ready(Some(Ok(frame))) = &polled
             && frame.data_ref().is_some_and(|bytes| !bytes.is_empty())
         {
-            waiting.hold();
+            progress.on_frame();
         }
-        polled.map_ok(|frame| frame.map_data(|bytes| outbox.send(bytes, || UnreadGuard::new(waiting))))
+        polled.map_ok(|frame| frame.map_data(|bytes| outbox.attach(bytes, || UnreadGuard::new(progress))))
     }
 
     fn is_end_stream(&self) -> bool {

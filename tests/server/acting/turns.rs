@@ -51,7 +51,7 @@ fn endless(size: usize) -> RolloutRequest {
         episodes_per_trial: 1,
     };
     let task = Some(CollectUntil::Steps(usize::MAX));
-    RolloutRequest { policy: Some(policy), weights: None, task, most_steps: usize::MAX, only_ended: true }
+    RolloutRequest { policy: Some(policy), weights: None, task, max_steps: usize::MAX, only_ended: true }
 }
 
 fn poll<F: Future>(future: &mut Pin<Box<F>>) -> Poll<F::Output> {
@@ -83,8 +83,8 @@ async fn a_play_that_nobody_waits_for_ends_and_the_batch_goes_on(#[values(4, 200
     let mut playing = Box::pin(batch.act(endless(size)));
     assert!(poll(&mut playing).is_pending());
     drop(playing);
-    batch.settle().await;
-    assert!(batch.play().is_none());
+    batch.finish_abandoned().await;
+    assert!(batch.policy_runner().is_none());
     batch.step(&vec![0; 4 * size]).await.unwrap();
     let short = RolloutRequest { task: Some(CollectUntil::Steps(3)), ..endless(size) };
     assert_eq!(batch.act(short).await.unwrap().steps, 3);

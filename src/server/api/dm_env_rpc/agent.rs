@@ -37,14 +37,14 @@ pub(super) struct Agent {
     caller: Caller,
     sessions: Sessions,
     joined: Option<JoinedWorld>,
-    about: SessionStats,
+    stats: SessionStats,
 }
 
 impl Agent {
     /// A stream that has joined no world.
     pub(super) fn new(worlds: Arc<Worlds>, bearer: Option<Bearer>, sessions: Sessions) -> Self {
         let caller = worlds.caller(bearer);
-        Self { worlds, caller, sessions, joined: None, about: SessionStats::default() }
+        Self { worlds, caller, sessions, joined: None, stats: SessionStats::default() }
     }
 
     async fn create_world(&mut self, request: rpc::CreateWorldRequest) -> Result<rpc::CreateWorldResponse, Error> {
@@ -62,13 +62,13 @@ impl Agent {
         if let Some(joined) = &self.joined {
             return Err(Error::AlreadyJoined { world: joined.world.name().into() });
         }
-        settings::none("join_world", &request.settings)?;
+        settings::check_none("join_world", &request.settings)?;
         let (world, runner) = self.worlds.join(&self.caller, &request.world_name)?;
         // Before anything is awaited: if the client goes now, the world is left and not lost.
         let joined = self.joined.insert(JoinedWorld { world, runner });
-        self.about = SessionStats { environment: Some(joined.world.spec().name), envs: 1, ..self.about };
-        joined.runner.settle().await;
-        Ok(rpc::JoinWorldResponse { specs: Some(specs::of(joined.world.spec())) })
+        self.stats = SessionStats { environment: Some(joined.world.spec().name), envs: 1, ..self.stats };
+        joined.runner.finish_abandoned().await;
+        Ok(rpc::JoinWorldResponse { specs: Some(specs::action_observation_specs(joined.world.spec())) })
     }
 
     async fn step(&mut self, request: rpc::StepRequest) -> Result<rpc::StepResponse, Error> {
@@ -77,7 +77,7 @@ impl Agent {
         let outcome = if runner.is_running() {
             let actions = specs::actions(world.spec(), &request.actions)?;
             let outcome = runner.step(&actions, world.take_interruption()).await?;
-            self.about.steps += 1;
+            self.stats.steps += 1;
             outcome
         } else {
             let changes = world.take_changes();
@@ -91,11 +91,11 @@ impl Agent {
         let JoinedWorld { world, runner } = self.joined("reset")?;
         world.change(settings::change(world.spec(), "reset", &request.settings)?)?;
         runner.stop();
-        Ok(rpc::ResetResponse { specs: Some(specs::of(world.spec())) })
+        Ok(rpc::ResetResponse { specs: Some(specs::action_observation_specs(world.spec())) })
     }
 
     fn reset_world(&mut self, request: rpc::ResetWorldRequest) -> Result<rpc::ResetWorldResponse, Error> {
-        let world = self.worlds.of(&self.caller, &request.world_name, "reset_world")?;
+        let world = self.worlds.find_owned(&self.caller, &request.world_name, "reset_world")?;
         world.change(settings::change(world.spec(), "reset_world", &request.settings)?)?;
         match &mut self.joined {
             Some(joined) if joined.world.name() == world.name() => joined.runner.stop(),
@@ -161,7 +161,7 @@ impl SessionHandler for Agent {
         }
     }
 
-    fn allowance(&self) -> RequestLimits {
+    fn request_limits(&self) -> RequestLimits {
         RequestLimits {
             bytes: if self.is_open() { MAX_REQUEST_BYTES } else { MAX_BYTES_BEFORE_OPEN },
             entries: 1,
@@ -174,8 +174,8 @@ impl SessionHandler for Agent {
         self.joined.is_some() || self.worlds.are_made_by(&self.caller)
     }
 
-    fn about(&self) -> SessionStats {
-        self.about
+    fn stats(&self) -> SessionStats {
+        self.stats
     }
 
     async fn answer(&mut self, request: Self::Request) -> Result<Reply<Self::Response>, Error> {
@@ -206,7 +206,7 @@ impl SessionHandler for Agent {
         None::<fn(Self::Request)>
     }
 
-    fn refusal(error: Error) -> Self::Response {
+    fn error_response(error: Error) -> Self::Response {
         rpc::EnvironmentResponse { payload: Some(Response::Error(error.into())) }
     }
 }

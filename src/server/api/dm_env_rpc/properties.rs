@@ -157,7 +157,7 @@ fn write(joined: Option<&JoinedWorld>, property: &Property, request: &WritePrope
     let value = request.value.as_ref().ok_or_else(no_value)?;
     let mut change = Change::default();
     match property.key.as_str() {
-        VERSION => change.version = Some(settings::version_of(field.clone(), tensors::text(&field, value)?)?),
+        VERSION => change.version = Some(settings::parse_version(field.clone(), tensors::text(&field, value)?)?),
         SEED => change.seed = Some(tensors::integer(&field, value, 0, u64::MAX)?),
         key => {
             let name = key.rsplit('.').next().unwrap_or_default();

@@ -73,8 +73,8 @@ impl Runner {
     ) -> Result<Self, Error> {
         let (begun, spec) = (draws.open(&settings).await?, settings.spec);
         let opened = Batch::open(pool, settings).await;
-        let (mut batch, first, started) = opened.inspect_err(|_| draws.not_opened(spec, begun))?;
-        draws.follow(&mut batch);
+        let (mut batch, first, started) = opened.inspect_err(|_| draws.open_failed(spec, begun))?;
+        draws.record_drop(&mut batch);
         let seed = batch.settings().groups[0].episodes.seed;
         Ok(Self { batch, draws, phase: Phase::Unseen, first, start: only(started), seed, version })
     }
@@ -122,8 +122,8 @@ impl Runner {
     }
 
     /// Waits for a step whose agent went away meanwhile.
-    pub(super) async fn settle(&mut self) {
-        self.batch.settle().await;
+    pub(super) async fn finish_abandoned(&mut self) {
+        self.batch.finish_abandoned().await;
     }
 
     /// Begins an episode: the next, or that of a world that is new. With changes a new trial begins, as in `perturb.v1`.

@@ -116,7 +116,7 @@ pub(super) fn change(
 ///
 /// # Errors
 /// If there are.
-pub(super) fn none(request: &'static str, settings: &Settings) -> Result<(), Error> {
+pub(super) fn check_none(request: &'static str, settings: &Settings) -> Result<(), Error> {
     match settings.keys().next() {
         Some(name) => Err(unknown(name, format!("{request} takes no settings; give them to create_world or reset"))),
         None => Ok(()),
@@ -127,13 +127,13 @@ pub(super) fn none(request: &'static str, settings: &Settings) -> Result<(), Err
 ///
 /// # Errors
 /// If it is another letter.
-pub(super) fn version_of(field: String, letter: &str) -> Result<Version, Error> {
+pub(super) fn parse_version(field: String, letter: &str) -> Result<Version, Error> {
     let found = letter.parse().ok().filter(|version| Version::ALL.contains(version));
     found.ok_or_else(|| Error::value(field, format!("{:?}", shorten(letter)), "\"D\", \"R\" or \"E\""))
 }
 
 fn version(settings: &Settings) -> Result<Option<Version>, Error> {
-    let read = |tensor| version_of(field(VERSION), tensors::text(&field(VERSION), tensor)?);
+    let read = |tensor| parse_version(field(VERSION), tensors::text(&field(VERSION), tensor)?);
     settings.get(VERSION).map(read).transpose()
 }
 

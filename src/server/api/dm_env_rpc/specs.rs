@@ -24,7 +24,7 @@ const DIVERGED: u64 = 5;
 /// The actions and observations of an environment.
 ///
 /// There is no `discount`: clients make it of the state, as they should, and must not get one with a first step.
-pub(super) fn of(spec: &EnvironmentSpec) -> ActionObservationSpecs {
+pub(super) fn action_observation_specs(spec: &EnvironmentSpec) -> ActionObservationSpecs {
     let scalar = |name: &str, dtype: DataType| TensorSpec {
         name: name.into(),
         shape: Vec::new(),

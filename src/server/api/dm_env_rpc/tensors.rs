@@ -66,7 +66,7 @@ pub(super) fn integer(field: &str, tensor: &Tensor, low: u64, high: u64) -> Resu
 pub(super) fn int32s(field: &str, tensor: &Tensor, shape: &[usize], bounds: &[(i32, i32)]) -> Result<Vec<i32>, Error> {
     match &tensor.payload {
         Some(Payload::Int32s(given)) => elements(field, tensor, &given.array, shape, DataType::Int32, bounds),
-        _ => Err(refuse(field, tensor, &of(DataType::Int32, shape))),
+        _ => Err(refuse(field, tensor, &describe(DataType::Int32, shape))),
     }
 }
 
@@ -77,7 +77,7 @@ pub(super) fn int32s(field: &str, tensor: &Tensor, shape: &[usize], bounds: &[(i
 pub(super) fn floats(field: &str, tensor: &Tensor, shape: &[usize], bounds: &[(f32, f32)]) -> Result<Vec<f32>, Error> {
     match &tensor.payload {
         Some(Payload::Floats(given)) => elements(field, tensor, &given.array, shape, DataType::Float, bounds),
-        _ => Err(refuse(field, tensor, &of(DataType::Float, shape))),
+        _ => Err(refuse(field, tensor, &describe(DataType::Float, shape))),
     }
 }
 
@@ -91,7 +91,7 @@ fn elements<T: Copy + PartialOrd + Display>(
     dtype: DataType,
     bounds: &[(T, T)],
 ) -> Result<Vec<T>, Error> {
-    let refuse = || refuse(field, tensor, &of(dtype, shape));
+    let refuse = || refuse(field, tensor, &describe(dtype, shape));
     let inferred = tensor.shape.iter().filter(|&&length| length < 0).count();
     let fits = |(&given, &wanted): (&i32, &usize)| given < 0 || usize::try_from(given).is_ok_and(|n| n == wanted);
     if tensor.shape.len() != shape.len() || inferred > 1 || !tensor.shape.iter().zip(shape).all(fits) {
@@ -120,7 +120,7 @@ fn refuse(field: &str, tensor: &Tensor, expected: &str) -> Error {
     Error::value(field.to_owned(), got, expected)
 }
 
-fn of(dtype: DataType, shape: &[usize]) -> String {
+fn describe(dtype: DataType, shape: &[usize]) -> String {
     let count = match shape.iter().product() {
         1 => "1".into(),
         n => format!("{n}, or 1 for all"),

@@ -147,8 +147,8 @@ impl Worlds {
     ///
     /// # Errors
     /// [`Error::Unknown`], [`Error::NotYours`].
-    pub(super) fn of(&self, caller: &Caller, name: &str, request: &'static str) -> Result<Arc<World>, Error> {
-        Ok(Arc::clone(&self.lock().of(caller, name, request)?.world))
+    pub(super) fn find_owned(&self, caller: &Caller, name: &str, request: &'static str) -> Result<Arc<World>, Error> {
+        Ok(Arc::clone(&self.lock().find_owned(caller, name, request)?.world))
     }
 
     /// Gives a world to a stream's agent.
@@ -179,7 +179,7 @@ impl Worlds {
     /// [`Error::Unknown`], [`Error::NotYours`], [`Error::Occupied`].
     pub(super) fn destroy(&self, caller: &Caller, name: &str) -> Result<(), Error> {
         let mut registry = self.lock();
-        if registry.of(caller, name, "destroy_world")?.runner.is_none() {
+        if registry.find_owned(caller, name, "destroy_world")?.runner.is_none() {
             return Err(Error::Occupied { world: name.into(), request: "destroy_world" });
         }
         registry.worlds.remove(&caller.key(name));
@@ -207,7 +207,7 @@ impl Worlds {
 
 impl Registry {
     /// The world of that name, if the stream has made it, is its agent's, or may do as if.
-    fn of(&mut self, caller: &Caller, name: &str, request: &'static str) -> Result<&Entry, Error> {
+    fn find_owned(&mut self, caller: &Caller, name: &str, request: &'static str) -> Result<&Entry, Error> {
         let entry = self.find(caller, name)?;
         let is_its = entry.shared || [entry.maker, entry.agent].contains(&Some(caller.stream));
         if is_its { Ok(entry) } else { Err(Error::NotYours { world: name.into(), request }) }

@@ -36,7 +36,7 @@ struct Sizes {
 
 /// Checks an `act` against the batch and the policy at play, of a client whose environments may take so many steps a
 /// second, if that is bounded.
-pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<RolloutRequest, Error> {
+pub fn rollout_request(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<RolloutRequest, Error> {
     let (settings, n_envs) = (batch.settings(), batch.size());
     let order = |when: &'static str, advice| Error::Order { request: "act", when: when.into(), advice };
     if settings.autoreset != Autoreset::SameStep {
@@ -56,7 +56,7 @@ pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Rol
     let sizes = Sizes { envs: n_envs, observation, parameters, action };
     let proto::Act { policy: given, weights: given_weights, task: given_task, most_steps, only_ended } = request;
     let task = task(given_task)?;
-    let (policy, given_weights) = match (given, batch.play()) {
+    let (policy, given_weights) = match (given, batch.policy_runner()) {
         (Some(_), _) if given_weights.is_empty() => {
             return Err(order("with a new policy but without its weights", "send both together"));
         }
@@ -65,12 +65,12 @@ pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Rol
             let advice = "send a policy with its weights, also after a step, reset, restore or release";
             return Err(order("without a policy while none plays", advice));
         }
-        (None, Some(play)) => {
-            let own = (!given_weights.is_empty()).then(|| weights(&given_weights, play.spec()));
+        (None, Some(runner)) => {
+            let own = (!given_weights.is_empty()).then(|| weights(&given_weights, runner.spec()));
             (None, own.transpose()?)
         }
     };
-    let unfinished = policy.is_none() && batch.play().is_some_and(|play| !play.task().is_done());
+    let unfinished = policy.is_none() && batch.policy_runner().is_some_and(|runner| !runner.task().is_done());
     match (&task, unfinished) {
         (None, false) => return Err(order("without a task and none is unfinished", "name steps or episodes")),
         (Some(_), true) => {
@@ -83,7 +83,7 @@ pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Rol
         let advice = "finish it by requests without weights, or send another policy";
         return Err(order("with weights while a task is unfinished", advice));
     }
-    let spec = policy.as_ref().map(|policy| &policy.spec).or_else(|| batch.play().map(PolicyRunner::spec));
+    let spec = policy.as_ref().map(|policy| &policy.spec).or_else(|| batch.policy_runner().map(PolicyRunner::spec));
     let computed = spec.map_or(0.0, |spec| spec.n_weights() as f64 / WEIGHTS_PER_US);
     if computed * n_envs as f64 > MAX_REPLY_COST_US {
         let got = format!("with {} weights in {n_envs} environments", spec.map_or(0, PolicySpec::n_weights));
@@ -93,8 +93,8 @@ pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Rol
     // Of a second, so that none waits long for the next.
     let allowed = rate.map_or(usize::MAX, |rate| (rate as usize / n_envs.max(1)).max(1));
     let affordable = affordable.min(allowed);
-    let most_steps = if most_steps == 0 { affordable } else { affordable.min(most_steps as usize) };
-    Ok(RolloutRequest { policy, weights: given_weights, task, most_steps, only_ended })
+    let max_steps = if most_steps == 0 { affordable } else { affordable.min(most_steps as usize) };
+    Ok(RolloutRequest { policy, weights: given_weights, task, max_steps, only_ended })
 }
 
 fn task(task: Option<proto::act::Task>) -> Result<Option<CollectUntil>, Error> {
@@ -121,7 +121,7 @@ fn policy(policy: proto::Policy, given: &Bytes, sizes: Sizes, episodes_per_trial
     })?;
     let role = match policy.role {
         Some(proto::policy::Role::Training(stream)) => {
-            PolicyRole::Training((&stream).try_into().map_err(within("act.policy.training"))?)
+            PolicyRole::Training((&stream).try_into().map_err(in_message("act.policy.training"))?)
         }
         Some(proto::policy::Role::Testing(proto::TestStreams { seed })) => PolicyRole::Testing { seed },
         None => return Err(Error::value("act.policy.role", "missing", "training or testing")),
@@ -168,8 +168,8 @@ fn spec(policy: &proto::Policy, input_size: usize, sizes: Sizes) -> Result<Polic
 }
 
 fn weights(given: &Bytes, spec: &PolicySpec) -> Result<Vec<f32>, Error> {
-    has_floats("act.weights", given, spec.n_weights(), "float32 [P]")?;
-    read_floats("weights", given).map_err(within("act"))
+    check_length("act.weights", given, spec.n_weights(), "float32 [P]")?;
+    read_floats("weights", given).map_err(in_message("act"))
 }
 
 /// Reads an optional message.
@@ -177,11 +177,11 @@ fn read<'a, M, T: TryFrom<&'a M, Error = DecodeError>>(
     field: &'static str,
     given: &'a Option<M>,
 ) -> Result<Option<T>, Error> {
-    given.as_ref().map(T::try_from).transpose().map_err(within(field))
+    given.as_ref().map(T::try_from).transpose().map_err(in_message(field))
 }
 
 /// Names the message that a field is of.
-fn within(message: &'static str) -> impl Fn(DecodeError) -> Error {
+fn in_message(message: &'static str) -> impl Fn(DecodeError) -> Error {
     move |wrong| {
         let DecodeError { field, got, expected } = wrong.within(message);
         Error::value(field, got, expected)
@@ -200,37 +200,37 @@ fn state(
         let got = format!("{} bytes", given.starts.len());
         return Err(Error::value("act.policy.state.starts", got, format!("{n} bytes: uint8 [N] with N = {n}")));
     }
-    let has = |field, bytes, size, shape| has_floats(field, bytes, n * size, shape);
-    has("act.policy.state.observations", &given.observations, sizes.observation, "float32 [N, O]")?;
-    has("act.policy.state.outcomes", &given.outcomes, extra, "float32 [N, E]")?;
-    has("act.policy.state.memory", &given.memory, memory_size, "float32 [N, S]")?;
-    player_state(given, actions).map_err(within("act.policy.state"))
+    let check_floats = |field, bytes, size, shape| check_length(field, bytes, n * size, shape);
+    check_floats("act.policy.state.observations", &given.observations, sizes.observation, "float32 [N, O]")?;
+    check_floats("act.policy.state.outcomes", &given.outcomes, extra, "float32 [N, E]")?;
+    check_floats("act.policy.state.memory", &given.memory, memory_size, "float32 [N, S]")?;
+    player_state(given, actions).map_err(in_message("act.policy.state"))
 }
 
 /// Whether there are bytes for exactly `count` numbers.
-fn has_floats(field: &'static str, bytes: &Bytes, count: usize, shape: &str) -> Result<(), Error> {
+fn check_length(field: &'static str, bytes: &Bytes, count: usize, shape: &str) -> Result<(), Error> {
     let expected = || format!("{} bytes: {shape}, {count} numbers", 4 * count);
     let got = || format!("{} bytes", bytes.len());
     if bytes.len() == 4 * count { Ok(()) } else { Err(Error::value(field, got(), expected())) }
 }
 
 /// The response of a rollout.
-pub fn acted(played: Rollout) -> proto::Acted {
+pub fn rollout_response(rollout: Rollout) -> proto::Acted {
     proto::Acted {
-        steps: played.steps as u32,
-        observations: played.observations.freeze(),
-        starts: played.starts.freeze(),
-        actions: played.actions.freeze(),
-        log_probs: played.log_probs.freeze(),
-        values: played.values.freeze(),
-        rewards: played.rewards.freeze(),
-        terminated: played.terminated.freeze(),
-        truncated: played.truncated.freeze(),
-        truncation_values: played.truncation_values.freeze(),
-        ended: played.ended.into_iter().map(ended_at).collect(),
-        finished: played.finished,
-        last_values: played.last_values.freeze(),
-        memory: played.memory.freeze(),
+        steps: rollout.steps as u32,
+        observations: rollout.observations.freeze(),
+        starts: rollout.starts.freeze(),
+        actions: rollout.actions.freeze(),
+        log_probs: rollout.log_probs.freeze(),
+        values: rollout.values.freeze(),
+        rewards: rollout.rewards.freeze(),
+        terminated: rollout.terminated.freeze(),
+        truncated: rollout.truncated.freeze(),
+        truncation_values: rollout.truncation_values.freeze(),
+        ended: rollout.ended.into_iter().map(ended_at).collect(),
+        finished: rollout.finished,
+        last_values: rollout.last_values.freeze(),
+        memory: rollout.memory.freeze(),
     }
 }
 
@@ -239,21 +239,21 @@ fn ended_at(EndedAt { step, slot, end, terminated, truncated }: EndedAt) -> prot
 }
 
 /// The state of the policy that plays, without its weights.
-pub fn saved(batch: &Batch) -> Result<proto::PlayerSaved, Error> {
+pub fn player_saved(batch: &Batch) -> Result<proto::PlayerSaved, Error> {
     let order = |when: &'static str, advice| Err(Error::Order { request: "save_player", when: when.into(), advice });
-    let Some(play) = batch.play() else {
+    let Some(runner) = batch.policy_runner() else {
         return order("while no policy plays", "send act with a policy first; step, reset, restore and release end it");
     };
-    if !play.task().is_done() {
+    if !runner.task().is_done() {
         return order("in the middle of a task", "finish it by act without a task");
     }
-    let Some(state) = play.player().state() else {
+    let Some(state) = runner.player().state() else {
         return order("in a test, which has nothing to save", "save in training");
     };
     if state.actions.get_word_pos() > u64::MAX.into() {
         return order("after 2^64 words of the stream of actions", "begin another stream");
     }
-    let Normalisers { observations, rewards } = play.player().normalisers();
+    let Normalisers { observations, rewards } = runner.player().normalisers();
     Ok(proto::PlayerSaved {
         observations: observations.as_ref().map(|it| it.moments().into()),
         rewards: rewards.as_ref().map(Into::into),

@@ -84,15 +84,15 @@ impl Session {
         let environment = environment.map(|entry| entry.observed(observes_parameters));
         let envs = settings.size();
         // More than there can be is for the pool to refuse.
-        let kept = (envs <= most).then(|| self.budget.take(sizes::session(&settings, envs))).transpose()?;
+        let kept = (envs <= most).then(|| self.budget.reserve(sizes::session(&settings, envs))).transpose()?;
         let held = self.bearer.as_ref().map(|bearer| bearer.envs(envs)).transpose()?;
         let (begun, spec) = (self.draws.open(&settings).await?, settings.spec);
         let opened = Batch::open(&self.shared.pool, settings).await;
-        let (mut batch, observations, started) = opened.inspect_err(|_| self.draws.not_opened(spec, begun))?;
-        self.draws.follow(&mut batch);
+        let (mut batch, observations, started) = opened.inspect_err(|_| self.draws.open_failed(spec, begun))?;
+        self.draws.record_drop(&mut batch);
         let grant = match unanswered {
             0 => None,
-            most => self.shared.leases.give(self.bearer.clone(), most as usize)?,
+            most => self.shared.leases.grant(self.bearer.clone(), most as usize)?,
         };
         let lease = grant.as_ref().map_or_else(Bytes::new, |grant| Bytes::copy_from_slice(&grant.name));
         let lease_seconds = grant.as_ref().map_or(0, |grant| grant.time().as_secs() as u32);
@@ -133,10 +133,10 @@ impl Session {
     async fn snapshot(&mut self, request: proto::Snapshot) -> Result<SessionReply, Error> {
         let batch = self.opened("snapshot")?;
         let slots = convert::mask("snapshot.mask", batch.size(), &request.mask)?;
-        let mut share = self.budget.take(sizes::snapshots(slots.len()))?;
+        let mut share = self.budget.reserve(sizes::snapshots(slots.len()))?;
         let batch = self.opened("snapshot")?;
         let snapshots = batch.snapshot(slots).await?;
-        share.set(sizes::taken(&snapshots));
+        share.resize(sizes::snapshot_bytes(&snapshots));
         Ok(Reply { memory: Some(share), ..reply(Response::Snapshot(proto::Snapshotted { snapshots })) })
     }
 
@@ -148,7 +148,7 @@ impl Session {
         let observations = match batch.restore(entries).await {
             Ok(observations) => observations,
             Err(error) => {
-                self.draws.not_restored(batch, &slots, begun);
+                self.draws.restore_failed(batch, &slots, begun);
                 return Err(error.into());
             }
         };
@@ -160,7 +160,7 @@ impl Session {
         let batch = self.opened("render")?;
         let (slot, size) = convert::render(batch.size(), request)?;
         let scene = batch.scene(slot)?.ok_or(Error::NothingToDraw { slot })?;
-        let share = self.budget.take(sizes::picture(size))?;
+        let share = self.budget.reserve(sizes::picture(size))?;
         let pixels = self.shared.renderer.draw(scene, size).await?;
         let rendered = proto::Rendered { pixels, width: size.width.into(), height: size.height.into() };
         Ok(Reply { memory: Some(share), ..reply(Response::Render(rendered)) })
@@ -172,7 +172,7 @@ impl Session {
         self.draws.release(batch, &slots);
         batch.release(&slots).await?;
         if let Some(held) = &mut self.held {
-            held.give_back(slots.len());
+            held.release(slots.len());
         }
         Ok(reply(Response::Release(proto::Released {})))
     }
@@ -180,16 +180,16 @@ impl Session {
     async fn act(&mut self, request: proto::Act) -> Result<SessionReply, Error> {
         let batch = self.batch.as_mut().ok_or(Error::NotOpen { request: "act" })?;
         let policy = sizes::policy(&request, batch.size());
-        let policy = (policy > 0).then(|| self.budget.take(policy)).transpose()?;
-        let turn = policy::turn(batch, self.bearer.as_ref().and_then(|bearer| bearer.rate()), request)?;
-        let share = self.budget.take(sizes::reply_to(&turn, batch))?;
+        let policy = (policy > 0).then(|| self.budget.reserve(policy)).transpose()?;
+        let rollout = policy::rollout_request(batch, self.bearer.as_ref().and_then(|bearer| bearer.rate()), request)?;
+        let share = self.budget.reserve(sizes::max_rollout_bytes(&rollout, batch))?;
         self.playing = policy.or(self.playing.take());
-        let acted = policy::acted(batch.act(turn).await?);
+        let acted = policy::rollout_response(batch.act(rollout).await?);
         Ok(Reply { memory: Some(share), ..reply(Response::Act(acted)) })
     }
 
     fn save_player(&mut self) -> Result<SessionReply, Error> {
-        Ok(reply(Response::SavePlayer(policy::saved(self.opened("save_player")?)?)))
+        Ok(reply(Response::SavePlayer(policy::player_saved(self.opened("save_player")?)?)))
     }
 
     async fn resume(&mut self, request: proto::Resume) -> Result<SessionReply, Error> {
@@ -201,7 +201,7 @@ impl Session {
             });
         }
         let proto::Resume { lease, last_reply } = request;
-        let ticket = self.shared.leases.ask(&lease, self.bearer.as_ref(), last_reply).await?;
+        let ticket = self.shared.leases.resume(&lease, self.bearer.as_ref(), last_reply).await?;
         let resumed = proto::Resumed { last_reply: ticket.last_reply };
         Ok(Reply { handover: Some(StreamHandover::Resume(ticket)), ..reply(Response::Resumed(resumed)) })
     }
@@ -256,14 +256,14 @@ impl SessionHandler for Session {
         }
     }
 
-    fn allowance(&self) -> RequestLimits {
+    fn request_limits(&self) -> RequestLimits {
         match &self.batch {
             None => {
                 let entries = self.shared.listing.max_batch_size as usize;
                 RequestLimits { bytes: MAX_BYTES_BEFORE_OPEN, entries, covered: 0 }
             }
             Some(batch) => RequestLimits {
-                bytes: sizes::most_of_a_request(batch),
+                bytes: sizes::max_request_bytes(batch),
                 entries: batch.size(),
                 covered: sizes::step_request(batch.settings(), batch.size()) + STEP_OVERHEAD_BYTES,
             },
@@ -274,7 +274,7 @@ impl SessionHandler for Session {
         self.batch.is_some()
     }
 
-    fn about(&self) -> SessionStats {
+    fn stats(&self) -> SessionStats {
         self.batch.as_ref().map_or_else(SessionStats::default, |batch| SessionStats {
             environment: Some(batch.settings().spec.name),
             envs: batch.settings().size(),
@@ -302,17 +302,17 @@ impl SessionHandler for Session {
     fn pipeline(&self, request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<>> {
         let batch = self.batch.as_ref().filter(|_| matches!(request.request, Some(Request::Step(_))))?;
         let has_no_rate = self.bearer.as_ref().is_none_or(|bearer| bearer.rate().is_none());
-        let follower = batch.follower().filter(|_| has_no_rate)?;
+        let queue = batch.step_queue().filter(|_| has_no_rate)?;
         Some(move |request: Self::Request| {
             if let Some(Request::Step(proto::Step { actions })) = request.request
-                && convert::actions(follower.spec, follower.size, &actions).is_ok()
+                && convert::actions(queue.spec, queue.size, &actions).is_ok()
             {
-                follower.follow(actions);
+                queue.enqueue(actions);
             }
         })
     }
 
-    fn refusal(error: Error) -> Self::Response {
+    fn error_response(error: Error) -> Self::Response {
         proto::SessionResponse { response: Some(Response::Error(error.into())) }
     }
 }

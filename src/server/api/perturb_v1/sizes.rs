@@ -28,7 +28,7 @@ fn action_width(settings: &BatchSettings) -> usize {
 
 /// The most bytes of a request that a batch can need. Weights are as many as a policy has, which any session may send
 /// that the server can act for.
-pub fn most_of_a_request(batch: &Batch) -> usize {
+pub fn max_request_bytes(batch: &Batch) -> usize {
     let settings = batch.settings();
     if settings.autoreset == Autoreset::SameStep {
         return usize::MAX;
@@ -58,7 +58,7 @@ pub fn snapshots(envs: usize) -> usize {
 }
 
 /// Snapshots that were taken.
-pub fn taken(snapshots: &[bytes::Bytes]) -> usize {
+pub fn snapshot_bytes(snapshots: &[bytes::Bytes]) -> usize {
     snapshots.iter().map(|snapshot| snapshot.len() + size_of::<bytes::Bytes>()).sum()
 }
 
@@ -77,12 +77,12 @@ pub fn policy(request: &proto::Act, envs: usize) -> usize {
 }
 
 /// The most of a turn's reply.
-pub fn reply_to(turn: &RolloutRequest, batch: &Batch) -> usize {
+pub fn max_rollout_bytes(request: &RolloutRequest, batch: &Batch) -> usize {
     let settings = batch.settings();
     // Flags, values and the like beside observations and two times the action: as sampled, and as an input.
     let numbers = settings.observation_size() + 2 * action_width(settings) + 10;
     let step = batch.size().saturating_mul(4 * numbers + RECEIPT_BYTES);
-    step.saturating_mul(turn.most_steps).min(MAX_ROLLOUT_BYTES.saturating_add(step))
+    step.saturating_mul(request.max_steps).min(MAX_ROLLOUT_BYTES.saturating_add(step))
 }
 
 /// The approximate length at which a rollout's reply is cut.

@@ -17,10 +17,10 @@ pub struct StepQueue {
 impl StepQueue {
     /// Queues a step with these actions, which were checked, behind the step under way, if there is one. The batch's next
     /// request must then be that step.
-    pub fn follow(&self, actions: Bytes) {
+    pub fn enqueue(&self, actions: Bytes) {
         // Who holds it now is at the step's end.
-        if let Ok(mut follow) = self.job.follow.try_lock() {
-            follow.offer(actions);
+        if let Ok(mut pipelined) = self.job.pipelined.try_lock() {
+            pipelined.offer(actions);
         }
     }
 }

@@ -3,12 +3,12 @@
 //! The worker that ends a step's last shard has the rollout take the outcome, choose the next actions and give them to the
 //! shards. Then the job goes to the queue's tail, like that of any other step. The session is woken at the rollout's end.
 
-use super::play::{Policy, PolicyRunner};
+use super::policy_runner::{Policy, PolicyRunner};
 use crate::{
     env::EpisodeEnd,
     pool::{
         Error,
-        encode::{put, put_flags},
+        encode::{push_f32, push_flags},
         shard::{Command, Shard},
         sync::lock,
     },
@@ -34,7 +34,7 @@ pub struct RolloutRequest {
     /// A new task; if `None`, the previous one continues.
     pub task: Option<CollectUntil>,
     /// The maximum number of steps, at least 1.
-    pub most_steps: usize,
+    pub max_steps: usize,
     /// Records nothing but the episodes that ended.
     pub only_ended: bool,
 }
@@ -101,27 +101,27 @@ enum Phase {
 
 /// The state of a rollout.
 pub(in crate::pool) struct RolloutTask {
-    turn: RolloutRequest,
-    play: Option<Box<PolicyRunner>>,
+    request: RolloutRequest,
+    runner: Option<Box<PolicyRunner>>,
     phase: Phase,
-    played: Rollout,
+    rollout: Rollout,
     error: Option<Error>,
 }
 
 impl RolloutTask {
     /// A rollout of the previous policy, if the request has no new one.
-    pub(in crate::pool) fn new(turn: RolloutRequest, play: Option<Box<PolicyRunner>>) -> Self {
-        Self { turn, play, phase: Phase::Begin, played: Rollout::default(), error: None }
+    pub(in crate::pool) fn new(request: RolloutRequest, runner: Option<Box<PolicyRunner>>) -> Self {
+        Self { request, runner, phase: Phase::Begin, rollout: Rollout::default(), error: None }
     }
 
     /// Returns the rollout, with the policy unless it failed.
     pub(in crate::pool) fn finish(self) -> Result<(Option<Box<PolicyRunner>>, Rollout), Error> {
-        self.error.map_or(Ok((self.play, self.played)), Err)
+        self.error.map_or(Ok((self.runner, self.rollout)), Err)
     }
 
     /// Takes what the shards did last and tells them what to do next. Returns false at the rollout's end, which comes in any
     /// case when it is `halted`.
-    pub(in crate::pool) fn conduct(&mut self, shards: &[Mutex<Shard>], halted: bool) -> bool {
+    pub(in crate::pool) fn after_step(&mut self, shards: &[Mutex<Shard>], halted: bool) -> bool {
         match self.advance(shards) {
             Ok(goes_on) => goes_on && !halted,
             Err(error) => {
@@ -132,47 +132,47 @@ impl RolloutTask {
     }
 
     fn advance(&mut self, shards: &[Mutex<Shard>]) -> Result<bool, Error> {
-        let Self { turn, play, phase, played, .. } = self;
-        if let Some(policy) = turn.policy.take() {
-            *play = Some(Box::new(PolicyRunner::begin(policy, shards)?));
+        let Self { request, runner, phase, rollout, .. } = self;
+        if let Some(policy) = request.policy.take() {
+            *runner = Some(Box::new(PolicyRunner::begin(policy, shards)?));
         }
-        let play = play.as_mut().ok_or(Error::Defect)?;
+        let runner = runner.as_mut().ok_or(Error::Defect)?;
         match phase {
             Phase::Begin => {
-                if let Some(weights) = turn.weights.take() {
-                    play.load(&weights)?;
+                if let Some(weights) = request.weights.take() {
+                    runner.load(&weights)?;
                 }
-                let begins = turn.task.is_some();
-                if turn.task.take().is_some_and(|task| play.begin_task(task)) {
+                let begins = request.task.is_some();
+                if request.task.take().is_some_and(|task| runner.begin_task(task)) {
                     shards.iter().for_each(|shard| lock(shard).command = Command::ResetAll);
                     *phase = Phase::Reset;
                     return Ok(true);
                 }
-                played.begin(play, begins, turn);
+                rollout.begin(runner, begins, request);
             }
             Phase::Reset => {
-                play.begin_episodes(shards)?;
-                played.begin(play, true, turn);
+                runner.begin_episodes(shards)?;
+                rollout.begin(runner, true, request);
             }
             Phase::Step => {
-                play.observe(shards)?;
-                played.take(play, turn.only_ended);
-                if play.task().is_done() {
-                    played.finished = true;
-                    if !turn.only_ended {
-                        put(&mut played.last_values, play.last_values()?);
+                runner.observe(shards)?;
+                rollout.take(runner, request.only_ended);
+                if runner.task().is_done() {
+                    rollout.finished = true;
+                    if !request.only_ended {
+                        push_f32(&mut rollout.last_values, runner.last_values()?);
                     }
                     return Ok(false);
                 }
-                if played.steps >= turn.most_steps || played.size() >= MAX_REPLY_BYTES {
+                if rollout.steps >= request.max_steps || rollout.size() >= MAX_REPLY_BYTES {
                     return Ok(false);
                 }
             }
         }
         *phase = Phase::Step;
-        let actions = play.act(shards)?;
-        if !turn.only_ended {
-            played.actions.extend_from_slice(actions);
+        let actions = runner.act(shards)?;
+        if !request.only_ended {
+            rollout.actions.extend_from_slice(actions);
         }
         Ok(true)
     }
@@ -180,37 +180,37 @@ impl RolloutTask {
 
 impl Rollout {
     /// Allocates the arrays, and records the memory of the policy where a task `begins`.
-    fn begin(&mut self, play: &PolicyRunner, begins: bool, turn: &RolloutRequest) {
-        if turn.only_ended {
+    fn begin(&mut self, runner: &PolicyRunner, begins: bool, request: &RolloutRequest) {
+        if request.only_ended {
             return;
         }
         if begins {
-            put(&mut self.memory, play.player().memory());
+            push_f32(&mut self.memory, runner.player().memory());
         }
-        let (n_envs, spec) = (play.player().n_envs(), play.spec());
+        let (n_envs, spec) = (runner.player().n_envs(), runner.spec());
         let step_bytes = n_envs * (4 * (spec.observation_size + spec.action.width() + 4) + 3);
-        let steps = match play.task() {
-            RemainingRollout::Steps(left) => turn.most_steps.min(*left),
-            RemainingRollout::Episodes(_) => turn.most_steps.min(INITIAL_CAPACITY_STEPS),
+        let steps = match runner.task() {
+            RemainingRollout::Steps(left) => request.max_steps.min(*left),
+            RemainingRollout::Episodes(_) => request.max_steps.min(INITIAL_CAPACITY_STEPS),
         };
         let steps = steps.min(MAX_REPLY_BYTES / step_bytes + 1);
-        let room = |bytes: usize| BytesMut::with_capacity(steps * n_envs * bytes);
-        self.observations = room(4 * spec.observation_size);
-        self.actions = room(4 * spec.action.width());
+        let with_capacity = |bytes: usize| BytesMut::with_capacity(steps * n_envs * bytes);
+        self.observations = with_capacity(4 * spec.observation_size);
+        self.actions = with_capacity(4 * spec.action.width());
         for array in [&mut self.log_probs, &mut self.values, &mut self.rewards, &mut self.truncation_values] {
-            *array = room(4);
+            *array = with_capacity(4);
         }
         for array in [&mut self.starts, &mut self.terminated, &mut self.truncated] {
-            *array = room(1);
+            *array = with_capacity(1);
         }
     }
 
     /// Appends the outputs of a step.
-    fn take(&mut self, play: &mut PolicyRunner, only_ended: bool) {
+    fn take(&mut self, runner: &mut PolicyRunner, only_ended: bool) {
         if !only_ended {
-            self.push(play.player().played());
+            self.push(runner.player().played());
         }
-        let PolicyRunner { task, step, .. } = play;
+        let PolicyRunner { task, step, .. } = runner;
         for (slot, end) in step.ends.drain(..).filter(|(slot, _)| task.counts(*slot as usize)) {
             self.ended_bytes += end_bytes(&end);
             let (terminated, truncated) = (step.terminated[slot as usize], step.truncated[slot as usize]);
@@ -220,14 +220,14 @@ impl Rollout {
     }
 
     fn push(&mut self, step: RolloutStep<'_>) {
-        put(&mut self.observations, step.observations);
-        put_flags(&mut self.starts, step.starts);
-        put(&mut self.log_probs, step.log_probs);
-        put(&mut self.values, step.values);
-        put(&mut self.rewards, step.rewards);
-        put_flags(&mut self.terminated, step.terminated);
-        put_flags(&mut self.truncated, step.truncated);
-        put(&mut self.truncation_values, step.truncation_values);
+        push_f32(&mut self.observations, step.observations);
+        push_flags(&mut self.starts, step.starts);
+        push_f32(&mut self.log_probs, step.log_probs);
+        push_f32(&mut self.values, step.values);
+        push_f32(&mut self.rewards, step.rewards);
+        push_flags(&mut self.terminated, step.terminated);
+        push_flags(&mut self.truncated, step.truncated);
+        push_f32(&mut self.truncation_values, step.truncation_values);
     }
 
     /// The estimated length in bytes, with another step.

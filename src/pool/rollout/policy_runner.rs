@@ -4,7 +4,7 @@ use crate::{
     env::EpisodeEnd,
     pool::{
         Error,
-        shard::{Shard, put_actions},
+        shard::{Shard, set_actions},
         sync::lock,
     },
 };
@@ -82,16 +82,16 @@ impl PolicyRunner {
             PolicyRole::Testing { seed } => (Role::testing_in(seed, trials.into_iter()), Some(seed)),
         };
         let player = Player::new(&spec, inputs, n_envs, episodes_per_trial, normalisers, role);
-        let mut play = Self { player, task: RemainingRollout::Steps(0), seed, step: StepBuffers::default(), spec };
-        play.player.load(&weights)?;
+        let mut runner = Self { player, task: RemainingRollout::Steps(0), seed, step: StepBuffers::default(), spec };
+        runner.player.load(&weights)?;
         match state {
-            Some(state) => play.player.restore(&state)?,
+            Some(state) => runner.player.restore(&state)?,
             None => {
-                play.step.gather_observations(shards);
-                play.player.begin(&play.step.observations, None)?;
+                runner.step.gather_observations(shards);
+                runner.player.begin(&runner.step.observations, None)?;
             }
         }
-        Ok(play)
+        Ok(runner)
     }
 
     /// The policy's shape.
@@ -138,7 +138,7 @@ impl PolicyRunner {
     /// Chooses actions and gives them to the shards; returns them as they are on the wire.
     pub(in crate::pool) fn act(&mut self, shards: &[Mutex<Shard>]) -> Result<&[u8], Error> {
         let actions = self.player.act()?;
-        put_actions(shards, actions);
+        set_actions(shards, actions);
         Ok(actions)
     }
 
