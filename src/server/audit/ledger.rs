@@ -38,21 +38,21 @@ impl Ledger {
             return Err(io::Error::other("that is no file, and a ledger is read again when the server begins"));
         }
         file.try_lock().map_err(|_| io::Error::other("another server writes it"))?;
-        let there = read(path, |_, _| {}).map_err(io::Error::other)?;
-        if there.chain.lines() == 0 && there.unfinished > 0 {
+        let existing = read(path, |_, _| {}).map_err(io::Error::other)?;
+        if existing.chain.lines() == 0 && existing.unfinished > 0 {
             return Err(io::Error::other("that is no ledger, and not empty: give another name"));
         }
         let mut writer = LedgerWriter {
             file,
             path: path.to_owned(),
-            bytes: there.bytes,
-            chain: there.chain,
+            bytes: existing.bytes,
+            chain: existing.chain,
             pending: Vec::new(),
             is_torn: true,
         };
         let (version, commit) = (env!("CARGO_PKG_VERSION").into(), env!("PERTURB_COMMIT").into());
-        let began = LedgerEvent::Began { version, commit, unfinished: there.unfinished };
-        writer.write([&began]).map_err(io::Error::other)?;
+        let start = LedgerEvent::Began { version, commit, unfinished: existing.unfinished };
+        writer.write([&start]).map_err(io::Error::other)?;
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
         File::open(folder)?.sync_all()?; // the name of a new file, too
         let (lines, received) = channel();

@@ -137,11 +137,7 @@ fn resources(page: &mut Page<'_>) -> EncodeResult {
         ("process_start_time_seconds", "When the process started, since 1970", resources.start_seconds),
         ("process_threads", "Threads", resources.threads as f64),
         ("process_open_fds", "File descriptors in use", resources.descriptors as f64),
-        (
-            "process_max_fds",
-            "The most file descriptors",
-            resources.most_descriptors.map_or(f64::INFINITY, |n| n as f64),
-        ),
+        ("process_max_fds", "The most file descriptors", resources.max_descriptors.map_or(f64::INFINITY, |n| n as f64)),
     ] {
         page.gauges(name, help, [(NO_LABELS, value)])?;
     }

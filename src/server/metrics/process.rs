@@ -19,7 +19,7 @@ pub struct Resources {
     /// File descriptors in use.
     pub descriptors: usize,
     /// The most there may be; none: as many as there are.
-    pub most_descriptors: Option<u64>,
+    pub max_descriptors: Option<u64>,
 }
 
 /// Reads them.
@@ -47,7 +47,7 @@ fn parse(stat: &str, system: &str, descriptors: usize) -> Option<Resources> {
         start_seconds: boot as f64 + seconds(field(22)?),
         threads: i64::try_from(field(20)?).ok()?,
         descriptors,
-        most_descriptors: getrlimit(Resource::Nofile).current,
+        max_descriptors: getrlimit(Resource::Nofile).current,
     })
 }
 

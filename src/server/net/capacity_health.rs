@@ -9,11 +9,11 @@ pub const NEW_SESSIONS: &str = "perturb.v1.Perturb.NewSessions";
 
 /// Keeps the health of [`NEW_SESSIONS`], for ever.
 pub async fn report_capacity(health: &HealthReporter, sessions: &PeerLimiter, pool: &Pool) {
-    let mut told = None;
+    let mut reported = None;
     loop {
         let full = sessions.in_use() >= sessions.limit() || pool.environments() >= pool.limit();
         let status = if full { ServingStatus::NotServing } else { ServingStatus::Serving };
-        if told.replace(full) != Some(full) {
+        if reported.replace(full) != Some(full) {
             health.set_service_status(NEW_SESSIONS, status).await;
         }
         tokio::select! {

@@ -257,13 +257,13 @@ async fn read_ahead<H: SessionHandler>(
     limits: RequestLimits,
 ) -> Infallible {
     if let Some(offer) = offer.filter(|_| ahead.is_none()) {
-        let came = requests.next(limits).await;
-        if let Ok(Some(Message::Whole(bytes, _))) = &came
+        let next = requests.next(limits).await;
+        if let Ok(Some(Message::Whole(bytes, _))) = &next
             && let Some(request) = decoded_at_once(bytes.clone(), H::FIELDS, limits)
         {
             offer(request);
         }
-        *ahead = Some(came);
+        *ahead = Some(next);
     }
     std::future::pending().await
 }

@@ -14,8 +14,8 @@ use bytes::Bytes;
 use perturb_protocol::limits::{DEFAULT_PICTURE_PIXELS, PICTURE_PIXELS};
 use std::{collections::HashMap, sync::Arc};
 
-/// Checks an `open` of at most `most` environments.
-pub fn open(catalogue: &Catalogue, most: usize, request: proto::Open) -> Result<BatchSettings, Error> {
+/// Checks an `open` of at most `max_envs` environments.
+pub fn open(catalogue: &Catalogue, max_envs: usize, request: proto::Open) -> Result<BatchSettings, Error> {
     let spec = catalogue.find(&request.environment)?;
     let autoreset = match request.autoreset_mode() {
         proto::AutoresetMode::NextStep => Autoreset::NextStep,
@@ -32,9 +32,13 @@ pub fn open(catalogue: &Catalogue, most: usize, request: proto::Open) -> Result<
     } else {
         check_no_single(&request)?;
         // Before anything is made of them: each has one environment at least.
-        if request.groups.len() > most {
+        if request.groups.len() > max_envs {
             let got = format!("{} groups", request.groups.len());
-            return Err(Error::value("open.groups", got, format!("at most {most}, as this server has environments")));
+            return Err(Error::value(
+                "open.groups",
+                got,
+                format!("at most {max_envs}, as this server has environments"),
+            ));
         }
         let numbered = request.groups.into_iter().enumerate();
         let named = |i, slots| group(spec, &format!("open.groups[{i}]"), &format!("open.groups[{i}].size"), slots);
@@ -240,8 +244,8 @@ pub fn render(n: usize, request: proto::Render) -> Result<(usize, Size), Error> 
         Ok(0) => Ok(DEFAULT_PICTURE_PIXELS),
         Ok(pixels) if PICTURE_PIXELS.contains(&pixels) => Ok(pixels),
         _ => {
-            let (least, most) = (PICTURE_PIXELS.start(), PICTURE_PIXELS.end());
-            let expected = format!("{least} … {most} pixels, or 0 for {DEFAULT_PICTURE_PIXELS}");
+            let (min, max) = (PICTURE_PIXELS.start(), PICTURE_PIXELS.end());
+            let expected = format!("{min} … {max} pixels, or 0 for {DEFAULT_PICTURE_PIXELS}");
             Err(Error::value(field, value, expected))
         }
     };

@@ -45,24 +45,24 @@ pub struct ServerContext {
 
 /// A client's session. Dropping it frees its environments.
 pub struct Session {
-    shared: Arc<ServerContext>,
+    context: Arc<ServerContext>,
     batch: Option<Batch>,
     bearer: Option<Bearer>,
     /// The session's part of its token's quota of environments.
-    held: Option<QuotaGuard>,
+    env_quota: Option<QuotaGuard>,
     draws: DrawAuditor,
     budget: Budget,
     /// Memory for the requests and replies of steps.
-    kept: Option<MemoryReservation>,
+    step_memory: Option<MemoryReservation>,
     /// Memory for the policy that plays.
-    playing: Option<MemoryReservation>,
+    policy_memory: Option<MemoryReservation>,
 }
 
 impl Session {
     /// A session that is not open yet, whose replies' bytes are taken from the budget.
-    pub fn new(shared: Arc<ServerContext>, bearer: Option<Bearer>, budget: Budget) -> Self {
-        let draws = DrawAuditor::new(bearer.clone(), shared.ledger.clone());
-        Self { shared, batch: None, bearer, held: None, draws, budget, kept: None, playing: None }
+    pub fn new(context: Arc<ServerContext>, bearer: Option<Bearer>, budget: Budget) -> Self {
+        let draws = DrawAuditor::new(bearer.clone(), context.ledger.clone());
+        Self { context, batch: None, bearer, env_quota: None, draws, budget, step_memory: None, policy_memory: None }
     }
 
     async fn open(&mut self, request: proto::Open) -> Result<SessionReply, Error> {
@@ -77,26 +77,27 @@ impl Session {
                 format!("requests that wait at a time, 0 … {MAX_STORED_REPLIES}"),
             ));
         }
-        let most = self.shared.listing.max_batch_size as usize;
-        let settings = convert::open(&self.shared.catalogue, most, request)?;
+        let max_envs = self.context.listing.max_batch_size as usize;
+        let settings = convert::open(&self.context.catalogue, max_envs, request)?;
         let (observes_parameters, receipt_arrays) = (settings.observe_parameters, settings.receipt_arrays);
-        let environment = self.shared.listing.environments.iter().find(|entry| entry.name == settings.spec.name);
+        let environment = self.context.listing.environments.iter().find(|entry| entry.name == settings.spec.name);
         let environment = environment.map(|entry| entry.observed(observes_parameters));
         let envs = settings.size();
         // More than there can be is for the pool to refuse.
-        let kept = (envs <= most).then(|| self.budget.reserve(sizes::session(&settings, envs))).transpose()?;
-        let held = self.bearer.as_ref().map(|bearer| bearer.envs(envs)).transpose()?;
+        let step_memory =
+            (envs <= max_envs).then(|| self.budget.reserve(sizes::session(&settings, envs))).transpose()?;
+        let env_quota = self.bearer.as_ref().map(|bearer| bearer.envs(envs)).transpose()?;
         let (begun, spec) = (self.draws.open(&settings).await?, settings.spec);
-        let opened = Batch::open(&self.shared.pool, settings).await;
+        let opened = Batch::open(&self.context.pool, settings).await;
         let (mut batch, observations, started) = opened.inspect_err(|_| self.draws.open_failed(spec, begun))?;
         self.draws.record_drop(&mut batch);
         let grant = match unanswered {
             0 => None,
-            most => self.shared.leases.grant(self.bearer.clone(), most as usize)?,
+            unanswered => self.context.leases.grant(self.bearer.clone(), unanswered as usize)?,
         };
         let lease = grant.as_ref().map_or_else(Bytes::new, |grant| Bytes::copy_from_slice(&grant.name));
         let lease_seconds = grant.as_ref().map_or(0, |grant| grant.time().as_secs() as u32);
-        (self.batch, self.kept, self.held) = (Some(batch), kept, held);
+        (self.batch, self.step_memory, self.env_quota) = (Some(batch), step_memory, env_quota);
         let started = convert::started(started);
         let acts = true;
         let opened = proto::Opened {
@@ -117,7 +118,7 @@ impl Session {
         let batch = self.opened("step")?;
         convert::actions(batch.settings().spec, batch.size(), &request.actions)?;
         let stepped = batch.step(&request.actions).await?;
-        self.playing = None;
+        self.policy_memory = None;
         Ok(reply(Response::Stepped(convert::stepped(stepped))))
     }
 
@@ -126,7 +127,7 @@ impl Session {
         let entries = convert::reset(batch, request)?;
         self.draws.reset(batch, &entries).await?;
         let (observations, started) = batch.reset(entries).await?;
-        self.playing = None;
+        self.policy_memory = None;
         Ok(reply(Response::Reset(proto::ResetDone { observations, started: convert::started(started) })))
     }
 
@@ -152,7 +153,7 @@ impl Session {
                 return Err(error.into());
             }
         };
-        self.playing = None;
+        self.policy_memory = None;
         Ok(reply(Response::Restore(proto::Restored { observations })))
     }
 
@@ -161,7 +162,7 @@ impl Session {
         let (slot, size) = convert::render(batch.size(), request)?;
         let scene = batch.scene(slot)?.ok_or(Error::NothingToDraw { slot })?;
         let share = self.budget.reserve(sizes::picture(size))?;
-        let pixels = self.shared.renderer.draw(scene, size).await?;
+        let pixels = self.context.renderer.draw(scene, size).await?;
         let rendered = proto::Rendered { pixels, width: size.width.into(), height: size.height.into() };
         Ok(Reply { memory: Some(share), ..reply(Response::Render(rendered)) })
     }
@@ -171,8 +172,8 @@ impl Session {
         let slots = convert::release(batch.size(), &request)?;
         self.draws.release(batch, &slots);
         batch.release(&slots).await?;
-        if let Some(held) = &mut self.held {
-            held.release(slots.len());
+        if let Some(env_quota) = &mut self.env_quota {
+            env_quota.release(slots.len());
         }
         Ok(reply(Response::Release(proto::Released {})))
     }
@@ -183,7 +184,7 @@ impl Session {
         let policy = (policy > 0).then(|| self.budget.reserve(policy)).transpose()?;
         let rollout = policy::rollout_request(batch, self.bearer.as_ref().and_then(|bearer| bearer.rate()), request)?;
         let share = self.budget.reserve(sizes::max_rollout_bytes(&rollout, batch))?;
-        self.playing = policy.or(self.playing.take());
+        self.policy_memory = policy.or(self.policy_memory.take());
         let acted = policy::rollout_response(batch.act(rollout).await?);
         Ok(Reply { memory: Some(share), ..reply(Response::Act(acted)) })
     }
@@ -201,7 +202,7 @@ impl Session {
             });
         }
         let proto::Resume { lease, last_reply } = request;
-        let ticket = self.shared.leases.resume(&lease, self.bearer.as_ref(), last_reply).await?;
+        let ticket = self.context.leases.resume(&lease, self.bearer.as_ref(), last_reply).await?;
         let resumed = proto::Resumed { last_reply: ticket.last_reply };
         Ok(Reply { handover: Some(StreamHandover::Resume(ticket)), ..reply(Response::Resumed(resumed)) })
     }
@@ -259,7 +260,7 @@ impl SessionHandler for Session {
     fn request_limits(&self) -> RequestLimits {
         match &self.batch {
             None => {
-                let entries = self.shared.listing.max_batch_size as usize;
+                let entries = self.context.listing.max_batch_size as usize;
                 RequestLimits { bytes: MAX_BYTES_BEFORE_OPEN, entries, covered: 0 }
             }
             Some(batch) => RequestLimits {
