@@ -99,19 +99,19 @@ pub struct Arguments {
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keepalive_seconds: Option<u64>,
-    /// A TOML file of tokens, one of which every call by TCP must show: for each a name, sha256 (or token), and if
-    /// need be max_sessions, max_envs, max_steps_per_second, max_bytes and a role, which says what may be drawn from. It
-    /// is read again when it changes.
+    /// A TOML file of tokens, one of which every call by TCP must show: for each a name, sha256 (or token), and if need
+    /// be max_sessions, max_envs, max_steps_per_second, max_bytes and a role, which says what may be drawn from. It is
+    /// read again when it changes.
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tokens: Option<PathBuf>,
-    /// Write into this file what every token draws from (distribution, seed, indices, episodes), before it does, in lines
-    /// that are chained to each other; `perturb audit --ledger` reads it. An old one is gone on with.
+    /// Write into this file what every token draws from (distribution, seed, indices, episodes), before it does, in
+    /// lines that are chained to each other; `perturb audit --ledger` reads it. An old one is gone on with.
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ledger: Option<PathBuf>,
-    /// The server's certificate for TLS on its TCP addresses, in PEM, with those between it and its authority's. The files
-    /// of TLS are read again when they change.
+    /// The server's certificate for TLS on its TCP addresses, in PEM, with those between it and its authority's. The
+    /// files of TLS are read again when they change.
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls_cert: Option<PathBuf>,
@@ -119,13 +119,13 @@ pub struct Arguments {
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls_key: Option<PathBuf>,
-    /// The authorities, as certificates in PEM, one of which must have signed a client's certificate. Without it clients
-    /// need none.
+    /// The authorities, as certificates in PEM, one of which must have signed a client's certificate. Without it
+    /// clients need none.
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls_client_ca: Option<PathBuf>,
-    /// Where to tell metrics, as Prometheus scrapes them, at the path /metrics: tcp://127.0.0.1:port or unix:/path. Whoever
-    /// can connect may read them. [default: nowhere]
+    /// Where to tell metrics, as Prometheus scrapes them, at the path /metrics: tcp://127.0.0.1:port or unix:/path.
+    /// Whoever can connect may read them. [default: nowhere]
     #[arg(long, value_name = "ADDRESS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub metrics: Option<String>,
@@ -181,8 +181,8 @@ pub struct Arguments {
     #[arg(long, group = "instead")]
     #[serde(skip)]
     pub health: bool,
-    /// Start no server, but print what it would serve, as JSON: the environments with their spaces, parameters and rules
-    /// of success, and the limits that clients keep to.
+    /// Start no server, but print what it would serve, as JSON: the environments with their spaces, parameters and
+    /// rules of success, and the limits that clients keep to.
     #[arg(long, group = "instead")]
     #[serde(skip)]
     pub catalogue: bool,

@@ -10,8 +10,8 @@ use crate::{
 use bytes::Bytes;
 use std::{path::Path, time::Instant};
 
-/// Pairs of servers for each figure. Which of two equal servers is faster depends on where the system places their threads,
-/// so each pair is started anew, and the other program first in every second pair.
+/// Pairs of servers for each figure. Which of two equal servers is faster depends on where the system places their
+/// threads, so each pair is started anew, and the other program first in every second pair.
 const PAIRS: usize = 6;
 /// Rounds with each pair.
 const ROUNDS: usize = 7;

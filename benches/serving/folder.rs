@@ -26,8 +26,8 @@ const ROUNDS: usize = 11;
 /// Environment steps of a round.
 const STEPS: usize = 1 << 13;
 
-/// The built-in Hopper's task, as far as a folder can say it: roboschool's terms, and its observation without the clipping
-/// of single entries.
+/// The built-in Hopper's task, as far as a folder can say it: roboschool's terms, and its observation without the
+/// clipping of single entries.
 const HOPPER: &str = r#"
 format = 1
 name = "FolderHopper"

@@ -181,16 +181,16 @@ impl Batch {
         self.job.tally.meter.times(self.size).observe(end.saturating_duration_since(start));
     }
 
-    /// Returns the queue for the step after the next one, or `None` if a step must know the result of the one before, or if
-    /// the session's own thread may take it.
+    /// Returns the queue for the step after the next one, or `None` if a step must know the result of the one before,
+    /// or if the session's own thread may take it.
     pub fn step_queue(&self) -> Option<StepQueue> {
         let (job, spec, size) = (Arc::clone(&self.job), self.settings.spec, self.size);
         let follows = self.settings.autoreset != Autoreset::Disabled && job.needs_workers();
         follows.then_some(StepQueue { job, spec, size })
     }
 
-    /// Has a policy play. Without a new policy the previous one continues, without a new task it continues its own. The caller
-    /// has checked that there is a policy, that the previous task is done if another begins, that the mode is
+    /// Has a policy play. Without a new policy the previous one continues, without a new task it continues its own. The
+    /// caller has checked that there is a policy, that the previous task is done if another begins, that the mode is
     /// [`Autoreset::SameStep`], and that policy and weights fit.
     ///
     /// # Errors
@@ -211,7 +211,8 @@ impl Batch {
         self.runner.as_deref()
     }
 
-    /// Frees environments, in order of slots; at least one stays. The others are numbered anew and keep everything else.
+    /// Frees environments, in order of slots; at least one stays. The others are numbered anew and keep everything
+    /// else.
     ///
     /// # Errors
     /// [`Error::Defect`].
@@ -317,8 +318,8 @@ impl Batch {
         self.drop_hook = Some(hook);
     }
 
-    /// Waits for a request whose future was dropped early. Call it before the next request: workers may still be running the
-    /// old one and a step queued behind it. A policy that plays ends with its present step.
+    /// Waits for a request whose future was dropped early. Call it before the next request: workers may still be
+    /// running the old one and a step queued behind it. A policy that plays ends with its present step.
     pub async fn finish_abandoned(&mut self) {
         // Whether any of it failed the next request will tell.
         if self.under_way {
@@ -336,8 +337,8 @@ impl Batch {
         }
     }
 
-    /// Returns the scene of a slot, or `None` where its physics diverged. Little is read, between two requests, so no worker
-    /// is asked.
+    /// Returns the scene of a slot, or `None` where its physics diverged. Little is read, between two requests, so no
+    /// worker is asked.
     ///
     /// # Errors
     /// [`Error::Defect`].
@@ -430,7 +431,7 @@ impl Drop for Batch {
             }
             return; // freed here, so that there is room at once
         }
-        // Who holds the job last frees the environments: neither this thread, which lets it go now, nor a worker.
+        // The last holder of the job frees the environments. It must be neither this thread nor a worker.
         let mut deferred = Some((Arc::clone(&self.job), self.runner.take(), self.drop_hook.take()));
         self.workers.reaper.drop_later(Box::new(move || {
             let is_alone = deferred.as_ref().is_none_or(|(job, ..)| Arc::strong_count(job) == 1);
@@ -470,7 +471,7 @@ fn cut(groups: &[SlotGroup], size: usize) -> Vec<Vec<SlotGroup>> {
             let taken = deferred.size.min(free_slots);
             part.push(SlotGroup { size: taken, ..deferred.clone() });
             deferred.size -= taken;
-            // Of an empty rest the index is never used, and may be one too many.
+            // The index of an empty rest is never used, and may be one too many.
             deferred.episodes.environment_index = deferred.episodes.environment_index.wrapping_add(taken as u32);
             free_slots -= taken;
             if free_slots == 0 {
@@ -483,7 +484,8 @@ fn cut(groups: &[SlotGroup], size: usize) -> Vec<Vec<SlotGroup>> {
     parts
 }
 
-/// Environments in a shard: by cost, but so many shards that every worker has one, if a shard is worth a wake-up.
+/// The number of environments in a shard: by cost, but small enough that every worker has a shard, if a shard is worth
+/// a wake-up.
 fn shard_size(spec: &EnvironmentSpec, batch: usize, workers: usize) -> usize {
     let by_workers = batch.div_ceil(workers);
     let share = spec.step_cost * by_workers as f64;

@@ -33,7 +33,8 @@ pub(super) enum Continuation {
     Request,
 }
 
-/// A batch's shards and the state of its current request. A batch has at most one request under way, and one that follows.
+/// A batch's shards and the state of its current request. A batch has at most one request under way, and one that
+/// follows.
 pub(super) struct Job {
     pub(super) shards: Vec<Mutex<Shard>>,
     /// For each worker the range of shards that it takes first, and the next of them. A worker that meets the same
@@ -116,7 +117,8 @@ impl Job {
         self.remaining.store(self.shards.len(), Ordering::Relaxed);
     }
 
-    /// Claims a shard that nobody has taken, first of the worker's own. The caller has a part from the queue, so there is one.
+    /// Claims a shard that nobody has taken, first of the worker's own. The caller has a part from the queue, so there
+    /// is one.
     fn claim(&self, worker: usize) -> usize {
         loop {
             for i in 0..self.ranges.len() {

@@ -2,8 +2,9 @@
 //!
 //! A batch is cut into shards, each with its environments and its own output buffers. A request puts the batch into the
 //! workers' queue; a worker takes one shard of the batch at the queue's head and puts the batch back at its tail if
-//! shards remain, so that batches of different sessions take turns, whatever their sizes. The last shard to finish wakes
-//! the session, which gathers the outputs into one reply. Which worker ran which shard cannot be seen from outside.
+//! shards remain, so that batches of different sessions take turns, whatever their sizes. The last shard to finish
+//! wakes the session, which gathers the outputs into one reply. Which worker ran which shard cannot be seen from
+//! outside.
 //!
 //! A step that was asked for before the one under way had ended begins at once when that ends: the last shard's worker
 //! gathers the outputs, and puts the batch back, before the session is woken.

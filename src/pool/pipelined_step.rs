@@ -1,5 +1,5 @@
-//! A pipelined step is requested while another is under way. It begins as soon as that ends, while the session, which has
-//! to answer the first, is still being woken.
+//! A pipelined step is requested while another is under way. It begins as soon as that ends, while the session, which
+//! has to answer the first, is still being woken.
 
 use super::{
     shard::{Shard, set_actions},
@@ -35,8 +35,8 @@ impl PipelinedStep {
         self.is_under_way = true;
     }
 
-    /// At the end of a step: if another is queued, keeps the result and gives the shards their next actions. Returns whether
-    /// one was queued.
+    /// At the end of a step: if another is queued, keeps the result and gives the shards their next actions. Returns
+    /// whether one was queued.
     pub(super) fn after_step(&mut self, shards: &[Mutex<Shard>]) -> bool {
         let Some(actions) = self.actions.take() else {
             (self.is_under_way, self.ended) = (false, Some(Instant::now()));

@@ -23,8 +23,8 @@ use std::{
 };
 use tokio::time::Instant;
 
-/// The number of times that an idle worker yields its core before it sleeps. To wake a worker takes longer than a step of
-/// many small environments.
+/// The number of times that an idle worker yields its core before it sleeps. To wake a worker takes longer than a step
+/// of many small environments.
 const YIELDS_BEFORE_SLEEP: usize = 100;
 
 /// The niceness of the workers: the transport, which has little to do at a time, comes before them.
@@ -134,8 +134,8 @@ pub(super) struct Scheduler {
 }
 
 struct Queue {
-    /// FIFO of jobs, each with its number of unclaimed parts (at least 1), which are shards or the beginning of a rollout, and
-    /// the time at which it was enqueued.
+    /// FIFO of jobs, each with its number of unclaimed parts (at least 1), which are shards or the beginning of a
+    /// rollout, and the time at which it was enqueued.
     jobs: VecDeque<(Arc<Job>, usize, Instant)>,
     /// The number of workers that wait for `ready`.
     sleeping: usize,
@@ -202,7 +202,7 @@ impl Scheduler {
             }
             tokio::task::yield_now().await;
         }
-        // What told of one end may have been meant for the one before.
+        // The notification may belong to the previous request; check the counter again.
         while !has_ended() {
             job.done.notified().await;
         }
@@ -263,8 +263,8 @@ impl Scheduler {
         }
     }
 
-    /// At the end of a job's last part: notifies its session, and begins another step if a rollout or a pipelined step wants
-    /// one.
+    /// At the end of a job's last part: notifies its session, and begins another step if a rollout or a pipelined step
+    /// wants one.
     fn after_step(&self, job: &Arc<Job>) {
         loop {
             let next = job.after_step(self.closing.load(Ordering::Relaxed));
@@ -273,8 +273,8 @@ impl Scheduler {
             }
             job.prepare();
             let shards = job.shards.len();
-            // Others have their turn first. One part is this worker's, which is awake, if nobody waits: through the queue
-            // an idle worker would snatch a job that is in this one's cache.
+            // Others have their turn first. One part is this worker's, which is awake, if nobody waits: through the
+            // queue an idle worker would snatch a job that is in this one's cache.
             let is_own = shards == 1 && self.waiting.load(Ordering::Acquire) == 0;
             if !is_own {
                 self.push(job, shards, shards - 1);

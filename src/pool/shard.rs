@@ -204,7 +204,7 @@ impl Shard {
             for i in 0..group.size {
                 match (self.spec.make)() {
                     Ok(environment) => {
-                        // Whoever opened has checked that the last index fits.
+                        // The caller of open has checked that the last index fits.
                         let environment_index = group.episodes.environment_index + i as u32;
                         let settings = Settings { environment_index, ..group.episodes.clone() };
                         let episodes = Episodes::new(environment, settings);
@@ -229,7 +229,8 @@ impl Shard {
         for slot in 0..self.size {
             let episodes = &mut self.slots[slot];
             if episodes.ended() {
-                // Only next-step mode gets here: same-step leaves none ended and restores none, disabled refuses the step.
+                // Only next-step mode gets here: same-step leaves none ended and restores none, disabled refuses the
+                // step.
                 episodes.begin(None);
                 self.rewards[slot] = 0.0;
                 self.terminated[slot] = 0;

@@ -15,8 +15,8 @@ pub struct StepQueue {
 }
 
 impl StepQueue {
-    /// Queues a step with these actions, which were checked, behind the step under way, if there is one. The batch's next
-    /// request must then be that step.
+    /// Queues a step with these actions, which were checked, behind the step under way, if there is one. The batch's
+    /// next request must then be that step.
     pub fn enqueue(&self, actions: Bytes) {
         // Who holds it now is at the step's end.
         if let Ok(mut pipelined) = self.job.pipelined.try_lock() {

@@ -29,8 +29,8 @@ pub struct StepResult {
     pub ended: Vec<(u32, EpisodeEnd)>,
     /// Slot and episode; only with receipts.
     pub started: Vec<(u32, EpisodeStart)>,
-    /// u64 `[M, 5]`, of what ended, then of what began; only with receipts as arrays: slot, indices of environment, trial
-    /// and episode, number in the trial.
+    /// u64 `[M, 5]`, of what ended, then of what began; only with receipts as arrays: slot, indices of environment,
+    /// trial and episode, number in the trial.
     pub receipt_episodes: Bytes,
     /// f64 `[M, P + Q]`: requested and applied values.
     pub receipt_values: Bytes,

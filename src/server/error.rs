@@ -1,6 +1,6 @@
-//! The classes of errors that clients are told of: the gRPC code of each, its word in metrics and logs, and how often it
-//! happened. Each layer has an error enum of its own, which says by [`RequestError`] which class each variant is of; this
-//! table alone has the codes.
+//! The classes of errors that clients get: the gRPC code of each, its word in metrics and logs, and its counter. Each
+//! layer has an error enum of its own, which says the class of each variant by [`RequestError`]. Only this table has
+//! the codes.
 
 use crate::{env, pool, render};
 use std::{
@@ -13,7 +13,7 @@ use std::{
 };
 use tonic::{Code, Status};
 
-/// An error of a request, a call or a stream that its client is told of.
+/// An error of a request, a call or a stream, which its client gets.
 pub trait RequestError: Error {
     /// The error's class.
     fn kind(&self) -> ErrorKind;
@@ -81,7 +81,7 @@ macro_rules! error_kinds {
                 match self { $(Self::$kind => Code::$code,)* }
             }
 
-            /// The word of metrics and logs; no two kinds share it and the code.
+            /// The word in metrics and logs. No two kinds have the same word and the same code.
             pub fn reason(self) -> &'static str {
                 match self { $(Self::$kind => $reason,)* }
             }

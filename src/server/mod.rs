@@ -1,14 +1,14 @@
 //! The server: gRPC in, gRPC out. Each module uses those below it alone:
 //!
-//! - `startup`: how it begins and how it ends; [`security`]: the files that keep strangers out.
-//! - [`metrics`]: what the server says of itself.
+//! - `startup`: startup and shutdown; [`security`]: the files of tokens, TLS and the ledger.
+//! - [`metrics`]: the page that Prometheus scrapes.
 //! - [`api`]: the protocols, with all validation.
 //! - [`session`]: the transport of a session, and leases.
-//! - [`transport`]: messages off the wire and onto it, and the bytes of both.
-//! - [`audit`]: what a session draws from, by its token's role, and the ledger that has it.
+//! - [`transport`]: messages off the wire and onto it, and the memory for both.
+//! - [`audit`]: the checks of what a session samples, by its token's role, and the ledger of it.
 //! - [`auth`]: tokens, their quotas and roles.
 //! - [`net`]: connections, their limits and encryption.
-//! - [`shutdown`]: how far the shutdown is; [`error`]: the classes of errors, with their gRPC codes; [`limits`], [`id`].
+//! - [`shutdown`]: the phases of a shutdown; [`error`]: the classes of errors, with their gRPC codes; [`limits`], [`id`].
 
 pub mod api;
 pub mod audit;

@@ -28,7 +28,8 @@ pub struct Security {
 }
 
 impl Security {
-    /// Loads the files that the configuration of a server of these environments names, and loads them again when they change.
+    /// Loads the files that the configuration of a server of these environments names, and loads them again when they
+    /// change.
     ///
     /// # Errors
     /// If a file is wrong: it is named, with what was expected.

@@ -50,7 +50,8 @@ use tower::{Layer, ServiceBuilder};
 
 /// The flow-control window of a stream: the actions of ten thousand robots.
 const STREAM_WINDOW_BYTES: u32 = 1 << 20;
-/// The flow-control window of a connection. A session whose requests pile up does not stall the others: there is room for
+/// The flow-control window of a connection. A session whose requests pile up does not stall the others: there is room
+/// for
 /// 16 of them.
 const CONNECTION_WINDOW_BYTES: u32 = 16 * STREAM_WINDOW_BYTES;
 /// The streams of a connection beside its sessions: health, the catalogue, reflection.
@@ -61,7 +62,7 @@ const UNARY_TIMEOUT: Duration = Duration::from_secs(10);
 const MAX_UNARY_BYTES: usize = 1 << 10;
 /// The time in which connections must close at the end of a shutdown.
 const CONNECTION_CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
-/// The services whose health is told by name.
+/// The services whose health can be asked for by name.
 const SERVICES: [&str; 2] = [PerturbServer::<Service>::NAME, EnvironmentServer::<dm_env_rpc::service::Service>::NAME];
 
 /// Why the server stopped.
@@ -82,9 +83,9 @@ pub enum Error {
     Reflection(#[from] tonic_reflection::server::Error),
 }
 
-/// Serves these environments on the listeners, to whom the guards let in, and metrics on another, if there is one, until
-/// `shutdown` resolves; then drains: new sessions are refused, running ones may go on for the grace period, and
-/// connections are closed. Must run on a tokio runtime; a current-thread one is fastest.
+/// Serves these environments on the listeners, and metrics on another, if there is one, until `shutdown` resolves. Then
+/// it drains: new sessions are refused, running ones may continue for the grace period, and connections are closed.
+/// Must run on a tokio runtime; a current-thread one is fastest.
 ///
 /// # Errors
 /// [`Error`], before anything is served, or when a listener fails.
@@ -124,8 +125,8 @@ pub async fn run(
     Ok(())
 }
 
-/// The catalogue as the protocol tells it, of a server with these settings. Builds each environment once, so that a
-/// model that cannot be loaded is known before anything is served.
+/// The catalogue of a server with these settings, as a message. Builds each environment once, so that a model that
+/// cannot be loaded is known before anything is served.
 ///
 /// # Errors
 /// [`env::Error`].
@@ -138,7 +139,7 @@ pub fn listing(catalogue: &Catalogue, config: &Config) -> Result<proto::ListEnvi
     })
 }
 
-/// The parts of a server that several services share, or the metrics tell of.
+/// The parts of a server that several services share, or that the metrics read.
 struct State {
     pool: Arc<Pool>,
     catalogue: Arc<Catalogue>,
@@ -155,7 +156,7 @@ struct State {
 impl State {
     fn new(config: &Config, catalogue: Catalogue, drain: Drain) -> io::Result<Self> {
         let pool = Arc::new(Pool::new(config.workers, config.max_envs)?);
-        // Told from the beginning, as are errors and ends of sessions: who watches a rate needs its zero.
+        // Every counter exists from the start, so that a rate shows its first event.
         catalogue.names().for_each(|name| _ = pool.meter(name));
         let seconds = |count: u64| (count > 0).then(|| Duration::from_secs(count));
         let handshake = Duration::from_secs(config.handshake_seconds);
@@ -255,7 +256,7 @@ fn router<H: Health>(
         .timeout(UNARY_TIMEOUT) // until an answer begins, which that of a stream does at once
         .add_service(perturb)
         .add_service(worlds)
-        // Health is for everybody: whoever watches over servers need not be able to use them.
+        // Health needs no token: a monitor need not be able to use the server.
         .add_service(health.max_decoding_message_size(MAX_UNARY_BYTES))
         .add_service(auth.layer(reflection_v1.max_decoding_message_size(MAX_UNARY_BYTES)))
         .add_service(auth.layer(reflection_v1alpha.max_decoding_message_size(MAX_UNARY_BYTES))))
@@ -307,7 +308,7 @@ fn serve(
     servers
 }
 
-/// Refuses new sessions, lets running ones go on for the grace period, and closes connections.
+/// Refuses new sessions, lets running ones continue for the grace period, and closes connections.
 async fn shut_down(
     config: &Config,
     controller: &Controller,

@@ -35,8 +35,8 @@ const DOCUMENT: &[(&str, &str, &str, f64, (f64, f64), [(f64, f64); 2])] = &[
 
 /// Trials drawn for each test of a distribution.
 const DRAWS: u32 = 4000;
-/// Standard deviations beyond which a count is wrong: happens by chance once in 1.7 million comparisons, and the seed is
-/// fixed.
+/// Standard deviations beyond which a count is wrong: happens by chance once in 1.7 million comparisons, and the seed
+/// is fixed.
 const SIGMAS: f64 = 5.0;
 /// Bound of √n times the Kolmogorov-Smirnov distance: exceeded by chance with probability 2 exp(-2 · 2.7²) = 9e-7.
 const KOLMOGOROV_SMIRNOV: f64 = 2.7;

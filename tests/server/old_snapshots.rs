@@ -1,4 +1,5 @@
-//! Snapshots that earlier servers took can be restored, unless their environment has another revision now. Each is of seed
+//! Snapshots that earlier servers took can be restored, unless their environment has another revision now. Each is of
+//! seed
 //! 77 and index 0 in version R, after 20 steps, as the server of commit 886bf00 saved it.
 
 #[cfg(feature = "mujoco")]

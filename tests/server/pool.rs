@@ -379,8 +379,8 @@ async fn small_batches_finish_before_a_large_one_that_came_first() {
         batches.push(Batch::open(&pool, batch_settings(spec, size, Autoreset::SameStep)).await.unwrap().0);
     }
     let actions = vec![0; 4 * size];
-    // The workers ring the bells: the order does not depend on when this thread is awake. Only if it slept from the large
-    // batch's request until the small ones' does an attempt say nothing.
+    // The workers ring the bells: the order does not depend on when this thread is awake. Only if it slept from the
+    // large batch's request until the small ones' does an attempt say nothing.
     for _ in 0..ATTEMPTS {
         let rung = Arc::new(Mutex::new(Vec::new()));
         let mut steps: Vec<_> = Vec::new();

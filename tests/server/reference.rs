@@ -1,4 +1,5 @@
-//! The classic tasks compute what Gymnasium computes: trajectories that Gymnasium 1.4 ran in f64 under edited parameters.
+//! The classic tasks compute what Gymnasium computes: trajectories that Gymnasium 1.4 ran in f64 under edited
+//! parameters.
 
 use perturb::{
     env::{Action, Environment, Transition},
@@ -8,8 +9,8 @@ use serde_json::Value;
 
 const GOLDEN: &str = include_str!("data/classic_control.jsonl");
 
-/// A single step is a few dozen operations, each rounding by 1.1e-16 and amplified by at most a few hundred (by the short
-/// light poles of E): 1e-12 leaves room for another order of the same operations, and for no error of the model.
+/// A single step is a few dozen operations, each rounding by 1.1e-16 and amplified by at most a few hundred (by the
+/// short light poles of E): 1e-12 leaves room for another order of the same operations, and for no error of the model.
 const SINGLE_STEP: f64 = 1e-12;
 /// Errors of single steps grow along a trajectory; over 50 steps less than a thousandfold.
 const TRAJECTORY: f64 = 1e-9;

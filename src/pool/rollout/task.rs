@@ -1,7 +1,8 @@
 //! A rollout: the steps of one reply, which a policy plays without a session in between.
 //!
-//! The worker that ends a step's last shard has the rollout take the outcome, choose the next actions and give them to the
-//! shards. Then the job goes to the queue's tail, like that of any other step. The session is woken at the rollout's end.
+//! The worker that ends a step's last shard has the rollout take the outcome, choose the next actions and give them to
+//! the shards. Then the job goes to the queue's tail, like that of any other step. The session is woken at the
+//! rollout's end.
 
 use super::policy_runner::{Policy, PolicyRunner};
 use crate::{
@@ -119,8 +120,8 @@ impl RolloutTask {
         self.error.map_or(Ok((self.runner, self.rollout)), Err)
     }
 
-    /// Takes what the shards did last and tells them what to do next. Returns false at the rollout's end, which comes in any
-    /// case when it is `halted`.
+    /// Takes what the shards did last and tells them what to do next. Returns false at the rollout's end, which comes
+    /// in any case when it is `halted`.
     pub(in crate::pool) fn after_step(&mut self, shards: &[Mutex<Shard>], halted: bool) -> bool {
         match self.advance(shards) {
             Ok(goes_on) => goes_on && !halted,

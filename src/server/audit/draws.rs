@@ -57,10 +57,10 @@ impl DrawAuditor {
         Self { bearer, ledger, session, refused: Arc::default() }
     }
 
-    /// Before environments are made.
+    /// Checks and records the draws of environments that are about to be made.
     ///
     /// # Errors
-    /// [`Error::NotAllowed`], [`Error::NoLedger`]; so the others.
+    /// [`Error::NotAllowed`], [`Error::NoLedger`].
     pub async fn open(&self, settings: &BatchSettings) -> Result<PendingDraws, Error> {
         if self.is_free() {
             return Ok(PendingDraws::default());
@@ -76,7 +76,7 @@ impl DrawAuditor {
         self.begin(settings.spec, begins, Vec::new()).await
     }
 
-    /// Before environments are reset.
+    /// Checks and records the draws of environments that are about to be reset.
     pub async fn reset(&self, batch: &Batch, entries: &[ResetEntry]) -> Result<PendingDraws, Error> {
         if self.is_free() {
             return Ok(PendingDraws::default());
@@ -84,7 +84,7 @@ impl DrawAuditor {
         let (mut previous, mut starts) = (Vec::new(), Vec::new());
         for ResetEntry { slot, seed, distributions, .. } in entries {
             if seed.is_none() && distributions.is_none() {
-                continue; // it goes on as before
+                continue; // it continues as before
             }
             let before = batch.draw(*slot);
             let next = match *seed {
@@ -102,7 +102,7 @@ impl DrawAuditor {
         self.begin(batch.settings().spec, begins, previous).await
     }
 
-    /// Before environments are restored.
+    /// Checks and records the draws of environments that are about to be restored.
     pub async fn restore(&self, batch: &Batch, entries: &[(usize, Bytes)]) -> Result<PendingDraws, Error> {
         if self.is_free() || entries.is_empty() {
             return Ok(PendingDraws::default());
@@ -126,12 +126,12 @@ impl DrawAuditor {
         self.begin(spec, begins, previous).await
     }
 
-    /// After environments could not be made.
+    /// Withdraws the draws of environments that could not be made.
     pub fn open_failed(&self, spec: &EnvironmentSpec, begun: PendingDraws) {
         self.note(spec, Vec::new(), Vec::new(), begun.withdraw());
     }
 
-    /// After environments could not be restored: those of these slots go on as before.
+    /// Withdraws the draws of environments that could not be restored. Those of these slots continue as before.
     pub fn restore_failed(&self, batch: &Batch, slots: &[usize], begun: PendingDraws) {
         let spec = batch.settings().spec;
         let previous: Vec<_> = slots.iter().map(|slot| (batch.draw(*slot), batch.distributions(*slot))).collect();
@@ -140,7 +140,7 @@ impl DrawAuditor {
         self.note(spec, regions, begins, begun.withdraw());
     }
 
-    /// Before environments are freed that a session gives back.
+    /// Records the environments that a session is about to release.
     pub fn release(&self, batch: &Batch, slots: &[usize]) {
         if self.ledger.is_some() {
             let previous = slots.iter().map(|slot| batch.draw(*slot));
@@ -148,7 +148,7 @@ impl DrawAuditor {
         }
     }
 
-    /// Has a batch's end written down.
+    /// Records the end of a batch when it is dropped.
     pub fn record_drop(&self, batch: &mut Batch) {
         if self.ledger.is_some() {
             let (own, spec) = (self.clone(), batch.settings().spec);
@@ -157,7 +157,7 @@ impl DrawAuditor {
         }
     }
 
-    /// Whether a token may draw from there; what is refused is written down.
+    /// Checks that the token may draw from there, and records a refusal.
     pub fn check(&self, spec: &EnvironmentSpec, distributions: &[Distribution]) -> Result<(), Error> {
         let Some(role) = self.bearer.as_ref().and_then(|bearer| bearer.role()) else { return Ok(()) };
         let region = spec.region(distributions);
@@ -179,7 +179,7 @@ impl DrawAuditor {
         self.ledger.is_none() && self.bearer.as_ref().is_none_or(|bearer| bearer.role().is_none())
     }
 
-    /// Checks what begins, each for so many environments, and writes it down, with what ends for it.
+    /// Checks the draws that begin, each for a number of environments, and records them with those that end.
     async fn begin<'a>(
         &self,
         spec: &EnvironmentSpec,

@@ -82,7 +82,7 @@ impl Ledger {
             .into());
         }
         let (done, written) = oneshot::channel();
-        let _ = self.lines.send((event, Some(done))); // nobody is there only if the thread is gone, and then nobody answers
+        let _ = self.lines.send((event, Some(done))); // it fails only if the thread is gone; then no answer comes
         let reason = match written.await {
             Ok(Ok(())) => return Ok(()),
             Ok(Err(reason)) => reason,
@@ -154,7 +154,7 @@ impl LedgerWriter {
             self.is_torn = false;
         }
         if let Err(error) = self.file.write_all(lines.as_bytes()).and_then(|()| self.file.sync_data()) {
-            // What is there of them is no line.
+            // A part of them is not a line.
             self.is_torn = self.file.set_len(self.bytes).is_err();
             return Err(error.to_string());
         }

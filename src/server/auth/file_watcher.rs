@@ -26,8 +26,8 @@ pub fn read(paths: &[PathBuf]) -> Contents {
 }
 
 impl FileWatcher {
-    /// Calls `reload` with what is in the files, which were read before, when it has changed and stays so for a moment:
-    /// whoever writes them may not be done. If it refuses, that is logged, and the next change is waited for.
+    /// Calls `reload` with the contents of the files when they have changed and stay so for a moment, since a writer
+    /// may not be done. `before` is what was read at first. An error is logged, and the next change is waited for.
     ///
     /// # Errors
     /// If there is no thread.

@@ -1,4 +1,4 @@
-//! The gate before the services.
+//! The layer that authenticates calls.
 
 use super::Tokens;
 use crate::server::{
@@ -18,7 +18,7 @@ use tonic::{
 };
 use tower::Layer;
 
-/// A service that answers whoever shows a token, if there are any to be shown.
+/// A service that answers calls with a good token, or all calls if the server has no tokens.
 #[derive(Clone)]
 pub struct AuthService<S> {
     service: S,
@@ -34,7 +34,7 @@ pub struct AuthLayer {
 }
 
 impl AuthLayer {
-    /// Asks for one of these, or for none, and counts whom it refuses.
+    /// A layer that asks for one of these tokens, if there are some, and counts refused calls.
     pub fn new(tokens: Option<Tokens>, counters: ErrorCounters) -> Self {
         Self { tokens, counters }
     }

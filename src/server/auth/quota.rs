@@ -19,7 +19,7 @@ impl Quota {
         self.taken.load(Ordering::Relaxed)
     }
 
-    /// Takes so many, or says how many there may be.
+    /// Takes `wanted`, or returns the limit.
     fn take(&self, wanted: usize) -> Result<(), usize> {
         let limit = self.limit.load(Ordering::Relaxed);
         let grown = |taken: usize| taken.checked_add(wanted).filter(|sum| *sum <= limit);
@@ -66,7 +66,7 @@ impl QuotaGuard {
         Self { token, count: 0, kind }
     }
 
-    /// Takes so many more.
+    /// Takes `count` more.
     ///
     /// # Errors
     /// [`Error::QuotaExceeded`]; then it is as before.
@@ -81,14 +81,14 @@ impl QuotaGuard {
         Ok(())
     }
 
-    /// Makes it so many, which may be more than the quota.
+    /// Changes the count, which may then be more than the quota.
     pub fn set(&mut self, count: usize) {
         let taken = &self.kind.quota(&self.token).taken;
         taken.fetch_add(count, Ordering::Relaxed);
         taken.fetch_sub(std::mem::replace(&mut self.count, count), Ordering::Relaxed);
     }
 
-    /// Gives some of it back.
+    /// Gives `count` back.
     pub fn release(&mut self, count: usize) {
         self.set(self.count.saturating_sub(count));
     }

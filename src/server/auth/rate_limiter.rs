@@ -1,6 +1,6 @@
-//! The rate limit for the steps of a token's environments. Steps are charged after they ran. A client that is ahead of the
-//! rate waits with its next request, while nothing is held but the request itself. Steps that were not used can be made up
-//! for within a second.
+//! The rate limit for the steps of a token's environments. Steps are charged after they ran. A client that is ahead of
+//! the rate waits with its next request, while nothing is held but the request itself. Steps that were not used can be
+//! made up for within a second.
 
 use std::{
     sync::{Mutex, MutexGuard, PoisonError},
@@ -23,7 +23,7 @@ pub(super) struct RateLimiter(Mutex<State>);
 
 #[derive(Default)]
 struct State {
-    /// Steps a second; none: as many as there can be.
+    /// The steps per second; `None` for no limit.
     rate: Option<u32>,
     /// Steps so far.
     done: f64,
@@ -41,7 +41,7 @@ pub(super) struct TooFast {
 }
 
 impl RateLimiter {
-    /// From now on so many steps a second.
+    /// Sets the steps per second; `None` for no limit.
     pub(super) fn set_rate(&self, rate: Option<u32>) {
         self.lock().set_rate(rate, Instant::now());
     }
@@ -98,8 +98,8 @@ impl State {
         self.at = Some(now);
     }
 
-    /// Returns how long to sleep before calling again, or `None` when the caller may proceed. Pass an empty `ticket` on the
-    /// first call.
+    /// Returns how long to sleep before calling again, or `None` when the caller may proceed. Pass an empty `ticket` on
+    /// the first call.
     fn wait(&mut self, ticket: &mut Option<f64>, now: Instant) -> Result<Option<Duration>, TooFast> {
         self.refill(now);
         let Some(rate) = self.rate else { return Ok(None) };

@@ -28,7 +28,7 @@ const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(200);
 const MAX_HEAD_BYTES: usize = 16 << 10;
 const CONTENT_TYPE_OPENMETRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
-/// Answers whoever connects, for ever.
+/// Answers scrapers, for ever.
 pub async fn serve(listener: Listener, sources: Arc<Sources>) {
     let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     loop {
@@ -64,7 +64,7 @@ async fn converse(stream: impl AsyncRead + AsyncWrite + Unpin, sources: Arc<Sour
         .header_read_timeout(CONNECTION_TIMEOUT)
         .keep_alive(false)
         .max_buf_size(MAX_HEAD_BYTES);
-    // Whoever goes early or sends what is no HTTP gets nothing, and nobody else minds.
+    // A client that leaves early or does not send HTTP gets nothing, and no other client is affected.
     let _ = timeout(CONNECTION_TIMEOUT, http.serve_connection(TokioIo::new(stream), answer)).await;
 }
 

@@ -1,4 +1,5 @@
-//! The access log: a line for each session that ended, so many a second, so that clients that come and go fill no disk.
+//! The access log has a line for each session that ended. The number of lines in a second is limited, so that clients
+//! that come and go do not fill the disk.
 
 use super::peer_limiter::Peer;
 use std::{
@@ -104,7 +105,7 @@ impl AccessLog {
         *state.endings.entry((protocol, ending)).or_default() += 1;
         let now = Instant::now();
         let (since, wanted) = state.window.get_or_insert((now, 0));
-        // A window with lines left out ends when they are told.
+        // A window that leaves lines out ends when the log says how many.
         if *wanted <= MAX_LINES_PER_WINDOW && since.elapsed() >= WINDOW {
             (*since, *wanted) = (now, 0);
         }

@@ -44,7 +44,7 @@ pub struct ConnectionLimits {
 }
 
 impl ConnectionLimits {
-    /// The connection, if there is a place for it.
+    /// The connection, if there is a permit for it.
     fn admit<S>(&self, stream: S, peer: Peer) -> Option<ManagedIo<S>> {
         self.acquire(peer).map(|permit| ManagedIo::new(stream, peer, permit, self.handshake))
     }
@@ -193,8 +193,8 @@ impl Drop for SocketFile {
 }
 
 impl Listener {
-    /// Binds an address; a Unix socket's file gets this mode before anybody can connect. One that a dead server left behind
-    /// is replaced.
+    /// Binds an address; a Unix socket's file gets this mode before anybody can connect. One that a dead server left
+    /// behind is replaced.
     ///
     /// # Errors
     /// If the address is in use or may not be bound; the message names it.

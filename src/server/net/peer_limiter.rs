@@ -18,7 +18,8 @@ pub enum Peer {
 }
 
 impl Peer {
-    /// The peer with this address. An IPv6 address stands for its network of 64 bits, the least that a machine is given.
+    /// The peer with this address. An IPv6 address stands for its network of 64 bits, the least that a machine is
+    /// given.
     pub fn at(address: IpAddr) -> Self {
         Self::Machine(match address.to_canonical() {
             IpAddr::V6(address) => Ipv6Addr::from_bits(address.to_bits() & !u128::from(u64::MAX)).into(),

@@ -89,8 +89,8 @@ impl Tls {
         Ok(())
     }
 
-    /// Shakes hands with a client. One with whom there is no agreement is told why, and hears it: a connection that is
-    /// closed while there is something to read is reset, and what was written last may be lost.
+    /// Does the handshake with a client. If it fails, the alert is sent and the rest of the client's data is read: a
+    /// connection that is closed while there is something to read is reset, and the alert may be lost.
     ///
     /// # Errors
     /// If they do not agree.

@@ -1,6 +1,6 @@
 //! The task that runs a session. Streams attach to it and detach from it. Without a lease the session ends with its
-//! stream. With one it outlives the stream for a while: what was asked for is done whether or not anybody waits for it, and
-//! the last replies are stored, to be sent again.
+//! stream. With one it outlives the stream for a while: what was asked for is done whether or not anybody waits for it,
+//! and the last replies are stored, to be sent again.
 
 use super::{
     Error,
@@ -35,8 +35,8 @@ use tokio::{
 };
 use tonic::Status;
 
-/// The most bytes of a session's stored replies, unless the last one alone has more: a client that has not received that
-/// much is better off with a snapshot.
+/// The most bytes of a session's stored replies, unless the last one alone has more: a client that has not received
+/// that much is better off with a snapshot.
 const MAX_STORED_BYTES: usize = 4 << 20;
 /// A stored reply's bytes beside those that are sent.
 const REPLY_OVERHEAD_BYTES: usize = 512;
@@ -120,7 +120,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         }
     }
 
-    /// Answers a stream's requests, until it is lost, or another takes its place, or the session ends.
+    /// Answers a stream's requests, until it is lost or replaced, or the session ends.
     async fn attached(&mut self, responses: &ResponseSender<H::Response>) -> Attachment<H::Response> {
         let mut closed = pin!(responses.closed());
         loop {
@@ -281,7 +281,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         self.lease.as_mut().and_then(|lease| lease.accept_resume(ask))
     }
 
-    /// Ends the stream, because another takes its place.
+    /// Ends the stream, because another resumes the session.
     fn supersede(
         &mut self,
         responses: &ResponseSender<H::Response>,
@@ -320,8 +320,8 @@ impl<H: SessionHandler> SessionDriver<H> {
         }
     }
 
-    /// Stores a reply for sending it, maybe again. If the memory budget is exhausted, the older stored replies are dropped
-    /// first.
+    /// Stores a reply for sending it, maybe again. If the memory budget is exhausted, the older stored replies are
+    /// dropped first.
     fn store_reply(&mut self, answer: Result<Reply<H::Response>, H::Error>) {
         let Self { exchange, lease: Some(lease) } = self else { return };
         let stored = &mut lease.stored;

@@ -18,7 +18,7 @@ pub enum Error {
     /// A message is refused.
     #[error(transparent)]
     Transport(#[from] transport::Error),
-    /// A session cannot be taken up, or was.
+    /// A session cannot be resumed, or another stream has resumed it.
     #[error(transparent)]
     Lease(#[from] lease::Error),
     /// A lease would have no name.

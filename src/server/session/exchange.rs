@@ -22,7 +22,7 @@ use std::{convert::Infallible, sync::Arc, time::Duration};
 use tokio::time::Instant;
 use tonic::Status;
 
-/// The ending of a stream that goes on with another session. It has no line in the access log.
+/// The ending of a stream that resumed another session. It has no line in the access log.
 pub(super) const MOVED: &str = "moved";
 
 /// A session's handler, and the requests of the stream that the session has now.
@@ -82,8 +82,8 @@ impl<H: SessionHandler> Exchange<H> {
         }
     }
 
-    /// Returns the next request, or `None` at the client's end. If the future is dropped, the next call goes on where it
-    /// was: nothing is lost.
+    /// Returns the next request, or `None` at the client's end. If the future is dropped, the next call continues where
+    /// it was: nothing is lost.
     pub(super) async fn request(&mut self) -> Result<Option<Message>, StreamStop<H::Error>> {
         let SessionLimits { handshake, idle, .. } = self.sessions.limits;
         let limits = self.request_limits();
@@ -103,7 +103,7 @@ impl<H: SessionHandler> Exchange<H> {
             let seconds = limit.map_or(0, |limit| limit.as_secs());
             Err(refused(Error::Idle { seconds }))
         };
-        // Also where the next request is there already.
+        // A request that is there already does not help.
         if limit.is_some_and(|limit| passed > limit) {
             return late();
         }
@@ -139,8 +139,8 @@ impl<H: SessionHandler> Exchange<H> {
             Message::Whole(bytes, share) => (bytes, share),
             Message::Refused(error) => return Ok(self.undecoded(error)),
         };
-        // A client that is ahead of its rate waits before anything has happened. Nothing steps before a session is open. A
-        // request that was read ahead had no rate to keep.
+        // A client that is ahead of its rate waits before anything has happened. Nothing steps before a session is
+        // open. A request that was read ahead had no rate to keep.
         let bearer = self.requests.bearer.clone();
         let paced = bearer.as_ref().filter(|_| self.handler.is_open() && !self.came_ahead);
         tokio::select! {

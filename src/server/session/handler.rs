@@ -16,7 +16,7 @@ use std::future::Future;
 pub enum StreamHandover<R> {
     /// The session has a lease from now on, and outlives the stream.
     Lease(LeaseGuard<R>),
-    /// The stream goes on with the session that it resumes.
+    /// The stream continues with the session that it resumes.
     Resume(ResumeAccepted<R>),
 }
 
@@ -69,14 +69,14 @@ pub trait SessionHandler: Send + 'static {
     /// Answers a request.
     ///
     /// # Errors
-    /// Why the request is refused; the session goes on.
+    /// Why the request is refused; the session stays open.
     fn answer(
         &mut self,
         request: Self::Request,
     ) -> impl Future<Output = Result<Reply<Self::Response>, Self::Error>> + Send;
 
-    /// Returns a function that offers the next request to the pool while `request` runs, or `None` if the next request must
-    /// wait. The caller must answer a request that it offered next.
+    /// Returns a function that offers the next request to the pool while `request` runs, or `None` if the next request
+    /// must wait. The caller must answer a request that it offered next.
     fn pipeline(&self, request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<Self>>;
 
     /// The response to a request that is refused.

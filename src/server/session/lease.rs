@@ -1,6 +1,6 @@
-//! Leases: sessions that outlive the loss of their stream for a while, and go on in another.
+//! Leases: sessions that outlive the loss of their stream for a while, and continue in another.
 //!
-//! - Here: which there are, and how a new stream asks for one.
+//! - This module: the leases of a server, and how a new stream asks for one.
 //! - [`replay_buffer`](super::replay_buffer): replies that may not have been received.
 //! - Beside it, the driver runs such a session and waits for its streams.
 
@@ -24,7 +24,7 @@ use tonic::Status;
 /// The maximum number of stored replies, and so of unanswered requests, of a session with a lease.
 pub const MAX_STORED_REPLIES: u32 = 64;
 
-/// Why a session cannot be taken up.
+/// Why a session cannot be resumed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {

@@ -21,7 +21,8 @@ impl<R> ReplayBuffer<R> {
         self.last
     }
 
-    /// Records a request. At most `max_unanswered` are unanswered, so the client has received all earlier replies, which are dropped.
+    /// Records a request. At most `max_unanswered` are unanswered, so the client has received all earlier replies,
+    /// which are dropped.
     pub fn on_request(&mut self) {
         let received = (self.replies.len() + 1).saturating_sub(self.max_unanswered);
         self.replies.drain(..received);

@@ -128,8 +128,8 @@ impl PendingReservations {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).push(share);
     }
 
-    /// Attaches the reservations, and what `hold` makes, to the bytes of a reply. They are held until the last of the bytes is
-    /// written or dropped. Without reservations the bytes are returned as they are.
+    /// Attaches the reservations, and what `hold` makes, to the bytes of a reply. They are held until the last of the
+    /// bytes is written or dropped. Without reservations the bytes are returned as they are.
     pub fn attach<H: Send + 'static>(&self, bytes: Bytes, hold: impl FnOnce() -> H) -> Bytes {
         let shares = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
         if shares.is_empty() { bytes } else { Bytes::from_owner(ReservedBytes { bytes, _held: (shares, hold()) }) }

@@ -1,7 +1,7 @@
 //! Messages off the wire: gRPC's frames, each bounded by what its stream may send now, before anything of it is kept.
 //!
-//! tonic has one limit for all messages of a service, and decodes them on the transport's thread. So the streams of both
-//! protocols keep their bodies from it ([`raw_body`](super::raw_body)) and read them here.
+//! tonic has one limit for all messages of a service, and decodes them on the transport's thread. So the streams of
+//! both protocols keep their bodies from it ([`raw_body`](super::raw_body)) and read them here.
 
 use super::{
     Error,

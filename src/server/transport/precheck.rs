@@ -1,5 +1,5 @@
-//! Requests from their bytes. The encoding lets two bytes stand for an entry of a hundred, so entries are counted before
-//! anything is made of them, and what has many fields is decoded by other threads than the transport's.
+//! Requests from their bytes. The encoding lets two bytes stand for an entry of a hundred, so entries are counted
+//! before anything is made of them, and what has many fields is decoded by other threads than the transport's.
 
 use self::FieldKind::{Fields, Numbers};
 use crate::{
@@ -130,8 +130,8 @@ enum PrecheckError {
     Refused(InvalidValue),
 }
 
-/// Counts a message's fields and entries, at most `work` of them. What is not well-formed ends the count, as it ends the
-/// decoding.
+/// Counts a message's fields and entries, at most `work` of them. What is not well-formed ends the count, as it ends
+/// the decoding.
 fn check(message: &[u8], fields: &[Field], limits: RequestLimits, mut work: usize) -> Result<(), PrecheckError> {
     count(message, fields, limits, &mut work).map(|_| ())
 }

@@ -47,8 +47,8 @@ struct State {
     /// Number of unread replies that hold reservations.
     unread: usize,
     unread_since: Instant,
-    /// The time since which a reply waits for the flow control of the client. The session is not asked for more meanwhile,
-    /// so none of its own limits would end it.
+    /// The time since which a reply waits for the flow control of the client. The session is not asked for more
+    /// meanwhile, so none of its own limits would end it.
     held_since: Option<Instant>,
     /// No reply has been taken yet.
     is_first: bool,
@@ -120,8 +120,8 @@ impl Drop for UnreadGuard {
 }
 
 impl WatchedBody {
-    /// Wraps a response body and attaches queued reservations to its bytes. Closes the connection when the client leaves data
-    /// unread longer than `timeouts`.
+    /// Wraps a response body and attaches queued reservations to its bytes. Closes the connection when the client
+    /// leaves data unread longer than `timeouts`.
     pub fn new(
         body: Body,
         outbox: PendingReservations,

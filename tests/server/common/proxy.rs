@@ -33,8 +33,8 @@ struct Connection {
 }
 
 impl Proxy {
-    /// In front of the server at `address`, host and port. Connection number n, counted from 0, is cut when `most(n)` bytes
-    /// went through.
+    /// In front of the server at `address`, host and port. Connection number n, counted from 0, is cut when `most(n)`
+    /// bytes went through.
     pub fn start(address: &str, most: impl Fn(usize) -> usize + Send + 'static) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let (port, state) = (listener.local_addr().unwrap().port(), Arc::<State>::default());

@@ -9,7 +9,8 @@ use perturb::proto::{Open, Reset, Restore, session_request::Request};
 use std::{io::Write, net::TcpStream};
 use tonic::Code;
 
-/// The longest that a refusal is, whatever came: a sentence or two with names of ours, and a hundred characters that came.
+/// The longest that a refusal is, whatever came: a sentence or two with names of ours, and a hundred characters that
+/// came.
 const LONGEST: usize = 1000;
 /// A line of the log has the refusal, and where it was.
 const LONGEST_LINE: usize = 2 * LONGEST;
@@ -84,7 +85,8 @@ async fn what_clients_write_is_shortened_and_escaped_in_refusals_and_the_log() {
 async fn what_goes_wrong_in_a_library_on_clients_demand_is_not_logged() {
     const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0";
     let server = Server::start(&[]);
-    // Headers that are none, a frame of a stream that is none, a window that overflows, resets without end, another end.
+    // Headers that are none, a frame of a stream that is none, a window that overflows, resets without end, another
+    // end.
     let resets: Vec<u8> = (0..3_000_u32).flat_map(|n| reset(2 * n + 1)).collect();
     for frames in [
         &b"\0\0\x05\x01\x04\0\0\0\x01\xFF\xFF\xFF\xFF\xFF"[..],

@@ -6,8 +6,8 @@ use rstest::rstest;
 
 const STEPS: usize = 100;
 
-/// A model with every element that can be edited: sliding and rolling contacts, a declared pair, a servo of each kind, a
-/// tendon, limits, air, and statistics of its own.
+/// A model with every element that can be edited: sliding and rolling contacts, a declared pair, a servo of each kind,
+/// a tendon, limits, air, and statistics of its own.
 const MODEL: &str = r#"<mujoco>
   <compiler angle="radian"/>
   <option timestep="0.004" gravity="0.3 0 -9.81" wind="1 0 0" density="20" viscosity="0.01"/>
@@ -71,8 +71,8 @@ fn environment(name: &str, edit: &str, bounds: (f64, f64, f64), model: &str) -> 
     (spec.make)().unwrap()
 }
 
-/// Positions, velocities and all else of the state after each of some steps of random actions, from a state in which the
-/// box slides, the ball rolls and spins, and the puck slides.
+/// Positions, velocities and all else of the state after each of some steps of random actions, from a state in which
+/// the box slides, the ball rolls and spins, and the puck slides.
 fn trajectory(environment: &mut dyn Environment) -> Vec<Vec<f64>> {
     let spec = environment.spec();
     let mut state = vec![0.0; spec.state.len()];

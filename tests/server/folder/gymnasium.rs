@@ -1,5 +1,5 @@
-//! Gymnasium's eleven MuJoCo tasks: the files that the Python package has, with the models of the package gymnasium, give
-//! Gymnasium's observations, rewards and ends.
+//! Gymnasium's eleven MuJoCo tasks: the files that the Python package has, with the models of the package gymnasium,
+//! give Gymnasium's observations, rewards and ends.
 
 use super::folder;
 use crate::common::server::{self, Server, Session, doubles, floats, open};

@@ -126,7 +126,8 @@ impl Runner {
         self.batch.finish_abandoned().await;
     }
 
-    /// Begins an episode: the next, or that of a world that is new. With changes a new trial begins, as in `perturb.v1`.
+    /// Begins an episode: the next, or that of a world that is new. With changes a new trial begins, as in
+    /// `perturb.v1`.
     ///
     /// # Errors
     /// If the server has a defect.

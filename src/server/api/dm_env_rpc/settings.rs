@@ -40,8 +40,8 @@ pub(super) struct Change {
     pub(super) parameters: Vec<(&'static str, Distribution)>,
 }
 
-/// Checks the settings of `create_world`. Returns the version, and whose the world is to be, beside what the batch needs
-/// to know.
+/// Checks the settings of `create_world`. Returns the version, and whose the world is to be, beside what the batch
+/// needs to know.
 ///
 /// # Errors
 /// For settings that are missing, unknown, of a wrong type or out of range.

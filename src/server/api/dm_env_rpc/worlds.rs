@@ -1,6 +1,6 @@
-//! All worlds of the server, by name. A world lives as long as the stream that made it or an agent that is in it. Names
-//! cannot be guessed, unless they were asked for: whoever is told one may join, with the token that the world was made
-//! with.
+//! All worlds of the server, by name. A world lives as long as the stream that made it, or an agent that is in it. A
+//! client that knows the name may join, with the token that the world was made with. Names cannot be guessed, unless a
+//! client chose them.
 
 use super::{Error, runner::Runner, settings::Ownership, world::World};
 use crate::{

@@ -1,4 +1,4 @@
-//! Between the protocol and the domain. All validation of what clients send is here: what leaves this file is legal.
+//! Conversion between the protocol and the domain, with all validation of what clients send.
 
 use super::Error;
 use crate::{
@@ -54,7 +54,7 @@ fn single(request: proto::Open) -> proto::SlotGroup {
     proto::SlotGroup { size: batch_size, version, parameters, seed, first_environment_index, episodes_per_trial }
 }
 
-/// Refuses groups beside what they are in place of.
+/// Refuses groups together with the fields that they replace.
 fn check_no_single(request: &proto::Open) -> Result<(), Error> {
     let given = [
         ("open.version", request.version != 0),

@@ -1,4 +1,4 @@
-//! Policies and what they played, between the protocol and the domain, with all validation.
+//! Conversion of policies and rollouts between the protocol and the domain, with all validation.
 
 use super::{Error, convert};
 use crate::{
@@ -34,8 +34,8 @@ struct Sizes {
     action: ActionKind,
 }
 
-/// Checks an `act` against the batch and the policy at play, of a client whose environments may take so many steps a
-/// second, if that is bounded.
+/// Checks an `act` against the batch and the policy that plays. `rate` limits the steps per second of the client's
+/// environments.
 pub fn rollout_request(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<RolloutRequest, Error> {
     let (settings, n_envs) = (batch.settings(), batch.size());
     let order = |when: &'static str, advice| Error::Order { request: "act", when: when.into(), advice };

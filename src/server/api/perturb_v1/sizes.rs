@@ -52,7 +52,7 @@ pub fn session(settings: &BatchSettings, envs: usize) -> usize {
     step_request(settings, envs).saturating_mul(2).saturating_add(reply.saturating_mul(3))
 }
 
-/// The snapshots of so many environments.
+/// The estimated length of the snapshots of `envs` environments.
 pub fn snapshots(envs: usize) -> usize {
     envs.saturating_mul(SNAPSHOT_BYTES)
 }
