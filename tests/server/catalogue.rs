@@ -181,7 +181,7 @@ fn observations_and_rewards_keep_to_the_spec() {
 }
 
 #[test]
-fn the_reward_is_the_sum_of_its_terms_and_the_return_that_of_the_rewards() {
+fn reward_is_the_sum_of_its_terms() {
     for spec in common::catalogue().specs() {
         let mut e = episodes(spec, Version::R, 3, 0, 1);
         let mut total = 0.0;

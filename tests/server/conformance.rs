@@ -114,7 +114,7 @@ async fn the_catalogue_is_complete_and_consistent() {
 }
 
 #[tokio::test]
-async fn every_request_is_answered_once_and_in_order_also_when_pipelined() {
+async fn every_request_is_answered_once_and_in_order() {
     let target = Target::get();
     for e in &target.catalogue().await {
         let actor = Actor::new(e, 3);
@@ -180,7 +180,7 @@ async fn open_tells_what_was_opened_and_how_the_first_episodes_began() {
 }
 
 #[tokio::test]
-async fn step_replies_have_the_promised_shapes_and_rewards_are_the_sum_of_their_terms() {
+async fn step_replies_have_the_promised_shapes_and_reward_sums() {
     const N: usize = 4;
     let target = Target::get();
     for e in &target.catalogue().await {
@@ -286,7 +286,7 @@ async fn episodes(target: &Target, e: &Environment, autoreset: AutoresetMode, ep
 }
 
 #[tokio::test]
-async fn the_three_autoreset_modes_run_the_same_episodes_and_never_lose_a_final_observation() {
+async fn autoreset_modes_run_the_same_episodes() {
     let target = Target::get();
     for e in &target.catalogue().await {
         let next_step = episodes(&target, e, AutoresetMode::NextStep, 2).await;
@@ -365,7 +365,7 @@ async fn a_seed_fixes_all_bytes_and_another_seed_gives_others() {
 }
 
 #[tokio::test]
-async fn versions_draw_parameters_from_their_sets_and_receipts_read_them_back() {
+async fn versions_draw_from_their_sets_and_receipts_say_so() {
     let target = Target::get();
     for e in &target.catalogue().await {
         for asked in [Version::Default, Version::Random, Version::Extreme] {
@@ -401,7 +401,7 @@ async fn versions_draw_parameters_from_their_sets_and_receipts_read_them_back() 
 }
 
 #[tokio::test]
-async fn a_parameter_may_be_a_fixed_value_an_interval_or_a_union_at_open() {
+async fn open_takes_fixed_values_intervals_and_unions() {
     let target = Target::get();
     for e in &target.catalogue().await {
         let p = &e.parameters[0];
@@ -426,7 +426,7 @@ async fn a_parameter_may_be_a_fixed_value_an_interval_or_a_union_at_open() {
 }
 
 #[tokio::test]
-async fn parameters_given_at_reset_begin_a_trial_and_stay_in_force_for_the_selected() {
+async fn parameters_at_reset_begin_a_trial_and_stay_in_force() {
     let target = Target::get();
     for e in &target.catalogue().await {
         let request = Open { episodes_per_trial: 100, ..version(open(&e.name, 2, 6), Version::Default) };

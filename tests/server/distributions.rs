@@ -84,7 +84,7 @@ fn the_table_is_the_document() {
 }
 
 #[test]
-fn defaults_lie_in_r_and_r_between_the_two_halves_of_e_and_all_within_bounds() {
+fn defaults_lie_in_r_and_r_lies_between_the_halves_of_e() {
     for (name, p) in all_parameters() {
         let place = format!("{name}, {}", p.name);
         assert!(p.random.low <= p.default && p.default <= p.random.high, "{place}");
@@ -124,7 +124,7 @@ fn r_is_uniform_on_its_interval() {
 }
 
 #[test]
-fn e_draws_each_interval_in_proportion_to_its_length_and_nothing_inside_r() {
+fn e_draws_intervals_by_length_and_nothing_inside_r() {
     for spec in tasks::catalogue().specs() {
         let rows = drawn(spec, Version::E);
         for (i, p) in spec.parameters.iter().enumerate() {
@@ -215,7 +215,7 @@ fn an_override_does_not_move_the_other_parameters_draws() {
 }
 
 #[test]
-fn a_trial_of_r_and_e_is_all_of_one_of_them_as_the_document_says() {
+fn trial_of_r_and_e_is_all_of_one_of_them() {
     for spec in tasks::catalogue().specs() {
         let mut of_r = 0;
         for (trial, got) in (1..).zip(drawn(spec, Version::RE)) {
@@ -262,7 +262,7 @@ fn a_union_that_is_none_is_refused(#[case] pairs: &[(f64, f64)], #[case] reason:
 }
 
 #[test]
-fn a_distribution_has_at_most_64_intervals_and_refusals_stay_short() {
+fn distribution_has_at_most_64_intervals() {
     let intervals = |n: u32| (0..n).map(|i| Interval::new(i.into(), f64::from(i) + 0.5)).collect::<Vec<_>>();
     assert!(Distribution::union(&intervals(64)).is_ok());
     let long = "m".repeat(1_000_000);

@@ -22,7 +22,7 @@ fn run<T>(future: impl Future<Output = T>) -> T {
 }
 
 #[test]
-fn more_requests_than_the_queue_holds_are_all_answered_each_with_its_own_picture() {
+fn pictures_beyond_the_queue_are_all_drawn() {
     let renderer = Renderer::new();
     let position = |i: usize| (i % 7) as f64 - 3.0;
     run(async {

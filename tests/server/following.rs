@@ -65,7 +65,7 @@ async fn wait_until(condition: impl Fn() -> bool) {
 }
 
 #[tokio::test]
-async fn a_step_that_follows_is_done_before_anybody_asks_for_it_and_has_the_same_bytes() {
+async fn pipelined_step_runs_early_and_gives_the_same_bytes() {
     let pool = Pool::new(2, 2 * N).unwrap();
     let settings = acrobots(Autoreset::SameStep);
     let spec = settings.spec;
@@ -129,7 +129,7 @@ async fn a_batch_with_a_step_that_follows_settles_and_can_be_dropped() {
 }
 
 #[tokio::test]
-async fn a_step_that_fails_after_another_takes_its_batch_with_it_and_no_worker() {
+async fn failing_pipelined_step_loses_its_batch_and_no_worker() {
     let pool = Pool::new(2, 2 * N).unwrap();
     let (mut other, ..) = Batch::open(&pool, acrobots(Autoreset::SameStep)).await.unwrap();
     let spec = other.settings().spec;
@@ -151,7 +151,7 @@ async fn a_step_that_fails_after_another_takes_its_batch_with_it_and_no_worker()
 }
 
 #[tokio::test]
-async fn where_a_step_needs_to_know_what_came_of_the_one_before_none_follows() {
+async fn no_step_is_pipelined_that_needs_the_last_result() {
     let pool = Pool::new(1, N).unwrap();
     let (batch, ..) = Batch::open(&pool, acrobots(Autoreset::Disabled)).await.unwrap();
     assert!(batch.step_queue().is_none());

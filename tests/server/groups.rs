@@ -58,7 +58,7 @@ fn part(stepped: &Stepped, first: u32, size: u32) -> Stepped {
 }
 
 #[tokio::test]
-async fn environments_of_a_group_give_the_bytes_of_a_session_of_their_own() {
+async fn group_gives_the_bytes_of_a_session_of_its_own() {
     let server = Server::start(&["--workers", "3"]);
     let (mut together, opened) = Session::open(server.unix(), with(groups())).await;
     assert!(opened.acts);
@@ -96,7 +96,7 @@ async fn environments_of_a_group_give_the_bytes_of_a_session_of_their_own() {
 }
 
 #[tokio::test]
-async fn parameters_of_a_session_of_r_and_e_replace_those_of_both_also_at_a_reset() {
+async fn parameters_of_r_and_e_replace_those_of_both() {
     let server = Server::start(&[]);
     let given = || parameters(&[("length", &[(0.3, 0.3)])]);
     let of = |parameters| Open { version: Version::RandomOrExtreme.into(), parameters, ..open("CartPole", 60, 4) };
@@ -151,7 +151,7 @@ async fn bad_groups_are_refused() {
 
 #[rstest]
 #[tokio::test]
-async fn environments_that_stay_keep_everything_when_others_are_released(#[values("1", "3")] workers: &str) {
+async fn release_leaves_the_other_environments_as_they_are(#[values("1", "3")] workers: &str) {
     const N: usize = 200;
     let server = Server::start(&["--workers", workers]);
     let asked = Open { autoreset_mode: AutoresetMode::SameStep.into(), ..open("CartPole", N as u32, 1) };

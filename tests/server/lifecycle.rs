@@ -65,9 +65,7 @@ async fn max_envs(server: &Server) -> u32 {
 
 #[rstest]
 #[tokio::test]
-async fn after_a_signal_running_sessions_go_on_new_ones_are_refused_and_the_exit_status_is_0(
-    #[values("TERM", "INT")] signal: &str,
-) {
+async fn signal_lets_running_sessions_go_on_and_refuses_new_ones(#[values("TERM", "INT")] signal: &str) {
     let mut server = Server::start(&["--grace-seconds", "100000"]);
     let e = environment(server.tcp(), "CartPole").await;
     let actor = Actor::new(&e, 4);
@@ -106,7 +104,7 @@ async fn after_a_signal_running_sessions_go_on_new_ones_are_refused_and_the_exit
 }
 
 #[tokio::test]
-async fn after_the_grace_period_sessions_end_with_unavailable_and_the_exit_status_is_0() {
+async fn grace_period_ends_sessions_with_unavailable() {
     let mut server = Server::start(&["--grace-seconds", "1"]);
     let (mut silent, _) = Session::open(server.tcp(), open("CartPole", 4, 1)).await;
     // This one always has requests on their way.
@@ -137,7 +135,7 @@ async fn after_the_grace_period_sessions_end_with_unavailable_and_the_exit_statu
 }
 
 #[tokio::test]
-async fn a_server_without_sessions_ends_at_once_whatever_its_grace_period() {
+async fn server_without_sessions_ends_at_once() {
     // Connections without a session do not keep it.
     let mut server = Server::start(&["--grace-seconds", "100000"]);
     let _idle = server::client(server.tcp()).await;
@@ -198,7 +196,7 @@ async fn a_second_signal_ends_the_server_at_once() {
 }
 
 #[tokio::test]
-async fn exit_with_stdin_ends_the_server_when_its_input_closes_and_only_then() {
+async fn exit_with_stdin_ends_the_server_with_its_input() {
     let mut server = Server::start(&["--exit-with-stdin"]);
     server.stdin.as_mut().unwrap().write_all(b"words mean nothing\n").unwrap();
     assert_eq!(health(server.tcp(), SERVICE).await.unwrap(), ServingStatus::Serving);
@@ -214,7 +212,7 @@ async fn exit_with_stdin_ends_the_server_when_its_input_closes_and_only_then() {
 }
 
 #[tokio::test]
-async fn a_private_server_ends_with_its_input_has_room_for_all_and_heeds_flags_alone() {
+async fn private_server_ends_with_its_input_and_heeds_only_flags() {
     let directory = tempfile::tempdir().unwrap();
     let mut others = command();
     others
@@ -309,7 +307,7 @@ async fn a_successors_socket_stays_when_an_old_server_ends() {
 }
 
 #[tokio::test]
-async fn a_socket_whose_server_accepts_nobody_is_in_use_and_nobody_waits_for_it() {
+async fn socket_of_a_stuck_server_is_in_use() {
     let directory = tempfile::tempdir().unwrap();
     let socket = directory.path().join("perturb.sock");
     let _deaf = UnixListener::bind(&socket).unwrap();

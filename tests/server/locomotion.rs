@@ -335,7 +335,7 @@ fn thrown(walker: &Walker, place: f64, pitch: f64, speed: f64) -> Vec<f64> {
 }
 
 #[test]
-fn a_robot_that_was_20_m_ahead_in_any_step_succeeds_wherever_it_is_later() {
+fn robot_succeeds_that_was_20_m_ahead_in_any_step() {
     for make in ROBOTS {
         let mut walker = make();
         let action = vec![0.0; n_actions(&walker)];
@@ -355,7 +355,7 @@ fn a_robot_that_was_20_m_ahead_in_any_step_succeeds_wherever_it_is_later() {
 
 /// The reference asks after the reset, and so never about the step that ends an episode.
 #[test]
-fn a_robot_that_comes_to_20_m_in_the_step_in_which_it_falls_succeeds() {
+fn robot_succeeds_that_falls_in_the_step_to_20_m() {
     for make in ROBOTS {
         let walker = make();
         let action = vec![0; 4 * n_actions(&walker)];

@@ -200,7 +200,7 @@ async fn a_reset_and_a_restore_bring_other_parameters(#[case] name: &str) {
 }
 
 #[tokio::test]
-async fn groups_observe_as_sessions_of_their_own_also_when_others_have_left() {
+async fn groups_observe_like_sessions_of_their_own() {
     let server = Server::with_folders(&["--workers", "2"]);
     let groups: Vec<SlotGroup> = [(Version::Random, 3), (Version::Extreme, 2), (Version::Default, 60)]
         .map(|(version, size)| SlotGroup { size, version: version.into(), seed: 9, ..SlotGroup::default() })

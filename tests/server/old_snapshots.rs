@@ -43,7 +43,7 @@ async fn what_follows_an_old_snapshot_is_what_follows_without_one() {
 }
 
 #[tokio::test]
-async fn an_old_snapshot_of_another_revision_is_refused_and_changes_nothing() {
+async fn snapshot_of_another_revision_is_refused() {
     let server = Server::start(&[]);
     let (mut session, _) = Session::open(server.unix(), open("CartPole", 1, SEED)).await;
     let before = session.snapshot(&[]).await;

@@ -121,7 +121,7 @@ impl Model {
 }
 
 #[tokio::test]
-async fn a_batch_gives_the_bytes_of_its_environments_in_every_autoreset_mode() {
+async fn batch_gives_the_bytes_of_its_environments() {
     for spec in common::catalogue().specs() {
         for mode in MODES {
             let size = 5;
@@ -176,7 +176,7 @@ fn beyond_the_limit(observation: &[u8]) -> bool {
 }
 
 #[tokio::test]
-async fn in_next_step_mode_the_step_after_the_last_resets_with_reward_0_and_neither_flag() {
+async fn next_step_mode_resets_with_reward_0_and_no_flags() {
     let pool = Pool::new(1, 1).unwrap();
     let (mut batch, last) = fall(&pool, Autoreset::NextStep).await;
     assert_eq!((last.terminated[0], last.truncated[0], floats(&last.rewards)[0]), (1, 0, 1.0));
@@ -203,7 +203,7 @@ async fn pool_with_room(pool: &Pool) -> &Pool {
 }
 
 #[tokio::test]
-async fn in_same_step_mode_the_last_step_resets_and_keeps_the_final_observation() {
+async fn same_step_mode_keeps_the_final_observation() {
     let pool = Pool::new(1, 1).unwrap();
     let (mut batch, last) = fall(&pool, Autoreset::SameStep).await;
     assert_eq!((last.terminated[0], last.truncated[0], floats(&last.rewards)[0]), (1, 0, 1.0));
@@ -217,7 +217,7 @@ async fn in_same_step_mode_the_last_step_resets_and_keeps_the_final_observation(
 }
 
 #[tokio::test]
-async fn in_disabled_mode_an_ended_environment_refuses_the_step_until_it_is_reset() {
+async fn disabled_mode_refuses_steps_of_ended_environments() {
     let pool = Pool::new(1, 1).unwrap();
     let (mut batch, last) = fall(&pool, Autoreset::Disabled).await;
     assert!(beyond_the_limit(&last.observations) && last.final_observations == last.observations);
@@ -437,7 +437,7 @@ async fn a_step_that_is_soon_done_waits_for_no_worker() {
 }
 
 #[tokio::test]
-async fn a_session_that_steps_alone_waits_for_no_worker_for_somewhat_longer_steps() {
+async fn uncontended_session_steps_inline_for_longer() {
     let pool = Pool::new(1, 10_000).unwrap();
     let open = |name, size| {
         Batch::open(&pool, batch_settings(common::catalogue().find(name).unwrap(), size, Autoreset::SameStep))
@@ -487,7 +487,7 @@ async fn workers_that_fell_asleep_are_woken_for_every_job() {
 }
 
 #[tokio::test]
-async fn a_full_pool_refuses_and_has_room_again_when_a_batch_is_dropped() {
+async fn full_pool_has_room_again_when_a_batch_is_dropped() {
     let spec = common::catalogue().find("CartPole").unwrap();
     let pool = Pool::new(2, 10).unwrap();
     let open = |size| Batch::open(&pool, batch_settings(spec, size, Autoreset::SameStep));
@@ -532,7 +532,7 @@ async fn a_batch_dropped_in_mid_step_gives_its_environments_back() {
 }
 
 #[tokio::test]
-async fn a_batch_whose_step_nobody_waits_for_settles_and_goes_on_after_it() {
+async fn batch_continues_after_an_abandoned_step() {
     const N: usize = 2000;
     let pool = Pool::new(2, N * 2).unwrap();
     let spec = common::catalogue().find("Acrobot").unwrap();
@@ -576,7 +576,7 @@ fn ids(started: &[(u32, EpisodeStart)]) -> Vec<(u32, u64, u64, u32)> {
 }
 
 #[tokio::test]
-async fn a_reset_touches_the_selected_slots_only_and_goes_on_with_their_trials() {
+async fn reset_touches_only_the_selected_slots() {
     for spec in common::catalogue().specs() {
         let pool = Pool::new(2, 8).unwrap();
         let (mut batch, mut untouched) = (open_four(&pool, spec.name).await, open_four(&pool, spec.name).await);

@@ -100,7 +100,7 @@ async fn every_environment_is_drawn_in_the_size_that_was_asked_for() {
 }
 
 #[tokio::test]
-async fn pictures_differ_as_states_do_and_equal_states_give_equal_bytes() {
+async fn pictures_differ_exactly_as_states_do() {
     let (server, other) = (start(), start());
     for environment in catalogue(server.unix()).await {
         let name = &environment.name;

@@ -87,7 +87,7 @@ fn refused(result: Result<(), Error>) -> String {
 }
 
 #[test]
-fn an_environment_of_r_and_e_goes_on_with_both_and_more_sets_are_refused() {
+fn restored_environment_of_r_and_e_continues_with_both() {
     for spec in common::catalogue().specs() {
         let mut e = episodes(spec, Version::RE, 31, 5, 1);
         let saved = e.snapshot();
@@ -149,7 +149,7 @@ fn every_moment_of_an_episode_can_be_restored() {
 }
 
 #[test]
-fn an_ended_environment_stays_ended_and_goes_on_with_its_next_episode() {
+fn restored_ended_environment_stays_ended() {
     for spec in common::catalogue().specs() {
         for episode_in_trial in 0..2 {
             let mut e = episodes(spec, Version::R, 31, 5, 2);
@@ -260,7 +260,7 @@ fn snapshots_of_other_environments_are_refused() {
 }
 
 #[test]
-fn snapshots_that_contradict_themselves_are_refused_and_change_nothing() {
+fn contradictory_snapshots_are_refused() {
     type Edit = fn(&mut Saved, &EnvironmentSpec);
     let edits: &[(&str, Edit)] = &[
         ("another format", |s, _| s.format += 1),
@@ -506,7 +506,7 @@ async fn a_refused_restore_of_several_changes_nothing_in_any_shard() {
 }
 
 #[tokio::test]
-async fn an_environment_saved_after_its_end_is_restored_in_next_step_mode_and_refused_in_same_step_mode() {
+async fn ended_snapshot_is_refused_in_same_step_mode() {
     let spec = common::catalogue().find("CartPole").unwrap();
     let pool = Pool::new(1, 2).unwrap();
     let (mut next, ..) = Batch::open(&pool, batch_settings(spec, 1, 1, Autoreset::NextStep)).await.unwrap();

@@ -28,7 +28,7 @@ async fn a_server_that_cannot_log_serves_and_ends_in_order() {
 
 /// Whoever started it was killed, and somebody else's session goes on: it warns of that before it ends.
 #[tokio::test]
-async fn a_private_server_that_cannot_warn_removes_its_folder_all_the_same() {
+async fn private_server_that_cannot_warn_removes_its_folder() {
     let directory = tempfile::tempdir().unwrap();
     let folder = directory.path().join("own");
     std::fs::create_dir(&folder).unwrap();

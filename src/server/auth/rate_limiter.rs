@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn who_waits_while_the_rate_is_lowered_is_refused_like_those_who_come() {
+    fn lowered_rate_also_refuses_waiting_requests() {
         let mut clocked = Clocked::new();
         clocked.set_rate(1000);
         clocked.state.done += 20_000.0;

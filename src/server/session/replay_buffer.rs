@@ -78,7 +78,7 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn a_request_says_that_what_its_client_does_not_wait_for_was_received() {
+    fn request_drops_the_replies_that_were_received() {
         let mut kept = ReplayBuffer::new(1);
         kept.on_request();
         kept.push_reply('a');

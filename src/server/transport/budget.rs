@@ -152,7 +152,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_does_not_fit_is_refused_and_what_is_dropped_is_free_again() {
+    fn reservation_over_the_limit_is_refused_until_one_is_dropped() {
         let budget = Budget::new(100);
         let mut first = budget.reserve(60).unwrap();
         assert_eq!(budget.reserve(41).err(), Some(Error::MemoryFull { wanted: 41, used: 60, limit: 100 }));

@@ -85,7 +85,7 @@ async fn same_bytes(game: Game) {
 
 #[rstest]
 #[tokio::test]
-async fn bytes_do_not_depend_on_the_number_of_workers_and_shards_or_replies(
+async fn bytes_do_not_depend_on_workers_shards_or_replies(
     #[values("Pendulum", "CartPole")] environment: &'static str,
     #[values("1", "3")] workers: &str,
     #[values(0, 1, 7)] most_steps: u32,

@@ -143,7 +143,7 @@ async fn an_act_out_of_order_is_refused(#[case] before: Before, #[case] spoil: f
 }
 
 #[tokio::test]
-async fn an_act_before_open_in_another_mode_or_among_trials_of_different_lengths_is_refused() {
+async fn act_is_refused_in_wrong_states_of_the_session() {
     let server = Server::start(&[]);
     let mut session = Session::connect(server.unix()).await;
     assert_eq!(session.refused(Act::default()).await.1, "act came before open; send open first");

@@ -60,9 +60,7 @@ fn poll<F: Future>(future: &mut Pin<Box<F>>) -> Poll<F::Output> {
 
 #[rstest]
 #[tokio::test]
-async fn others_have_their_turns_while_a_policy_plays_and_its_environments_go_with_their_batch(
-    #[values(4, 2000)] size: usize,
-) {
+async fn others_step_while_a_policy_plays(#[values(4, 2000)] size: usize) {
     let pool = Pool::new(1, 3000).unwrap();
     let (mut played, mut stepped) = (mountain_cars(&pool, size).await, mountain_cars(&pool, 8).await);
     let mut playing = Box::pin(played.act(endless(size)));
@@ -102,7 +100,7 @@ async fn a_pool_ends_while_a_policy_plays() {
 }
 
 #[tokio::test]
-async fn environments_of_a_client_that_goes_in_the_middle_of_a_play_are_freed() {
+async fn environments_are_freed_when_a_client_leaves_mid_rollout() {
     let server = Server::start(&["--max-envs", "5"]);
     let (session, environment) = PLAIN.session(&server).await;
     session.send(PLAIN.act(&environment, Asked::Steps(u32::MAX))).await;

@@ -11,7 +11,7 @@ fn transport_time(server: &Server) -> Duration {
 }
 
 #[tokio::test]
-async fn thousands_of_hoppers_are_freed_by_another_thread_than_the_transports() {
+async fn transport_does_not_free_thousands_of_hoppers() {
     const HOPPERS: u32 = 8_192;
     let server = Server::start(&["--max-envs", "8192", "--workers", "2"]);
     let (session, _) = Session::open(server.tcp(), open("Hopper", HOPPERS, 1)).await;

@@ -108,7 +108,7 @@ async fn pictures_that_nobody_reads_take_no_more_than_the_budget() {
 }
 
 #[tokio::test]
-async fn a_session_for_which_there_is_no_room_is_refused_and_those_that_are_open_step_on() {
+async fn session_without_room_is_refused_and_open_ones_step_on() {
     let server = Server::start(&["--max-memory", "9000000"]);
     let (mut first, _) = Session::open(server.tcp(), open("CartPole", 2_000, 1)).await;
     let mut second = Session::connect(server.tcp()).await;
@@ -146,7 +146,7 @@ async fn a_snapshot_of_empty_lists_takes_no_memory() {
 }
 
 #[tokio::test]
-async fn a_client_that_reads_nothing_and_one_that_never_ends_a_message_are_gone_in_time() {
+async fn client_that_neither_reads_nor_ends_a_message_is_gone() {
     let server = Server::start(&["--stall-seconds", "1", "--max-envs", "2"]);
     let mut unread = Connection::new(server.port(), 1 << 16).await;
     let mut call = unread.call(SESSION).await.unwrap();
@@ -229,7 +229,7 @@ async fn nothing_is_left_of_a_connection_that_has_ended() {
 
 #[cfg(feature = "mujoco")]
 #[tokio::test]
-async fn environments_opened_and_dropped_again_and_again_take_little_more_than_once() {
+async fn repeated_opens_take_little_more_memory_than_one() {
     const N: u32 = 16_384;
     let server = Server::start(&[]);
     let mut once = 0;

@@ -31,7 +31,7 @@ fn opened(environment: &str, n: u32) -> Vec<u8> {
 }
 
 #[tokio::test]
-async fn before_open_a_request_of_more_than_64_kib_is_refused_before_it_is_read() {
+async fn request_over_64_kib_before_open_is_refused_unread() {
     let server = Server::start(&[]);
     let neighbour = Neighbour::start(server.unix());
     for length in [(64 << 10) + 1, 60 << 20] {
@@ -94,7 +94,7 @@ async fn counts_are_bounded_while_a_large_request_is_decoded() {
 }
 
 #[tokio::test]
-async fn a_request_with_too_many_parts_is_refused_in_its_place_and_the_session_goes_on() {
+async fn request_with_too_many_parts_is_refused_in_its_place() {
     let server = Server::start(&[]);
     let (mut session, _) = Session::open(server.tcp(), open("CartPole", 2, 1)).await;
     let snapshots = session.snapshot(&[]).await;

@@ -41,7 +41,7 @@ async fn a_small_picture_does_not_wait_for_all_the_large_ones() {
 
 #[cfg(feature = "mujoco")]
 #[tokio::test]
-async fn a_robot_that_could_not_be_drawn_for_want_of_descriptors_can_be_later() {
+async fn robot_can_be_drawn_when_descriptors_are_free_again() {
     use crate::common::server::{command, until};
     use perturb::proto::session_response::Response;
     use std::net::TcpStream;

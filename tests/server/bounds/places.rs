@@ -48,7 +48,7 @@ async fn sessions_that_are_never_opened_give_their_places_back() {
 
 /// Each stream's first reply waits for a window that its client never opens, so that nothing else of it is looked at.
 #[tokio::test]
-async fn sessions_whose_first_reply_is_never_let_come_give_their_places_back() {
+async fn session_with_unread_first_reply_gives_its_place_back() {
     let server = Server::start(&["--handshake-seconds", "3", "--max-sessions", "20"]);
     let mut connection = Connection::new(server.port(), 0).await;
     let mut calls = Vec::new();
@@ -83,7 +83,7 @@ async fn who_is_refused_again_and_again_has_not_opened_a_session() {
 
 /// Its next request is always there already.
 #[tokio::test]
-async fn who_is_refused_without_a_pause_has_not_opened_a_session_either() {
+async fn refusals_without_a_pause_do_not_extend_the_handshake() {
     let server = Server::start(&["--handshake-seconds", "2"]);
     let mut session = Session::connect(server.tcp()).await;
     let sender = session.sender();
@@ -124,7 +124,7 @@ async fn a_peer_has_no_more_sessions_and_connections_than_its_quota() {
 }
 
 #[tokio::test]
-async fn more_connections_are_served_than_the_soft_limit_of_descriptors_allows() {
+async fn connections_beyond_the_soft_descriptor_limit_are_served() {
     let mut limited = std::process::Command::new("sh");
     limited.arg("-c").arg("ulimit -S -n 64; exec \"$@\"").arg("sh").arg(command().get_program());
     limited.args(["--listen", "tcp://127.0.0.1:0"]).arg0("sh");
@@ -141,7 +141,7 @@ const SECONDS: &str = "PERTURB_TEST_FULL_SERVER_SECONDS";
 
 #[cfg(feature = "mujoco")]
 #[tokio::test]
-async fn every_place_can_be_taken_by_hoppers_and_one_more_is_refused_at_once() {
+async fn hoppers_can_fill_all_places_and_one_more_is_refused() {
     use crate::common::server::{step, stepped};
     const SESSIONS: usize = 1024;
     let server = Server::start(&[]);

@@ -113,7 +113,7 @@ async fn can_step(address: &str) {
 }
 
 #[tokio::test]
-async fn a_stream_beyond_a_connections_limit_is_refused_until_another_is_over() {
+async fn stream_over_the_limit_is_refused_until_another_ends() {
     let server = Server::start(&FLAGS);
     let mut greedy = Greedy::connect(server.port()).await;
     assert_eq!(greedy.announced().await, Some(STREAMS));

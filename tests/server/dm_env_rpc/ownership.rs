@@ -42,7 +42,7 @@ async fn a_name_cannot_be_guessed_unless_it_was_asked_for() {
 }
 
 #[tokio::test]
-async fn a_world_is_changed_by_its_maker_and_its_agent_and_by_nobody_else() {
+async fn world_is_changed_only_by_its_maker_and_its_agent() {
     let server = Server::start(&[]);
     let (mut maker, mut agent) = (Agent::connect(server.tcp()).await, Agent::connect(server.tcp()).await);
     let mut stranger = Agent::connect(server.unix()).await;

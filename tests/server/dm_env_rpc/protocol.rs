@@ -40,7 +40,7 @@ fn python(program: &str, arguments: &[&str]) -> Option<String> {
 }
 
 #[tokio::test]
-async fn the_packages_44_compliance_cases_pass_on_discrete_and_continuous_environments() {
+async fn compliance_cases_of_the_package_pass() {
     let server = Server::with_folders(&[]);
     let catalogue = server::catalogue(server.tcp()).await;
     let has = |name: &&str| catalogue.iter().any(|e| e.name == **name);
@@ -53,7 +53,7 @@ async fn the_packages_44_compliance_cases_pass_on_discrete_and_continuous_enviro
 }
 
 #[tokio::test]
-async fn the_packages_adaptor_and_properties_work_and_the_documents_examples_run() {
+async fn adaptor_and_examples_of_the_package_run() {
     let server = Server::start(&[]);
     let document = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/dm_env_rpc.md");
     python("adaptor.py", &[server.port(), document.to_str().unwrap()]);
@@ -86,7 +86,7 @@ fn actions(e: &Environment, t: u64) -> (Vec<u8>, Tensor) {
 }
 
 #[tokio::test]
-async fn a_world_plays_the_same_bytes_as_a_session_and_its_states_are_the_sessions_flags() {
+async fn world_plays_the_same_bytes_as_a_session() {
     let server = Server::start(&["--workers", "2"]);
     let mut ends = BTreeMap::new();
     for e in &server::catalogue(server.tcp()).await {
@@ -136,7 +136,7 @@ async fn a_world_plays_the_same_bytes_as_a_session_and_its_states_are_the_sessio
 }
 
 #[tokio::test]
-async fn specs_tell_types_shapes_and_bounds_and_every_observation_is_within() {
+async fn observations_are_within_their_specs() {
     let server = Server::start(&[]);
     for e in &server::catalogue(server.tcp()).await {
         let (mut agent, _) = Agent::in_world(server.tcp(), settings(&e.name, [("version", text("R"))])).await;
@@ -315,7 +315,7 @@ fn wrong_settings() -> Vec<client::Settings> {
 }
 
 #[tokio::test]
-async fn wrong_settings_of_a_world_are_refused_by_name_and_nothing_is_created() {
+async fn wrong_settings_of_a_world_are_refused_by_name() {
     let server = Server::start(&["--max-envs", "1"]);
     let mut agent = Agent::connect(server.tcp()).await;
     let mut refusals = String::new();
@@ -329,7 +329,7 @@ async fn wrong_settings_of_a_world_are_refused_by_name_and_nothing_is_created() 
 }
 
 #[tokio::test]
-async fn wrong_settings_of_a_join_or_a_reset_are_refused_by_name_and_change_nothing() {
+async fn wrong_settings_of_a_join_or_reset_are_refused_by_name() {
     let server = Server::start(&[]);
     let mut agent = Agent::connect(server.tcp()).await;
     let world = agent.create(settings("CartPole", [("mass", double(0.5))])).await;
@@ -349,7 +349,7 @@ async fn wrong_settings_of_a_join_or_a_reset_are_refused_by_name_and_change_noth
 }
 
 #[tokio::test]
-async fn every_request_is_answered_once_in_order_by_its_variant_or_an_error() {
+async fn every_request_is_answered_once_in_order() {
     let server = Server::start(&[]);
     let mut agent = Agent::connect(server.tcp()).await;
     let world = "pole";

@@ -142,7 +142,7 @@ async fn a_dropped_stream_frees_its_worlds_and_one_that_closes_too() {
 }
 
 #[tokio::test]
-async fn a_world_whose_agent_vanishes_in_mid_step_goes_on_with_the_next() {
+async fn world_continues_after_its_agent_vanishes_mid_step() {
     let server = Server::start(&["--workers", "1"]);
     let catalogue = server::catalogue(server.tcp()).await;
     // Of those here the one with the longest step.
@@ -176,7 +176,7 @@ async fn a_world_whose_agent_vanishes_in_mid_step_goes_on_with_the_next() {
 }
 
 #[tokio::test]
-async fn a_reset_begins_the_next_episode_and_consumes_none_where_none_runs() {
+async fn reset_begins_the_next_episode_and_skips_none() {
     let server = Server::start(&[]);
     let cart = || settings("CartPole", [("version", text("R")), ("seed", int64(4))]);
     let (mut agent, world) = Agent::in_world(server.tcp(), cart()).await;
@@ -327,7 +327,7 @@ async fn properties_are_listed_read_and_written_as_their_specs_say() {
 }
 
 #[tokio::test]
-async fn a_parameter_beyond_its_bounds_is_refused_in_every_environment() {
+async fn parameter_beyond_its_bounds_is_refused() {
     let server = Server::start(&[]);
     for e in &server::catalogue(server.tcp()).await {
         let (mut agent, _) = Agent::in_world(server.tcp(), settings(&e.name, [])).await;
@@ -396,7 +396,7 @@ async fn an_idle_stream_is_ended_and_its_worlds_freed() {
 }
 
 #[tokio::test]
-async fn an_oversized_message_ends_its_stream_and_one_below_the_limit_is_read() {
+async fn oversized_message_ends_its_stream() {
     let server = Server::start(&["--max-message-bytes", "1000000", "--max-envs", "1"]);
     let (mut agent, _) = Agent::in_world(server.tcp(), settings("CartPole", [])).await;
     agent.step(choice(0)).await;
@@ -450,7 +450,7 @@ async fn at_the_end_of_the_grace_period_agents_get_unavailable() {
 }
 
 #[tokio::test]
-async fn a_session_of_perturb_v1_beside_busy_agents_gives_the_same_bytes() {
+async fn session_beside_busy_agents_gives_the_same_bytes() {
     let server = Server::start(&["--workers", "2"]);
     let e = environment(server.tcp(), "Pendulum").await;
     let run = async || -> Vec<SessionResponse> {

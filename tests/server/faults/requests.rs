@@ -267,7 +267,7 @@ async fn raw<T: prost::Message + Default + 'static>(
 }
 
 #[tokio::test]
-async fn an_empty_or_unknown_request_is_refused_and_a_malformed_one_ends_its_session_only() {
+async fn unknown_request_is_refused_and_malformed_ends_its_session() {
     const PATH: &str = "/perturb.v1.Perturb/Session";
     let server = Server::start(&[]);
     let bystander = Bystander::start(server.tcp()).await;
@@ -290,7 +290,7 @@ async fn an_empty_or_unknown_request_is_refused_and_a_malformed_one_ends_its_ses
 }
 
 #[tokio::test]
-async fn an_oversized_message_ends_its_session_and_frees_its_environments() {
+async fn oversized_message_ends_its_session() {
     let server = Server::start(&["--max-message-bytes", "4096", "--max-envs", "10"]);
     let bystander = Bystander::start(server.tcp()).await;
     for size in [4_097, 100_000, 20_000_000] {

@@ -27,7 +27,7 @@ fn is_harmless(words: &str) {
 }
 
 #[tokio::test]
-async fn what_clients_write_is_shortened_and_escaped_in_refusals_and_the_log() {
+async fn clients_texts_are_shortened_and_escaped() {
     let directory = tempfile::tempdir().unwrap();
     let tokens = directory.path().join("tokens.toml");
     std::fs::write(&tokens, entry("ann", "correct-horse-battery", "")).unwrap();

@@ -121,7 +121,7 @@ async fn a_server_may_ask_for_certificates_of_clients() {
 }
 
 #[tokio::test]
-async fn new_certificates_are_taken_without_a_restart_and_broken_ones_are_not() {
+async fn new_certificates_are_loaded_and_broken_ones_are_not() {
     let encrypted = Encrypted::usual();
     let connection = connect(encrypted.address(), &[(CA, &encrypted.ca)]).await.unwrap();
     let mut session = begin(&connection, 1).await.unwrap();

@@ -40,7 +40,7 @@ async fn steps(session: &mut Stream, envs: usize, count: usize) {
 }
 
 #[tokio::test]
-async fn what_a_session_draws_is_in_the_ledger_before_it_does_and_how_far_it_came_behind() {
+async fn ledger_has_draws_before_they_happen_and_their_ends() {
     let guarded = Guarded::start(&entry("ann", ANN, ""));
     let path = guarded.directory.path().join("ledger");
     let ann = guarded.connect(ANN).await;
@@ -182,7 +182,7 @@ async fn worlds_are_in_the_ledger_and_under_roles_too() {
 }
 
 #[tokio::test]
-async fn what_was_refused_or_failed_after_it_was_written_is_taken_back() {
+async fn ledger_withdraws_draws_that_did_not_happen() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("ledger");
     let server = Server::start(&["--ledger", path.to_str().unwrap(), "--max-envs", "2"]);

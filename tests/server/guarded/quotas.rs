@@ -35,7 +35,7 @@ async fn timed(session: &mut Session, envs: usize, count: usize) -> (Vec<Bytes>,
 }
 
 #[tokio::test]
-async fn a_tokens_sessions_step_at_its_rate_together_and_see_what_others_see() {
+async fn sessions_of_a_token_share_its_rate() {
     const ENVS: usize = 20;
     let rate = "max_steps_per_second = 200";
     let guarded = Guarded::start(&(entry("ann", ANN, rate) + &entry("bob", BOB, "")));
@@ -88,7 +88,7 @@ async fn an_agent_of_the_other_protocol_steps_at_the_rate_too() {
 }
 
 #[tokio::test]
-async fn who_is_too_far_ahead_is_told_and_a_new_file_sets_free_at_once() {
+async fn client_far_ahead_is_told_and_freed_by_a_new_file() {
     let guarded = Guarded::start(&entry("ann", ANN, "max_steps_per_second = 1"));
     let mut session = session(&guarded, ANN, open("CartPole", 100, 1)).await;
     session.step(vec![0; 400].into()).await;
@@ -144,7 +144,7 @@ async fn a_token_has_so_many_bytes_in_flight_and_no_more() {
 }
 
 #[tokio::test]
-async fn a_session_is_taken_up_however_far_its_token_is_ahead_of_its_rate() {
+async fn session_is_resumed_although_its_token_is_ahead_of_its_rate() {
     let guarded = Guarded::start(&entry("ann", ANN, "max_steps_per_second = 1"));
     let mut connection = client(guarded.server.tcp()).await;
     let mut lost = Session::show(&mut connection, Some(ANN)).await.unwrap();

@@ -24,7 +24,7 @@ fn refused(mut command: Command) -> String {
 #[case::second(&["--listen", "tcp://127.0.0.1:0", "--listen", "tcp://0.0.0.0:0"], "tcp://0.0.0.0:0 can be reached")]
 #[case::tokens(&["--listen", "tcp://0.0.0.0:0", "--tokens", "x"], "unencrypted")]
 #[case::tls(&["--listen", "tcp://0.0.0.0:0", "--tls-cert", "x", "--tls-key", "x"], "not ask who they are")]
-fn what_other_machines_can_reach_is_guarded_or_said_to_be_insecure(#[case] flags: &[&str], #[case] part: &str) {
+fn reachable_address_is_guarded_or_called_insecure(#[case] flags: &[&str], #[case] part: &str) {
     let mut command = command();
     command.args(flags);
     let words = refused(command);

@@ -32,7 +32,7 @@ async fn a_full_server_takes_up_its_sessions_and_nothing_else() {
 }
 
 #[tokio::test]
-async fn a_session_is_taken_up_by_the_token_that_opened_it_and_its_quota_is_kept() {
+async fn session_is_resumed_only_with_its_own_token() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("tokens.toml");
     let entry = |name, token| format!("[[token]]\nname = \"{name}\"\ntoken = \"{token}\"\nmax_sessions = 1\n");
@@ -58,7 +58,7 @@ async fn a_session_is_taken_up_by_the_token_that_opened_it_and_its_quota_is_kept
 }
 
 #[tokio::test]
-async fn kept_replies_come_out_of_the_budget_and_go_when_there_is_no_room() {
+async fn stored_replies_are_budgeted_and_dropped_for_room() {
     const PICTURE: u64 = 3 * 512 * 512;
     let watched = Watched::start(&["--max-memory", "4000000"]);
     let address = watched.server.unix();
@@ -94,7 +94,7 @@ async fn a_session_keeps_little_however_much_room_there_is() {
 }
 
 #[tokio::test]
-async fn the_server_says_which_sessions_have_no_stream_and_how_often_one_was_taken_up() {
+async fn metrics_count_detached_and_resumed_sessions() {
     let watched = Watched::start(&[]);
     let (session, opened, _) = begin(watched.server.tcp(), 1).await;
     assert_eq!(watched.page().number("perturb_sessions_detached"), 0.0);

@@ -55,7 +55,7 @@ async fn it_ends_at_once_when_its_client_closes_it() {
 }
 
 #[tokio::test]
-async fn a_connection_that_says_nothing_any_more_is_lost_and_not_its_clients_end() {
+async fn silent_connection_is_lost_and_not_closed_by_its_client() {
     let watched = Watched::start(&["--keepalive-seconds", "1", "--lease-seconds", "60"]);
     let server = &watched.server;
     let proxy = Proxy::start(server.port(), |_| usize::MAX);

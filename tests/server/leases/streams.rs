@@ -42,7 +42,7 @@ async fn play(
 #[case::one_by_one(1)]
 #[case::ahead(3)]
 #[tokio::test]
-async fn a_session_over_a_line_that_breaks_at_any_byte_has_the_bytes_of_one_that_does_not(#[case] ahead: u32) {
+async fn session_over_a_breaking_line_has_the_same_bytes(#[case] ahead: u32) {
     let server = Server::start(&[]);
     let expected = undisturbed(server.tcp(), STEPS).await;
     let described = environment(server.tcp(), "CartPole").await;
@@ -92,7 +92,7 @@ async fn a_session_whose_lease_is_over_is_a_lost_server() {
 }
 
 #[tokio::test]
-async fn a_server_that_is_gone_is_not_waited_for_as_long_as_the_lease_holds() {
+async fn gone_server_is_not_waited_for_until_the_lease_ends() {
     let server = Server::start(&[]);
     let described = environment(server.tcp(), "CartPole").await;
     let connection = within(Connection::open(&server.tcp().parse().unwrap())).await.unwrap();

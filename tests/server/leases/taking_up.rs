@@ -31,7 +31,7 @@ async fn a_session_whose_connection_broke_goes_on_in_another() {
 }
 
 #[tokio::test]
-async fn a_reply_that_did_not_arrive_is_given_again_and_its_step_is_not_run_again() {
+async fn lost_reply_is_sent_again_without_another_step() {
     let server = Server::start(&[]);
     let expected = undisturbed(server.tcp(), 30).await;
     let (mut session, opened, environment) = begin(server.tcp(), 1).await;
@@ -48,7 +48,7 @@ async fn a_reply_that_did_not_arrive_is_given_again_and_its_step_is_not_run_agai
 }
 
 #[tokio::test]
-async fn as_many_replies_are_kept_as_requests_may_wait_refusals_included() {
+async fn replies_are_stored_for_all_unanswered_requests() {
     let server = Server::start(&[]);
     let expected = undisturbed(server.tcp(), 12).await;
     let (mut session, opened, environment) = begin(server.tcp(), 4).await;
@@ -116,7 +116,7 @@ async fn what_was_under_way_when_the_connection_broke_is_done() {
 }
 
 #[tokio::test]
-async fn what_cannot_be_taken_up_is_refused_and_the_stream_may_open_another() {
+async fn refused_resume_leaves_the_stream_usable() {
     let server = Server::start(&[]);
     let (_session, opened, _) = begin(server.tcp(), 1).await;
     let mut wrong = opened.lease.to_vec();

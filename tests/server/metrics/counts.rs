@@ -56,7 +56,7 @@ async fn what_happens_in_a_session_is_counted() {
 }
 
 #[tokio::test]
-async fn steps_that_begin_an_episode_are_none_and_episodes_that_end_are_counted() {
+async fn reset_steps_are_not_counted_and_ended_episodes_are() {
     const REQUESTS: usize = 200;
     let watched = Watched::start(&[]);
     let (mut session, _) = Session::open(watched.server.unix(), open("CartPole", 1, 1)).await;
@@ -233,7 +233,7 @@ async fn nothing_that_a_client_sends_is_told_or_logged() {
 }
 
 #[tokio::test]
-async fn every_metric_is_described_and_every_environment_told_from_the_beginning() {
+async fn metrics_are_described_and_have_all_environments() {
     let watched = Watched::start(&[]);
     let page = watched.page();
     let described = include_str!("../../../docs/monitoring.md");

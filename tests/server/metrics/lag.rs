@@ -26,7 +26,7 @@ async fn keep_from_work(watched: &Watched) {
 }
 
 #[tokio::test]
-async fn a_transport_that_is_kept_from_its_work_is_told_to_be_late_and_no_later_than_it_can_be() {
+async fn lag_of_a_busy_transport_is_measured() {
     let start = Instant::now();
     let watched = Watched::start(&[]);
     let [count, sum, soon] =

@@ -42,7 +42,7 @@ async fn a_session_that_ends_has_a_line_with_what_it_came_to() {
 }
 
 #[tokio::test]
-async fn many_sessions_have_few_lines_and_one_that_says_how_many_were_left_out() {
+async fn access_log_is_bounded_and_says_what_it_left_out() {
     const SESSIONS: usize = 400;
     let server = Server::start(&[]);
     let start = Instant::now();

@@ -66,7 +66,7 @@ async fn another_environment_is_listed_with_all_that_clients_ask_for() {
 }
 
 #[tokio::test]
-async fn another_environment_is_opened_stepped_edited_drawn_saved_and_restored() {
+async fn toy_environment_is_opened_stepped_drawn_and_saved() {
     let server = InThread::start().await;
     let ball = server::environment(&server.address, "Ball").await;
     let actor = Actor::new(&ball, 3);

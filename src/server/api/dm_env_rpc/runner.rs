@@ -194,7 +194,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_end_by_the_task_and_by_the_step_limit_at_once_is_terminated() {
+    fn end_by_task_and_step_limit_at_once_is_terminated() {
         assert_eq!(state(true, true), State::Terminated);
         assert_eq!(state(true, false), State::Terminated);
         assert_eq!(state(false, true), State::Interrupted);
