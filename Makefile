@@ -191,7 +191,7 @@ qemu-test: build-all ## train on emulated processors, to the same weights as on 
 	PERTURB_QEMU_REQUIRED=1 cargo test $(ALL) --test cli processors::
 
 generate: all-deps ## write the generated files anew, after an edit of a .proto file or of crates/mujoco/src/shim.h
-	cargo run $(ALL) --bin perturb-generate
+	cargo run --release --locked --package perturb-generate
 
 slurm-acceptance: ## the same with experiments/quick.toml
 	PERTURB_SLURM_PLAN=$(CURDIR)/experiments/quick.toml $(MAKE) slurm-test

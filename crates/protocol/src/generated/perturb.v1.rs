@@ -11,11 +11,11 @@ pub struct ListEnvironmentsResponse {
     /// The server's version, e.g. "0.1.0".
     #[prost(string, tag = "2")]
     pub server_version: ::prost::alloc::string::String,
-    /// The most environments that one session may open on this server.
+    /// Maximal number of environments that one session may open on this server.
     #[prost(uint32, tag = "3")]
     pub max_batch_size: u32,
 }
-/// What is known of an environment without opening it.
+/// The description of an environment.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Environment {
     /// The name to open it by, e.g. "CartPole".
@@ -24,7 +24,7 @@ pub struct Environment {
     /// Raised by every change of dynamics, reward or observation; the N of "perturb/CartPole-vN".
     #[prost(uint32, tag = "2")]
     pub revision: u32,
-    /// One sentence.
+    /// A description in one sentence.
     #[prost(string, tag = "3")]
     pub description: ::prost::alloc::string::String,
     /// The parameters that can be changed, in the order in which receipts list them.
@@ -42,7 +42,7 @@ pub struct Environment {
     /// The reward is the sum of these terms, in order.
     #[prost(message, repeated, tag = "8")]
     pub reward_terms: ::prost::alloc::vec::Vec<RewardTerm>,
-    /// What receipts report as read back from the physics.
+    /// The quantities that receipts report as read back from the physics.
     #[prost(message, repeated, tag = "9")]
     pub applied: ::prost::alloc::vec::Vec<Quantity>,
     /// An episode is truncated after this many steps.
@@ -51,7 +51,7 @@ pub struct Environment {
     /// Simulated seconds in one step.
     #[prost(double, tag = "11")]
     pub control_timestep: f64,
-    /// When an episode counts as a success.
+    /// The success rule of the environment.
     #[prost(message, optional, tag = "12")]
     pub success: ::core::option::Option<Success>,
     /// SHA-256 of the model's MJCF, in hexadecimal; empty for environments without a model.
@@ -60,28 +60,28 @@ pub struct Environment {
     /// The names of the two parameters, along x and along y, that show best where a policy works; empty if none are.
     #[prost(string, repeated, tag = "14")]
     pub heatmap_axes: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
-    /// When an episode counts as a success in the paper's published code, which is not always what the paper says; absent from
-    /// servers that did not know it yet.
+    /// The success rule of the paper's published code, which sometimes differs from that of the paper; absent from older
+    /// servers.
     #[prost(message, optional, tag = "15")]
     pub code_success: ::core::option::Option<Success>,
-    /// What `Open.observe_parameters` appends to an observation: an entry for each parameter, in their order; empty from
-    /// servers that do not know it.
+    /// The entries that `Open.observe_parameters` appends to an observation: one for each parameter, in their order; empty
+    /// from older servers.
     #[prost(message, repeated, tag = "16")]
     pub parameter_observations: ::prost::alloc::vec::Vec<ParameterObservation>,
 }
-/// How a parameter is observed, in float64 rounded to float32:
+/// The scaling of an observed parameter, computed in float64 and rounded to float32:
 ///    entry = 2 (value - at_minus_one) / (at_plus_one - at_minus_one) - 1
 /// and value - at_minus_one if the two are equal. Nothing is clipped. `value` is the parameter that the physics has,
 /// read back from it as in a receipt: `Receipt.applied` of the quantity `Parameter.applied`.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ParameterObservation {
-    /// The entry: its name, without a unit, and what it can be within the parameter's bounds.
+    /// The entry: its name, without a unit, and its range within the parameter's bounds.
     #[prost(message, optional, tag = "1")]
     pub entry: ::core::option::Option<Channel>,
-    /// The parameter's least value in versions R and E, in its unit; observed as -1.
+    /// The parameter's minimum in versions R and E, in its unit; observed as -1.
     #[prost(double, tag = "2")]
     pub at_minus_one: f64,
-    /// Its greatest value in versions R and E, in its unit; observed as 1.
+    /// The parameter's maximum in versions R and E, in its unit; observed as 1.
     #[prost(double, tag = "3")]
     pub at_plus_one: f64,
 }
@@ -95,10 +95,10 @@ pub struct Channel {
     /// SI unit, e.g. "m/s"; "1" if dimensionless.
     #[prost(string, tag = "2")]
     pub unit: ::prost::alloc::string::String,
-    /// Least possible value; -inf if unbounded.
+    /// Minimum; -inf if unbounded.
     #[prost(double, tag = "3")]
     pub low: f64,
-    /// Greatest possible value; +inf if unbounded.
+    /// Maximum; +inf if unbounded.
     #[prost(double, tag = "4")]
     pub high: f64,
 }
@@ -111,16 +111,16 @@ pub struct Parameter {
     /// SI unit, e.g. "kg"; "1" if dimensionless.
     #[prost(string, tag = "2")]
     pub unit: ::prost::alloc::string::String,
-    /// What it is, in a few words.
+    /// The meaning, in a few words.
     #[prost(string, tag = "3")]
     pub description: ::prost::alloc::string::String,
     /// The value in version D.
     #[prost(double, tag = "4")]
     pub default_value: f64,
-    /// Least value that the server accepts.
+    /// Minimum that the server accepts.
     #[prost(double, tag = "5")]
     pub low: f64,
-    /// Greatest value that the server accepts.
+    /// Maximum that the server accepts.
     #[prost(double, tag = "6")]
     pub high: f64,
     /// The set of version R.
@@ -129,8 +129,8 @@ pub struct Parameter {
     /// The set of version E.
     #[prost(message, optional, tag = "8")]
     pub extreme: ::core::option::Option<Distribution>,
-    /// The name in `Environment.applied` of the quantity that reads this parameter back from the physics, in the same unit:
-    /// a receipt's applied value of that name equals the requested one but for rounding.
+    /// The name in `Environment.applied` of the quantity that reads this parameter back from the physics, in the same
+    /// unit: a receipt's applied value of that name equals the requested one up to rounding.
     #[prost(string, tag = "9")]
     pub applied: ::prost::alloc::string::String,
 }
@@ -144,7 +144,7 @@ pub struct ActionSpace {
 pub mod action_space {
     #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Kind {
-        /// One of n choices, sent as int32.
+        /// A choice out of n, sent as int32.
         #[prost(message, tag = "1")]
         Discrete(super::Discrete),
         /// A vector, sent as float32.
@@ -152,10 +152,10 @@ pub mod action_space {
         Continuous(super::Continuous),
     }
 }
-/// Choices 0 … n-1.
+/// The choices 0 … n-1.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Discrete {
-    /// What each choice does; n is their number.
+    /// The name of each choice; n is their number.
     #[prost(string, repeated, tag = "1")]
     pub names: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
 }
@@ -188,33 +188,34 @@ pub struct Quantity {
     #[prost(string, tag = "2")]
     pub unit: ::prost::alloc::string::String,
 }
-/// When an episode is a success: what it achieved is compared with a threshold.
+/// A success rule: a quantity that the episode achieved is compared with a threshold.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Success {
     /// The rule, as a sentence.
     #[prost(string, tag = "1")]
     pub description: ::prost::alloc::string::String,
-    /// The number of steps that the rule speaks of; an episode's step limit where it speaks of something else.
+    /// The number of steps in the rule; the step limit if the rule is about another quantity.
     #[prost(uint32, tag = "2")]
     pub steps: u32,
-    /// What is compared, e.g. "steps" or "distance": `EpisodeEnd.achieved`.
+    /// The quantity, e.g. "steps" or "distance"; `EpisodeEnd.achieved` has its value.
     #[prost(string, tag = "3")]
     pub quantity: ::prost::alloc::string::String,
-    /// Its unit, e.g. "m"; "1" for steps.
+    /// The quantity's unit, e.g. "m"; "1" for steps.
     #[prost(string, tag = "4")]
     pub unit: ::prost::alloc::string::String,
-    /// How it is compared.
+    /// The comparison.
     #[prost(enumeration = "Comparison", tag = "5")]
     pub comparison: i32,
-    /// With what, in the quantity's unit.
+    /// The threshold, in the quantity's unit.
     #[prost(double, tag = "6")]
     pub threshold: f64,
 }
-/// A set of values, drawn from uniformly: a point of the union is as likely in any interval, so an interval's
-/// probability is its share of the total length. A single interval with low = high is a fixed value.
+/// A uniform distribution over a union of intervals: an interval's probability is its share of the total length. A
+/// single interval with low = high is a fixed value.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Distribution {
-    /// 1 to 64 intervals, ascending, that share no more than end points. Of several, each must have a positive length.
+    /// 1 to 64 intervals, ascending, that share at most end points. If there are several, each must have a positive
+    /// length.
     #[prost(message, repeated, tag = "1")]
     pub intervals: ::prost::alloc::vec::Vec<Interval>,
 }
@@ -228,7 +229,7 @@ pub struct Interval {
     #[prost(double, tag = "2")]
     pub high: f64,
 }
-/// A request of a session. The first must be `open`, or `resume` in its place; after that any of the others, in any order.
+/// A request of a session. The first must be `open` or `resume`; after that any of the others, in any order.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SessionRequest {
     #[prost(oneof = "session_request::Request", tags = "1, 2, 3, 4, 5, 6, 7, 8, 9, 10")]
@@ -250,22 +251,22 @@ pub mod session_request {
         /// Saves environments.
         #[prost(message, tag = "4")]
         Snapshot(super::Snapshot),
-        /// Brings saved environments back.
+        /// Restores saved environments.
         #[prost(message, tag = "5")]
         Restore(super::Restore),
-        /// Draws an environment.
+        /// Renders a picture of an environment.
         #[prost(message, tag = "6")]
         Render(super::Render),
         /// Frees some of the environments.
         #[prost(message, tag = "7")]
         Release(super::Release),
-        /// Has the server play the environments with a policy.
+        /// Lets the server play the environments with a policy.
         #[prost(message, tag = "8")]
         Act(super::Act),
-        /// Saves what stands beside the policy's weights.
+        /// Saves the player's state and statistics.
         #[prost(message, tag = "9")]
         SavePlayer(super::SavePlayer),
-        /// Takes up a session with a lease whose stream was lost.
+        /// Resumes a session with a lease whose stream was lost.
         #[prost(message, tag = "10")]
         Resume(super::Resume),
     }
@@ -283,61 +284,61 @@ pub struct SessionResponse {
 pub mod session_response {
     #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Response {
-        /// To `open`.
+        /// The response to `open`.
         #[prost(message, tag = "1")]
         Opened(super::Opened),
-        /// To `step`.
+        /// The response to `step`.
         #[prost(message, tag = "2")]
         Stepped(super::Stepped),
-        /// To `reset`.
+        /// The response to `reset`.
         #[prost(message, tag = "3")]
         Reset(super::ResetDone),
-        /// To `snapshot`.
+        /// The response to `snapshot`.
         #[prost(message, tag = "4")]
         Snapshot(super::Snapshotted),
-        /// To `restore`.
+        /// The response to `restore`.
         #[prost(message, tag = "5")]
         Restore(super::Restored),
-        /// To `render`.
+        /// The response to `render`.
         #[prost(message, tag = "6")]
         Render(super::Rendered),
-        /// To `release`.
+        /// The response to `release`.
         #[prost(message, tag = "7")]
         Release(super::Released),
-        /// To `act`.
+        /// The response to `act`.
         #[prost(message, tag = "8")]
         Act(super::Acted),
-        /// To `save_player`.
+        /// The response to `save_player`.
         #[prost(message, tag = "9")]
         SavePlayer(super::PlayerSaved),
-        /// To `resume`; replies that the client has not received follow.
+        /// The response to `resume`; replies that the client has not received follow.
         #[prost(message, tag = "10")]
         Resumed(super::Resumed),
-        /// To any request that was refused; it changed nothing.
+        /// The response to any request that was refused; the request changed nothing.
         #[prost(message, tag = "15")]
         Error(super::Error),
     }
 }
-/// A refusal.
+/// The error of a request.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Error {
-    /// A gRPC status code: 3 INVALID_ARGUMENT a bad value; 5 NOT_FOUND an unknown name; 7 PERMISSION_DENIED not what the
-    /// token allows; 8 RESOURCE_EXHAUSTED the server is full; 9 FAILED_PRECONDITION a request out of order; 11 OUT_OF_RANGE
-    /// a reply that there is not; 13 INTERNAL a defect of the server.
+    /// A gRPC status code: 3 INVALID_ARGUMENT a bad value; 5 NOT_FOUND an unknown name; 7 PERMISSION_DENIED not allowed
+    /// with this token; 8 RESOURCE_EXHAUSTED the server is full; 9 FAILED_PRECONDITION a request out of order; 11
+    /// OUT_OF_RANGE a reply number that does not exist; 13 INTERNAL a bug of the server.
     #[prost(int32, tag = "1")]
     pub code: i32,
-    /// What came, what was expected, and what to do.
+    /// A sentence: the value that was received, the expected value, and a remedy.
     #[prost(string, tag = "2")]
     pub message: ::prost::alloc::string::String,
 }
 /// Creates N environments and begins their first episodes. A session is opened once.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Open {
-    /// A name from the catalogue; letters count in either case, `-` and `_` not at all. Or the id in Gymnasium,
-    /// `perturb/CartPole-v1`, whose revision must be the catalogue's. The answer has the name as it is in the catalogue.
+    /// A name from the catalogue; case does not count, nor do `-` and `_`. Or the id in Gymnasium, `perturb/CartPole-v1`,
+    /// whose revision must be the catalogue's. The response has the name as it is in the catalogue.
     #[prost(string, tag = "1")]
     pub environment: ::prost::alloc::string::String,
-    /// Where parameters come from.
+    /// The version whose distributions parameters are drawn from.
     #[prost(enumeration = "Version", tag = "2")]
     pub version: i32,
     /// Replaces the version's distribution of the named parameters; the others keep the version's.
@@ -346,21 +347,21 @@ pub struct Open {
         ::prost::alloc::string::String,
         Distribution,
     >,
-    /// N, at least 1.
+    /// N, the number of environments, at least 1.
     #[prost(uint32, tag = "4")]
     pub batch_size: u32,
     /// Fixes all randomness, together with the environment's index. Any value.
     #[prost(uint64, tag = "5")]
     pub seed: u64,
     /// The index of the session's first environment; the others count up from it. A batch that is split over several
-    /// sessions or servers gives the same bytes as a whole one if each part gets its place here. The last index must be
-    /// below 2^32.
+    /// sessions or servers gives the same bytes as a whole one if each part has its offset in the batch here. The last
+    /// index must be below 2^32.
     #[prost(uint32, tag = "6")]
     pub first_environment_index: u32,
     /// Episodes in a trial: parameters are drawn anew when a trial begins. 0 means 1.
     #[prost(uint32, tag = "7")]
     pub episodes_per_trial: u32,
-    /// What happens to ended episodes.
+    /// The reset of environments whose episode has ended.
     #[prost(enumeration = "AutoresetMode", tag = "8")]
     pub autoreset_mode: i32,
     /// Whether episodes carry receipts.
@@ -369,34 +370,34 @@ pub struct Open {
     /// Whether step replies carry the reward's terms.
     #[prost(bool, tag = "10")]
     pub reward_terms: bool,
-    /// In place of `version`, `parameters`, `batch_size`, `seed`, `first_environment_index` and `episodes_per_trial`,
-    /// which are then left out: groups of successive slots with settings of their own. Environments of a group give the
-    /// bytes that they give in a session of their own.
+    /// Groups of successive slots with settings of their own, instead of `version`, `parameters`, `batch_size`, `seed`,
+    /// `first_environment_index` and `episodes_per_trial`, which must then be empty. Environments of a group give the same
+    /// bytes as in a session of their own.
     #[prost(message, repeated, tag = "11")]
     pub groups: ::prost::alloc::vec::Vec<SlotGroup>,
-    /// Whether every observation, first and final ones included, has the parameters of its own episode at its end, as
+    /// Whether every observation, first and final ones included, ends with the parameters of its own episode, as
     /// `Environment.parameter_observations` says. O grows by their number.
     #[prost(bool, tag = "12")]
     pub observe_parameters: bool,
-    /// With `receipts`: whether steps bring them as arrays, in `Stepped.receipt_episodes` and `Stepped.receipt_values`, which
-    /// cost a large batch a fraction of the messages. `EpisodeEnd.receipt` and `Stepped.started` are empty then, and episodes
-    /// that end in an `act` have no receipts.
+    /// Whether steps have receipts as arrays, in `Stepped.receipt_episodes` and `Stepped.receipt_values`. For a large
+    /// batch they cost a fraction of the messages. Needs `receipts`. `EpisodeEnd.receipt` and `Stepped.started` are empty
+    /// then, and episodes that end in an `act` have no receipts.
     #[prost(bool, tag = "13")]
     pub receipt_arrays: bool,
-    /// 0: no lease. Otherwise the session outlives the loss of its stream for a while (`Opened.lease_seconds`), and a new
-    /// stream may take it up (`Resume`). The number is W, the most requests that the client ever has sent without having
-    /// received their replies, 1 … 64: the server keeps the last W replies, and takes a request as word that all but the last
-    /// W - 1 were received.
+    /// W, the maximal number of requests that the client sends without having received their replies, 1 … 64; 0 means no
+    /// lease. With a lease, the session outlives the loss of its stream for a while (`Opened.lease_seconds`), and a new
+    /// stream may resume it (`Resume`). The server stores the last W replies. A request tells it that all replies but the
+    /// last W - 1 were received.
     #[prost(uint32, tag = "14")]
     pub lease: u32,
 }
 /// Successive slots; the fields are those of `Open`.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SlotGroup {
-    /// How many, at least 1.
+    /// The number of slots, at least 1.
     #[prost(uint32, tag = "1")]
     pub size: u32,
-    /// Where parameters come from.
+    /// The version whose distributions parameters are drawn from.
     #[prost(enumeration = "Version", tag = "2")]
     pub version: i32,
     /// Replaces the version's distribution of the named parameters; the others keep the version's.
@@ -415,10 +416,10 @@ pub struct SlotGroup {
     #[prost(uint32, tag = "6")]
     pub episodes_per_trial: u32,
 }
-/// The session is open and every environment is at the start of its first episode.
+/// The session is open, and every environment is at the start of its first episode.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Opened {
-    /// What was opened; with `observe_parameters` its `observation` has the appended entries, too.
+    /// The environment; with `observe_parameters` its `observation` has the appended entries, too.
     #[prost(message, optional, tag = "1")]
     pub environment: ::core::option::Option<Environment>,
     /// float32 \[N, O\]: first observations.
@@ -427,33 +428,35 @@ pub struct Opened {
     /// The begun episodes, in order of slots; empty unless receipts were asked for at `open`.
     #[prost(message, repeated, tag = "3")]
     pub started: ::prost::alloc::vec::Vec<EpisodeStart>,
-    /// The mode in force, as asked for.
+    /// The autoreset mode, as requested.
     #[prost(enumeration = "AutoresetMode", tag = "4")]
     pub autoreset_mode: i32,
     /// Whether this server knows `groups`, `release`, `act` and `save_player`.
     #[prost(bool, tag = "5")]
     pub acts: bool,
-    /// Whether observations have parameters at their end, as asked for; false from servers that do not know it.
+    /// Whether observations end with the parameters, as requested; false from older servers.
     #[prost(bool, tag = "6")]
     pub observes_parameters: bool,
-    /// Whether steps bring receipts as arrays, as asked for; false from servers that do not know it.
+    /// Whether steps have receipts as arrays, as requested; false from older servers.
     #[prost(bool, tag = "7")]
     pub receipt_arrays: bool,
-    /// With `lease`: 16 random bytes that `Resume` names the session by. A secret: whoever knows it may take the session up,
-    /// if he has the same bearer token. Empty from servers that give no lease (`--lease-seconds 0`), or do not know them.
+    /// The name of the lease, 16 random bytes for `Resume`. Keep it secret: any client that has it and the same bearer
+    /// token may resume the session. Empty without `Open.lease`, and from servers that grant none (`--lease-seconds 0`, or
+    /// older).
     #[prost(bytes = "bytes", tag = "8")]
     pub lease: ::prost::bytes::Bytes,
-    /// With `lease`: how long the session stays without a stream, s, counted from when the server knows that it is lost.
+    /// Seconds for which the session is kept without a stream, counted from the moment at which the server notices the
+    /// loss.
     #[prost(uint32, tag = "9")]
     pub lease_seconds: u32,
 }
-/// Takes up a session with a lease, as the first request of a new stream, whether or not the server knows yet that the
-/// one before is lost: that ends with ABORTED. The session is as it was; of its requests those are carried out of which
-/// the server has read all. Refused, and nothing is changed, with NOT_FOUND if there is no such lease, it is over or its
-/// session has ended; PERMISSION_DENIED if the bearer token is not that of `open`; OUT_OF_RANGE if there is no such
-/// reply; FAILED_PRECONDITION if replies after it are not kept, because a request said that they were received, or the
-/// server had no memory for them. Then the stream may go on with `open`, unless a full server ends it. A server that
-/// shuts down takes up none (UNAVAILABLE).
+/// Resumes a session with a lease, as the first request of a new stream. The server need not have noticed the loss of
+/// the stream before: that one ends with ABORTED. The session is as it was; requests that the server has read completely
+/// are carried out. Errors, which change nothing: NOT_FOUND if there is no such lease, or it or its session has ended;
+/// PERMISSION_DENIED if the bearer token is not that of `open`; OUT_OF_RANGE if `last_reply` does not exist yet;
+/// FAILED_PRECONDITION if replies after `last_reply` are not stored, because a request said that they were received, or
+/// the server had no memory for them. After an error the stream may continue with `open`, unless a full server ends it.
+/// A server that shuts down resumes none (UNAVAILABLE).
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Resume {
     /// `Opened.lease`.
@@ -464,12 +467,12 @@ pub struct Resume {
     #[prost(uint64, tag = "2")]
     pub last_reply: u64,
 }
-/// The session goes on in this stream. Responses with the numbers from `Resume.last_reply` + 1 to `last_reply` follow, then
-/// those to what is requested now.
+/// The session continues in this stream. Responses with the numbers from `Resume.last_reply` + 1 to `last_reply` follow,
+/// then those to new requests.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Resumed {
-    /// The number of the last reply that there is. Requests whose replies have higher numbers did not arrive: they have
-    /// changed nothing, and may be sent again.
+    /// The number of the last reply. Requests whose replies would have higher numbers did not arrive: they have changed
+    /// nothing, and must be sent again.
     #[prost(uint64, tag = "1")]
     pub last_reply: u64,
 }
@@ -480,7 +483,7 @@ pub struct Step {
     #[prost(bytes = "bytes", tag = "1")]
     pub actions: ::prost::bytes::Bytes,
 }
-/// The outcome of a step.
+/// The result of a step.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Stepped {
     /// float32 \[N, O\].
@@ -492,7 +495,7 @@ pub struct Stepped {
     /// uint8 \[N\]: 1 where the task ended the episode.
     #[prost(bytes = "bytes", tag = "3")]
     pub terminated: ::prost::bytes::Bytes,
-    /// uint8 \[N\]: 1 where the step limit ended it. Both flags may be set.
+    /// uint8 \[N\]: 1 where the step limit ended the episode. Both flags may be set.
     #[prost(bytes = "bytes", tag = "4")]
     pub truncated: ::prost::bytes::Bytes,
     /// float32 \[K, O\], in the order of `ended`: the last observations of episodes that ended in this step. Always sent, in
@@ -505,27 +508,27 @@ pub struct Stepped {
     /// The episodes that began in this step by autoreset, in order of slots; empty unless receipts were asked for.
     #[prost(message, repeated, tag = "7")]
     pub started: ::prost::alloc::vec::Vec<EpisodeStart>,
-    /// float32 \[N, number of terms\], if asked for at `open`.
+    /// float32 \[N, number of terms\], if requested at `open`.
     #[prost(bytes = "bytes", tag = "8")]
     pub reward_terms: ::prost::bytes::Bytes,
-    /// uint64 \[M, 5\], with `receipt_arrays`: of each of the K episodes that ended, in the order of `ended`, then of each that
-    /// began by autoreset, in order of slots: slot, environment_index, trial_index, episode_index, episode_in_trial.
+    /// uint64 \[M, 5\], with `receipt_arrays`: slot, environment_index, trial_index, episode_index, episode_in_trial of each
+    /// of the K episodes that ended, in the order of `ended`, then of each that began by autoreset, in order of slots.
     #[prost(bytes = "bytes", tag = "9")]
     pub receipt_episodes: ::prost::bytes::Bytes,
-    /// float64 \[M, length of `requested` + length of `applied`\], likewise: what `Receipt` has, in its order. The model's hash is
-    /// that of `Opened.environment`.
+    /// float64 \[M, length of `requested` + length of `applied`\], with `receipt_arrays`: `Receipt.requested`, then
+    /// `Receipt.applied` of the same episodes. The model's hash is that of `Opened.environment`.
     #[prost(bytes = "bytes", tag = "10")]
     pub receipt_values: ::prost::bytes::Bytes,
 }
-/// Begins a new episode in the selected environments, whether or not the current one has ended. An episode that is
-/// broken off is not reported. The trial goes on, unless seeds or parameters are given: then a new trial begins.
+/// Begins a new episode in the selected environments, whether or not the current one has ended. An episode that has not
+/// ended is not reported. The trial continues, unless seeds or parameters are given: then a new trial begins.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Reset {
-    /// Which environments; empty = all.
+    /// The mask of the environments; empty = all.
     #[prost(bytes = "bytes", tag = "1")]
     pub mask: ::prost::bytes::Bytes,
-    /// Empty, or M seeds, which replace the seeds of the selected environments, in order, and restart their episode and
-    /// trial counts at 0. The index of an environment stays.
+    /// Empty, or M seeds, which replace the seeds of the selected environments, in order, and set their episode and trial
+    /// counts to 0. The index of an environment stays.
     #[prost(uint64, repeated, tag = "2")]
     pub seeds: ::prost::alloc::vec::Vec<u64>,
     /// Replaces the distributions of the named parameters, for the selected environments and from now on.
@@ -534,7 +537,7 @@ pub struct Reset {
         ::prost::alloc::string::String,
         Distribution,
     >,
-    /// Empty, or float64 \[M, S\]: exact initial states in place of drawn ones, for this episode.
+    /// Empty, or float64 \[M, S\]: exact initial states instead of drawn ones, for this episode.
     #[prost(bytes = "bytes", tag = "4")]
     pub states: ::prost::bytes::Bytes,
 }
@@ -548,52 +551,52 @@ pub struct ResetDone {
     #[prost(message, repeated, tag = "2")]
     pub started: ::prost::alloc::vec::Vec<EpisodeStart>,
 }
-/// An episode began.
+/// The start of an episode.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct EpisodeStart {
-    /// Where in the batch, 0 … N-1.
+    /// The slot in the batch, 0 … N-1.
     #[prost(uint32, tag = "1")]
     pub slot: u32,
-    /// Which one.
+    /// The address of the episode.
     #[prost(message, optional, tag = "2")]
     pub episode: ::core::option::Option<Episode>,
-    /// Its receipt.
+    /// The receipt.
     #[prost(message, optional, tag = "3")]
     pub receipt: ::core::option::Option<Receipt>,
 }
-/// An episode ended.
+/// The end of an episode.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct EpisodeEnd {
-    /// Where in the batch, 0 … N-1.
+    /// The slot in the batch, 0 … N-1.
     #[prost(uint32, tag = "1")]
     pub slot: u32,
-    /// Which one.
+    /// The address of the episode.
     #[prost(message, optional, tag = "2")]
     pub episode: ::core::option::Option<Episode>,
-    /// The undiscounted sum of its rewards.
+    /// The undiscounted sum of the rewards.
     #[prost(double, tag = "3")]
     pub r#return: f64,
-    /// Its number of steps.
+    /// The number of steps.
     #[prost(uint32, tag = "4")]
     pub length: u32,
-    /// Whether it was a success: whether `achieved` is there and compares with the threshold as `Success` says.
+    /// Whether the episode was a success: `achieved` is present, and its comparison with the threshold of `Success` holds.
     #[prost(bool, tag = "5")]
     pub success: bool,
     /// Whether the physics diverged: the state was not finite. Such an episode is terminated.
     #[prost(bool, tag = "6")]
     pub diverged: bool,
-    /// Its receipt, if asked for at `open`.
+    /// The receipt, if requested at `open`.
     #[prost(message, optional, tag = "7")]
     pub receipt: ::core::option::Option<Receipt>,
-    /// What it achieved: the value of the quantity that `Success` names. Absent where there is none, as for a goal that was
-    /// never reached.
+    /// The value of the quantity of `Environment.success`. Absent if it has no value, e.g. for a goal that was never
+    /// reached.
     #[prost(double, optional, tag = "8")]
     pub achieved: ::core::option::Option<f64>,
-    /// The same of `Environment.code_success`.
+    /// The value of the quantity of `Environment.code_success`.
     #[prost(double, optional, tag = "9")]
     pub code_achieved: ::core::option::Option<f64>,
 }
-/// Names an episode: with the seed it fixes the episode's parameters and initial state.
+/// The address of an episode: with the seed it fixes the episode's parameters and initial state.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Episode {
     /// The environment's index: `first_environment_index` plus its slot, or that of the restored snapshot.
@@ -609,7 +612,7 @@ pub struct Episode {
     #[prost(uint32, tag = "4")]
     pub episode_in_trial: u32,
 }
-/// What physics an episode ran with.
+/// The physics of an episode.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Receipt {
     /// The parameters that were drawn or given, in the order of `Environment.parameters`.
@@ -622,26 +625,26 @@ pub struct Receipt {
     #[prost(string, tag = "3")]
     pub model_hash: ::prost::alloc::string::String,
 }
-/// Saves the selected environments, complete: physics, parameters, counters and random streams.
+/// Saves the selected environments completely: physics, parameters, counters and random streams.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Snapshot {
-    /// Which environments; empty = all.
+    /// The mask of the environments; empty = all.
     #[prost(bytes = "bytes", tag = "1")]
     pub mask: ::prost::bytes::Bytes,
 }
 /// Saved environments.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Snapshotted {
-    /// M opaque snapshots. They can be restored in any session of the same environment, also of another server of the same
+    /// M opaque snapshots. They can be restored in any session of the same environment, also on another server of the same
     /// version.
     #[prost(bytes = "bytes", repeated, tag = "1")]
     pub snapshots: ::prost::alloc::vec::Vec<::prost::bytes::Bytes>,
 }
-/// Brings saved environments back: what follows is what followed the snapshot, byte for byte. All are restored, or none.
+/// Restores saved environments: they continue as they did after the snapshot, byte for byte. All are restored, or none.
 /// A session in same-step mode refuses an environment that was saved after its episode had ended.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Restore {
-    /// Which environments; empty = all.
+    /// The mask of the environments; empty = all.
     #[prost(bytes = "bytes", tag = "1")]
     pub mask: ::prost::bytes::Bytes,
     /// M snapshots, in order.
@@ -655,11 +658,11 @@ pub struct Restored {
     #[prost(bytes = "bytes", tag = "1")]
     pub observations: ::prost::bytes::Bytes,
 }
-/// Draws one environment as it is now, and changes nothing. FAILED_PRECONDITION where the server cannot draw it: the
+/// Renders a picture of one environment, and changes nothing. FAILED_PRECONDITION if the server cannot render it: the
 /// message says what is missing.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Render {
-    /// Which environment: its place in the batch, 0 … N-1.
+    /// The slot of the environment, 0 … N-1.
     #[prost(uint32, tag = "1")]
     pub slot: u32,
     /// Pixels, 16 … 2048; 0 means 480.
@@ -675,115 +678,119 @@ pub struct Rendered {
     /// uint8 \[height, width, 3\]: red, green, blue; the first row is the uppermost.
     #[prost(bytes = "bytes", tag = "1")]
     pub pixels: ::prost::bytes::Bytes,
-    /// In pixels.
+    /// Pixels.
     #[prost(uint32, tag = "2")]
     pub width: u32,
-    /// In pixels.
+    /// Pixels.
     #[prost(uint32, tag = "3")]
     pub height: u32,
 }
-/// Frees environments, and makes room for others at once. Those that stay keep their order and everything else, and are
-/// numbered anew from 0; N is their number.
+/// Frees environments, and makes room for others at once. The remaining ones keep their order and everything else; their
+/// slots are numbered again from 0, and N is their number.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Release {
-    /// Which environments. At least one must go, and one stay: here an empty mask, all, is refused.
+    /// The mask of the environments to free. At least one must go, and at least one stay: an empty mask (all) is refused.
     #[prost(bytes = "bytes", tag = "1")]
     pub mask: ::prost::bytes::Bytes,
 }
-/// The environments are gone.
+/// The environments are freed.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Released {}
-/// Has the server play: it chooses the actions of all environments with a policy, steps them, and sends what came of it,
-/// the same bytes as if the client had acted, on any processor. Only in AUTORESET_MODE_SAME_STEP, and where all
-/// environments have as many episodes in a trial. I is the length of the policy's inputs: O, and for `Policy.outcomes`
-/// the numbers of the last action (n one-hot, or A), its reward and whether it ended an episode.
+/// Lets the server play: it chooses the actions of all environments with a policy, steps them, and sends the rollout,
+/// with the same bytes as if the client had acted, on any processor. Only in AUTORESET_MODE_SAME_STEP, and if all
+/// environments have the same number of episodes in a trial. I is the length of the policy's inputs: O, and with
+/// `Policy.outcomes` also the last action (n one-hot, or A numbers), its reward and whether it ended an episode.
 ///
-/// A task, begun by `steps` or `episodes`, may be cut over several requests, the later of which name none, until
-/// `finished`. `step`, `reset`, `restore` and `release` end the policy's play, and so does an error after the task has
-/// begun: numbers that are not finite (INVALID_ARGUMENT). Then a policy must be handed over again. An `act` that cannot
-/// come now is refused with FAILED_PRECONDITION and changes nothing.
+/// A task is begun by `steps` or `episodes`. It may be cut over several requests until `finished`; the later ones name
+/// no task. `step`, `reset`, `restore` and `release` end the policy's play. So does an error after the task has begun:
+/// numbers that are not finite (INVALID_ARGUMENT). Then a policy must be sent again. An `act` out of order is refused
+/// with FAILED_PRECONDITION and changes nothing.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Act {
-    /// Whose turn it is now; absent: the policy of before goes on. One that comes breaks off what is left of a task.
+    /// The policy to play; if absent, the previous one continues. A new policy discards an unfinished task.
     #[prost(message, optional, tag = "1")]
     pub policy: ::core::option::Option<Policy>,
-    /// float32 \[P\]: all weights in a row, finite, in the order that docs/protocol.md gives. Empty: those of before, which
-    /// a policy that has just come has none of. Not in the middle of a task.
+    /// float32 \[P\]: all weights in a row, finite, in the order of docs/protocol.md. Empty: the previous weights; a new
+    /// policy needs weights. Not allowed while a task is unfinished.
     #[prost(bytes = "bytes", tag = "2")]
     pub weights: ::prost::bytes::Bytes,
-    /// The most steps in this reply. 0, or more than the server puts into a reply: as many as it does, about 4 MB or a
-    /// second's computing, at least one.
+    /// Maximal number of steps in this reply. 0, or more than the server's own limit, means that limit: about 4 MB or a
+    /// second of computing, at least one step.
     #[prost(uint32, tag = "5")]
     pub most_steps: u32,
-    /// Leaves out everything but `steps`, `ended` and `finished`, as a test needs it.
+    /// Whether to leave out everything but `steps`, `ended` and `finished`, which is enough for a test.
     #[prost(bool, tag = "6")]
     pub only_ended: bool,
-    /// What is to be played, at least 1. None: what is left of the task before, and only then.
+    /// The amount to play, at least 1. None: the rest of an unfinished task.
     #[prost(oneof = "act::Task", tags = "3, 4")]
     pub task: ::core::option::Option<act::Task>,
 }
 /// Nested message and enum types in `Act`.
 pub mod act {
-    /// What is to be played, at least 1. None: what is left of the task before, and only then.
+    /// The amount to play, at least 1. None: the rest of an unfinished task.
     #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Oneof)]
     pub enum Task {
-        /// So many steps of every environment; episodes run on from one task to the next.
+        /// Number of steps of every environment. Episodes continue from one task to the next.
         #[prost(uint32, tag = "3")]
         Steps(u32),
-        /// So many complete episodes. All environments are reset before, as by an empty `Reset`. How many each contributes
-        /// is fixed beforehand, as evenly as possible, the first ones one more; one that has done its part goes on unseen.
+        /// Number of complete episodes. All environments are reset first, as by an empty `Reset`. The number of each
+        /// environment is fixed beforehand, as evenly as possible, with one more for the first environments. An environment
+        /// that has played its episodes is stepped on, but its steps do not count.
         #[prost(uint32, tag = "4")]
         Episodes(u32),
     }
 }
-/// A policy that plays: its shape, what stands between it and the environments, and where its actions' randomness comes
-/// from. The action space is the environment's.
+/// A policy that plays: its shape, its normalisers, and the randomness of its actions. The action space is the
+/// environment's.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Policy {
-    /// Widths of the hidden layers, tanh, none or at most 8 of 1 … 1024. N times the sum of all widths, with the LSTM's, is
-    /// at most 2^25, and a step of all environments must take the policy less than about a second. Feed-forward: of the
-    /// policy network and of the value network, which are separate. Recurrent: of the one network below the LSTM.
+    /// Widths of the hidden layers with tanh, at most 8 layers of 1 … 1024. N times the sum of all widths, the LSTM's
+    /// included, must be at most 2^25, and the policy's part of a step of all environments must take less than about a
+    /// second. Feed-forward: the layers of the policy network and of the value network, which are separate. Recurrent: the
+    /// layers of the one network below the LSTM.
     #[prost(uint32, repeated, tag = "1")]
     pub hidden: ::prost::alloc::vec::Vec<u32>,
-    /// Width of the LSTM, 1 … 1024; 0: a feed-forward policy.
+    /// Width of the LSTM, 1 … 1024; 0 means a feed-forward policy.
     #[prost(uint32, tag = "2")]
     pub lstm: u32,
-    /// Whether an input has the last action, its reward and whether it ended an episode beside the observation (RL²).
+    /// Whether an input also has the last action, its reward and whether it ended an episode (RL²).
     #[prost(bool, tag = "3")]
     pub outcomes: bool,
-    /// Statistics that observations are normalised with; absent: they are not. Parameters that `Open.observe_parameters`
-    /// puts at the end of an observation are scaled already, and stay as they are in either case.
+    /// Statistics for the normalisation of observations; absent: no normalisation. Parameters that
+    /// `Open.observe_parameters` appends to an observation are scaled already, and are never normalised.
     #[prost(message, optional, tag = "4")]
     pub observations: ::core::option::Option<Moments>,
-    /// Statistics that rewards are normalised with; absent: they are not.
+    /// Statistics for the normalisation of rewards; absent: no normalisation.
     #[prost(message, optional, tag = "5")]
     pub rewards: ::core::option::Option<RewardMoments>,
-    /// Goes on from here; absent: a trial begins in every environment, with its present observation, which running
-    /// statistics take in, also where the task then resets all. Discounted returns begin at 0. Only in training.
+    /// The state to continue from; only in training. Absent: a trial begins in every environment with its present
+    /// observation, which is added to running statistics even if the task then resets all environments, and discounted
+    /// returns begin at 0.
     #[prost(message, optional, tag = "8")]
     pub state: ::core::option::Option<PlayerState>,
-    /// Required.
+    /// The source of randomness, required.
     #[prost(oneof = "policy::Role", tags = "6, 7")]
     pub role: ::core::option::Option<policy::Role>,
 }
 /// Nested message and enum types in `Policy`.
 pub mod policy {
-    /// Required.
+    /// The source of randomness, required.
     #[derive(Clone, PartialEq, Eq, Hash, ::prost::Oneof)]
     pub enum Role {
-        /// Statistics take in every step, and this stream gives all actions, in the order of slots.
+        /// In training, every step is added to the statistics, and all actions are sampled from this stream, in order of
+        /// slots.
         #[prost(message, tag = "6")]
         Training(super::RandomStream),
-        /// Statistics are frozen, and each trial has a stream of its own.
+        /// In testing, statistics are frozen, and each trial has a stream of its own.
         #[prost(message, tag = "7")]
         Testing(super::TestStreams),
     }
 }
-/// Mean and variance of vectors of some size: O for observations, but for parameters at their end; 1 for discounted
+/// Mean and variance of vectors. Their size is O for observations, without appended parameters, and 1 for discounted
 /// returns.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Moments {
-    /// Vectors seen, at most 2^53. Where it is 0 the rest is 0 too.
+    /// Number of vectors seen, at most 2^53. If it is 0, the rest must be 0, too.
     #[prost(uint64, tag = "1")]
     pub count: u64,
     /// float64 \[size\]: means.
@@ -793,7 +800,7 @@ pub struct Moments {
     #[prost(bytes = "bytes", tag = "3")]
     pub squares: ::prost::bytes::Bytes,
 }
-/// What rewards are divided by: the standard deviation of discounted returns.
+/// Statistics of discounted returns; rewards are divided by their standard deviation.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct RewardMoments {
     /// The discount factor, 0 … 1.
@@ -802,10 +809,10 @@ pub struct RewardMoments {
     /// float64 \[N\]: the discounted returns of the running episodes.
     #[prost(bytes = "bytes", tag = "2")]
     pub returns: ::prost::bytes::Bytes,
-    /// Their statistics.
+    /// The statistics of the discounted returns.
     #[prost(message, optional, tag = "3")]
     pub moments: ::core::option::Option<Moments>,
-    /// Whether the returns run on over the ends of episodes and trials, in place of starting again from 0 there.
+    /// Whether the returns run on over the ends of episodes and trials, instead of starting again from 0 there.
     #[prost(bool, tag = "4")]
     pub runs_on: bool,
 }
@@ -818,43 +825,44 @@ pub struct RandomStream {
     /// The stream's number.
     #[prost(uint64, tag = "2")]
     pub stream: u64,
-    /// 32-bit words that have been drawn.
+    /// Number of 32-bit words that have been drawn.
     #[prost(uint64, tag = "3")]
     pub position: u64,
 }
-/// Each trial's stream follows from this seed, the environment's index and the trial's, see docs/protocol.md.
+/// The streams of a test: each trial's follows from this seed, the environment's index and the trial's, see
+/// docs/protocol.md.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct TestStreams {
     /// Any value.
     #[prost(uint64, tag = "1")]
     pub seed: u64,
 }
-/// What a policy goes on from, finite. S is twice the LSTM's width, 0 without one; E = I - O.
+/// The state of a player, with finite numbers. S is twice the LSTM's width, 0 without one; E = I - O.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct PlayerState {
     /// float32 \[N, O\]: normalised observations that the next actions are chosen on.
     #[prost(bytes = "bytes", tag = "1")]
     pub observations: ::prost::bytes::Bytes,
-    /// uint8 \[N\]: 1 where those are the first of a trial.
+    /// uint8 \[N\]: 1 where these are the first of a trial.
     #[prost(bytes = "bytes", tag = "2")]
     pub starts: ::prost::bytes::Bytes,
-    /// float32 \[N, E\]: what stands beside the observations.
+    /// float32 \[N, E\]: the last action, its reward and whether it ended an episode.
     #[prost(bytes = "bytes", tag = "3")]
     pub outcomes: ::prost::bytes::Bytes,
     /// float32 \[N, S\]: the LSTM's outputs and cell states.
     #[prost(bytes = "bytes", tag = "4")]
     pub memory: ::prost::bytes::Bytes,
 }
-/// What was played: T steps of N environments, row-major \[T, N, …\].
+/// A rollout: T steps of N environments, row-major \[T, N, …\].
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Acted {
-    /// T.
+    /// T, the number of steps.
     #[prost(uint32, tag = "1")]
     pub steps: u32,
     /// float32 \[T, N, I\]: inputs that the actions were chosen on, normalised.
     #[prost(bytes = "bytes", tag = "2")]
     pub observations: ::prost::bytes::Bytes,
-    /// uint8 \[T, N\]: 1 where an input is the first of a trial: the policy remembers nothing before it.
+    /// uint8 \[T, N\]: 1 where an input is the first of a trial: the policy's memory was emptied before it.
     #[prost(bytes = "bytes", tag = "3")]
     pub starts: ::prost::bytes::Bytes,
     /// Discrete: int32 \[T, N\]. Continuous: float32 \[T, N, A\], as sampled.
@@ -872,66 +880,66 @@ pub struct Acted {
     /// uint8 \[T, N\]: 1 where the task ended the trial's last episode.
     #[prost(bytes = "bytes", tag = "8")]
     pub terminated: ::prost::bytes::Bytes,
-    /// uint8 \[T, N\]: 1 where the step limit did.
+    /// uint8 \[T, N\]: 1 where the step limit ended the trial's last episode.
     #[prost(bytes = "bytes", tag = "9")]
     pub truncated: ::prost::bytes::Bytes,
     /// float32 \[T, N\]: where truncated, the value of the last observation; 0 elsewhere.
     #[prost(bytes = "bytes", tag = "10")]
     pub truncation_values: ::prost::bytes::Bytes,
-    /// The episodes that ended, in order of steps and slots. Of a task of complete episodes only those that count.
+    /// The episodes that ended, in order of steps and slots. In a task of complete episodes only those that count.
     #[prost(message, repeated, tag = "11")]
     pub ended: ::prost::alloc::vec::Vec<EndedAt>,
-    /// Whether nothing is left of the task.
+    /// Whether the task is finished.
     #[prost(bool, tag = "12")]
     pub finished: bool,
     /// float32 \[N\]: values of the observations after the last step, 0 after complete episodes; only when finished.
     #[prost(bytes = "bytes", tag = "13")]
     pub last_values: ::prost::bytes::Bytes,
-    /// float32 \[N, S\]: what the policy remembered before the task's first step; only in its first reply.
+    /// float32 \[N, S\]: the policy's memory before the task's first step; only in the task's first reply.
     #[prost(bytes = "bytes", tag = "14")]
     pub memory: ::prost::bytes::Bytes,
 }
 /// An episode that ended in one of several steps.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct EndedAt {
-    /// 0 … T-1.
+    /// The step, 0 … T-1.
     #[prost(uint32, tag = "1")]
     pub step: u32,
-    /// What ended.
+    /// The end of the episode.
     #[prost(message, optional, tag = "2")]
     pub end: ::core::option::Option<EpisodeEnd>,
-    /// Whether the task ended it; unlike `Acted.terminated`, of every episode of a trial.
+    /// Whether the task ended it. Unlike `Acted.terminated`, this is set for every episode of a trial.
     #[prost(bool, tag = "3")]
     pub terminated: bool,
-    /// Whether the step limit ended it, likewise. Both flags may be set.
+    /// Whether the step limit ended it, also for every episode of a trial. Both flags may be set.
     #[prost(bool, tag = "4")]
     pub truncated: bool,
 }
-/// Asks what stands beside the weights of the policy that plays, between two tasks in training; at other times
-/// FAILED_PRECONDITION. Changes nothing.
+/// Saves the player's state and statistics between two tasks in training; at other times FAILED_PRECONDITION. Changes
+/// nothing.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct SavePlayer {}
-/// What goes into a later `Policy` to go on.
+/// The player's state and statistics, to be sent with a later `Policy`.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct PlayerSaved {
-    /// Absent if observations are not normalised.
+    /// Statistics of observations; absent if observations are not normalised.
     #[prost(message, optional, tag = "1")]
     pub observations: ::core::option::Option<Moments>,
-    /// Absent if rewards are not normalised.
+    /// Statistics of rewards; absent if rewards are not normalised.
     #[prost(message, optional, tag = "2")]
     pub rewards: ::core::option::Option<RewardMoments>,
-    /// Where the stream of actions is.
+    /// The position in the stream of actions.
     #[prost(message, optional, tag = "3")]
     pub actions: ::core::option::Option<RandomStream>,
-    /// The rest.
+    /// The state.
     #[prost(message, optional, tag = "4")]
     pub state: ::core::option::Option<PlayerState>,
 }
-/// How a success rule compares what an episode achieved with a threshold.
+/// The comparison of a success rule.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Comparison {
-    /// Not given, as by servers that did not know it yet.
+    /// Not given, as by older servers.
     Unspecified = 0,
     /// A success achieved the threshold or more.
     AtLeast = 1,
@@ -960,7 +968,7 @@ impl Comparison {
         }
     }
 }
-/// Where parameters come from.
+/// A version of an environment: the distributions of its parameters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Version {
@@ -972,8 +980,8 @@ pub enum Version {
     Random = 2,
     /// E: every parameter is drawn from its E set.
     Extreme = 3,
-    /// R+E: a trial is one of R or one of E, each with probability 1/2: its parameters are all drawn from R or all from E.
-    /// `parameters` replace the sets of both.
+    /// R+E: each trial is drawn from R or from E, with probability 1/2 each: its parameters are all drawn from R or all
+    /// from E. `parameters` replace the sets of both.
     RandomOrExtreme = 4,
 }
 impl Version {
@@ -1002,7 +1010,7 @@ impl Version {
         }
     }
 }
-/// What happens to an environment whose episode has ended (Gymnasium's three modes).
+/// The reset of environments whose episode has ended (Gymnasium's three modes).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum AutoresetMode {
@@ -1014,7 +1022,8 @@ pub enum AutoresetMode {
     /// The last step itself resets: `observations` holds the first observation of the next episode and
     /// `final_observations` the last one of the ended episode.
     SameStep = 2,
-    /// Nothing. Stepping an ended environment is an error (FAILED_PRECONDITION); the client resets it with a mask.
+    /// No automatic reset. Stepping an ended environment is an error (FAILED_PRECONDITION); the client resets it with a
+    /// mask.
     Disabled = 3,
 }
 impl AutoresetMode {
@@ -1122,7 +1131,7 @@ pub mod perturb_client {
             self.inner = self.inner.max_encoding_message_size(limit);
             self
         }
-        /// The catalogue: every environment that this server can run, with its spaces, parameters and limits.
+        /// Returns the catalogue: every environment that this server can run, with its spaces, parameters and limits.
         pub async fn list_environments(
             &mut self,
             request: impl tonic::IntoRequest<super::ListEnvironmentsRequest>,
@@ -1147,16 +1156,15 @@ pub mod perturb_client {
                 .insert(GrpcMethod::new("perturb.v1.Perturb", "ListEnvironments"));
             self.inner.unary(req, path, codec).await
         }
-        /// One stream is one session, which owns a batch of N environments from `open` until the stream ends.
-        /// Every request gets exactly one response, in order; requests may be sent without waiting for earlier responses.
-        /// A request that is wrong gets an `Error` and changes nothing, but for an `act` that meets numbers that are not finite
-        /// on its way; the session lives on. The stream itself ends with a
-        /// status only when the transport fails, a message is larger than the server accepts (OUT_OF_RANGE), the server has no
-        /// place for another session (RESOURCE_EXHAUSTED), it shuts down (UNAVAILABLE), or the session was idle for longer than
-        /// the server allows (DEADLINE_EXCEEDED). When the stream ends, however it ends, its environments are freed, but for a
-        /// session with a lease (`Open.lease`): that one ends when its client closes its side of the stream. After any other loss
-        /// a new stream may take it up (`resume`) until the lease is over. A stream whose session another has taken up ends with
-        /// ABORTED.
+        /// Runs a session. A session owns a batch of N environments from `open` until its stream ends. Every request gets
+        /// exactly one response, in order; requests may be sent without waiting for earlier responses. A wrong request gets an
+        /// `Error` and changes nothing, and the session continues. An `act` that meets numbers that are not finite on its way
+        /// is the only exception: it ends the policy's play. The stream itself ends with a status only when the transport
+        /// fails, a message is larger than the server accepts (OUT_OF_RANGE), the server is full (RESOURCE_EXHAUSTED), it
+        /// shuts down (UNAVAILABLE), or the session was idle for longer than the server allows (DEADLINE_EXCEEDED). When the
+        /// stream ends, its environments are freed. A session with a lease (`Open.lease`) is different: it ends when its
+        /// client closes its side of the stream. After any other loss a new stream may resume it (`resume`) until the lease
+        /// ends. A stream whose session was resumed by another ends with ABORTED.
         pub async fn session(
             &mut self,
             request: impl tonic::IntoStreamingRequest<Message = super::SessionRequest>,
@@ -1196,7 +1204,7 @@ pub mod perturb_server {
     /// Generated trait containing gRPC methods that should be implemented for use with PerturbServer.
     #[async_trait]
     pub trait Perturb: std::marker::Send + std::marker::Sync + 'static {
-        /// The catalogue: every environment that this server can run, with its spaces, parameters and limits.
+        /// Returns the catalogue: every environment that this server can run, with its spaces, parameters and limits.
         async fn list_environments(
             &self,
             request: tonic::Request<super::ListEnvironmentsRequest>,
@@ -1210,16 +1218,15 @@ pub mod perturb_server {
             >
             + std::marker::Send
             + 'static;
-        /// One stream is one session, which owns a batch of N environments from `open` until the stream ends.
-        /// Every request gets exactly one response, in order; requests may be sent without waiting for earlier responses.
-        /// A request that is wrong gets an `Error` and changes nothing, but for an `act` that meets numbers that are not finite
-        /// on its way; the session lives on. The stream itself ends with a
-        /// status only when the transport fails, a message is larger than the server accepts (OUT_OF_RANGE), the server has no
-        /// place for another session (RESOURCE_EXHAUSTED), it shuts down (UNAVAILABLE), or the session was idle for longer than
-        /// the server allows (DEADLINE_EXCEEDED). When the stream ends, however it ends, its environments are freed, but for a
-        /// session with a lease (`Open.lease`): that one ends when its client closes its side of the stream. After any other loss
-        /// a new stream may take it up (`resume`) until the lease is over. A stream whose session another has taken up ends with
-        /// ABORTED.
+        /// Runs a session. A session owns a batch of N environments from `open` until its stream ends. Every request gets
+        /// exactly one response, in order; requests may be sent without waiting for earlier responses. A wrong request gets an
+        /// `Error` and changes nothing, and the session continues. An `act` that meets numbers that are not finite on its way
+        /// is the only exception: it ends the policy's play. The stream itself ends with a status only when the transport
+        /// fails, a message is larger than the server accepts (OUT_OF_RANGE), the server is full (RESOURCE_EXHAUSTED), it
+        /// shuts down (UNAVAILABLE), or the session was idle for longer than the server allows (DEADLINE_EXCEEDED). When the
+        /// stream ends, its environments are freed. A session with a lease (`Open.lease`) is different: it ends when its
+        /// client closes its side of the stream. After any other loss a new stream may resume it (`resume`) until the lease
+        /// ends. A stream whose session was resumed by another ends with ABORTED.
         async fn session(
             &self,
             request: tonic::Request<tonic::Streaming<super::SessionRequest>>,
