@@ -14,7 +14,7 @@ pub mod tensor {
     /// 32-bit floating-point elements.
     #[derive(Clone, PartialEq, ::prost::Message)]
     pub struct FloatArray {
-        /// In row-major order, as in all of these.
+        /// The elements in row-major order.
         #[prost(float, repeated, tag = "1")]
         pub array: ::prost::alloc::vec::Vec<f32>,
     }
@@ -28,7 +28,7 @@ pub mod tensor {
     /// 8-bit signed elements.
     #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
     pub struct Int8Array {
-        /// One byte an element.
+        /// The elements, one byte each.
         #[prost(bytes = "bytes", tag = "1")]
         pub array: ::prost::bytes::Bytes,
     }
@@ -49,7 +49,7 @@ pub mod tensor {
     /// 8-bit unsigned elements.
     #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
     pub struct Uint8Array {
-        /// One byte an element.
+        /// The elements, one byte each.
         #[prost(bytes = "bytes", tag = "1")]
         pub array: ::prost::bytes::Bytes,
     }
@@ -126,7 +126,7 @@ pub mod tensor {
         Protos(ProtoArray),
     }
 }
-/// What a tensor looks like.
+/// The shape, type and bounds of a tensor.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct TensorSpec {
     /// Unique among the actions, the observations or the properties.
@@ -138,10 +138,10 @@ pub struct TensorSpec {
     /// The elements' type.
     #[prost(enumeration = "DataType", tag = "3")]
     pub dtype: i32,
-    /// The least value, inclusive; not set if unbounded.
+    /// The minimum, inclusive; not set if unbounded.
     #[prost(message, optional, tag = "4")]
     pub min: ::core::option::Option<tensor_spec::Value>,
-    /// The greatest value, inclusive; not set if unbounded.
+    /// The maximum, inclusive; not set if unbounded.
     #[prost(message, optional, tag = "5")]
     pub max: ::core::option::Option<tensor_spec::Value>,
 }
@@ -150,13 +150,13 @@ pub mod tensor_spec {
     /// A bound: one element for all, or one for each element of the shape.
     #[derive(Clone, PartialEq, ::prost::Message)]
     pub struct Value {
-        /// Of the spec's type.
+        /// The bound, of the spec's type.
         #[prost(oneof = "value::Payload", tags = "9, 10, 11, 12, 13, 14, 15, 16")]
         pub payload: ::core::option::Option<value::Payload>,
     }
     /// Nested message and enum types in `Value`.
     pub mod value {
-        /// Of the spec's type.
+        /// The bound, of the spec's type.
         #[derive(Clone, PartialEq, ::prost::Oneof)]
         pub enum Payload {
             /// FLOAT
@@ -189,21 +189,21 @@ pub mod tensor_spec {
 /// Makes a world.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct CreateWorldRequest {
-    /// `env_id` and whatever should not have its default.
+    /// `env_id`, and settings that differ from their defaults.
     #[prost(btree_map = "string, message", tag = "1")]
     pub settings: ::prost::alloc::collections::BTreeMap<
         ::prost::alloc::string::String,
         Tensor,
     >,
 }
-/// The world is there.
+/// The world is made.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct CreateWorldResponse {
-    /// Unique on this server; any stream may join by it.
+    /// The name, unique on this server; any stream may join the world by it.
     #[prost(string, tag = "1")]
     pub world_name: ::prost::alloc::string::String,
 }
-/// What an agent can do and see, by uids that never change.
+/// The actions and observations of an agent, by uids that never change.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ActionObservationSpecs {
     /// The actions.
@@ -219,7 +219,7 @@ pub struct JoinWorldRequest {
     /// The world.
     #[prost(string, tag = "1")]
     pub world_name: ::prost::alloc::string::String,
-    /// There are none.
+    /// Must be empty: there are no settings.
     #[prost(btree_map = "string, message", tag = "2")]
     pub settings: ::prost::alloc::collections::BTreeMap<
         ::prost::alloc::string::String,
@@ -229,7 +229,7 @@ pub struct JoinWorldRequest {
 /// The stream is the world's agent. Its next step begins an episode.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct JoinWorldResponse {
-    /// What it can do and see.
+    /// The actions and observations of the agent.
     #[prost(message, optional, tag = "1")]
     pub specs: ::core::option::Option<ActionObservationSpecs>,
 }
@@ -243,20 +243,20 @@ pub struct StepRequest {
     #[prost(uint64, repeated, tag = "2")]
     pub requested_observations: ::prost::alloc::vec::Vec<u64>,
 }
-/// The outcome of a step.
+/// The result of a step.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct StepResponse {
-    /// After the step.
+    /// The state after the step.
     #[prost(enumeration = "EnvironmentStateType", tag = "1")]
     pub state: i32,
-    /// Those requested.
+    /// The requested observations.
     #[prost(btree_map = "uint64, message", tag = "2")]
     pub observations: ::prost::alloc::collections::BTreeMap<u64, Tensor>,
 }
-/// Has the agent's next step begin an episode. Does nothing if that is so already and no settings are given.
+/// Makes the agent's next step begin an episode. Does nothing if it does already and no settings are given.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ResetRequest {
-    /// `seed`, `version`, parameters; from the next episode on.
+    /// `seed`, `version` and parameters, from the next episode on.
     #[prost(btree_map = "string, message", tag = "1")]
     pub settings: ::prost::alloc::collections::BTreeMap<
         ::prost::alloc::string::String,
@@ -266,7 +266,7 @@ pub struct ResetRequest {
 /// The next step begins an episode.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ResetResponse {
-    /// Those of the join.
+    /// The actions and observations, as in the response to the join.
     #[prost(message, optional, tag = "1")]
     pub specs: ::core::option::Option<ActionObservationSpecs>,
 }
@@ -277,7 +277,7 @@ pub struct ResetWorldRequest {
     /// The world.
     #[prost(string, tag = "1")]
     pub world_name: ::prost::alloc::string::String,
-    /// As in `ResetRequest`.
+    /// The settings, as in `ResetRequest`.
     #[prost(btree_map = "string, message", tag = "2")]
     pub settings: ::prost::alloc::collections::BTreeMap<
         ::prost::alloc::string::String,
@@ -287,10 +287,10 @@ pub struct ResetWorldRequest {
 /// The world is, or will be, reset.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ResetWorldResponse {}
-/// Ends being an agent. Legal without a world too.
+/// Leaves the world. Legal without a world, too.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct LeaveWorldRequest {}
-/// The stream is no agent.
+/// The stream is not an agent.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct LeaveWorldResponse {}
 /// Frees a world, which must not have an agent.
@@ -300,7 +300,7 @@ pub struct DestroyWorldRequest {
     #[prost(string, tag = "1")]
     pub world_name: ::prost::alloc::string::String,
 }
-/// The world is gone.
+/// The world is freed.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct DestroyWorldResponse {}
 /// A request.
@@ -352,31 +352,31 @@ pub struct EnvironmentResponse {
 pub mod environment_response {
     #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Payload {
-        /// To `create_world`.
+        /// The response to `create_world`.
         #[prost(message, tag = "1")]
         CreateWorld(super::CreateWorldResponse),
-        /// To `join_world`.
+        /// The response to `join_world`.
         #[prost(message, tag = "2")]
         JoinWorld(super::JoinWorldResponse),
-        /// To `step`.
+        /// The response to `step`.
         #[prost(message, tag = "3")]
         Step(super::StepResponse),
-        /// To `reset`.
+        /// The response to `reset`.
         #[prost(message, tag = "4")]
         Reset(super::ResetResponse),
-        /// To `reset_world`.
+        /// The response to `reset_world`.
         #[prost(message, tag = "5")]
         ResetWorld(super::ResetWorldResponse),
-        /// To `leave_world`.
+        /// The response to `leave_world`.
         #[prost(message, tag = "6")]
         LeaveWorld(super::LeaveWorldResponse),
-        /// To `destroy_world`.
+        /// The response to `destroy_world`.
         #[prost(message, tag = "7")]
         DestroyWorld(super::DestroyWorldResponse),
-        /// To `extension`: a PropertyResponse.
+        /// The response to `extension`: a PropertyResponse.
         #[prost(message, tag = "15")]
         Extension(::prost_types::Any),
-        /// To any request that was refused; it changed nothing.
+        /// The response to any request that was refused; the request changed nothing.
         #[prost(message, tag = "16")]
         Error(super::super::super::google::rpc::Status),
     }
@@ -450,13 +450,13 @@ impl DataType {
         }
     }
 }
-/// Where an agent stands in its sequence (its episode).
+/// The place of an agent in its sequence (its episode).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum EnvironmentStateType {
     /// Never sent.
     InvalidEnvironmentState = 0,
-    /// The episode goes on.
+    /// The episode continues.
     Running = 1,
     /// The task ended the episode. The next step ignores its actions and begins the next episode.
     Terminated = 2,
