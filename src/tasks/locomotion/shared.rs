@@ -53,7 +53,13 @@ impl Shared {
         match &self.edit {
             Some(edit) if edit.is_of(density, friction) => Ok(Arc::clone(edit)),
             _ => {
-                let edit = Arc::new(Edit::new(self.pristine, &mut self.simulation, density, friction)?);
+                let edit = Arc::new(Edit::new(
+                    self.pristine.targets,
+                    &self.pristine.constants,
+                    &mut self.simulation,
+                    density,
+                    friction,
+                )?);
                 self.edit = Some(Arc::clone(&edit));
                 Ok(edit)
             }
