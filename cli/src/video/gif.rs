@@ -39,7 +39,7 @@ pub(super) struct GifEncoder {
     indices: Vec<u8>,
     /// Total duration of the frames so far, in hundredths of a second.
     time: u64,
-    films: Vec<Thinned>,
+    films: Vec<ThinnedFilm>,
 }
 
 impl GifEncoder {
@@ -52,7 +52,7 @@ impl GifEncoder {
         // The delay must fit its field, also when an episode's last frame comes in between.
         let fits =
             |stride: &u16| *stride == 1 || u32::from(*stride) * u32::from(delay(seconds)) <= u32::from(u16::MAX / 2);
-        let films = STRIDES.into_iter().filter(fits).map(|stride| Thinned::new(stride, delay(seconds))).collect();
+        let films = STRIDES.into_iter().filter(fits).map(|stride| ThinnedFilm::new(stride, delay(seconds))).collect();
         let file = File::create(path)?;
         Ok(Self { file, size, seconds, palette: None, indices: Vec::new(), time: 0, films })
     }
@@ -101,30 +101,37 @@ impl Encode for GifEncoder {
 }
 
 /// A film that shows every `stride`-th frame.
-struct Thinned {
+struct ThinnedFilm {
     stride: u16,
     /// Time between shown frames, in hundredths of a second. Last frames of episodes are shown, too.
     interval: u64,
-    /// Duration of a frame that is not held.
-    usual: u16,
+    /// Duration of a frame other than the last one of an episode, in hundredths of a second.
+    frame_delay: u16,
     /// Compressed frames.
     frames: Vec<Frame<'static>>,
     /// Size of the file so far.
     bytes: usize,
     /// Pixels that are visible after the last of `frames`.
-    seen: Vec<u8>,
+    visible: Vec<u8>,
 }
 
-impl Thinned {
+impl ThinnedFilm {
     fn new(stride: u16, delay: u16) -> Self {
         let interval = u64::from(stride) * u64::from(delay);
-        Self { stride, interval, usual: delay, frames: Vec::new(), bytes: FILE_OVERHEAD_BYTES, seen: Vec::new() }
+        Self {
+            stride,
+            interval,
+            frame_delay: delay,
+            frames: Vec::new(),
+            bytes: FILE_OVERHEAD_BYTES,
+            visible: Vec::new(),
+        }
     }
 
     /// Adds a frame that is shown from `time` on, or extends the frame before it.
     fn add(&mut self, indices: &[u8], width: usize, time: u64, delay: u16) {
-        if delay > self.usual || time.next_multiple_of(self.interval) < time + u64::from(delay) {
-            let frame = changes(&mut self.seen, indices, width);
+        if delay > self.frame_delay || time.next_multiple_of(self.interval) < time + u64::from(delay) {
+            let frame = changed_rectangle(&mut self.visible, indices, width);
             self.bytes += FRAME_OVERHEAD_BYTES + frame.buffer.len() + frame.buffer.len().div_ceil(255);
             self.frames.push(frame);
         }
@@ -134,18 +141,18 @@ impl Thinned {
     }
 }
 
-/// Returns the compressed rectangle of the pixels that differ between `seen` and `indices`, and updates `seen`. At
-/// first `seen` is empty.
-fn changes(seen: &mut Vec<u8>, indices: &[u8], width: usize) -> Frame<'static> {
-    seen.resize(indices.len(), UNCHANGED); // no pixel has this index
+/// Returns the compressed rectangle of the pixels that differ between `visible` and `indices`, and updates `visible`. At
+/// first `visible` is empty.
+fn changed_rectangle(visible: &mut Vec<u8>, indices: &[u8], width: usize) -> Frame<'static> {
+    visible.resize(indices.len(), UNCHANGED); // no pixel has this index
     let mut left = width;
     let mut right = 0;
     let mut top = usize::MAX;
     let mut bottom = 0;
-    for (row, (seen, new)) in seen.chunks_exact(width).zip(indices.chunks_exact(width)).enumerate() {
-        let differs = |(seen, new)| seen != new;
-        let Some(first) = seen.iter().zip(new).position(differs) else { continue };
-        let last = seen.iter().zip(new).rposition(differs).unwrap_or(first);
+    for (row, (visible, new)) in visible.chunks_exact(width).zip(indices.chunks_exact(width)).enumerate() {
+        let differs = |(visible, new)| visible != new;
+        let Some(first) = visible.iter().zip(new).position(differs) else { continue };
+        let last = visible.iter().zip(new).rposition(differs).unwrap_or(first);
         (left, right) = (left.min(first), right.max(last + 1));
         (top, bottom) = (top.min(row), row + 1);
     }
@@ -155,10 +162,10 @@ fn changes(seen: &mut Vec<u8>, indices: &[u8], width: usize) -> Frame<'static> {
     let mut buffer = Vec::with_capacity((right - left) * (bottom - top));
     for row in top..bottom {
         let row = row * width + left..row * width + right;
-        let pixels = seen[row.clone()].iter().zip(&indices[row]);
-        buffer.extend(pixels.map(|(seen, new)| if seen == new { UNCHANGED } else { *new }));
+        let pixels = visible[row.clone()].iter().zip(&indices[row]);
+        buffer.extend(pixels.map(|(visible, new)| if visible == new { UNCHANGED } else { *new }));
     }
-    seen.copy_from_slice(indices);
+    visible.copy_from_slice(indices);
     let mut frame = Frame {
         dispose: DisposalMethod::Keep,
         transparent: Some(UNCHANGED),
@@ -281,7 +288,7 @@ mod tests {
 
     #[test]
     fn last_frames_of_episodes_are_always_shown() {
-        let mut film = Thinned::new(256, 2);
+        let mut film = ThinnedFilm::new(256, 2);
         for frame in 0..200_u64 {
             let held = frame == 150;
             film.add(

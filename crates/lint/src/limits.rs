@@ -127,12 +127,15 @@ impl LimitTable {
         limit.unwrap_or(0.0).max(check.default_limit())
     }
 
-    /// Returns the limits that `findings` need, without those that every folder has.
-    pub fn needed_for(findings: &[Finding]) -> Self {
+    /// Returns these limits lowered to the present numbers. No limit rises, and limits that every folder has are left out.
+    pub fn lowered_to(&self, findings: &[Finding]) -> Self {
         let mut limits = Self::default();
-        for finding in findings.iter().filter(|finding| finding.count > finding.check.default_limit()) {
-            let section = limits.0.entry(finding.check.section().to_owned()).or_default();
-            section.insert(finding.folder.clone(), finding.count);
+        for finding in findings {
+            let limit = self.get(finding.check, &finding.folder).min(finding.count);
+            if limit > finding.check.default_limit() {
+                let section = limits.0.entry(finding.check.section().to_owned()).or_default();
+                section.insert(finding.folder.clone(), limit);
+            }
         }
         limits
     }
@@ -148,7 +151,7 @@ impl fmt::Display for LimitTable {
             f,
             "# of the doc comments, and none of all else. Limits only fall: `cargo run --release --package perturb-lint --"
         )?;
-        writeln!(f, "# --write-limits` writes the numbers of today.")?;
+        writeln!(f, "# --lower-limits` lowers them to the present numbers.")?;
         for check in Check::ALL {
             let Some(folders) = self.0.get(check.section()) else { continue };
             writeln!(f, "\n[{}]", check.section())?;

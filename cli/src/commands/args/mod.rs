@@ -37,11 +37,11 @@ Exit status: 0 success; 1 failure; 2 an argument or file is missing or wrong; 12
 )]
 pub struct Cli {
     /// Print only warnings and errors on standard error.
-    #[arg(short, long, global = true, conflicts_with = "verbose")]
+    #[arg(short, long, global = true, display_order = 1000, conflicts_with = "verbose")]
     pub quiet: bool,
     /// Log to standard error; give it twice for all details. RUST_LOG sets a filter, e.g. warn,h2=debug, also for
     /// dependencies.
-    #[arg(short, long, global = true, action = ArgAction::Count)]
+    #[arg(short, long, global = true, display_order = 1001, action = ArgAction::Count)]
     pub verbose: u8,
     #[command(subcommand)]
     pub command: CliCommand,
