@@ -10,6 +10,7 @@ use std::{
     thread,
     time::Duration,
 };
+use tokio::time::Instant;
 
 /// Limits of the process that loads a folder.
 const MAX_MEMORY_BYTES: u64 = 2 << 30;
@@ -93,8 +94,8 @@ fn how_it_ended(status: ExitStatus, last_words: Option<&str>) -> String {
 
 /// Waits for the end of a process, and kills it after [`MAX_WALL_SECONDS`].
 fn wait(child: &mut Child) -> io::Result<Option<ExitStatus>> {
-    let polls = MAX_WALL_SECONDS * 1000 / POLL_INTERVAL.as_millis() as u64;
-    for _ in 0..polls {
+    let start = Instant::now();
+    while start.elapsed() < Duration::from_secs(MAX_WALL_SECONDS) {
         if let Some(status) = child.try_wait()? {
             return Ok(Some(status));
         }
