@@ -161,7 +161,8 @@ fn recompiled(mjcf: &str, edit: &str) -> Option<String> {
     let attributes = |name: &str| mjcf.matches(&format!(" {name}=\"")).count();
     let option = |attribute: &str| {
         let (before, after) = mjcf.split_once("<option ")?;
-        (!after.split('>').next()?.contains(attribute)).then(|| format!("{before}<option {attribute} {after}"))
+        let name = attribute.split('=').next()?;
+        (!after.split('>').next()?.contains(name)).then(|| format!("{before}<option {attribute} {after}"))
     };
     match edit {
         "gravity" => option("gravity=\"0 0 -6.5\""),
