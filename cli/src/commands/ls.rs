@@ -10,8 +10,7 @@ use super::display::terminal_width;
 use super::error::{CommandError, Result};
 
 /// Explanation of the column `success`, printed below the list.
-const SUCCESS_NOTE: &str =
-    "\nsuccess: of a training's last 100 episodes, or of all tests of an experiment's finished cells";
+const SUCCESS_NOTE: &str = "\nsuccess: a training's last 100 episodes, or all tests of finished cells";
 
 pub(super) fn run(args: &LsArgs) -> Result<()> {
     args.json.check()?;

@@ -43,7 +43,8 @@ fn reports_do_not_depend_on_interruptions() {
     }
 
     let page = String::from_utf8_lossy(&whole["page"]).into_owned();
-    assert!(page.matches("<svg").count() == 18 && page.matches("<table").count() == 15, "every picture and table");
+    // One of the tables has the numbers that depend on ties.
+    assert_eq!((page.matches("<svg").count(), page.matches("<table").count()), (18, 16), "every picture and table");
     let pictures = ["profiles.png", "Pendulum-E-parameters.svg", "CartPole-thresholds.svg"];
     assert!(pictures.iter().all(|name| whole.contains_key(*name)), "{:?}", whole.keys());
     assert!(!page.contains("<script") && !page.contains("src=") && !page.contains("@import"), "it needs nothing else");
@@ -195,7 +196,10 @@ fn a_heatmap_of_several_policies_is_their_mean() {
     assert!(output.status.code() == Some(2) && stderr(&output).contains("twice: give different policies"));
     let output = draw(&[a, b], &["--records", &records[0]]);
     let said = stderr(&output);
-    assert!(output.status.code() == Some(2) && said.contains("1 files for 2 policies; give one for each"), "{said}");
+    assert!(
+        output.status.code() == Some(2) && said.contains("1 files for 2 policies; give one file for each"),
+        "{said}"
+    );
 
     // The third parameter is force: the default on D, drawn for each episode on E.
     succeeded(&draw(&[a], &small(&["--base-version", "E"])));
