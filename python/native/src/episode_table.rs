@@ -28,7 +28,7 @@ impl EpisodeTable {
     ///
     /// # Errors
     /// If receipts have other lengths.
-    pub fn with_messages<'a>(mut self, messages: impl Iterator<Item = Message<'a>>) -> PyResult<Self> {
+    pub fn with_messages<'a>(mut self, messages: impl Iterator<Item = EpisodeMessage<'a>>) -> PyResult<Self> {
         for (slot, episode, receipt) in messages {
             let (Some(episode), Some(receipt)) = (episode, receipt) else { continue };
             if receipt.requested.len() != self.requested || receipt.applied.len() + self.requested != self.width {
@@ -74,7 +74,7 @@ impl EpisodeTable {
 }
 
 /// A message: its slot, and what it says.
-pub type Message<'a> = (u32, Option<&'a proto::Episode>, Option<&'a proto::Receipt>);
+pub type EpisodeMessage<'a> = (u32, Option<&'a proto::Episode>, Option<&'a proto::Receipt>);
 
 /// The error for episodes that do not fit the batch.
 pub fn mismatched_episodes() -> PyErr {

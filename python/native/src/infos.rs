@@ -50,7 +50,7 @@ impl Label {
 }
 
 /// Keys of a session's infos, made once.
-pub struct Labels {
+pub struct InfoKeys {
     /// N.
     num_envs: usize,
     parameters: Vec<Label>,
@@ -81,7 +81,7 @@ fixed_labels! {
     episode_index, model_hash, reward_terms, final_obs, final_info
 }
 
-impl Labels {
+impl InfoKeys {
     /// Makes the keys of N environments.
     pub fn new(py: Python<'_>, environment: &proto::Environment, num_envs: usize) -> Self {
         Self {
@@ -104,7 +104,7 @@ impl Labels {
 /// Episodes that began and ended in a request.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Events {
-    labels: Arc<Labels>,
+    labels: Arc<InfoKeys>,
     ended: Vec<proto::EpisodeEnd>,
     /// Their receipts, and those of the episodes that began; none if they were not asked for.
     ended_episodes: EpisodeTable,
@@ -120,7 +120,7 @@ impl Events {
     ///
     /// # Errors
     /// If they do not fit.
-    pub fn begun(labels: &Arc<Labels>, started: Vec<proto::EpisodeStart>) -> PyResult<Self> {
+    pub fn begun(labels: &Arc<InfoKeys>, started: Vec<proto::EpisodeStart>) -> PyResult<Self> {
         let started = started.iter().map(|start| (start.slot, start.episode.as_ref(), start.receipt.as_ref()));
         Self {
             labels: Arc::clone(labels),
@@ -138,7 +138,7 @@ impl Events {
     ///
     /// # Errors
     /// If they do not fit.
-    pub fn stepped(labels: &Arc<Labels>, stepped: proto::Stepped, observation_size: usize) -> PyResult<Option<Self>> {
+    pub fn stepped(labels: &Arc<InfoKeys>, stepped: proto::Stepped, observation_size: usize) -> PyResult<Option<Self>> {
         let proto::Stepped { ended, started, final_observations, reward_terms, receipt_episodes, .. } = stepped;
         if ended.is_empty() && started.is_empty() && reward_terms.is_empty() && receipt_episodes.is_empty() {
             return Ok(None);

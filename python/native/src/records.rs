@@ -18,17 +18,17 @@ use crate::sets::{Set, to_python};
 const RESAMPLES: usize = 1000;
 
 /// Mean and deviation, %.
-type Number = (f64, Option<f64>);
+type MeanAndDeviation = (f64, Option<f64>);
 
 /// A part of a parameter's range: low, high, successes, episodes, and the interval of the success rate, %.
-type Part = (f64, f64, u64, u64, f64, f64);
+type BinRow = (f64, f64, u64, u64, f64, f64);
 
 /// A part of two parameters' ranges: low and high of either, successes, episodes.
-type Cell = ((f64, f64), (f64, f64), u64, u64);
+type GridRow = ((f64, f64), (f64, f64), u64, u64);
 
 /// Episodes, success % and its interval, mean return and its interval, mean length, the mean of the worst tenth of returns
 /// and its interval, and the success rate in the worst tenth of contexts, %.
-type Figures = (u64, f64, (f64, f64), f64, (f64, f64), f64, f64, (f64, f64), Option<f64>);
+type ResultRow = (u64, f64, (f64, f64), f64, (f64, f64), f64, f64, (f64, f64), Option<f64>);
 
 /// The recorded tests of a policy.
 #[pyclass(frozen, module = "perturb._native")]
@@ -109,7 +109,7 @@ impl Records {
     }
 
     /// The figures of the test on a set.
-    fn result(&self, py: Python<'_>, name: &str) -> Figures {
+    fn result(&self, py: Python<'_>, name: &str) -> ResultRow {
         py.detach(|| {
             let result = self.0.result(name, None);
             let outcomes = Outcomes::of(&self.0, name);
@@ -144,7 +144,7 @@ impl Records {
     }
 
     /// Success over two parameters on a set, by y, then x.
-    fn success_by_parameters(&self, name: &str, x: &str, y: &str) -> PyResult<Vec<Cell>> {
+    fn success_by_parameters(&self, name: &str, x: &str, y: &str) -> PyResult<Vec<GridRow>> {
         let places = [self.place(x)?, self.place(y)?];
         let outcomes = Outcomes::of(&self.0, name);
         let bins = places.map(|place| bins(std::iter::once(&outcomes), place));
@@ -158,7 +158,7 @@ impl Records {
     }
 
     /// Success over a parameter on a set.
-    fn success_by_parameter(&self, name: &str, parameter: &str) -> PyResult<Vec<Part>> {
+    fn success_by_parameter(&self, name: &str, parameter: &str) -> PyResult<Vec<BinRow>> {
         let place = self.place(parameter)?;
         let outcomes = Outcomes::of(&self.0, name);
         let bins = bins(std::iter::once(&outcomes), place);
@@ -198,7 +198,7 @@ pub fn metrics(rates: std::collections::HashMap<String, f64>) -> (Option<f64>, O
 
 /// The paper's methods in an environment, with the mean and deviation over five runs of their three numbers, %.
 #[pyfunction]
-pub fn published(environment: &str) -> Vec<(String, Vec<Option<Number>>)> {
+pub fn published(environment: &str) -> Vec<(String, Vec<Option<MeanAndDeviation>>)> {
     let numbers = |method| {
         let number = |metric| paper::number(environment, &method, metric).map(|it| (it.mean, it.std));
         (method.to_string(), Metric::ALL.into_iter().map(number).collect())

@@ -11,10 +11,10 @@ use pyo3::types::{PyBool, PyBytes, PyInt};
 use crate::failure::{INVALID, failure};
 
 /// Sets of parameters: by name, intervals from low to high.
-pub type Intervals = HashMap<String, Vec<(f64, f64)>>;
+pub type IntervalsByName = HashMap<String, Vec<(f64, f64)>>;
 
 /// Converts sets of parameters for the protocol.
-pub fn distributions(parameters: Intervals) -> HashMap<String, proto::Distribution> {
+pub fn distributions(parameters: IntervalsByName) -> HashMap<String, proto::Distribution> {
     let interval = |(low, high)| proto::Interval { low, high };
     let distribution =
         |intervals: Vec<_>| proto::Distribution { intervals: intervals.into_iter().map(interval).collect() };

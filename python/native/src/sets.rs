@@ -12,10 +12,10 @@ use pyo3::exceptions::PyOSError;
 use pyo3::prelude::*;
 
 use crate::failure::{INVALID, failure};
-use crate::requests::Intervals;
+use crate::requests::IntervalsByName;
 
 /// A set: its name, its version, what is drawn in place of the version's, and the contexts if they are listed.
-pub type Set = (String, String, Intervals, Option<Vec<BTreeMap<String, f64>>>);
+pub type Set = (String, String, IntervalsByName, Option<Vec<BTreeMap<String, f64>>>);
 
 /// The set that values of parameters make, each as experiment files write them: drawn, or a grid.
 #[pyfunction]
@@ -88,7 +88,7 @@ pub fn from_python((name, version, drawn, contexts): Set) -> PyResult<TestSet> {
     Ok(TestSet { name, version, contexts })
 }
 
-fn parameters(drawn: Intervals) -> PyResult<BTreeMap<String, Distribution>> {
+fn parameters(drawn: IntervalsByName) -> PyResult<BTreeMap<String, Distribution>> {
     let distribution = |(name, intervals): (String, Vec<(f64, f64)>)| {
         let intervals: Vec<Interval> = intervals.into_iter().map(|(low, high)| Interval::new(low, high)).collect();
         let values = Distribution::union(&intervals);

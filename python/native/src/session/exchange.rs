@@ -8,30 +8,30 @@ use pyo3::prelude::*;
 
 use super::Session;
 use crate::failure::{self, TIMED_OUT, UNUSABLE, failure};
-use crate::infos::Labels;
+use crate::infos::InfoKeys;
 use crate::session_runtime::{SessionRuntime, WaitError};
 
-/// State of a session.
-pub(super) enum State {
+/// SessionState of a session.
+pub(super) enum SessionState {
     New,
-    Idle(Box<Open>),
+    Idle(Box<OpenSession>),
     /// A thread waits, and has it.
     Busy,
     Ended,
 }
 
 /// An open session. The stream is dropped before the runtime that drives it.
-pub(super) struct Open {
+pub(super) struct OpenSession {
     pub(super) stream: Stream,
     pub(super) connection: Connection,
     pub(super) runtime: SessionRuntime,
-    pub(super) labels: Arc<Labels>,
+    pub(super) labels: Arc<InfoKeys>,
     /// Steps that were sent and not received.
     pub(super) under_way: usize,
 }
 
 impl Session {
-    pub(super) fn state(&self) -> MutexGuard<'_, State> {
+    pub(super) fn state(&self) -> MutexGuard<'_, SessionState> {
         unpoisoned(&self.state)
     }
 
@@ -54,17 +54,17 @@ impl Session {
     }
 
     /// The session, with at most so many steps under way, for this thread alone.
-    pub(super) fn take(&self, max_under_way: usize) -> PyResult<Box<Open>> {
+    pub(super) fn take(&self, max_under_way: usize) -> PyResult<Box<OpenSession>> {
         self.require_own()?;
         let mut state = self.state();
-        match std::mem::replace(&mut *state, State::Busy) {
-            State::Idle(open) if open.under_way <= max_under_way => Ok(open),
-            State::Idle(open) => {
+        match std::mem::replace(&mut *state, SessionState::Busy) {
+            SessionState::Idle(open) if open.under_way <= max_under_way => Ok(open),
+            SessionState::Idle(open) => {
                 let under_way = open.under_way;
-                *state = State::Idle(open);
+                *state = SessionState::Idle(open);
                 Err(failure(UNUSABLE, 0, format!("steps are under way, {under_way} of them: recv() first")))
             }
-            State::Busy => Err(failure(
+            SessionState::Busy => Err(failure(
                 UNUSABLE,
                 0,
                 "another thread waits for a reply: an environment is for one thread at a time",
@@ -76,22 +76,27 @@ impl Session {
         }
     }
 
-    pub(super) fn put_back(&self, py: Python<'_>, open: Box<Open>) {
+    pub(super) fn put_back(&self, py: Python<'_>, open: Box<OpenSession>) {
         let mut state = self.state();
         if self.closing.is_closed() {
-            *state = State::Ended;
+            *state = SessionState::Ended;
             drop(state);
             open.close(py);
         } else {
-            *state = State::Idle(open);
+            *state = SessionState::Idle(open);
         }
     }
 
     pub(super) fn end(&self) {
-        *self.state() = State::Ended;
+        *self.state() = SessionState::Ended;
     }
 
-    pub(super) fn ask<A>(&self, py: Python<'_>, open: Box<Open>, request: A) -> PyResult<(Arc<Labels>, A::Reply)>
+    pub(super) fn ask<A>(
+        &self,
+        py: Python<'_>,
+        open: Box<OpenSession>,
+        request: A,
+    ) -> PyResult<(Arc<InfoKeys>, A::Reply)>
     where
         A: TypedRequest + Send + 'static,
         A::Reply: Send,
@@ -99,7 +104,7 @@ impl Session {
         self.exchange::<A>(py, open, Some(request))
     }
 
-    pub(super) fn receive<A>(&self, py: Python<'_>, mut open: Box<Open>) -> PyResult<(Arc<Labels>, A::Reply)>
+    pub(super) fn receive<A>(&self, py: Python<'_>, mut open: Box<OpenSession>) -> PyResult<(Arc<InfoKeys>, A::Reply)>
     where
         A: TypedRequest + Send + 'static,
         A::Reply: Send,
@@ -109,12 +114,17 @@ impl Session {
     }
 
     /// Sends a request, or none if it was sent before, and takes the reply. After a refusal the session lives on.
-    fn exchange<A>(&self, py: Python<'_>, open: Box<Open>, request: Option<A>) -> PyResult<(Arc<Labels>, A::Reply)>
+    fn exchange<A>(
+        &self,
+        py: Python<'_>,
+        open: Box<OpenSession>,
+        request: Option<A>,
+    ) -> PyResult<(Arc<InfoKeys>, A::Reply)>
     where
         A: TypedRequest + Send + 'static,
         A::Reply: Send,
     {
-        let Open { mut stream, connection, runtime, labels, under_way } = *open;
+        let OpenSession { mut stream, connection, runtime, labels, under_way } = *open;
         let pending = Box::pin(async move {
             let reply = match request {
                 Some(request) => stream.ask(request).await,
@@ -136,12 +146,12 @@ impl Session {
             Ok(reply) => {
                 self.put_back(
                     py,
-                    Box::new(Open { stream, connection, runtime, labels: Arc::clone(&labels), under_way }),
+                    Box::new(OpenSession { stream, connection, runtime, labels: Arc::clone(&labels), under_way }),
                 );
                 Ok((labels, reply))
             }
             Err(error @ ClientError::Refused { .. }) => {
-                self.put_back(py, Box::new(Open { stream, connection, runtime, labels, under_way }));
+                self.put_back(py, Box::new(OpenSession { stream, connection, runtime, labels, under_way }));
                 Err(failure::from_client(&error))
             }
             Err(error) => {
@@ -157,12 +167,12 @@ impl Drop for Session {
         if std::process::id() != self.owner {
             // A copy of the parent's: its locks may be locked for ever, and its connection is the parent's.
             let state = self.state.get_mut().unwrap_or_else(PoisonError::into_inner);
-            std::mem::forget(std::mem::replace(state, State::Ended));
+            std::mem::forget(std::mem::replace(state, SessionState::Ended));
         }
     }
 }
 
-impl Open {
+impl OpenSession {
     /// Tells the server, so that it frees the environments even where another process has the socket, too.
     pub(super) fn close(self, py: Python<'_>) {
         let Self { stream, connection, runtime, .. } = self;

@@ -20,17 +20,17 @@ use pyo3::types::PyBytes;
 
 use crate::arrays;
 use crate::failure::{self, INVALID, MALFORMED, UNREACHABLE, UNUSABLE, failure, malformed};
-use crate::infos::{Events, Labels};
-use crate::requests::{self, Actions, Intervals};
+use crate::infos::{Events, InfoKeys};
+use crate::requests::{self, Actions, IntervalsByName};
 use crate::session_runtime::{CloseSignal, SessionRuntime};
-use exchange::{Open, OpeningGuard, State, duration, explain, unpoisoned};
+use exchange::{OpenSession, OpeningGuard, SessionState, duration, explain, unpoisoned};
 
 pub use opened::Opened;
 
 /// Maximum number of steps under way, whose replies are kept until they are received.
 const MAX_STEPS_UNDER_WAY: usize = 64;
 /// The outcome of a step: observations, rewards, both flags, and the episodes that began or ended.
-type Stepped<'py> = (
+type StepArrays<'py> = (
     Bound<'py, PyArray2<f32>>,
     Bound<'py, PyArray1<f32>>,
     Bound<'py, PyArray1<bool>>,
@@ -51,7 +51,7 @@ pub struct Session {
     /// The process that made it.
     owner: u32,
     closing: Arc<CloseSignal>,
-    state: Mutex<State>,
+    state: Mutex<SessionState>,
     last: Mutex<LastStep>,
 }
 
@@ -95,7 +95,7 @@ impl Session {
             observation_size,
             owner: std::process::id(),
             closing: Arc::default(),
-            state: Mutex::new(State::New),
+            state: Mutex::new(SessionState::New),
             last: Mutex::default(),
         })
     }
@@ -109,20 +109,20 @@ impl Session {
     /// Whether a thread waits for a reply.
     #[getter]
     fn waits(&self) -> bool {
-        matches!(*self.state(), State::Busy)
+        matches!(*self.state(), SessionState::Busy)
     }
 
     /// Whether it is of no more use.
     #[getter]
     fn ended(&self) -> bool {
-        self.require_own().is_err() || matches!(*self.state(), State::Ended)
+        self.require_own().is_err() || matches!(*self.state(), SessionState::Ended)
     }
 
     /// Number of steps that were sent and not received.
     #[getter]
     fn under_way(&self) -> usize {
         match &*self.state() {
-            State::Idle(open) => open.under_way,
+            SessionState::Idle(open) => open.under_way,
             _ => 0,
         }
     }
@@ -145,7 +145,7 @@ impl Session {
         py: Python<'_>,
         environment: String,
         version: &str,
-        parameters: Intervals,
+        parameters: IntervalsByName,
         seed: u64,
         first_environment_index: u32,
         episodes_per_trial: u32,
@@ -176,7 +176,7 @@ impl Session {
         {
             let mut state = self.state();
             match *state {
-                State::New => *state = State::Busy,
+                SessionState::New => *state = SessionState::Busy,
                 _ => return Err(failure(UNUSABLE, 0, "the session was opened before")),
             }
         }
@@ -196,11 +196,11 @@ impl Session {
             check_observations(&opened.observations, n, self.observation_size).map_err(|error| malformed(&error))?;
         }
         let served = opened.environment.unwrap_or_default();
-        let labels = Arc::new(Labels::new(py, &served, n));
+        let labels = Arc::new(InfoKeys::new(py, &served, n));
         let events = Events::begun(&labels, opened.started)?;
         *unpoisoned(&self.last) = LastStep { observations: opened.observations.clone(), ..LastStep::default() };
         std::mem::forget(unopened);
-        self.put_back(py, Box::new(Open { stream, connection, runtime, labels, under_way: 0 }));
+        self.put_back(py, Box::new(OpenSession { stream, connection, runtime, labels, under_way: 0 }));
         Ok(Opened {
             environment: perturb_protocol::catalogue::environment(&served).to_string(),
             observes_parameters: opened.observes_parameters,
@@ -217,7 +217,7 @@ impl Session {
         py: Python<'py>,
         actions: &Bound<'py, PyAny>,
         encode: &Bound<'py, PyAny>,
-    ) -> PyResult<Stepped<'py>> {
+    ) -> PyResult<StepArrays<'py>> {
         let request = proto::Step { actions: self.actions.encode(actions, encode)? };
         let open = self.take(0)?;
         let (labels, stepped) = self.ask(py, open, request)?;
@@ -228,7 +228,7 @@ impl Session {
     fn send(&self, py: Python<'_>, actions: &Bound<'_, PyAny>, encode: &Bound<'_, PyAny>) -> PyResult<()> {
         let request = proto::Step { actions: self.actions.encode(actions, encode)? };
         let mut open = self.take(MAX_STEPS_UNDER_WAY - 1)?;
-        let Open { mut stream, connection, runtime, labels, under_way } = *open;
+        let OpenSession { mut stream, connection, runtime, labels, under_way } = *open;
         let sending = Box::pin(async move {
             let sent = stream.send_ahead(request).await;
             (stream, sent)
@@ -236,7 +236,7 @@ impl Session {
         match runtime.wait(py, sending, self.deadline(), &self.closing) {
             Ok((stream, Ok(()))) => {
                 py.detach(|| runtime.poll_io());
-                open = Box::new(Open { stream, connection, runtime, labels, under_way: under_way + 1 });
+                open = Box::new(OpenSession { stream, connection, runtime, labels, under_way: under_way + 1 });
                 self.put_back(py, open);
                 Ok(())
             }
@@ -252,7 +252,7 @@ impl Session {
     }
 
     /// The second half: the outcome of the oldest step that was sent.
-    fn recv<'py>(&self, py: Python<'py>) -> PyResult<Stepped<'py>> {
+    fn recv<'py>(&self, py: Python<'py>) -> PyResult<StepArrays<'py>> {
         let open = self.take(MAX_STEPS_UNDER_WAY)?;
         if open.under_way == 0 {
             self.put_back(py, open);
@@ -268,7 +268,7 @@ impl Session {
         py: Python<'py>,
         mask: &[u8],
         seeds: Vec<u64>,
-        parameters: Intervals,
+        parameters: IntervalsByName,
         states: &[u8],
     ) -> PyResult<(Bound<'py, PyArray2<f32>>, Events)> {
         let selected = self.selected(mask);
@@ -332,7 +332,7 @@ impl Session {
         }
         // Locked and unlocked without Python's lock: who has that one may wait for this one.
         py.detach(|| {
-            if let Ok(State::Idle(open)) = self.state.try_lock().as_deref() {
+            if let Ok(SessionState::Idle(open)) = self.state.try_lock().as_deref() {
                 open.runtime.poll_io();
             }
         });
@@ -345,10 +345,10 @@ impl Session {
         }
         self.closing.close();
         let mut state = self.state();
-        if matches!(*state, State::Busy) {
+        if matches!(*state, SessionState::Busy) {
             return; // whoever waits ends it
         }
-        if let State::Idle(open) = std::mem::replace(&mut *state, State::Ended) {
+        if let SessionState::Idle(open) = std::mem::replace(&mut *state, SessionState::Ended) {
             drop(state);
             open.close(py);
         }
@@ -376,7 +376,12 @@ impl Session {
         arrays::rows(py, &last.observations, self.actions.num_envs, self.observation_size)
     }
 
-    fn stepped<'py>(&self, py: Python<'py>, labels: &Arc<Labels>, stepped: proto::Stepped) -> PyResult<Stepped<'py>> {
+    fn stepped<'py>(
+        &self,
+        py: Python<'py>,
+        labels: &Arc<InfoKeys>,
+        stepped: proto::Stepped,
+    ) -> PyResult<StepArrays<'py>> {
         let n = self.actions.num_envs;
         check_step(&stepped, n, self.observation_size).map_err(|error| malformed(&error))?;
         *unpoisoned(&self.last) = LastStep {
