@@ -22,7 +22,7 @@ use bytes::Bytes;
 use numpy::{Element, PyArray1, PyArrayMethods, PyReadonlyArray1};
 use perturb_protocol::proto;
 use pyo3::prelude::*;
-use pyo3::types::{PyDict, PyString};
+use pyo3::types::{PyDict, PyString, PyTuple};
 
 use crate::arrays;
 use crate::episode_table::{EpisodeTable, mismatched_episodes};
@@ -217,7 +217,7 @@ impl Events {
             receipt.set_item(&known.trial_index.key, trial)?;
             receipt.set_item(&known.episode_index.key, episode)?;
             receipt.set_item(&known.applied.key, values(&self.labels.applied, applied)?)?;
-            receipt.set_item(&known.model_hash.key, PyArray1::from_slice(py, &self.labels.model_hash_bytes))?;
+            receipt.set_item(&known.model_hash.key, PyTuple::new(py, self.labels.model_hash_bytes)?)?;
             info.set_item(&known.context_id.key, trial)?;
             info.set_item(&known.parameters.key, values(&self.labels.parameters, requested)?)?;
             info.set_item(&known.receipt.key, receipt)?;
