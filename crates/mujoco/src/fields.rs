@@ -64,9 +64,10 @@ macro_rules! float_fields {
                     Self::Density => (unsafe { &raw mut (*raw).opt.density }, 1),
                     // SAFETY: as above.
                     Self::Viscosity => (unsafe { &raw mut (*raw).opt.viscosity }, 1),
-                    // SAFETY: as above. The statistics are plain numbers of one type.
                     Self::Statistic => {
-                        (unsafe { &raw mut (*raw).stat }.cast(), size_of::<sys::mjStatistic>() / size_of::<f64>())
+                        // SAFETY: as above. The statistics are plain numbers of one type.
+                        let start = unsafe { &raw mut (*raw).stat }.cast();
+                        (start, size_of::<sys::mjStatistic>() / size_of::<f64>())
                     }
                 }
             }

@@ -309,7 +309,7 @@ impl Model {
     }
 
     /// An array of whole numbers: types, flags and numbers of other elements.
-    pub fn index(&self, index: Index) -> &[i32] {
+    pub fn index_array(&self, index: Index) -> &[i32] {
         let (start, length) = index.place(self.raw());
         self.array(start, length)
     }

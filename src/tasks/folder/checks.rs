@@ -218,10 +218,12 @@ fn contacts_of(model: &Model, geom: usize) -> Vec<Contact> {
         return Vec::new();
     }
     let (body, weld, parent) =
-        (model.index(Index::GeomBody), model.index(Index::BodyWeld), model.index(Index::BodyParent));
-    let (contact_type, affinity) = (model.index(Index::GeomContactType), model.index(Index::GeomContactAffinity));
-    let (priority, dimension) = (model.index(Index::GeomPriority), model.index(Index::GeomContactDimension));
-    let pairs = model.index(Index::PairGeom1).iter().zip(model.index(Index::PairGeom2));
+        (model.index_array(Index::GeomBody), model.index_array(Index::BodyWeld), model.index_array(Index::BodyParent));
+    let (contact_type, affinity) =
+        (model.index_array(Index::GeomContactType), model.index_array(Index::GeomContactAffinity));
+    let (priority, dimension) =
+        (model.index_array(Index::GeomPriority), model.index_array(Index::GeomContactDimension));
+    let pairs = model.index_array(Index::PairGeom1).iter().zip(model.index_array(Index::PairGeom2));
     let declared: Vec<(usize, usize)> = pairs.map(|(&a, &b)| (a as usize, b as usize)).collect();
     let weld_of = |geom: usize| weld[body[geom] as usize];
     let can_touch = |&other: &usize| {

@@ -90,8 +90,8 @@ pub(super) fn actuator_name(model: &Model, elements: &Elements, actuator: usize)
 
 /// The joint that an actuator drives, if it drives one.
 pub(super) fn actuated_joint(model: &Model, actuator: usize) -> Option<usize> {
-    let drives_a_joint = matches!(model.index(Index::ActuatorTransmission)[actuator], 0 | 1);
-    drives_a_joint.then(|| model.index(Index::ActuatorTarget)[2 * actuator] as usize)
+    let drives_a_joint = matches!(model.index_array(Index::ActuatorTransmission)[actuator], 0 | 1);
+    drives_a_joint.then(|| model.index_array(Index::ActuatorTarget)[2 * actuator] as usize)
 }
 
 /// Whether a name fits a pattern, in which `*` stands for any text and `?` for any character.

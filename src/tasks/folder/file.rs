@@ -367,12 +367,12 @@ fn state_channels(model: &Model, elements: &Elements) -> &'static [Channel] {
     for is_velocity in [false, true] {
         for joint in 0..model.n_joint() {
             let name = channel_name(elements.name(Kind::Joint, joint));
-            let (position, velocity): (&[&str], &[&str]) = match model.index(Index::JointType)[joint] {
+            let (position, velocity): (&[&str], &[&str]) = match model.index_array(Index::JointType)[joint] {
                 0 => (&["_x", "_y", "_z", "_qw", "_qx", "_qy", "_qz"], &["_vx", "_vy", "_vz", "_wx", "_wy", "_wz"]),
                 1 => (&["_qw", "_qx", "_qy", "_qz"], &["_wx", "_wy", "_wz"]),
                 _ => (&[""], &["_velocity"]),
             };
-            let is_slide = model.index(Index::JointType)[joint] == 2;
+            let is_slide = model.index_array(Index::JointType)[joint] == 2;
             for part in if is_velocity { velocity } else { position } {
                 let is_length = is_slide || matches!(*part, "_x" | "_y" | "_z" | "_vx" | "_vy" | "_vz");
                 let (unit, limit) = match (is_velocity, part.starts_with("_q"), is_length) {

@@ -100,9 +100,9 @@ impl Source<'_> {
         let mut numbers = Numbers::new();
         for joint in joints {
             let name = self.elements.name(Kind::Joint, joint);
-            let kind = model.index(Index::JointType)[joint];
-            let position = model.index(Index::JointPosition)[joint] as usize;
-            let velocity = model.index(Index::JointVelocity)[joint] as usize;
+            let kind = model.index_array(Index::JointType)[joint];
+            let position = model.index_array(Index::JointPosition)[joint] as usize;
+            let velocity = model.index_array(Index::JointVelocity)[joint] as usize;
             let positions: &[&str] = match kind {
                 FREE => &FREE_POSITION,
                 BALL => &FREE_POSITION[3..],
@@ -264,8 +264,8 @@ impl Source<'_> {
         let mut numbers = Numbers::new();
         for sensor in self.elements.select(Kind::Sensor, value)? {
             let name = self.elements.name(Kind::Sensor, sensor);
-            let first = self.model.index(Index::SensorAddress)[sensor] as usize;
-            let length = self.model.index(Index::SensorDimension)[sensor] as usize;
+            let first = self.model.index_array(Index::SensorAddress)[sensor] as usize;
+            let length = self.model.index_array(Index::SensorDimension)[sensor] as usize;
             for i in 0..length {
                 let part = if length == 1 { String::new() } else { i.to_string() };
                 let suffix = if length == 1 { name.to_owned() } else { format!("{name}_{i}") };
@@ -345,6 +345,6 @@ fn joint_unit(get: &str, kind: i32, part: &str) -> &'static str {
 
 /// The place of an actuator's activation: actuators with dynamics have one each, in the model's order.
 fn activation(model: &Model, actuator: usize) -> Option<usize> {
-    let dynamics = model.index(Index::ActuatorDynamics);
+    let dynamics = model.index_array(Index::ActuatorDynamics);
     (dynamics[actuator] != 0).then(|| dynamics[..actuator].iter().filter(|&&kind| kind != 0).count())
 }

@@ -115,9 +115,9 @@ impl Reset {
 /// The entries of a joint in `qpos`, or in `qvel`.
 fn numbers_of(model: &Model, joint: usize, velocity: bool) -> std::ops::Range<usize> {
     let (starts, end) = if velocity {
-        (model.index(Index::JointVelocity), model.n_v())
+        (model.index_array(Index::JointVelocity), model.n_v())
     } else {
-        (model.index(Index::JointPosition), model.n_q())
+        (model.index_array(Index::JointPosition), model.n_q())
     };
     let next = starts.get(joint + 1).map_or(end, |&next| next as usize);
     starts[joint] as usize..next

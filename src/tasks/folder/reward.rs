@@ -314,12 +314,12 @@ fn power(value: &Value<'_>, model: &Model, elements: &Elements) -> Result<Vec<(u
     table.only(&["actuator"])?;
     let actuators = elements.select(Kind::Actuator, &table.require("actuator", "\"*\"")?)?;
     let place = |actuator| {
-        let joint = actuated_joint(model, actuator).filter(|&joint| model.index(Index::JointType)[joint] > 1);
+        let joint = actuated_joint(model, actuator).filter(|&joint| model.index_array(Index::JointType)[joint] > 1);
         let joint = joint.ok_or_else(|| {
             let name = escaped(elements.name(Kind::Actuator, actuator));
             value.error(format_args!("actuator {name:?} does not drive a hinge or slide; name those that do"))
         })?;
-        Ok((actuator, model.index(Index::JointVelocity)[joint] as usize))
+        Ok((actuator, model.index_array(Index::JointVelocity)[joint] as usize))
     };
     actuators.into_iter().map(place).collect()
 }
@@ -330,11 +330,11 @@ fn limits(value: &Value<'_>, model: &Model, elements: &Elements) -> Result<Vec<(
     table.only(&["joint"])?;
     let joints = elements.select(Kind::Joint, &table.require("joint", "\"*\"")?)?;
     let limited =
-        |&joint: &usize| model.flags(Flags::JointLimited)[joint] != 0 && model.index(Index::JointType)[joint] > 1;
+        |&joint: &usize| model.flags(Flags::JointLimited)[joint] != 0 && model.index_array(Index::JointType)[joint] > 1;
     let places: Vec<(usize, usize)> = joints
         .into_iter()
         .filter(limited)
-        .map(|joint| (joint, model.index(Index::JointPosition)[joint] as usize))
+        .map(|joint| (joint, model.index_array(Index::JointPosition)[joint] as usize))
         .collect();
     if places.is_empty() {
         Err(value.error("none of these joints is a hinge or slide with a range"))

@@ -199,7 +199,7 @@ fn mass(model: &Model, body: usize) -> Option<Target> {
 
 /// The degrees of freedom of a joint.
 pub(super) fn degrees_of_freedom(model: &Model, joint: usize) -> std::ops::Range<usize> {
-    let starts = model.index(Index::JointVelocity);
+    let starts = model.index_array(Index::JointVelocity);
     let end = starts.get(joint + 1).map_or(model.n_v(), |&next| next as usize);
     starts[joint] as usize..end
 }
@@ -223,8 +223,8 @@ const AFFINE: i32 = 1;
 fn position_gain(model: &Model, actuator: usize) -> Option<Target> {
     let gain = model.field(Field::ActuatorGain)[N_GAIN * actuator];
     let bias = model.field(Field::ActuatorBias)[N_GAIN * actuator + 1];
-    let is_servo = model.index(Index::ActuatorGainType)[actuator] == 0
-        && model.index(Index::ActuatorBiasType)[actuator] == AFFINE
+    let is_servo = model.index_array(Index::ActuatorGainType)[actuator] == 0
+        && model.index_array(Index::ActuatorBiasType)[actuator] == AFFINE
         && gain != 0.0
         && bias == -gain;
     is_servo.then_some(Target::PositionGain(actuator))
@@ -233,7 +233,7 @@ fn position_gain(model: &Model, actuator: usize) -> Option<Target> {
 fn velocity_gain(model: &Model, actuator: usize) -> Option<Target> {
     let gain = model.field(Field::ActuatorGain)[N_GAIN * actuator];
     let bias = &model.field(Field::ActuatorBias)[N_GAIN * actuator..][..3];
-    if model.index(Index::ActuatorBiasType)[actuator] != AFFINE || bias[2] == 0.0 {
+    if model.index_array(Index::ActuatorBiasType)[actuator] != AFFINE || bias[2] == 0.0 {
         None
     } else if bias[1] == 0.0 && bias[2] == -gain {
         Some(Target::VelocityGain(actuator))

@@ -58,8 +58,8 @@ fn elements_have_names_and_types() {
     assert_eq!(model.name(Kind::Keyframe, 0), Some("raised"));
     assert_eq!(model.name(Kind::Tendon, 0), Some("string"));
     assert_eq!((model.count(Kind::Site), model.count(Kind::Sensor), model.count(Kind::Pair)), (1, 2, 0));
-    assert_eq!(model.index(Index::JointType), [3, 1, 0]);
-    assert_eq!(model.index(Index::SensorDimension), [1, 3]);
+    assert_eq!(model.index_array(Index::JointType), [3, 1, 0]);
+    assert_eq!(model.index_array(Index::SensorDimension), [1, 3]);
     assert_eq!(model.flags(Flags::JointLimited), [1, 0, 0]);
     assert_eq!(model.flags(Flags::ActuatorControlLimited), [1, 0]);
 }

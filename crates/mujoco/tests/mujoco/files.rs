@@ -29,7 +29,8 @@ fn a_mesh_comes_from_the_given_bytes() {
     let model = Model::from_files(MODEL, &[("other.stl", b"unused"), ("m0.stl", &mesh)]).unwrap();
     let body = model.id(Kind::Body, "corner").unwrap();
     let volume = model.body_mass()[body] / 1000.0;
-    assert!((volume - 1.0 / 6.0).abs() < 1e-9, "{volume} m³");
+    // Corners are float32, and MuJoCo moves and turns them to the centre of mass: eight digits are left.
+    assert!((volume - 1.0 / 6.0).abs() < 1e-8, "{volume} m³");
 }
 
 #[test]
