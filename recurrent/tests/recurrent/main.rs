@@ -37,7 +37,7 @@ fn only_one_of_the_programs_loads_libtorch() {
 }
 
 #[test]
-fn a_program_without_the_other_one_trains_what_needs_no_libtorch_and_says_what_the_rest_needs() {
+fn missing_perturb_recurrent_is_reported_with_a_remedy() {
     let folder = tempfile::tempdir().expect("a directory");
     let alone = folder.path().join("perturb");
     fs::copy(perturb(), &alone).expect("copied");
