@@ -298,7 +298,8 @@ fn a_lost_server_is_reported_with_the_resume_command() {
     let mut server = place.command(&["perturb-server", "--listen", &address, "--log", "error"]);
     let mut server = server.stdout(Stdio::null()).spawn().expect("a server");
     wait_for_server(&place.path("socket"));
-    let train = ["perturb", "train", "--env", "CartPole", "--episodes", "1000000", "--out", "my run"];
+    // --quiet, because a line of progress would come first on a slow machine.
+    let train = ["perturb", "-q", "train", "--env", "CartPole", "--episodes", "1000000", "--out", "my run"];
     let words = [&train[..], &["--server", &address, "--server-wait", "0"]].concat();
     let child = place.start(&words);
     wait_for("a checkpoint", || place.path("my run/checkpoint/checkpoint.json").exists());
