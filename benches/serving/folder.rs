@@ -148,13 +148,15 @@ async fn beside_mujoco(id: &str, path: &Path, mjcf: &str, external_forces: bool)
     Ok(())
 }
 
+/// An environment's state before the round, and the steps after which an episode began, with its state.
+type RoundStart = (Vec<f64>, Vec<(usize, Vec<f64>)>);
+
 /// Environments of the same seed in this process, and their physics alone.
 struct Bare {
     spec: &'static EnvironmentSpec,
     episodes: Vec<Episodes>,
     simulation: Simulation,
-    /// For each environment its state before the round, and the steps after which an episode began, with its state.
-    starts: Vec<(Vec<f64>, Vec<(usize, Vec<f64>)>)>,
+    starts: Vec<RoundStart>,
     n_substeps: usize,
     external_forces: bool,
 }

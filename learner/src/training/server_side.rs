@@ -32,6 +32,7 @@ type PendingReply<'a> =
 pub(super) struct ServerSide<'a> {
     servers: &'a Servers,
     /// Runs whose server plays nothing: between two rollouts.
+    #[expect(clippy::vec_box, reason = "a lane moves into its pending reply and back, as a pointer")]
     idle: Vec<Box<ServerLane<'a>>>,
     /// Runs whose server plays.
     playing: FuturesUnordered<PendingReply<'a>>,

@@ -270,13 +270,14 @@ impl Writer<'_> {
             write_attribute(&mut picture, key, &picture_value);
         }
         // Without a name the element would be called after its file, which has another name now.
-        if let Some(file) = node.attribute("file").filter(|_| names_file(tag, "file").is_some()) {
-            if !node.has_attribute("name") && !in_defaults(&node) {
-                let stem = file.rsplit(['/', '\\']).next().unwrap_or_default();
-                let stem = stem.rsplit_once('.').map_or(stem, |(stem, _)| stem);
-                write_attribute(&mut physics, "name", stem);
-                write_attribute(&mut picture, "name", stem);
-            }
+        if let Some(file) = node.attribute("file").filter(|_| names_file(tag, "file").is_some())
+            && !node.has_attribute("name")
+            && !in_defaults(&node)
+        {
+            let stem = file.rsplit(['/', '\\']).next().unwrap_or_default();
+            let stem = stem.rsplit_once('.').map_or(stem, |(stem, _)| stem);
+            write_attribute(&mut physics, "name", stem);
+            write_attribute(&mut picture, "name", stem);
         }
         let place = (part, self.parts[part].line(&node));
         let children: Vec<Node<'_, '_>> = node.children().filter(Node::is_element).collect();

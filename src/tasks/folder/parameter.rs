@@ -69,12 +69,12 @@ impl EditedParameter {
         for edit in &self.edits {
             for (target, value) in edit.targets.all.iter().flat_map(|target| [(target, low), (target, high)]) {
                 let number = edit.number(target.value(model), value);
-                if let Some((least, strict)) = edit.targets.least() {
-                    if number < least || (strict && number == least) {
-                        let (field, than) = (edit.targets.field, if strict { "above" } else { "at least" });
-                        let problem = format!("{value} would make a {field} of {number}; expected {than} {least}");
-                        return Err(bounds.error(problem));
-                    }
+                if let Some((least, strict)) = edit.targets.least()
+                    && (number < least || (strict && number == least))
+                {
+                    let (field, than) = (edit.targets.field, if strict { "above" } else { "at least" });
+                    let problem = format!("{value} would make a {field} of {number}; expected {than} {least}");
+                    return Err(bounds.error(problem));
                 }
                 if let (Field::JointRange | Field::ActuatorForceRange, at) = target.place() {
                     edit.check_range(bounds, model, (*target, at), value)?;

@@ -137,11 +137,11 @@ fn join(numbers: Vec<Number>) -> Vec<Number> {
     let mut joined: Vec<Number> = Vec::new();
     for number in numbers {
         if let (Some(Number::Array(last, first, length)), Number::Array(array, next, 1)) = (joined.last_mut(), &number)
+            && last == array
+            && *first + *length == *next
         {
-            if last == array && *first + *length == *next {
-                *length += 1;
-                continue;
-            }
+            *length += 1;
+            continue;
         }
         joined.push(number);
     }

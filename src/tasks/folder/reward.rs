@@ -146,10 +146,10 @@ impl Term {
                 );
             }
         }
-        if let (Some(least), Some(most)) = (term.at_least, term.at_most) {
-            if least > most {
-                return Err(table.error(format_args!("at_least {least} is above at_most {most}")));
-            }
+        if let (Some(least), Some(most)) = (term.at_least, term.at_most)
+            && least > most
+        {
+            return Err(table.error(format_args!("at_least {least} is above at_most {most}")));
         }
         term.about.description = match table.text("description")? {
             Some(description) => leaked(description),
