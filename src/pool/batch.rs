@@ -10,7 +10,7 @@ use super::{
         policy_runner::PolicyRunner,
         task::{Rollout, RolloutRequest, RolloutTask},
     },
-    scheduler::{Pool, Scheduler},
+    scheduler::{Pool, StepScheduler},
     settings::{Autoreset, BatchSettings, SlotGroup},
     shard::{Command, Shard, SlotReset, set_actions},
     step_queue::StepQueue,
@@ -59,7 +59,7 @@ pub struct Batch {
     size: usize,
     shard_size: usize,
     job: Arc<Job>,
-    workers: Arc<Scheduler>,
+    workers: Arc<StepScheduler>,
     n_workers: usize,
     buffer: BytesMut,
     /// The number of requests that were handed to the workers.

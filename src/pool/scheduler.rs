@@ -32,7 +32,7 @@ const WORKER_NICENESS: i32 = 1;
 
 /// Worker threads that step batches, and the count of environments they may hold.
 pub struct Pool {
-    shared: Arc<Scheduler>,
+    shared: Arc<StepScheduler>,
     threads: Vec<JoinHandle<()>>,
 }
 
@@ -43,10 +43,10 @@ impl Pool {
     /// If the operating system starts no thread.
     pub fn new(workers: usize, max_environments: usize) -> io::Result<Self> {
         let (reaper, freeing) = Reaper::start()?;
-        let shared = Arc::new(Scheduler {
+        let shared = Arc::new(StepScheduler {
             reaper,
             capacity: Arc::new(Capacity::new(max_environments)),
-            queue: Mutex::new(Queue { jobs: VecDeque::with_capacity(1024), sleeping: 0, closed: false }),
+            queue: Mutex::new(JobQueue { jobs: VecDeque::with_capacity(1024), sleeping: 0, closed: false }),
             waiting: AtomicUsize::new(0),
             ready: Condvar::new(),
             closing: AtomicBool::new(false),
@@ -99,7 +99,7 @@ impl Pool {
         &self.shared.waits
     }
 
-    pub(super) fn queue(&self) -> Arc<Scheduler> {
+    pub(super) fn queue(&self) -> Arc<StepScheduler> {
         Arc::clone(&self.shared)
     }
 }
@@ -118,10 +118,10 @@ impl Drop for Pool {
 }
 
 /// The queue of the workers, which the batches share.
-pub(super) struct Scheduler {
+pub(super) struct StepScheduler {
     pub(super) reaper: Reaper,
     pub(super) capacity: Arc<Capacity>,
-    queue: Mutex<Queue>,
+    queue: Mutex<JobQueue>,
     /// The number of jobs in the queue, readable without its lock.
     waiting: AtomicUsize,
     ready: Condvar,
@@ -133,7 +133,7 @@ pub(super) struct Scheduler {
     waits: Histogram,
 }
 
-struct Queue {
+struct JobQueue {
     /// FIFO of jobs, each with its number of unclaimed parts (at least 1), which are shards or the beginning of a
     /// rollout, and the time at which it was enqueued.
     jobs: VecDeque<(Arc<Job>, usize, Instant)>,
@@ -142,7 +142,7 @@ struct Queue {
     closed: bool,
 }
 
-impl Scheduler {
+impl StepScheduler {
     /// Steps the environments of every shard on this thread, if that is cheap. Returns whether it did.
     pub(super) fn step_inline(&self, job: &Job) -> bool {
         let tiny = if self.mark_last_stepped(job) { INLINE_MAX_US_UNCONTENDED } else { INLINE_MAX_US };

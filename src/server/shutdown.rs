@@ -4,7 +4,7 @@ use tokio::sync::watch;
 
 /// The phase of the shutdown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Phase {
+pub enum ShutdownPhase {
     /// Serving.
     Running,
     /// New sessions are refused, running ones go on.
@@ -16,7 +16,7 @@ pub enum Phase {
 /// A view of the shutdown. Those made by [`Drain::enter`] count as running sessions.
 #[derive(Clone)]
 pub struct Drain {
-    phase: watch::Receiver<Phase>,
+    phase: watch::Receiver<ShutdownPhase>,
     /// Held by sessions: when the last clone is gone, no session runs.
     _session: Option<watch::Receiver<()>>,
     sessions: watch::Sender<()>,
@@ -24,20 +24,20 @@ pub struct Drain {
 
 /// Drives the shutdown.
 pub struct Controller {
-    phase: watch::Sender<Phase>,
+    phase: watch::Sender<ShutdownPhase>,
     sessions: watch::Sender<()>,
 }
 
 impl Controller {
-    /// A controller in [`Phase::Running`], and a view of it.
+    /// A controller in [`ShutdownPhase::Running`], and a view of it.
     pub fn new() -> (Self, Drain) {
-        let (phase, view) = watch::channel(Phase::Running);
+        let (phase, view) = watch::channel(ShutdownPhase::Running);
         let sessions = watch::Sender::new(());
         (Self { phase, sessions: sessions.clone() }, Drain { phase: view, _session: None, sessions })
     }
 
     /// Moves on to a phase.
-    pub fn set(&self, phase: Phase) {
+    pub fn set(&self, phase: ShutdownPhase) {
         self.phase.send_replace(phase);
     }
 
@@ -54,21 +54,21 @@ impl Drain {
     }
 
     /// The phase of the shutdown.
-    pub fn phase(&self) -> Phase {
+    pub fn phase(&self) -> ShutdownPhase {
         *self.phase.borrow()
     }
 
-    /// Waits for [`Phase::Closed`].
+    /// Waits for [`ShutdownPhase::Closed`].
     pub async fn closed(&mut self) {
-        self.reached(Phase::Closed).await;
+        self.reached(ShutdownPhase::Closed).await;
     }
 
-    /// Waits for [`Phase::Draining`].
+    /// Waits for [`ShutdownPhase::Draining`].
     pub async fn draining(&mut self) {
-        self.reached(Phase::Draining).await;
+        self.reached(ShutdownPhase::Draining).await;
     }
 
-    async fn reached(&mut self, wanted: Phase) {
+    async fn reached(&mut self, wanted: ShutdownPhase) {
         if self.phase.wait_for(|phase| *phase >= wanted).await.is_err() {
             std::future::pending().await // the controller is gone: nobody will close
         }

@@ -5,17 +5,17 @@ use super::{
         dm_env_rpc,
         perturb_v1::{
             convert,
-            service::{ENDPOINT, Service},
+            service::{ENDPOINT, PerturbService},
             session::ServerContext,
         },
     },
     auth::{AuthLayer, Tokens},
     error::ErrorCounters,
-    metrics::{self, RequestCounts, Sources},
+    metrics::{self, MetricsSources, RequestCounts},
     net::{
         access_log::AccessLog,
         capacity_health,
-        listener::{self, ConnectionLimits, Listener},
+        listener::{self, AcceptLimits, Listener},
         peer_limiter::PeerLimiter,
         tls::Tls,
     },
@@ -24,7 +24,7 @@ use super::{
         admission::{SessionLimits, Sessions},
         lease::{self, Leases},
     },
-    shutdown::{Controller, Drain, Phase},
+    shutdown::{Controller, Drain, ShutdownPhase},
     transport::{budget::Budget, message_reader::StreamLimits, raw_body::RawBodyLayer},
 };
 use crate::{
@@ -63,7 +63,8 @@ const MAX_UNARY_BYTES: usize = 1 << 10;
 /// The time in which connections must close at the end of a shutdown.
 const CONNECTION_CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 /// The services whose health can be asked for by name.
-const SERVICES: [&str; 2] = [PerturbServer::<Service>::NAME, EnvironmentServer::<dm_env_rpc::service::Service>::NAME];
+const SERVICES: [&str; 2] =
+    [PerturbServer::<PerturbService>::NAME, EnvironmentServer::<dm_env_rpc::service::DmEnvRpcService>::NAME];
 
 /// Why the server stopped.
 #[derive(Debug, thiserror::Error)]
@@ -99,7 +100,7 @@ pub async fn run(
 ) -> Result<(), Error> {
     let listing = listing(&catalogue, config)?;
     let (controller, drain) = Controller::new();
-    let state = State::new(config, catalogue, drain.clone())?;
+    let state = ServerParts::new(config, catalogue, drain.clone())?;
     let renderer = Renderer::new();
     let pictures = renderer.times();
     let worlds = state.worlds(guards);
@@ -140,11 +141,11 @@ pub fn listing(catalogue: &Catalogue, config: &Config) -> Result<proto::ListEnvi
 }
 
 /// The parts of a server that several services share, or that the metrics read.
-struct State {
+struct ServerParts {
     pool: Arc<Pool>,
     catalogue: Arc<Catalogue>,
     limiter: PeerLimiter,
-    admission: ConnectionLimits,
+    admission: AcceptLimits,
     transit: StreamLimits,
     sessions: Sessions,
     leases: Leases<proto::SessionResponse>,
@@ -153,7 +154,7 @@ struct State {
     access: AccessLog,
 }
 
-impl State {
+impl ServerParts {
     fn new(config: &Config, catalogue: Catalogue, drain: Drain) -> io::Result<Self> {
         let pool = Arc::new(Pool::new(config.workers, config.max_envs)?);
         // Every counter exists from the start, so that a rate shows its first event.
@@ -171,7 +172,7 @@ impl State {
             pool,
             catalogue: Arc::new(catalogue),
             limiter,
-            admission: ConnectionLimits { limiter: connections, handshake },
+            admission: AcceptLimits { limiter: connections, handshake },
             transit: StreamLimits {
                 budget: Budget::new(config.max_memory),
                 limit: seconds(config.stall_seconds),
@@ -186,7 +187,12 @@ impl State {
     }
 
     /// The service of `perturb.v1`.
-    fn service(&self, listing: proto::ListEnvironmentsResponse, renderer: Renderer, guards: &Security) -> Service {
+    fn service(
+        &self,
+        listing: proto::ListEnvironmentsResponse,
+        renderer: Renderer,
+        guards: &Security,
+    ) -> PerturbService {
         let shared = ServerContext {
             pool: Arc::clone(&self.pool),
             catalogue: Arc::clone(&self.catalogue),
@@ -195,19 +201,19 @@ impl State {
             ledger: guards.ledger.clone(),
             leases: self.leases.clone(),
         };
-        Service::new(shared, self.sessions.clone())
+        PerturbService::new(shared, self.sessions.clone())
     }
 
     /// The service of `dm_env_rpc.v1`.
-    fn worlds(&self, guards: &Security) -> dm_env_rpc::service::Service {
+    fn worlds(&self, guards: &Security) -> dm_env_rpc::service::DmEnvRpcService {
         let (pool, catalogue) = (Arc::clone(&self.pool), Arc::clone(&self.catalogue));
-        dm_env_rpc::service::Service::new(pool, catalogue, self.sessions.clone(), guards.ledger.clone())
+        dm_env_rpc::service::DmEnvRpcService::new(pool, catalogue, self.sessions.clone(), guards.ledger.clone())
     }
 
     /// The counters that the metrics read.
-    fn sources(&self, requests: [RequestCounts; 2], guards: &Security, pictures: Arc<Histogram>) -> Sources {
+    fn sources(&self, requests: [RequestCounts; 2], guards: &Security, pictures: Arc<Histogram>) -> MetricsSources {
         requests.iter().for_each(|(protocol, _)| self.access.register_protocol(protocol));
-        Sources {
+        MetricsSources {
             pool: Arc::clone(&self.pool),
             sessions: self.limiter.clone(),
             leases: self.leased.clone(),
@@ -226,10 +232,10 @@ impl State {
 /// All services, with what stands before each.
 fn router<H: Health>(
     config: &Config,
-    state: &State,
+    state: &ServerParts,
     tokens: Option<Tokens>,
-    service: Service,
-    worlds: dm_env_rpc::service::Service,
+    service: PerturbService,
+    worlds: dm_env_rpc::service::DmEnvRpcService,
     health: HealthServer<H>,
 ) -> Result<Router, Error> {
     let auth = AuthLayer::new(tokens, state.errors.clone());
@@ -269,7 +275,7 @@ fn reflection() -> tonic_reflection::server::Builder<'static> {
 }
 
 /// Serves metrics, until the set of tasks is dropped.
-fn watch(listener: Listener, sources: &Arc<Sources>) -> JoinSet<()> {
+fn watch(listener: Listener, sources: &Arc<MetricsSources>) -> JoinSet<()> {
     let mut tasks = JoinSet::new();
     let watched = Arc::clone(sources);
     tasks.spawn(async move { watched.watch_lag().await });
@@ -281,7 +287,7 @@ fn watch(listener: Listener, sources: &Arc<Sources>) -> JoinSet<()> {
 fn serve(
     listeners: Vec<Listener>,
     router: &Router,
-    admission: &ConnectionLimits,
+    admission: &AcceptLimits,
     tls: Option<&Tls>,
     drain: &Drain,
 ) -> JoinSet<Result<(), tonic::transport::Error>> {
@@ -317,14 +323,14 @@ async fn shut_down(
     mut servers: JoinSet<Result<(), tonic::transport::Error>>,
 ) {
     tracing::info!(grace_seconds = config.grace_seconds, "shutting down: no new sessions");
-    controller.set(Phase::Draining);
+    controller.set(ShutdownPhase::Draining);
     set_health(health, ServingStatus::NotServing).await;
     health.set_service_status(capacity_health::NEW_SESSIONS, ServingStatus::NotServing).await;
     health.set_service_status("", ServingStatus::NotServing).await;
     if timeout(config.grace(), controller.idle()).await.is_err() {
         tracing::warn!("the grace period is over: ending the sessions that still run");
     }
-    controller.set(Phase::Closed);
+    controller.set(ShutdownPhase::Closed);
     for (protocol, counts) in requests {
         tracing::info!(protocol, "requests: {counts}");
     }

@@ -91,7 +91,7 @@ pub struct EndedAt {
 }
 
 /// The event that a rollout waits for.
-enum Phase {
+enum RolloutPhase {
     /// The first worker that takes it.
     Begin,
     /// All environments to be reset.
@@ -104,7 +104,7 @@ enum Phase {
 pub(in crate::pool) struct RolloutTask {
     request: RolloutRequest,
     runner: Option<Box<PolicyRunner>>,
-    phase: Phase,
+    phase: RolloutPhase,
     rollout: Rollout,
     error: Option<Error>,
 }
@@ -112,7 +112,7 @@ pub(in crate::pool) struct RolloutTask {
 impl RolloutTask {
     /// A rollout of the previous policy, if the request has no new one.
     pub(in crate::pool) fn new(request: RolloutRequest, runner: Option<Box<PolicyRunner>>) -> Self {
-        Self { request, runner, phase: Phase::Begin, rollout: Rollout::default(), error: None }
+        Self { request, runner, phase: RolloutPhase::Begin, rollout: Rollout::default(), error: None }
     }
 
     /// Returns the rollout, with the policy unless it failed.
@@ -139,23 +139,23 @@ impl RolloutTask {
         }
         let runner = runner.as_mut().ok_or(Error::Defect)?;
         match phase {
-            Phase::Begin => {
+            RolloutPhase::Begin => {
                 if let Some(weights) = request.weights.take() {
                     runner.load(&weights)?;
                 }
                 let begins = request.task.is_some();
                 if request.task.take().is_some_and(|task| runner.begin_task(task)) {
                     shards.iter().for_each(|shard| lock(shard).command = Command::ResetAll);
-                    *phase = Phase::Reset;
+                    *phase = RolloutPhase::Reset;
                     return Ok(true);
                 }
                 rollout.begin(runner, begins, request);
             }
-            Phase::Reset => {
+            RolloutPhase::Reset => {
                 runner.begin_episodes(shards)?;
                 rollout.begin(runner, true, request);
             }
-            Phase::Step => {
+            RolloutPhase::Step => {
                 runner.observe(shards)?;
                 rollout.take(runner, request.only_ended);
                 if runner.task().is_done() {
@@ -170,7 +170,7 @@ impl RolloutTask {
                 }
             }
         }
-        *phase = Phase::Step;
+        *phase = RolloutPhase::Step;
         let actions = runner.act(shards)?;
         if !request.only_ended {
             rollout.actions.extend_from_slice(actions);

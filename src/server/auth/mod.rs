@@ -27,7 +27,7 @@ use std::{
     time::Duration,
 };
 use subtle::ConstantTimeEq;
-use token_file::{Entry, ParsedToken, listed};
+use token_file::{ParsedToken, TokenEntry, listed};
 use tokio::sync::Notify;
 use tonic::{body::Body, codegen::http};
 
@@ -211,7 +211,7 @@ impl Tokens {
         let mut tokens = self.good.write().unwrap_or_else(PoisonError::into_inner);
         let mut renewed = Vec::with_capacity(listed.len());
         for ParsedToken { digest, entry, role } in listed {
-            let Entry { name, max_sessions, max_envs, max_steps_per_second, max_bytes, .. } = entry;
+            let TokenEntry { name, max_sessions, max_envs, max_steps_per_second, max_bytes, .. } = entry;
             // Another token of the same name has what was taken with the one before, too.
             let before = tokens.iter().find(|token| token.name == name);
             let quotas = before.map_or_else(Default::default, |token| Arc::clone(&token.quotas));

@@ -19,10 +19,10 @@ const RECHECK_INTERVAL: Duration = Duration::from_millis(500);
 
 /// A token's rate, and the steps that it has allowed and seen.
 #[derive(Default)]
-pub(super) struct RateLimiter(Mutex<State>);
+pub(super) struct RateLimiter(Mutex<RateState>);
 
 #[derive(Default)]
-struct State {
+struct RateState {
     /// The steps per second; `None` for no limit.
     rate: Option<u32>,
     /// Steps so far.
@@ -77,12 +77,12 @@ impl RateLimiter {
         self.lock().wait(ticket, Instant::now())
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, RateState> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl State {
+impl RateState {
     fn set_rate(&mut self, rate: Option<u32>, now: Instant) {
         self.refill(now);
         self.rate = rate;
@@ -124,13 +124,13 @@ mod tests {
 
     /// A rate's state, and a clock that only waiting moves.
     struct Clocked {
-        state: State,
+        state: RateState,
         now: Instant,
     }
 
     impl Clocked {
         fn new() -> Self {
-            Self { state: State::default(), now: Instant::now() }
+            Self { state: RateState::default(), now: Instant::now() }
         }
 
         fn set_rate(&mut self, rate: u32) {

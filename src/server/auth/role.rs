@@ -9,21 +9,21 @@ use std::fmt;
 pub struct Role {
     pub(super) name: String,
     /// Nothing that is not within these; none: anything.
-    pub(super) draws: Option<Vec<Set>>,
+    pub(super) draws: Option<Vec<DrawSet>>,
     /// Nothing that overlaps one of these.
-    pub(super) never: Vec<Set>,
+    pub(super) never: Vec<DrawSet>,
 }
 
 /// Parameter values with a name.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Set {
+pub(super) enum DrawSet {
     /// A version of every environment.
     Version(Version),
     /// A set of the file's own.
     Own { name: String, environment: &'static str, region: Region },
 }
 
-impl Set {
+impl DrawSet {
     /// The values of an environment, if it has some of that one.
     fn region(&self, spec: &EnvironmentSpec) -> Option<Region> {
         match self {
@@ -33,7 +33,7 @@ impl Set {
     }
 }
 
-impl fmt::Display for Set {
+impl fmt::Display for DrawSet {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Version(version) => version.fmt(f),
@@ -53,7 +53,7 @@ impl Role {
     /// # Errors
     /// Why not, in half a sentence.
     pub fn check(&self, spec: &EnvironmentSpec, region: &Region) -> Result<(), String> {
-        let overlaps = |set: &&Set| set.region(spec).is_some_and(|never| region.overlaps(&never));
+        let overlaps = |set: &&DrawSet| set.region(spec).is_some_and(|never| region.overlaps(&never));
         if let Some(never) = self.never.iter().find(overlaps) {
             return Err(format!("it may never draw from {never}, which that overlaps"));
         }
@@ -62,7 +62,7 @@ impl Role {
         if region.is_within(&within) {
             return Ok(());
         }
-        let names: Vec<String> = draws.iter().map(Set::to_string).collect();
+        let names: Vec<String> = draws.iter().map(DrawSet::to_string).collect();
         Err(format!("it may draw from {} alone", if names.is_empty() { "nothing".into() } else { names.join(" and ") }))
     }
 }

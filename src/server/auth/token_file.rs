@@ -1,6 +1,6 @@
 //! The file of tokens: what is in it, and what may be.
 
-use super::role::{Role, Set};
+use super::role::{DrawSet, Role};
 use crate::env::{Catalogue, Distribution, Version, resolve};
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
@@ -31,7 +31,7 @@ pub struct TokenFileError {
 #[serde(deny_unknown_fields)]
 struct TokenFile {
     #[serde(default)]
-    token: Vec<Spanned<Entry>>,
+    token: Vec<Spanned<TokenEntry>>,
     #[serde(default)]
     role: Vec<Spanned<RoleEntry>>,
     #[serde(default)]
@@ -40,7 +40,7 @@ struct TokenFile {
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Entry {
+pub(super) struct TokenEntry {
     pub(super) name: String,
     sha256: Option<String>,
     token: Option<String>,
@@ -74,7 +74,7 @@ struct SetEntry {
 pub(super) struct ParsedToken {
     /// SHA-256 of the token.
     pub(super) digest: [u8; 32],
-    pub(super) entry: Entry,
+    pub(super) entry: TokenEntry,
     pub(super) role: Option<Arc<Role>>,
 }
 
@@ -88,8 +88,8 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
         let what = if about_keys { words.lines().next().unwrap_or_default() } else { "this cannot be read" };
         TokenFileError { line: line(error.span().map_or(0, |span| span.start)), what: what.into() }
     })?;
-    let mut known_sets: BTreeMap<String, Set> =
-        Version::KNOWN.iter().map(|version| (version.to_string(), Set::Version(*version))).collect();
+    let mut known_sets: BTreeMap<String, DrawSet> =
+        Version::KNOWN.iter().map(|version| (version.to_string(), DrawSet::Version(*version))).collect();
     for set in sets {
         let line = line(set.span().start);
         let set = set.into_inner();
@@ -107,7 +107,7 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
         let line = line(role.span().start);
         let RoleEntry { name, draws, never } = role.into_inner();
         let find = |names: Vec<String>| names.iter().map(|name| found("set", name, &known_sets)).collect();
-        let sets: Result<(Option<Vec<Set>>, Vec<Set>), String> =
+        let sets: Result<(Option<Vec<DrawSet>>, Vec<DrawSet>), String> =
             draws.map(find).transpose().and_then(|draws| Ok((draws, find(never)?)));
         let (draws, never) = sets.map_err(|what| TokenFileError { line, what })?;
         if draws.is_none() && !never.is_empty() {
@@ -147,18 +147,18 @@ fn found<T: Clone>(what: &str, name: &str, known: &BTreeMap<String, T>) -> Resul
 }
 
 /// A set of the file's own.
-fn own_set(catalogue: &Catalogue, set: SetEntry) -> Result<Set, String> {
+fn own_set(catalogue: &Catalogue, set: SetEntry) -> Result<DrawSet, String> {
     let SetEntry { name, environment, version, parameters } = set;
     let spec = catalogue.find(&environment).map_err(|error| error.to_string())?;
     let version = version.map_or(Ok(Version::D), |version| version.parse()).map_err(|error| error.to_string())?;
     let mut distributions = spec.distributions(version);
     let own = parameters.iter().map(|(name, values)| (name.as_str(), values.clone()));
     resolve(spec, &mut distributions, own).map_err(|error| error.to_string())?;
-    Ok(Set::Own { name, environment: spec.name, region: spec.region(&distributions) })
+    Ok(DrawSet::Own { name, environment: spec.name, region: spec.region(&distributions) })
 }
 
 /// The digest of an entry's token, or what is wrong with the entry.
-fn digest(entry: &Entry) -> Result<[u8; 32], String> {
+fn digest(entry: &TokenEntry) -> Result<[u8; 32], String> {
     let name = &entry.name;
     if name.is_empty() || name.chars().any(char::is_control) {
         return Err(format!("{name:?} is no name"));

@@ -1,6 +1,6 @@
 //! The HTTP endpoint for scrapers: one page, small requests, few connections at a time.
 
-use super::{Sources, page};
+use super::{MetricsSources, page};
 use crate::server::net::listener::Listener;
 use bytes::Bytes;
 use http_body_util::Full;
@@ -29,7 +29,7 @@ const MAX_HEAD_BYTES: usize = 16 << 10;
 const CONTENT_TYPE_OPENMETRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
 /// Answers scrapers, for ever.
-pub async fn serve(listener: Listener, sources: Arc<Sources>) {
+pub async fn serve(listener: Listener, sources: Arc<MetricsSources>) {
     let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     loop {
         let Ok(place) = Arc::clone(&places).acquire_owned().await else { return };
@@ -54,7 +54,7 @@ async fn pause(error: &io::Error) {
 }
 
 /// Answers the one request of a connection.
-async fn converse(stream: impl AsyncRead + AsyncWrite + Unpin, sources: Arc<Sources>) {
+async fn converse(stream: impl AsyncRead + AsyncWrite + Unpin, sources: Arc<MetricsSources>) {
     let answer = service_fn(|request| {
         let response = answer(&request, &sources);
         async move { Ok::<_, Infallible>(response) }
@@ -68,7 +68,7 @@ async fn converse(stream: impl AsyncRead + AsyncWrite + Unpin, sources: Arc<Sour
     let _ = timeout(CONNECTION_TIMEOUT, http.serve_connection(TokioIo::new(stream), answer)).await;
 }
 
-fn answer(request: &Request<Incoming>, sources: &Arc<Sources>) -> Response<Full<Bytes>> {
+fn answer(request: &Request<Incoming>, sources: &Arc<MetricsSources>) -> Response<Full<Bytes>> {
     let (status, format, text) = match (request.uri().path(), request.method()) {
         (PATH, &Method::GET) => match page::page(sources) {
             Ok(text) => (StatusCode::OK, CONTENT_TYPE_OPENMETRICS, text),

@@ -26,7 +26,7 @@ const LAG_CHECK_INTERVAL: Duration = Duration::from_millis(100);
 pub type RequestCounts = (&'static str, Arc<RequestCounters>);
 
 /// The counters of the other layers, which the page reads.
-pub struct Sources {
+pub struct MetricsSources {
     /// Environments, and what happens in them.
     pub pool: Arc<Pool>,
     /// The limiter of sessions.
@@ -51,7 +51,7 @@ pub struct Sources {
     pub lag: Histogram,
 }
 
-impl Sources {
+impl MetricsSources {
     /// Watches how late the thread wakes that runs this, for ever.
     pub async fn watch_lag(&self) {
         loop {

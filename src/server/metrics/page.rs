@@ -1,7 +1,7 @@
 //! The metrics. Labels have names of this program, of its environments and of the file of tokens: nothing that clients
 //! send.
 
-use super::{Sources, process};
+use super::{MetricsSources, process};
 use crate::meters::Histogram;
 use prometheus_client::{
     collector::Collector,
@@ -16,15 +16,15 @@ use std::{
 use tonic::Code;
 
 type EncodeResult = Result<(), fmt::Error>;
-type Labels<'a, const N: usize> = [(&'static str, &'a str); N];
+type MetricLabels<'a, const N: usize> = [(&'static str, &'a str); N];
 /// The labels of a metric without labels.
-const NO_LABELS: Labels<'static, 0> = [];
+const NO_LABELS: MetricLabels<'static, 0> = [];
 
 /// The page of these numbers, as they are now.
 ///
 /// # Errors
 /// A defect: memory takes all text.
-pub fn page(sources: &Arc<Sources>) -> Result<String, fmt::Error> {
+pub fn page(sources: &Arc<MetricsSources>) -> Result<String, fmt::Error> {
     let mut registry = Registry::default();
     registry.register_collector(Box::new(MetricsCollector(Arc::clone(sources))));
     let mut text = String::new();
@@ -32,7 +32,7 @@ pub fn page(sources: &Arc<Sources>) -> Result<String, fmt::Error> {
     Ok(text)
 }
 
-struct MetricsCollector(Arc<Sources>);
+struct MetricsCollector(Arc<MetricsSources>);
 
 impl fmt::Debug for MetricsCollector {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -56,7 +56,7 @@ impl Collector for MetricsCollector {
 impl MetricsCollector {
     /// Writes what is in use, and the limits.
     fn capacity(&self, page: &mut Page<'_>) -> EncodeResult {
-        let Sources { pool, sessions, leases, connections, budget, .. } = &*self.0;
+        let MetricsSources { pool, sessions, leases, connections, budget, .. } = &*self.0;
         for (name, help, value) in [
             ("perturb_sessions", "Sessions now", sessions.in_use()),
             ("perturb_sessions_limit", "The most sessions at a time", sessions.limit()),
@@ -74,7 +74,7 @@ impl MetricsCollector {
     }
 
     fn requests(&self, page: &mut Page<'_>) -> EncodeResult {
-        let Sources { requests, errors, access, .. } = &*self.0;
+        let MetricsSources { requests, errors, access, .. } = &*self.0;
         let each = requests.iter().flat_map(|(protocol, counts)| {
             counts.iter().flat_map(move |(kind, count)| {
                 let refused = count.refused.load(Ordering::Relaxed);
@@ -105,7 +105,7 @@ impl MetricsCollector {
         });
         let help = "How long a step request takes from its check to its reply, by the size of the batch";
         page.histograms("perturb_step_seconds", help, each)?;
-        let Sources { pool, pictures, lag, .. } = &*self.0;
+        let MetricsSources { pool, pictures, lag, .. } = &*self.0;
         let help = "How long a batch waits until a worker takes a part of it, each time";
         page.histograms("perturb_queue_wait_seconds", help, [(NO_LABELS, pool.waits())])?;
         let help = "How late the thread wakes that talks to clients; 1 ms or 2 are the timer's own";

@@ -54,10 +54,10 @@ pub struct SessionRecord<'a> {
 
 /// The log, and how many sessions ended how.
 #[derive(Clone, Default)]
-pub struct AccessLog(Arc<Mutex<State>>);
+pub struct AccessLog(Arc<Mutex<LogState>>);
 
 #[derive(Default)]
-struct State {
+struct LogState {
     /// By protocol and ending.
     endings: BTreeMap<(&'static str, &'static str), u64>,
     /// The window's beginning, and the number of sessions that ended in it.
@@ -128,7 +128,7 @@ impl AccessLog {
         tracing::info!(target: "perturb::access", left_out, "more sessions ended than there are lines for");
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, LogState> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -36,14 +36,14 @@ pub enum Listener {
 
 /// The limits for connections.
 #[derive(Clone)]
-pub struct ConnectionLimits {
+pub struct AcceptLimits {
     /// The limiter of connections.
     pub limiter: PeerLimiter,
     /// The time in which a client must begin.
     pub handshake: Duration,
 }
 
-impl ConnectionLimits {
+impl AcceptLimits {
     /// The connection, if there is a permit for it.
     fn admit<S>(&self, stream: S, peer: Peer) -> Option<ManagedIo<S>> {
         self.acquire(peer).map(|permit| ManagedIo::new(stream, peer, permit, self.handshake))
@@ -77,7 +77,7 @@ impl ConnectionLimits {
 /// Connections as they come, without Nagle's delay: a step is one small message each way.
 pub fn tcp_connections(
     listener: TcpListener,
-    limits: ConnectionLimits,
+    limits: AcceptLimits,
 ) -> impl Stream<Item = io::Result<ManagedIo<TcpStream>>> {
     stream::unfold((listener, limits), |(listener, limits)| async {
         let connection = loop {
@@ -99,7 +99,7 @@ pub fn tcp_connections(
 /// Connections whose clients have finished the handshake, in the order in which they finish: none waits for another.
 pub fn tls_connections(
     listener: TcpListener,
-    limits: ConnectionLimits,
+    limits: AcceptLimits,
     tls: Tls,
 ) -> impl Stream<Item = io::Result<ManagedIo<TlsStream<TcpStream>>>> {
     stream::unfold((listener, limits, tls, JoinSet::new()), |(listener, limits, tls, mut handshakes)| async {
@@ -126,7 +126,7 @@ pub fn tls_connections(
 pub fn unix_connections(
     listener: UnixListener,
     file: SocketFile,
-    limits: ConnectionLimits,
+    limits: AcceptLimits,
 ) -> impl Stream<Item = io::Result<ManagedIo<UnixStream>>> {
     stream::unfold((listener, file, limits), |(listener, file, limits)| async {
         let connection = loop {

@@ -40,9 +40,9 @@ impl fmt::Display for Peer {
 
 /// A concurrency limiter, with a limit in all and one for each peer.
 #[derive(Clone)]
-pub struct PeerLimiter(Arc<State>);
+pub struct PeerLimiter(Arc<PermitCounts>);
 
-struct State {
+struct PermitCounts {
     max_total: usize,
     max_per_peer: usize,
     in_use: Mutex<(usize, BTreeMap<Peer, usize>)>,
@@ -68,7 +68,7 @@ pub struct PeerPermit {
 impl PeerLimiter {
     /// A limiter with a limit in all, and one for each peer.
     pub fn new(max_total: usize, max_per_peer: usize) -> Self {
-        Self(Arc::new(State { max_total, max_per_peer, in_use: Mutex::default(), changed: Notify::new() }))
+        Self(Arc::new(PermitCounts { max_total, max_per_peer, in_use: Mutex::default(), changed: Notify::new() }))
     }
 
     /// Takes a permit for a peer. An unknown peer has no limit of its own.

@@ -11,7 +11,7 @@ use crate::server::{
         access_log::AccessLog,
         peer_limiter::{LimitReached, PeerLimiter, PeerPermit},
     },
-    shutdown::{Drain, Phase},
+    shutdown::{Drain, ShutdownPhase},
     transport::{message_reader::MessageReader, precheck::Decoder},
 };
 use std::time::Duration;
@@ -53,7 +53,7 @@ impl Sessions {
     }
 
     /// The phase of the shutdown.
-    pub fn phase(&self) -> Phase {
+    pub fn phase(&self) -> ShutdownPhase {
         self.drain.phase()
     }
 
@@ -91,7 +91,7 @@ impl Sessions {
     }
 
     fn acquire_permits(&self, requests: &MessageReader) -> Result<Admission, Error> {
-        if self.phase() != Phase::Running {
+        if self.phase() != ShutdownPhase::Running {
             return Err(Error::Draining);
         }
         let permit = self.limiter.acquire(requests.connection.as_ref().map(|connection| connection.peer));

@@ -77,11 +77,11 @@ impl Sessions {
 
 struct SessionDriver<H: SessionHandler> {
     exchange: Exchange<H>,
-    lease: Option<Lease<H::Response>>,
+    lease: Option<ActiveLease<H::Response>>,
 }
 
 /// A session's lease, and the replies that its client may not have received.
-struct Lease<R> {
+struct ActiveLease<R> {
     grant: LeaseGuard<R>,
     stored: ReplayBuffer<StoredReply<R>>,
     /// The number of the last reply that was sent in the present stream.
@@ -129,7 +129,7 @@ impl<H: SessionHandler> SessionDriver<H> {
                     Ok(slot) => slot,
                     Err(attachment) => return attachment,
                 };
-                if let Some(response) = self.lease.as_mut().and_then(Lease::next) {
+                if let Some(response) = self.lease.as_mut().and_then(ActiveLease::next) {
                     slot.send(Ok(response));
                 }
             }
@@ -196,7 +196,7 @@ impl<H: SessionHandler> SessionDriver<H> {
             Some(StreamHandover::Lease(grant)) => {
                 // A request that was read ahead would be lost with its stream, and come again.
                 self.exchange.reads_ahead = false;
-                self.lease = Some(Lease { stored: ReplayBuffer::new(grant.max_unanswered), grant, sent: 0 });
+                self.lease = Some(ActiveLease { stored: ReplayBuffer::new(grant.max_unanswered), grant, sent: 0 });
                 None
             }
             Some(StreamHandover::Resume(ticket)) => Some(ticket),
@@ -342,7 +342,7 @@ impl<H: SessionHandler> SessionDriver<H> {
     }
 }
 
-impl<R: Clone> Lease<R> {
+impl<R: Clone> ActiveLease<R> {
     /// The next reply that the stream does not have.
     fn next(&mut self) -> Option<OutgoingResponse<R>> {
         self.sent += 1;
@@ -376,7 +376,7 @@ fn end_stream<R: Send + 'static>(responses: &ResponseSender<R>, status: Status) 
 }
 
 /// Waits for a stream that asks for the session; for ever without a lease.
-async fn resume_request<R>(lease: &mut Option<Lease<R>>) -> ResumeRequest<R> {
+async fn resume_request<R>(lease: &mut Option<ActiveLease<R>>) -> ResumeRequest<R> {
     if let Some(lease) = lease
         && let Some(ask) = lease.grant.resume_requests.recv().await
     {

@@ -11,7 +11,7 @@ use crate::server::{
     error::{RequestError, status},
     limits::RequestLimits,
     net::access_log::{BROKEN, GONE, SessionRecord},
-    shutdown::Phase,
+    shutdown::ShutdownPhase,
     transport::{
         message_reader::{Message, MessageReader, StreamStop},
         precheck::decoded_at_once,
@@ -131,7 +131,7 @@ impl<H: SessionHandler> Exchange<H> {
         &mut self,
         message: Message,
     ) -> Result<Result<Reply<H::Response>, H::Error>, StreamStop<H::Error>> {
-        if self.sessions.phase() != Phase::Running && !self.handler.is_open() {
+        if self.sessions.phase() != ShutdownPhase::Running && !self.handler.is_open() {
             return Err(refused(Error::Draining));
         }
         // The request's bytes count until it is answered.

@@ -84,7 +84,7 @@ pub struct OutgoingResponse<R> {
 pub type ResponseSender<R> = mpsc::Sender<Result<OutgoingResponse<R>, Status>>;
 
 /// The leases of a server, of sessions with these responses.
-pub struct Leases<R>(Arc<State<R>>);
+pub struct Leases<R>(Arc<LeaseRegistry<R>>);
 
 impl<R> Clone for Leases<R> {
     fn clone(&self) -> Self {
@@ -92,14 +92,14 @@ impl<R> Clone for Leases<R> {
     }
 }
 
-struct State<R> {
+struct LeaseRegistry<R> {
     time: Duration,
     counters: LeaseCounters,
-    leases: Mutex<Vec<Lease<R>>>,
+    leases: Mutex<Vec<LeaseEntry<R>>>,
 }
 
 /// A lease that is held.
-struct Lease<R> {
+struct LeaseEntry<R> {
     name: Id,
     bearer: Option<Bearer>,
     resume_requests: mpsc::Sender<ResumeRequest<R>>,
@@ -198,7 +198,7 @@ pub struct LeaseGuard<R> {
 impl<R> Leases<R> {
     /// No leases yet. Each holds for `time` without a stream.
     pub fn new(time: Duration, counters: LeaseCounters) -> Self {
-        Self(Arc::new(State { time, counters, leases: Mutex::default() }))
+        Self(Arc::new(LeaseRegistry { time, counters, leases: Mutex::default() }))
     }
 
     /// Grants a session a lease, unless leases are switched off.
@@ -212,7 +212,7 @@ impl<R> Leases<R> {
         let name = random()?;
         // One at a time is answered.
         let (sender, resume_requests) = mpsc::channel(1);
-        self.lock().push(Lease { name, bearer, resume_requests: sender });
+        self.lock().push(LeaseEntry { name, bearer, resume_requests: sender });
         self.0.counters.0.held.fetch_add(1, Ordering::Relaxed);
         Ok(Some(LeaseGuard { leases: self.clone(), name, max_unanswered, resume_requests }))
     }
@@ -239,7 +239,7 @@ impl<R> Leases<R> {
         let found = leases
             .iter()
             .fold(None, |found, lease| if lease.name[..].ct_eq(name).into() { Some(lease) } else { found });
-        let Lease { bearer: own, resume_requests, .. } = found.ok_or(Error::Unknown)?;
+        let LeaseEntry { bearer: own, resume_requests, .. } = found.ok_or(Error::Unknown)?;
         // A name that has another token now has lost its sessions.
         if own.as_ref().map(|own| own.name()) != bearer.map(|bearer| bearer.name()) {
             return Err(Error::OtherToken);
@@ -247,7 +247,7 @@ impl<R> Leases<R> {
         Ok(resume_requests.clone())
     }
 
-    fn lock(&self) -> MutexGuard<'_, Vec<Lease<R>>> {
+    fn lock(&self) -> MutexGuard<'_, Vec<LeaseEntry<R>>> {
         self.0.leases.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -12,11 +12,11 @@ use std::sync::{
 /// A handle to the memory budget. Reservations made through it also count against the token's quota.
 #[derive(Clone)]
 pub struct Budget {
-    state: Arc<State>,
+    state: Arc<BudgetCounter>,
     bearer: Option<Bearer>,
 }
 
-struct State {
+struct BudgetCounter {
     used: AtomicUsize,
     limit: usize,
 }
@@ -24,7 +24,7 @@ struct State {
 impl Budget {
     /// A budget of `limit` bytes, without a token.
     pub fn new(limit: usize) -> Self {
-        Self { state: Arc::new(State { used: AtomicUsize::new(0), limit }), bearer: None }
+        Self { state: Arc::new(BudgetCounter { used: AtomicUsize::new(0), limit }), bearer: None }
     }
 
     /// A handle to the same budget, whose reservations also count against this token's quota.
@@ -64,7 +64,7 @@ impl Budget {
 
 /// A part of the memory budget.
 pub struct MemoryReservation {
-    state: Arc<State>,
+    state: Arc<BudgetCounter>,
     bytes: usize,
     /// The token's quota for these bytes.
     held: Option<QuotaGuard>,
@@ -85,7 +85,7 @@ impl MemoryReservation {
             return Ok(());
         }
         self.held.as_mut().map(|held| held.grow(bytes)).transpose()?;
-        let State { used, limit } = &*self.state;
+        let BudgetCounter { used, limit } = &*self.state;
         let fits = |used: usize| used.checked_add(bytes).filter(|sum| sum <= limit);
         match used.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits) {
             Ok(_) => {

@@ -38,12 +38,12 @@ pub struct WatchedBody {
 
 /// The progress of the client with the replies.
 struct ReadProgress {
-    state: Mutex<State>,
+    state: Mutex<ProgressState>,
     /// The task that checks the timeouts. It is aborted with the body, because it holds on to the connection.
     watch: OnceLock<AbortHandle>,
 }
 
-struct State {
+struct ProgressState {
     /// Number of unread replies that hold reservations.
     unread: usize,
     unread_since: Instant,
@@ -54,7 +54,7 @@ struct State {
     is_first: bool,
 }
 
-impl State {
+impl ProgressState {
     fn new() -> Self {
         Self { unread: 0, unread_since: Instant::now(), held_since: None, is_first: true }
     }
@@ -69,7 +69,7 @@ impl State {
 }
 
 impl ReadProgress {
-    fn state(&self) -> MutexGuard<'_, State> {
+    fn state(&self) -> MutexGuard<'_, ProgressState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -128,7 +128,7 @@ impl WatchedBody {
         connection: Option<Connection>,
         timeouts: Option<ReadTimeouts>,
     ) -> Self {
-        let progress = Arc::new(ReadProgress { state: Mutex::new(State::new()), watch: OnceLock::new() });
+        let progress = Arc::new(ReadProgress { state: Mutex::new(ProgressState::new()), watch: OnceLock::new() });
         if let (Some(connection), Some(timeouts)) = (connection, timeouts) {
             let watch = tokio::spawn(watch(Arc::downgrade(&progress), connection, timeouts));
             progress.watch.get_or_init(|| watch.abort_handle());

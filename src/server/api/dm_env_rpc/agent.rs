@@ -22,7 +22,7 @@ use crate::{
             admission::Sessions,
             handler::{Reply, SessionHandler},
         },
-        shutdown::Phase,
+        shutdown::ShutdownPhase,
         transport::precheck::Field,
     },
 };
@@ -48,7 +48,7 @@ impl Agent {
     }
 
     async fn create_world(&mut self, request: rpc::CreateWorldRequest) -> Result<rpc::CreateWorldResponse, Error> {
-        if self.sessions.phase() != Phase::Running {
+        if self.sessions.phase() != ShutdownPhase::Running {
             return Err(session::Error::Draining.into());
         }
         let (settings, version, own) = settings::create(self.worlds.catalogue(), &request.settings)?;

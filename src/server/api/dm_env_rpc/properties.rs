@@ -3,7 +3,7 @@
 
 use super::{
     Error,
-    settings::{self, Change},
+    settings::{self, WorldChange},
     tensors,
     world::JoinedWorld,
 };
@@ -155,7 +155,7 @@ fn write(joined: Option<&JoinedWorld>, property: &Property, request: &WritePrope
     let field = format!("property {:?}", property.key);
     let no_value = || Error::value(field.clone(), "written without a value", "a tensor");
     let value = request.value.as_ref().ok_or_else(no_value)?;
-    let mut change = Change::default();
+    let mut change = WorldChange::default();
     match property.key.as_str() {
         VERSION => change.version = Some(settings::parse_version(field.clone(), tensors::text(&field, value)?)?),
         SEED => change.seed = Some(tensors::integer(&field, value, 0, u64::MAX)?),

@@ -14,7 +14,7 @@ use std::sync::Arc;
 pub(super) struct Runner {
     batch: Batch,
     draws: DrawAuditor,
-    phase: Phase,
+    phase: EpisodePhase,
     /// The first observation of the episode that was begun last, f32 `[O]`.
     first: Bytes,
     start: Option<EpisodeStart>,
@@ -24,7 +24,7 @@ pub(super) struct Runner {
 
 /// The state of the episode.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Phase {
+enum EpisodePhase {
     /// The first episode of a new world has begun, and no agent has seen it.
     Unseen,
     /// The episode runs.
@@ -34,7 +34,7 @@ enum Phase {
 }
 
 /// The outcome of a step, as an agent may observe it.
-pub(super) struct Outcome {
+pub(super) struct WorldStep {
     /// The state of the agent's sequence.
     pub(super) state: State,
     /// f32 `[O]`, little-endian.
@@ -76,7 +76,7 @@ impl Runner {
         let (mut batch, first, started) = opened.inspect_err(|_| draws.open_failed(spec, begun))?;
         draws.record_drop(&mut batch);
         let seed = batch.settings().groups[0].episodes.seed;
-        Ok(Self { batch, draws, phase: Phase::Unseen, first, start: only(started), seed, version })
+        Ok(Self { batch, draws, phase: EpisodePhase::Unseen, first, start: only(started), seed, version })
     }
 
     /// The settings of the episodes when the world was made.
@@ -111,13 +111,13 @@ impl Runner {
 
     /// Whether an episode runs, so that the next step advances it.
     pub(super) fn is_running(&self) -> bool {
-        self.phase == Phase::Running
+        self.phase == EpisodePhase::Running
     }
 
     /// Interrupts a running episode: the next step begins another.
     pub(super) fn stop(&mut self) {
         if self.is_running() {
-            self.phase = Phase::Over;
+            self.phase = EpisodePhase::Over;
         }
     }
 
@@ -131,17 +131,17 @@ impl Runner {
     ///
     /// # Errors
     /// If the server has a defect.
-    pub(super) async fn begin(&mut self, changes: Changes) -> Result<Outcome, Error> {
+    pub(super) async fn begin(&mut self, changes: Changes) -> Result<WorldStep, Error> {
         let Changes { version, seed, distributions } = changes;
-        if self.phase != Phase::Unseen || seed.is_some() || distributions.is_some() {
+        if self.phase != EpisodePhase::Unseen || seed.is_some() || distributions.is_some() {
             let entries = vec![ResetEntry { slot: 0, seed, distributions, state: None }];
             self.draws.reset(&self.batch, &entries).await?;
-            (self.phase, self.version, self.seed) = (Phase::Over, version, seed.unwrap_or(self.seed));
+            (self.phase, self.version, self.seed) = (EpisodePhase::Over, version, seed.unwrap_or(self.seed));
             let (first, started) = self.batch.reset(entries).await?;
             (self.first, self.start) = (first, only(started));
         }
-        self.phase = Phase::Running;
-        Ok(Outcome {
+        self.phase = EpisodePhase::Running;
+        Ok(WorldStep {
             state: State::Running,
             observation: self.first.clone(),
             reward: 0.0,
@@ -155,16 +155,16 @@ impl Runner {
     ///
     /// # Errors
     /// If the server has a defect.
-    pub(super) async fn step(&mut self, actions: &[u8], interrupted: bool) -> Result<Outcome, Error> {
+    pub(super) async fn step(&mut self, actions: &[u8], interrupted: bool) -> Result<WorldStep, Error> {
         let StepResult { observations, rewards, terminated, truncated, ended, .. } = self.batch.step(actions).await?;
         let is_set = |flags: &Bytes| flags.first().is_some_and(|flag| *flag == 1);
         let truncated = is_set(&truncated);
         let state = state(is_set(&terminated), truncated || interrupted);
         if state != State::Running {
-            self.phase = Phase::Over;
+            self.phase = EpisodePhase::Over;
         }
         let end = ended.first().map(|(_, end)| end);
-        Ok(Outcome {
+        Ok(WorldStep {
             state,
             observation: observations,
             reward: rewards.first_chunk().map_or(0.0, |word| f32::from_le_bytes(*word)),

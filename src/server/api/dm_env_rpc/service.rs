@@ -19,13 +19,13 @@ pub const ENDPOINT: &str = "/dm_env_rpc.v1.Environment/Process";
 
 /// Serves worlds, which all streams share.
 #[derive(Clone)]
-pub struct Service {
+pub struct DmEnvRpcService {
     worlds: Arc<Worlds>,
     sessions: Sessions,
     counts: Arc<RequestCounters>,
 }
 
-impl Service {
+impl DmEnvRpcService {
     /// A service over a pool, without worlds, whose draws the ledger has.
     pub fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>, sessions: Sessions, ledger: Option<Ledger>) -> Self {
         Self {
@@ -42,7 +42,7 @@ impl Service {
 }
 
 #[tonic::async_trait]
-impl Environment for Service {
+impl Environment for DmEnvRpcService {
     type ProcessStream = Responses<EnvironmentResponse>;
 
     async fn process(

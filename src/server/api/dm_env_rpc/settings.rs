@@ -19,7 +19,7 @@ const SHARED: &str = "shared";
 /// The maximum length of a name that a client asks for.
 const MAX_NAME_BYTES: usize = 64;
 
-type Settings = BTreeMap<String, Tensor>;
+type WorldSettings = BTreeMap<String, Tensor>;
 
 /// The name of a world, and who may reset and destroy it.
 pub(super) struct Ownership {
@@ -31,7 +31,7 @@ pub(super) struct Ownership {
 
 /// Changes by a reset or a written property, from the next episode on.
 #[derive(Default)]
-pub(super) struct Change {
+pub(super) struct WorldChange {
     /// All parameters get this version's distributions, then those named below theirs.
     pub(super) version: Option<Version>,
     /// Restarts the counts of episodes and trials.
@@ -45,7 +45,10 @@ pub(super) struct Change {
 ///
 /// # Errors
 /// For settings that are missing, unknown, of a wrong type or out of range.
-pub(super) fn create(catalogue: &Catalogue, settings: &Settings) -> Result<(BatchSettings, Version, Ownership), Error> {
+pub(super) fn create(
+    catalogue: &Catalogue,
+    settings: &WorldSettings,
+) -> Result<(BatchSettings, Version, Ownership), Error> {
     let id = settings.get(ENV_ID).ok_or_else(|| {
         let expected = format!("a STRING scalar, one of {}", catalogue.names().collect::<Vec<_>>().join(", "));
         Error::value(field(ENV_ID), "missing", expected)
@@ -82,7 +85,7 @@ pub(super) fn create(catalogue: &Catalogue, settings: &Settings) -> Result<(Batc
     Ok((batch, version, ownership(settings)?))
 }
 
-fn ownership(settings: &Settings) -> Result<Ownership, Error> {
+fn ownership(settings: &WorldSettings) -> Result<Ownership, Error> {
     let name = settings.get(WORLD_NAME).map(|tensor| tensors::text(&field(WORLD_NAME), tensor)).transpose()?;
     let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
     if let Some(name) =
@@ -102,10 +105,10 @@ fn ownership(settings: &Settings) -> Result<Ownership, Error> {
 pub(super) fn change(
     spec: &'static EnvironmentSpec,
     request: &'static str,
-    settings: &Settings,
-) -> Result<Change, Error> {
+    settings: &WorldSettings,
+) -> Result<WorldChange, Error> {
     check_names(spec, request, &[VERSION, SEED], settings)?;
-    Ok(Change {
+    Ok(WorldChange {
         version: version(settings)?,
         seed: settings.get(SEED).map(|tensor| tensors::integer(&field(SEED), tensor, 0, u64::MAX)).transpose()?,
         parameters: parameters(spec, settings)?,
@@ -116,7 +119,7 @@ pub(super) fn change(
 ///
 /// # Errors
 /// If there are.
-pub(super) fn check_none(request: &'static str, settings: &Settings) -> Result<(), Error> {
+pub(super) fn check_none(request: &'static str, settings: &WorldSettings) -> Result<(), Error> {
     match settings.keys().next() {
         Some(name) => Err(unknown(name, format!("{request} takes no settings; give them to create_world or reset"))),
         None => Ok(()),
@@ -132,13 +135,13 @@ pub(super) fn parse_version(field: String, letter: &str) -> Result<Version, Erro
     found.ok_or_else(|| Error::value(field, format!("{:?}", shorten(letter)), "\"D\", \"R\" or \"E\""))
 }
 
-fn version(settings: &Settings) -> Result<Option<Version>, Error> {
+fn version(settings: &WorldSettings) -> Result<Option<Version>, Error> {
     let read = |tensor| parse_version(field(VERSION), tensors::text(&field(VERSION), tensor)?);
     settings.get(VERSION).map(read).transpose()
 }
 
 /// Returns the settings that are the environment's parameters.
-fn parameters(spec: &EnvironmentSpec, settings: &Settings) -> Result<Vec<(&'static str, Distribution)>, Error> {
+fn parameters(spec: &EnvironmentSpec, settings: &WorldSettings) -> Result<Vec<(&'static str, Distribution)>, Error> {
     let given = spec.parameters.iter().filter_map(|p| Some((p.name, settings.get(p.name)?)));
     given.map(|(name, tensor)| Ok((name, Distribution::fixed(tensors::number(&field(name), tensor)?)))).collect()
 }
@@ -147,7 +150,7 @@ fn check_names(
     spec: &'static EnvironmentSpec,
     request: &'static str,
     own: &[&str],
-    settings: &Settings,
+    settings: &WorldSettings,
 ) -> Result<(), Error> {
     let is_known = |name: &&String| own.contains(&name.as_str()) || spec.parameters.iter().any(|p| p.name == *name);
     match settings.keys().find(|name| !is_known(name)) {

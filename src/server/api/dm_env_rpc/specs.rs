@@ -1,6 +1,6 @@
 //! Actions and observations: uids, names, types and bounds.
 
-use super::{Error, runner::Outcome, tensors};
+use super::{Error, runner::WorldStep, tensors};
 use crate::{
     env::{ActionSpace, Channel, EnvironmentSpec},
     proto::dm_env_rpc::v1::{
@@ -95,7 +95,7 @@ pub(super) fn actions(spec: &EnvironmentSpec, actions: &BTreeMap<u64, Tensor>) -
 }
 
 /// The response to a step, with the observations that were requested.
-pub(super) fn response(outcome: &Outcome, requested: &[u64]) -> StepResponse {
+pub(super) fn response(outcome: &WorldStep, requested: &[u64]) -> StepResponse {
     let bool = |x| tensors::tensor(Payload::Bools(BoolArray { array: vec![x] }), &[]);
     let floats = |array, shape: &[usize]| tensors::tensor(Payload::Floats(FloatArray { array }), shape);
     let observation = |uid| match uid {

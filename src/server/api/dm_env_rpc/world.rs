@@ -3,7 +3,7 @@
 use super::{
     Error,
     runner::{Changes, Runner},
-    settings::Change,
+    settings::WorldChange,
 };
 use crate::{
     env::{Distribution, EnvironmentSpec, Version, resolve},
@@ -64,7 +64,7 @@ impl World {
     ///
     /// # Errors
     /// If a parameter is out of its bounds, or the token may not draw from there; nothing is noted then.
-    pub(super) fn change(&self, change: Change) -> Result<(), Error> {
+    pub(super) fn change(&self, change: WorldChange) -> Result<(), Error> {
         let mut wanted = self.lock();
         let version = change.version.unwrap_or(wanted.version);
         if change.version.is_some() || !change.parameters.is_empty() {

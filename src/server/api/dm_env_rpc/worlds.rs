@@ -54,11 +54,11 @@ pub(super) struct Worlds {
 
 #[derive(Default)]
 struct Registry {
-    worlds: BTreeMap<Key, Entry>,
+    worlds: BTreeMap<Key, WorldEntry>,
     streams: StreamId,
 }
 
-struct Entry {
+struct WorldEntry {
     world: Arc<World>,
     /// The stream that made it, until it ends.
     maker: Option<StreamId>,
@@ -131,7 +131,7 @@ impl Worlds {
             return Err(Error::Taken { world: name });
         }
         let world = Arc::new(World::new(name.clone(), &runner));
-        let entry = Entry {
+        let entry = WorldEntry {
             world,
             maker: Some(maker.stream),
             agent: None,
@@ -207,14 +207,14 @@ impl Worlds {
 
 impl Registry {
     /// The world of that name, if the stream has made it, is its agent's, or may do as if.
-    fn find_owned(&mut self, caller: &Caller, name: &str, request: &'static str) -> Result<&Entry, Error> {
+    fn find_owned(&mut self, caller: &Caller, name: &str, request: &'static str) -> Result<&WorldEntry, Error> {
         let entry = self.find(caller, name)?;
         let is_its = entry.shared || [entry.maker, entry.agent].contains(&Some(caller.stream));
         if is_its { Ok(entry) } else { Err(Error::NotYours { world: name.into(), request }) }
     }
 
     /// The world of that name, if there is one for streams with this token.
-    fn find(&mut self, caller: &Caller, name: &str) -> Result<&mut Entry, Error> {
+    fn find(&mut self, caller: &Caller, name: &str) -> Result<&mut WorldEntry, Error> {
         self.worlds.get_mut(&caller.key(name)).ok_or_else(|| unknown(name))
     }
 

@@ -16,13 +16,13 @@ pub const ENDPOINT: &str = "/perturb.v1.Perturb/Session";
 
 /// Serves the catalogue and sessions.
 #[derive(Clone)]
-pub struct Service {
+pub struct PerturbService {
     shared: Arc<ServerContext>,
     sessions: Sessions,
     counts: Arc<RequestCounters>,
 }
 
-impl Service {
+impl PerturbService {
     /// A service of sessions that share this.
     pub fn new(shared: ServerContext, sessions: Sessions) -> Self {
         Self { shared: Arc::new(shared), sessions, counts: RequestCounters::new::<Session>() }
@@ -35,7 +35,7 @@ impl Service {
 }
 
 #[tonic::async_trait]
-impl Perturb for Service {
+impl Perturb for PerturbService {
     type SessionStream = Responses<proto::SessionResponse>;
 
     async fn list_environments(
