@@ -303,7 +303,7 @@ impl Batch {
         Ok(self.observations(&slots))
     }
 
-    /// The distributions in force in a slot: [`Settings::distributions`].
+    /// The distributions in force in a slot, one for each parameter.
     pub fn distributions(&self, slot: usize) -> Vec<Distribution> {
         lock(&self.job.shards[slot / self.shard_size]).distributions(slot).to_vec()
     }

@@ -25,10 +25,12 @@ use std::path::PathBuf;
 
 /// The environments that are built in.
 pub fn catalogue() -> Catalogue {
-    let mut specs = vec![&cart_pole::SPEC, &mountain_car::SPEC, &acrobot::SPEC, &pendulum::SPEC];
+    let analytic = [&cart_pole::SPEC, &mountain_car::SPEC, &acrobot::SPEC, &pendulum::SPEC];
     #[cfg(feature = "mujoco")]
-    specs.extend([&half_cheetah::SPEC, &hopper::SPEC]);
-    Catalogue::new(specs)
+    let robots = [&half_cheetah::SPEC, &hopper::SPEC];
+    #[cfg(not(feature = "mujoco"))]
+    let robots = [];
+    Catalogue::new(analytic.into_iter().chain(robots).collect())
 }
 
 /// The environments that are built in, and those of folders, in order.
