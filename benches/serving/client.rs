@@ -36,6 +36,7 @@ impl Client {
     }
 
     /// Opens an environment that need not be built in.
+    #[cfg(feature = "mujoco")]
     pub(crate) async fn open_spec(
         socket: &Path,
         spec: &'static EnvironmentSpec,
