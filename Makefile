@@ -27,6 +27,8 @@ VENV := $(TARGET)/python
 DM_ENV_RPC := $(TARGET)/dm_env_rpc
 # The Python package whose models of MuJoCo `make test` compares tasks with.
 GYMNASIUM := $(TARGET)/gymnasium
+# The Python environment with buf, which checks the contract.
+BUF := $(TARGET)/buf
 # The site and what builds it.
 DOCS := $(TARGET)/docs
 # What perturb's training is compared with. PUREJAXRL is an address that git can clone, or where GitHub is out of reach the
@@ -85,7 +87,7 @@ endef
 
 .DEFAULT_GOAL := help
 .PHONY: help deps all-deps opengl toolchain build generate recurrent build-all install install-recurrent demo all-pairs report-check serve-test test slurm-test kill-test \
-	load-test bounds-test attack-test faults-test asan-test qemu-test simulation-test slurm-acceptance lint bench fuzz fuzz-keep \
+	load-test bounds-test attack-test faults-test asan-test qemu-test simulation-test slurm-acceptance lint proto-lint proto-baseline bench fuzz fuzz-keep \
 	bench-peers audit cargo-deny metrics-test otel-test python-test interrupts-test wheel wheel-test python-acceptance \
 	bench-python python-venv docs docs-test docker docker-base docker-test
 
@@ -196,7 +198,7 @@ generate: all-deps ## write the generated files anew, after an edit of a .proto 
 slurm-acceptance: ## the same with experiments/quick.toml
 	PERTURB_SLURM_PLAN=$(CURDIR)/experiments/quick.toml $(MAKE) slurm-test
 
-lint: all-deps cargo-deny ## check formatting, names, import cycles, clippy, documentation and dependencies
+lint: all-deps cargo-deny proto-lint ## check formatting, the contract, names, import cycles, clippy, documentation and dependencies
 	cargo fmt --all --check
 	cargo run --quiet --release --locked --package perturb-lint
 	cargo clippy $(ALL) --all-targets -- -D warnings
@@ -207,6 +209,14 @@ lint: all-deps cargo-deny ## check formatting, names, import cycles, clippy, doc
 	@twice=$$(cargo tree --locked --package perturb --package perturb-cli --edges normal,build --prefix none | \
 		awk 'NF { print $$1, $$2 }' | sort -u | cut -d ' ' -f 1 | uniq -d | grep -vxE '$(TWICE)'); \
 		[ -z "$$twice" ] || { echo "perturb-server and perturb compile two versions of:" $$twice >&2; exit 1; }
+
+# The baseline holds what clients may rely on. An addition is added to it in the same change.
+proto-lint: $(BUF)/installed ## check the contract's style, and that it still says what proto/baseline.binpb says
+	cd proto && $(abspath $(BUF))/bin/buf lint
+	cd proto && $(abspath $(BUF))/bin/buf breaking --path perturb --against baseline.binpb
+
+proto-baseline: proto-lint ## add what is new in the contract to proto/baseline.binpb
+	cd proto && $(abspath $(BUF))/bin/buf build --path perturb --exclude-source-info --output baseline.binpb
 
 bench: export PERTURB_TEST_GYMNASIUM_ASSETS := $(abspath $(GYMNASIUM))/gymnasium/envs/mujoco/assets
 bench: build-all opengl $(GYMNASIUM)/installed ## measure throughput, latency and memory
@@ -305,6 +315,11 @@ $(DM_ENV_RPC)/installed: tests/server/dm_env_rpc/requirements.txt | python-venv
 $(GYMNASIUM)/installed: tests/server/folder/requirements.txt | python-venv
 	python3 -m venv $(GYMNASIUM)/venv
 	$(GYMNASIUM)/venv/bin/pip install -q --disable-pip-version-check --no-deps --upgrade --target $(GYMNASIUM) -r $<
+	touch $@
+
+$(BUF)/installed: proto/requirements.txt | python-venv
+	python3 -m venv $(BUF)
+	$(BUF)/bin/pip install -q --disable-pip-version-check -r $<
 	touch $@
 
 $(PEERS)/installed: benches/peers/requirements.txt | python-venv

@@ -137,11 +137,13 @@ pub struct Parameter {
 /// The actions of an environment.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ActionSpace {
+    /// The kind of actions.
     #[prost(oneof = "action_space::Kind", tags = "1, 2")]
     pub kind: ::core::option::Option<action_space::Kind>,
 }
 /// Nested message and enum types in `ActionSpace`.
 pub mod action_space {
+    /// The kind of actions.
     #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Kind {
         /// A choice out of n, sent as int32.
@@ -232,11 +234,13 @@ pub struct Interval {
 /// A request of a session. The first must be `open` or `resume`; after that any of the others, in any order.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SessionRequest {
+    /// The request.
     #[prost(oneof = "session_request::Request", tags = "1, 2, 3, 4, 5, 6, 7, 8, 9, 10")]
     pub request: ::core::option::Option<session_request::Request>,
 }
 /// Nested message and enum types in `SessionRequest`.
 pub mod session_request {
+    /// The request.
     #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Request {
         /// Creates the environments.
@@ -274,6 +278,7 @@ pub mod session_request {
 /// The response to one request: the variant of the same name, or `error`.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SessionResponse {
+    /// The response.
     #[prost(
         oneof = "session_response::Response",
         tags = "1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 15"
@@ -282,6 +287,7 @@ pub struct SessionResponse {
 }
 /// Nested message and enum types in `SessionResponse`.
 pub mod session_response {
+    /// The response.
     #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Response {
         /// The response to `open`.
