@@ -119,7 +119,7 @@ build-all: all-deps
 
 install: build ## copy the programs, manual pages and completions to PREFIX, by default ~/.local
 	install -D --target-directory $(PREFIX)/bin $(addprefix $(PROGRAMS)/,perturb perturb-server)
-	strip --strip-debug $(PREFIX)/bin/perturb $(PREFIX)/bin/perturb-server
+	strip $(PREFIX)/bin/perturb $(PREFIX)/bin/perturb-server
 	mkdir -p $(PREFIX)/share/man/man1 $(PREFIX)/share/bash-completion/completions $(PREFIX)/share/zsh/site-functions \
 		$(PREFIX)/share/fish/vendor_completions.d
 	$(PROGRAMS)/perturb --quiet man $(PREFIX)/share/man/man1
@@ -135,7 +135,7 @@ install: build ## copy the programs, manual pages and completions to PREFIX, by 
 
 install-recurrent: recurrent install ## install perturb-recurrent too, which trains recurrent policies with libtorch
 	install -D --target-directory $(PREFIX)/bin $(PROGRAMS)/perturb-recurrent
-	strip --strip-debug $(PREFIX)/bin/perturb-recurrent
+	strip $(PREFIX)/bin/perturb-recurrent
 
 demo: build opengl ## train Hopper on default and on random physics, and see what still works; a minute or two
 	$(PROGRAMS)/perturb demo $(DEMO_ARGS)
