@@ -285,7 +285,7 @@ fn test_cost(cell: &Cell) -> f64 {
 /// Returns the duration of each cell relative to the others: the measured seconds of its kind, or an estimate by the
 /// number of its episodes.
 fn weights(status: &ExperimentStatus) -> Vec<f64> {
-    let taken = status.taken();
+    let taken = status.durations();
     let cells = &status.plan.cells;
     let episodes = |cell: &Cell| generated_episodes(&cell.config, cell.config.common.episodes) + test_cost(cell);
     // Seconds per episode of the kinds that were measured.

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 
-use perturb_experiment::generated_episodes;
-use perturb_experiment::scheduler::{Pace, Status};
+use perturb_experiment::{TrainingProgress, generated_episodes};
+use perturb_experiment::scheduler::RunStatus;
 use perturb_learner::logging::{EpisodeFigures, Progress};
 use perturb_settings::TrainConfig;
 use perturb_text::{duration, grouped};
@@ -90,7 +90,7 @@ pub(super) struct Display {
     unit: &'static str,
     total: u64,
     /// For a training: its speed, and the number of episodes that it generates.
-    pace: Option<(Pace, f64)>,
+    pace: Option<(TrainingProgress, f64)>,
     start: Instant,
     last_line: Option<Instant>,
 }
@@ -106,8 +106,8 @@ impl Display {
     /// Makes the display of a training that begins after this number of episodes and steps.
     pub(super) fn for_training(what: String, config: &TrainConfig, episodes: u64, timesteps: u64) -> Self {
         let budget = config.common.episodes;
-        let mut pace = Pace::default();
-        pace.hear(generated_episodes(config, episodes), timesteps);
+        let mut pace = TrainingProgress::default();
+        pace.update(generated_episodes(config, episodes), timesteps);
         let mut display = Self::for_episodes(what, budget);
         display.pace = Some((pace, generated_episodes(config, budget)));
         display
@@ -134,9 +134,9 @@ impl Display {
     pub(super) fn training(&mut self, progress: &Progress) {
         let mut figures = Vec::new();
         if let Some((pace, total)) = &mut self.pace {
-            pace.hear(progress.generated_episodes as f64, progress.timesteps);
-            let ratio = pace.left(*total);
-            let bound = if pace.is_least(*total) { "at least " } else { "" };
+            pace.update(progress.generated_episodes as f64, progress.timesteps);
+            let ratio = pace.remaining_ratio(*total);
+            let bound = if pace.is_lower_bound(*total) { "at least " } else { "" };
             figures.extend(self.remaining_time(ratio).map(|time| format!("{bound}{time}")));
         }
         if let Some(EpisodeFigures { episode_return, success, .. }) = progress.recent {
@@ -155,8 +155,8 @@ impl Display {
 
     /// Shows the progress of a run. A terminal also shows the groups of cells in work, and the success of finished
     /// cells.
-    pub(super) fn cells(&mut self, status: &Status) {
-        let Status { done, failed, running, doing, remaining, rates, .. } = status;
+    pub(super) fn cells(&mut self, status: &RunStatus) {
+        let RunStatus { done, failed, running, doing, remaining, rates, .. } = status;
         let mut figures = vec![doing.clone()];
         if *failed > 0 {
             figures.push(format!("{failed} failed"));

@@ -5,7 +5,7 @@ use std::io::Write;
 use std::time::Duration;
 
 use perturb_experiment::{
-    Cell, Estimate, Folder, Grouping, Measurement, Plan, Selection, Taken, estimates, representatives,
+    Cell, Estimate, Folder, Grouping, Measurement, Plan, Selection, CellDurations, estimates, benchmark_cells,
 };
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::client::Servers;
@@ -29,7 +29,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     }
     args.json.check()?;
     let folder = args.unfinished_in.as_deref().map(Folder::new);
-    let known = folder.as_ref().map_or_else(|| Ok(plan.clone()), |folder| plan.in_folder(folder))?;
+    let known = folder.as_ref().map_or_else(|| Ok(plan.clone()), |folder| plan.with_selected_cells(folder))?;
     let listed: Vec<&Cell> = match &folder {
         Some(folder) => known.cells.iter().filter(|cell| !folder.cell(&cell.id).is_settled(true)).collect(),
         None if args.cells => known.cells.iter().collect(),
@@ -47,8 +47,8 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     }
     let timings_from = args.timings_from.as_deref().map(Folder::new);
     timings_from.iter().try_for_each(|folder| folder.require_plan().map(drop))?;
-    let known = plan.in_full(timings_from.as_ref())?;
-    let grouping = Grouping { most: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
+    let known = plan.with_expected_cells(timings_from.as_ref())?;
+    let grouping = Grouping { max_cells: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
     let all: Vec<usize> = (0..known.cells.len()).collect();
     let groups = known.groups(&all, grouping);
     let groups_shown = groups_line(&groups, grouping);
@@ -77,7 +77,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
         writeln!(out, "{trained}, {} with {}", counted(cells * pairs, "train/test pair"), count(runs, "run"))?;
     }
     writeln!(out, "{groups_shown}")?;
-    let measured = timings_from.map(|folder| (folder.clone(), Taken::read(&known, &folder)));
+    let measured = timings_from.map(|folder| (folder.clone(), CellDurations::read(&known, &folder)));
     estimate(args, &known, grouping, measured.as_ref(), (&servers, &limits), &stop)
 }
 
@@ -97,7 +97,7 @@ fn estimate(
     args: &PlanArgs,
     plan: &Plan,
     grouping: Grouping,
-    finished: Option<&(Folder, Taken<'_>)>,
+    finished: Option<&(Folder, CellDurations<'_>)>,
     (servers, limits): (&Servers, &HashMap<&str, u32>),
     stop: &StopFlag,
 ) -> Result<()> {
@@ -152,7 +152,7 @@ fn measurements(
     stop: &StopFlag,
     out: &mut impl Write,
 ) -> Result<Vec<Measurement>> {
-    let groups = representatives(plan, cells, grouping);
+    let groups = benchmark_cells(plan, cells, grouping);
     let jobs = grouping.at_a_time;
     writeln!(
         out,
@@ -179,7 +179,7 @@ pub(super) fn step_limits<'a>(servers: &Servers, plan: &'a Plan) -> Result<HashM
 
 fn speeds(measurements: &[Measurement]) -> Table {
     let per_second = |seconds: f64| grouped((1.0 / seconds.max(1e-9)).round() as usize);
-    Table::of("", measurements)
+    Table::builder("", measurements)
         .text("environment", |measured| &measured.environment)
         .text("method", |measured| &measured.method)
         .number("cells", |measured| measured.cells)

@@ -8,9 +8,9 @@ use std::process::{Command, ExitCode};
 use std::sync::Mutex;
 use std::time::Duration;
 
-use perturb_experiment::runs::Kind;
-use perturb_experiment::scheduler::{CellEvent, Local, News, Order, OrderedCell, Teller};
-use perturb_experiment::{Cell, Folder, Grouping, Plan, Taken, estimates, representatives};
+use perturb_experiment::runs::RunKind;
+use perturb_experiment::scheduler::{CellEvent, Local, BackendEvent, WorkerJob, JobCell, EventWriter};
+use perturb_experiment::{Cell, Folder, Grouping, Plan, CellDurations, estimates, benchmark_cells};
 use perturb_files::interrupt::StopFlag;
 use perturb_files::require_writable;
 use perturb_learner::cell::{CellJob, run_cells};
@@ -36,7 +36,7 @@ pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
     }
     let plan = load_plan(&args.plan)?;
     refuse_file(&args.out)?;
-    if Kind::of(&args.out) == Some(Kind::Training) {
+    if RunKind::of(&args.out) == Some(RunKind::Training) {
         let message = format!("--out {} holds a training (config.toml): choose another directory", args.out.display());
         return Err(CommandError::Usage(message));
     }
@@ -75,13 +75,13 @@ fn find_cell<'a>(args: &RunArgs, plan: &'a Plan, name: &str) -> Result<&'a Cell>
 fn run_worker(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
     let mut text = String::new();
     std::io::stdin().lock().read_line(&mut text).map_err(system("read the order"))?;
-    let order: Order = serde_json::from_str(&text)
+    let order: WorkerJob = serde_json::from_str(&text)
         .map_err(|error| CommandError::Usage(format!("the order on standard input is not valid: {error}")))?;
     stop_at_end_of_input(stop)?;
-    let mut teller = Teller::new(order.cells.len(), std::io::stdout());
+    let mut writer = EventWriter::new(order.cells.len(), std::io::stdout());
     let plan = Plan::load(&args.plan);
     let mut orders = Vec::new();
-    for OrderedCell { cell: id, retry } in &order.cells {
+    for JobCell { cell: id, retry } in &order.cells {
         let cell = match &plan {
             Ok(plan) => find_cell(args, plan, id).map_err(|error| error.to_string()),
             Err(error) => Err(error.to_string()),
@@ -89,12 +89,12 @@ fn run_worker(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<ExitCo
         match cell {
             Ok(cell) => orders.push(CellJob { cell, folder: folder.cell(&cell.id), retry: *retry }),
             Err(reason) => {
-                teller.tell(id, CellEvent::Refused { reason });
+                writer.write(id, CellEvent::Refused { reason });
                 return Ok(ExitCode::SUCCESS);
             }
         }
     }
-    let mut tell = |cell: &Cell, event| teller.tell(&cell.id, event);
+    let mut tell = |cell: &Cell, event| writer.write(&cell.id, event);
     match Servers::connect_to_one(&args.server.server, order.turn) {
         Ok(servers) => {
             for order in &orders {
@@ -129,8 +129,8 @@ fn stop_at_end_of_input(stop: &StopFlag) -> Result<()> {
 fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
     // Workers are started from this program.
     recurrent::prepare_for(&plan)?;
-    let grouping = Grouping { most: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
-    let unfinished = unfinished_cells(args, &plan.in_full(Some(folder))?, folder).len();
+    let grouping = Grouping { max_cells: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
+    let unfinished = unfinished_cells(args, &plan.with_expected_cells(Some(folder))?, folder).len();
     let (local, addresses) = servers_of_jobs(&args.server, grouping.at_a_time.min(unfinished))?;
     let local: Vec<Mutex<PrivateServer>> = local.into_iter().map(Mutex::new).collect();
     let (servers, errors) = Servers::connect_to_some(&addresses)?;
@@ -145,18 +145,18 @@ fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Re
         let mut server = server.lock().ok()?;
         let ended = format!("the private server ended with {}", server.exit_status()?);
         if args.wait.time().is_zero() {
-            return Some(News::NoServer(ended));
+            return Some(BackendEvent::NoServer(ended));
         }
         Some(match server.restart() {
-            Ok(()) => News::Note(format!("{ended}; it was restarted")),
-            Err(error) => News::NoServer(format!("{ended}; {error}")),
+            Ok(()) => BackendEvent::Note(format!("{ended}; it was restarted")),
+            Err(error) => BackendEvent::NoServer(format!("{ended}; {error}")),
         })
     };
     let server = || local.iter().find_map(restart);
     let mut runner = PlanRunner::begin(args, plan, folder, stop)?;
     while let Some(plan) = runner.next_round()? {
         let bounds = if is_quiet() { Vec::new() } else { upper_bounds(args, &servers, &plan, folder, grouping, stop)? };
-        runner.run(&plan, &mut Local::new(&plan, folder, grouping, &command, &server).with_most(bounds))?;
+        runner.run(&plan, &mut Local::new(&plan, folder, grouping, &command, &server).with_max_seconds(bounds))?;
     }
     runner.finish()
 }
@@ -183,13 +183,13 @@ fn upper_bounds(
     let groups = plan.groups(&unfinished, grouping);
     let at_a_time = grouping.at_a_time.min(groups.len());
     let first: HashSet<_> = groups.iter().take(at_a_time).flatten().map(|&cell| kind(cell)).collect();
-    let timings = Taken::read(plan, folder);
+    let timings = CellDurations::read(plan, folder);
     let is_unknown = |&cell: &usize| !first.contains(&kind(cell)) && timings.seconds(&plan.cells[cell]).is_none();
     let unknown: Vec<usize> = unfinished.into_iter().filter(is_unknown).collect();
     if unknown.is_empty() {
         return Ok(Vec::new());
     }
-    let groups = representatives(plan, &unknown, grouping);
+    let groups = benchmark_cells(plan, &unknown, grouping);
     note(format_args!("measuring the duration of cells that begin later: {}", count(groups.len(), "group")));
     let measure = |group: Vec<&Cell>| measure(servers, &group, at_a_time, MEASURE_TIME, stop);
     let measured = match groups.into_iter().map(measure).collect::<Result<Vec<_>, _>>() {

@@ -3,16 +3,14 @@
 //! A step costs what its environment costs plus what its method costs. So each environment is measured with one
 //! method, and each method in one environment, in groups as large as those of a run; the other pairs follow. How many
 //! steps there are depends on what is learned, so that only the most can be said beforehand; what cells of the same
-//! environment and method took, which are done, says it better: [`Taken`].
+//! environment and method took, which are done, says it better: [`CellDurations`](crate::CellDurations).
 
 use std::collections::HashMap;
 use std::iter::Sum;
 
 use perturb_settings::{Method, TrainConfig, Wrapper};
 
-use crate::folder::Folder;
 use crate::plan::{Cell, Grouping, Plan, distinct};
-use crate::times::Times;
 
 /// Seconds of a process that a step of one environment takes, with all that belongs to it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -89,36 +87,6 @@ pub fn representatives<'a>(plan: &'a Plan, cells: &[usize], grouping: Grouping) 
         group
     };
     chosen.iter().map(group_of).collect()
-}
-
-/// What cells took that are done.
-#[derive(Debug)]
-pub struct Taken<'a> {
-    times: Times<'a>,
-}
-
-impl<'a> Taken<'a> {
-    /// The cells of `plan` that are done in `folder`.
-    pub fn read(plan: &'a Plan, folder: &Folder) -> Self {
-        let mut times = Times::default();
-        for cell in &plan.cells {
-            let place = folder.cell(&cell.id);
-            if let Some(timing) = place.timing().filter(|_| place.is_settled(false)) {
-                times.add(cell, timing.seconds);
-            }
-        }
-        Self { times }
-    }
-
-    /// The mean of those of the same environment and method as `cell`, s of a process; `None` if there are none.
-    pub fn seconds(&self, cell: &Cell) -> Option<f64> {
-        self.times.of_pair(cell)
-    }
-
-    /// How many there are.
-    pub fn cells(&self) -> usize {
-        self.times.cells()
-    }
 }
 
 fn pair(cell: &Cell) -> (&str, Method) {
@@ -220,23 +188,6 @@ mod tests {
         assert_eq!(chosen(&all, 6)[0].1, [10, 15, 15, 5, 5, 10], "all over the grid");
         assert_eq!(chosen(&all, 6)[2].1.len(), 3, "there are no more");
         assert_eq!(chosen(&[18, 19], 36), [("CartPole ppo ff".to_owned(), vec![32, 32])], "those that are asked for");
-    }
-
-    #[test]
-    fn what_cells_took_says_what_others_of_the_same_kind_take() {
-        let plan = plan();
-        let directory = tempfile::tempdir().unwrap();
-        let folder = Folder::new(directory.path());
-        for (cell, seconds, done) in [(0, 10.0, true), (1, 20.0, true), (2, 900.0, false)] {
-            let place = folder.cell(&plan.cells[cell].id);
-            place.write_timing(&crate::folder::Timing { seconds }).unwrap();
-            if done {
-                std::fs::write(place.path().join("result.json"), "x").unwrap();
-            }
-        }
-        let taken = Taken::read(&plan, &folder);
-        assert_eq!(taken.cells(), 2, "a cell without a result took more");
-        assert_eq!((taken.seconds(&plan.cells[5]), taken.seconds(&plan.cells[18])), (Some(15.0), None));
     }
 
     #[test]

@@ -11,6 +11,7 @@ extern crate self as perturb_experiment; // by this name fixtures call it in eve
 
 mod cost;
 mod curves;
+mod eta;
 mod external;
 #[cfg(test)]
 mod fixture;
@@ -22,12 +23,12 @@ mod reselection;
 pub mod runs;
 pub mod scheduler;
 mod selection;
-mod times;
 mod tuning;
 mod verify;
 
-pub use cost::{Estimate, Measurement, Speed, Taken, estimates, generated_episodes, representatives, tested_episodes};
+pub use cost::{Estimate, Measurement, Speed, estimates, generated_episodes, representatives, tested_episodes};
 pub use curves::{Curve, EnvironmentCurves, Footing, Point, read_curves};
+pub use eta::{CellDurations, RemainingTime, TrainingProgress};
 pub use external::{add_assessed, elsewhere, judged_as_in};
 pub use folder::{
     CellFolder, CellResult, CellState, Failure, FailureMark, Folder, FolderError, MarkResult, Timing, Training,

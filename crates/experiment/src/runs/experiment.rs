@@ -8,7 +8,7 @@ use perturb_records::statistics::mean;
 use perturb_text::{grouped, shortened};
 
 use super::{LONGEST_TEXT, RunSummary};
-use crate::cost::Taken;
+use crate::eta::CellDurations;
 use crate::folder::{CellResult, CellState, Folder, FolderError};
 use crate::plan::{Cell, Plan};
 use crate::scheduler::{Rate, Rates};
@@ -147,9 +147,9 @@ impl ExperimentStatus {
         rates.list()
     }
 
-    /// What cells took that are done.
-    pub fn taken(&self) -> Taken<'_> {
-        Taken::read(&self.plan, &self.folder)
+    /// Returns the durations of finished cells.
+    pub fn durations(&self) -> CellDurations<'_> {
+        CellDurations::read(&self.plan, &self.folder)
     }
 
     /// "in work", "finished", "with failures" or "broken off".

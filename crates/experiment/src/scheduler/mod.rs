@@ -6,9 +6,7 @@
 
 mod event;
 mod local;
-mod pace;
 mod rates;
-mod remaining;
 mod running;
 pub mod slurm;
 
@@ -20,16 +18,13 @@ use perturb_files::interrupt::StopFlag;
 use perturb_text::{count, duration};
 
 use crate::cost::generated_episodes;
+use crate::eta::{CellDurations, RemainingTime, TrainingProgress, UnfinishedCell, remaining_time};
 use crate::folder::{CellState, Failure, FailureMark, Folder};
 use crate::plan::{Cell, Grouping, Plan, SELECTION_TEST, Tests};
-use crate::times::Times;
 pub use event::{CellEvent, Line, Order, OrderedCell, Teller, write_line};
 pub use local::Local;
-pub use pace::Pace;
 pub use rates::Rate;
 pub(crate) use rates::Rates;
-pub use remaining::Remaining;
-use remaining::{Left, remaining};
 use running::Running;
 pub use running::RunningGroup;
 use slurm::SlurmError;
@@ -138,7 +133,7 @@ pub struct Status {
     /// What the backend is doing, in a few words.
     pub doing: String,
     /// How long it may take; `None` while there is a cell of whose kind nothing is known.
-    pub remaining: Option<Remaining>,
+    pub remaining: Option<RemainingTime>,
     /// Success of the cells that are done.
     pub rates: Vec<Rate>,
 }
@@ -241,7 +236,7 @@ struct Tracked {
     saved: u64,
     saved_before: Option<u64>,
     /// How far this attempt is.
-    pace: Pace,
+    progress: TrainingProgress,
     lost_servers: usize,
     /// How often in a row it had no server, and how long nothing was begun for that.
     lost_in_a_row: u32,
@@ -278,7 +273,7 @@ struct Scheduler<'a> {
     cells: Vec<Tracked>,
     /// The cells that wait, in order.
     queue: VecDeque<usize>,
-    times: Times<'a>,
+    durations: CellDurations<'a>,
     rates: Rates,
     paused_until: Option<Instant>,
     server_wait: Duration,
@@ -302,7 +297,7 @@ impl<'a> Scheduler<'a> {
             report,
             cells: cells.collect(),
             queue: VecDeque::new(),
-            times: Times::default(),
+            durations: CellDurations::default(),
             rates: Rates::default(),
             paused_until: None,
             server_wait: Duration::ZERO,
@@ -350,7 +345,7 @@ impl<'a> Scheduler<'a> {
         match event {
             CellEvent::Server { .. } => tracked.served = tracked.served.or(Some(now)),
             CellEvent::Training { saved, episodes, timesteps } => {
-                tracked.pace.hear(generated_episodes(&self.plan.cells[cell].config, episodes), timesteps);
+                tracked.progress.update(generated_episodes(&self.plan.cells[cell].config, episodes), timesteps);
                 tracked.saved_before.get_or_insert(saved);
                 if saved > tracked.saved {
                     (tracked.saved, tracked.attempts) = (saved, 0);
@@ -452,7 +447,7 @@ impl<'a> Scheduler<'a> {
         } else if place.is_settled(false) {
             *phase = Phase::Done;
             if let Some(timing) = place.timing() {
-                self.times.add(&self.plan.cells[cell], timing.seconds);
+                self.durations.add(&self.plan.cells[cell], timing.seconds);
             }
             // One that cannot be read is left out: the report says what is wrong with it.
             if let Ok(CellState::Done(result)) = place.state() {
@@ -499,7 +494,7 @@ impl<'a> Scheduler<'a> {
             if (place.is_none() && offers.len() >= room) || self.settled(cell) {
                 continue;
             }
-            let seconds = self.times.of_pair(&self.plan.cells[cell]);
+            let seconds = self.durations.seconds(&self.plan.cells[cell]);
             let offer = Offer { cell, retry, group, lost_servers, seconds };
             match place {
                 Some(place) => offers[place].push(offer),
@@ -517,7 +512,7 @@ impl<'a> Scheduler<'a> {
                 let tracked = &mut self.cells[cell];
                 tracked.phase = Phase::Running;
                 (tracked.begun, tracked.served, tracked.last, tracked.saved_before) = (None, None, None, None);
-                tracked.pace = Pace::default();
+                tracked.progress = TrainingProgress::default();
             }
         }
         self.queue.retain(|&cell| self.cells[cell].phase == Phase::Waiting);
@@ -547,14 +542,17 @@ impl<'a> Scheduler<'a> {
         let number = |phase| self.cells.iter().filter(|cell| cell.phase == phase).count();
         let (mut running, mut left) = (Running::default(), Vec::new());
         for (place, (tracked, cell)) in self.cells.iter().zip(&self.plan.cells).enumerate() {
-            let most = self.backend.most(place);
+            let max_seconds = self.backend.most(place);
             match (tracked.phase, &tracked.last, tracked.begun) {
                 (Phase::Running, Some(event), Some(begun)) => {
                     running.add(cell, (!tracked.alone).then_some(tracked.group), event);
-                    let rest = rest(cell, event, &tracked.pace);
-                    left.push(Left { cell, elapsed: Some((now - begun).as_secs_f64()), rest, most });
+                    let rest = rest(cell, event, &tracked.progress);
+                    let elapsed_seconds = Some((now - begun).as_secs_f64());
+                    left.push(UnfinishedCell { cell, elapsed_seconds, remaining_ratio: rest, max_seconds });
                 }
-                (Phase::Waiting | Phase::Running, ..) => left.push(Left { cell, elapsed: None, rest: None, most }),
+                (Phase::Waiting | Phase::Running, ..) => {
+                    left.push(UnfinishedCell { cell, elapsed_seconds: None, remaining_ratio: None, max_seconds });
+                }
                 _ => {}
             }
         }
@@ -564,7 +562,7 @@ impl<'a> Scheduler<'a> {
             failed: number(Phase::Failed),
             running: running.groups,
             doing,
-            remaining: remaining(&self.times, &left, at_a_time),
+            remaining: remaining_time(&self.durations, &left, at_a_time),
             rates: self.rates.list(),
         }
     }
@@ -580,14 +578,14 @@ fn pause(in_a_row: u32) -> Duration {
 }
 
 /// What is left of a cell under way, in terms of what was done of it.
-fn rest(cell: &Cell, event: &CellEvent, pace: &Pace) -> Option<f64> {
+fn rest(cell: &Cell, event: &CellEvent, progress: &TrainingProgress) -> Option<f64> {
     let training = generated_episodes(&cell.config, cell.config.common.episodes);
     let testing = test_episodes(cell, None);
     match event {
-        CellEvent::Training { .. } => pace.left(training + TEST_SHARE * testing),
+        CellEvent::Training { .. } => progress.remaining_ratio(training + TEST_SHARE * testing),
         CellEvent::Testing { set, episodes } => {
             let tested = test_episodes(cell, Some(set)) + *episodes as f64;
-            let done = (training - pace.begun()).max(0.0) + TEST_SHARE * tested; // in this attempt
+            let done = (training - progress.first_episodes()).max(0.0) + TEST_SHARE * tested; // in this attempt
             (done > 0.0).then(|| TEST_SHARE * (testing - tested).max(0.0) / done)
         }
         _ => None,

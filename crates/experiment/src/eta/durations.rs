@@ -1,0 +1,80 @@
+//! Durations of finished cells.
+
+use std::collections::HashMap;
+
+use perturb_settings::Method;
+
+use crate::folder::Folder;
+use crate::plan::{Cell, Plan};
+
+/// Durations of finished cells, by environment and method.
+#[derive(Debug, Default)]
+pub struct CellDurations<'a> {
+    by_kind: HashMap<(&'a str, Method), Sum>,
+    count: usize,
+}
+
+#[derive(Clone, Copy, Debug, Default)]
+struct Sum {
+    seconds: f64,
+    count: f64,
+}
+
+impl<'a> CellDurations<'a> {
+    /// Reads the durations of the cells of `plan` that have a result in `folder`.
+    pub fn read(plan: &'a Plan, folder: &Folder) -> Self {
+        let mut durations = Self::default();
+        for cell in &plan.cells {
+            let place = folder.cell(&cell.id);
+            if let Some(timing) = place.timing().filter(|_| place.is_settled(false)) {
+                durations.add(cell, timing.seconds);
+            }
+        }
+        durations
+    }
+
+    /// Adds a finished cell, which took `seconds` of a process.
+    pub(crate) fn add(&mut self, cell: &'a Cell, seconds: f64) {
+        let sum = self.by_kind.entry((&cell.config.common.environment, cell.method())).or_default();
+        sum.seconds += seconds;
+        sum.count += 1.0;
+        self.count += 1;
+    }
+
+    /// Returns the mean duration of cells with the environment and method of `cell`, s of a process; `None` if there are
+    /// none.
+    pub fn seconds(&self, cell: &Cell) -> Option<f64> {
+        let sum = self.by_kind.get(&(cell.config.common.environment.as_str(), cell.method()))?;
+        Some(sum.seconds / sum.count)
+    }
+
+    /// Returns the number of finished cells.
+    pub fn cells(&self) -> usize {
+        self.count
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Timing;
+
+    #[test]
+    fn durations_of_finished_cells_are_averaged_by_kind() {
+        let text = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 3
+            [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
+        let plan = Plan::parse("test", text.into()).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        for (cell, seconds, done) in [(0, 10.0, true), (1, 20.0, true), (2, 900.0, false)] {
+            let place = folder.cell(&plan.cells[cell].id);
+            place.write_timing(&Timing { seconds }).unwrap();
+            if done {
+                std::fs::write(place.path().join("result.json"), "x").unwrap();
+            }
+        }
+        let durations = CellDurations::read(&plan, &folder);
+        assert_eq!(durations.cells(), 2, "a cell without a result is left out");
+        assert_eq!((durations.seconds(&plan.cells[2]), durations.seconds(&plan.cells[3])), (Some(15.0), None));
+    }
+}

@@ -1,0 +1,141 @@
+//! The remaining time of an experiment.
+
+use std::collections::HashMap;
+use std::time::Duration;
+
+use perturb_settings::Method;
+
+use super::durations::CellDurations;
+use crate::plan::Cell;
+
+/// The remaining time of an experiment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RemainingTime {
+    /// The estimate.
+    pub time: Duration,
+    /// Whether a part of the estimate is an upper bound.
+    pub at_most: bool,
+}
+
+/// A cell that is not done.
+pub(crate) struct UnfinishedCell<'a> {
+    pub(crate) cell: &'a Cell,
+    /// Time since the cell began, s; `None` if it waits.
+    pub(crate) elapsed_seconds: Option<f64>,
+    /// Remaining work divided by the work since the cell began; `None` if it is not known.
+    pub(crate) remaining_ratio: Option<f64>,
+    /// Upper bound of the whole cell by a measurement, s of a process; `None` without a measurement.
+    pub(crate) max_seconds: Option<f64>,
+}
+
+/// Estimates the remaining time of `cells`, of which `at_a_time` run together. The duration of a waiting cell is the mean
+/// of finished cells of its kind, of running ones, or its measured upper bound, in this order. Returns `None` if nothing
+/// is known of a cell.
+pub(crate) fn remaining_time(
+    durations: &CellDurations<'_>,
+    cells: &[UnfinishedCell<'_>],
+    at_a_time: usize,
+) -> Option<RemainingTime> {
+    let under_way = cells.iter().filter(|cell| cell.elapsed_seconds.is_some()).count();
+    // Cells in one process share its time.
+    let share = (at_a_time as f64 / under_way.max(1) as f64).min(1.0);
+    let kind = |cell: &'_ Cell| (cell.config.common.environment.clone(), cell.method());
+    let mut running: HashMap<(String, Method), (f64, f64)> = HashMap::new();
+    for one in cells {
+        if let (Some(elapsed), Some(ratio)) = (one.elapsed_seconds, one.remaining_ratio) {
+            let (sum, count) = running.entry(kind(one.cell)).or_default();
+            (*sum, *count) = (*sum + elapsed * share * (1.0 + ratio), *count + 1.0);
+        }
+    }
+    let (mut seconds, mut longest, mut at_most) = (0.0, 0.0_f64, false);
+    for one in cells {
+        let elapsed = one.elapsed_seconds.unwrap_or_default();
+        let rest = if let Some(ratio) = one.remaining_ratio {
+            elapsed * share * ratio
+        } else {
+            let of_running = || running.get(&kind(one.cell)).map(|(sum, count)| sum / count);
+            let expected = durations.seconds(one.cell).or_else(of_running).or_else(|| {
+                at_most |= one.max_seconds.is_some();
+                one.max_seconds
+            });
+            (expected? - elapsed * share).max(0.0)
+        };
+        seconds += rest;
+        longest = longest.max(if one.elapsed_seconds.is_some() { rest / share } else { rest });
+    }
+    let at_a_time = at_a_time.clamp(1, cells.len().max(1)) as f64;
+    Some(RemainingTime { time: Duration::from_secs_f64((seconds / at_a_time).max(longest)), at_most })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::Plan;
+
+    const PLAN: &str = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 2
+        [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+
+    /// A cell that waits, or has been under way for so long with so much left.
+    type OfCell<'a> = (&'a Cell, Option<(f64, Option<f64>)>);
+
+    fn seconds(durations: &CellDurations<'_>, cells: &[OfCell<'_>], at_a_time: usize) -> Option<f64> {
+        let left = cells.iter().map(|&(cell, running)| UnfinishedCell {
+            cell,
+            elapsed_seconds: running.map(|(elapsed, _)| elapsed),
+            remaining_ratio: running.and_then(|(_, rest)| rest),
+            max_seconds: None,
+        });
+        remaining_time(times, &left.collect::<Vec<_>>(), at_a_time).map(|left| left.time.as_secs_f64())
+    }
+
+    #[test]
+    fn waiting_cells_take_the_mean_of_their_kind() {
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        let [cart_pole, cart_pole_2, hopper, hopper_2] = &plan.cells[..] else { panic!() };
+        let mut times = CellDurations::default();
+        assert_eq!(seconds(&times, &[(hopper, None)], 1), None);
+        times.add(cart_pole, 10.0);
+        assert_eq!(seconds(&times, &[(cart_pole_2, None), (hopper, None)], 1), None, "a Hopper is no CartPole");
+        times.add(hopper, 30.0);
+        let left = [(cart_pole_2, Some((4.0, None))), (hopper_2, None)];
+        assert_eq!(seconds(&times, &left, 1), Some(36.0));
+        assert_eq!(seconds(&times, &left, 2), Some(30.0), "the longest ends last");
+        assert_eq!(seconds(&times, &left, 8), Some(30.0));
+        assert_eq!(seconds(&times, &[(cart_pole_2, Some((99.0, None)))], 1), Some(0.0));
+    }
+
+    #[test]
+    fn running_cells_predict_waiting_cells_of_their_kind() {
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        let [cart_pole, cart_pole_2, hopper, hopper_2] = &plan.cells[..] else { panic!() };
+        let times = CellDurations::default();
+        let a_third = Some((20.0, Some(2.0)));
+        assert_eq!(seconds(&times, &[(hopper, a_third)], 1), Some(40.0));
+        assert_eq!(seconds(&times, &[(hopper, a_third), (hopper_2, None)], 1), Some(100.0));
+        // Two in one process had half of it each.
+        assert_eq!(seconds(&times, &[(cart_pole, a_third), (cart_pole_2, a_third)], 1), Some(40.0));
+        assert_eq!(seconds(&times, &[(cart_pole, a_third), (cart_pole_2, None), (hopper, None)], 1), None);
+    }
+
+    #[test]
+    fn measured_maxima_fill_in_for_kinds_that_have_not_begun() {
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        let waits = |max_seconds| UnfinishedCell {
+            cell: &plan.cells[3],
+            elapsed_seconds: None,
+            remaining_ratio: None,
+            max_seconds,
+        };
+        let begun = || UnfinishedCell {
+            cell: &plan.cells[0],
+            elapsed_seconds: Some(10.0),
+            remaining_ratio: Some(1.0),
+            max_seconds: Some(9e9),
+        };
+        let of = |cells: &[UnfinishedCell<'_>]| remaining_time(&CellDurations::default(), cells, 1);
+        assert_eq!(of(&[begun()]), Some(RemainingTime { time: Duration::from_secs(10), at_most: false }));
+        assert_eq!(of(&[begun(), waits(Some(70.0))]).unwrap().time, Duration::from_secs(80));
+        assert!(of(&[begun(), waits(Some(70.0))]).unwrap().at_most);
+        assert_eq!(of(&[begun(), waits(None)]), None);
+    }
+}
