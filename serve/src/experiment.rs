@@ -109,7 +109,7 @@ impl LiveExperiment {
     /// Reads the status again if its files have changed, or if enough time has passed.
     pub(crate) fn refresh(&mut self) {
         // A new cell changes the stamp of `cells/`. Changes inside of a cell's folder do not, hence the time.
-        let stamps = ["cells", "plan.toml"].map(|name| Stamp::of(&self.path.join(name)));
+        let stamps = ["cells", "plan.toml"].map(|name| Stamp::read(&self.path.join(name)));
         let is_idle = self.state() != "in work";
         let reread_pause = LOCK_INTERVAL.max(self.read_duration * REREAD_FACTOR);
         let pause = if self.status.is_err() { reread_pause } else { LOCK_INTERVAL };
@@ -141,7 +141,7 @@ impl LiveExperiment {
         for id in working(status) {
             let file = Path::new("cells").join(id).join("training/progress.csv");
             let mut progress = before.remove(id).unwrap_or_default();
-            let stamp = Stamp::of(&self.path.join(&file)).filter(|_| !leads_out(&self.root, &self.path, &file));
+            let stamp = Stamp::read(&self.path.join(&file)).filter(|_| !leads_out(&self.root, &self.path, &file));
             if stamp != progress.stamp {
                 let last = stamp.and_then(|_| last_progress(&self.path.join(&file)));
                 progress = CellProgress { stamp, episodes: last.and_then(|last| last.episodes()).unwrap_or_default() };
@@ -306,7 +306,7 @@ impl ReportFiles {
             if outside.is_none() && leads_out(root, folder, name) {
                 outside = Some(name.display().to_string());
             }
-            (name, Stamp::of(path)).hash(&mut hasher);
+            (name, Stamp::read(path)).hash(&mut hasher);
         };
         add(&status.folder.plan_path());
         let listed = |folder: &Path| files::list(folder).unwrap_or_default();

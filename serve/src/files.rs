@@ -21,7 +21,7 @@ use crate::paths::{RelativePath, Root, media_type};
 #[derive(Debug, PartialEq)]
 enum RequestedRange {
     /// The whole file.
-    Whole,
+    ReportBundle,
     /// The bytes at these positions.
     Part(RangeInclusive<u64>),
     /// Bytes after the end of the file.
@@ -38,7 +38,7 @@ pub(crate) async fn send(root: Root, relative: RelativePath, headers: &HeaderMap
     let (kind, (file, metadata)) = opened.await.ok()??;
     let length = metadata.len();
     let mut file = tokio::fs::File::from_std(file);
-    let tag = format!("\"{}\"", Stamp::of_metadata(&metadata).tag());
+    let tag = format!("\"{}\"", Stamp::from_metadata(&metadata).tag());
     let header_text = |name: header::HeaderName| headers.get(name).and_then(|value| value.to_str().ok());
     let has_tag = |tags: &str| tags.split(',').any(|known| known.trim().trim_start_matches("W/") == tag);
     if header_text(header::IF_NONE_MATCH).is_some_and(has_tag) {
@@ -46,9 +46,9 @@ pub(crate) async fn send(root: Root, relative: RelativePath, headers: &HeaderMap
     }
     // The client has parts of an earlier file if the tag differs. It gets the whole new file.
     let range = header_text(header::RANGE).filter(|_| header_text(header::IF_RANGE).is_none_or(|known| known == tag));
-    let requested = range.map_or(RequestedRange::Whole, |range| parse_range(range, length));
+    let requested = range.map_or(RequestedRange::ReportBundle, |range| parse_range(range, length));
     let (status, from, count) = match &requested {
-        RequestedRange::Whole => (StatusCode::OK, 0, length),
+        RequestedRange::ReportBundle => (StatusCode::OK, 0, length),
         RequestedRange::Part(range) => (StatusCode::PARTIAL_CONTENT, *range.start(), range.end() - range.start() + 1),
         RequestedRange::NotSatisfiable => {
             let range = [(header::CONTENT_RANGE, format!("bytes */{length}"))];
@@ -83,14 +83,14 @@ fn open(path: &Path) -> std::io::Result<(File, Metadata)> {
 /// Parses a `Range` header with one range. The whole file is sent for several ranges and for invalid headers.
 fn parse_range(header: &str, length: u64) -> RequestedRange {
     let Some((from, to)) = header.strip_prefix("bytes=").and_then(|range| range.split_once('-')) else {
-        return RequestedRange::Whole;
+        return RequestedRange::ReportBundle;
     };
     let last = length.saturating_sub(1);
     let (from, to) = match (from.parse::<u64>(), to.parse::<u64>()) {
         (Ok(from), Ok(to)) if from <= to => (from, to.min(last)),
         (Ok(from), Err(_)) if to.is_empty() => (from, last),
         (Err(_), Ok(count)) if from.is_empty() => (length.saturating_sub(count), last),
-        _ => return RequestedRange::Whole,
+        _ => return RequestedRange::ReportBundle,
     };
     if from > to || length == 0 { RequestedRange::NotSatisfiable } else { RequestedRange::Part(from..=to) }
 }
@@ -108,9 +108,9 @@ mod tests {
     #[case("bytes=-4", RequestedRange::Part(6..=9))]
     #[case("bytes=-99", RequestedRange::Part(0..=9))]
     #[case("bytes=10-", RequestedRange::NotSatisfiable)]
-    #[case("bytes=3-2", RequestedRange::Whole)]
-    #[case("bytes=0-1,4-5", RequestedRange::Whole)]
-    #[case("lines=1-2", RequestedRange::Whole)]
+    #[case("bytes=3-2", RequestedRange::ReportBundle)]
+    #[case("bytes=0-1,4-5", RequestedRange::ReportBundle)]
+    #[case("lines=1-2", RequestedRange::ReportBundle)]
     fn ranges_of_ten_bytes(#[case] header: &str, #[case] expected: RequestedRange) {
         assert_eq!(parse_range(header, 10), expected);
     }

@@ -1,6 +1,6 @@
 //! The list of all runs below the served folder.
 
-use perturb_experiment::runs::{Kind, Place, RunSummary, places};
+use perturb_experiment::runs::{RunFolder, RunKind, RunSummary, places};
 use perturb_files::FileError;
 
 use crate::experiment::LiveExperiment;
@@ -33,7 +33,7 @@ pub(crate) struct Index {
 #[derive(Debug)]
 pub(crate) struct Row {
     pub(crate) relative: RelativePath,
-    pub(crate) kind: Kind,
+    pub(crate) kind: RunKind,
     pub(crate) summary: RunSummary,
     /// Time of the last change, in seconds since 1970.
     pub(crate) changed: i64,
@@ -67,9 +67,9 @@ impl Index {
 }
 
 impl Row {
-    fn new(relative: RelativePath, Place { path, kind }: &Place, root: &Root, runs: &Runs) -> Self {
+    fn new(relative: RelativePath, RunFolder { path, kind }: &RunFolder, root: &Root, runs: &Runs) -> Self {
         let (summary, changed, remaining_seconds) = match kind {
-            Kind::Training => runs.trainings.with(
+            RunKind::Training => runs.trainings.with(
                 path,
                 || LiveTraining::new(root.path(), path),
                 |training| {
@@ -81,7 +81,7 @@ impl Row {
                     (training.summary(), training.changed(), training.remaining_seconds())
                 },
             ),
-            Kind::Experiment => runs.experiments.with(
+            RunKind::Experiment => runs.experiments.with(
                 path,
                 || LiveExperiment::new(root.path(), path),
                 |experiment| {

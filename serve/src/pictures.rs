@@ -57,7 +57,7 @@ pub(crate) fn scan_folder(relative: &RelativePath, path: &Path, max_shown: usize
         }
         if found.shown.len() == max_shown {
             found.more += 1;
-        } else if let Some(stamp) = file.is_file().then(|| Stamp::of(file)).flatten() {
+        } else if let Some(stamp) = file.is_file().then(|| Stamp::read(file)).flatten() {
             let relative = relative.join(name);
             let name = name.to_string_lossy().into_owned();
             found.shown.push(RunPicture { relative, name, is_film: ["mp4", "webm"].contains(&extension), stamp });

@@ -7,7 +7,7 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use perturb_experiment::runs::Kind;
+use perturb_experiment::runs::RunKind;
 use tokio::sync::{Notify, Semaphore, watch};
 
 use crate::cached_loader::{CachedLoader, pause_after};
@@ -119,8 +119,8 @@ impl Publisher {
             Topic::Run(relative) => relative,
         };
         let path = root.resolve(relative).ok_or(ViewError::RunNotFound)?;
-        Ok(match Kind::of(&path).ok_or(ViewError::RunNotFound)? {
-            Kind::Training => self.runs.trainings.with(
+        Ok(match RunKind::detect(&path).ok_or(ViewError::RunNotFound)? {
+            RunKind::Training => self.runs.trainings.with(
                 &path,
                 || LiveTraining::new(root.path(), &path),
                 |training| {
@@ -128,7 +128,7 @@ impl Publisher {
                     pages::training::update(root, relative, &path, training)
                 },
             ),
-            Kind::Experiment => self.runs.experiments.with(
+            RunKind::Experiment => self.runs.experiments.with(
                 &path,
                 || LiveExperiment::new(root.path(), &path),
                 |experiment| {

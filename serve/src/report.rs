@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use perturb_experiment::Folder;
-use perturb_report::{ReportError, Sources, Whole};
+use perturb_report::{ReportBundle, ReportError, ReportInputs};
 use tokio::sync::Semaphore;
 
 /// Number of reports that are kept.
@@ -158,8 +158,8 @@ impl ReportCache {
 }
 
 fn build(folder: &Path) -> Result<Arc<str>, String> {
-    let sources = Sources { folder: Some(Folder::new(folder)), ..Sources::default() };
-    let page = sources.read(|whole: Whole<'_>| whole.page().map_err(ReportError::from));
+    let sources = ReportInputs { folder: Some(Folder::new(folder)), ..ReportInputs::default() };
+    let page = sources.read(|whole: ReportBundle<'_>| whole.page().map_err(ReportError::from));
     page.map(Arc::from).map_err(|error| error.to_string())
 }
 

@@ -52,7 +52,7 @@ impl Tail {
             }
             opened => opened?,
         };
-        let now = Stamp::of_metadata(&metadata);
+        let now = Stamp::from_metadata(&metadata);
         let stamp = Some(now);
         let still_oversized = self.oversized_inode == Some(now.inode()) && now.length() >= self.offset + MAX_READ_BYTES;
         if stamp == self.stamp || still_oversized {

@@ -47,7 +47,7 @@ impl LiveTraining {
             *self = Self { status: Err(format!("{name} is {LEADS_OUT}")), ..Self::new(&self.root, &self.path) };
             return;
         }
-        let stamps = STATUS_FILES.map(|name| Stamp::of(&self.path.join(name)));
+        let stamps = STATUS_FILES.map(|name| Stamp::read(&self.path.join(name)));
         let lock_is_due = self.checked.is_none_or(|checked| checked.elapsed() >= LOCK_INTERVAL);
         let in_work = self.status.as_ref().is_ok_and(|status| status.state == "in work");
         if stamps != self.stamps || self.checked.is_none() || (lock_is_due && is_locked(&self.path) != in_work) {

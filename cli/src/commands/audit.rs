@@ -14,7 +14,7 @@ use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::Servers;
 use perturb_learner::evaluation::{Audit, audit};
-use perturb_records::{Assessed, FILE, Records};
+use perturb_records::{ExternalEvaluation, FILE, Records};
 
 use super::args::AuditArgs;
 use super::display::{Display, say};
@@ -103,7 +103,7 @@ fn recorded_policies(args: &AuditArgs) -> Result<Vec<RecordedPolicy>> {
         records: path.join(FILE),
         checkpoint: path.join("training"),
     };
-    if Assessed::is_in(path) {
+    if ExternalEvaluation::is_in(path) {
         return policies_of_assessment(path, &args.checkpoint);
     }
     if let [_, second, ..] = &args.checkpoint[..] {
@@ -151,7 +151,7 @@ fn recorded_policies(args: &AuditArgs) -> Result<Vec<RecordedPolicy>> {
 
 /// Returns the policies of an assessment whose checkpoints are in `checkpoints`. Prints the names of the others.
 fn policies_of_assessment(path: &Path, checkpoints: &[PathBuf]) -> Result<Vec<RecordedPolicy>> {
-    let assessed = Assessed::read(path)?;
+    let assessed = ExternalEvaluation::read(path)?;
     let id = |path: &PathBuf| -> Result<(PathBuf, String)> {
         let id = Checkpoint::load(path)?.id().map_err(|reason| CommandError::Failed(format!("{path:?}: {reason}")))?;
         Ok((path.clone(), id))

@@ -4,10 +4,10 @@ use std::collections::HashMap;
 use std::io::Write;
 use std::process::ExitCode;
 
-use perturb_experiment::scheduler::{Announcement, Backend, Rate, RunEnd, RunError, run as run_plan, write_line};
-use perturb_experiment::{FailureMark, Folder, Plan};
+use perturb_experiment::scheduler::{Backend, ProgressEvent, Rate, RunEnd, RunError, run as run_plan, write_line};
+use perturb_experiment::{FailureId, Folder, Plan};
 use perturb_files::interrupt::StopFlag;
-use perturb_report::Sources;
+use perturb_report::ReportInputs;
 use perturb_text::{count, quoted};
 
 use super::args::RunArgs;
@@ -28,7 +28,7 @@ pub(super) struct PlanRunner<'a> {
     /// The plan with all cells that are known so far.
     plan: Plan,
     /// Failures that existed when the run began, and that --retry-failed runs again.
-    forgiven: HashMap<String, FailureMark>,
+    retryable: HashMap<String, FailureId>,
     /// End of the last round; `None` before the first round.
     end: Option<RunEnd>,
     /// Success of the finished cells.
@@ -42,8 +42,8 @@ impl<'a> PlanRunner<'a> {
     pub(super) fn begin(args: &'a RunArgs, plan: Plan, folder: &'a Folder, stop: &'a StopFlag) -> Result<Self> {
         let events = args.json.as_deref().map(json::event_writer).transpose()?;
         keep_plan(args, &plan, folder)?;
-        let forgiven = if args.retry_failed { folder.failures()? } else { HashMap::new() };
-        Ok(Self { args, folder, stop, plan, forgiven, end: None, rates: Vec::new(), events })
+        let retryable = if args.retry_failed { folder.failures()? } else { HashMap::new() };
+        Ok(Self { args, folder, stop, plan, retryable, end: None, rates: Vec::new(), events })
     }
 
     /// Returns the next plan to run: the given one, then the one with the selected cells. Returns `None` at the end.
@@ -52,7 +52,7 @@ impl<'a> PlanRunner<'a> {
             None => {}
             Some(RunEnd::Stopped { .. }) => return Ok(None),
             Some(RunEnd::Finished { .. }) => {
-                let plan = self.plan.in_folder(self.folder)?;
+                let plan = self.plan.with_selected_cells(self.folder)?;
                 let new = plan.cells.len() - self.plan.cells.len();
                 if new == 0 {
                     return Ok(None);
@@ -68,15 +68,15 @@ impl<'a> PlanRunner<'a> {
     pub(super) fn run(&mut self, plan: &Plan, backend: &mut dyn Backend) -> Result<()> {
         let mut display = Display::for_cells(plan.cells.len());
         let mut rates = Vec::new();
-        let mut report = |report: Announcement<'_>| match report {
-            Announcement::Status(status) => {
+        let mut report = |report: ProgressEvent<'_>| match report {
+            ProgressEvent::Status(status) => {
                 display.cells(status);
                 rates.clone_from(&status.rates);
             }
-            Announcement::Note(sentence) => note(sentence),
-            Announcement::Line(line) => self.events.iter_mut().for_each(|out| write_line(out, line)),
+            ProgressEvent::Note(sentence) => note(sentence),
+            ProgressEvent::Line(line) => self.events.iter_mut().for_each(|out| write_line(out, line)),
         };
-        let end = run_plan(plan, self.folder, backend, &self.forgiven, self.args.wait.time(), self.stop, &mut report);
+        let end = run_plan(plan, self.folder, backend, &self.retryable, self.args.wait.time(), self.stop, &mut report);
         drop(display);
         self.rates = rates;
         self.end = Some(end.map_err(|error| match error {
@@ -108,7 +108,7 @@ impl<'a> PlanRunner<'a> {
             None => Vec::new(),
         };
         if let Some(page) = &args.html {
-            let sources = Sources { folder: Some(folder.clone()), ..Sources::default() };
+            let sources = ReportInputs { folder: Some(folder.clone()), ..ReportInputs::default() };
             report::write(sources, None, Some(page))?;
             let tables = folder.path().join("report");
             note(format_args!("the report is in {} and {}", page.display(), tables.display()));

@@ -154,7 +154,7 @@ impl Demo<'_> {
             .flat_map(|one| one.rates.iter().map(|(&test, &rate)| (Scenario { train: one.version, test }, rate)))
             .collect();
         let method = trained[0].checkpoint.state.config.method();
-        let here = |metric: Metric| metric.of(|scenario| rates.get(&scenario).copied());
+        let here = |metric: Metric| metric.value(|scenario| rates.get(&scenario).copied());
         let DemoArgs { episodes, test_episodes, .. } = *self.args;
         let rows = [("here", 1, episodes, test_episodes), ("paper", PAPER_RUNS, PAPER_EPISODES, PAPER_TEST_EPISODES)];
         let shown = |row: &str, metric: Metric| match row {
@@ -162,7 +162,7 @@ impl Demo<'_> {
             _ => paper::number(environment, &method, metric).map(|number| number.to_string()),
         };
         let column = |metric| move |row: &(&str, u64, u64, u64)| shown(row.0, metric).unwrap_or_else(|| "–".into());
-        Table::of("", &rows)
+        Table::builder("", &rows)
             .text("success, %", |(row, ..)| *row)
             .number("runs", |(_, runs, ..)| runs)
             .number("episodes", |(.., episodes, _)| grouped(*episodes as usize))
@@ -254,7 +254,7 @@ fn first_result(policy: &DemoPolicy) -> String {
 }
 
 fn rates_table(trained: &[DemoPolicy]) -> Table {
-    let mut table = Table::of("", trained).text("success, %", |one| format!("trained on {}", one.version));
+    let mut table = Table::builder("", trained).text("success, %", |one| format!("trained on {}", one.version));
     for test in Version::ALL {
         let shown = move |one: &DemoPolicy| one.rates.get(&test).map_or_else(String::new, |rate| format!("{rate:.1}"));
         table = table.number(format!("tested on {test}"), shown);

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 
-use perturb_experiment::{TrainingProgress, generated_episodes};
 use perturb_experiment::scheduler::RunStatus;
+use perturb_experiment::{TrainingProgress, generated_episodes};
 use perturb_learner::logging::{EpisodeFigures, Progress};
 use perturb_settings::TrainConfig;
 use perturb_text::{duration, grouped};

@@ -42,7 +42,7 @@ fn print(out: &mut impl Write, environment: &Environment) -> std::io::Result<()>
             writeln!(out, "   (code)      {}", code.description)?;
         }
     }
-    let parameters = Table::of("", &environment.parameters)
+    let parameters = Table::builder("", &environment.parameters)
         .text("parameter", |parameter| &parameter.name)
         .text("unit", |parameter| &parameter.unit)
         .number("D", |parameter| parameter.default_value)

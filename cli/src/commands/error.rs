@@ -11,7 +11,7 @@ use perturb_learner::client::ClientError;
 use perturb_learner::evaluation::{AuditError, HeatmapError, TestError};
 use perturb_learner::measure::MeasureError;
 use perturb_learner::training::{RunDirectoryError, TrainError};
-use perturb_records::{AssessedError, RecordsError};
+use perturb_records::{ExternalEvaluationError, RecordsError};
 use perturb_report::ReportError;
 use perturb_report::plot::PlotError;
 use perturb_serve::ServeError;
@@ -38,7 +38,7 @@ pub(super) enum CommandError {
     #[error("{place}: {source}")]
     Heatmaps { place: String, source: Box<CommandError> },
     #[error(transparent)]
-    Assessed(#[from] AssessedError),
+    ExternalEvaluation(#[from] ExternalEvaluationError),
     #[error(transparent)]
     Audit(#[from] AuditError),
     #[error("{}", with_searched_folders(.0))]

@@ -32,8 +32,8 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     let environment = servers.environment(&common.environment)?;
     let normalize = |set| sets::normalize_set(set, &environment);
     let sets = sets.into_iter().map(normalize).collect::<Result<Vec<_>, _>>()?;
-    let text = Criterion::of(&environment);
-    let code = Criterion::of_code(&environment);
+    let text = Criterion::from_environment(&environment);
+    let code = Criterion::from_environment_code(&environment);
     let success =
         args.success.as_ref().map(|rule| sets::normalize_rule(rule, text.as_ref(), code.as_ref())).transpose()?;
     let options = TestOptions { episodes: args.episodes, seed, selects: args.selection_episodes, success };
@@ -59,7 +59,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     if args.json.is_printed() {
         return Ok(());
     }
-    let table = Table::of("", &results)
+    let table = Table::builder("", &results)
         .text("tested on", |(set, _)| set)
         .number("episodes", |(_, result)| result.episodes)
         .number("success, %", |(_, result)| format!("{:.1}", result.success_percent))

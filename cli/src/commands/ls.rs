@@ -34,7 +34,7 @@ pub(super) fn run(args: &LsArgs) -> Result<()> {
         let number = |number: u64| grouped(number as usize);
         format!("{} of {} {}", number(found.done), number(found.budget), found.unit)
     };
-    let table = Table::of("", &found)
+    let table = Table::builder("", &found)
         .text("run", |found| found.path.display())
         .text("what", |found| &found.what)
         .number("done", done)

@@ -164,7 +164,7 @@ fn playing_servers(args: &PlayArgs) -> Result<Servers> {
 
 /// Returns the plan of an experiment's folder, with the cells that its tuning has selected so far.
 fn plan_in(folder: &Folder) -> Result<Plan> {
-    Ok(Plan::load(&folder.require_plan()?)?.in_folder(folder)?)
+    Ok(Plan::load(&folder.require_plan()?)?.with_selected_cells(folder)?)
 }
 
 /// Refuses a missing file and a folder, with a remedy. Pipes are accepted.

@@ -5,7 +5,7 @@ use std::io::Write;
 use std::time::Duration;
 
 use perturb_experiment::{
-    Cell, Estimate, Folder, Grouping, Measurement, Plan, Selection, CellDurations, estimates, benchmark_cells,
+    Cell, CellDurations, Estimate, Folder, Grouping, Measurement, Plan, Selection, benchmark_cells, estimates,
 };
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::client::Servers;
@@ -215,7 +215,7 @@ mod tests {
     fn groups_are_described_in_a_line() {
         let line = |sizes: &[usize], at_a_time| {
             let groups: Vec<Vec<usize>> = sizes.iter().map(|&size| vec![0; size]).collect();
-            groups_line(&groups, Grouping { most: 36, at_a_time })
+            groups_line(&groups, Grouping { max_cells: 36, at_a_time })
         };
         assert_eq!(line(&[36, 35, 36, 1], 2), "108 cells in 4 groups of 1 to 36, 2 at a time");
         assert_eq!(line(&[3], 8), "3 cells in 1 group of 3, 1 at a time");

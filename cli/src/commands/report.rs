@@ -3,11 +3,11 @@
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use perturb_experiment::{Folder, Footing, Results, read_curves};
+use perturb_experiment::{BudgetAxis, Folder, Results, read_curves};
 use perturb_files::{require_writable, write_atomically};
-use perturb_report::curves_table;
-use perturb_report::plot::{Quantity, draw_curves, save};
-use perturb_report::{Sources, save_heatmaps};
+use perturb_report::plot::{CurveQuantity, draw_curves, save};
+use perturb_report::{ReportInputs, save_heatmaps};
+use perturb_report::{curves_table, old_file_name};
 
 use super::args::{CurvesArgs, ReportArgs};
 use super::display::{note, terminal_width};
@@ -15,7 +15,7 @@ use super::error::{CommandError, Result};
 use super::{plan_in, refuse_file};
 
 pub(super) fn run(args: &ReportArgs) -> Result<()> {
-    let mut sources = Sources { rule: args.selection, ..Sources::default() };
+    let mut sources = ReportInputs { rule: args.selection, ..ReportInputs::default() };
     for dir in &args.dirs {
         sources.add(dir)?;
     }
@@ -26,7 +26,7 @@ pub(super) fn run(args: &ReportArgs) -> Result<()> {
 }
 
 /// Writes tables and pictures, and with `page` also everything as HTML. Returns the tables as text, and their folder.
-pub(super) fn write(sources: Sources, out: Option<PathBuf>, page: Option<&Path>) -> Result<(String, PathBuf)> {
+pub(super) fn write(sources: ReportInputs, out: Option<PathBuf>, page: Option<&Path>) -> Result<(String, PathBuf)> {
     let out = match out {
         Some(out) => out,
         None => default_folder(&sources)?,
@@ -39,7 +39,8 @@ pub(super) fn write(sources: Sources, out: Option<PathBuf>, page: Option<&Path>)
         let report = &whole.report;
         write_atomically(&out.join("report.md"), report.markdown().as_bytes())?;
         for table in report.files() {
-            write_atomically(&out.join(&table.title), &table.to_csv())?;
+            let names = std::iter::once(table.title.as_str()).chain(old_file_name(&table.title));
+            names.map(|name| out.join(name)).try_for_each(|path| write_atomically(&path, &table.to_csv()))?;
         }
         report.pictures().iter().try_for_each(|picture| picture.save(&out))?;
         save_heatmaps(whole.heatmaps, &out)?;
@@ -51,7 +52,7 @@ pub(super) fn write(sources: Sources, out: Option<PathBuf>, page: Option<&Path>)
 }
 
 /// Returns the folder report/ of the experiment. It is refused for assessments, which do not belong to the experiment.
-fn default_folder(sources: &Sources) -> Result<PathBuf> {
+fn default_folder(sources: &ReportInputs) -> Result<PathBuf> {
     let Some(folder) = sources.folder.as_ref().filter(|_| sources.assessed.is_empty()) else {
         let message = "give --out: a report with assessments is not written to an experiment's folder";
         return Err(CommandError::Usage(message.into()));
@@ -78,8 +79,8 @@ pub(super) fn curves(args: &CurvesArgs) -> Result<()> {
             note(format_args!("{}: no finished training with a monitor.csv", curves.environment));
             continue;
         }
-        for (axis, suffix) in [(Footing::Episodes, ""), (Footing::Steps, "-steps")] {
-            for quantity in Quantity::ALL {
+        for (axis, suffix) in [(BudgetAxis::Episodes, ""), (BudgetAxis::Steps, "-steps")] {
+            for quantity in CurveQuantity::ALL {
                 let path = out.join(format!("{}-{quantity}{suffix}", curves.environment));
                 save(&draw_curves(curves, quantity, axis), &path)?;
                 writeln!(stdout, "{}.svg and .png", path.display())?;

@@ -52,7 +52,7 @@ pub(super) fn run(args: &RescoreArgs) -> Result<()> {
     if args.json.is_printed() {
         return Ok(());
     }
-    let table = Table::of("", &rows)
+    let table = Table::builder("", &rows)
         .text("tested on", |(set, ..)| set)
         .text("success", |(_, criterion, _)| criterion)
         .number("episodes", |(.., result)| result.episodes)

@@ -9,8 +9,8 @@ use std::sync::Mutex;
 use std::time::Duration;
 
 use perturb_experiment::runs::RunKind;
-use perturb_experiment::scheduler::{CellEvent, Local, BackendEvent, WorkerJob, JobCell, EventWriter};
-use perturb_experiment::{Cell, Folder, Grouping, Plan, CellDurations, estimates, benchmark_cells};
+use perturb_experiment::scheduler::{BackendEvent, CellEvent, EventLineWriter, JobCell, Local, WorkerJob};
+use perturb_experiment::{Cell, CellDurations, Folder, Grouping, Plan, benchmark_cells, estimates};
 use perturb_files::interrupt::StopFlag;
 use perturb_files::require_writable;
 use perturb_learner::cell::{CellJob, run_cells};
@@ -36,7 +36,7 @@ pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
     }
     let plan = load_plan(&args.plan)?;
     refuse_file(&args.out)?;
-    if RunKind::of(&args.out) == Some(RunKind::Training) {
+    if RunKind::detect(&args.out) == Some(RunKind::Training) {
         let message = format!("--out {} holds a training (config.toml): choose another directory", args.out.display());
         return Err(CommandError::Usage(message));
     }
@@ -78,7 +78,7 @@ fn run_worker(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<ExitCo
     let order: WorkerJob = serde_json::from_str(&text)
         .map_err(|error| CommandError::Usage(format!("the order on standard input is not valid: {error}")))?;
     stop_at_end_of_input(stop)?;
-    let mut writer = EventWriter::new(order.cells.len(), std::io::stdout());
+    let mut writer = EventLineWriter::new(order.cells.len(), std::io::stdout());
     let plan = Plan::load(&args.plan);
     let mut orders = Vec::new();
     for JobCell { cell: id, retry } in &order.cells {

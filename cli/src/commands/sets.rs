@@ -119,7 +119,7 @@ pub(super) fn normalize_rule(
     }
     let hint = names::did_you_mean(quantity, known);
     let with_hint = |error: ValueError| ValueError { expected: format!("{}{hint}", error.expected), ..error };
-    rule.of(text, code).map(|_| rule.clone()).map_err(with_hint)
+    rule.criterion(text, code).map(|_| rule.clone()).map_err(with_hint)
 }
 
 #[cfg(test)]

@@ -3,8 +3,8 @@
 use std::process::ExitCode;
 use std::time::Duration;
 
-use perturb_experiment::scheduler::slurm::{Jobs, Slurm, SlurmOptions, Task};
-use perturb_experiment::{Estimate, Folder, Grouping, Plan, estimates, representatives};
+use perturb_experiment::scheduler::slurm::{JobCommand, Jobs, Slurm, SlurmOptions};
+use perturb_experiment::{Estimate, Folder, Grouping, Plan, benchmark_cells, estimates};
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::client::{Address, Servers};
 use perturb_learner::measure::measure;
@@ -34,7 +34,7 @@ pub(super) fn run(args: &RunArgs, plan: Plan, stop: &StopFlag) -> Result<ExitCod
     // Environments and durations are checked here with private servers like those of a job, because the servers that
     // jobs share may be unreachable from this machine.
     step_limits(&Servers::local(args.server.workers)?, &plan)?;
-    let grouping = Grouping { most: args.group, at_a_time: options.task.jobs };
+    let grouping = Grouping { max_cells: args.group, at_a_time: options.task.jobs };
     let job_servers = ServerArgs { server: Vec::new(), workers: Some(options.task.workers) };
     let mut runner = PlanRunner::begin(args, plan, &folder, stop)?;
     while let Some(plan) = runner.next_round()? {
@@ -54,7 +54,7 @@ fn options(args: &RunArgs) -> Result<SlurmOptions> {
         refuse_workers(&args.server)?;
     }
     let jobs = args.jobs.unwrap_or(1);
-    let task = Task {
+    let task = JobCommand {
         program: recurrent::perturb_program()?,
         jobs,
         group: args.group,
@@ -76,7 +76,7 @@ fn options(args: &RunArgs) -> Result<SlurmOptions> {
 /// Returns an upper bound of each cell's duration in seconds, from a short measurement on this machine.
 fn cell_seconds(servers: &Servers, plan: &Plan, grouping: Grouping, stop: &StopFlag) -> Result<Vec<f64>> {
     let all: Vec<usize> = (0..plan.cells.len()).collect();
-    let groups = representatives(plan, &all, grouping);
+    let groups = benchmark_cells(plan, &all, grouping);
     let groups_shown = count(groups.len(), "group");
     note(format_args!("measuring the duration of cells: {groups_shown} for {} s each", MEASURE_TIME.as_secs()));
     let mut measurements = Vec::new();

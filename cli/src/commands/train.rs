@@ -6,7 +6,7 @@ mod resume;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use perturb_experiment::runs::Kind;
+use perturb_experiment::runs::RunKind;
 use perturb_files::interrupt::StopFlag;
 use perturb_files::{create_folder, io};
 use perturb_learner::logging::Progress;
@@ -39,7 +39,7 @@ fn begin_run(args: &TrainArgs) -> Result<ExitCode> {
     let mut config = TrainConfig::load(args.config.as_deref(), &args.set, flags(args)?)?;
     recurrent::prepare(config.common.architecture, false)?;
     args.out.iter().try_for_each(|out| refuse_file(out))?;
-    if let Some(out) = args.out.as_deref().filter(|out| Kind::of(out) == Some(Kind::Experiment)) {
+    if let Some(out) = args.out.as_deref().filter(|out| RunKind::detect(out) == Some(RunKind::Experiment)) {
         let message = format!("--out {} holds an experiment (plan.toml): choose another directory", out.display());
         return Err(CommandError::Usage(message));
     }

@@ -49,7 +49,7 @@ pub(super) fn run(args: &VideoArgs) -> Result<()> {
     }
     let mut out = std::io::stdout();
     let episodes: Vec<_> = footage.episodes.iter().enumerate().collect();
-    let table = Table::of("", &episodes)
+    let table = Table::builder("", &episodes)
         .number("episode", |(index, _)| index + 1)
         .number("return", |(_, episode)| format!("{:.2}", episode.episode_return))
         .number("steps", |(_, episode)| episode.length)

@@ -191,7 +191,8 @@ impl<'a> Film<'a> {
             format!("{} {}", environment.name, set.name),
             format!("{}, trained on {}", state.config.method(), state.config.common.trained_on()),
         );
-        let rule = Criterion::of(&environment).map_or_else(String::new, |criterion| format!("success: {criterion}"));
+        let rule = Criterion::from_environment(&environment)
+            .map_or_else(String::new, |criterion| format!("success: {criterion}"));
         let caption = Caption::new(options.size, title, rule.replace('_', " "), environment.parameters.len())?;
         let mut film = Self {
             options,

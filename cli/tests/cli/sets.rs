@@ -121,7 +121,7 @@ fn parameters_are_those_of_the_sets(records: &Records) {
     let force = place("force");
     let length = place("length");
     let mass = place("mass");
-    for episode in records.of("long_poles") {
+    for episode in records.episodes_on("long_poles") {
         let value = episode.requested[length];
         assert!((0.7..=0.8).contains(&value) || (0.9..=1.0).contains(&value), "{value}");
         assert_eq!((episode.requested[force], episode.requested[mass]), (10.0, 0.2));
@@ -131,7 +131,8 @@ fn parameters_are_those_of_the_sets(records: &Records) {
         ("rows", [length, force], &[[0.3, 5.0], [0.6, 15.0]]),
     ] {
         for context in expected {
-            let count = records.of(set).filter(|episode| at.map(|place| episode.requested[place]) == *context).count();
+            let count =
+                records.episodes_on(set).filter(|episode| at.map(|place| episode.requested[place]) == *context).count();
             assert_eq!(count, 12 / expected.len(), "{set} {context:?}");
         }
     }

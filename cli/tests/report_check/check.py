@@ -230,7 +230,7 @@ def expectations(directory):
     environments = len({line["environment"] for line in scenarios})
     compared = sum((report / f"{name}.csv").exists() for name in ("comparisons", "gains"))
     settings = (report / "settings.csv").exists()
-    files = [path for path in (report / "worst.csv", report / "footing.csv") if path.exists()]
+    files = [path for path in (report / "cvar.csv", report / "sample_efficiency.csv") if path.exists()]
     detailed = sum(len({line["environment"] for line in lines(path)}) for path in files)
     return {
         "rows": {

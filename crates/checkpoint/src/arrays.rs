@@ -16,19 +16,19 @@ pub struct Array {
 }
 
 impl Array {
-    /// Of `shape`.
+    /// Returns an array of `shape`.
     pub fn f32(name: impl Into<String>, shape: Vec<usize>, data: &[f32]) -> Self {
         let bytes = data.iter().flat_map(|x| x.to_le_bytes()).collect();
         Self { name: name.into(), dtype: Dtype::F32, shape, bytes }
     }
 
-    /// Of one axis.
+    /// Returns an array with one axis.
     pub fn u64(name: &str, data: impl ExactSizeIterator<Item = u64>) -> Self {
         let shape = vec![data.len()];
         Self { name: name.to_owned(), dtype: Dtype::U64, shape, bytes: data.flat_map(u64::to_le_bytes).collect() }
     }
 
-    /// Of one axis.
+    /// Returns an array with one axis.
     pub fn u8(name: &str, bytes: Vec<u8>) -> Self {
         Self { name: name.to_owned(), dtype: Dtype::U8, shape: vec![bytes.len()], bytes }
     }

@@ -1,8 +1,8 @@
-//! How far a training has come.
+//! Counters of a training's progress.
 
 use serde::{Deserialize, Serialize};
 
-/// How far a training has come.
+/// Counters of a training's progress.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Counters {

@@ -1,4 +1,4 @@
-//! What a checkpoint keeps of its environment.
+//! The part of an environment that a checkpoint stores.
 
 use std::fmt;
 
@@ -6,7 +6,7 @@ use perturb_policy::ActionKind;
 use perturb_protocol::proto;
 use serde::{Deserialize, Serialize};
 
-/// What an environment must still be for a policy to fit it.
+/// The properties of an environment that a policy depends on.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EnvironmentSummary {
@@ -36,7 +36,7 @@ pub struct EnvironmentSummary {
 pub struct Changed {
     /// The environment.
     pub environment: String,
-    /// What differs.
+    /// The name of the property that differs.
     pub what: &'static str,
     /// In training.
     pub trained: String,
@@ -45,8 +45,8 @@ pub struct Changed {
 }
 
 impl EnvironmentSummary {
-    /// What a checkpoint keeps of an environment; `None` if its action space is not given.
-    pub fn of(environment: &proto::Environment) -> Option<Self> {
+    /// Returns the summary of an environment; `None` if its action space is not given.
+    pub fn from_environment(environment: &proto::Environment) -> Option<Self> {
         let action = match environment.action.as_ref()?.kind.as_ref()? {
             proto::action_space::Kind::Discrete(discrete) => ActionKind::Discrete { n: discrete.names.len() },
             proto::action_space::Kind::Continuous(box_) => ActionKind::Continuous { size: box_.channels.len() },

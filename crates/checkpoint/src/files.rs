@@ -31,7 +31,7 @@ impl ArraysFile {
         Ok(Self { file, bytes: content.len() as u64, crc32c })
     }
 
-    /// Where it is: in the directory, whatever its name says.
+    /// Returns the file's path. The file is always in `directory`, whatever folder its name has.
     pub fn path(&self, directory: &Path) -> PathBuf {
         directory.join(Path::new(&self.file).file_name().unwrap_or_default())
     }
@@ -50,7 +50,7 @@ impl ArraysFile {
         }
     }
 
-    /// Its content.
+    /// Reads the file and checks its length and checksum.
     ///
     /// # Errors
     /// [`CheckpointError`], also if it is not what was written.

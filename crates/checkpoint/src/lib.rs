@@ -14,7 +14,7 @@ mod named;
 
 use std::path::{Path, PathBuf};
 
-use perturb_files::checksum::Sealed;
+use perturb_files::checksum::WithChecksum;
 use perturb_files::{FileError, checksum, has_file, read_if_there, write_atomically};
 use perturb_policy::{Inputs, Normalisers, ObservationNormaliser, Player, PolicySpec, RewardNormaliser, Role, Weights};
 use perturb_protocol::proto;
@@ -28,8 +28,8 @@ pub use self::environment::{Changed, EnvironmentSummary};
 use self::files::remove_others;
 pub use self::files::{ArraysFile, damaged};
 
-/// Of the JSON's layout; raised when older programs could misread it. Format 1 says beside the configuration what follows
-/// from it, formats 1 and 2 have no checksum.
+/// Format of the JSON document; raised when older programs could misread it. Format 1 also stores what follows from the
+/// configuration. Formats 1 and 2 have no checksum.
 const FORMAT_VERSION: u32 = 3;
 /// The first with a checksum.
 const SEALED: u32 = 3;
@@ -53,13 +53,13 @@ pub struct Checkpoint {
 /// Everything in a checkpoint but the weights.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct State {
-    /// What the environment was like.
+    /// The environment at the time of training.
     pub environment_spec: EnvironmentSummary,
     /// The statistics of observations; `None` if they were not normalised.
     pub observation_normaliser: Option<ObservationNormaliser>,
     /// The statistics of rewards; `None` if they were not normalised.
     pub reward_normaliser: Option<RewardNormaliser>,
-    /// How far the training had come.
+    /// The progress of the training.
     pub counters: Counters,
     /// The training's configuration, flat, as in `config.toml`.
     pub config: TrainConfig,
@@ -69,18 +69,18 @@ pub struct State {
     pub commits: Vec<String>,
 }
 
-/// What a training needs beside its policy to go on.
+/// The state of a training beside its policy, from which it resumes.
 #[derive(Clone, Debug)]
 pub struct Resume {
-    /// Its file of arrays, whose name begins with [`RESUME_PREFIX`].
+    /// The file of arrays, whose name begins with [`RESUME_PREFIX`].
     pub arrays: ArraysFile,
-    /// What stands in `checkpoint.json`.
+    /// The entry in `checkpoint.json`.
     pub document: serde_json::Value,
 }
 
 /// `checkpoint.json`.
 #[derive(Serialize, Deserialize)]
-struct Document {
+struct CheckpointDocument {
     format_version: u32,
     weights: ArraysFile,
     /// Not looked into for testing.
@@ -104,17 +104,17 @@ pub enum CheckpointError {
         path.display()
     )]
     Missing {
-        /// What was given.
+        /// The given path.
         path: PathBuf,
     },
     /// A name is the beginning of several.
     #[error("`{name}` could be any of these policies in {}, give the name or the path of one: {}", folder.display(), names.join(", "))]
     Several {
-        /// What was given.
+        /// The given name.
         name: String,
-        /// Where it was looked for.
+        /// The folder that was searched.
         folder: PathBuf,
-        /// What begins so.
+        /// The policies whose names match.
         names: Vec<String>,
     },
     /// A file is damaged.
@@ -122,7 +122,7 @@ pub enum CheckpointError {
     Damaged {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The fault.
         reason: String,
     },
     /// Another program wrote it, which may go on with it.
@@ -134,7 +134,7 @@ pub enum CheckpointError {
     Newer {
         /// The file.
         path: PathBuf,
-        /// Its format.
+        /// The format of the file.
         format: u64,
     },
     /// There is a policy, but not the state of its training.
@@ -149,7 +149,7 @@ pub enum CheckpointError {
     },
 }
 
-/// What has gone well unless it was a [`CheckpointError`].
+/// A result with a [`CheckpointError`].
 pub type Result<T> = std::result::Result<T, CheckpointError>;
 
 impl Checkpoint {
@@ -165,14 +165,14 @@ impl Checkpoint {
         let weights = ArraysFile::write(directory, WEIGHTS_PREFIX, iterations, &weights)?;
         let weights_file = weights.file.clone();
 
-        let document = Document {
+        let document = CheckpointDocument {
             format_version: FORMAT_VERSION,
             weights,
             resume,
             rest: serde_json::to_value(&self.state).map_err(|error| damaged(directory, error.to_string()))?,
         };
         let not_written = |error: serde_json::Error| damaged(directory, error.to_string());
-        let sealed = Sealed::new(&document).map_err(not_written)?;
+        let sealed = WithChecksum::new(&document).map_err(not_written)?;
         let json = serde_json::to_vec_pretty(&sealed).map_err(not_written)?;
         write_atomically(&directory.join(JSON), &json)?;
         let current = [weights_file.as_str(), resume_file.as_deref().unwrap_or_default()];
@@ -186,8 +186,8 @@ impl Checkpoint {
     /// [`CheckpointError`], which names the file.
     pub fn load(path: &Path) -> Result<Self> {
         let named = named::find(path)?;
-        let (directory, document) = Document::read(named.as_deref().unwrap_or(path))?;
-        Self::of(&directory, document)
+        let (directory, document) = CheckpointDocument::read(named.as_deref().unwrap_or(path))?;
+        Self::from_document(&directory, document)
     }
 
     /// Reads the checkpoint in `path`, or in its folder `checkpoint`, with where that is and what its training needs to go
@@ -196,16 +196,16 @@ impl Checkpoint {
     /// # Errors
     /// [`CheckpointError`], which names the file.
     pub fn load_resumable(path: &Path) -> Result<(Self, PathBuf, serde_json::Value)> {
-        let (directory, mut document) = Document::read(path)?;
+        let (directory, mut document) = CheckpointDocument::read(path)?;
         let resume = document.resume.take();
-        let checkpoint = Self::of(&directory, document)?;
+        let checkpoint = Self::from_document(&directory, document)?;
         let resume = resume.ok_or_else(|| CheckpointError::NotResumable { path: directory.clone() })?;
         Ok((checkpoint, directory, resume))
     }
 
-    /// What `document` in `directory` describes.
-    fn of(directory: &Path, document: Document) -> Result<Self> {
-        let state = State::of(directory, document.rest)?;
+    /// Reads the policy that `document` in `directory` describes.
+    fn from_document(directory: &Path, document: CheckpointDocument) -> Result<Self> {
+        let state = State::from_document(directory, document.rest)?;
         let policy = state.policy();
         let bytes = document.weights.read(directory)?;
         let file = document.weights.path(directory);
@@ -259,8 +259,8 @@ impl State {
     /// [`CheckpointError`], which names the file.
     pub fn load(path: &Path) -> Result<Self> {
         let load = || {
-            let (directory, document) = Document::read(path)?;
-            let state = Self::of(&directory, document.rest)?;
+            let (directory, document) = CheckpointDocument::read(path)?;
+            let state = Self::from_document(&directory, document.rest)?;
             document.weights.require(&directory)?;
             Ok(state)
         };
@@ -271,8 +271,8 @@ impl State {
         }
     }
 
-    /// What `checkpoint.json` in `directory` says.
-    fn of(directory: &Path, document: serde_json::Value) -> Result<Self> {
+    /// Reads the state from the document of `checkpoint.json` in `directory`.
+    fn from_document(directory: &Path, document: serde_json::Value) -> Result<Self> {
         let json = directory.join(JSON);
         let state: Self = serde_json::from_value(document)
             .map_err(|error| damaged(&json, format!("it is not understood: {error}")))?;
@@ -305,7 +305,7 @@ impl State {
     /// [`Changed`], with the first difference.
     pub fn check_unchanged(&self, served: &proto::Environment) -> std::result::Result<(), Changed> {
         let trained = &self.environment_spec;
-        let (what, trained, served) = match EnvironmentSummary::of(served) {
+        let (what, trained, served) = match EnvironmentSummary::from_environment(served) {
             None => ("actions", format!("{:?}", trained.action), "none".into()),
             Some(served) => match trained.difference(&served) {
                 None => return Ok(()),
@@ -315,13 +315,13 @@ impl State {
         Err(Changed { environment: self.config.common.environment.clone(), what, trained, served })
     }
 
-    /// How many entries at the end of an observation are parameters.
+    /// Returns the number of parameters at the end of an observation.
     fn parameters_seen(&self) -> usize {
         if self.config.common.observe.sees_parameters() { self.environment_spec.parameters.len() } else { 0 }
     }
 
-    /// What normalises observations in training from its beginning, if they are normalised. Parameters that are seen
-    /// are scaled already.
+    /// Returns a new normaliser of observations, if they are normalised. Observed parameters are not normalised, since
+    /// they are scaled already.
     pub fn fresh_normaliser(&self) -> Option<ObservationNormaliser> {
         let (size, parameters) = (self.environment_spec.observation.len(), self.parameters_seen());
         let fresh = || ObservationNormaliser::new(size.saturating_sub(parameters)).leaving_alone(parameters);
@@ -346,14 +346,14 @@ impl State {
         shape(self.inputs(1).size(), self.environment_spec.action)
     }
 
-    /// What the policy gets to see of `n_envs` environments at the start of a trial.
+    /// Returns the policy's inputs for `n_envs` environments at the start of a trial.
     pub fn inputs(&self, n_envs: usize) -> Inputs {
         let EnvironmentSummary { observation, action, .. } = &self.environment_spec;
         Inputs::new(observation.len(), *action, n_envs, self.config.settings.has_trials())
     }
 }
 
-impl Document {
+impl CheckpointDocument {
     /// Reads `checkpoint.json` in `path`, or in its folder `checkpoint`; gives the folder, too.
     fn read(path: &Path) -> Result<(PathBuf, Self)> {
         let directory = match has_file(&path.join(JSON))? {
@@ -373,7 +373,7 @@ impl Document {
         }
         let document: Self = serde_json::from_value(value).map_err(not_understood)?;
         if sealed.is_err() || (document.format_version >= SEALED && sealed == Ok(false)) {
-            return Err(damaged(&json, format!("{}; give a copy that is whole", checksum::BROKEN)));
+            return Err(damaged(&json, format!("{}; give a copy that is whole", checksum::CHECKSUM_MISMATCH)));
         }
         Ok((directory, document))
     }

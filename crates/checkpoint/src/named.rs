@@ -7,16 +7,16 @@ use perturb_protocol::names;
 
 use super::{CheckpointError, JSON, Result};
 
-/// Where they are, unless this variable says otherwise.
+/// The folder of the policies, unless [`VARIABLE`] is set.
 const FOLDER: &str = "results";
 const VARIABLE: &str = "PERTURB_RESULTS";
 /// Folders between it and `cells`, at most.
 const DEPTH: usize = 3;
-/// Letters that a name may have more or fewer than the one that it is taken for.
-const MOST_SLIPS: usize = 3;
+/// Maximum difference in length between a name and a suggestion.
+const MAX_LENGTH_DIFFERENCE: usize = 3;
 
-/// The checkpoint that `path` stands for, if it does not hold one itself: that in the folder of a cell, which may be given
-/// as it is found below `results/`, or that of the cell whose id is `path` or alone begins with it, in either case.
+/// Finds the checkpoint that `path` stands for, if `path` holds none itself. `path` may be the folder of a cell, also
+/// relative to `results/`, or the id of a cell, or a unique beginning of an id. Upper and lower case are equal.
 ///
 /// # Errors
 /// [`CheckpointError::Several`] with the cells whose ids begin so or, if none does, are much like it.
@@ -56,12 +56,12 @@ fn find_below(folder: &Path, path: &Path) -> Result<Option<PathBuf>> {
     if meant.is_empty() {
         let nearest = names::closest(name, all.iter().map(|kept| kept.id.as_str()));
         // The beginnings of all are alike: a folder that is not there, `hopper_run`, is no slip in an id.
-        meant = of(&|id| nearest == Some(id) && id.len().abs_diff(name.len()) <= MOST_SLIPS);
+        meant = of(&|id| nearest == Some(id) && id.len().abs_diff(name.len()) <= MAX_LENGTH_DIFFERENCE);
     }
     if meant.is_empty() {
         return Ok(None);
     }
-    let shown = |kept: &&Kept| kept.cell.strip_prefix(folder).unwrap_or(&kept.cell).display().to_string();
+    let shown = |kept: &&StoredPolicy| kept.cell.strip_prefix(folder).unwrap_or(&kept.cell).display().to_string();
     let names = meant.iter().map(shown).collect();
     Err(CheckpointError::Several { name: name.to_owned(), folder: folder.to_owned(), names })
 }
@@ -72,18 +72,18 @@ fn holds_checkpoint(path: &Path) -> Result<bool> {
 }
 
 /// A cell whose training was kept.
-struct Kept {
+struct StoredPolicy {
     id: String,
     cell: PathBuf,
     checkpoint: PathBuf,
 }
 
 /// Adds the cells that have a checkpoint, in the order of their paths. What cannot be listed has none.
-fn collect(folder: &Path, depth: usize, found: &mut Vec<Kept>) {
+fn collect(folder: &Path, depth: usize, found: &mut Vec<StoredPolicy>) {
     let kept = |cell: PathBuf| {
         let id = cell.file_name()?.to_str()?.to_owned();
         let checkpoint = cell.join("training/checkpoint");
-        checkpoint.join(JSON).is_file().then_some(Kept { id, cell, checkpoint })
+        checkpoint.join(JSON).is_file().then_some(StoredPolicy { id, cell, checkpoint })
     };
     for path in list(folder).unwrap_or_default() {
         if path.ends_with("cells") {
@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn the_folder_of_a_cell_stands_for_its_policy_with_and_without_what_is_before_it() {
+    fn cell_folder_names_its_policy_with_any_prefix() {
         let folder = tempfile::tempdir().unwrap();
         let cell = "a/cells/Hopper-R-1";
         let training = folder.path().join(cell).join("training");
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn a_name_that_is_near_is_refused_with_the_one_that_was_probably_meant() {
+    fn near_name_is_refused_with_a_suggestion() {
         let folder = tempfile::tempdir().unwrap();
         for cell in ["CartPole-ppo-ff-D-9bd6546b-s7", "CartPole-ppo-ff-E-9bd6546b-s7"] {
             std::fs::create_dir_all(folder.path().join("a/cells").join(cell).join("training/checkpoint")).unwrap();

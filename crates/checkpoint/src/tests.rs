@@ -65,7 +65,7 @@ fn what_the_learner_wrote_is_read_and_named_as_it_names_it() {
 }
 
 #[test]
-fn what_is_saved_is_loaded_bit_for_bit_from_the_run_or_its_folder() {
+fn checkpoint_loads_bit_for_bit_from_run_or_folder() {
     let run = tempfile::tempdir().unwrap();
     for seed in [1, 2] {
         let saved = checkpoint(seed, seed);
@@ -174,7 +174,7 @@ fn statistics_that_cannot_be_are_refused() {
         let mut document: serde_json::Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
         *document.pointer_mut(pointer).unwrap() = value;
         checksum::open(&mut document).unwrap_err();
-        fs::write(&path, serde_json::to_vec(&Sealed::new(&document).unwrap()).unwrap()).unwrap();
+        fs::write(&path, serde_json::to_vec(&WithChecksum::new(&document).unwrap()).unwrap()).unwrap();
         let error = Checkpoint::load(directory.path()).unwrap_err();
         assert!(matches!(error, CheckpointError::Damaged { .. }), "{error}");
         error.to_string()
@@ -210,7 +210,7 @@ fn statistics_that_cannot_be_are_refused() {
 }
 
 #[test]
-fn a_changed_environment_is_told_from_the_one_that_was_trained_in() {
+fn changed_environment_is_detected() {
     let trained = checkpoint(1, 1).state.environment_spec;
     assert_eq!(trained.difference(&trained), None);
     let mut served = trained.clone();

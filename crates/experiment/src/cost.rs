@@ -1,4 +1,4 @@
-//! What a plan costs, from short measurements.
+//! The cost of a plan, from short measurements.
 //!
 //! A step costs what its environment costs plus what its method costs. So each environment is measured with one
 //! method, and each method in one environment, in groups as large as those of a run; the other pairs follow. How many
@@ -26,20 +26,20 @@ pub struct Speed {
 pub struct Measurement {
     /// By its name in the catalogue.
     pub environment: String,
-    /// What learned.
+    /// The measured method.
     pub method: Method,
-    /// How many trainings there were.
+    /// The number of trainings in the group.
     pub cells: usize,
-    /// How fast it was.
+    /// The measured speed.
     pub speed: Speed,
 }
 
-/// What cells cost at most, if every episode goes on to the step limit. Seconds are those of processes.
+/// Upper bound of the cost of cells, if every episode lasts until the step limit. Seconds are those of processes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Estimate {
-    /// Of EPOpt, also those that it does not learn from.
+    /// Steps of training. With EPOpt, all generated episodes count.
     pub training_steps: f64,
-    /// Of RL², those of whole trials.
+    /// Steps of tests. With RL², whole trials count.
     pub testing_steps: f64,
     /// With rollouts and updates.
     pub training_seconds: f64,
@@ -48,7 +48,7 @@ pub struct Estimate {
 }
 
 impl Estimate {
-    /// Of trainings and tests.
+    /// Returns the seconds of trainings and tests.
     pub fn seconds(&self) -> f64 {
         self.training_seconds + self.testing_seconds
     }
@@ -68,7 +68,7 @@ impl Sum for Estimate {
 /// The groups of trainings to measure for `cells`, places in the plan: of each environment with its first method, and of
 /// each method in its first environment, as many cells as are in a group of a run, evenly from all over the grid. The
 /// one in its middle is the first.
-pub fn representatives<'a>(plan: &'a Plan, cells: &[usize], grouping: Grouping) -> Vec<Vec<&'a Cell>> {
+pub fn benchmark_cells<'a>(plan: &'a Plan, cells: &[usize], grouping: Grouping) -> Vec<Vec<&'a Cell>> {
     let groups = plan.groups(cells, grouping);
     let pair_at = |&cell: &usize| pair(&plan.cells[cell]);
     let mut chosen: Vec<(&str, Method)> = Vec::new();
@@ -93,8 +93,8 @@ fn pair(cell: &Cell) -> (&str, Method) {
     (&cell.config.common.environment, cell.method())
 }
 
-/// What each cell of `plan` costs at most, in its order, given measurements of its [`representatives`] and the step limit
-/// of each environment.
+/// Returns the upper bound of each cell's cost in the plan's order, from measurements of its [`benchmark_cells`] and
+/// the step limit of each environment.
 pub fn estimates(plan: &Plan, measurements: &[Measurement], step_limits: &HashMap<&str, u32>) -> Vec<Estimate> {
     let mut speeds: HashMap<(&str, Method), Speed> = HashMap::new();
     let estimate = |cell| {
@@ -113,8 +113,8 @@ pub fn estimates(plan: &Plan, measurements: &[Measurement], step_limits: &HashMa
     plan.cells.iter().map(estimate).collect()
 }
 
-/// How many episodes a training has had when its budget counts so many: more if it learns from the worst of them only, none
-/// if nothing learns.
+/// Returns the number of episodes that a training has generated when its budget counts `counted`. The number is higher
+/// if the algorithm learns from the worst episodes only, and 0 if nothing learns.
 pub fn generated_episodes(config: &TrainConfig, counted: u64) -> f64 {
     if config.settings.is_random() {
         return 0.0;
@@ -125,7 +125,7 @@ pub fn generated_episodes(config: &TrainConfig, counted: u64) -> f64 {
     full + (budget - full) / epopt.epsilon
 }
 
-/// How many episodes the tests of a cell have, of RL² those of whole trials.
+/// Returns the number of episodes in the tests of a cell. With RL², all episodes of a trial count.
 pub fn tested_episodes(cell: &Cell) -> f64 {
     let times = cell.tests.sets.len() as f64 * (1.0 + cell.tests.marks.len() as f64);
     let trials = cell.tests.episodes as f64 * times + cell.tests.selection.unwrap_or_default() as f64;
@@ -176,7 +176,7 @@ mod tests {
         let plan = plan();
         let all: Vec<usize> = (0..plan.cells.len()).collect();
         let chosen = |cells: &[usize], most| -> Vec<(String, Vec<i64>)> {
-            let groups = representatives(&plan, cells, Grouping { most, at_a_time: 1 });
+            let groups = benchmark_cells(&plan, cells, Grouping { max_cells: most, at_a_time: 1 });
             let steps = |cell: &&Cell| cell.config.table()["n_steps"].as_integer().unwrap_or_default();
             let name = |cell: &Cell| format!("{} {}", cell.config.common.environment, cell.method());
             groups.iter().map(|group| (name(group[0]), group.iter().map(steps).collect())).collect()
@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn episodes_that_are_not_learned_from_and_episodes_of_a_trial_cost_too() {
+    fn unlearned_episodes_and_whole_trials_count_as_cost() {
         let text = "environments = ['CartPole']\nversions = ['D']\ntest_versions = ['R']\ntest_episodes = 10
             settings = { episodes = 15000 }
             [[algorithm]]\nname = 'epopt-ppo'\narchitectures = ['ff']\nsettings = { epsilon = 0.1 }

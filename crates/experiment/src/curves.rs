@@ -12,38 +12,38 @@ use perturb_settings::Method;
 use crate::folder::{Folder, FolderError};
 use crate::selection::MethodResults;
 
-/// There is a point for so many episodes of the shortest run …
-const LEAST_EPISODES: usize = 20;
-/// … and at most so many points.
-const MOST_POINTS: usize = 100;
+/// Minimum number of episodes of the shortest run for each point.
+const MIN_EPISODES_PER_POINT: usize = 20;
+/// Maximum number of points of a curve.
+const MAX_POINTS: usize = 100;
 
 /// By what trainings are compared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Footing {
+pub enum BudgetAxis {
     /// Episodes that ended, also those that EPOpt generates and does not learn from.
     Episodes,
     /// Steps of these episodes, of all environments together.
     Steps,
 }
 
-impl Footing {
+impl BudgetAxis {
     /// Both.
-    pub const ALL: [Footing; 2] = [Footing::Episodes, Footing::Steps];
+    pub const ALL: [BudgetAxis; 2] = [BudgetAxis::Episodes, BudgetAxis::Steps];
 
-    /// What an episode adds.
-    fn of(self, episode: &Episode) -> f64 {
+    /// Returns the share of the budget that an episode takes.
+    fn weight(self, episode: &MonitorEpisode) -> f64 {
         match self {
-            Footing::Episodes => 1.0,
-            Footing::Steps => episode.length,
+            BudgetAxis::Episodes => 1.0,
+            BudgetAxis::Steps => episode.length,
         }
     }
 }
 
-impl std::fmt::Display for Footing {
+impl std::fmt::Display for BudgetAxis {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.pad(match self {
-            Footing::Episodes => "episodes",
-            Footing::Steps => "steps",
+            BudgetAxis::Episodes => "episodes",
+            BudgetAxis::Steps => "steps",
         })
     }
 }
@@ -51,7 +51,7 @@ impl std::fmt::Display for Footing {
 /// The curves of all methods in an environment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EnvironmentCurves {
-    /// Its name.
+    /// The environment's name.
     pub environment: String,
     /// For each method and training version that has a finished training.
     pub curves: Vec<Curve>,
@@ -60,24 +60,24 @@ pub struct EnvironmentCurves {
 /// A method's curve on a training version.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Curve {
-    /// What was trained.
+    /// The method.
     pub method: Method,
-    /// Where it was trained.
+    /// The version of the training.
     pub version: Version,
-    /// How long its trainings were, and their points, by episodes and by steps.
-    lines: [Line; 2],
+    /// The curve over episodes and over steps.
+    lines: [AxisCurve; 2],
 }
 
-/// A curve by one [`Footing`].
+/// A curve by one [`BudgetAxis`].
 #[derive(Clone, Debug, Default, PartialEq)]
-struct Line {
+struct AxisCurve {
     total: f64,
-    points: Vec<Point>,
+    points: Vec<CurvePoint>,
 }
 
 /// Part of a training.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Point {
+pub struct CurvePoint {
     /// Episodes, or steps, in the middle of it; mean over runs.
     pub progress: f64,
     /// The mean undiscounted return of the episodes that had their middle in it, over runs.
@@ -88,7 +88,7 @@ pub struct Point {
 
 /// A line of `monitor.csv`.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Episode {
+struct MonitorEpisode {
     episode_return: f64,
     /// Steps.
     length: f64,
@@ -97,8 +97,8 @@ struct Episode {
 }
 
 impl Curve {
-    fn of(method: &Method, version: Version, runs: &[Vec<Episode>]) -> Self {
-        Self { method: method.clone(), version, lines: Footing::ALL.map(|footing| line(runs, footing)) }
+    fn from_runs(method: &Method, version: Version, runs: &[Vec<MonitorEpisode>]) -> Self {
+        Self { method: method.clone(), version, lines: BudgetAxis::ALL.map(|footing| line(runs, footing)) }
     }
 
     /// Without points.
@@ -107,24 +107,24 @@ impl Curve {
     }
 
     /// Adds a point after all others.
-    pub fn add(&mut self, by: Footing, point: Point) {
+    pub fn add(&mut self, by: BudgetAxis, point: CurvePoint) {
         let line = &mut self.lines[by as usize];
         line.total = point.progress;
         line.points.push(point);
     }
 
     /// In order.
-    pub fn points(&self, by: Footing) -> &[Point] {
+    pub fn points(&self, by: BudgetAxis) -> &[CurvePoint] {
         &self.lines[by as usize].points
     }
 
-    /// How long a training was: episodes or steps, mean over runs.
-    pub fn total(&self, by: Footing) -> f64 {
+    /// Returns the length of a training, episodes or steps, as the mean over runs.
+    pub fn total(&self, by: BudgetAxis) -> f64 {
         self.lines[by as usize].total
     }
 
     /// The last point that is not beyond `progress`, or the first of all.
-    pub fn at(&self, by: Footing, progress: f64) -> Option<&Point> {
+    pub fn at(&self, by: BudgetAxis, progress: f64) -> Option<&CurvePoint> {
         let points = self.points(by);
         points.get(points.partition_point(|point| point.progress <= progress).saturating_sub(1))
     }
@@ -142,7 +142,7 @@ pub fn read_curves(selections: &[MethodResults<'_>], folder: &Folder) -> Result<
             for version in Version::KNOWN {
                 let runs = read_runs(selection, version, folder)?;
                 if !runs.is_empty() {
-                    curves.push(Curve::of(&selection.method, version, &runs));
+                    curves.push(Curve::from_runs(&selection.method, version, &runs));
                 }
             }
         }
@@ -156,7 +156,7 @@ fn read_runs(
     selection: &MethodResults<'_>,
     version: Version,
     folder: &Folder,
-) -> Result<Vec<Vec<Episode>>, FolderError> {
+) -> Result<Vec<Vec<MonitorEpisode>>, FolderError> {
     let mut runs = Vec::new();
     for selected in selection.runs.values().filter_map(|run| run.cell_trained_on(TrainedOn::Version(version))) {
         let episodes = read_monitor(&folder.cell(&selected.cell.id).training().join("monitor.csv"))?;
@@ -168,14 +168,14 @@ fn read_runs(
 }
 
 /// The episodes in the order in which they ended; none without a file.
-fn read_monitor(path: &Path) -> Result<Vec<Episode>, FolderError> {
+fn read_monitor(path: &Path) -> Result<Vec<MonitorEpisode>, FolderError> {
     let Some(content) = read_if_there(path)? else { return Ok(Vec::new()) };
     let damaged = |error: AnyError| FolderError::Damaged { path: path.to_owned(), reason: error.to_string() };
     parse_monitor(&content).map_err(damaged)
 }
 
-/// Of a study's millions of lines only three fields are looked at.
-fn parse_monitor(content: &[u8]) -> Result<Vec<Episode>, AnyError> {
+/// Parses the three columns that the curves need.
+fn parse_monitor(content: &[u8]) -> Result<Vec<MonitorEpisode>, AnyError> {
     let mut reader = csv::ReaderBuilder::new().comment(Some(b'#')).from_reader(content);
     let names = reader.headers()?.clone();
     let place = |name: &str| names.iter().position(|known| known == name).ok_or_else(|| format!("no column {name}"));
@@ -188,40 +188,40 @@ fn parse_monitor(content: &[u8]) -> Result<Vec<Episode>, AnyError> {
         };
         let [episode_return, length, success] = places;
         let (episode_return, length, success) = (number(episode_return)?, number(length)?, number(success)?);
-        episodes.push(Episode { episode_return, length, success });
+        episodes.push(MonitorEpisode { episode_return, length, success });
     }
     Ok(episodes)
 }
 
 /// Parts each run evenly by `footing`, and averages each part over runs. What is averaged are equal shares of a training,
 /// since trainings end some episodes after their budget. A part in which no episode had its middle has no point.
-fn line(runs: &[Vec<Episode>], footing: Footing) -> Line {
+fn line(runs: &[Vec<MonitorEpisode>], footing: BudgetAxis) -> AxisCurve {
     let shortest = runs.iter().map(Vec::len).min().unwrap_or_default();
-    let count = (shortest / LEAST_EPISODES).clamp(usize::from(shortest > 0), MOST_POINTS);
-    let totals: Vec<f64> = runs.iter().map(|run| run.iter().map(|episode| footing.of(episode)).sum()).collect();
-    let total = Summary::of(&totals).map_or(0.0, |total| total.mean);
-    let parts: Vec<Vec<&[Episode]>> =
+    let count = (shortest / MIN_EPISODES_PER_POINT).clamp(usize::from(shortest > 0), MAX_POINTS);
+    let totals: Vec<f64> = runs.iter().map(|run| run.iter().map(|episode| footing.weight(episode)).sum()).collect();
+    let total = Summary::from_values(&totals).map_or(0.0, |total| total.mean);
+    let parts: Vec<Vec<&[MonitorEpisode]>> =
         runs.iter().zip(&totals).map(|(run, total)| split(run, count, *total, footing)).collect();
     let point = |part: usize| {
-        let over_runs = |number: fn(&Episode) -> f64| {
+        let over_runs = |number: fn(&MonitorEpisode) -> f64| {
             let there = parts.iter().map(|run| run[part]).filter(|part| !part.is_empty());
-            Summary::of(&there.map(|part| mean(part.iter().map(number))).collect::<Vec<_>>())
+            Summary::from_values(&there.map(|part| mean(part.iter().map(number))).collect::<Vec<_>>())
         };
-        Some(Point {
+        Some(CurvePoint {
             progress: (part as f64 + 0.5) / count as f64 * total,
             episode_return: over_runs(|episode| episode.episode_return)?,
             success: over_runs(|episode| 100.0 * episode.success)?,
         })
     };
-    Line { total, points: (0..count).filter_map(point).collect() }
+    AxisCurve { total, points: (0..count).filter_map(point).collect() }
 }
 
 /// `count` parts of `run`, by where the middles of its episodes are.
-fn split(run: &[Episode], count: usize, total: f64, footing: Footing) -> Vec<&[Episode]> {
+fn split(run: &[MonitorEpisode], count: usize, total: f64, footing: BudgetAxis) -> Vec<&[MonitorEpisode]> {
     let mut before = 0.0;
     let mut part_of = Vec::with_capacity(run.len());
     for episode in run {
-        let own = footing.of(episode);
+        let own = footing.weight(episode);
         part_of.push(((before + own / 2.0) / total * count as f64) as usize);
         before += own;
     }
@@ -238,8 +238,8 @@ mod tests {
 
     const PLAN: &str = "environments = ['CartPole']\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
 
-    fn episodes(count: usize, of: impl Fn(usize) -> (f64, f64, f64)) -> Vec<Episode> {
-        let episode = |(episode_return, length, success)| Episode { episode_return, length, success };
+    fn episodes(count: usize, of: impl Fn(usize) -> (f64, f64, f64)) -> Vec<MonitorEpisode> {
+        let episode = |(episode_return, length, success)| MonitorEpisode { episode_return, length, success };
         (0..count).map(|i| episode(of(i))).collect()
     }
 
@@ -248,13 +248,13 @@ mod tests {
         // 40 and 43 episodes: two parts of 20 and 20, or 21 and 22.
         let first = episodes(40, |i| if i < 20 { (1.0, 1.0, 0.0) } else { (3.0, 1.0, 1.0) });
         let second = episodes(43, |i| if i < 21 { (5.0, 1.0, 1.0) } else { (5.0, 1.0, 0.0) });
-        let point = |progress: f64, mean: f64, std: f64| Point {
+        let point = |progress: f64, mean: f64, std: f64| CurvePoint {
             progress,
             episode_return: Summary { mean, std: Some(std), runs: 2 },
             success: Summary { mean: 50.0, std: Some(50.0), runs: 2 },
         };
         let expected = [point(10.375, 3.0, 2.0), point(31.125, 4.0, 1.0)];
-        assert_eq!(line(&[first, second], Footing::Episodes), Line { total: 41.5, points: expected.into() });
+        assert_eq!(line(&[first, second], BudgetAxis::Episodes), AxisCurve { total: 41.5, points: expected.into() });
     }
 
     #[test]
@@ -264,9 +264,9 @@ mod tests {
         let run = episodes(40, |i| if i < 30 { (0.0, 1.0, 0.0) } else { (1.0, 27.0, 1.0) });
         let rates =
             |by| line(std::slice::from_ref(&run), by).points.iter().map(|point| point.success.mean).collect::<Vec<_>>();
-        assert_eq!(rates(Footing::Episodes), [0.0, 50.0]);
-        assert_eq!(rates(Footing::Steps), [100.0 * 4.0 / 34.0, 100.0]);
-        assert_eq!(line(&[run], Footing::Steps).total, 300.0);
+        assert_eq!(rates(BudgetAxis::Episodes), [0.0, 50.0]);
+        assert_eq!(rates(BudgetAxis::Steps), [100.0 * 4.0 / 34.0, 100.0]);
+        assert_eq!(line(&[run], BudgetAxis::Steps).total, 300.0);
     }
 
     #[test]
@@ -274,10 +274,10 @@ mod tests {
         // Of 60 episodes the last has most of the steps: its middle is in the second part of three.
         let run = episodes(60, |i| (0.0, if i < 59 { 1.0 } else { 121.0 }, 0.0));
         let method = Plan::parse("test", PLAN.into()).unwrap().methods().remove(0);
-        let curve = Curve::of(&method, Version::D, &[run]);
+        let curve = Curve::from_runs(&method, Version::D, &[run]);
         let places = |by| curve.points(by).iter().map(|point| point.progress).collect::<Vec<_>>();
-        assert_eq!(places(Footing::Steps), [30.0, 90.0]);
-        let at = |progress: f64| curve.at(Footing::Steps, progress).unwrap().progress;
+        assert_eq!(places(BudgetAxis::Steps), [30.0, 90.0]);
+        let at = |progress: f64| curve.at(BudgetAxis::Steps, progress).unwrap().progress;
         assert_eq!([0.0, 89.9, 90.0, 999.0].map(at), [30.0, 30.0, 90.0, 90.0]);
     }
 
@@ -288,14 +288,14 @@ mod tests {
     #[case(400, 20)]
     #[case(15_008, 100)]
     fn curves_have_a_hundred_points_at_most_and_one_at_least(#[case] count: usize, #[case] expected: usize) {
-        for by in Footing::ALL {
+        for by in BudgetAxis::ALL {
             assert_eq!(line(&[episodes(count, |_| (0.0, 3.0, 0.0))], by).points.len(), expected);
         }
     }
 
     #[test]
     fn without_runs_there_is_no_curve() {
-        assert_eq!(line(&[], Footing::Steps), Line::default());
+        assert_eq!(line(&[], BudgetAxis::Steps), AxisCurve::default());
     }
 
     #[test]

@@ -9,7 +9,7 @@ const PLAN: &str = "environments = ['CartPole', 'Pendulum']\nversions = ['D']\nr
     [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
 
 #[test]
-fn agents_are_rows_behind_those_of_their_environment_and_their_assessments_are_runs() {
+fn external_agents_follow_their_environment_as_rows() {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
     let results = fixture::results(&plan, |_| Some(([90.0; 3], 1.0)));
     let mut selections = results.select();

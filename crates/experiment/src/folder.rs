@@ -1,4 +1,4 @@
-//! Where an experiment is kept.
+//! The folder of an experiment.
 //!
 //! ```text
 //! DIR/plan.toml              the experiment file
@@ -21,10 +21,10 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use perturb_checkpoint::Counters;
-use perturb_files::checksum::Sealed;
+use perturb_files::checksum::WithChecksum;
 use perturb_files::{self as files, FileError, Lock, checksum, write_atomically};
 use perturb_protocol::Version;
-use perturb_records::{Agreement, TestResult};
+use perturb_records::{ParameterCheck, TestResult};
 use perturb_settings::Method;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -32,10 +32,10 @@ use serde_json::Value;
 
 use crate::plan::{Cell, Plan};
 
-/// Of `result.json`; raised when older programs could misread it.
+/// Format of `result.json`; raised when older programs could misread it.
 const FORMAT_VERSION: u32 = 1;
 /// A record of a cell is shorter, bytes.
-const LONGEST: u64 = 64 << 20;
+const MAX_BYTES: u64 = 64 << 20;
 
 /// The folder of an experiment.
 #[derive(Clone, Debug)]
@@ -51,19 +51,19 @@ pub struct CellFolder {
 
 /// Tells one record of a failure from the next, even if both say the same.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct FailureMark {
-    /// The file's number, which another file may get when this one is deleted …
+pub struct FailureId {
+    /// The inode. Another file may get it after this one is deleted.
     inode: u64,
-    /// … and when it was written, s and ns.
+    /// The time of the last write, s and ns.
     written: (i64, i64),
 }
 
-/// How far a cell is.
+/// The state of a cell.
 #[derive(Clone, Debug, PartialEq)]
 pub enum CellState {
     /// There is a result.
     Done(Box<CellResult>),
-    /// It failed.
+    /// The cell failed.
     Failed(Failure),
     /// Neither.
     Missing,
@@ -73,66 +73,66 @@ pub enum CellState {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellResult {
-    /// Of this layout.
+    /// The format of the document.
     pub format_version: u32,
     /// The cell.
     pub id: String,
-    /// What was trained.
+    /// The training.
     pub training: Training,
     /// Success, return and length, by the name of the set that was tested: "D", "R", "E", "R+E" or one of the plan's
     /// own.
     pub results: BTreeMap<String, TestResult>,
-    /// The same of the policies of earlier moments, by the episodes of the budget that mark these.
+    /// Tests of intermediate policies, by the episodes of the budget after which they were stored.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    pub marks: BTreeMap<u64, MarkResult>,
-    /// How far requested and applied parameters agreed in the tests; `None` in results of earlier programs.
+    pub marks: BTreeMap<u64, IntermediateEvaluation>,
+    /// Check of requested and applied parameters in the tests; `None` in results of earlier programs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub agreement: Option<Agreement>,
+    pub agreement: Option<ParameterCheck>,
     /// The program's version and the commit that it was built from.
     pub commit: String,
     /// Other programs that did a part of the training before it was broken off, in order.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub earlier_commits: Vec<String>,
-    /// What gives the same numbers again without the plan.
+    /// The command that gives the same numbers without the plan.
     pub command: String,
 }
 
 /// Tests of the policy of an earlier moment.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct MarkResult {
-    /// How long the training had become: to the end of the iteration in which the mark was passed.
+pub struct IntermediateEvaluation {
+    /// The progress of the training at the end of the iteration that passed the mark.
     pub counters: Counters,
-    /// As those of the cell.
+    /// The results by test set, as in the cell's result.
     pub results: BTreeMap<String, TestResult>,
-    /// How far requested and applied parameters agreed.
-    pub agreement: Agreement,
+    /// Check of requested and applied parameters.
+    pub agreement: ParameterCheck,
 }
 
-/// What was trained.
+/// A training in a result.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Training {
     /// By its name in the catalogue.
     pub environment: String,
-    /// As the server told it: a change of dynamics raises it.
+    /// The environment's revision on the server. Changes of dynamics raise it.
     pub environment_revision: u32,
     /// SHA-256 of its model; empty without one.
     pub model_hash: String,
-    /// Where parameters came from, but for those that the settings name.
+    /// The distribution of parameters that the settings do not list.
     pub version: Version,
     /// The name of the plan's own set of parameters, if it was trained on one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub set: Option<String>,
-    /// What learned.
+    /// The method.
     #[serde(flatten)]
     pub method: Method,
     /// Names the settings.
     pub configuration: String,
     /// The run, from 1.
     pub run: u32,
-    /// Of the training and of the tests.
+    /// The seed of the training and of the tests.
     pub seed: u64,
-    /// How long it became.
+    /// The length of the training.
     pub counters: Counters,
     /// All settings, as in `config.toml`.
     pub settings: toml::Table,
@@ -148,12 +148,13 @@ pub struct Failure {
     pub reason: String,
     /// The program's version and the commit that it was built from.
     pub commit: String,
-    /// Whether another attempt must begin anew: from its last checkpoint the training would come to the same.
-    #[serde(default = "yes")]
-    pub begins_anew: bool,
+    /// Whether another attempt must restart the training, since resuming from the last checkpoint would fail the same
+    /// way.
+    #[serde(rename = "begins_anew", default = "yes")]
+    pub requires_restart: bool,
 }
 
-/// What earlier programs meant.
+/// The value for documents of earlier programs.
 fn yes() -> bool {
     true
 }
@@ -179,7 +180,7 @@ pub enum FolderError {
     #[error("{} is not understood: {reason}; delete it to have the cell done again", path.display())]
     Damaged {
         path: PathBuf,
-        /// What is wrong with it.
+        /// The fault.
         reason: String,
     },
     /// There is no experiment.
@@ -195,7 +196,7 @@ impl Folder {
         Self { path: path.to_owned() }
     }
 
-    /// Where it is.
+    /// Returns the path.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -235,20 +236,20 @@ impl Folder {
         Ok(earlier.is_some() && !same)
     }
 
-    /// Which records of failures there are, by the cells' ids, whatever plan has them.
+    /// Returns the failure records by the cells' ids, also of cells that are in no plan.
     ///
     /// # Errors
     /// [`FileError`].
-    pub fn failures(&self) -> files::Result<HashMap<String, FailureMark>> {
+    pub fn failures(&self) -> files::Result<HashMap<String, FailureId>> {
         let places = files::list(&self.path.join("cells"))?.into_iter().map(|path| CellFolder { path });
         let marked = |place: CellFolder| {
             let id = place.path.file_name()?.to_str()?.to_owned();
-            Some((id, place.failure_mark()?))
+            Some((id, place.failure_id()?))
         };
         Ok(places.filter_map(marked).collect())
     }
 
-    /// How far `cell` is.
+    /// Reads the state of `cell`.
     ///
     /// # Errors
     /// [`FolderError`] if a file is there that cannot be read.
@@ -258,27 +259,27 @@ impl Folder {
 }
 
 impl CellFolder {
-    /// Where it is.
+    /// Returns the path.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// What `perturb train --out` writes.
+    /// Returns the folder of the training, as `perturb train --out` writes it.
     pub fn training(&self) -> PathBuf {
         self.path.join("training")
     }
 
-    /// Where the recorded episodes of the policy of an earlier moment are.
+    /// Returns the folder of the recorded episodes of an intermediate policy.
     pub fn mark(&self, mark: u64) -> PathBuf {
         self.path.join("marks").join(mark.to_string())
     }
 
-    /// What a worker process said.
+    /// Returns the path of the worker's log.
     pub fn log(&self) -> PathBuf {
         self.path.join("log.txt")
     }
 
-    /// How far the cell is.
+    /// Reads the state of the cell.
     ///
     /// # Errors
     /// [`FolderError`] if a file is there that cannot be read.
@@ -298,13 +299,13 @@ impl CellFolder {
         self.path.join("result.json").exists() || (failed_too && self.path.join("failure.json").exists())
     }
 
-    /// Which record of a failure there is; `None` if there is none.
-    pub fn failure_mark(&self) -> Option<FailureMark> {
+    /// Returns the identity of the failure record; `None` if there is none.
+    pub fn failure_id(&self) -> Option<FailureId> {
         let file = fs::metadata(self.path.join("failure.json")).ok()?;
-        Some(FailureMark { inode: file.ino(), written: (file.mtime(), file.mtime_nsec()) })
+        Some(FailureId { inode: file.ino(), written: (file.mtime(), file.mtime_nsec()) })
     }
 
-    /// Tries to become the one who works on the cell; `None` while somebody else does.
+    /// Tries to lock the cell. Returns `None` while another process holds the lock.
     ///
     /// # Errors
     /// [`FileError`].
@@ -329,15 +330,15 @@ impl CellFolder {
         write(&self.path.join("failure.json"), failure)
     }
 
-    /// Forgets a failure, and the training that led to it if another attempt [must begin anew](Failure::begins_anew).
+    /// Forgets a failure, and the training that led to it if another attempt [must begin anew](Failure::requires_restart).
     ///
     /// # Errors
     /// [`FileError`]; nothing was forgotten then.
-    pub fn forget_failure(&self) -> files::Result<()> {
+    pub fn clear_failure(&self) -> files::Result<()> {
         let path = self.path.join("failure.json");
         match read::<Failure>(&path) {
             Ok(None) => return Ok(()),
-            Ok(Some(Failure { begins_anew: false, .. })) => {}
+            Ok(Some(Failure { requires_restart: false, .. })) => {}
             Err(FolderError::File(error)) => return Err(error),
             Ok(Some(_)) | Err(_) => files::delete(&self.training())?,
         }
@@ -348,10 +349,10 @@ impl CellFolder {
     ///
     /// # Errors
     /// [`FileError`].
-    pub fn forgive(&self, mark: FailureMark) -> files::Result<bool> {
+    pub fn clear_failure_if(&self, mark: FailureId) -> files::Result<bool> {
         let lock = self.try_lock()?;
-        if lock.is_some() && self.failure_mark() == Some(mark) {
-            self.forget_failure()?;
+        if lock.is_some() && self.failure_id() == Some(mark) {
+            self.clear_failure()?;
         }
         Ok(lock.is_some())
     }
@@ -364,7 +365,7 @@ impl CellFolder {
         files::write_json(&self.path.join("timing.json"), timing)
     }
 
-    /// How long the cell took; `None` if that is not known.
+    /// Returns the duration of the cell; `None` if it is not known.
     pub fn timing(&self) -> Option<Timing> {
         read(&self.path.join("timing.json")).ok().flatten()
     }
@@ -382,7 +383,7 @@ impl CellResult {
 
 /// A JSON file, whose checksum is the right one, if it has any; `None` if it is not there.
 pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
-    let Some(text) = files::read_plain(path, LONGEST)? else { return Ok(None) };
+    let Some(text) = files::read_plain(path, MAX_BYTES)? else { return Ok(None) };
     let damaged = |reason: String| FolderError::Damaged { path: path.to_owned(), reason };
     let not_understood = |error: serde_json::Error| damaged(error.to_string());
     let mut value: Value = serde_json::from_slice(&text).map_err(not_understood)?;
@@ -392,7 +393,7 @@ pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
 
 /// Writes a record with its checksum.
 fn write(path: &Path, record: &impl Serialize) -> files::Result<()> {
-    let sealed = Sealed::new(record).map_err(|error| files::io("write", path)(error.into()))?;
+    let sealed = WithChecksum::new(record).map_err(|error| files::io("write", path)(error.into()))?;
     files::write_json(path, &sealed)
 }
 
@@ -424,7 +425,7 @@ mod tests {
                     episodes_per_trial: None,
                     preset: Preset::Perturb,
                     observe: Default::default(),
-                    elsewhere: false,
+                    external: false,
                 },
                 configuration: "00000000".into(),
                 run: 2,
@@ -446,20 +447,20 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let cell = Folder::new(directory.path()).cell("a");
         assert_eq!(cell.state().unwrap(), CellState::Missing);
-        let failure = Failure { id: "a".into(), reason: "NaN".into(), commit: "x".into(), begins_anew: true };
+        let failure = Failure { id: "a".into(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
         cell.write_failure(&failure).unwrap();
         assert_eq!(cell.state().unwrap(), CellState::Failed(failure));
         assert!(cell.is_settled(true) && !cell.is_settled(false));
         cell.write_result(&result()).unwrap();
         assert_eq!(cell.state().unwrap(), CellState::Done(Box::new(result())));
-        cell.forget_failure().unwrap();
-        cell.forget_failure().unwrap();
+        cell.clear_failure().unwrap();
+        cell.clear_failure().unwrap();
         let names: Vec<_> = fs::read_dir(cell.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
         assert_eq!(names, ["result.json"], "nothing temporary stays");
     }
 
     #[test]
-    fn what_was_trained_is_forgotten_with_a_failure_of_its_numbers_only() {
+    fn training_is_deleted_only_with_numerical_failures() {
         let directory = tempfile::tempdir().unwrap();
         let cell = Folder::new(directory.path()).cell("a");
         let earlier = r#"{"id": "a", "reason": "NaN", "commit": "x"}"#;
@@ -470,10 +471,10 @@ mod tests {
         ] {
             files::write_json(&cell.training().join("checkpoint.json"), &0).unwrap();
             files::write_json(&cell.path().join("failure.json"), &failure).unwrap();
-            cell.forget_failure().unwrap();
+            cell.clear_failure().unwrap();
             assert_eq!(cell.training().exists(), stays, "{failure}");
-            assert_eq!(cell.failure_mark(), None);
-            cell.forget_failure().unwrap();
+            assert_eq!(cell.failure_id(), None);
+            cell.clear_failure().unwrap();
             assert_eq!(cell.training().exists(), stays, "there is nothing to forget any more");
         }
     }
@@ -482,20 +483,20 @@ mod tests {
     fn a_failure_recorded_again_is_another_one() {
         let directory = tempfile::tempdir().unwrap();
         let cell = Folder::new(directory.path()).cell("a");
-        let failure = Failure { id: "a".into(), reason: "NaN".into(), commit: "x".into(), begins_anew: true };
-        assert_eq!(cell.failure_mark(), None);
+        let failure = Failure { id: "a".into(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
+        assert_eq!(cell.failure_id(), None);
         cell.write_failure(&failure).unwrap();
-        let first = cell.failure_mark().unwrap();
-        assert_eq!(cell.failure_mark(), Some(first));
-        assert_eq!(serde_json::from_value::<FailureMark>(serde_json::to_value(first).unwrap()).unwrap(), first);
+        let first = cell.failure_id().unwrap();
+        assert_eq!(cell.failure_id(), Some(first));
+        assert_eq!(serde_json::from_value::<FailureId>(serde_json::to_value(first).unwrap()).unwrap(), first);
         cell.write_failure(&failure).unwrap();
-        assert_ne!(cell.failure_mark(), Some(first));
-        assert!(cell.forgive(first).unwrap() && cell.failure_mark().is_some(), "it is another one");
+        assert_ne!(cell.failure_id(), Some(first));
+        assert!(cell.clear_failure_if(first).unwrap() && cell.failure_id().is_some(), "it is another one");
         let lock = cell.try_lock().unwrap();
-        assert!(!cell.forgive(cell.failure_mark().unwrap()).unwrap() && cell.failure_mark().is_some());
+        assert!(!cell.clear_failure_if(cell.failure_id().unwrap()).unwrap() && cell.failure_id().is_some());
         drop(lock);
-        assert!(cell.forgive(cell.failure_mark().unwrap()).unwrap());
-        assert_eq!(cell.failure_mark(), None);
+        assert!(cell.clear_failure_if(cell.failure_id().unwrap()).unwrap());
+        assert_eq!(cell.failure_id(), None);
     }
 
     #[test]
@@ -512,7 +513,7 @@ mod tests {
     }
 
     #[test]
-    fn a_changed_digit_of_a_result_is_refused_and_one_of_an_earlier_program_read() {
+    fn changed_result_is_refused_and_old_format_is_read() {
         let directory = tempfile::tempdir().unwrap();
         let cell = Folder::new(directory.path()).cell("a");
         cell.write_result(&result()).unwrap();

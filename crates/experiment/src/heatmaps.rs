@@ -21,7 +21,7 @@ use crate::folder::{Folder, FolderError};
 use crate::plan::Cell;
 use crate::selection::{MethodResults, Selected};
 
-/// Of the records; raised when older programs could misread them.
+/// Format of the records; raised when older programs could misread them.
 const FORMAT_VERSION: u32 = 2;
 
 /// A policy that an experiment has heatmaps of, or could have.
@@ -29,30 +29,30 @@ const FORMAT_VERSION: u32 = 2;
 pub struct HeatmapPlace<'a> {
     /// The environment's name.
     pub environment: &'a str,
-    /// What was trained.
+    /// The method.
     pub method: &'a Method,
-    /// Where it was trained.
+    /// The training distribution.
     pub trained_on: TrainedOn<'a>,
     /// Counted from 1.
     pub run: u32,
-    /// What was selected; `None` if nothing has a result.
+    /// The selected policy; `None` if no cell has a result.
     pub selected: Option<Selected<'a>>,
 }
 
 /// `ID-X-Y.json`: what a heatmap shows. It depends on nothing but the results, the program and the settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct HeatmapRecord {
-    /// Of this layout.
+    /// The format of the document.
     format_version: u32,
     /// The cell.
     pub cell: String,
     /// CRC-32C of its `result.json`.
     result: String,
-    /// What the checkpoint's weights are called, see the learner's `Checkpoint::id`.
+    /// The name of the checkpoint's weights, see the learner's `Checkpoint::id`.
     pub checkpoint: String,
-    /// Of the training.
+    /// The seed of the training.
     pub train_seed: u64,
-    /// How it was tested.
+    /// The options of the test.
     #[serde(flatten)]
     pub options: HeatmapOptions,
     /// x and y.
@@ -66,9 +66,9 @@ pub struct HeatmapRecord {
 /// A heatmap that belongs to the current results.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StoredHeatmap {
-    /// How it was made.
+    /// The record of the heatmap.
     pub record: HeatmapRecord,
-    /// What it shows.
+    /// The heatmap.
     pub heatmap: Heatmap,
 }
 
@@ -92,7 +92,7 @@ pub enum NoHeatmap {
 /// The policies that a plan has heatmaps of, in the order of `selections`, of what it trains on and of runs.
 pub fn heatmap_places<'a>(selections: &'a [MethodResults<'a>]) -> Vec<HeatmapPlace<'a>> {
     let mut places = Vec::new();
-    for MethodResults { environment, method, runs, .. } in selections.iter().filter(|row| !row.method.elsewhere) {
+    for MethodResults { environment, method, runs, .. } in selections.iter().filter(|row| !row.method.external) {
         let trained_on: BTreeSet<TrainedOn<'a>> = runs.values().flat_map(|run| run.selected.keys().copied()).collect();
         for trained_on in trained_on {
             places.extend(runs.iter().map(|(&run, of_run)| {
@@ -104,7 +104,7 @@ pub fn heatmap_places<'a>(selections: &'a [MethodResults<'a>]) -> Vec<HeatmapPla
     places
 }
 
-/// What there are heatmaps over in `folder`, by environment; of results that have been replaced, too.
+/// Returns the kinds of heatmaps in `folder` by environment, including heatmaps of results that have been replaced.
 ///
 /// # Errors
 /// The operating system's.
@@ -119,7 +119,7 @@ pub fn heatmap_kinds<'a>(
         if path.extension().is_none_or(|ending| ending != "json") {
             continue;
         }
-        let Some(record) = read_if_there(&path)?.and_then(|text| HeatmapRecord::of(&text)) else { continue };
+        let Some(record) = read_if_there(&path)?.and_then(|text| HeatmapRecord::parse(&text)) else { continue };
         if let Some(environment) = environments.get(record.cell.as_str()) {
             kinds.entry(environment).or_default().insert(record.options.kind());
         }
@@ -128,8 +128,8 @@ pub fn heatmap_kinds<'a>(
 }
 
 impl HeatmapRecord {
-    /// One that is not understood is made again like one that is not there.
-    fn of(text: &[u8]) -> Option<Self> {
+    /// Parses a record. `None` for an unknown record, whose heatmap is then made again.
+    fn parse(text: &[u8]) -> Option<Self> {
         serde_json::from_slice(text).ok().filter(|record: &Self| record.format_version == FORMAT_VERSION)
     }
 }
@@ -142,7 +142,7 @@ impl HeatmapPlace<'_> {
     pub fn read(&self, folder: &Folder, kind: &HeatmapKind) -> Result<Result<StoredHeatmap, NoHeatmap>, FolderError> {
         let Some(Selected { cell, .. }) = self.selected else { return Ok(Err(NoHeatmap::NoResult)) };
         let path = heatmap_path(folder, cell, kind);
-        let record = read_if_there(&path.with_added_extension("json"))?.and_then(|text| HeatmapRecord::of(&text));
+        let record = read_if_there(&path.with_added_extension("json"))?.and_then(|text| HeatmapRecord::parse(&text));
         let Some(record) = record.filter(|record| record.cell == cell.id && record.options.kind() == *kind) else {
             return Ok(Err(NoHeatmap::NotMade));
         };
@@ -171,7 +171,7 @@ impl std::fmt::Display for HeatmapPlace<'_> {
     }
 }
 
-/// Where a heatmap of `cell` is, without the ending.
+/// Returns the path of a cell's heatmap without its extension.
 pub fn heatmap_path(folder: &Folder, cell: &Cell, kind: &HeatmapKind) -> PathBuf {
     folder.path().join("heatmaps").join(format!("{}-{kind}", cell.id))
 }
@@ -207,7 +207,7 @@ pub fn store_heatmap(
     write_json(&record_path, &record)
 }
 
-/// Of a cell's result as it is on the disk.
+/// Returns the checksum of a cell's result file.
 fn result_checksum(folder: &Folder, cell: &Cell) -> files::Result<Option<String>> {
     Ok(read_if_there(&folder.cell(&cell.id).path().join("result.json"))?.map(|content| checksum(&content)))
 }

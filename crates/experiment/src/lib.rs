@@ -26,19 +26,20 @@ mod selection;
 mod tuning;
 mod verify;
 
-pub use cost::{Estimate, Measurement, Speed, estimates, generated_episodes, representatives, tested_episodes};
-pub use curves::{Curve, EnvironmentCurves, Footing, Point, read_curves};
+pub use cost::{Estimate, Measurement, Speed, benchmark_cells, estimates, generated_episodes, tested_episodes};
+pub use curves::{BudgetAxis, Curve, CurvePoint, EnvironmentCurves, read_curves};
 pub use eta::{CellDurations, RemainingTime, TrainingProgress};
 pub use external::{add_assessed, elsewhere, judged_as_in};
 pub use folder::{
-    CellFolder, CellResult, CellState, Failure, FailureMark, Folder, FolderError, MarkResult, Timing, Training,
+    CellFolder, CellResult, CellState, Failure, FailureId, Folder, FolderError, IntermediateEvaluation, Timing,
+    Training,
 };
 pub use heatmaps::{
     HeatmapPlace, HeatmapRecord, NoHeatmap, StoredHeatmap, heatmap_kinds, heatmap_path, heatmap_places, store_heatmap,
 };
 pub use plan::{Cell, Counts, Grouping, Plan, PlanError, SELECTION_TEST, Selection, Tests, distinct};
 pub use recorded::Recorded;
-pub use reselection::Reselection;
+pub use reselection::SelectionBootstrap;
 pub use selection::{
     MethodResults, Reported, Results, Selected, SelectedRun, TieRange, average, average_tie_range, interquartile,
     scores,

@@ -17,8 +17,8 @@ pub struct Recorded {
 }
 
 impl Recorded {
-    /// Of the cells that `selections` are of; nothing so far.
-    pub fn of(selections: &[MethodResults<'_>]) -> Self {
+    /// Returns an empty collection for the cells in `selections`.
+    pub fn new(selections: &[MethodResults<'_>]) -> Self {
         let runs = selections.iter().flat_map(|selection| selection.runs.values());
         let selected = runs.flat_map(|run| run.selected.values().flatten()).filter_map(Reported::cell);
         Self { wanted: selected.map(|selected| selected.cell.id.clone()).collect(), policies: BTreeMap::new() }
@@ -28,11 +28,11 @@ impl Recorded {
     pub fn add(&mut self, result: &CellResult, records: &Records) {
         if self.wanted.contains(&result.id) {
             let names = result.results.keys().map(String::as_str);
-            self.policies.insert(result.id.clone(), PolicyOutcomes::of(records, names));
+            self.policies.insert(result.id.clone(), PolicyOutcomes::new(records, names));
         }
     }
 
-    /// Of the cells that are wanted: how many have recorded episodes, and how many there are.
+    /// Returns the number of selected cells that have recorded episodes, and the number of selected cells.
     pub fn count(&self) -> (usize, usize) {
         (self.policies.len(), self.wanted.len())
     }
@@ -41,7 +41,7 @@ impl Recorded {
     pub fn policy<'a>(&'a self, reported: &Reported<'a>) -> Option<&'a PolicyOutcomes> {
         match reported {
             Reported::Cell(selected) => self.policies.get(&selected.cell.id),
-            Reported::Elsewhere(_, policy) => Some(policy.outcomes()),
+            Reported::External(_, policy) => Some(policy.outcomes()),
         }
     }
 }

@@ -22,31 +22,31 @@ use crate::folder::{CellResult, CellState};
 use crate::plan::{Cell, SELECTION_TEST, Selection};
 use crate::selection::{MethodResults, Results, Selected, common_runs};
 
-/// Of the runs, as in the interval without selection.
+/// The seed for drawing runs, which is that of the interval without selection.
 const RUNS_SEED: u64 = 1;
-/// Of the selections: drawing them leaves the drawn runs alone.
+/// The seed for drawing selections. Separate draws leave the drawn runs unchanged.
 const SELECTION_SEED: u64 = 2;
 
 /// All selections of a plan, and among what they are made.
-pub struct Reselection<'a> {
-    contests: HashMap<(&'a str, Method, TrainedOn<'a>, Option<u32>), Contest<'a>>,
+pub struct SelectionBootstrap<'a> {
+    contests: HashMap<(&'a str, Method, TrainedOn<'a>, Option<u32>), Candidates<'a>>,
     rule: Selection,
 }
 
 /// A selection, whose candidates are in the plan's order.
 #[derive(Default)]
-struct Contest<'a> {
+struct Candidates<'a> {
     seeds: Vec<u64>,
-    candidates: Vec<Candidate<'a>>,
+    candidates: Vec<SelectableCell<'a>>,
 }
 
-struct Candidate<'a> {
+struct SelectableCell<'a> {
     configuration: &'a str,
-    tests: Vec<SelectingTest>,
+    tests: Vec<SelectionTest>,
 }
 
 /// A cell's test that selects.
-struct SelectingTest {
+struct SelectionTest {
     seed: u64,
     successes: Binomial,
     mean_return: f64,
@@ -55,14 +55,14 @@ struct SelectingTest {
 }
 
 /// A run that is reported, with the places of the selections that it comes from, by what it was trained on.
-struct Reported<'a> {
+struct DrawnPolicy<'a> {
     score: f64,
     selected: [Option<(usize, Selected<'a>)>; 3],
 }
 
-impl<'a> Reselection<'a> {
-    /// Of all results that there are.
-    pub fn of(results: &'a Results<'a>) -> Self {
+impl<'a> SelectionBootstrap<'a> {
+    /// Returns the bootstrap over all results.
+    pub fn new(results: &'a Results<'a>) -> Self {
         let rule = results.plan.selection;
         let mut contests = HashMap::new();
         for (cell, state) in results.plan.cells.iter().zip(&results.states) {
@@ -72,8 +72,8 @@ impl<'a> Reselection<'a> {
                 Selection::Clean => SELECTION_TEST.into(), // which cells that are trained anew do not have
             };
             if let Some(test) = result.results.get(&name) {
-                let contest: &mut Contest<'a> = contests.entry(key(cell, rule, cell.run)).or_default();
-                contest.add(cell, SelectingTest::of(cell, result, test));
+                let contest: &mut Candidates<'a> = contests.entry(key(cell, rule, cell.run)).or_default();
+                contest.add(cell, SelectionTest::new(cell, result, test));
             }
         }
         Self { contests, rule }
@@ -113,15 +113,15 @@ impl<'a> Reselection<'a> {
         Some(points.into_iter().zip(estimates).map(with_interval).collect())
     }
 
-    /// What is reported, by `selections`, then by run, and what it was selected by.
+    /// Returns the reported policies by `selections`, then by run, and the tests that selected them.
     fn reported(
         &self,
         selections: &[&MethodResults<'a>],
         metric: Metric,
-    ) -> (Vec<&Contest<'a>>, Vec<Vec<Reported<'a>>>) {
+    ) -> (Vec<&Candidates<'a>>, Vec<Vec<DrawnPolicy<'a>>>) {
         let (mut contests, mut places) = (Vec::new(), HashMap::new());
-        let needs = |version| metric.of(|scenario| (scenario.train != version).then_some(0.0)).is_none();
-        let mut reported: Vec<Vec<Reported<'a>>> = selections.iter().map(|_| Vec::new()).collect();
+        let needs = |version| metric.value(|scenario| (scenario.train != version).then_some(0.0)).is_none();
+        let mut reported: Vec<Vec<DrawnPolicy<'a>>> = selections.iter().map(|_| Vec::new()).collect();
         for (number, scores) in common_runs(selections, metric) {
             for ((runs, selection), score) in reported.iter_mut().zip(selections).zip(scores) {
                 let selected = Version::ALL.map(|version| {
@@ -135,7 +135,7 @@ impl<'a> Reselection<'a> {
                     });
                     Some((place, selected))
                 });
-                runs.push(Reported { score, selected });
+                runs.push(DrawnPolicy { score, selected });
             }
         }
         (contests, reported)
@@ -148,20 +148,20 @@ fn key(cell: &Cell, rule: Selection, run: u32) -> (&str, Method, TrainedOn<'_>, 
     (&cell.config.common.environment, cell.method(), cell.trained_on(), run)
 }
 
-impl<'a> Contest<'a> {
-    fn add(&mut self, cell: &'a Cell, test: SelectingTest) {
+impl<'a> Candidates<'a> {
+    fn add(&mut self, cell: &'a Cell, test: SelectionTest) {
         if !self.seeds.contains(&test.seed) {
             self.seeds.push(test.seed);
         }
         match self.candidates.iter_mut().find(|known| known.configuration == cell.configuration) {
             Some(known) => known.tests.push(test),
-            None => self.candidates.push(Candidate { configuration: &cell.configuration, tests: vec![test] }),
+            None => self.candidates.push(SelectableCell { configuration: &cell.configuration, tests: vec![test] }),
         }
     }
 
     /// The candidate with the highest rank when episodes and seeds are drawn again, one of several that tie at random;
     /// `None` if no candidate has a drawn seed.
-    fn decide(&self, uniform: &mut impl FnMut() -> f64) -> Option<&Candidate<'a>> {
+    fn decide(&self, uniform: &mut impl FnMut() -> f64) -> Option<&SelectableCell<'a>> {
         if let [only] = &self.candidates[..] {
             return Some(only);
         }
@@ -189,7 +189,7 @@ impl<'a> Contest<'a> {
     }
 }
 
-impl Candidate<'_> {
+impl SelectableCell<'_> {
     /// Success rate and mean return over the `seeds` that it has a test of.
     fn rank(&self, seeds: &[u64], uniform: &mut impl FnMut() -> f64) -> Option<(f64, f64)> {
         let found = seeds.iter().filter_map(|seed| self.tests.iter().find(|test| test.seed == *seed));
@@ -199,27 +199,32 @@ impl Candidate<'_> {
     }
 }
 
-impl SelectingTest {
-    fn of(cell: &Cell, result: &CellResult, test: &TestResult) -> Self {
+impl SelectionTest {
+    fn new(cell: &Cell, result: &CellResult, test: &TestResult) -> Self {
         Self {
             seed: cell.config.common.seed,
-            successes: Binomial::of(test),
+            successes: Binomial::new(test),
             mean_return: test.mean_return,
             rates: Version::ALL.map(|on| result.results.get(&on.to_string()).map(|test| test.success_percent)),
         }
     }
 }
 
-impl Reported<'_> {
+impl DrawnPolicy<'_> {
     /// The metric of this run if `winners` had been selected; the reported score if a test is missing.
-    fn score_of(&self, metric: Metric, winners: &[Option<&Candidate<'_>>], uniform: &mut impl FnMut() -> f64) -> f64 {
+    fn score_of(
+        &self,
+        metric: Metric,
+        winners: &[Option<&SelectableCell<'_>>],
+        uniform: &mut impl FnMut() -> f64,
+    ) -> f64 {
         let others = self.selected.map(|selected| {
             let (place, selected) = selected?;
             let of_tuning = selected.cell.tuned_as.as_ref().unwrap_or(&selected.cell.configuration);
             let winner = winners[place].filter(|winner| winner.configuration != of_tuning)?;
             Some(if let [only] = &winner.tests[..] { only } else { draw(&winner.tests, uniform) })
         });
-        let score = metric.of(|scenario| match others[scenario.train as usize] {
+        let score = metric.value(|scenario| match others[scenario.train as usize] {
             Some(other) => other.rates[scenario.test as usize],
             None => self.selected[scenario.train as usize]?.1.rate(scenario.test),
         });
@@ -231,14 +236,14 @@ fn draw<'t, T>(all: &'t [T], uniform: &mut impl FnMut() -> f64) -> &'t T {
     &all[(uniform() * all.len() as f64) as usize]
 }
 
-/// How many of n episodes are successes when they are drawn anew from n, k of which were.
+/// The number of successes among n episodes that are drawn again from n, of which k were successes.
 struct Binomial {
-    /// Of 0, 1 … n successes or fewer, not normalised.
+    /// Cumulative weights of 0, 1 … n successes, not normalised.
     cumulative: Vec<f64>,
 }
 
 impl Binomial {
-    fn of(test: &TestResult) -> Self {
+    fn new(test: &TestResult) -> Self {
         let n = test.episodes as usize;
         let k = ((test.success_percent * n as f64 / 100.0).round() as usize).min(n);
         let odds = k as f64 / (n - k) as f64;

@@ -32,7 +32,7 @@ fn intervals(results: &Results<'_>, metric: Metric) -> [[f64; 2]; 2] {
     let both: Vec<_> = selections.iter().collect();
     let iqm = |strata: &[Vec<f64>]| vec![interquartile_mean(strata)];
     let without = bootstrap(&scores(&both, metric), RESAMPLES, RUNS_SEED, iqm).unwrap()[0];
-    let with = Reselection::of(results).bootstrap(&both, metric, RESAMPLES, iqm).unwrap()[0];
+    let with = SelectionBootstrap::new(results).bootstrap(&both, metric, RESAMPLES, iqm).unwrap()[0];
     assert_eq!((without.point, without.runs), (with.point, with.runs));
     [without, with].map(|number| number.interval_95.unwrap())
 }
@@ -56,7 +56,7 @@ fn a_selection_without_doubt_leaves_the_interval_as_it_is() {
 }
 
 #[test]
-fn a_doubtful_selection_widens_the_interval_to_what_else_would_have_been_selected() {
+fn doubtful_selection_widens_the_interval() {
     // Ranks are 0.1 apart, with a deviation of some 1.5: B is selected about as often, and extrapolates to nothing.
     let [without, with] = by_paper(0.1, Metric::Extrapolation);
     assert!(without[0] > 50.0 && with[0] == 0.0 && with[1] <= without[1], "{without:?} {with:?}");
@@ -96,7 +96,7 @@ fn by_clean(selecting: fn(bool, u32) -> f64) -> [[f64; 2]; 2] {
 }
 
 #[test]
-fn tuning_seeds_are_drawn_anew_and_tuning_cells_stand_for_what_was_not_trained_anew() {
+fn tuning_cells_replace_missing_final_cells() {
     // On both seeds A is better: whatever is drawn, it stays so, and only what was trained anew is reported.
     let [without, with] = by_clean(|is_a, _| if is_a { 70.0 } else { 30.0 });
     assert_eq!(without, with);
@@ -120,7 +120,7 @@ fn a_run_alone_has_no_interval() {
     let selections = results.select();
     let both: Vec<_> = selections.iter().collect();
     let mean = |strata: &[Vec<f64>]| vec![interquartile_mean(strata)];
-    let alone = Reselection::of(&results).bootstrap(&both, Metric::Default, RESAMPLES, mean).unwrap();
+    let alone = SelectionBootstrap::new(&results).bootstrap(&both, Metric::Default, RESAMPLES, mean).unwrap();
     assert_eq!(alone, [Bootstrapped { point: 50.0, interval_95: None, runs: 1 }]);
 }
 
@@ -133,16 +133,16 @@ fn redrawn_successes_are_binomial() {
         mean_return: 0.0,
         mean_length: 0.0,
     };
-    let quarter = Binomial::of(&test(25.0, 4));
+    let quarter = Binomial::new(&test(25.0, 4));
     // (3/4)⁴ = 0.3164, and 0.4219 more with one success.
     for (place, percent) in [(0.0, 0.0), (0.316, 0.0), (0.317, 25.0), (0.738, 25.0), (0.739, 50.0), (0.9999, 100.0)] {
         assert_eq!(quarter.draw_percent(place), percent, "{place}");
     }
     for sure in [0.0, 100.0] {
-        let sure_of = Binomial::of(&test(sure, 1000));
+        let sure_of = Binomial::new(&test(sure, 1000));
         assert!([0.0, 0.5, 0.999_999].into_iter().all(|place| sure_of.draw_percent(place) == sure));
     }
-    let many = Binomial::of(&test(40.0, 1000));
+    let many = Binomial::new(&test(40.0, 1000));
     // The 2.5th percentile: 40 - 1.96 · √(0.4 · 0.6 / 1000) · 100 = 37.0.
     assert!((many.draw_percent(0.025) - 37.0).abs() < 0.11, "{}", many.draw_percent(0.025));
 }

@@ -12,38 +12,39 @@ use std::collections::BTreeMap;
 
 use perturb_protocol::Version;
 use perturb_records::statistics::{Bootstrapped, Summary, interquartile_mean, mean};
-use perturb_records::{Assessed, AssessedPolicy, Metric, Scenario, TestResult, TrainedOn};
+use perturb_records::{ExternalEvaluation, ExternalPolicy, Metric, Scenario, TestResult, TrainedOn};
 use perturb_settings::Method;
 
 use crate::folder::{CellResult, CellState, Failure, Folder, FolderError};
 use crate::plan::{Cell, Plan, Selection};
 use crate::tuning::{Tuned, tuned};
 
-/// What is known of a plan's cells.
+/// The states of a plan's cells.
 #[derive(Debug)]
 pub struct Results<'a> {
-    /// What was asked for.
+    /// The plan.
     pub plan: &'a Plan,
     /// By the cells' indices.
     pub states: Vec<CellState>,
 }
 
-/// What was selected for a row of the paper's tables, which is a method in an environment.
+/// The selected policies of a method in an environment, which is a row of the paper's tables.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MethodResults<'a> {
     /// The environment's name.
     pub environment: &'a str,
-    /// What was trained.
+    /// The method.
     pub method: Method,
     /// Cells that the plan has for it, also those that it will have, without those that are trained on its own sets.
     pub cells: usize,
-    /// Of these, cells with a result. If some are missing, selection was among fewer than the plan asks for.
+    /// Number of these cells with a result. If some are missing, the selection was among fewer configurations than the
+    /// plan has.
     pub done: usize,
     /// By the runs' numbers, from 1.
     pub runs: BTreeMap<u32, SelectedRun<'a>>,
 }
 
-/// What is reported of a run.
+/// The reported policies of a run.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SelectedRun<'a> {
     /// The selected policy for each training version or set; `None` while there is no result.
@@ -52,7 +53,7 @@ pub struct SelectedRun<'a> {
     pub tied: BTreeMap<TrainedOn<'a>, Vec<Selected<'a>>>,
 }
 
-/// How far a metric depends on the choice among tied configurations.
+/// The range of a metric over the choices among tied configurations.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TieRange {
     /// The largest number of choices in any run: of tied configurations, or of pairs of these.
@@ -66,23 +67,23 @@ pub struct TieRange {
 /// A policy whose tests are reported.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Reported<'a> {
-    /// Of a cell that was selected.
+    /// A selected cell.
     Cell(Selected<'a>),
-    /// Of an agent that was trained elsewhere.
-    Elsewhere(&'a Assessed, &'a AssessedPolicy),
+    /// An externally trained agent.
+    External(&'a ExternalEvaluation, &'a ExternalPolicy),
 }
 
 /// A cell that was selected.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Selected<'a> {
-    /// What the plan says of it.
+    /// The cell in the plan.
     pub cell: &'a Cell,
-    /// What it came to.
+    /// The cell's result.
     pub result: &'a CellResult,
 }
 
 impl<'a> Results<'a> {
-    /// Reads all cells of `plan`, see [`Plan::in_folder`], in `folder`.
+    /// Reads all cells of `plan`, see [`Plan::with_selected_cells`], in `folder`.
     ///
     /// # Errors
     /// [`FolderError`] if a file is there that cannot be read.
@@ -91,7 +92,7 @@ impl<'a> Results<'a> {
         Ok(Self { plan, states })
     }
 
-    /// The results that there are, in the plan's order.
+    /// Returns the results in the plan's order.
     pub fn done(&self) -> impl Iterator<Item = &CellResult> {
         self.states.iter().filter_map(|state| match state {
             CellState::Done(result) => Some(&**result),
@@ -107,7 +108,7 @@ impl<'a> Results<'a> {
         })
     }
 
-    /// What tuning cells select.
+    /// Returns the configurations that the tuning cells select.
     pub fn tuned(&self) -> Vec<Tuned<'_>> {
         tuned(self.plan, &self.states)
     }
@@ -175,7 +176,8 @@ impl<'a> MethodResults<'a> {
         self.runs.iter().filter_map(of_run).collect()
     }
 
-    /// How far a metric depends on the choice among tied configurations; `None` if no run that has it has a tie.
+    /// Returns the range of a metric over the choices among tied configurations; `None` if no run with the metric has a
+    /// tie.
     pub fn tie_range(&self, metric: Metric) -> Option<TieRange> {
         let by_run = self.runs.values().map(|run| run.metric_by_choice(metric));
         let by_run: Vec<Vec<f64>> = by_run.filter(|values| !values.is_empty()).collect();
@@ -187,7 +189,7 @@ impl<'a> MethodResults<'a> {
 
     /// A metric's mean and deviation over runs, %.
     pub fn summary(&self, metric: Metric) -> Option<Summary> {
-        Summary::of(&self.metric(metric).into_values().collect::<Vec<_>>())
+        Summary::from_values(&self.metric(metric).into_values().collect::<Vec<_>>())
     }
 
     /// A scenario's success rate over runs, %.
@@ -198,7 +200,7 @@ impl<'a> MethodResults<'a> {
     /// A figure of the tests on a set or version, over runs; in a run the mean over tied configurations.
     pub fn test(&self, trained_on: TrainedOn<'_>, tested_on: &str, figure: fn(&TestResult) -> f64) -> Option<Summary> {
         let of_run = |run: &SelectedRun<'_>| run.mean_over_ties(trained_on, tested_on, figure);
-        Summary::of(&self.runs.values().filter_map(of_run).collect::<Vec<_>>())
+        Summary::from_values(&self.runs.values().filter_map(of_run).collect::<Vec<_>>())
     }
 }
 
@@ -230,7 +232,7 @@ impl<'a> SelectedRun<'a> {
     fn metric_by_choice(&self, metric: Metric) -> Vec<f64> {
         let choices = Version::ALL.map(|train| {
             // The metric does not depend on a policy without whose scenarios it is known.
-            let matters = metric.of(|scenario| (scenario.train != train).then_some(0.0)).is_none();
+            let matters = metric.value(|scenario| (scenario.train != train).then_some(0.0)).is_none();
             let tied = self.tied_on(TrainedOn::Version(train)).into_iter().map(Some).take(if matters {
                 usize::MAX
             } else {
@@ -246,7 +248,7 @@ impl<'a> SelectedRun<'a> {
                 for e in on_e {
                     let chosen = [d, r, e];
                     let rate = |Scenario { train, test }| chosen[train as usize].as_ref()?.rate(test);
-                    values.extend(metric.of(rate));
+                    values.extend(metric.value(rate));
                 }
             }
         }
@@ -269,7 +271,7 @@ impl<'a> Reported<'a> {
     pub fn cell(&self) -> Option<Selected<'a>> {
         match self {
             Self::Cell(selected) => Some(*selected),
-            Self::Elsewhere(..) => None,
+            Self::External(..) => None,
         }
     }
 
@@ -277,7 +279,7 @@ impl<'a> Reported<'a> {
     pub fn test(&self, tested_on: &str) -> Option<&'a TestResult> {
         match self {
             Self::Cell(selected) => selected.test(tested_on),
-            Self::Elsewhere(_, policy) => policy.test(tested_on),
+            Self::External(_, policy) => policy.test(tested_on),
         }
     }
 
@@ -313,10 +315,10 @@ impl<'a> Selected<'a> {
 /// these runs.
 pub fn average(selections: &[&MethodResults<'_>], metric: Metric) -> Option<Summary> {
     let runs = common_runs(selections, metric);
-    Summary::of(&runs.into_iter().map(|(_, numbers)| mean(numbers.into_iter())).collect::<Vec<_>>())
+    Summary::from_values(&runs.into_iter().map(|(_, numbers)| mean(numbers.into_iter())).collect::<Vec<_>>())
 }
 
-/// How far [`average`] depends on the choice among tied configurations; `None` without a tie.
+/// Returns the range of [`average`] over the choices among tied configurations; `None` without a tie.
 pub fn average_tie_range(selections: &[&MethodResults<'_>], metric: Metric) -> Option<TieRange> {
     let ranges: Vec<Option<TieRange>> = selections.iter().map(|selection| selection.tie_range(metric)).collect();
     let choices = ranges.iter().flatten().map(|range| range.choices).max()?;
@@ -332,7 +334,7 @@ pub fn average_tie_range(selections: &[&MethodResults<'_>], metric: Metric) -> O
 /// The interquartile mean of a metric over the environments of `selections` and the runs that all of them have, with
 /// its bootstrap interval.
 pub fn interquartile(selections: &[&MethodResults<'_>], metric: Metric, resamples: usize) -> Option<Bootstrapped> {
-    Bootstrapped::of(&scores(selections, metric), resamples, 1, interquartile_mean)
+    Bootstrapped::new(&scores(selections, metric), resamples, 1, interquartile_mean)
 }
 
 /// A metric by `selections`, then by the runs that all of them have.

@@ -16,10 +16,10 @@ fn plan() -> Plan {
 }
 
 /// Success rates on D, R and E and a mean return, by environment, training version, configuration ("A" or "B") and run.
-type Known<'f> = &'f dyn Fn(&str, Version, &str, u32) -> Option<([f64; 3], f64)>;
+type PolicyMetadata<'f> = &'f dyn Fn(&str, Version, &str, u32) -> Option<([f64; 3], f64)>;
 
 /// What `rates` does not know is missing.
-fn results<'a>(plan: &'a Plan, rates: Known<'_>) -> Results<'a> {
+fn results<'a>(plan: &'a Plan, rates: PolicyMetadata<'_>) -> Results<'a> {
     fixture::results(plan, |cell| {
         let common = &cell.config.common;
         rates(&common.environment, common.version, if is_a(cell) { "A" } else { "B" }, cell.run)
@@ -121,7 +121,7 @@ fn return_breaks_ties_and_the_rest_is_averaged() {
     let plan = plan();
     // A and B are told apart by their rates on R.
     let on_r = |name: &str| [100.0, if name == "A" { 1.0 } else { 2.0 }, 0.0];
-    let chosen = |rates: Known<'_>| {
+    let chosen = |rates: PolicyMetadata<'_>| {
         let results = results(&plan, rates);
         let selections = results.select();
         [1, 2].map(|run| selections[0].runs[&run].rate(Scenario { train: Version::D, test: Version::R }))

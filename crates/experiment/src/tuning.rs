@@ -15,31 +15,31 @@ use perturb_settings::Method;
 use crate::folder::{CellState, Folder, FolderError};
 use crate::plan::{Cell, Plan, SELECTION_TEST};
 
-/// Configurations of which one is selected.
+/// Configurations from which one is selected.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tuned<'a> {
     /// The environment's name.
     pub environment: &'a str,
-    /// What was trained.
+    /// The method.
     pub method: Method,
     /// On what, also in selection episodes.
     pub trained_on: TrainedOn<'a>,
     /// Tuning cells.
     pub cells: usize,
-    /// Of these, cells with a result.
+    /// Number of these cells with a result.
     pub done: usize,
-    /// Of these, cells that failed.
+    /// Number of these cells that failed.
     pub failed: usize,
     /// Tuning seeds.
     pub seeds: usize,
-    /// What is selected; `None` while cells are left, or if all failed.
+    /// The selected configuration; `None` while cells are left, or if all failed.
     pub chosen: Option<Chosen<'a>>,
 }
 
 /// A configuration that was selected.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Chosen<'a> {
-    /// Its first tuning cell that has a result.
+    /// The configuration's first tuning cell with a result.
     pub cell: &'a Cell,
     /// The mean success rate in selection episodes, %.
     pub success_percent: f64,
@@ -56,7 +56,7 @@ impl Tuned<'_> {
     }
 }
 
-/// What the tuning cells of `plan`, which are in these `states`, select; in the plan's order.
+/// Returns the configurations that the tuning cells of `plan` with these `states` select, in the plan's order.
 pub fn tuned<'a>(plan: &'a Plan, states: &'a [CellState]) -> Vec<Tuned<'a>> {
     let mut groups: Vec<(Tuned<'a>, Vec<Vec<Candidate<'a>>>)> = Vec::new();
     let mut places = HashMap::new();
@@ -82,7 +82,7 @@ pub fn tuned<'a>(plan: &'a Plan, states: &'a [CellState]) -> Vec<Tuned<'a>> {
         candidates[configuration].push((cell, test));
     }
     let select = |(tuned, candidates): (Tuned<'a>, Vec<Vec<Candidate<'a>>>)| {
-        let chosen = candidates.iter().map(|tests| Chosen::of(tests)).reduce(Chosen::better);
+        let chosen = candidates.iter().map(|tests| Chosen::new(tests)).reduce(Chosen::better);
         Tuned { chosen: chosen.filter(|_| tuned.is_complete()), ..tuned }
     };
     groups.into_iter().map(select).collect()
@@ -93,7 +93,7 @@ type Candidate<'a> = (&'a Cell, &'a TestResult);
 
 impl<'a> Chosen<'a> {
     /// A configuration with its tests, at least one.
-    fn of(tests: &[Candidate<'a>]) -> Self {
+    fn new(tests: &[Candidate<'a>]) -> Self {
         let over_seeds = |figure: fn(&TestResult) -> f64| mean(tests.iter().map(|(_, test)| figure(test)));
         Self {
             cell: tests[0].0,
@@ -103,7 +103,7 @@ impl<'a> Chosen<'a> {
         }
     }
 
-    /// The better one of two, of which `self` is listed first.
+    /// Returns the better of two configurations, of which `self` is listed first.
     fn better(self, other: Self) -> Self {
         let rank = |chosen: &Self| (chosen.success_percent, chosen.mean_return);
         if rank(&other) > rank(&self) { other } else { self }
@@ -121,15 +121,15 @@ impl Plan {
     ///
     /// # Errors
     /// [`FolderError`] if a file is there that cannot be read.
-    pub fn in_folder(&self, folder: &Folder) -> Result<Self, FolderError> {
+    pub fn with_selected_cells(&self, folder: &Folder) -> Result<Self, FolderError> {
         self.with_chosen(Some(folder), false)
     }
 
-    /// The same with as many cells as there will be: others stand in for those that are not known yet.
+    /// Returns the plan with its final number of cells. Placeholders stand for cells that are not selected yet.
     ///
     /// # Errors
     /// [`FolderError`] if a file is there that cannot be read.
-    pub fn in_full(&self, folder: Option<&Folder>) -> Result<Self, FolderError> {
+    pub fn with_expected_cells(&self, folder: Option<&Folder>) -> Result<Self, FolderError> {
         self.with_chosen(folder, true)
     }
 

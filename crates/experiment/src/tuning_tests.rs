@@ -32,10 +32,10 @@ fn is_a(cell: &Cell) -> bool {
 
 /// The success rate and the mean return in selection episodes of a configuration, "A" or "B", with a seed. Ordinary tests
 /// say the contrary.
-type Known = fn(&str, u64) -> Option<(f64, f64)>;
+type PolicyMetadata = fn(&str, u64) -> Option<(f64, f64)>;
 
 /// What `known` does not know has failed, if `failed`, or is missing.
-fn done(plan: &Plan, folder: &Folder, known: Known, failed: bool) {
+fn done(plan: &Plan, folder: &Folder, known: PolicyMetadata, failed: bool) {
     for cell in &plan.cells {
         let place = folder.cell(&cell.id);
         match known(if is_a(cell) { "A" } else { "B" }, cell.config.common.seed) {
@@ -50,7 +50,7 @@ fn done(plan: &Plan, folder: &Folder, known: Known, failed: bool) {
             }
             None if failed => {
                 let failure =
-                    Failure { id: cell.id.clone(), reason: "NaN".into(), commit: "x".into(), begins_anew: true };
+                    Failure { id: cell.id.clone(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
                 place.write_failure(&failure).unwrap();
             }
             None => {}
@@ -98,7 +98,7 @@ fn selection_episodes_have_the_parameters_that_were_trained_on() {
 
 /// Results of a plan without selection episodes are those of what is trained anew, and of no tuning cell.
 #[test]
-fn a_cell_without_selection_episodes_has_the_id_that_it_has_by_the_papers_rule() {
+fn cell_id_without_selection_matches_the_papers_rule() {
     let papers = PLAN.replace("'clean'", "'paper'").replace("runs = 3\nseed = 4", "runs = 5\nseed = 4");
     let papers = papers.replace("tuning_runs = 2\n", "").replace("selection_episodes = 70\n", "");
     let papers = Plan::parse("test", papers).unwrap();
@@ -116,10 +116,10 @@ fn a_cell_without_selection_episodes_has_the_id_that_it_has_by_the_papers_rule()
 #[case::then_the_return(|name: &str, seed: u64| Some((if seed == 4 { 90.0 } else { 10.0 }, if name == "B" { 2.0 } else { 1.0 })), "B", 2)]
 #[case::then_the_plan(|_: &str, _: u64| Some((50.0, 1.0)), "A", 2)]
 #[case::of_what_has_not_failed(|name: &str, seed: u64| (name == "B" && seed == 5).then_some((0.0, -9.0)), "B", 1)]
-fn selection_episodes_select(#[case] known: Known, #[case] expected: &str, #[case] seeds: usize) {
+fn selection_episodes_select(#[case] known: PolicyMetadata, #[case] expected: &str, #[case] seeds: usize) {
     let (plan, (_directory, folder)) = (plan(), place());
     done(&plan, &folder, known, true);
-    let chosen = plan.in_folder(&folder).unwrap();
+    let chosen = plan.with_selected_cells(&folder).unwrap();
     assert_eq!(chosen.cells[..16], plan.cells[..]);
     let anew = &chosen.cells[16..];
     assert_eq!(anew.len(), 2 * 2 * 3, "environments, versions and runs");
@@ -129,17 +129,17 @@ fn selection_episodes_select(#[case] known: Known, #[case] expected: &str, #[cas
 }
 
 #[test]
-fn nothing_is_selected_before_every_tuning_cell_is_settled_or_if_all_failed() {
+fn selection_waits_for_all_tuning_cells() {
     let plan = plan();
     for failed in [true, false] {
         let (_directory, folder) = place();
         done(&plan, &folder, |_, _| None, failed);
-        assert_eq!(plan.in_folder(&folder).unwrap().cells, plan.cells);
+        assert_eq!(plan.with_selected_cells(&folder).unwrap().cells, plan.cells);
     }
     let (_directory, folder) = place();
     done(&plan, &folder, |_, _| Some((1.0, 1.0)), false);
     std::fs::remove_file(folder.cell(&plan.cells[0].id).path().join("result.json")).unwrap();
-    let known = plan.in_folder(&folder).unwrap();
+    let known = plan.with_selected_cells(&folder).unwrap();
     assert_eq!(known.cells.len(), 16 + 3 * 3, "one of four waits");
     assert!(
         known.cells[16..]
@@ -148,16 +148,16 @@ fn nothing_is_selected_before_every_tuning_cell_is_settled_or_if_all_failed() {
     );
     // Whatever is selected, so many cells it will be.
     for folder in [None, Some(&folder)] {
-        assert_eq!(plan.in_full(folder).unwrap().cells.len(), 16 + 4 * 3);
+        assert_eq!(plan.with_expected_cells(folder).unwrap().cells.len(), 16 + 4 * 3);
     }
 }
 
 #[test]
-fn what_is_reported_are_the_cells_that_were_trained_anew_or_by_the_papers_rule_the_others() {
+fn reported_cells_depend_on_the_rule() {
     let (plan, (_directory, folder)) = (plan(), place());
-    let known: Known = |name, seed| Some((if name == "A" { 60.0 } else { 50.0 } + seed as f64, 1.0));
+    let known: PolicyMetadata = |name, seed| Some((if name == "A" { 60.0 } else { 50.0 } + seed as f64, 1.0));
     done(&plan, &folder, known, false);
-    let waiting = plan.in_folder(&folder).unwrap();
+    let waiting = plan.with_selected_cells(&folder).unwrap();
     let results = Results::read(&waiting, &folder).unwrap();
     let selections = results.select();
     assert_eq!((selections[0].cells, selections[0].done), (8 + 6, 8));
@@ -173,7 +173,7 @@ fn what_is_reported_are_the_cells_that_were_trained_anew_or_by_the_papers_rule_t
     // Ordinary tests of A with seeds 6 to 8.
     assert_eq!(rates(&selections), [(1, 34.0), (2, 33.0), (3, 32.0)].into());
 
-    let papers = plan.by(Selection::Paper).unwrap().in_folder(&folder).unwrap();
+    let papers = plan.with_rule(Selection::Paper).unwrap().with_selected_cells(&folder).unwrap();
     let results = Results::read(&papers, &folder).unwrap();
     // Those of B with seeds 4 and 5, which are better there.
     assert_eq!(rates(&results.select()), [(1, 46.0), (2, 45.0)].into());
@@ -184,7 +184,7 @@ fn a_rule_that_a_plan_was_not_made_for_is_refused() {
     let papers = "environments = ['CartPole']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
     let papers = Plan::parse("test", papers.into()).unwrap();
     assert_eq!((papers.selection, papers.candidates.len()), (Selection::Paper, 0));
-    let message = papers.by(Selection::Clean).unwrap_err().to_string();
+    let message = papers.with_rule(Selection::Clean).unwrap_err().to_string();
     assert!(message.contains("selection is clean, but must be \"paper\": the plan has no tuning cells"), "{message}");
     for (from, to, part) in [
         ("'clean'", "'fair'", "unknown variant `fair`, expected `paper` or `clean`"),

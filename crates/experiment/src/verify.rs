@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use perturb_records::{Agreement, Records, RecordsError, TestResult};
+use perturb_records::{ParameterCheck, Records, RecordsError, TestResult};
 
 use crate::folder::{CellResult, Folder};
 use crate::selection::Results;
@@ -35,7 +35,7 @@ pub enum VerifyError {
         "the result of cell {cell} does not follow from its recorded episodes: requested and applied parameters differ \
          otherwise; delete result.json to have the tests done again"
     )]
-    Agreement { cell: String },
+    ParameterCheck { cell: String },
 }
 
 /// Computes every result again from its recorded episodes, where they are there, and hands them to `each`; gives how many
@@ -68,7 +68,7 @@ fn follows(
     result: &CellResult,
     path: &Path,
     results: &BTreeMap<String, TestResult>,
-    agreement: Option<&Agreement>,
+    agreement: Option<&ParameterCheck>,
 ) -> Result<Option<Records>, VerifyError> {
     let records = match Records::read(&path.join(perturb_records::FILE)) {
         Err(RecordsError::Missing { .. }) => return Ok(None),
@@ -82,7 +82,7 @@ fn follows(
         }
     }
     if agreement.is_some_and(|agreement| *agreement != records.agreement()) {
-        return Err(VerifyError::Agreement { cell: result.id.clone() });
+        return Err(VerifyError::ParameterCheck { cell: result.id.clone() });
     }
     Ok(Some(records))
 }
@@ -93,10 +93,10 @@ mod tests {
 
     use super::*;
     use crate::fixture;
-    use crate::folder::{CellState, MarkResult};
+    use crate::folder::{CellState, IntermediateEvaluation};
     use crate::plan::Plan;
     use perturb_protocol::Version;
-    use perturb_records::{About, Ending, EpisodeRecord, RecordedTest};
+    use perturb_records::{Ending, EpisodeRecord, RecordedTest, RecordsMetadata};
 
     const PLAN: &str = "environments = ['CartPole']\nversions = ['D']\ntest_versions = ['D']
         [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
@@ -117,7 +117,7 @@ mod tests {
             achieved: None,
             also_achieved: None,
         };
-        let about = About {
+        let about = RecordsMetadata {
             environment: "CartPole".into(),
             revision: 0,
             parameters: Vec::new(),
@@ -174,7 +174,11 @@ mod tests {
             let mut test = records.result("D", None);
             test.mean_length += wrong;
             let of_mark = [("D".to_owned(), test)].into();
-            let of_mark = MarkResult { counters: Default::default(), results: of_mark, agreement: records.agreement() };
+            let of_mark = IntermediateEvaluation {
+                counters: Default::default(),
+                results: of_mark,
+                agreement: records.agreement(),
+            };
             result.marks.insert(5, of_mark);
             assert_eq!(verify(&results, &folder, |_, _| ()).is_err(), refused);
         }

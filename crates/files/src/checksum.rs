@@ -13,18 +13,18 @@ const ENTRY: &str = "crc32c";
 const MARK: &[u8] = b"perturb.crc32c=";
 /// Digits of a file's checksum.
 const DIGITS: usize = 8;
-/// What a document is whose checksum is another.
-pub const BROKEN: &str = "it is not what was written: its checksum is another";
+/// The error for a document with a wrong checksum.
+pub const CHECKSUM_MISMATCH: &str = "it is not what was written: its checksum is another";
 
 /// A document and its checksum, in one object.
 #[derive(Serialize)]
-pub struct Sealed<'a, T> {
+pub struct WithChecksum<'a, T> {
     #[serde(flatten)]
     document: &'a T,
     crc32c: u32,
 }
 
-impl<'a, T: Serialize> Sealed<'a, T> {
+impl<'a, T: Serialize> WithChecksum<'a, T> {
     /// `document`, which must be an object.
     ///
     /// # Errors
@@ -37,16 +37,16 @@ impl<'a, T: Serialize> Sealed<'a, T> {
 /// Takes the checksum out of a document that was read; says whether it had one.
 ///
 /// # Errors
-/// [`BROKEN`] if it is another.
+/// [`CHECKSUM_MISMATCH`] if it is another.
 pub fn open(document: &mut Value) -> Result<bool, &'static str> {
     match document.as_object_mut().and_then(|entries| entries.remove(ENTRY)) {
         None => Ok(false),
         Some(sum) if sum == checksum(document) => Ok(true),
-        Some(_) => Err(BROKEN),
+        Some(_) => Err(CHECKSUM_MISMATCH),
     }
 }
 
-/// Of a document without its own entry.
+/// Returns the checksum of a document without its checksum entry.
 fn checksum(document: &Value) -> u32 {
     crc32c::crc32c(document.to_string().as_bytes())
 }
@@ -60,13 +60,13 @@ pub fn insert(file: &mut Vec<u8>, place: usize) {
 /// Whether `file` is what was written, if it says so.
 ///
 /// # Errors
-/// [`BROKEN`] if it is not.
+/// [`CHECKSUM_MISMATCH`] if it is not.
 pub fn check(file: &[u8]) -> Result<(), &'static str> {
     let Some(place) = file.windows(MARK.len()).rposition(|piece| piece == MARK) else { return Ok(()) };
     let (before, rest) = (&file[..place], &file[place + MARK.len()..]);
-    let (digits, behind) = rest.split_at_checked(DIGITS).ok_or(BROKEN)?;
+    let (digits, behind) = rest.split_at_checked(DIGITS).ok_or(CHECKSUM_MISMATCH)?;
     let sum = crc32c::crc32c_append(crc32c::crc32c(before), behind);
-    if format!("{sum:0DIGITS$x}").as_bytes() == digits { Ok(()) } else { Err(BROKEN) }
+    if format!("{sum:0DIGITS$x}").as_bytes() == digits { Ok(()) } else { Err(CHECKSUM_MISMATCH) }
 }
 
 #[cfg(test)]
@@ -78,11 +78,11 @@ mod tests {
     #[test]
     fn a_document_is_what_was_written_or_refused() {
         let document = json!({ "b": [1, 0.1, null], "a": { "d": "e", "c": u64::MAX } });
-        let mut sealed = serde_json::to_value(Sealed::new(&document).unwrap()).unwrap();
+        let mut sealed = serde_json::to_value(WithChecksum::new(&document).unwrap()).unwrap();
         assert_eq!(open(&mut sealed.clone()), Ok(true));
         let text = serde_json::to_string_pretty(&sealed).unwrap();
         let mut read: Value = serde_json::from_str(&text.replace("0.1", "0.2")).unwrap();
-        assert_eq!(open(&mut read), Err(BROKEN));
+        assert_eq!(open(&mut read), Err(CHECKSUM_MISMATCH));
         sealed.as_object_mut().unwrap().remove(ENTRY);
         assert_eq!(open(&mut sealed), Ok(false), "of an earlier program");
         assert_eq!(sealed, document);
@@ -97,7 +97,7 @@ mod tests {
         for place in (0..7).chain(22..file.len()) {
             let mut changed = file.clone();
             changed[place] ^= 1;
-            assert_eq!(check(&changed), Err(BROKEN), "byte {place}");
+            assert_eq!(check(&changed), Err(CHECKSUM_MISMATCH), "byte {place}");
             assert_eq!(check(&file[..place]).is_err(), place >= 22, "cut at byte {place}");
         }
     }

@@ -17,21 +17,21 @@ mod plain;
 
 pub use self::plain::{Stamp, leads_out, open_plain, read_plain, read_plain_text};
 
-/// What files begin with that a write has not finished.
+/// The prefix of files that a write has not finished.
 pub const TEMPORARY_PREFIX: &str = ".tmp-";
-/// Whoever finds a lock taken by somebody who only looks tries so often …
-const TRIES: u32 = 100;
-/// … and waits so long in between: looking takes some microseconds.
-const LOOK: Duration = Duration::from_millis(1);
+/// Attempts to take a lock while another process only tests it.
+const MAX_LOCK_TRIES: u32 = 100;
+/// Time between two of these attempts. A test takes some microseconds.
+const LOCK_RETRY_INTERVAL: Duration = Duration::from_millis(1);
 
-/// Whatever went wrong, where its words are all that matters.
+/// A boxed error, for messages only.
 pub type AnyError = Box<dyn std::error::Error + Send + Sync>;
 
 /// The operating system refused a file.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot {action} {}: {source}", path.display())]
 pub struct FileError {
-    /// What was tried.
+    /// The action, e.g. "read".
     pub action: &'static str,
     /// On what.
     pub path: PathBuf,
@@ -78,10 +78,10 @@ pub fn read_text(path: &Path) -> Result<String> {
 /// # Errors
 /// The operating system's; a pipe or a device, and what is larger than anything that a run writes.
 pub fn read_if_there(path: &Path) -> Result<Option<Vec<u8>>> {
-    read_plain(path, plain::MOST)
+    read_plain(path, plain::MAX_BYTES)
 }
 
-/// What is at a path; `None` if nothing is. That the system cannot tell is not taken for that nothing is there.
+/// Returns the metadata of a path, or `None` if nothing is there. A failure of the file system is an error, not `None`.
 ///
 /// # Errors
 /// The operating system's.
@@ -120,7 +120,7 @@ pub fn list(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-/// Makes sure that there is a folder.
+/// Refuses a path that is no folder.
 ///
 /// # Errors
 /// The operating system's.
@@ -229,7 +229,7 @@ impl Lock {
             options.create(true).truncate(false).read(true).write(true).custom_flags(plain::nonblocking()).open(path)
         };
         let file = file.map_err(io("open", path))?;
-        for _ in 0..TRIES {
+        for _ in 0..MAX_LOCK_TRIES {
             match file.try_lock() {
                 Ok(()) => return Ok(Some(Self(file))),
                 Err(TryLockError::WouldBlock) => {}
@@ -241,7 +241,7 @@ impl Lock {
                 Err(TryLockError::WouldBlock) => return Ok(None),
                 Err(TryLockError::Error(source)) => return Err(io("lock", path)(source)),
             }
-            std::thread::sleep(LOOK);
+            std::thread::sleep(LOCK_RETRY_INTERVAL);
         }
         Ok(None)
     }
@@ -267,7 +267,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lock_ends_with_its_value_although_a_started_process_has_the_open_file() {
+    fn lock_ends_with_its_value_despite_inherited_files() {
         let directory = tempfile::tempdir().unwrap();
         let lock = Lock::try_take(directory.path()).unwrap().unwrap();
         let copy = lock.0.try_clone().unwrap(); // as a process gets it
@@ -351,7 +351,7 @@ mod tests {
         looks.lock_shared().unwrap();
         let begun = std::time::Instant::now();
         assert!(Lock::try_take(&path).unwrap().is_none(), "who looks for ever");
-        assert!(begun.elapsed() >= TRIES * LOOK, "was waited for");
+        assert!(begun.elapsed() >= MAX_LOCK_TRIES * LOCK_RETRY_INTERVAL, "was waited for");
         looks.unlock().unwrap();
         let _lock = Lock::try_take(&path).unwrap().unwrap();
         assert!(is_locked(&path) && Lock::try_take(&path).unwrap().is_none());

@@ -10,7 +10,7 @@ use rustix::fs::OFlags;
 use super::{Result, if_there, io};
 
 /// Nothing that is read whole is larger, bytes.
-pub(super) const MOST: u64 = 1 << 30;
+pub(super) const MAX_BYTES: u64 = 1 << 30;
 
 /// Tells what is at a path from what was there, without reading it: another one when its content is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
@@ -21,13 +21,13 @@ pub struct Stamp {
 }
 
 impl Stamp {
-    /// Of what is at `path`; `None` if nothing is.
-    pub fn of(path: &Path) -> Option<Self> {
-        std::fs::metadata(path).ok().as_ref().map(Self::of_metadata)
+    /// Returns the stamp of the file at `path`; `None` if there is none.
+    pub fn read(path: &Path) -> Option<Self> {
+        std::fs::metadata(path).ok().as_ref().map(Self::from_metadata)
     }
 
-    /// Of what has this metadata.
-    pub fn of_metadata(file: &Metadata) -> Self {
+    /// Returns the stamp for a file's metadata.
+    pub fn from_metadata(file: &Metadata) -> Self {
         Self { inode: file.ino(), length: file.len(), changed: (file.mtime(), file.mtime_nsec()) }
     }
 
@@ -37,17 +37,17 @@ impl Stamp {
         format!("{inode:x}-{length:x}-{seconds:x}-{nanoseconds:x}")
     }
 
-    /// When it was changed, s since 1970.
+    /// The time of the last change, s since 1970.
     pub fn seconds(&self) -> i64 {
         self.changed.0
     }
 
-    /// Which file it is, whatever is in it.
+    /// The inode number.
     pub fn inode(&self) -> u64 {
         self.inode
     }
 
-    /// How long it is, bytes.
+    /// The length, bytes.
     pub fn length(&self) -> u64 {
         self.length
     }
@@ -64,7 +64,7 @@ pub fn open_plain(path: &Path) -> std::io::Result<(File, Metadata)> {
     Ok((file, metadata))
 }
 
-/// The flag that keeps opening a pipe from waiting for its other end.
+/// The flag with which opening a pipe does not wait for its other end.
 pub(super) fn nonblocking() -> i32 {
     OFlags::NONBLOCK.bits().cast_signed()
 }
@@ -77,7 +77,7 @@ fn require_plain(metadata: Metadata) -> std::io::Result<Metadata> {
     }
 }
 
-/// The content of a plain file of at most so many bytes; `None` if it is not there.
+/// Reads a plain file of at most `most` bytes; `None` if it is not there.
 ///
 /// # Errors
 /// The operating system's; a file that is not plain, or longer.
@@ -99,7 +99,7 @@ pub fn read_plain(path: &Path, most: u64) -> Result<Option<Vec<u8>>> {
     if_there(read()).map_err(io("read", path))
 }
 
-/// The text in a plain file of at most so many bytes.
+/// Reads the text in a plain file of at most `most` bytes.
 ///
 /// # Errors
 /// As those of [`read_plain`]; a file that is not there or not UTF-8.
@@ -142,7 +142,7 @@ mod tests {
         symlink("/dev/zero", path("zeros")).unwrap();
         std::fs::create_dir(path("folder")).unwrap();
         for (name, words) in [("pipe", "it is a pipe"), ("zeros", "it is a pipe or a device"), ("folder", "a folder")] {
-            let error = read_plain(&path(name), MOST).unwrap_err();
+            let error = read_plain(&path(name), MAX_BYTES).unwrap_err();
             assert!(error.to_string().contains(words) && !error.is_fault(), "{name}: {error}");
             assert!(super::super::read_if_there(&path(name)).is_err());
         }

@@ -8,9 +8,9 @@ use serde::{Deserialize, Serialize};
 pub struct Axis {
     /// The parameter.
     pub name: String,
-    /// Its unit; "1" if dimensionless.
+    /// The unit; "1" if dimensionless.
     pub unit: String,
-    /// Its value in D.
+    /// The value in D.
     pub default: f64,
     /// The lowest value of R and E.
     pub low: f64,
@@ -18,7 +18,7 @@ pub struct Axis {
     pub high: f64,
     /// R, as pairs of low and high.
     pub random: Vec<(f64, f64)>,
-    /// E, likewise.
+    /// E, as pairs of low and high.
     pub extreme: Vec<(f64, f64)>,
 }
 
@@ -29,7 +29,7 @@ impl Axis {
     }
 
     /// The axis of a parameter.
-    pub fn of(parameter: &proto::Parameter) -> Self {
+    pub fn new(parameter: &proto::Parameter) -> Self {
         let pairs = |distribution: &Option<proto::Distribution>| -> Vec<(f64, f64)> {
             let intervals = distribution.iter().flat_map(|distribution| &distribution.intervals);
             intervals.map(|Interval { low, high }| (*low, *high)).collect()

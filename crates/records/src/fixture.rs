@@ -4,8 +4,8 @@
 use perturb_protocol::Version;
 use perturb_records::success::{Criterion, Side};
 use perturb_records::{
-    About, Assessed, AssessedPolicy, Axis, Ending, EpisodeRecord, Heatmap, HeatmapPoint, Known, RecordedParameter,
-    RecordedTest, Records,
+    Axis, Ending, EpisodeRecord, ExternalEvaluation, ExternalPolicy, Heatmap, HeatmapPoint, PolicyMetadata,
+    RecordedParameter, RecordedTest, Records, RecordsMetadata,
 };
 use perturb_settings::Observe;
 
@@ -52,7 +52,7 @@ pub fn heatmap(grid: usize, figures: impl Fn(f64, f64) -> (f64, f64)) -> Heatmap
 
 /// An agent in `environment` that took so many steps in each of the ten episodes of its tests on D, R and E, where 195 are a
 /// success; a policy for each of what was `trained_on`.
-pub fn assessed(agent: &str, environment: &str, trained_on: &[Option<Version>], steps: [u32; 3]) -> Assessed {
+pub fn assessed(agent: &str, environment: &str, trained_on: &[Option<Version>], steps: [u32; 3]) -> ExternalEvaluation {
     let criterion = |threshold| Criterion {
         quantity: "steps".into(),
         unit: "1".into(),
@@ -62,7 +62,7 @@ pub fn assessed(agent: &str, environment: &str, trained_on: &[Option<Version>], 
     };
     let policy = |&trained_on: &Option<Version>| {
         let parameter = RecordedParameter { name: "length".into(), unit: "m".into(), applied: "length".into() };
-        let mut records = Records::new(About {
+        let mut records = Records::new(RecordsMetadata {
             environment: environment.into(),
             revision: 1,
             parameters: vec![parameter],
@@ -81,8 +81,12 @@ pub fn assessed(agent: &str, environment: &str, trained_on: &[Option<Version>], 
             records.add(RecordedTest { set: version.into(), seed: 7, axes: None }, (0..10).map(one).collect());
         }
         let (timesteps, observe, deterministic) = (Some(100_000), Observe::State, Some(false));
-        AssessedPolicy::new(Known { trained_on, timesteps, seed: 1, episodes: 10, observe, deterministic }, records)
+        ExternalPolicy::new(
+            PolicyMetadata { trained_on, timesteps, seed: 1, episodes: 10, observe, deterministic },
+            records,
+        )
     };
     let policies = trained_on.iter().map(policy).collect();
-    Assessed::new("mine".into(), agent.into(), policies).expect("one environment, each trained on something else")
+    ExternalEvaluation::new("mine".into(), agent.into(), policies)
+        .expect("one environment, each trained on something else")
 }

@@ -1,4 +1,4 @@
-//! How policies do over two parameters.
+//! Heatmaps: return and success of policies over two parameters.
 
 use serde::{Deserialize, Serialize};
 
@@ -12,15 +12,15 @@ use crate::records::{EpisodeRecord, Records};
 use crate::statistics::mean;
 
 /// The most points along an axis: all environments run together.
-pub const MOST_POINTS: usize = 100;
+pub const MAX_POINTS: usize = 100;
 
-/// What to test.
+/// Options of a heatmap.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct HeatmapOptions {
     /// Names of the two parameters, along x and along y.
     pub parameters: [String; 2],
-    /// Where all other parameters come from: of D each has its default, of R and E they are drawn for each episode (RL²: each
-    /// trial).
+    /// The distribution of all other parameters. In D they have their defaults. In R and E they are drawn for each
+    /// episode (RL²: each trial).
     pub base: Version,
     /// Points along each axis, 1 … 100.
     pub grid: usize,
@@ -47,12 +47,12 @@ impl HeatmapOptions {
     }
 }
 
-/// What heatmaps have in common that stand beside each other.
+/// The parameters and the base of a heatmap. Heatmaps of one kind can be compared.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct HeatmapKind {
     /// Along x and along y.
     pub parameters: [String; 2],
-    /// Where the other parameters come from.
+    /// The distribution of the other parameters.
     pub base: Version,
 }
 
@@ -63,9 +63,9 @@ pub struct Heatmap {
     pub environment: String,
     /// x and y.
     pub axes: [Axis; 2],
-    /// Where the other parameters come from, see [`HeatmapOptions::base`].
+    /// The distribution of the other parameters, see [`HeatmapOptions::base`].
     pub base: Version,
-    /// Those that have a value of their own.
+    /// The values of parameters that are fixed.
     pub fixed: Context,
     /// G, points along each axis.
     pub grid: usize,
@@ -84,19 +84,19 @@ pub struct HeatmapPoint {
     pub y: f64,
     /// Undiscounted.
     pub mean_return: f64,
-    /// Of the point's episodes.
+    /// The success rate of the point's episodes, %.
     pub success_percent: f64,
 }
 
 impl HeatmapOptions {
-    /// What it is over.
+    /// Returns the kind of the heatmap.
     pub fn kind(&self) -> HeatmapKind {
         HeatmapKind { parameters: self.parameters.clone(), base: self.base }
     }
 }
 
 impl std::fmt::Display for HeatmapKind {
-    /// As in the names of files.
+    /// Formats the kind as in the names of files.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { parameters: [x, y], base } = self;
         write!(f, "{x}-{y}")?;
@@ -105,7 +105,7 @@ impl std::fmt::Display for HeatmapKind {
 }
 
 impl Heatmap {
-    /// What the set of a heatmap's recorded test is called.
+    /// The name of the test set in a heatmap's records.
     pub const SET: &str = "heatmap";
 
     /// The axes of a heatmap's set: the two parameters that vary, the faster one along x. `None` of another set.
@@ -119,20 +119,21 @@ impl Heatmap {
                 if value(first) != value(second) {
                     faster = Some(varying.len());
                 }
-                varying.push(Axis::of(parameter));
+                varying.push(Axis::new(parameter));
             }
         }
         let [one, other]: [Axis; 2] = varying.try_into().ok()?;
         Some(if faster? == 0 { [one, other] } else { [other, one] })
     }
 
-    /// That of recorded episodes, if they have the test of one.
-    pub fn recorded(records: &Records) -> Option<Self> {
+    /// Computes the heatmap of recorded episodes, if they contain the test of one.
+    pub fn from_recorded_test(records: &Records) -> Option<Self> {
         let axes = records.about.tests.iter().find_map(|test| test.axes.clone())?;
-        Self::of(records, axes)
+        Self::from_records(records, axes)
     }
 
-    /// The contexts of its set over `axes`, of `grid` points along each, where others have the values of `fixed`.
+    /// Returns the contexts of a heatmap's set over `axes`, with `grid` points along each axis. Other parameters have
+    /// the values of `fixed`.
     pub fn contexts(axes: &[Axis; 2], grid: usize, fixed: &Context) -> Vec<Context> {
         let context = |point: usize| {
             let places = [point % grid, point / grid];
@@ -142,19 +143,19 @@ impl Heatmap {
         (0..grid * grid).map(context).collect()
     }
 
-    /// Over what it is.
+    /// Returns the kind of the heatmap.
     pub fn kind(&self) -> HeatmapKind {
         HeatmapKind { parameters: self.axes.clone().map(|axis| axis.name), base: self.base }
     }
 
-    /// Where other parameters came from in a recorded test; `None` if it is not that of a heatmap.
+    /// Returns the base of a recorded heatmap; `None` for other tests.
     pub fn base_of(records: &Records) -> Option<Version> {
         records.about.tests.iter().find(|test| test.set.name == Self::SET).map(|test| test.set.version)
     }
 
     /// From the recorded episodes of a test over `axes`, whose contexts are the points, by y, then x; `None` if they are
     /// those of something else.
-    pub fn of(records: &Records, axes: [Axis; 2]) -> Option<Self> {
+    pub fn from_records(records: &Records, axes: [Axis; 2]) -> Option<Self> {
         let test = records.about.tests.iter().find(|test| test.set.name == Self::SET)?;
         let contexts = test.set.listed();
         let fixed_of = |context: &Context| -> Context {
@@ -170,7 +171,7 @@ impl Heatmap {
         let value = |context: &Context, axis: &Axis| context.get(&axis.name).copied().unwrap_or(f64::NAN);
         let mut by_point: Vec<Vec<&EpisodeRecord>> = vec![Vec::new(); contexts.len()];
         let place = |episode: &EpisodeRecord| episode.environment_index as usize % contexts.len();
-        records.of(Self::SET).for_each(|episode| by_point[place(episode)].push(episode));
+        records.episodes_on(Self::SET).for_each(|episode| by_point[place(episode)].push(episode));
         let figures = |(context, episodes): (&Context, &Vec<&EpisodeRecord>)| HeatmapPoint {
             x: value(context, x),
             y: value(context, y),
@@ -226,7 +227,7 @@ impl Heatmap {
         grid > 0 && grid.checked_mul(grid) == Some(self.points.len()) && self.points.iter().enumerate().all(fits)
     }
 
-    /// What is said of the parameters that are no axes.
+    /// Describes the values of the parameters that are no axes.
     pub fn others(&self) -> String {
         let fixed: String = self.fixed.iter().map(|(name, value)| format!("{name} = {value}, ")).collect();
         match self.base {
@@ -239,7 +240,7 @@ impl Heatmap {
 /// A line for each point.
 pub fn heatmap_table(heatmap: &Heatmap) -> Table {
     let [x, y] = &heatmap.axes;
-    Table::of("", &heatmap.points)
+    Table::builder("", &heatmap.points)
         .number(&x.name, |point| point.x)
         .number(&y.name, |point| point.y)
         .number("mean_return", |point| point.mean_return)
@@ -271,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mean_is_over_policies_at_each_point_and_over_like_points_alone() {
+    fn mean_is_over_policies_with_equal_points() {
         let [a, b] = [0.0, 100.0].map(|success| fixture::heatmap(2, |x, y| (10.0 * x + y + success, success)));
         let both = Heatmap::mean(&[a.clone(), b.clone()]).unwrap();
         for (index, point) in both.points.iter().enumerate() {
@@ -310,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn the_axes_of_a_recorded_heatmap_are_the_parameters_that_vary_the_faster_one_along_x() {
+    fn recorded_axes_are_varying_parameters_faster_one_along_x() {
         let heatmap = fixture::heatmap(2, |_, _| (0.0, 0.0));
         let parameter = |axis: &Axis| {
             let distribution = |pairs: &[(f64, f64)]| proto::Distribution {

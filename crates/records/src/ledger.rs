@@ -1,7 +1,8 @@
-//! What servers' ledgers prove of a policy: that its training drew from what it says, and never from its test sets.
+//! Audit of a policy by servers' ledgers: the training drew from the claimed distribution, and never from its test
+//! sets.
 //!
-//! LedgerSession trained is known by tokens: the names under which the training's seed was drawn. Whatever these drew before the
-//! training's end may have been learned from, in whichever session.
+//! Tokens tell who trained: they are the names under which the training's seed was drawn. Everything that these tokens
+//! drew before the training's end may have been learned from, in any session.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -19,35 +20,35 @@ use crate::records::{RecordedTest, Records};
 #[derive(Debug, Default)]
 pub struct Ledgers {
     heads: Vec<Head>,
-    /// One for each environment that began.
+    /// The sampling of each environment.
     drawn: Vec<Drawn>,
-    /// Those of each address in a session.
-    at: BTreeMap<(Session, u64, u32), Address>,
+    /// The environments of each address in a session.
+    at: BTreeMap<(SessionId, u64, u32), EnvironmentAddress>,
     refused: Vec<Refused>,
-    /// When each beginning of each server was over, whether or not it said so.
+    /// The end of each server process, written or not.
     over: Vec<Option<Moment>>,
     /// A line that contradicts itself.
     defect: Option<(u64, &'static str)>,
 }
 
-/// What environments of one seed and index drew in a session.
+/// The sampling of environments with one seed and index in a session.
 #[derive(Debug, Default)]
-struct Address {
-    /// Which of `drawn` have not ended.
+struct EnvironmentAddress {
+    /// Indices of entries of `drawn` that have not ended.
     open: Vec<usize>,
-    /// What ended of them so far. Only when all have is it known of which.
+    /// Ends so far. They are assigned to environments when all have ended.
     ends: Vec<(Option<u64>, Moment)>,
-    /// Which had ended last.
+    /// Indices of the entries that ended last.
     closed: Vec<usize>,
 }
 
 /// The most environments that a line may name.
-const MOST_ENVS: u32 = 1 << 22;
+const MAX_ENVS: u32 = 1 << 22;
 
-/// Where a ledger ends now.
+/// The end of a ledger.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Head {
-    /// Its file.
+    /// The file of the ledger.
     pub path: PathBuf,
     /// Lines.
     pub lines: u64,
@@ -57,31 +58,31 @@ pub struct Head {
     pub unfinished: u64,
 }
 
-/// What was found of one policy.
+/// The result of the audit of one policy.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct Proof {
     /// Under which tokens' names its training drew, `None` where none was needed; empty if no ledger has it.
     pub tokens: BTreeSet<Option<String>>,
     /// Sessions of its training.
     pub sessions: usize,
-    /// What speaks against it, each in a sentence.
+    /// Findings against the policy, one sentence each.
     pub against: Vec<String>,
-    /// What its tokens were refused until its end, each in a sentence.
+    /// Requests that were refused to the policy's tokens before it ended, one sentence each.
     pub refused: Vec<String>,
 }
 
-/// A session: which beginning of which server, and its number there.
-type Session = (usize, u64);
+/// A session: the index of the server process, and the session's number in it.
+type SessionId = (usize, u64);
 
-/// Where a line stands.
+/// The position of a line.
 #[derive(Debug, Clone)]
-struct Line {
+struct LedgerLine {
     at: Moment,
-    session: Session,
+    session: SessionId,
     who: LedgerSession,
 }
 
-/// When something was written: by its place in its ledger, and between ledgers by the clock.
+/// The time of a record: its position in its ledger, and the clock between ledgers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Moment {
     ledger: usize,
@@ -98,30 +99,30 @@ impl Moment {
 /// An environment that began to draw.
 #[derive(Debug)]
 struct Drawn {
-    line: Arc<Line>,
+    line: Arc<LedgerLine>,
     seed: u64,
     index: u32,
-    /// The first episode …
+    /// Index of the first episode.
     first: u64,
-    /// … and the last, if it is known; none at all if nothing was drawn.
-    last: Last,
-    /// When the last was begun.
+    /// Index of the last episode, if it is known. Below the first if nothing was drawn.
+    last: LastDraw,
+    /// The time at which the last one ended.
     ended: Option<Moment>,
     region: Arc<Region>,
 }
 
 /// The last episode that was begun.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Last {
+enum LastDraw {
     None,
     Episode(u64),
     Unknown,
 }
 
-/// What a session wanted to draw from.
+/// A refused sampling request of a session.
 #[derive(Debug)]
 struct Refused {
-    line: Line,
+    line: LedgerLine,
     region: Region,
     reason: String,
 }
@@ -159,7 +160,7 @@ impl Ledgers {
         }
     }
 
-    /// Where each of them ends now.
+    /// Returns the end of each ledger.
     pub fn heads(&self) -> &[Head] {
         &self.heads
     }
@@ -171,7 +172,7 @@ impl Ledgers {
             return;
         }
         let beginning = self.over.len().saturating_sub(1);
-        let line = |who: LedgerSession| Line { at, session: (beginning, who.session), who };
+        let line = |who: LedgerSession| LedgerLine { at, session: (beginning, who.session), who };
         match event {
             LedgerEvent::Began { .. } => {
                 // The one before it, of the same ledger, ended by then.
@@ -190,10 +191,10 @@ impl Ledgers {
         }
     }
 
-    /// What a line ends it ends before it begins something.
-    fn take_draws(&mut self, line: Line, DrawRecord { regions, begins, ends, .. }: DrawRecord) {
+    /// Takes a sampling record. Its ends come before its beginnings.
+    fn take_draws(&mut self, line: LedgerLine, DrawRecord { regions, begins, ends, .. }: DrawRecord) {
         let named = begins.iter().map(|begin| begin.count).chain(ends.iter().map(|end| end.count));
-        if named.fold(0, u32::saturating_add) > MOST_ENVS {
+        if named.fold(0, u32::saturating_add) > MAX_ENVS {
             self.defect = Some((line.at.n, "names more environments than a session has"));
             return;
         }
@@ -211,12 +212,12 @@ impl Ledgers {
             for index in (0..count).map(|offset| index.saturating_add(offset)) {
                 self.at.entry((line.session, seed, index)).or_default().open.push(self.drawn.len());
                 let (line, region) = (Arc::clone(&line), Arc::clone(region));
-                self.drawn.push(Drawn { line, seed, index, first, last: Last::Unknown, ended: None, region });
+                self.drawn.push(Drawn { line, seed, index, first, last: LastDraw::Unknown, ended: None, region });
             }
         }
     }
 
-    fn end_one(&mut self, address: (Session, u64, u32), end: (Option<u64>, Moment)) {
+    fn end_one(&mut self, address: (SessionId, u64, u32), end: (Option<u64>, Moment)) {
         let address = self.at.entry(address).or_default();
         address.ends.push(end);
         // Where nothing was open, what had ended went on after all.
@@ -228,8 +229,11 @@ impl Ledgers {
             address.closed = std::mem::take(&mut address.open);
         }
         let ends = std::mem::take(&mut address.ends);
-        let last =
-            ends.iter().map(|(episode, _)| episode.map_or(Last::None, Last::Episode)).max().unwrap_or(Last::None);
+        let last = ends
+            .iter()
+            .map(|(episode, _)| episode.map_or(LastDraw::None, LastDraw::Episode))
+            .max()
+            .unwrap_or(LastDraw::None);
         for &which in &address.closed {
             let drawn = &mut self.drawn[which];
             drawn.last = if went_on { drawn.last.max(last) } else { last };
@@ -237,7 +241,7 @@ impl Ledgers {
         }
     }
 
-    /// What they say of a policy that was trained in an environment as `training` says, for so many episodes, and of its
+    /// Audits a policy that was trained for `episodes` episodes in an environment as `training` says, together with its
     /// recorded tests.
     pub fn prove(
         &self,
@@ -250,14 +254,14 @@ impl Ledgers {
         // Other trainings with its seed, on something else, are told by what they draw from.
         let is_own = |drawn: &&Drawn| {
             drawn.line.who.environment == environment.name
-                && drawn.last != Last::None
+                && drawn.last != LastDraw::None
                 && drawn.seed == training.seed
                 && (drawn.index as usize) < training.num_envs
                 && drawn.region.is_within([&claimed])
                 && claimed.is_within([&*drawn.region])
         };
         let own: Vec<&Drawn> = self.drawn.iter().filter(is_own).collect();
-        let sessions: BTreeSet<Session> = own.iter().map(|drawn| drawn.line.session).collect();
+        let sessions: BTreeSet<SessionId> = own.iter().map(|drawn| drawn.line.session).collect();
         let tokens = own.iter().map(|drawn| drawn.line.who.token.clone()).collect();
         let mut proof = Proof { tokens, sessions: sessions.len(), ..Proof::default() };
         let drawn = own.iter().map(|drawn| drawn.episodes()).fold(0, u64::saturating_add);
@@ -271,7 +275,7 @@ impl Ledgers {
         // A session that did not say how far it came went on as long as its server.
         let end = |drawn: &&Drawn| drawn.ended.or(self.over.get(drawn.line.session.0).copied().flatten());
         let ends: Vec<Option<Moment>> = own.iter().map(end).collect();
-        let is_its = |line: &Line| {
+        let is_its = |line: &LedgerLine| {
             line.who.environment == environment.name
                 && proof.tokens.contains(&line.who.token)
                 && ends.iter().any(|end| end.is_none_or(|end| line.at.is_before(end)))
@@ -281,7 +285,7 @@ impl Ledgers {
             let others = tested(environment, test, &claimed);
             let overlaps = |region: &Region| others.iter().any(|other| other.overlaps(region));
             let mut said: Option<Moment> = None;
-            for drawn in self.drawn.iter().filter(|drawn| drawn.last != Last::None && is_its(&drawn.line)) {
+            for drawn in self.drawn.iter().filter(|drawn| drawn.last != LastDraw::None && is_its(&drawn.line)) {
                 let what = if said == Some(drawn.line.at) {
                     continue;
                 } else if drawn.has_episode(test, records) {
@@ -303,8 +307,8 @@ impl Ledgers {
         proof
     }
 
-    fn sentence(&self, line: &Line, what: &str) -> String {
-        let Line { at: Moment { ledger, n, unix_ms }, who, .. } = line;
+    fn sentence(&self, line: &LedgerLine, what: &str) -> String {
+        let LedgerLine { at: Moment { ledger, n, unix_ms }, who, .. } = line;
         let path = self.heads.get(*ledger).map(|head| head.path.display().to_string()).unwrap_or_default();
         let mut sentence = format!("line {} of {path}: {what}", n + 1);
         let token = who.token.as_ref().map_or("without a token".into(), |token| format!("by the token {token:?}"));
@@ -314,28 +318,28 @@ impl Ledgers {
     }
 }
 
-/// What a test draws from, context by context, where that is not what the training draws from, too.
+/// Returns the regions that a test draws from and the training does not, by context.
 fn tested(environment: &proto::Environment, test: &RecordedTest, claimed: &Region) -> Vec<Region> {
     let of = |context| Region::from_version(environment, test.set.version, &test.set.parameters(context));
     test.set.listed().iter().map(of).filter(|region| !region.is_within([claimed])).collect()
 }
 
 impl Drawn {
-    /// How many episodes it drew; if that is not known, no end of them.
+    /// Returns the number of sampled episodes; the maximum if it is not known.
     fn episodes(&self) -> u64 {
         match self.last {
-            Last::None => 0,
-            Last::Episode(last) => last.saturating_sub(self.first).saturating_add(u64::from(last >= self.first)),
-            Last::Unknown => u64::MAX,
+            LastDraw::None => 0,
+            LastDraw::Episode(last) => last.saturating_sub(self.first).saturating_add(u64::from(last >= self.first)),
+            LastDraw::Unknown => u64::MAX,
         }
     }
 
     /// Whether it may have drawn a recorded episode of a test.
     fn has_episode(&self, test: &RecordedTest, records: &Records) -> bool {
         let may = |episode: u64| match self.last {
-            Last::None => false,
-            Last::Episode(last) => (self.first..=last).contains(&episode),
-            Last::Unknown => self.first <= episode,
+            LastDraw::None => false,
+            LastDraw::Episode(last) => (self.first..=last).contains(&episode),
+            LastDraw::Unknown => self.first <= episode,
         };
         let its = records.episodes.iter().filter(|record| record.set == test.set.name && record.seed == test.seed);
         self.seed == test.seed

@@ -11,7 +11,7 @@ use toml::Table;
 
 use crate::fixture;
 use crate::ledger::{Ledgers, Proof};
-use crate::records::{About, RecordedTest, Records};
+use crate::records::{RecordedTest, Records, RecordsMetadata};
 
 fn environment() -> proto::Environment {
     let drawn = |low, high| Some(proto::Distribution { intervals: vec![proto::Interval { low, high }] });
@@ -30,7 +30,7 @@ fn environment() -> proto::Environment {
 fn prove(ledgers: &Ledgers) -> Proof {
     let table: Table = toml::from_str("environment = 'CartPole'\nversion = 'R'\nseed = 1\nnum_envs = 2").unwrap();
     let training = TrainConfig::load(None, &[], table).unwrap().common;
-    let mut records = Records::new(About::new(&environment(), "policy".into(), 1));
+    let mut records = Records::new(RecordsMetadata::new(&environment(), "policy".into(), 1));
     for version in [R, E] {
         let mut episode = fixture::episode(&version.to_string(), 0, 1.0, 9, true);
         (episode.seed, episode.environment_index, episode.episode_index) = (7, 0, 5);
@@ -95,7 +95,7 @@ fn a_training_that_kept_to_its_own_is_clean() {
 }
 
 #[test]
-fn what_its_token_drew_of_the_tests_before_its_end_speaks_against_it() {
+fn early_draws_from_test_sets_count_against_a_policy() {
     let [begun, ended] = trained();
     let with = |event: LedgerEvent| proof(&[begun.clone(), event, ended.clone()]);
     says(&with(begins(1, "ann", E, (9, 0, 1, 0))), "line 3 of ");

@@ -1,4 +1,4 @@
-//! What the paper reports: Packer et al. (2018), arXiv:1810.12282.
+//! The published results of Packer et al. (2018), arXiv:1810.12282.
 
 use perturb_settings::{Method, Observe, Preset};
 use serde::Deserialize;
@@ -8,9 +8,9 @@ use crate::statistics::Summary;
 
 /// Every number of its tables.
 const TABLE: &str = include_str!("../data/paper_results.csv");
-/// Its environments, as they are spelled here.
+/// The paper's environments by their names in the catalogue.
 pub const ENVIRONMENTS: [&str; 6] = ["CartPole", "MountainCar", "Acrobot", "Pendulum", "HalfCheetah", "Hopper"];
-/// Of these, those whose physics is another engine's than the paper's: its numbers are no measure of ours.
+/// Environments with another physics engine than the paper's. Their numbers cannot be compared.
 const OTHER_ENGINE: [&str; 2] = ["HalfCheetah", "Hopper"];
 const RUNS: usize = 5;
 
@@ -37,7 +37,7 @@ impl Record {
             && self.architecture.eq_ignore_ascii_case(&method.architecture)
             && self.episodes_per_trial == method.episodes_per_trial
             && !method.observe.sees_parameters()
-            && !method.elsewhere
+            && !method.external
     }
 }
 
@@ -57,7 +57,7 @@ pub fn methods(environment: &str) -> Vec<Method> {
             episodes_per_trial: record.episodes_per_trial,
             preset: Preset::default(),
             observe: Observe::default(),
-            elsewhere: false,
+            external: false,
         };
         if !methods.contains(&method) {
             methods.push(method);
@@ -91,7 +91,7 @@ mod tests {
             episodes_per_trial,
             preset: Preset::Perturb,
             observe: Observe::State,
-            elsewhere: false,
+            external: false,
         }
     }
 
@@ -145,7 +145,7 @@ mod tests {
         assert_eq!(averages.len(), 42);
         for Record { algorithm, architecture, episodes_per_trial, metric, mean_percent, .. } in averages {
             let (preset, observe) = (Preset::Paper, Observe::State);
-            let method = Method { algorithm, architecture, episodes_per_trial, preset, observe, elsewhere: false };
+            let method = Method { algorithm, architecture, episodes_per_trial, preset, observe, external: false };
             let means = ENVIRONMENTS.map(|environment| number(environment, &method, metric).unwrap().mean);
             let mean = means.iter().sum::<f64>() / means.len() as f64;
             // Either is rounded to 0.01: half of that each, and some for the binary fractions.

@@ -1,11 +1,11 @@
-//! What tests come to.
+//! Results of tests.
 
 use serde::{Deserialize, Serialize};
 
 /// Figures over test episodes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TestResult {
-    /// Of RL², the last one of each trial.
+    /// The number of episodes. With RL², only the last episode of each trial counts.
     pub episodes: u64,
     /// The share of the episodes that were successes.
     pub success_percent: f64,

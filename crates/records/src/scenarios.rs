@@ -8,12 +8,12 @@ use crate::statistics::geometric_mean;
 
 use perturb_protocol::Version;
 
-/// The paper's versions, and those others that there is something of: lines to compare with.
+/// Returns the paper's versions, and those other versions for which `is_there` holds.
 pub fn versions(is_there: impl Fn(Version) -> bool) -> Vec<Version> {
     Version::KNOWN.into_iter().filter(|version| Version::ALL.contains(version) || is_there(*version)).collect()
 }
 
-/// What a policy is trained on.
+/// The training distribution of a policy.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum TrainedOn<'a> {
     /// D, R, E or R+E.
@@ -24,11 +24,11 @@ pub enum TrainedOn<'a> {
     Unknown,
 }
 
-/// What stands where it is not known what was trained on.
+/// The name of an unknown training distribution.
 const UNKNOWN: &str = "unknown";
 
 impl TrainedOn<'_> {
-    /// Its name where a file has it.
+    /// Returns the name for use in file names.
     pub fn file_name(&self) -> &str {
         match self {
             TrainedOn::Version(version) => version.file_name(),
@@ -51,20 +51,20 @@ impl std::fmt::Display for TrainedOn<'_> {
 /// Training on one version and testing on another, e.g. "DR".
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Scenario {
-    /// Where the policy was trained.
+    /// The version of the training.
     pub train: Version,
-    /// Where it is tested.
+    /// The version of the test.
     pub test: Version,
 }
 
 impl Scenario {
     /// The nine pairs: DD, DR, DE, RD, … EE.
     pub fn all() -> impl Iterator<Item = Scenario> {
-        Self::of(&Version::ALL, &Version::ALL)
+        Self::pairs(&Version::ALL, &Version::ALL)
     }
 
     /// All pairs of what was trained on and tested on.
-    pub fn of(trained: &[Version], tested: &[Version]) -> impl Iterator<Item = Scenario> {
+    pub fn pairs(trained: &[Version], tested: &[Version]) -> impl Iterator<Item = Scenario> {
         trained.iter().flat_map(|&train| tested.iter().map(move |&test| Scenario { train, test }))
     }
 }
@@ -75,7 +75,7 @@ impl fmt::Display for Scenario {
     }
 }
 
-/// One of the paper's three numbers.
+/// A metric of the paper.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Metric {
@@ -91,7 +91,7 @@ impl Metric {
     /// All, in the paper's order.
     pub const ALL: [Metric; 3] = [Metric::Default, Metric::Interpolation, Metric::Extrapolation];
 
-    /// What Extrapolation is the geometric mean of.
+    /// The scenarios whose geometric mean is Extrapolation.
     pub const EXTRAPOLATION: [Scenario; 3] = [
         Scenario { train: Version::D, test: Version::R },
         Scenario { train: Version::D, test: Version::E },
@@ -99,7 +99,7 @@ impl Metric {
     ];
 
     /// The metric from the success rates of scenarios; `None` if one that it needs has none.
-    pub fn of(self, rate_of: impl Fn(Scenario) -> Option<f64>) -> Option<f64> {
+    pub fn value(self, rate_of: impl Fn(Scenario) -> Option<f64>) -> Option<f64> {
         use Version::{D, R};
         let rate = |train, test| rate_of(Scenario { train, test });
         match self {
@@ -139,11 +139,11 @@ mod tests {
             "RE" => Some(10.0),
             _ => None,
         };
-        assert_eq!((Metric::Default.of(rate), Metric::Interpolation.of(rate)), (Some(90.0), Some(70.0)));
-        let extrapolation = Metric::Extrapolation.of(rate).unwrap();
+        assert_eq!((Metric::Default.value(rate), Metric::Interpolation.value(rate)), (Some(90.0), Some(70.0)));
+        let extrapolation = Metric::Extrapolation.value(rate).unwrap();
         assert!((extrapolation - 20.0).abs() < 1e-12, "the third root of 20 · 40 · 10");
         for needed in ["DR", "DE", "RE"] {
-            assert_eq!(Metric::Extrapolation.of(|s| rate(s).filter(|_| s.to_string() != needed)), None, "{needed}");
+            assert_eq!(Metric::Extrapolation.value(|s| rate(s).filter(|_| s.to_string() != needed)), None, "{needed}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! When an episode counts as a success.
+//! Success criteria of episodes.
 
 use std::fmt;
 use std::str::FromStr;
@@ -9,23 +9,23 @@ use serde::{Deserialize, Serialize};
 
 use perturb_settings::{ValueError, require};
 
-/// What is counted, not measured.
+/// Quantities that count steps.
 const STEPS: [&str; 2] = ["steps", "steps_in_a_row"];
 
 /// A success achieved the threshold, or was better than it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Criterion {
-    /// What an episode achieves, e.g. "steps" or "distance".
+    /// The quantity that is compared, e.g. "steps" or "distance".
     pub quantity: String,
-    /// Its unit; "1" for steps.
+    /// The unit; "1" for steps.
     pub unit: String,
     /// On which side of the threshold successes are.
     pub side: Side,
     /// In the quantity's unit.
     pub threshold: f64,
-    /// The most that an episode can come to: its step limit, if steps are compared. Of thresholds beyond it nothing is
-    /// known.
+    /// The maximum value of an episode: the step limit, if steps are compared. Nothing is known of thresholds beyond
+    /// it.
     #[serde(default)]
     pub most: Option<f64>,
 }
@@ -43,35 +43,35 @@ pub enum Side {
 /// A threshold of one's own, written `steps=90`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Threshold {
-    /// What is compared with it.
+    /// The quantity that is compared.
     pub quantity: String,
     /// In the quantity's unit.
     pub value: f64,
 }
 
-/// What decides about success in a test, written `text`, `code` or `steps=90`.
+/// The success rule of a test, written `text`, `code` or `steps=90`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Rule {
     /// The environment's own, which is that of the paper's text.
     Text,
-    /// That of the paper's published code.
+    /// The rule of the paper's published code.
     Code,
     /// Either of them with another threshold, whichever compares that quantity.
     At(Threshold),
 }
 
-/// What a refusal calls a threshold.
+/// The name of a threshold in errors.
 const THRESHOLD: &str = "the success threshold";
 
 impl Criterion {
-    /// That of `environment`, after the paper's text; `None` if its server does not say.
-    pub fn of(environment: &proto::Environment) -> Option<Self> {
+    /// Returns the criterion of `environment` after the paper's text; `None` if its server does not say.
+    pub fn from_environment(environment: &proto::Environment) -> Option<Self> {
         Self::read(environment.success.as_ref()?, environment.step_limit)
     }
 
-    /// That of the paper's published code; `None` if the server does not say.
-    pub fn of_code(environment: &proto::Environment) -> Option<Self> {
+    /// Returns the criterion of the paper's published code; `None` if the server does not say.
+    pub fn from_environment_code(environment: &proto::Environment) -> Option<Self> {
         Self::read(environment.code_success.as_ref()?, environment.step_limit)
     }
 
@@ -86,7 +86,7 @@ impl Criterion {
         Some(Self { quantity, unit, side, threshold: success.threshold, most })
     }
 
-    /// The same with another threshold.
+    /// Returns the criterion with another threshold.
     ///
     /// # Errors
     /// [`ValueError`] if that is one of another quantity.
@@ -112,7 +112,7 @@ impl Rule {
     ///
     /// # Errors
     /// [`ValueError`] if it is one of another quantity, or if the server does not say what is compared.
-    pub fn of(&self, text: Option<&Criterion>, code: Option<&Criterion>) -> Result<Criterion, ValueError> {
+    pub fn criterion(&self, text: Option<&Criterion>, code: Option<&Criterion>) -> Result<Criterion, ValueError> {
         let unknown = |expected| move || ValueError::new("the rule of success", self, expected);
         match self {
             Self::Code => {
@@ -214,14 +214,14 @@ mod tests {
     }
 
     #[test]
-    fn a_rule_is_the_texts_the_codes_or_one_of_them_with_another_threshold() {
+    fn rule_is_text_code_or_a_threshold() {
         let text = steps(Side::AtLeast, 100.0);
         let code = Criterion { quantity: "steps_in_a_row".into(), threshold: 90.0, ..text.clone() };
-        let of = |rule: &str| rule.parse::<Rule>().unwrap().of(Some(&text), Some(&code)).unwrap();
+        let of = |rule: &str| rule.parse::<Rule>().unwrap().criterion(Some(&text), Some(&code)).unwrap();
         assert_eq!((of("text"), of("code")), (text.clone(), code.clone()));
         assert_eq!(of("steps=80"), Criterion { threshold: 80.0, ..text.clone() });
         assert_eq!(of("steps_in_a_row=70"), Criterion { threshold: 70.0, ..code.clone() });
-        let refused = |rule: &str| rule.parse::<Rule>().unwrap().of(Some(&text), None).unwrap_err().to_string();
+        let refused = |rule: &str| rule.parse::<Rule>().unwrap().criterion(Some(&text), None).unwrap_err().to_string();
         assert_eq!(
             refused("code"),
             "the rule of success is code, but must be left out: the server does not say what the paper's code asks"

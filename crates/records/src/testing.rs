@@ -1,4 +1,4 @@
-//! Which episodes a test plays, and how they are recorded, whoever plays them: equal policies have equal records.
+//! Choice and recording of a test's episodes. Equal policies have equal records, whichever program plays them.
 
 use perturb_policy::random::{Purpose, stream};
 use perturb_protocol::region::{self, Region};
@@ -10,7 +10,7 @@ use crate::heatmap::Heatmap;
 use crate::records::{Difference, EpisodeRecord, RecordedTest, Records};
 
 /// The most environments that are tested together, unless a set has more contexts.
-const MOST_ENVS: usize = 100;
+const MAX_ENVS: usize = 100;
 
 /// Why a test's episodes are not recorded.
 #[derive(Debug, thiserror::Error)]
@@ -44,23 +44,23 @@ pub fn environment_seed(purpose: Purpose, seed: u64, version: Version) -> u64 {
 fn quotas(episodes: u64, contexts: usize) -> Vec<u64> {
     let each = episodes.div_ceil(contexts as u64).max(1);
     // One context has as many environments as it can use, each of several its share.
-    let copies = ((MOST_ENVS / contexts) as u64).clamp(1, each);
+    let copies = ((MAX_ENVS / contexts) as u64).clamp(1, each);
     (0..copies).flat_map(|i| vec![each / copies + u64::from(i < each % copies); contexts]).collect()
 }
 
 /// A test under way: of each environment the first trials count, and of each the last episode. Counting the first to end
 /// instead would favour short ones.
 #[derive(Clone, Debug)]
-pub struct Counting {
+pub struct TestCollector {
     test: RecordedTest,
     quotas: Vec<u64>,
     episodes_per_trial: u32,
     counted: Vec<EndedEpisode>,
 }
 
-impl Counting {
-    /// Of `episodes` episodes on `set`, of a test with `seed` for `purpose`, see [`environment_seed`]. Of a trial of
-    /// several episodes the last one counts.
+impl TestCollector {
+    /// Collects `episodes` episodes on `set`. `seed` and `purpose` are described at [`environment_seed`]. Of a trial
+    /// with several episodes, the last one counts.
     pub fn new(set: TestSet, purpose: Purpose, seed: u64, episodes: u64, episodes_per_trial: u32) -> Self {
         let quotas = quotas(episodes, set.listed().len());
         let seed = environment_seed(purpose, seed, set.version);
@@ -106,11 +106,11 @@ impl Counting {
         for end in &counted {
             check_requested(environment, &test.set, &asked[end.slot % contexts.len()], &end.receipt.requested)?;
         }
-        let record = |end| EpisodeRecord::of(&records.about, &test.set.name, test.seed, end);
+        let record = |end| EpisodeRecord::new(&records.about, &test.set.name, test.seed, end);
         let episodes = counted.into_iter().map(record).collect();
         let mut added = Records::new(records.about.clone());
         added.episodes = episodes;
-        if let Some(difference) = added.agreement().largest.filter(Difference::is_real) {
+        if let Some(difference) = added.agreement().largest.filter(Difference::exceeds_tolerance) {
             return Err(NotRecorded::NotApplied { set: test.set.name, difference });
         }
         records.add(test, added.episodes);
@@ -118,7 +118,7 @@ impl Counting {
     }
 }
 
-/// What each parameter may be in a context of a set, in a trial of each part of its version.
+/// Returns the permitted values of each parameter in a context of a set, for each part of its version.
 fn asked(environment: &proto::Environment, set: &TestSet, context: &Context) -> Vec<Vec<Distribution>> {
     let region = Region::from_version(environment, set.version, &set.parameters(context));
     let in_order = |values: &region::ParameterBox| {
@@ -157,7 +157,7 @@ fn wrong(asked: &[Vec<Distribution>], requested: &[f64]) -> Option<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::records::{About, Ending};
+    use crate::records::{Ending, RecordsMetadata};
 
     fn environment() -> proto::Environment {
         let drawn = |low, high| Some(proto::Distribution { intervals: vec![proto::Interval { low, high }] });
@@ -192,8 +192,8 @@ mod tests {
     }
 
     fn finished(version: Version, ends: &[EndedEpisode]) -> Result<Records, NotRecorded> {
-        let mut records = Records::new(About::new(&environment(), "policy".into(), 1));
-        let mut counting = Counting::new(version.into(), Purpose::TestEnvironments, 1, 2, 1);
+        let mut records = Records::new(RecordsMetadata::new(&environment(), "policy".into(), 1));
+        let mut counting = TestCollector::new(version.into(), Purpose::TestEnvironments, 1, 2, 1);
         for end in ends {
             counting.take([end.clone()]);
         }
@@ -242,7 +242,7 @@ mod tests {
     fn progress_of_too_many_episodes_saturates() {
         let contexts = perturb_settings::sets::Contexts::Listed(vec![Context::new(); 2]);
         let set = TestSet { name: "two".into(), version: Version::D, contexts };
-        let counting = Counting::new(set, Purpose::TestEnvironments, 1, u64::MAX, 1);
+        let counting = TestCollector::new(set, Purpose::TestEnvironments, 1, u64::MAX, 1);
         assert_eq!(counting.progress(), (0, u64::MAX), "the sum of the quotas is 2^64");
     }
 
@@ -265,7 +265,7 @@ mod tests {
                 let own: u64 = quotas.iter().skip(context).step_by(contexts).sum();
                 assert_eq!(own, each, "{episodes} episodes in {contexts} contexts");
             }
-            assert!(quotas.len() <= MOST_ENVS.max(contexts) && quotas.iter().all(|&quota| quota > 0));
+            assert!(quotas.len() <= MAX_ENVS.max(contexts) && quotas.iter().all(|&quota| quota > 0));
         }
     }
 

@@ -13,9 +13,9 @@ pub struct PolicyHeatmap {
     pub method: String,
     /// E.g. "D".
     pub trained_on: String,
-    /// Of the training.
+    /// The seed of the training.
     pub seed: u64,
-    /// What it does.
+    /// The heatmap of the policy.
     pub heatmap: Heatmap,
 }
 
@@ -60,7 +60,7 @@ fn table(columns: &[(String, usize, Heatmap)]) -> Table {
     };
     let lines: Vec<(String, usize, HeatmapPoint)> = columns.iter().flat_map(of).collect();
     let [x, y] = columns.first().map(|(.., mean)| mean.axes.clone().map(|axis| axis.name)).unwrap_or_default();
-    Table::of("", &lines)
+    Table::builder("", &lines)
         .text("trained", |(caption, ..)| caption)
         .number("policies", |(_, policies, _)| policies)
         .number(x, |(.., point)| point.x)
@@ -86,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn policies_that_were_trained_alike_are_one_mean_and_others_stand_beside_it() {
+    fn policies_trained_alike_are_averaged() {
         let policies = [policy("ppo ff", "D", 1, 0.0), policy("ppo ff", "R", 1, 30.0), policy("ppo ff", "D", 2, 100.0)];
         let (panels, table) = policies_side_by_side(&policies).unwrap();
         let success: Vec<f64> =
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn a_single_columns_figures_are_those_of_its_mean_and_other_points_are_refused() {
+    fn single_column_shows_its_mean() {
         let one = policy("ppo ff", "D", 1, 0.0);
         let (_, table) = policies_side_by_side(std::slice::from_ref(&one)).unwrap();
         assert_eq!(table, heatmap_table(&one.heatmap));

@@ -3,16 +3,16 @@
 //! - [`Report`] compares results, in tables and on a page; [`plot`] draws.
 #![forbid(unsafe_code)]
 
-mod against_training;
 #[cfg(test)]
 #[path = "../../experiment/src/fixture.rs"]
 mod fixture;
+mod generalization_curves;
 mod heatmap_policies;
 pub mod plot;
 mod report;
 
 pub use heatmap_policies::{PolicyHeatmap, policies_side_by_side};
 pub use report::{
-    Drawing, Figure, FigureData, Figures, HeatmapPicture, Picture, Report, ReportError, Sources, Whole, curves_table,
-    heatmap_pictures, html, save_heatmaps,
+    Figure, FigureData, Figures, HeatmapPicture, Picture, PictureDrawing, Report, ReportBundle, ReportError,
+    ReportInputs, curves_table, heatmap_pictures, html, old_file_name, save_heatmaps,
 };

@@ -6,7 +6,7 @@ mod settings;
 mod value_error;
 
 pub use settings::{
-    A2cConfig, Architecture, Base, Common, ConfigError, EpoptConfig, Method, Observe, PpoConfig, Preset, Ranking,
-    Rl2Config, Rollouts, Schedule, SettingError, Settings, TrainConfig, Wrapper, spelled,
+    A2cConfig, Architecture, Base, CollectionMode, Common, ConfigError, EpoptConfig, Method, Observe, PpoConfig,
+    Preset, Ranking, Rl2Config, Schedule, SettingError, Settings, TrainConfig, Wrapper, spelled,
 };
 pub use value_error::{ValueError, require};

@@ -1,4 +1,4 @@
-//! What a policy is tested on: a version of its environment, or parameters of one's own.
+//! Test sets: a version of an environment, or parameters of your own.
 
 use std::collections::BTreeMap;
 use std::str::FromStr;
@@ -11,24 +11,24 @@ use crate::value_error::{ValueError, require};
 
 /// The values that named parameters may take; the others keep their version's.
 pub type Parameters = BTreeMap<String, Distribution>;
-/// One value for each of some parameters; the others keep their version's.
+/// A value for each of some parameters. The other parameters follow the version.
 pub type Context = BTreeMap<String, f64>;
 
 /// The most contexts of a set: all of them run together.
-const MOST_CONTEXTS: usize = DEFAULT_MAX_ENVS;
+const MAX_CONTEXTS: usize = DEFAULT_MAX_ENVS;
 
-/// What a policy is tested on.
+/// A set of parameters that a policy is tested on.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TestSet {
-    /// What results call it.
+    /// The name of the set in results.
     pub name: String,
-    /// Where the parameters come from of which nothing else is said.
+    /// The distribution of parameters that are not listed.
     pub version: Version,
-    /// What else is said of them.
+    /// The parameters that are listed.
     pub contexts: Contexts,
 }
 
-/// How the parameters of a set's episodes are chosen.
+/// The choice of the listed parameters in a set's episodes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Contexts {
@@ -121,14 +121,14 @@ pub fn distinct(sets: &[TestSet]) -> Result<(), ValueError> {
     })
 }
 
-/// A parameter's part of a set, as it is written: `length=0.3..0.4,0.8..0.9`, `mass=0.1`, or the points of a grid,
+/// The values of one parameter in a set, written `length=0.3..0.4,0.8..0.9`, `mass=0.1`, or as points of a grid,
 /// `length=0.1..1.0/10` or `length=0.1,0.2,0.5`. Two whole numbers as in `force=7,5` are refused, because they may be a
 /// number with a decimal comma; `force=7, 5` has two values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Assignment {
     /// By its name in the catalogue.
     pub parameter: String,
-    /// What it may be.
+    /// The accepted values.
     pub values: Values,
 }
 
@@ -148,13 +148,13 @@ impl FromStr for Assignment {
         let expected = "PARAMETER=VALUES, e.g. length=0.3..0.4,0.8..0.9, mass=0.1 or length=0.1..1.0/10";
         let wrong = || ValueError::new("a set of parameters", format!("`{text}`"), expected);
         let (parameter, values) = text.split_once('=').ok_or_else(wrong)?;
-        Ok(Self { parameter: parameter.trim().into(), values: Values::of(parameter.trim(), values.trim())? })
+        Ok(Self { parameter: parameter.trim().into(), values: Values::parse(parameter.trim(), values.trim())? })
     }
 }
 
 impl Values {
-    /// What `text` says of `parameter`.
-    fn of(parameter: &str, text: &str) -> Result<Self, ValueError> {
+    /// Parses the values of `parameter`.
+    fn parse(parameter: &str, text: &str) -> Result<Self, ValueError> {
         if let Some((range, count)) = text.split_once('/') {
             return grid_points(parameter, text, range, count);
         }
@@ -173,14 +173,14 @@ impl Values {
     }
 }
 
-/// `low..high/count`: so many points from `low` to `high`, both included.
+/// Returns the points of `low..high/count`: `count` points from `low` to `high`, both included.
 fn grid_points(parameter: &str, text: &str, range: &str, count: &str) -> Result<Values, ValueError> {
     let wrong = || ValueError::new(parameter, format!("`{text}`"), "a grid such as 0.1..1.0/10, of at least 1 point");
     let (low, high) = range.split_once("..").ok_or_else(wrong)?;
     let number = |text: &str| text.trim().parse::<f64>().ok().filter(|number| number.is_finite()).ok_or_else(wrong);
     let (low, high) = (number(low)?, number(high)?);
     let count: usize =
-        count.trim().parse().ok().filter(|count| (1..=MOST_CONTEXTS).contains(count)).ok_or_else(wrong)?;
+        count.trim().parse().ok().filter(|count| (1..=MAX_CONTEXTS).contains(count)).ok_or_else(wrong)?;
     let step = |index: usize| if count == 1 { 0.0 } else { index as f64 / (count - 1) as f64 };
     finite(parameter, text, (0..count).map(|index| low + (high - low) * step(index)).collect()).map(Values::Points)
 }
@@ -217,8 +217,8 @@ pub fn set_of(name: &str, version: Version, assignments: Vec<Assignment>) -> Res
             Values::Points(points) => points,
         };
         let count = contexts.len().saturating_mul(points.len());
-        let expected = format!("a grid of at most {MOST_CONTEXTS} points");
-        require(count <= MOST_CONTEXTS, name, format!("{count} points"), expected)?;
+        let expected = format!("a grid of at most {MAX_CONTEXTS} points");
+        require(count <= MAX_CONTEXTS, name, format!("{count} points"), expected)?;
         let with = |point: &f64| {
             let add = |context: &Context| {
                 let mut context = context.clone();
@@ -257,8 +257,8 @@ pub fn set_of_csv(name: &str, version: Version, text: &[u8]) -> Result<TestSet, 
         }
         contexts.push(context);
     }
-    let expected = format!("1 to {MOST_CONTEXTS} rows of parameters");
-    require((1..=MOST_CONTEXTS).contains(&contexts.len()), name, format!("{} rows", contexts.len()), expected)?;
+    let expected = format!("1 to {MAX_CONTEXTS} rows of parameters");
+    require((1..=MAX_CONTEXTS).contains(&contexts.len()), name, format!("{} rows", contexts.len()), expected)?;
     Ok(TestSet { name: name.into(), version, contexts: Contexts::Listed(contexts) })
 }
 

@@ -1,4 +1,4 @@
-//! The refusal of a value, whoever wrote it: in a plan, a configuration, a set or a threshold.
+//! The error for an invalid value in a plan, a configuration, a set or a threshold.
 
 use std::fmt::Display;
 
@@ -6,11 +6,11 @@ use std::fmt::Display;
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{what} is {got}, but must be {expected}")]
 pub struct ValueError {
-    /// Which value of what.
+    /// The name of the value.
     pub what: String,
-    /// What was given.
+    /// The given value.
     pub got: String,
-    /// What is accepted.
+    /// The accepted values.
     pub expected: String,
 }
 

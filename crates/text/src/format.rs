@@ -44,13 +44,13 @@ pub fn quoted(word: impl AsRef<OsStr>) -> String {
     shlex::try_quote(&word).map_or_else(|_| word.to_string(), |quoted| quoted.into_owned())
 }
 
-/// Of a text that anybody may have written: no more than anybody reads, characters.
-const LONGEST: usize = 300;
+/// Length to which [`shortened`] cuts texts of unknown origin, characters.
+const MAX_CHARS: usize = 300;
 
 /// A text, of a long one the beginning.
 pub fn shortened(text: impl Into<String>) -> String {
     let mut text = text.into();
-    if let Some((end, _)) = text.char_indices().nth(LONGEST) {
+    if let Some((end, _)) = text.char_indices().nth(MAX_CHARS) {
         text.truncate(end);
         text.push_str(" …");
     }

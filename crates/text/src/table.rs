@@ -8,7 +8,7 @@ use comfy_table::{CellAlignment, TableStyle};
 /// A table for reading, or the lines of a file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Table {
-    /// What it shows, or the name of its file.
+    /// The title, or the name of the file.
     pub title: String,
     /// From left to right.
     pub columns: Vec<Column>,
@@ -19,18 +19,18 @@ pub struct Table {
 /// The head of a column.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Column {
-    /// What stands in it.
+    /// The heading.
     pub name: String,
-    /// What neighbouring columns have in common, where one name is not enough.
+    /// A heading over neighbouring columns, if their own headings are not enough.
     pub group: Option<String>,
     /// Texts stand on the left, numbers on the right.
     pub is_number: bool,
 }
 
-/// What stands in a row and a column.
+/// The content of one row and column.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Entry {
-    /// As it is shown.
+    /// The text that is shown.
     pub text: String,
     /// A share, %, that may be shown by a colour.
     pub heat: Option<f64>,
@@ -50,7 +50,7 @@ pub struct TableBuilder<'r, R> {
 
 impl Table {
     /// A table with a row for each of `sources`, and no columns yet.
-    pub fn of<R>(title: impl Into<String>, sources: &[R]) -> TableBuilder<'_, R> {
+    pub fn builder<R>(title: impl Into<String>, sources: &[R]) -> TableBuilder<'_, R> {
         let rows = vec![Vec::new(); sources.len()];
         TableBuilder { sources, table: Table { title: title.into(), columns: Vec::new(), rows } }
     }
@@ -60,7 +60,8 @@ impl Table {
         self.drawn(NOTHING, str::to_owned).trim_fmt()
     }
 
-    /// The same for a terminal of so many columns: what does not fit stands below, beside the first texts once more.
+    /// Renders the table for a terminal of `width` columns. Columns that do not fit follow below, and the text columns
+    /// on the left are repeated.
     pub fn to_text_within(&self, width: usize) -> String {
         let keys = self.columns.iter().take_while(|column| !column.is_number).count();
         let fits = |text: &str| text.lines().all(|line| line.chars().count() <= width);
@@ -120,7 +121,7 @@ impl Table {
 }
 
 impl<'r, R> TableBuilder<'r, R> {
-    /// What the rows are of.
+    /// Returns the values from which the rows are made.
     pub fn sources(&self) -> &'r [R] {
         self.sources
     }
@@ -162,7 +163,7 @@ mod tests {
     fn table() -> Table {
         let sources = [("ppo ff", Some(93.25)), ("a|b\nc", None)];
         let number = |number: Option<f64>| number.map_or_else(String::new, |number| number.to_string());
-        Table::of("A title", &sources)
+        Table::builder("A title", &sources)
             .text("method", |(method, _)| method)
             .number("success, %", |(_, success)| number(*success))
             .build()
@@ -181,7 +182,7 @@ mod tests {
     #[test]
     fn a_table_that_is_wider_than_the_terminal_goes_on_below() {
         let sources = [("ppo ff", 93.25), ("a2c ff", 1.5)];
-        let mut table = Table::of("", &sources).text("method", |(method, _)| method);
+        let mut table = Table::builder("", &sources).text("method", |(method, _)| method);
         for metric in ["Default", "Interpolation", "Extrapolation"] {
             table = table.number(metric, |(_, success)| success).number("paper", |_| 70);
         }
@@ -200,7 +201,7 @@ mod tests {
         ");
         assert_eq!(table.to_text_within(10).lines().filter(|line| line.contains("method")).count(), 3);
         assert_eq!(table.to_text_within(5), whole, "not even the methods have room");
-        let texts = Table::of("", &sources).text("method", |(method, _)| method).build();
+        let texts = Table::builder("", &sources).text("method", |(method, _)| method).build();
         assert_eq!(texts.to_text_within(5), texts.to_text());
     }
 
@@ -215,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn csv_quotes_what_is_more_than_a_word_and_leaves_out_what_is_not_known() {
+    fn csv_quotes_texts_and_leaves_unknown_values_empty() {
         insta::assert_snapshot!(String::from_utf8(table().to_csv()).unwrap(), @r#"
         method,"success, %"
         ppo ff,93.25

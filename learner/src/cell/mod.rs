@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use perturb_checkpoint::Counters;
 use perturb_experiment::scheduler::CellEvent;
-use perturb_experiment::{Cell, CellFolder, CellState, Failure, FailureMark, FolderError, Timing};
+use perturb_experiment::{Cell, CellFolder, CellState, Failure, FailureId, FolderError, Timing};
 use perturb_files::Lock;
 use perturb_files::interrupt::StopFlag;
 use perturb_records::RecordsError;
@@ -77,7 +77,7 @@ pub struct CellJob<'a> {
     /// The folder of the cell's files.
     pub folder: CellFolder,
     /// The earlier failure that may be cleared; any other failure stays.
-    pub retry: Option<FailureMark>,
+    pub retry: Option<FailureId>,
 }
 
 /// A cell that is being run.
@@ -194,10 +194,10 @@ impl<'a> RunningCell<'a> {
         let Some(lock) = folder.try_lock().map_err(failed)? else { return Err(CellEvent::Busy) };
         match folder.state().map_err(failed)? {
             CellState::Done(_) => return Err(CellEvent::Done),
-            CellState::Failed(failure) if folder.failure_mark() != *retry => {
+            CellState::Failed(failure) if folder.failure_id() != *retry => {
                 return Err(CellEvent::Failed { reason: failure.reason });
             }
-            CellState::Failed(_) => folder.forget_failure().map_err(failed)?,
+            CellState::Failed(_) => folder.clear_failure().map_err(failed)?,
             CellState::Missing => {}
         }
         let mut work = Self { job, _lock: lock, training: None, trained: None };
@@ -281,8 +281,8 @@ impl<'a> RunningCell<'a> {
                 // Without the folder's path, so that equal failures have equal texts.
                 let reason = reason.replace(&format!("{}/", folder.path().display()), "");
                 let commit = perturb_experiment::VERSION.into();
-                let begins_anew = fault == Fault::Training;
-                let failure = Failure { id: cell.id.clone(), reason, commit, begins_anew };
+                let requires_restart = fault == Fault::Training;
+                let failure = Failure { id: cell.id.clone(), reason, commit, requires_restart };
                 folder.write_failure(&failure)?;
                 Ok(CellEvent::Failed { reason: failure.reason })
             }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 
 use perturb_experiment::scheduler::CellEvent;
-use perturb_experiment::{Cell, CellFolder, CellResult, MarkResult, Tests, Training};
+use perturb_experiment::{Cell, CellFolder, CellResult, IntermediateEvaluation, Tests, Training};
 use perturb_files::interrupt::StopFlag;
 use perturb_protocol::Distribution;
 use perturb_records::{RecordedTest, Records, TestResult};
@@ -48,7 +48,7 @@ pub(super) fn tested(
         records.write(&folder.mark(mark).join(perturb_records::FILE))?;
         let results = results(&records);
         let agreement = records.agreement();
-        of_marks.insert(mark, MarkResult { counters: kept.state.counters, results, agreement });
+        of_marks.insert(mark, IntermediateEvaluation { counters: kept.state.counters, results, agreement });
     }
     let Some(mut records) = test(&checkpoint, sets, episodes, false, "")? else { return Ok(None) };
     if let Some((set, episodes)) = cell.selection_test() {

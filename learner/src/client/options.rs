@@ -32,7 +32,7 @@ pub struct OpenOptions {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ActorLocation {
     /// At the server, if it can: the network's delay is then paid once a rollout, not at each step. Trainings over several
-    /// servers, groups of trainings with [short](perturb_settings::Rollouts) rollouts, and trainings with observation noise
+    /// servers, groups of trainings with [short](perturb_settings::CollectionMode) rollouts, and trainings with observation noise
     /// choose their actions at the client in any case.
     #[default]
     Server,

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use perturb_files::interrupt::StopFlag;
 use perturb_protocol::Version;
-use perturb_records::{About, EpisodeRecord, Records};
+use perturb_records::{EpisodeRecord, Records, RecordsMetadata};
 
 use super::error::TestError;
 use super::test::retry_on_disconnect;
@@ -162,8 +162,8 @@ impl<'a> Replay<'a> {
 }
 
 /// A sentence on the first difference of an episode from its record; `None` if there is none.
-fn difference(about: &About, recorded: &EpisodeRecord, end: EndedEpisode) -> Option<String> {
-    let got = EpisodeRecord::of(about, &recorded.set, recorded.seed, end);
+fn difference(about: &RecordsMetadata, recorded: &EpisodeRecord, end: EndedEpisode) -> Option<String> {
+    let got = EpisodeRecord::new(about, &recorded.set, recorded.seed, end);
     let what = |told: fn(&EpisodeRecord) -> String| (told(recorded), told(&got));
     let parts = [
         ("episode", what(|it| it.episode_index.to_string())),

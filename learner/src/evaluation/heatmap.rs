@@ -2,7 +2,7 @@
 
 use perturb_files::interrupt::StopFlag;
 use perturb_protocol::proto;
-use perturb_records::{Axis, Heatmap, HeatmapOptions, MOST_POINTS, Records};
+use perturb_records::{Axis, Heatmap, HeatmapOptions, MAX_POINTS, Records};
 use perturb_settings::sets::{Contexts, TestSet};
 
 use super::error::TestError;
@@ -64,7 +64,7 @@ pub fn heatmap(
     stop: &StopFlag,
     report: &mut dyn FnMut(u64),
 ) -> Result<(Heatmap, Records), HeatmapError> {
-    let grid = options.grid.clamp(1, MOST_POINTS);
+    let grid = options.grid.clamp(1, MAX_POINTS);
     let episodes = HeatmapOptions { grid, ..options.clone() }.total_episodes().map_err(TestError::Value)?;
     let test = TestOptions { episodes, seed: options.seed, selects: false, success: None };
     let tester = Tester::new(servers, checkpoint, test)?;
@@ -75,7 +75,7 @@ pub fn heatmap(
     let contexts = Contexts::Listed(Heatmap::contexts(&axes, grid, &options.fixed));
     let set = TestSet { name: Heatmap::SET.into(), version: options.base, contexts };
     let records = tester.test(&[set], stop, &mut |_, done| report(done))?;
-    let heatmap = Heatmap::of(&records, axes).ok_or(HeatmapError::NotOfAxes)?;
+    let heatmap = Heatmap::from_records(&records, axes).ok_or(HeatmapError::NotOfAxes)?;
     Ok((heatmap, records))
 }
 
@@ -94,7 +94,7 @@ pub fn heatmap_again(
         return Err(HeatmapError::Policy { recorded: records.about.policy.clone(), got });
     }
     let axes = axes(environment, parameters)?;
-    Heatmap::of(records, axes).ok_or(HeatmapError::NotOfAxes)
+    Heatmap::from_records(records, axes).ok_or(HeatmapError::NotOfAxes)
 }
 
 fn axes(environment: &proto::Environment, names: &[String; 2]) -> Result<[Axis; 2], HeatmapError> {
@@ -108,5 +108,5 @@ fn axes(environment: &proto::Environment, names: &[String; 2]) -> Result<[Axis; 
     if x == y {
         return Err(refuse(y));
     }
-    Ok([Axis::of(find(x).ok_or_else(|| refuse(x))?), Axis::of(find(y).ok_or_else(|| refuse(y))?)])
+    Ok([Axis::new(find(x).ok_or_else(|| refuse(x))?), Axis::new(find(y).ok_or_else(|| refuse(y))?)])
 }

@@ -4,8 +4,8 @@ use perturb_files::interrupt::StopFlag;
 use perturb_policy::random::Purpose;
 use perturb_protocol::{Version, proto};
 use perturb_records::success::Rule;
-use perturb_records::testing::{Counting, environment_seed};
-use perturb_records::{About, Records, TestResult};
+use perturb_records::testing::{TestCollector, environment_seed};
+use perturb_records::{Records, RecordsMetadata, TestResult};
 use perturb_settings::sets::TestSet;
 use perturb_settings::{TrainConfig, sets};
 
@@ -38,7 +38,7 @@ pub struct Tester<'a> {
     servers: &'a Servers,
     checkpoint: &'a Checkpoint,
     options: TestOptions,
-    about: About,
+    about: RecordsMetadata,
     environment: proto::Environment,
 }
 
@@ -52,7 +52,7 @@ impl<'a> Tester<'a> {
         let environment = servers.environment_seen(&state.config.common)?;
         state.check_unchanged(&environment)?;
         let id = checkpoint.id().map_err(TestError::Unnamed)?;
-        let mut about = About::new(&environment, id, state.config.settings.episodes_per_trial());
+        let mut about = RecordsMetadata::new(&environment, id, state.config.settings.episodes_per_trial());
         if let Some(rule) = &options.success {
             about.judge_by(rule)?;
         }
@@ -83,7 +83,7 @@ impl<'a> Tester<'a> {
             let TestOptions { episodes, seed, .. } = self.options;
             let purpose = self.options.purpose();
             let counting = retry_on_disconnect(self.servers, stop, || {
-                let mut counting = Counting::new(set.clone(), purpose, seed, episodes, episodes_per_trial);
+                let mut counting = TestCollector::new(set.clone(), purpose, seed, episodes, episodes_per_trial);
                 self.play(&mut counting, stop, &mut |done| report(set, done))?;
                 Ok(counting)
             })?;
@@ -94,7 +94,12 @@ impl<'a> Tester<'a> {
 
     /// Plays the episodes of a test, with sampled actions and frozen statistics. The result depends only on the checkpoint,
     /// the set, the number of episodes and the seed.
-    fn play(&self, counting: &mut Counting, stop: &StopFlag, report: &mut dyn FnMut(u64)) -> Result<(), TestError> {
+    fn play(
+        &self,
+        counting: &mut TestCollector,
+        stop: &StopFlag,
+        report: &mut dyn FnMut(u64),
+    ) -> Result<(), TestError> {
         let test = counting.test();
         let num_envs = counting.num_envs();
         let contexts = test.set.listed();

@@ -34,7 +34,7 @@ pub(super) fn make(servers: &Servers, entry: &TrainRequest<'_>) -> Result<TrainO
 
 fn checkpoint(config: &TrainConfig, environment: &Environment) -> Result<Checkpoint> {
     let Common { normalize_rewards, num_envs, reward_return_runs_on, .. } = config.common;
-    let summary = EnvironmentSummary::of(environment).ok_or(TrainError::NoActions)?;
+    let summary = EnvironmentSummary::from_environment(environment).ok_or(TrainError::NoActions)?;
     let rewards = normalize_rewards
         .then(|| RewardNormaliser::new(num_envs, config.settings.gamma()).running_on(reward_return_runs_on));
     let mut state = State {

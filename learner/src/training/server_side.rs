@@ -11,7 +11,7 @@ use futures_util::StreamExt;
 use futures_util::stream::FuturesUnordered;
 use perturb_policy::{CollectUntil, Normalisers, Player, PlayerState, PolicySpec};
 use perturb_protocol::player::{floats, read_floats};
-use perturb_settings::Rollouts;
+use perturb_settings::CollectionMode;
 
 use super::start::{options, start_or_resume};
 use super::trainer::Trainer;
@@ -78,7 +78,7 @@ impl<'a> ServerSide<'a> {
         for (index, entry) in entries {
             let config = entry.start.config();
             let rollouts = config.rollouts();
-            if rollouts == Rollouts::Noisy || (!is_one && rollouts != Rollouts::Long) {
+            if rollouts == CollectionMode::Noisy || (!is_one && rollouts != CollectionMode::Long) {
                 others.push((index, entry));
                 continue;
             }

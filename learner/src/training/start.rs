@@ -6,7 +6,7 @@ use std::ops::Range;
 use perturb_checkpoint::Counters;
 use perturb_files::write_atomically;
 use perturb_policy::{CollectUntil, Normalisers, Player, RewardNormaliser, Role};
-use perturb_records::Comparison;
+use perturb_records::ParameterComparison;
 use perturb_settings::{Base, Common, Settings, TrainConfig, Wrapper};
 
 use super::ending::RECENT;
@@ -70,7 +70,7 @@ fn begin<'a>(
     threads: usize,
 ) -> Result<(Trainer<'a>, Player)> {
     let common = &config.common;
-    let summary = EnvironmentSummary::of(environment).ok_or(TrainError::NoActions)?;
+    let summary = EnvironmentSummary::from_environment(environment).ok_or(TrainError::NoActions)?;
     let state = State {
         environment_spec: summary,
         observation_normaliser: None,
@@ -112,7 +112,7 @@ fn resume<'a>(
     restore: impl FnOnce() -> Result<()>,
 ) -> Result<(Trainer<'a>, Player)> {
     let state = &checkpoint.state;
-    let served = EnvironmentSummary::of(environment).ok_or(TrainError::NoActions)?;
+    let served = EnvironmentSummary::from_environment(environment).ok_or(TrainError::NoActions)?;
     if let Some((what, trained, served)) = state.environment_spec.difference(&served) {
         let environment = state.config.common.environment.clone();
         return Err(TrainError::Changed { environment, what, trained, served });
@@ -167,7 +167,7 @@ fn new_trainer<'a>(
         algorithm,
         rollout,
         tally: EpisodeTally {
-            comparison: Comparison::of(environment),
+            comparison: ParameterComparison::new(environment),
             recent: VecDeque::with_capacity(RECENT),
             ended: Vec::new(),
         },

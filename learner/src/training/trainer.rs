@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use perturb_checkpoint::Counters;
 use perturb_files::interrupt::StopFlag;
 use perturb_policy::{CollectUntil, Normalisers, Player, PlayerState, PolicySpec};
-use perturb_records::Comparison;
+use perturb_records::ParameterComparison;
 use perturb_settings::{Common, EpoptConfig, TrainConfig, Wrapper};
 
 use super::ending::{RECENT, is_over};
@@ -42,7 +42,7 @@ pub(super) struct Trainer<'a> {
 /// The episodes that ended while a rollout was collected.
 pub(super) struct EpisodeTally {
     /// Compares the parameters that episodes ran with to those that were requested.
-    pub(super) comparison: Comparison,
+    pub(super) comparison: ParameterComparison,
     /// The last episodes, at most [`RECENT`].
     pub(super) recent: VecDeque<EpisodeFigures>,
     /// Episodes that are still to be written to the log.
@@ -292,9 +292,9 @@ impl EpisodeTally {
 }
 
 /// The error of an episode that did not run with the requested parameters.
-fn difference(comparison: &mut Comparison, episode: &EndedEpisode) -> Option<TrainError> {
+fn difference(comparison: &mut ParameterComparison, episode: &EndedEpisode) -> Option<TrainError> {
     let receipt = &episode.receipt;
-    let difference = comparison.real_difference(&receipt.requested, &receipt.applied)?;
+    let difference = comparison.difference_beyond_rounding(&receipt.requested, &receipt.applied)?;
     let EndedEpisode { environment_index, episode_index, .. } = *episode;
     Some(TrainError::NotApplied { environment_index, episode_index, difference })
 }

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use perturb_records::{Assessed, AssessedError, AssessedPolicy, Known, RecordsError};
-use perturb_report::{ReportError, Sources};
+use perturb_records::{ExternalEvaluation, ExternalEvaluationError, ExternalPolicy, PolicyMetadata, RecordsError};
+use perturb_report::{ReportError, ReportInputs};
 use pyo3::exceptions::PyOSError;
 use pyo3::prelude::*;
 
@@ -16,23 +16,23 @@ type KnownOf = (Option<String>, Option<u64>, u64, u64, String, Option<bool>);
 
 /// The tests of an agent in one environment.
 #[pyclass(frozen, module = "perturb._native")]
-pub struct Assessment(Assessed);
+pub struct Assessment(ExternalEvaluation);
 
 #[pymethods]
 impl Assessment {
     #[new]
     fn new(agent: String, policies: Vec<(KnownOf, PyRef<'_, Records>)>) -> PyResult<Self> {
         let policy = |(known, records): (KnownOf, PyRef<'_, Records>)| {
-            Ok(AssessedPolicy::new(known_of(known)?, records.0.clone()))
+            Ok(ExternalPolicy::new(known_of(known)?, records.0.clone()))
         };
         let policies = policies.into_iter().map(policy).collect::<PyResult<_>>()?;
-        Assessed::new(String::new(), agent, policies).map(Self).map_err(refused)
+        ExternalEvaluation::new(String::new(), agent, policies).map(Self).map_err(refused)
     }
 
     /// Reads what is in a folder.
     #[staticmethod]
     fn read(path: PathBuf) -> PyResult<Self> {
-        Assessed::read(&path).map(Self).map_err(refused)
+        ExternalEvaluation::read(&path).map(Self).map_err(refused)
     }
 
     /// Writes it into a folder.
@@ -48,8 +48,8 @@ impl Assessment {
 
     /// Returns the policies with their records.
     fn policies(&self) -> Vec<(KnownOf, Records)> {
-        let of = |policy: &AssessedPolicy| {
-            let Known { trained_on, timesteps, seed, episodes, observe, deterministic } = policy.known.clone();
+        let of = |policy: &ExternalPolicy| {
+            let PolicyMetadata { trained_on, timesteps, seed, episodes, observe, deterministic } = policy.known.clone();
             let trained_on = trained_on.map(|version| version.to_string());
             let known = (trained_on, timesteps, seed, episodes, observe.to_string(), deterministic);
             (known, Records(policy.records.clone()))
@@ -63,27 +63,27 @@ impl Assessment {
 pub fn report_page(py: Python<'_>, assessments: Vec<PyRef<'_, Assessment>>, beside: Vec<PathBuf>) -> PyResult<String> {
     let assessed = assessments.iter().map(|one| one.0.clone()).collect();
     py.detach(|| {
-        let mut sources = Sources { assessed, ..Sources::default() };
+        let mut sources = ReportInputs { assessed, ..ReportInputs::default() };
         beside.iter().try_for_each(|path| sources.add(path))?;
         sources.read(|whole| whole.page().map_err(ReportError::from))
     })
     .map_err(|error| match error {
-        ReportError::Assessed(error) => refused(error),
+        ReportError::ExternalEvaluation(error) => refused(error),
         error => failure(INVALID, 0, error.to_string()),
     })
 }
 
-fn known_of((trained_on, timesteps, seed, episodes, observe, deterministic): KnownOf) -> PyResult<Known> {
+fn known_of((trained_on, timesteps, seed, episodes, observe, deterministic): KnownOf) -> PyResult<PolicyMetadata> {
     let invalid = |error: String| failure(INVALID, 0, error);
     let trained_on = trained_on.map(|version| version.parse()).transpose();
     let trained_on = trained_on.map_err(|error: perturb_protocol::UnknownVersion| invalid(error.to_string()))?;
     let observe = serde_json::from_value(observe.into()).map_err(|error| invalid(error.to_string()))?;
-    Ok(Known { trained_on, timesteps, seed, episodes, observe, deterministic })
+    Ok(PolicyMetadata { trained_on, timesteps, seed, episodes, observe, deterministic })
 }
 
-fn refused(error: AssessedError) -> PyErr {
+fn refused(error: ExternalEvaluationError) -> PyErr {
     match error {
-        AssessedError::File(error) | AssessedError::Records(RecordsError::File(error)) => {
+        ExternalEvaluationError::File(error) | ExternalEvaluationError::Records(RecordsError::File(error)) => {
             PyOSError::new_err(error.to_string())
         }
         error => failure(INVALID, 0, error.to_string()),

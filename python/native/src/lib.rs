@@ -51,5 +51,5 @@ mod _native {
     const HEATMAP_SET: &str = perturb_records::Heatmap::SET;
     /// Maximum number of points along a heatmap's axis.
     #[pymodule_export]
-    const MAX_HEATMAP_POINTS: usize = perturb_records::MOST_POINTS;
+    const MAX_HEATMAP_POINTS: usize = perturb_records::MAX_POINTS;
 }

@@ -112,7 +112,7 @@ impl Records {
     fn result(&self, py: Python<'_>, name: &str) -> ResultRow {
         py.detach(|| {
             let result = self.0.result(name, None);
-            let outcomes = Outcomes::of(&self.0, name);
+            let outcomes = Outcomes::new(&self.0, name);
             let statistics = |returns: &[Vec<f64>]| {
                 vec![mean(returns[0].iter().copied()), conditional_value_at_risk(&returns[0], SHARE)]
             };
@@ -140,13 +140,13 @@ impl Records {
 
     /// `[n]` the part of the parameter space, from 0, that each episode of the test on a set lies in.
     fn parts(&self, name: &str) -> Vec<usize> {
-        Outcomes::of(&self.0, name).parts()
+        Outcomes::new(&self.0, name).parts()
     }
 
     /// Success over two parameters on a set, by y, then x.
     fn success_by_parameters(&self, name: &str, x: &str, y: &str) -> PyResult<Vec<GridRow>> {
         let places = [self.place(x)?, self.place(y)?];
-        let outcomes = Outcomes::of(&self.0, name);
+        let outcomes = Outcomes::new(&self.0, name);
         let bins = places.map(|place| bins(std::iter::once(&outcomes), place));
         let [over_x, over_y] = [&bins[0], &bins[1]];
         let counted = success_within_both(&outcomes, places, [over_x, over_y]);
@@ -160,7 +160,7 @@ impl Records {
     /// Success over a parameter on a set.
     fn success_by_parameter(&self, name: &str, parameter: &str) -> PyResult<Vec<BinRow>> {
         let place = self.place(parameter)?;
-        let outcomes = Outcomes::of(&self.0, name);
+        let outcomes = Outcomes::new(&self.0, name);
         let bins = bins(std::iter::once(&outcomes), place);
         let counted = success_within(&outcomes, place, &bins);
         let told = bins.iter().zip(counted).map(|(bin, counted)| {
@@ -192,7 +192,7 @@ pub fn wilson(successes: u64, episodes: u64) -> (f64, f64) {
 #[pyfunction]
 pub fn metrics(rates: std::collections::HashMap<String, f64>) -> (Option<f64>, Option<f64>, Option<f64>) {
     let [default, interpolation, extrapolation] =
-        Metric::ALL.map(|metric| metric.of(|scenario| rates.get(&scenario.to_string()).copied()));
+        Metric::ALL.map(|metric| metric.value(|scenario| rates.get(&scenario.to_string()).copied()));
     (default, interpolation, extrapolation)
 }
 

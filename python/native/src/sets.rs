@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use perturb_experiment::Plan;
 use perturb_files as files;
 use perturb_protocol::{Distribution, Interval, Version};
-use perturb_records::{Axis, Heatmap, MOST_POINTS};
+use perturb_records::{Axis, Heatmap, MAX_POINTS};
 use perturb_settings::sets::{Assignment, Contexts, TestSet, set_of, set_of_csv};
 use pyo3::exceptions::PyOSError;
 use pyo3::prelude::*;
@@ -55,7 +55,7 @@ pub fn heatmap_contexts(
         random: Vec::new(),
         extreme: Vec::new(),
     };
-    Heatmap::contexts(&axes.map(axis), points.min(MOST_POINTS), &fixed)
+    Heatmap::contexts(&axes.map(axis), points.min(MAX_POINTS), &fixed)
 }
 
 /// Converts a set for Python.

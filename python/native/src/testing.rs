@@ -5,9 +5,9 @@ use std::sync::Arc;
 use numpy::PyReadonlyArray1;
 use perturb_policy::random::Purpose;
 use perturb_protocol::{EndedEpisode, proto};
-use perturb_records::About;
+use perturb_records::RecordsMetadata;
 use perturb_records::success::Rule;
-use perturb_records::testing::Counting;
+use perturb_records::testing::TestCollector;
 use perturb_settings::sets;
 use perturb_settings::sets::TestSet;
 use pyo3::prelude::*;
@@ -30,7 +30,7 @@ pub struct Tests {
     episodes_per_trial: u32,
     /// The environment that the first session opened, and the records.
     begun: Option<(Arc<proto::Environment>, perturb_records::Records)>,
-    counting: Option<Counting>,
+    counting: Option<TestCollector>,
 }
 
 #[pymethods]
@@ -53,8 +53,13 @@ impl Tests {
     /// Begins the test on the set in this place: the seed of its environments, and their number N.
     fn plan(&mut self, place: usize) -> PyResult<(u64, usize)> {
         let Some(set) = self.sets.get(place) else { return Err(failure(UNUSABLE, 0, "there is no such set")) };
-        let counting =
-            Counting::new(set.clone(), Purpose::TestEnvironments, self.seed, self.episodes, self.episodes_per_trial);
+        let counting = TestCollector::new(
+            set.clone(),
+            Purpose::TestEnvironments,
+            self.seed,
+            self.episodes,
+            self.episodes_per_trial,
+        );
         let plan = (counting.test().seed, counting.num_envs());
         self.counting = Some(counting);
         Ok(plan)
@@ -73,7 +78,7 @@ impl Tests {
         }
         policy.map_or(Ok(()), |policy| policy.check_unchanged(served))?;
         self.sets.iter().try_for_each(|set| set.check(served)).map_err(|error| invalid(&error))?;
-        let mut about = About::new(served, self.policy.clone(), self.episodes_per_trial);
+        let mut about = RecordsMetadata::new(served, self.policy.clone(), self.episodes_per_trial);
         if let Some(rule) = &self.success {
             about.judge_by(rule).map_err(|error| invalid(&error))?;
         }

@@ -54,7 +54,7 @@ fn all_cells_in_work_have_progress_and_some_have_curves() {
     fixture.write(59, "training/progress.csv", "rollout/episodes\n100\n");
     experiment.refresh_details();
     assert_eq!(experiment.shares(experiment.status().unwrap())[59], (100.0 / 102.5) as f32);
-    assert!(experiment.changed() >= Stamp::of(&fixture.folder().plan_path()).unwrap().seconds());
+    assert!(experiment.changed() >= Stamp::read(&fixture.folder().plan_path()).unwrap().seconds());
 }
 
 #[test]
@@ -75,7 +75,7 @@ fn the_fingerprint_covers_all_files_of_a_report() {
         id: fixture.plan.cells[0].id.clone(),
         reason: "NaN".into(),
         commit: "x".into(),
-        begins_anew: true,
+        requires_restart: true,
     };
     fixture.folder().cell(&record.id).write_failure(&record).unwrap();
     let status = || ExperimentStatus::read_within(fixture.folder().path(), &fixture.root()).unwrap();

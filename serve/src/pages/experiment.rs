@@ -5,7 +5,7 @@ use std::path::Path;
 
 use maud::{Markup, html};
 use perturb_experiment::Cell;
-use perturb_experiment::runs::{CellStatus, ExperimentStatus, Kind};
+use perturb_experiment::runs::{CellStatus, ExperimentStatus, RunKind};
 use perturb_text::{duration, grouped};
 use serde_json::json;
 
@@ -44,7 +44,7 @@ pub(crate) fn update(
     let source = ReportSource { folder: experiment.report_folder(), fingerprint: experiment.report_fingerprint() };
     Update {
         title,
-        kind: Some(Kind::Experiment),
+        kind: Some(RunKind::Experiment),
         parts,
         charts,
         report,

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use maud::{Markup, html};
-use perturb_experiment::runs::Kind;
+use perturb_experiment::runs::RunKind;
 use perturb_protocol::Address;
 use perturb_text::{duration, grouped};
 
@@ -73,7 +73,7 @@ fn run(root: &Root, Row { relative, kind, summary, changed, remaining_seconds }:
         tr role="row" {
             th scope="row" role="rowheader" { a href=(run_link(relative)) { (name) } }
             td.what role="cell" {
-                (match kind { Kind::Training => "training", Kind::Experiment => "experiment" })
+                (match kind { RunKind::Training => "training", RunKind::Experiment => "experiment" })
                 @if !summary.what.is_empty() { ": " (summary.what) }
             }
             td.amount role="cell" {

@@ -14,7 +14,7 @@ use axum::http::StatusCode;
 use axum::response::{Html, IntoResponse, Response};
 use chrono::DateTime;
 use maud::{DOCTYPE, Markup, html};
-use perturb_experiment::runs::Kind;
+use perturb_experiment::runs::RunKind;
 use perturb_text::shortened;
 use serde_json::{Map, Value, json};
 
@@ -28,7 +28,7 @@ pub(crate) struct Update {
     /// Title of the window.
     pub(crate) title: String,
     /// Kind of the run; `None` for the list of all runs.
-    pub(crate) kind: Option<Kind>,
+    pub(crate) kind: Option<RunKind>,
     /// The parts of the page, by their names.
     pub(crate) parts: Vec<(&'static str, Markup)>,
     /// Numbers of the charts.
@@ -100,7 +100,7 @@ fn describe(error: &ViewError) -> (StatusCode, String) {
 /// Returns the page of a run.
 pub(crate) fn run_page(root: &Root, relative: &RelativePath, update: &Update) -> String {
     match update.kind {
-        Some(Kind::Experiment) => experiment::page(root, relative, update),
+        Some(RunKind::Experiment) => experiment::page(root, relative, update),
         _ => training::page(root, relative, update),
     }
 }
@@ -148,7 +148,7 @@ fn breadcrumbs(root: &Root, relative: &RelativePath) -> Markup {
             format!("{shown}/{}", name.to_string_lossy())
         };
         let last = index + 1 == names.len();
-        if last || root.resolve(&way).is_some_and(|path| Kind::of(&path).is_some()) {
+        if last || root.resolve(&way).is_some_and(|path| RunKind::detect(&path).is_some()) {
             links.push((std::mem::take(&mut shown), way.clone(), last));
         }
     }

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use maud::{Markup, html};
 use perturb_experiment::CellResult;
-use perturb_experiment::runs::{Kind, TrainingStatus};
+use perturb_experiment::runs::{RunKind, TrainingStatus};
 use perturb_records::TestResult;
 use perturb_text::{duration, grouped, shortened};
 use serde_json::json;
@@ -45,7 +45,7 @@ pub(crate) fn update(root: &Root, relative: &RelativePath, path: &Path, training
     ];
     let charts = json!({ "curve": curve });
     let breadcrumbs = breadcrumbs(root, relative);
-    Update { title, kind: Some(Kind::Training), parts, charts, breadcrumbs, ..Update::default() }
+    Update { title, kind: Some(RunKind::Training), parts, charts, breadcrumbs, ..Update::default() }
 }
 
 pub(crate) fn page(root: &Root, relative: &RelativePath, update: &Update) -> String {

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use perturb_protocol::{Version, names};
-use perturb_records::MOST_POINTS;
+use perturb_records::MAX_POINTS;
 use perturb_records::success::Rule;
 use perturb_settings::ValueError;
 use perturb_settings::sets::Assignment;
@@ -169,7 +169,7 @@ pub struct HeatmapArgs {
     )]
     pub records: Vec<PathBuf>,
     /// Number of points along each axis, at most 100.
-    #[arg(long, value_name = "N", default_value_t = 40, value_parser = |text: &str| within(text, 1..=MOST_POINTS))]
+    #[arg(long, value_name = "N", default_value_t = 40, value_parser = |text: &str| within(text, 1..=MAX_POINTS))]
     pub grid: usize,
     /// Number of episodes of each policy at each point.
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = at_least_one::<u64>)]

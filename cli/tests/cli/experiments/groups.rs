@@ -1,7 +1,7 @@
 //! Events of the cells of a group.
 
 use perturb_experiment::scheduler::CellEvent;
-use perturb_experiment::{Failure, FailureMark, Folder};
+use perturb_experiment::{Failure, FailureId, Folder};
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::cell::{CellJob, run_cells};
 use perturb_learner::client::Servers;
@@ -14,11 +14,11 @@ use crate::common::{kill, server};
 fn ends(
     experiment: &Experiment,
     servers: &Servers,
-    cells: &[(usize, Option<FailureMark>)],
+    cells: &[(usize, Option<FailureId>)],
     stop: &StopFlag,
 ) -> Vec<(usize, CellEvent)> {
     let folder = Folder::new(&experiment.out("out"));
-    let order = |&(cell, retry): &(usize, Option<FailureMark>)| {
+    let order = |&(cell, retry): &(usize, Option<FailureId>)| {
         let cell = &experiment.plan.cells[cell];
         CellJob { cell, folder: folder.cell(&cell.id), retry }
     };
@@ -48,7 +48,7 @@ fn each_cell_of_a_group_ends_once() {
         id: experiment.plan.cells[2].id.clone(),
         reason: "NaN".into(),
         commit: "x".into(),
-        begins_anew: true,
+        requires_restart: true,
     };
     place(2).write_failure(&failure).expect("written");
     let failed = CellEvent::Failed { reason: "NaN".into() };
@@ -58,17 +58,17 @@ fn each_cell_of_a_group_ends_once() {
     drop(lock);
 
     // One cell is stopped, then the server is lost, and then there is another server.
-    let left = [(1, None), (2, place(2).failure_mark())];
+    let left = [(1, None), (2, place(2).failure_id())];
     stop.raise(15);
     let stopped = CellEvent::Stopped { signal: 15 };
     assert_eq!(ends(&experiment, &servers, &left, &stop), [(1, stopped.clone()), (2, stopped)]);
-    let left = [(1, None), (2, place(2).failure_mark())];
+    let left = [(1, None), (2, place(2).failure_id())];
     kill("-KILL", local.process_id());
     let lost = ends(&experiment, &servers, &left, &StopFlag::default());
     assert!(lost.len() == 2 && lost.iter().all(|(_, end)| matches!(end, CellEvent::LostServer { .. })), "{lost:?}");
     let local = server(2);
     let servers = Servers::connect(std::slice::from_ref(local.address())).unwrap_or_else(|error| panic!("{error}"));
-    let left = [(2, place(2).failure_mark()), (1, None)];
+    let left = [(2, place(2).failure_id()), (1, None)];
     let done = [(1, CellEvent::Done), (2, CellEvent::Done)];
     assert_eq!(ends(&experiment, &servers, &left, &StopFlag::default()), done);
 }

@@ -28,7 +28,7 @@ grid = { learning_rate = [7e-3, 7e-4] }
 impl Experiment {
     /// Returns all cells of the plan, with those that the folder's results select.
     fn cells(&self, name: &str) -> Vec<Cell> {
-        self.plan.in_folder(&Folder::new(&self.out(name))).expect("readable").cells
+        self.plan.with_selected_cells(&Folder::new(&self.out(name))).expect("readable").cells
     }
 
     /// Returns the bytes of all results of these cells.

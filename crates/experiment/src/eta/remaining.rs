@@ -85,7 +85,7 @@ mod tests {
             remaining_ratio: running.and_then(|(_, rest)| rest),
             max_seconds: None,
         });
-        remaining_time(times, &left.collect::<Vec<_>>(), at_a_time).map(|left| left.time.as_secs_f64())
+        remaining_time(durations, &left.collect::<Vec<_>>(), at_a_time).map(|left| left.time.as_secs_f64())
     }
 
     #[test]

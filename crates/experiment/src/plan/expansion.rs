@@ -12,8 +12,8 @@ use super::{AnyError, Cell, SELECTION_TEST, Tests};
 
 type Result<T, E = AnyError> = std::result::Result<T, E>;
 
-/// The cells of `file`, whose versions and sets are `sets`, and what may become one when it is selected: in the order of the
-/// environments, otherwise as the tables give them.
+/// Expands `file`, whose versions and sets are `sets`, to its cells and to the cells that a selection may add. Cells
+/// are ordered by environment, then as in the tables.
 pub(super) fn expand(file: &File, sets: &BTreeMap<String, TestSet>) -> Result<(Vec<Cell>, Vec<Cell>)> {
     let mut expansion = Expansion { file, sets, cells: Vec::new(), tables: HashMap::new() };
     for (index, block) in file.algorithm.iter().enumerate() {
@@ -32,7 +32,7 @@ struct Expansion<'a> {
     file: &'a File,
     sets: &'a BTreeMap<String, TestSet>,
     cells: Vec<Cell>,
-    /// Which table asked for a cell, by the cell's id.
+    /// The table that asked for a cell, by the cell's id.
     tables: HashMap<String, String>,
 }
 
@@ -167,7 +167,7 @@ fn grid_points(name: &str, grid: &Table) -> Result<Vec<Table>, ValueError> {
     Ok(points)
 }
 
-/// Which table a refused key stands in.
+/// Returns the table of a refused key.
 fn place_of(error: &ConfigError, name: &str, block: &Block, common: &Table) -> String {
     let key = match error {
         ConfigError::UnknownKey { key, .. } | ConfigError::Value(ValueError { what: key, .. }) => key.as_str(),

@@ -1,4 +1,4 @@
-//! An experiment file as it is written, and what is refused before it is expanded.
+//! The experiment file as it is written, and the checks before it is expanded.
 
 use std::collections::BTreeMap;
 
@@ -18,25 +18,25 @@ use super::{Selection, distinct};
 /// Settings that the plan itself decides for each cell.
 const OWN_KEYS: [&str; 7] = ["preset", "environment", "version", "parameters", "algorithm", "architecture", "seed"];
 /// The most cells of a plan.
-const MOST_CELLS: usize = 1_000_000;
+const MAX_CELLS: usize = 1_000_000;
 
 /// The file's keys.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct File {
-    /// What reports of it are headed with (default: methods and environments).
+    /// Heading of reports (default: methods and environments).
     pub(super) title: Option<String>,
-    /// What reports say its date is, `2026-11-23`: they depend on no clock (default: none).
+    /// Date of reports, e.g. `2026-11-23`; reports read no clock (default: none).
     pub(super) date: Option<toml::value::Datetime>,
-    /// Whose defaults settings have: "perturb" or "paper" (default: `"perturb"`).
+    /// Preset, which decides about default settings: "perturb" or "paper" (default: `"perturb"`).
     #[serde(default, deserialize_with = "preset")]
     preset: Option<Preset>,
     /// Names of the catalogue.
     pub(super) environments: Vec<String>,
-    /// What is trained on: "D", "R", "E", "R+E", or names of `sets` (default: `["D", "R", "E"]`).
+    /// Training distributions: "D", "R", "E", "R+E", or names of `sets` (default: `["D", "R", "E"]`).
     #[serde(default = "all_versions")]
     pub(super) versions: Vec<String>,
-    /// Who selects of a grid: "paper", the tests that are reported, or "clean", trainings and episodes of their own
+    /// Selection from a grid: "paper" selects by the reported tests, "clean" by separate trainings and episodes
     /// (default: `"paper"`).
     #[serde(default, deserialize_with = "selection")]
     pub(super) selection: Selection,
@@ -53,7 +53,7 @@ pub(super) struct File {
     /// Episodes of each test (default: `1000`).
     #[serde(default = "a_thousand")]
     pub(super) test_episodes: u64,
-    /// What every policy is tested on: versions, or names of `sets` (default: `["D", "R", "E"]`).
+    /// Test sets of every policy: versions, or names of `sets` (default: `["D", "R", "E"]`).
     #[serde(default = "all_versions")]
     pub(super) test_versions: Vec<String>,
     /// Episodes of the budget after which the policy is tested, too, ascending (default: none).
@@ -63,28 +63,28 @@ pub(super) struct File {
     /// parameter its values, or `file`, a CSV file of contexts beside this file.
     #[serde(default)]
     pub(super) sets: BTreeMap<String, Table>,
-    /// What decides about success: "text", "code", or by environment one of these or a threshold such as "steps=90"
-    /// (default: `"text"`, of the preset "paper" `"code"`).
+    /// Success rule: "text", "code", or for each environment one of these or a threshold such as "steps=90" (default:
+    /// `"text"`, of the preset "paper" `"code"`).
     #[serde(default)]
-    success: Success,
+    success: SuccessRules,
     /// Settings of every training.
     #[serde(default)]
     pub(super) settings: Table,
-    /// What is trained: tables `[[algorithm]]`.
+    /// Algorithms: tables `[[algorithm]]`.
     pub(super) algorithm: Vec<Block>,
 }
 
-/// What decides about success.
+/// The success rule of a plan.
 #[derive(Deserialize)]
 #[serde(untagged, expecting = "\"text\", \"code\", or a table of environments with \"text\", \"code\" or thresholds")]
-enum Success {
+enum SuccessRules {
     /// In every environment.
     All(Rule),
     /// In these, and as ever in the others.
     Some(BTreeMap<String, Rule>),
 }
 
-impl Default for Success {
+impl Default for SuccessRules {
     fn default() -> Self {
         Self::Some(BTreeMap::new())
     }
@@ -121,7 +121,7 @@ fn selection<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Selection, D:
     one_of(deserializer, &Selection::NAMES)
 }
 
-/// What one of `known` names stands for, however it is spelled.
+/// Reads the value that one of the `known` names stands for, in any spelling.
 fn one_of<'de, T: DeserializeOwned, D: Deserializer<'de>>(
     deserializer: D,
     known: &'static [&'static str],
@@ -177,7 +177,7 @@ impl File {
             block.environments.iter_mut().for_each(spell_environments);
             block.versions.iter_mut().for_each(spell_versions);
         }
-        if let Success::Some(rules) = &mut self.success {
+        if let SuccessRules::Some(rules) = &mut self.success {
             for (written, rule) in std::mem::take(rules) {
                 let name = environment(&written).0;
                 let expected = format!("an environment that has no rule yet: {name} has one");
@@ -187,7 +187,7 @@ impl File {
         Ok(revisions)
     }
 
-    /// Those of the file itself, then those that only its tables name.
+    /// Returns the environments of the file, then those that only its tables name.
     pub(super) fn all_environments(&self) -> Vec<&str> {
         let own = self.algorithm.iter().flat_map(|block| block.environments.iter().flatten());
         distinct(self.environments.iter().chain(own).map(String::as_str))
@@ -201,16 +201,16 @@ impl File {
         block.versions.as_ref().unwrap_or(&self.versions)
     }
 
-    /// Whose defaults the settings of `block` have.
+    /// Returns the preset of the settings in `block`.
     pub(super) fn preset_of(&self, block: &Block) -> Preset {
         block.preset.or(self.preset).unwrap_or_default()
     }
 
-    /// What decides about success in tests of `environment` with a preset; `None` for the environment's own rule.
+    /// Returns the success rule in tests of `environment` with a preset; `None` for the environment's own rule.
     pub(super) fn success_in(&self, environment: &str, preset: Preset) -> Option<Rule> {
         let given = match &self.success {
-            Success::All(rule) => Some(rule),
-            Success::Some(rules) => rules.get(environment),
+            SuccessRules::All(rule) => Some(rule),
+            SuccessRules::Some(rules) => rules.get(environment),
         };
         let usual = if preset == Preset::Paper { Rule::Code } else { Rule::Text };
         Some(given.cloned().unwrap_or(usual)).filter(|rule| *rule != Rule::Text)
@@ -242,12 +242,12 @@ impl File {
         check_list("test_versions", &self.test_versions)?;
         let environments = self.all_environments();
         match &self.success {
-            Success::All(Rule::At(threshold)) => {
+            SuccessRules::All(Rule::At(threshold)) => {
                 let expected = "\"text\" or \"code\"; a threshold belongs to an environment: [success] NAME = …";
                 Err(ValueError::new("success", threshold, expected))
             }
-            Success::All(_) => Ok(()),
-            Success::Some(rules) => rules.keys().try_for_each(|name| {
+            SuccessRules::All(_) => Ok(()),
+            SuccessRules::Some(rules) => rules.keys().try_for_each(|name| {
                 let known = environments.contains(&name.as_str());
                 require(known, "[success]", format!("`{name}`"), format!("one of {}", environments.join(", ")))
             }),
@@ -310,11 +310,11 @@ impl File {
         let cells = cells.saturating_add(before);
         let what =
             format!("{name}: the number of cells up to here, every combination of [algorithm.grid] in each run,");
-        require(cells <= MOST_CELLS, what, cells, format!("at most {MOST_CELLS}"))
+        require(cells <= MAX_CELLS, what, cells, format!("at most {MAX_CELLS}"))
     }
 }
 
-/// How an environment is spelled, and the revision that is asked for.
+/// Returns the name of an environment and the requested revision.
 fn environment(written: &str) -> (String, Option<u32>) {
     let EnvironmentName { name, revision } = EnvironmentName::new(written);
     let known = names::find(&name, ENVIRONMENTS.into_iter());

@@ -1,4 +1,4 @@
-//! Which cells one process does together.
+//! Groups of cells that one process trains together.
 //!
 //! A group's cells have the same environment and architecture and see the same, so that their steps can be one batch,
 //! which only those with short rollouts make: all of a group wait for its slowest. A random policy, which takes none, is no
@@ -6,17 +6,17 @@
 
 use std::ops::Range;
 
-use perturb_settings::{Architecture, Observe, Rollouts, TrainConfig};
+use perturb_settings::{Architecture, CollectionMode, Observe, TrainConfig};
 
 use super::{Cell, Plan, distinct};
 
-/// How large groups are.
+/// The size of groups.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Grouping {
     /// The most cells in one, at least 1.
-    pub most: usize,
-    /// How many groups are done at a time, at least 1: each kind of cells makes a multiple of so many, as far as it has
-    /// cells, so that all processes have work.
+    pub max_cells: usize,
+    /// Number of groups at a time, at least 1. Each kind of cells makes a multiple of this number of groups, as far as
+    /// it has cells, so that all processes have work.
     pub at_a_time: usize,
 }
 
@@ -24,11 +24,11 @@ impl Grouping {
     /// The most cells in a group, unless said otherwise: with more, a step's fixed cost is small already.
     pub const USUAL: usize = 36;
     /// A group for each kind of cells.
-    pub const BY_KIND: Self = Self { most: usize::MAX, at_a_time: 1 };
+    pub const BY_KIND: Self = Self { max_cells: usize::MAX, at_a_time: 1 };
 
-    /// Cuts so many cells of one kind into groups whose sizes differ by one at most.
+    /// Cuts `cells` cells of one kind into groups whose sizes differ by at most one.
     fn cut(self, cells: usize) -> impl Iterator<Item = Range<usize>> {
-        let groups = cells.div_ceil(self.most.max(1)).next_multiple_of(self.at_a_time.max(1)).min(cells);
+        let groups = cells.div_ceil(self.max_cells.max(1)).next_multiple_of(self.at_a_time.max(1)).min(cells);
         (0..groups).map(move |group| group * cells / groups..(group + 1) * cells / groups)
     }
 }
@@ -36,7 +36,7 @@ impl Grouping {
 impl Cell {
     /// Environment, architecture, what is observed, and what rollouts are like: cells that have all in common may be in
     /// one group.
-    pub fn kind(&self) -> (&str, Architecture, Observe, Rollouts) {
+    pub fn kind(&self) -> (&str, Architecture, Observe, CollectionMode) {
         let TrainConfig { common, .. } = &self.config;
         (&common.environment, common.architecture, common.observe, self.config.rollouts())
     }
@@ -76,23 +76,26 @@ mod tests {
         #[case] cells: usize,
         #[case] sizes: &[usize],
     ) {
-        let ranges: Vec<Range<usize>> = Grouping { most, at_a_time }.cut(cells).collect();
+        let ranges: Vec<Range<usize>> = Grouping { max_cells: most, at_a_time }.cut(cells).collect();
         assert_eq!(ranges.iter().map(Range::len).collect::<Vec<_>>(), sizes);
         assert!(ranges.into_iter().flatten().eq(0..cells));
     }
 
     #[test]
-    fn a_group_has_one_environment_and_one_architecture_and_neighbours() {
+    fn group_has_one_environment_and_architecture() {
         let text = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 2
             [[algorithm]]\nname = 'a2c'\narchitectures = ['ff', 'rc']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']
             settings = { n_steps = 63, n_minibatches = 1 }";
         let plan = Plan::parse("test", text.into()).unwrap();
         let all: Vec<usize> = (0..plan.cells.len()).collect();
         // Of each environment two cells of A2C with FF, two with RC, and two of PPO with FF.
-        let groups = plan.groups(&all, Grouping { most: 3, at_a_time: 1 });
+        let groups = plan.groups(&all, Grouping { max_cells: 3, at_a_time: 1 });
         assert_eq!(groups, [vec![0, 1], vec![4, 5], vec![2, 3], vec![6, 7], vec![10, 11], vec![8, 9]]);
-        assert_eq!(plan.cells[groups[1][0]].kind(), ("CartPole", Architecture::Ff, Observe::State, Rollouts::Short));
-        let left = plan.groups(&[1, 5, 8, 11], Grouping { most: 36, at_a_time: 1 });
+        assert_eq!(
+            plan.cells[groups[1][0]].kind(),
+            ("CartPole", Architecture::Ff, Observe::State, CollectionMode::Short)
+        );
+        let left = plan.groups(&[1, 5, 8, 11], Grouping { max_cells: 36, at_a_time: 1 });
         assert_eq!(left, [vec![1, 5], vec![8], vec![11]]);
     }
 

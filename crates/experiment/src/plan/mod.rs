@@ -29,9 +29,9 @@ use perturb_settings::{Method, TrainConfig, ValueError, require};
 pub struct Plan {
     /// The file, as it was written.
     pub text: String,
-    /// What a report of it is headed with; empty if it does not say.
+    /// The heading of reports; empty if the file has none.
     pub title: String,
-    /// Its date, as it is written; empty if it does not say.
+    /// The date as written in the file; empty if the file has none.
     pub date: String,
     /// The files beside it that its sets name, with their content.
     pub beside: BTreeMap<String, Vec<u8>>,
@@ -39,22 +39,23 @@ pub struct Plan {
     pub revisions: BTreeMap<String, u32>,
     /// By which rule configurations are selected.
     pub selection: Selection,
-    /// How often what is reported is repeated, each time with another seed.
+    /// Number of repetitions of what is reported, each with another seed.
     pub runs: u32,
-    /// How often everything is done before that, with seeds of its own, so that configurations can be selected; 0 if the
-    /// reported tests select.
+    /// Number of repetitions before that, with separate seeds, to select configurations; 0 if the reported tests
+    /// select.
     pub tuning_runs: u32,
     /// All cells that are known before anything is done, tuning cells if there are any. A cell's index is its place here.
     pub cells: Vec<Cell>,
-    /// What may become a cell when its configuration is selected; indices go on. [`Plan::in_folder`] has those that do.
+    /// Cells that are added when their configuration is selected, with the following indices.
+    /// [`Plan::with_selected_cells`] adds them.
     pub candidates: Vec<Cell>,
 }
 
-/// How one configuration of many is selected for a report.
+/// The rule that selects one of several configurations for a report.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Selection {
-    /// As published: by the tests that are reported.
+    /// The paper's rule: the reported tests select.
     #[default]
     Paper,
     /// By selection episodes of trainings on tuning seeds. What is selected is trained anew on other seeds, and tested on
@@ -63,7 +64,7 @@ pub enum Selection {
 }
 
 impl Selection {
-    /// As they are typed.
+    /// The names in files and options.
     pub const NAMES: [&'static str; 2] = ["paper", "clean"];
 }
 
@@ -83,32 +84,32 @@ impl std::str::FromStr for Selection {
     }
 }
 
-/// What results and recorded episodes call the test that selects, and does nothing else.
+/// The name of the selecting test in results and records. It is used for nothing else.
 pub const SELECTION_TEST: &str = "selection";
 
-/// One training and its tests.
+/// A training and its tests.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cell {
-    /// Its place in the plan, from 0.
+    /// The index in the plan, from 0.
     pub index: usize,
-    /// Its name: environment, algorithm, architecture, training version, configuration and seed. It depends on nothing
-    /// else in the plan, so that a cell keeps its results when others are added.
+    /// The cell's name: environment, algorithm, architecture, training version, configuration and seed. It depends on
+    /// nothing else in the plan, so a cell keeps its results when others are added.
     pub id: String,
     /// Names the settings, without environment, version and seed, in eight hexadecimal digits.
     pub configuration: String,
-    /// Which run it belongs to, from 1; tuning cells have runs of their own.
+    /// The run, from 1. Tuning cells have separate runs.
     pub run: u32,
     /// The configuration of the tuning cells that select this one, if it is trained anew; `None` of a cell of the grid.
     pub tuned_as: Option<String>,
     /// The name of the plan's own set of parameters, if it is trained on one.
     pub set: Option<String>,
-    /// What is trained.
+    /// The configuration of the training.
     pub config: TrainConfig,
-    /// How it is tested.
+    /// The tests of the policy.
     pub tests: Tests,
 }
 
-/// How a trained policy is tested.
+/// The tests of a policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Tests {
     /// Episodes of each test.
@@ -121,12 +122,12 @@ pub struct Tests {
     /// Episodes of the training's budget, ascending and fewer than it has: the policies of these moments are tested, too.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub marks: Vec<u64>,
-    /// What decides about success; `None` for the environment's own rule.
+    /// The success rule; `None` for the environment's own rule.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub success: Option<Rule>,
 }
 
-/// How much a plan asks for.
+/// The amounts of work in a plan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Counts {
     /// Algorithms with their architectures and settings, whatever the environment.
@@ -135,9 +136,9 @@ pub struct Counts {
     pub trainings: usize,
     /// Pairs of a training and a test in one run.
     pub pairs: usize,
-    /// The same in all runs.
+    /// Train/test pairs of all runs.
     pub all_pairs: usize,
-    /// How often the whole is repeated.
+    /// The number of repetitions.
     pub runs: u32,
 }
 
@@ -145,13 +146,13 @@ pub struct Counts {
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum PlanError {
-    /// It cannot be read.
+    /// The file cannot be read.
     #[error(transparent)]
     File(#[from] FileError),
-    /// It is not TOML, or something in it cannot be.
+    /// The file is not TOML, or has an invalid value.
     #[error("{path}: {reason}")]
     Refused {
-        /// As it was given.
+        /// The path as it was given.
         path: String,
         /// Names the table, the key and what is accepted.
         reason: AnyError,
@@ -159,7 +160,7 @@ pub enum PlanError {
 }
 
 impl Plan {
-    /// Of a report without an experiment.
+    /// Returns an empty plan, for reports without an experiment.
     pub fn without_cells() -> Self {
         let (selection, cells, candidates) = (Selection::Paper, Vec::new(), Vec::new());
         let (text, beside, revisions) = (String::new(), BTreeMap::new(), BTreeMap::new());
@@ -230,19 +231,19 @@ impl Plan {
                 format!("the server's perturb/{name}-v{served}, or {name}"),
             )?;
         }
-        let (text, code) = (Criterion::of(environment), Criterion::of_code(environment));
+        let (text, code) = (Criterion::from_environment(environment), Criterion::from_environment_code(environment));
         for cell in self.cells.iter().filter(|cell| cell.config.common.environment == environment.name) {
             let trained = cell.set.as_deref().unwrap_or_default();
             check_parameters(trained, &cell.config.common.parameters, environment)?;
             cell.tests.sets.iter().try_for_each(|set| set.check(environment))?;
             if let Some(rule) = &cell.tests.success {
-                rule.of(text.as_ref(), code.as_ref())?;
+                rule.criterion(text.as_ref(), code.as_ref())?;
             }
         }
         Ok(())
     }
 
-    /// How much it asks for, but for what is trained anew.
+    /// Returns the amounts of work, without the cells that are trained after the selection.
     pub fn counts(&self) -> Counts {
         let of_grid = || self.cells.iter().filter(|cell| cell.tuned_as.is_none());
         let first = of_grid().filter(|cell| cell.run == 1);
@@ -256,11 +257,11 @@ impl Plan {
         }
     }
 
-    /// The same results by another rule: as published, a plan's tuning cells are what is reported.
+    /// Changes the selection rule of the same results. With the paper's rule, a plan's tuning cells are reported.
     ///
     /// # Errors
     /// [`ValueError`] for `clean` of a plan that was not made for it.
-    pub fn by(self, rule: Selection) -> Result<Self, ValueError> {
+    pub fn with_rule(self, rule: Selection) -> Result<Self, ValueError> {
         match (self.selection, rule) {
             (Selection::Clean, Selection::Paper) => {
                 let runs = self.tuning_runs;
@@ -299,12 +300,12 @@ impl Plan {
 }
 
 impl Cell {
-    /// Its set or version.
+    /// Returns the training distribution.
     pub fn trained_on(&self) -> TrainedOn<'_> {
         self.set.as_deref().map_or(TrainedOn::Version(self.config.common.version), TrainedOn::Set)
     }
 
-    /// What it is one of, over settings and runs: "CartPole ppo ff, trained on R".
+    /// Describes the cell without settings and run: "CartPole ppo ff, trained on R".
     pub fn described(&self) -> String {
         format!("{} {}, trained on {}", self.config.common.environment, self.method(), self.trained_on())
     }
@@ -316,7 +317,7 @@ impl Cell {
         self.tests.selection.map(|episodes| (set, episodes))
     }
 
-    /// What trains.
+    /// Returns the method.
     pub fn method(&self) -> Method {
         self.config.method()
     }
@@ -328,8 +329,7 @@ pub fn distinct<T: Eq + std::hash::Hash + Clone>(items: impl Iterator<Item = T>)
     items.filter(|item| seen.insert(item.clone())).collect()
 }
 
-/// What is wrong with a file, without the names that numbers have in this program, and with the key that was probably
-/// meant.
+/// Describes an error in a file in words for users, with the key that was probably meant.
 fn words(error: &toml::de::Error) -> String {
     let whole = "expected a whole number that is not negative, in digits";
     let text = ["expected u32", "expected u64"]

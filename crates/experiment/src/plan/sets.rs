@@ -11,7 +11,7 @@ use toml::{Table, Value};
 
 use super::file::is_plain;
 
-/// What a set's table may name beside parameters.
+/// A key of a set's table that is no parameter.
 const VERSION: &str = "version";
 const FILE: &str = "file";
 

@@ -151,7 +151,7 @@ fn the_order_of_a_list_without_order_changes_no_id() {
 }
 
 #[test]
-fn r_and_e_together_are_a_version_like_the_others_and_change_no_id_of_theirs() {
+fn r_plus_e_is_a_version_and_keeps_other_ids() {
     let plan = |versions: &str| parse(&SMALL.replacen("versions = ['D', 'E']", versions, 1)).unwrap();
     let tests = "test_versions = ['D', 'R', 'E']";
     let with = plan(&format!("versions = ['D', 'E', 'R+E']\n{tests}"));
@@ -294,7 +294,7 @@ fn trials_of_different_lengths_are_different_methods() {
 }
 
 #[test]
-fn a_plan_and_each_of_its_tables_may_name_a_preset_which_decides_about_success_too() {
+fn preset_of_plan_or_table_decides_success_rule() {
     let text = "environments = ['Pendulum', 'Acrobot']\npreset = 'paper'
         [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']
         [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\npreset = 'perturb'";

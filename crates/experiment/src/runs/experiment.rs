@@ -1,4 +1,4 @@
-//! How far an experiment is.
+//! The status of an experiment.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -7,58 +7,58 @@ use perturb_files::{AnyError, Stamp, is_locked, leads_out, list, read_plain_text
 use perturb_records::statistics::mean;
 use perturb_text::{grouped, shortened};
 
-use super::{LONGEST_TEXT, RunSummary};
+use super::{MAX_TEXT_BYTES, RunSummary};
 use crate::eta::CellDurations;
 use crate::folder::{CellResult, CellState, Folder, FolderError};
 use crate::plan::{Cell, Plan};
 use crate::scheduler::{Rate, Rates};
 
-/// Of more cells it is not followed how far they are.
-const MOST_FOLLOWED: usize = 50_000;
-/// What stands in the place of anything that is behind a link out of the folder that may be shown.
+/// Maximum number of cells whose progress is followed.
+const MAX_FOLLOWED_CELLS: usize = 50_000;
+/// The text for files behind a link that leads out of the shown folder.
 pub const LEADS_OUT: &str = "a link that leads out of the folder";
 
 /// An experiment, as its folder has it.
 #[derive(Clone, Debug)]
 pub struct ExperimentStatus {
-    /// Where it is.
+    /// The folder of the experiment.
     pub folder: Folder,
     /// With all cells that are known by now.
     pub plan: Plan,
-    /// Of each cell of the plan, in its order.
+    /// The status of each cell, in the plan's order.
     pub cells: Vec<CellStatus>,
-    /// Of plan.toml, as it was read.
+    /// The stamp of plan.toml when it was read.
     stamp: Option<Stamp>,
-    /// Of each cell's result and failure, as they were read.
-    records: Vec<Records>,
-    /// What links may not lead out of.
+    /// The stamps of each cell's result and failure when they were read.
+    records: Vec<RecordStamps>,
+    /// The folder that links may not leave.
     within: Option<PathBuf>,
 }
 
-/// How far a cell is.
+/// The status of a cell.
 #[derive(Clone, Debug, PartialEq)]
 pub enum CellStatus {
     /// There is a result.
     Done(Box<CellResult>),
-    /// It failed, for this reason.
+    /// The cell failed with this reason.
     Failed(String),
-    /// Its files cannot be read.
+    /// The cell's files cannot be read.
     NotUnderstood(String),
     /// Somebody works on it.
     InWork,
-    /// None of these; whether it was begun.
+    /// The cell waits.
     Waiting {
         /// Whether it has a folder.
         begun: bool,
     },
 }
 
-/// Of `result.json` and `failure.json`.
-type Records = [Option<Stamp>; 2];
+/// The stamps of `result.json` and `failure.json`.
+type RecordStamps = [Option<Stamp>; 2];
 const RECORDS: [&str; 2] = ["result.json", "failure.json"];
 
 impl ExperimentStatus {
-    /// Of the experiment in `path`.
+    /// Reads the status of the experiment in `path`.
     ///
     /// # Errors
     /// If the plan cannot be read.
@@ -66,8 +66,8 @@ impl ExperimentStatus {
         Self::with(path, None)
     }
 
-    /// The same to be followed and shown to others: nothing is read that is behind a link out of `root`, in which `path`
-    /// is, itself without links.
+    /// Reads the status of an experiment that is shown to others. Nothing behind a link that leads out of `root` is
+    /// read. `path` is in `root` and has no links.
     ///
     /// # Errors
     /// If the plan cannot be read, leads out, or has too many cells.
@@ -77,7 +77,7 @@ impl ExperimentStatus {
 
     fn with(path: &Path, within: Option<PathBuf>) -> Result<Self, AnyError> {
         let folder = Folder::new(path);
-        let stamp = Stamp::of(&folder.plan_path());
+        let stamp = Stamp::read(&folder.plan_path());
         let plan = read_plan(&folder, within.as_deref())?;
         let (records, cells) = plan.cells.iter().map(|cell| known(&folder, cell, within.as_deref())).unzip();
         Ok(Self { folder, plan, cells, stamp, records, within })
@@ -88,7 +88,7 @@ impl ExperimentStatus {
     /// # Errors
     /// If the plan cannot be read.
     pub fn refresh(&mut self) -> Result<(), AnyError> {
-        if Stamp::of(&self.folder.plan_path()) != self.stamp {
+        if Stamp::read(&self.folder.plan_path()) != self.stamp {
             *self = Self::with(self.folder.path(), self.within.clone())?;
             return Ok(());
         }
@@ -113,7 +113,7 @@ impl ExperimentStatus {
         let plan = read_plan(&self.folder, within)?;
         let had = self.plan.cells.iter().map(|cell| cell.id.clone());
         let had = had.zip(self.records.drain(..).zip(self.cells.drain(..)));
-        let mut had: HashMap<String, (Records, CellStatus)> = had.collect();
+        let mut had: HashMap<String, (RecordStamps, CellStatus)> = had.collect();
         let all =
             plan.cells.iter().map(|cell| had.remove(&cell.id).unwrap_or_else(|| known(&self.folder, cell, within)));
         (self.records, self.cells) = all.unzip();
@@ -121,13 +121,13 @@ impl ExperimentStatus {
         Ok(())
     }
 
-    /// When its plan, a result or a failure last changed, s since 1970.
+    /// Returns the time of the last change of the plan, a result or a failure, s since 1970.
     pub fn changed(&self) -> i64 {
         let stamps = self.records.iter().flatten().chain([&self.stamp]).flatten();
         stamps.map(Stamp::seconds).max().unwrap_or_default()
     }
 
-    /// How many cells are as `is` says.
+    /// Returns the number of cells with a status for which `is` holds.
     pub fn count(&self, is: impl Fn(&CellStatus) -> bool) -> usize {
         self.cells.iter().filter(|cell| is(cell)).count()
     }
@@ -203,9 +203,9 @@ fn read_plan(folder: &Folder, within: Option<&Path>) -> Result<Plan, AnyError> {
             }
         }
     }
-    let plan = Plan::parse(&path.display().to_string(), read_plain_text(&path, LONGEST_TEXT)?)?;
-    if within.is_some() && plan.cells.len() > MOST_FOLLOWED {
-        let (cells, most) = (grouped(plan.cells.len()), grouped(MOST_FOLLOWED));
+    let plan = Plan::parse(&path.display().to_string(), read_plain_text(&path, MAX_TEXT_BYTES)?)?;
+    if within.is_some() && plan.cells.len() > MAX_FOLLOWED_CELLS {
+        let (cells, most) = (grouped(plan.cells.len()), grouped(MAX_FOLLOWED_CELLS));
         return Err(
             format!("its {cells} cells are too many to follow, expected {most} at most; ask `perturb ls`").into()
         );
@@ -215,7 +215,7 @@ fn read_plan(folder: &Folder, within: Option<&Path>) -> Result<Plan, AnyError> {
             require_within(folder, cell, root)?; // results say which candidates become cells
         }
     }
-    Ok(plan.in_folder(folder)?)
+    Ok(plan.with_selected_cells(folder)?)
 }
 
 /// Refuses a cell whose records are behind a link that leads out.
@@ -225,18 +225,18 @@ fn require_within(folder: &Folder, cell: &Cell, root: &Path) -> Result<(), Strin
     out.map_or(Ok(()), |name| Err(format!("{} is {LEADS_OUT}", place.join(name).display())))
 }
 
-fn records(folder: &Folder, cell: &Cell) -> Records {
+fn records(folder: &Folder, cell: &Cell) -> RecordStamps {
     let place = folder.cell(&cell.id);
-    RECORDS.map(|name| Stamp::of(&place.path().join(name)))
+    RECORDS.map(|name| Stamp::read(&place.path().join(name)))
 }
 
-fn known(folder: &Folder, cell: &Cell, within: Option<&Path>) -> (Records, CellStatus) {
+fn known(folder: &Folder, cell: &Cell, within: Option<&Path>) -> (RecordStamps, CellStatus) {
     let records = records(folder, cell);
     (records, status(folder, cell, records, within))
 }
 
-/// How far a cell is that has these records.
-fn status(folder: &Folder, cell: &Cell, records: Records, within: Option<&Path>) -> CellStatus {
+/// Returns the status of a cell with these records.
+fn status(folder: &Folder, cell: &Cell, records: RecordStamps, within: Option<&Path>) -> CellStatus {
     let place = folder.cell(&cell.id);
     if records == [None; 2] {
         let begun = place.path().is_dir();
@@ -288,7 +288,7 @@ mod tests {
         assert_eq!(status.cells[0], CellStatus::Waiting { begun: true });
         places[0].write_result(&fixture::result(&plan.cells[0], [90.0, 60.0, 30.0], 1.0)).unwrap();
         let failure =
-            Failure { id: plan.cells[1].id.clone(), reason: "NaN".into(), commit: "x".into(), begins_anew: true };
+            Failure { id: plan.cells[1].id.clone(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
         places[1].write_failure(&failure).unwrap();
         std::fs::create_dir_all(places[2].path()).unwrap();
         std::fs::write(places[2].path().join("result.json"), "{").unwrap();
@@ -347,13 +347,13 @@ mod tests {
     }
 
     #[test]
-    fn a_long_reason_is_shortened_and_too_many_cells_are_not_followed() {
+    fn long_reasons_and_large_plans_are_limited() {
         let directory = tempfile::tempdir().unwrap();
         let folder = Folder::new(directory.path());
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         folder.keep_plan(&plan).unwrap();
         let (id, commit) = (plan.cells[0].id.clone(), "x".into());
-        let failure = Failure { id, reason: "long ".repeat(1000), commit, begins_anew: true };
+        let failure = Failure { id, reason: "long ".repeat(1000), commit, requires_restart: true };
         folder.cell(&failure.id).write_failure(&failure).unwrap();
         let status = ExperimentStatus::read(directory.path()).unwrap();
         assert!(matches!(&status.cells[0], CellStatus::Failed(reason) if reason.len() < 400));

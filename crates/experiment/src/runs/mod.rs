@@ -14,33 +14,33 @@ pub use self::training::TrainingStatus;
 use perturb_files::{self as files, AnyError};
 
 /// A run's `config.toml` or `plan.toml` is shorter, bytes.
-const LONGEST_TEXT: u64 = 16 << 20;
+const MAX_TEXT_BYTES: u64 = 16 << 20;
 
 /// A folder that holds a run.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Place {
-    /// Where it is.
+pub struct RunFolder {
+    /// The path of the folder.
     pub path: PathBuf,
-    /// What is in it.
-    pub kind: Kind,
+    /// The kind of the run.
+    pub kind: RunKind,
 }
 
-/// What a folder holds.
+/// The kind of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Kind {
-    /// What `perturb train --out` writes.
+pub enum RunKind {
+    /// A training, as `perturb train --out` writes it.
     Training,
-    /// What `perturb run --out` writes.
+    /// An experiment, as `perturb run --out` writes it.
     Experiment,
 }
 
-impl Kind {
-    /// Of the folder at `path`; `None` if it holds neither.
-    pub fn of(path: &Path) -> Option<Self> {
+impl RunKind {
+    /// Detects the kind of the folder at `path`; `None` if it holds no run.
+    pub fn detect(path: &Path) -> Option<Self> {
         if path.join("plan.toml").is_file() {
-            Some(Kind::Experiment)
+            Some(RunKind::Experiment)
         } else {
-            path.join("config.toml").is_file().then_some(Kind::Training)
+            path.join("config.toml").is_file().then_some(RunKind::Training)
         }
     }
 }
@@ -50,11 +50,11 @@ pub fn no_folder(path: &Path) -> String {
     format!("there is no folder {}: give the one that your runs are in", path.display())
 }
 
-/// What is below a folder.
+/// The runs below a folder.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Places {
+pub struct RunFolders {
     /// The runs, in the order of their paths. Nothing is looked for in a run.
-    pub runs: Vec<Place>,
+    pub runs: Vec<RunFolder>,
     /// All other folders, the first one itself among them.
     pub others: Vec<PathBuf>,
     /// Whether there are more folders than were looked at.
@@ -65,8 +65,8 @@ pub struct Places {
 ///
 /// # Errors
 /// The operating system's, of `folder` itself; what else cannot be listed is passed over.
-pub fn places(folder: &Path, most: usize) -> files::Result<Places> {
-    let mut found = Places::default();
+pub fn places(folder: &Path, most: usize) -> files::Result<RunFolders> {
+    let mut found = RunFolders::default();
     let mut left = vec![folder.to_owned()];
     files::require_folder(folder)?;
     while let Some(path) = left.pop() {
@@ -74,8 +74,8 @@ pub fn places(folder: &Path, most: usize) -> files::Result<Places> {
             found.more = true;
             break;
         }
-        if let Some(kind) = Kind::of(&path) {
-            found.runs.push(Place { path, kind });
+        if let Some(kind) = RunKind::detect(&path) {
+            found.runs.push(RunFolder { path, kind });
             continue;
         }
         let inner = files::list(&path).unwrap_or_default();
@@ -88,13 +88,13 @@ pub fn places(folder: &Path, most: usize) -> files::Result<Places> {
 /// A training or an experiment in a few figures.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RunSummary {
-    /// Where it is.
+    /// The path of the folder.
     pub path: PathBuf,
-    /// What is trained, or of which environments.
+    /// The trained method, or the environments of an experiment.
     pub what: String,
-    /// Episodes of a training, cells of an experiment: those that are done, …
+    /// Number of finished episodes of a training, or finished cells of an experiment.
     pub done: u64,
-    /// … and those that there are to be.
+    /// Number of all these episodes or cells.
     pub budget: u64,
     /// "episodes" or "cells".
     pub unit: &'static str,
@@ -105,18 +105,18 @@ pub struct RunSummary {
 }
 
 impl RunSummary {
-    /// Of the run in `place`. What cannot be read is "not understood".
-    pub fn read(place: &Place) -> Self {
+    /// Reads the summary of the run in `place`. A run that cannot be read is "not understood".
+    pub fn read(place: &RunFolder) -> Self {
         let read = || -> Result<Self, AnyError> {
             Ok(match place.kind {
-                Kind::Training => TrainingStatus::read(&place.path)?.summary(),
-                Kind::Experiment => ExperimentStatus::read(&place.path)?.summary(),
+                RunKind::Training => TrainingStatus::read(&place.path)?.summary(),
+                RunKind::Experiment => ExperimentStatus::read(&place.path)?.summary(),
             })
         };
         read().unwrap_or_else(|_| Self::not_understood(&place.path))
     }
 
-    /// Of a run that cannot be read.
+    /// Returns the summary of a run that cannot be read.
     pub fn not_understood(path: &Path) -> Self {
         let (what, state) = (String::new(), "not understood");
         Self { path: path.to_owned(), what, done: 0, budget: 0, unit: "", success_percent: None, state }
@@ -129,7 +129,7 @@ mod tests {
     use perturb_files::write_atomically;
 
     #[test]
-    fn runs_are_found_however_deep_and_nothing_is_looked_for_in_a_run() {
+    fn runs_are_found_at_any_depth_but_not_inside_runs() {
         let directory = tempfile::tempdir().unwrap();
         let path = |name: &str| directory.path().join(name);
         for name in ["b/config.toml", "a/deep/plan.toml", "a/deep/cells/x/training/config.toml", "pictures/one.svg"] {
@@ -137,21 +137,21 @@ mod tests {
         }
         std::os::unix::fs::symlink(path("b"), path("link")).unwrap();
         let found = places(directory.path(), 100).unwrap();
-        let place = |name: &str, kind| Place { path: path(name), kind };
-        assert_eq!(found.runs, [place("a/deep", Kind::Experiment), place("b", Kind::Training)]);
+        let place = |name: &str, kind| RunFolder { path: path(name), kind };
+        assert_eq!(found.runs, [place("a/deep", RunKind::Experiment), place("b", RunKind::Training)]);
         assert_eq!(found.others, [directory.path().to_owned(), path("a"), path("pictures")]);
         assert!(!found.more && places(directory.path(), 3).unwrap().more);
-        assert_eq!(places(&path("b"), 9).unwrap().runs, [place("b", Kind::Training)], "it may be a run itself");
+        assert_eq!(places(&path("b"), 9).unwrap().runs, [place("b", RunKind::Training)], "it may be a run itself");
         assert!(places(&path("missing"), 9).unwrap_err().to_string().contains("/missing"));
     }
 
     #[test]
     fn a_run_that_cannot_be_read_is_listed_as_such() {
         let directory = tempfile::tempdir().unwrap();
-        for (name, kind) in [("config.toml", Kind::Training), ("plan.toml", Kind::Experiment)] {
+        for (name, kind) in [("config.toml", RunKind::Training), ("plan.toml", RunKind::Experiment)] {
             let path = directory.path().join(name.replace('.', "-"));
             write_atomically(&path.join(name), b"no TOML").unwrap();
-            let summary = RunSummary::read(&Place { path: path.clone(), kind });
+            let summary = RunSummary::read(&RunFolder { path: path.clone(), kind });
             assert_eq!(summary, RunSummary::not_understood(&path));
         }
     }

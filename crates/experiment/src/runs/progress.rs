@@ -7,14 +7,14 @@ use std::path::Path;
 use perturb_files::open_plain;
 
 /// A line and its names are shorter.
-const LONGEST: u64 = 16 * 1024;
+const MAX_LINE_BYTES: u64 = 16 * 1024;
 
-/// How far a training is, and what its last update came to.
+/// The progress of a training and the figures of its last update.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LastProgress(HashMap<String, f64>);
 
 impl LastProgress {
-    /// What stands in a column, e.g. `rollout/episodes`; `None` if nothing does.
+    /// Returns the value of a column, e.g. `rollout/episodes`; `None` if it is empty.
     pub fn get(&self, column: &str) -> Option<f64> {
         self.0.get(column).copied()
     }
@@ -30,19 +30,20 @@ impl LastProgress {
     }
 }
 
-/// The last whole line of the file at `path`, of which the beginning and the end are read; `None` if there is none.
+/// Returns the last whole line of the file at `path`; `None` if there is none. Only the beginning and the end of the
+/// file are read.
 pub fn last_progress(path: &Path) -> Option<LastProgress> {
     let (mut file, metadata) = open_plain(path).ok()?;
     let length = metadata.len();
     let mut read = |from: u64| -> Option<String> {
         let mut bytes = Vec::new();
         file.seek(SeekFrom::Start(from)).ok()?;
-        file.by_ref().take(LONGEST).read_to_end(&mut bytes).ok()?;
+        file.by_ref().take(MAX_LINE_BYTES).read_to_end(&mut bytes).ok()?;
         Some(String::from_utf8_lossy(&bytes).into_owned())
     };
     let beginning = read(0)?;
     let (names, first) = beginning.split_once('\n')?;
-    let ending = if length > LONGEST { read(length - LONGEST)? } else { first.to_owned() };
+    let ending = if length > MAX_LINE_BYTES { read(length - MAX_LINE_BYTES)? } else { first.to_owned() };
     let whole = &ending[..ending.rfind('\n')?];
     let line = whole.rsplit('\n').next().unwrap_or_default();
     let number = |(name, text): (&str, &str)| Some((name.to_owned(), text.trim().parse().ok()?));

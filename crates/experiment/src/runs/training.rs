@@ -1,4 +1,4 @@
-//! How far a training is.
+//! The status of a training.
 
 use std::path::{Path, PathBuf};
 
@@ -7,17 +7,17 @@ use perturb_files::{AnyError, is_locked, read_plain_text};
 use perturb_settings::{ConfigError, TrainConfig};
 use perturb_text::shortened;
 
-use super::{LONGEST_TEXT, LastProgress, RunSummary, last_progress};
+use super::{LastProgress, MAX_TEXT_BYTES, RunSummary, last_progress};
 
-/// So many episodes decide whether it has had enough success.
+/// Number of episodes after which the success rate may end a training.
 const RECENT: u64 = 100;
 
 /// A training, as its folder has it.
 #[derive(Clone, Debug)]
 pub struct TrainingStatus {
-    /// Where it is.
+    /// The folder of the training.
     pub path: PathBuf,
-    /// Its settings.
+    /// The settings.
     pub config: TrainConfig,
     /// Episodes of the budget: of the last line of the log while it is in work, otherwise of the last checkpoint, from
     /// which it would go on.
@@ -26,17 +26,17 @@ pub struct TrainingStatus {
     pub progress: Option<LastProgress>,
     /// Episodes of the last checkpoint; `None` if there is none.
     pub saved: Option<u64>,
-    /// What is wrong with the checkpoint.
+    /// The fault of the checkpoint, if it is damaged.
     pub damaged: Option<String>,
     /// "in work", "finished", "broken off", "without a checkpoint".
     pub state: &'static str,
-    /// Whether it has come to its end, by its budget or by its success. It may be in work all the same: what was trained
-    /// in a cell is tested.
+    /// Whether the training has ended by its budget or by its success rate. A cell may still be in work then, because
+    /// its policy is tested.
     pub over: bool,
 }
 
 impl TrainingStatus {
-    /// Of the training in `path`.
+    /// Reads the status of the training in `path`.
     ///
     /// # Errors
     /// If `config.toml` is not that of a training.
@@ -65,7 +65,7 @@ impl TrainingStatus {
         Ok(Self { path: path.to_owned(), config, episodes, progress, saved, damaged, state, over })
     }
 
-    /// What is trained, in a few words.
+    /// Describes the training.
     pub fn what(&self) -> String {
         self.config.to_string()
     }
@@ -86,9 +86,8 @@ impl TrainingStatus {
 
 fn read_config(path: &Path) -> Result<TrainConfig, AnyError> {
     let origin = path.display().to_string();
-    let table = read_plain_text(path, LONGEST_TEXT)?.parse().map_err(|error: toml::de::Error| ConfigError::Syntax {
-        origin: origin.clone(),
-        reason: error.to_string().trim().to_owned(),
+    let table = read_plain_text(path, MAX_TEXT_BYTES)?.parse().map_err(|error: toml::de::Error| {
+        ConfigError::Syntax { origin: origin.clone(), reason: error.to_string().trim().to_owned() }
     })?;
     Ok(TrainConfig::from_table(&origin, table)?)
 }
@@ -99,7 +98,7 @@ mod tests {
     use perturb_files::{Lock, write_atomically};
 
     #[test]
-    fn a_training_in_work_is_as_far_as_its_log_and_otherwise_as_its_checkpoint() {
+    fn progress_is_from_the_log_or_the_checkpoint() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("run");
         assert!(TrainingStatus::read(&path).is_err());

@@ -1,4 +1,4 @@
-//! What a worker is told and what it tells: one JSON object a line, on its standard input and output.
+//! Messages between a run and its workers: one JSON object a line on the worker's standard input and output.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -10,57 +10,57 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use super::count;
-use crate::folder::FailureMark;
+use crate::folder::FailureId;
 
-/// How often a worker says how far a cell is, …
+/// Interval of a worker's progress messages for one cell.
 const INTERVAL: Duration = Duration::from_secs(1);
-/// … times the number of its cells, but not more than this.
+/// Maximum factor by which the interval grows with the number of the worker's cells.
 const MAX_INTERVALS: u32 = 10;
 
 /// The only line that a worker reads. It stops when its standard input is closed, which also happens when the process
 /// that started it dies, however it dies.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Order {
+pub struct WorkerJob {
     /// The cells of a group, at least one.
-    pub cells: Vec<OrderedCell>,
-    /// Which of several servers it should take, counted around.
+    pub cells: Vec<JobCell>,
+    /// The index of the server to use, modulo the number of servers.
     pub turn: usize,
 }
 
-/// A cell of an [`Order`].
+/// A cell of an [`WorkerJob`].
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct OrderedCell {
-    /// Its id.
+pub struct JobCell {
+    /// The cell's id.
     pub cell: String,
     /// The failure that may be forgotten, and no other.
-    pub retry: Option<FailureMark>,
+    pub retry: Option<FailureId>,
 }
 
 /// A line that a worker writes, `{"cell": "…", "event": "training", …}`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Line {
+pub struct EventLine {
     /// The cell's id.
     pub cell: String,
-    /// What happens to it.
+    /// The event.
     #[serde(flatten)]
     pub event: CellEvent,
 }
 
-/// What happens to a cell. All but the first three end an attempt, and are a worker's last line about the cell.
+/// An event of a cell. All but the first three end an attempt and are the worker's last line about the cell.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 #[expect(missing_docs, reason = "the variants say what their fields are")]
 pub enum CellEvent {
     /// There is a server for it, at this address.
     Server { address: String },
-    /// It is trained, so far for so many episodes and steps, of which `saved` steps are in a checkpoint: what another
-    /// attempt would begin with. The first such line of an attempt says where that begins.
+    /// The training has had so many episodes and steps. `saved` steps are in a checkpoint, from which another attempt
+    /// would resume. The first such line of an attempt says where the attempt begins.
     Training { episodes: u64, timesteps: u64, saved: u64 },
-    /// It is tested on this set, so far in so many episodes.
+    /// The policy is tested on this set and has had so many episodes.
     Testing { set: String, episodes: u64 },
     /// There is a result, of now or of earlier.
     Done,
-    /// It failed, now or earlier, for this reason.
+    /// The cell failed with this reason, now or earlier.
     Failed { reason: String },
     /// Somebody else works on it.
     Busy,
@@ -73,7 +73,7 @@ pub enum CellEvent {
     Stopped { signal: i32 },
     /// The order makes no sense to the worker.
     Refused { reason: String },
-    /// The worker ended without a last line about the cell, in this way: said by whoever started it.
+    /// The worker ended without a last line about the cell. The process that started the worker says how.
     Killed { reason: String },
 }
 
@@ -88,7 +88,7 @@ impl CellEvent {
         !matches!(self, Self::Server { .. } | Self::Training { .. } | Self::Testing { .. })
     }
 
-    /// What stays the same while it only says how far something is.
+    /// Returns the part of the event that is constant during a stage.
     fn stage(&self) -> Option<(&str, u64)> {
         match self {
             Self::Training { saved, .. } => Some(("", *saved)),
@@ -117,33 +117,33 @@ impl std::fmt::Display for CellEvent {
 }
 
 /// Writes the lines of a group's cells.
-pub struct Teller<W> {
+pub struct EventLineWriter<W> {
     out: W,
     interval: Duration,
     /// The last line about each cell.
     last: HashMap<String, (CellEvent, Instant)>,
 }
 
-impl<W: Write> Teller<W> {
-    /// Of so many cells.
+impl<W: Write> EventLineWriter<W> {
+    /// Returns a writer for `cells` cells.
     pub fn new(cells: usize, out: W) -> Self {
         let intervals = cells.clamp(1, MAX_INTERVALS as usize) as u32;
         Self { out, interval: INTERVAL * intervals, last: HashMap::new() }
     }
 
     /// Writes a line about the cell with this id, unless it says hardly more than one of a moment ago.
-    pub fn tell(&mut self, cell: &str, event: CellEvent) {
+    pub fn write(&mut self, cell: &str, event: CellEvent) {
         let said =
             |(last, time): &(CellEvent, Instant)| time.elapsed() < self.interval && last.stage() == event.stage();
         if event.stage().is_some() && self.last.get(cell).is_some_and(said) {
             return;
         }
         self.last.insert(cell.to_owned(), (event.clone(), Instant::now()));
-        write_line(&mut self.out, &Line { cell: cell.to_owned(), event });
+        write_line(&mut self.out, &EventLine { cell: cell.to_owned(), event });
     }
 }
 
-/// Writes `line` for whoever reads. That nobody does is no reason to stop: the folder says what was done.
+/// Writes `line`. A failed write is ignored, because the folder has the results.
 pub fn write_line(out: &mut impl Write, line: &impl Serialize) {
     let Ok(mut text) = serde_json::to_vec(line) else { return };
     text.push(b'\n');
@@ -154,7 +154,7 @@ pub fn write_line(out: &mut impl Write, line: &impl Serialize) {
 
 /// The lines that were completed in `file` since `offset`, which goes on behind them. Others may write there too, a
 /// cluster's prologue for instance: what is no such line is passed over.
-pub(super) fn read_lines(file: &File, offset: &mut u64) -> std::io::Result<Vec<Line>> {
+pub(super) fn read_lines(file: &File, offset: &mut u64) -> std::io::Result<Vec<EventLine>> {
     let mut new = Vec::new();
     let mut piece = [0; 1 << 14];
     loop {
@@ -197,29 +197,29 @@ mod tests {
     #[case(CellEvent::Refused { reason: "no".into() }, r#""refused","reason":"no"}"#)]
     #[case(CellEvent::Killed { reason: "no".into() }, r#""killed","reason":"no"}"#)]
     fn a_line_is_a_flat_object_and_reads_back(#[case] event: CellEvent, #[case] text: &str) {
-        let line = Line { cell: "a".into(), event };
+        let line = EventLine { cell: "a".into(), event };
         let text = format!(r#"{{"cell":"a","event":{text}"#);
         assert_eq!(serde_json::to_string(&line).unwrap(), text);
-        assert_eq!(serde_json::from_str::<Line>(&text).unwrap(), line);
+        assert_eq!(serde_json::from_str::<EventLine>(&text).unwrap(), line);
     }
 
     #[test]
-    fn how_far_it_is_is_said_once_a_second_but_each_checkpoint_at_once() {
+    fn progress_is_sent_each_second_and_checkpoints_at_once() {
         let mut out = Vec::new();
-        let mut teller = Teller::new(1, &mut out);
+        let mut teller = EventLineWriter::new(1, &mut out);
         let training = |episodes, saved| CellEvent::Training { episodes, timesteps: 10 * episodes, saved };
         for (episodes, saved) in [(0, 0), (1, 0), (2, 20), (3, 20)] {
-            teller.tell("a", training(episodes, saved));
+            teller.write("a", training(episodes, saved));
         }
         let testing = |set: &str, episodes| CellEvent::Testing { set: set.into(), episodes };
-        teller.tell("a", testing("D", 1));
-        teller.tell("a", testing("R", 1));
-        teller.tell("b", testing("R", 1));
+        teller.write("a", testing("D", 1));
+        teller.write("a", testing("R", 1));
+        teller.write("b", testing("R", 1));
         let (_, time) = teller.last.get_mut("a").unwrap();
         *time = time.checked_sub(INTERVAL).unwrap();
-        teller.tell("a", testing("R", 2));
-        teller.tell("b", testing("R", 2));
-        teller.tell("a", CellEvent::Done);
+        teller.write("a", testing("R", 2));
+        teller.write("b", testing("R", 2));
+        teller.write("a", CellEvent::Done);
         let words: Vec<String> = String::from_utf8(out).unwrap().lines().map(|line| line.replace('"', "")).collect();
         assert_eq!(
             words,
@@ -237,7 +237,7 @@ mod tests {
 
     #[test]
     fn of_many_cells_less_is_said_about_each() {
-        let seconds = |cells| Teller::new(cells, Vec::new()).interval.as_secs();
+        let seconds = |cells| EventLineWriter::new(cells, Vec::new()).interval.as_secs();
         assert_eq!([0, 1, 4, 36].map(seconds), [1, 1, 4, 10]);
     }
 

@@ -10,66 +10,66 @@ use std::time::Instant;
 use perturb_files::{FileError, create_folder, io};
 
 use super::event::{last_words, read_lines, write_line};
-use super::{Backend, CellEvent, News, Offer, Order, OrderedCell, Result};
+use super::{Backend, BackendEvent, CellEvent, JobCell, PendingCell, Result, WorkerJob};
 use crate::folder::Folder;
 use crate::plan::{Grouping, Plan};
 
-/// Worker processes, each of which takes the locks of its cells itself.
+/// Worker processes on this machine. Each worker locks its cells itself.
 pub struct Local<'a> {
     plan: &'a Plan,
     folder: &'a Folder,
     grouping: Grouping,
     command: &'a dyn Fn(usize) -> Command,
-    server: &'a dyn Fn() -> Option<News>,
+    server: &'a dyn Fn() -> Option<BackendEvent>,
     workers: Vec<Worker>,
-    /// What each cell may take at most, s of a process, as far as it was measured.
-    most: Vec<Option<f64>>,
+    /// Measured upper bounds of the cells' durations, s of a process.
+    max_seconds: Vec<Option<f64>>,
 }
 
 struct Worker {
     /// The cells without a last line: their places in the plan, by id.
     cells: BTreeMap<String, usize>,
-    /// Those whose turn has come.
+    /// The cells that have begun.
     begun: HashSet<usize>,
     /// The lowest number that no other worker has.
-    seat: usize,
+    slot: usize,
     child: Child,
     events: File,
     /// Up to where they were read.
     offset: u64,
     log: PathBuf,
-    /// Where its words begin in the log, in bytes.
+    /// The start of the worker's output in the log, bytes.
     log_start: u64,
 }
 
 impl<'a> Local<'a> {
-    /// `grouping.at_a_time` workers, started by `command` for their seat, the lowest number from 0 that no other
-    /// worker has; each reads an [`Order`] and writes [`Line`](super::Line)s. `server` says what has become of their servers, if
-    /// anything.
+    /// Returns a backend of `grouping.at_a_time` workers. `command` starts a worker for its slot, the lowest free
+    /// number from 0. Each worker reads a [`WorkerJob`] and writes [`EventLine`](super::EventLine)s. `server` reports
+    /// events of the servers.
     pub fn new(
         plan: &'a Plan,
         folder: &'a Folder,
         grouping: Grouping,
         command: &'a dyn Fn(usize) -> Command,
-        server: &'a dyn Fn() -> Option<News>,
+        server: &'a dyn Fn() -> Option<BackendEvent>,
     ) -> Self {
-        Self { plan, folder, grouping, command, server, workers: Vec::new(), most: Vec::new() }
+        Self { plan, folder, grouping, command, server, workers: Vec::new(), max_seconds: Vec::new() }
     }
 
-    /// The same, which knows what cells may take at most, by their places in the plan, s of a process.
-    pub fn with_most(self, most: Vec<Option<f64>>) -> Self {
-        Self { most, ..self }
+    /// Sets the measured upper bounds of the cells' durations by index, s of a process.
+    pub fn with_max_seconds(self, max_seconds: Vec<Option<f64>>) -> Self {
+        Self { max_seconds, ..self }
     }
 
-    fn start(&self, group: &[Offer]) -> Result<Option<Worker>> {
+    fn start(&self, group: &[PendingCell]) -> Result<Option<Worker>> {
         let Some(first) = group.first() else { return Ok(None) };
-        let cells: Vec<OrderedCell> =
-            group.iter().map(|offer| OrderedCell { cell: self.id(offer.cell).into(), retry: offer.retry }).collect();
+        let cells: Vec<JobCell> =
+            group.iter().map(|offer| JobCell { cell: self.id(offer.cell).into(), retry: offer.retry }).collect();
         let (log, path) = self.open_logs(group)?;
         let log_start = log.metadata().map_err(io("read", &path))?.len();
-        let is_free = |seat: &usize| self.workers.iter().all(|worker| worker.seat != *seat);
-        let seat = (0..self.workers.len()).find(is_free).unwrap_or(self.workers.len());
-        let mut command = (self.command)(seat);
+        let is_free = |slot: &usize| self.workers.iter().all(|worker| worker.slot != *slot);
+        let slot = (0..self.workers.len()).find(is_free).unwrap_or(self.workers.len());
+        let mut command = (self.command)(slot);
         let program = PathBuf::from(command.get_program());
         let mut start = || {
             // A file, not a pipe: nobody has to read while the worker writes.
@@ -78,17 +78,17 @@ impl<'a> Local<'a> {
             Ok((child, events))
         };
         let (mut child, events) = start().map_err(io("start a worker process of", &program))?;
-        let order = Order { cells, turn: self.first_turn().wrapping_add(first.group + first.lost_servers) };
+        let order = WorkerJob { cells, turn: self.first_turn().wrapping_add(first.group + first.lost_servers) };
         if let Some(input) = &mut child.stdin {
             write_line(input, &order);
         }
         let cells = group.iter().map(|offer| (self.id(offer.cell).to_owned(), offer.cell)).collect();
-        Ok(Some(Worker { cells, begun: HashSet::new(), seat, child, events, offset: 0, log: path, log_start }))
+        Ok(Some(Worker { cells, begun: HashSet::new(), slot, child, events, offset: 0, log: path, log_start }))
     }
 
     /// The log of a group, which is that of its first cell; the others' say so.
-    fn open_logs(&self, group: &[Offer]) -> Result<(File, PathBuf), FileError> {
-        let open = |offer: &Offer| {
+    fn open_logs(&self, group: &[PendingCell]) -> Result<(File, PathBuf), FileError> {
+        let open = |offer: &PendingCell| {
             let place = self.folder.cell(self.id(offer.cell));
             create_folder(place.path())?;
             let path = place.log();
@@ -115,8 +115,8 @@ impl<'a> Local<'a> {
 }
 
 impl Worker {
-    /// What it has said about its cells since the last call, and whether it has ended.
-    fn news(&mut self) -> std::io::Result<(Vec<News>, bool)> {
+    /// Returns the events since the last call, and whether the worker has ended.
+    fn news(&mut self) -> std::io::Result<(Vec<BackendEvent>, bool)> {
         let status = self.child.try_wait()?; // before its words are read, so that they are the last
         let mut news = Vec::new();
         for line in read_lines(&self.events, &mut self.offset)? {
@@ -127,7 +127,7 @@ impl Worker {
             if line.event.is_last() {
                 self.cells.remove(&line.cell);
             }
-            news.push(News::Event(cell, line.event));
+            news.push(BackendEvent::Event(cell, line.event));
         }
         if let Some(status) = status.filter(|_| !self.cells.is_empty()) {
             let words = last_words(&self.log, self.log_start).map_or_else(String::new, |words| format!(": {words}"));
@@ -135,9 +135,9 @@ impl Worker {
             let mut killed: Vec<usize> = std::mem::take(&mut self.cells).into_values().collect();
             killed.sort_unstable();
             news.extend(killed.into_iter().map(|cell| match self.begun.is_empty() || self.begun.contains(&cell) {
-                true => News::Event(cell, CellEvent::Killed { reason: reason.clone() }),
+                true => BackendEvent::Event(cell, CellEvent::Killed { reason: reason.clone() }),
                 // A process that did other cells is no fault of one that had no turn.
-                false => News::Returned(cell),
+                false => BackendEvent::Returned(cell),
             }));
         }
         Ok((news, status.is_some()))
@@ -149,7 +149,7 @@ impl Backend for Local<'_> {
         self.grouping
     }
 
-    fn convicts(&self) -> bool {
+    fn records_crashes_as_failures(&self) -> bool {
         true
     }
 
@@ -157,7 +157,7 @@ impl Backend for Local<'_> {
         true
     }
 
-    fn poll(&mut self, _now: Instant) -> Result<Vec<News>> {
+    fn poll(&mut self, _now: Instant) -> Result<Vec<BackendEvent>> {
         let mut news = Vec::new();
         for mut worker in std::mem::take(&mut self.workers) {
             let (said, ended) = worker.news().map_err(io("read what is told about", &worker.log))?;
@@ -170,11 +170,11 @@ impl Backend for Local<'_> {
         Ok(news)
     }
 
-    fn room(&self) -> usize {
+    fn free_slots(&self) -> usize {
         self.grouping.at_a_time.saturating_sub(self.workers.len())
     }
 
-    fn begin(&mut self, groups: &[Vec<Offer>]) -> Result<Vec<usize>> {
+    fn begin(&mut self, groups: &[Vec<PendingCell>]) -> Result<Vec<usize>> {
         for group in groups {
             let worker = self.start(group)?;
             self.workers.extend(worker);
@@ -182,8 +182,8 @@ impl Backend for Local<'_> {
         Ok(groups.iter().flatten().map(|offer| offer.cell).collect())
     }
 
-    fn most(&self, cell: usize) -> Option<f64> {
-        self.most.get(cell).copied().flatten()
+    fn max_seconds(&self, cell: usize) -> Option<f64> {
+        self.max_seconds.get(cell).copied().flatten()
     }
 
     fn load(&self) -> (String, usize) {
@@ -210,7 +210,7 @@ mod tests {
     use std::collections::HashMap;
     use std::time::Duration;
 
-    use super::super::{Announcement, Line, RunEnd, run};
+    use super::super::{EventLine, ProgressEvent, RunEnd, run};
     use super::*;
     use perturb_files::interrupt::StopFlag;
 
@@ -224,12 +224,12 @@ mod tests {
 
     struct Ran {
         end: Result<RunEnd>,
-        lines: Vec<Line>,
+        lines: Vec<EventLine>,
     }
 
     /// Runs with a shell script as a worker of one cell.
-    fn run_script(folder: &Folder, script: &str, stop: &StopFlag, server: &dyn Fn() -> Option<News>) -> Ran {
-        run_grouped(Grouping { most: 1, at_a_time: 2 }, folder, script, stop, server)
+    fn run_script(folder: &Folder, script: &str, stop: &StopFlag, server: &dyn Fn() -> Option<BackendEvent>) -> Ran {
+        run_grouped(Grouping { max_cells: 1, at_a_time: 2 }, folder, script, stop, server)
     }
 
     fn run_grouped(
@@ -237,7 +237,7 @@ mod tests {
         folder: &Folder,
         script: &str,
         stop: &StopFlag,
-        server: &dyn Fn() -> Option<News>,
+        server: &dyn Fn() -> Option<BackendEvent>,
     ) -> Ran {
         run_plan(&Plan::parse("test", PLAN.into()).unwrap(), grouping, folder, script, stop, server)
     }
@@ -248,17 +248,17 @@ mod tests {
         folder: &Folder,
         script: &str,
         stop: &StopFlag,
-        server: &dyn Fn() -> Option<News>,
+        server: &dyn Fn() -> Option<BackendEvent>,
     ) -> Ran {
-        let command = |seat: usize| {
+        let command = |slot: usize| {
             let mut command = Command::new("sh");
-            command.arg("-c").arg(format!("{BEGIN} {script}")).current_dir(folder.path()).env("SEAT", seat.to_string());
+            command.arg("-c").arg(format!("{BEGIN} {script}")).current_dir(folder.path()).env("SEAT", slot.to_string());
             command
         };
         let mut local = Local::new(plan, folder, grouping, &command, server);
         let mut lines = Vec::new();
-        let mut report = |report: Announcement<'_>| {
-            if let Announcement::Line(line) = report {
+        let mut report = |report: ProgressEvent<'_>| {
+            if let ProgressEvent::Line(line) = report {
                 lines.push(line.clone());
             }
         };
@@ -283,13 +283,13 @@ mod tests {
     fn orders_are_read(at_a_time: usize) {
         let (_directory, folder, ids) = place();
         let script = "say '\"server\",\"address\":\"unix:/x\"'; echo x >result.json; say '\"done\"'";
-        let grouping = Grouping { most: 1, at_a_time };
+        let grouping = Grouping { max_cells: 1, at_a_time };
         let ran = run_grouped(grouping, &folder, script, &StopFlag::default(), &|| None);
         assert_eq!(ran.end.unwrap(), RunEnd::Finished { failed: Vec::new() });
         for (number, id) in ids.iter().enumerate() {
             let orders = std::fs::read_to_string(folder.cell(id).path().join("orders")).unwrap();
-            let order: Order = serde_json::from_str(&orders).unwrap();
-            assert_eq!(order.cells, [OrderedCell { cell: id.clone(), retry: None }]);
+            let order: WorkerJob = serde_json::from_str(&orders).unwrap();
+            assert_eq!(order.cells, [JobCell { cell: id.clone(), retry: None }]);
             assert_eq!(
                 order.turn,
                 turn(&ids[0], number),
@@ -305,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn a_worker_has_the_lowest_seat_that_is_free_and_goes_on_with_the_next_server() {
+    fn worker_takes_lowest_free_slot_and_next_server() {
         let (_directory, folder, _) = place();
         let plan = Plan::parse("test", PLAN.replace("runs = 2", "runs = 3")).unwrap();
         let [first, second, third] = [0, 1, 2].map(|cell: usize| plan.cells[cell].id.clone());
@@ -318,25 +318,25 @@ mod tests {
             esac
             echo x >result.json; say '"done"'"#
         );
-        let grouping = Grouping { most: 1, at_a_time: 2 };
+        let grouping = Grouping { max_cells: 1, at_a_time: 2 };
         let ran = run_plan(&plan, grouping, &folder, &script, &StopFlag::default(), &|| None);
         assert_eq!(ran.end.unwrap(), RunEnd::Finished { failed: Vec::new() });
         let read = |id: &str, name: &str| std::fs::read_to_string(folder.cell(id).path().join(name)).unwrap();
         assert_eq!([&first, &second, &third].map(|id| read(id, "seats")), ["0\n", "1\n", "0\n0\n"]);
         let turns = |id: &str| -> Vec<usize> {
             let orders = read(id, "orders");
-            orders.lines().map(|order| serde_json::from_str::<Order>(order).unwrap().turn).collect()
+            orders.lines().map(|order| serde_json::from_str::<WorkerJob>(order).unwrap().turn).collect()
         };
         assert_eq!(turns(&second), [turn(&first, 1)]);
         assert_eq!(turns(&third), [turn(&first, 2), turn(&first, 3)]);
     }
 
-    fn said(line: &Line) -> String {
+    fn said(line: &EventLine) -> String {
         serde_json::to_string(&line.event).unwrap()
     }
 
     #[test]
-    fn a_worker_without_a_last_line_was_killed_and_its_log_may_say_why() {
+    fn worker_without_last_line_counts_as_killed() {
         let (_directory, folder, ids) = place();
         std::fs::create_dir_all(folder.cell(&ids[1]).path()).unwrap();
         std::fs::write(folder.cell(&ids[1]).log(), "of an earlier run\n").unwrap();
@@ -351,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn a_worker_does_a_group_and_takes_only_the_cells_in_work_with_it() {
+    fn dead_worker_loses_only_its_running_cells() {
         let (.., ids) = place();
         let [first, second] = &ids;
         // Done with the first, the worker dies; the second is begun again, and where its log was then is said.
@@ -365,7 +365,7 @@ mod tests {
         for turn in [false, true] {
             let (_directory, folder, _) = place();
             let script = format!("WORKED={}; {script}", if turn { "1" } else { "" });
-            let grouping = Grouping { most: 2, at_a_time: 1 };
+            let grouping = Grouping { max_cells: 2, at_a_time: 1 };
             let ran = run_grouped(grouping, &folder, &script, &StopFlag::default(), &|| None);
             assert_eq!(ran.end.unwrap(), RunEnd::Finished { failed: Vec::new() });
             let events = ran.lines.iter().map(|line| (&*line.cell, line.event.to_string()));
@@ -383,7 +383,7 @@ mod tests {
     #[track_caller]
     fn logs_of_a_group(folder: &Folder, [first, second]: &[String; 2]) {
         let read = |id: &String, name: &str| std::fs::read_to_string(folder.cell(id).path().join(name)).unwrap();
-        let order: Order = serde_json::from_str(&read(first, "orders")).unwrap();
+        let order: WorkerJob = serde_json::from_str(&read(first, "orders")).unwrap();
         assert_eq!(order.cells.iter().map(|ordered| &ordered.cell).collect::<Vec<_>>(), [first, second]);
         assert_eq!(read(second, "log.txt"), format!("done together with {first}: see ../{first}/log.txt\n"));
     }
@@ -411,8 +411,9 @@ mod tests {
     fn the_end_of_the_shared_server_is_that_of_the_run() {
         let (_directory, folder, _) = place();
         let stop = StopFlag::default();
-        let ran =
-            run_script(&folder, "cat >/dev/null", &stop, &|| Some(News::NoServer("the private server ended".into())));
+        let ran = run_script(&folder, "cat >/dev/null", &stop, &|| {
+            Some(BackendEvent::NoServer("the private server ended".into()))
+        });
         let message = ran.end.unwrap_err().to_string();
         assert!(message.starts_with("the run cannot go on without a server: the private server ended;"), "{message}");
     }

@@ -19,9 +19,9 @@ use perturb_text::{count, duration};
 
 use crate::cost::generated_episodes;
 use crate::eta::{CellDurations, RemainingTime, TrainingProgress, UnfinishedCell, remaining_time};
-use crate::folder::{CellState, Failure, FailureMark, Folder};
+use crate::folder::{CellState, Failure, FailureId, Folder};
 use crate::plan::{Cell, Grouping, Plan, SELECTION_TEST, Tests};
-pub use event::{CellEvent, Line, Order, OrderedCell, Teller, write_line};
+pub use event::{CellEvent, EventLine, EventLineWriter, JobCell, WorkerJob, write_line};
 pub use local::Local;
 pub use rates::Rate;
 pub(crate) use rates::Rates;
@@ -29,51 +29,51 @@ use running::Running;
 pub use running::RunningGroup;
 use slurm::SlurmError;
 
-/// How often in a row a cell may be broken off without getting any further.
-pub const MOST_ATTEMPTS: u32 = 3;
-/// How often in a row a cell may be without a disk before the run ends, after some fifteen seconds.
-const MOST_FAULTS: u32 = 5;
-/// How long a cell is kept without a server at least before the run ends: one may be started again meanwhile.
-const LEAST_WAIT: Duration = Duration::from_secs(15);
+/// Maximum number of attempts in a row without progress.
+pub const MAX_ATTEMPTS: u32 = 3;
+/// Maximum number of disk failures in a row, about fifteen seconds, before the run ends.
+const MAX_FAULTS: u32 = 5;
+/// Minimum time that a cell waits for a server before the run ends, since a server may be restarted.
+const MIN_SERVER_WAIT: Duration = Duration::from_secs(15);
 /// A cell that had a server for so long made some progress: what is lost then is not lost in a row.
-const HAD_A_SERVER: Duration = Duration::from_secs(60);
-/// How long nothing is begun after a cell had no server or no disk; doubled at each time in a row, …
-const PAUSE: Duration = Duration::from_secs(1);
-/// … up to this.
-const LONGEST_PAUSE: Duration = Duration::from_secs(30);
-/// How often the folder is looked at, and it is said how far the run is.
-const LOOK_INTERVAL: Duration = Duration::from_secs(1);
-/// A test episode takes about so much of the time of a training's: there are no updates, and many at a time.
+const STABLE_CONNECTION: Duration = Duration::from_secs(60);
+/// First pause after a cell had no server or no disk. Every further failure in a row doubles the pause.
+const FIRST_PAUSE: Duration = Duration::from_secs(1);
+/// Maximum pause.
+const MAX_PAUSE: Duration = Duration::from_secs(30);
+/// Interval of reading the folder and of progress messages.
+const POLL_INTERVAL: Duration = Duration::from_secs(1);
+/// Time of a test episode relative to a training episode: there are no updates, and many environments run together.
 const TEST_SHARE: f64 = 0.25;
-/// How long this process sleeps at a time.
+/// Sleep between two steps of the scheduler.
 const TICK: Duration = Duration::from_millis(50);
 
-/// What does cells.
+/// A backend that runs cells.
 pub trait Backend {
-    /// How cells are to be put into groups.
+    /// Returns the size of groups.
     fn grouping(&self) -> Grouping;
     /// Whether a cell that is broken off too often has failed. If not, its machines may be to blame: nothing is
     /// recorded, and the next run tries again.
-    fn convicts(&self) -> bool;
-    /// Whether it tells of every cell that has begun how it ends, so that a run can wait for that.
+    fn records_crashes_as_failures(&self) -> bool;
+    /// Whether the backend reports the end of every cell that has begun, so that a run can wait for it.
     fn tells_ends(&self) -> bool;
-    /// What has happened since the last call.
+    /// Returns the events since the last call.
     ///
     /// # Errors
     /// The run cannot go on.
-    fn poll(&mut self, now: Instant) -> Result<Vec<News>>;
-    /// How many groups it would take now.
-    fn room(&self) -> usize;
+    fn poll(&mut self, now: Instant) -> Result<Vec<BackendEvent>>;
+    /// Returns the number of groups that can begin now.
+    fn free_slots(&self) -> usize;
     /// Begins with some of `groups`, none of them empty, and gives the cells that it took: these, and those that it has
     /// in work already.
     ///
     /// # Errors
     /// The run cannot go on.
-    fn begin(&mut self, groups: &[Vec<Offer>]) -> Result<Vec<usize>>;
-    /// What it is doing, in a few words, and how many groups at a time.
+    fn begin(&mut self, groups: &[Vec<PendingCell>]) -> Result<Vec<usize>>;
+    /// Describes the backend's activity, and returns the number of groups at a time.
     fn load(&self) -> (String, usize);
-    /// What a cell may take at most, s of a process, if it was measured.
-    fn most(&self, _cell: usize) -> Option<f64> {
+    /// Returns the measured upper bound of a cell's duration, s of a process.
+    fn max_seconds(&self, _cell: usize) -> Option<f64> {
         None
     }
     /// Ends all that cannot go on without this process, and names what can.
@@ -82,22 +82,22 @@ pub trait Backend {
 
 /// A cell that waits to be done.
 #[derive(Clone, Copy, Debug)]
-pub struct Offer {
-    /// Its place in the plan.
+pub struct PendingCell {
+    /// The index in the plan.
     pub cell: usize,
-    /// The failure that is forgiven it.
-    pub retry: Option<FailureMark>,
+    /// The failure that is retryable it.
+    pub retry: Option<FailureId>,
     /// The number of its group in this run, also if it is offered alone.
     pub group: usize,
-    /// How many servers it has lost.
+    /// The number of servers that were lost.
     pub lost_servers: usize,
-    /// What other cells of its environment and learner took, s; `None` before the first.
+    /// The mean duration of finished cells with the same environment and method, s; `None` before the first.
     pub seconds: Option<f64>,
 }
 
-/// What a backend has to say. Cells are places in the plan.
+/// An event of a backend. Cells are indices in the plan.
 #[derive(Clone, Debug, PartialEq)]
-pub enum News {
+pub enum BackendEvent {
     /// Something happened to a cell.
     Event(usize, CellEvent),
     /// A cell was given back before its turn came.
@@ -108,37 +108,37 @@ pub enum News {
     Note(String),
 }
 
-/// What a run says while it goes on.
+/// A progress message of a run.
 #[derive(Clone, Debug)]
-pub enum Announcement<'a> {
-    /// How far it is.
-    Status(&'a Status),
+pub enum ProgressEvent<'a> {
+    /// The status of the run.
+    Status(&'a RunStatus),
     /// A sentence about what happened.
     Note(&'a str),
-    /// What happened to a cell.
-    Line(&'a Line),
+    /// An event of a cell.
+    Line(&'a EventLine),
 }
 
-/// How far a run is.
+/// The status of a run.
 #[derive(Clone, Debug)]
-pub struct Status {
+pub struct RunStatus {
     /// Cells of the plan.
     pub cells: usize,
     /// Cells with a result.
     pub done: usize,
     /// Cells with a failure that counts.
     pub failed: usize,
-    /// What is being done.
+    /// The groups that run.
     pub running: Vec<RunningGroup>,
-    /// What the backend is doing, in a few words.
+    /// A description of the backend's activity.
     pub doing: String,
-    /// How long it may take; `None` while there is a cell of whose kind nothing is known.
+    /// The remaining time; `None` if nothing is known of a kind of cells.
     pub remaining: Option<RemainingTime>,
     /// Success of the cells that are done.
     pub rates: Vec<Rate>,
 }
 
-/// How a run ended.
+/// The end of a run.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum RunEnd {
     /// All cells have a result or have failed; these have failed.
@@ -148,9 +148,9 @@ pub enum RunEnd {
     },
     /// This signal ended it. Calling it again goes on.
     Stopped {
-        /// Its number.
+        /// The signal's number.
         signal: i32,
-        /// What goes on without this process: a cluster's jobs.
+        /// Work that continues without this process, i.e. jobs of a cluster.
         left: Vec<String>,
     },
 }
@@ -173,7 +173,7 @@ pub enum RunError {
     FileFault(String),
     /// Cells were tried several times, which did not bring them any further.
     #[error(
-        "{} without a result after {MOST_ATTEMPTS} attempts, the first is {}: {words}; when that is mended, the same \
+        "{} without a result after {MAX_ATTEMPTS} attempts, the first is {}: {words}; when that is mended, the same \
          command tries again",
         count(ids.len(), "cell"),
         ids[0]
@@ -181,7 +181,7 @@ pub enum RunError {
     GaveUp {
         /// At least one.
         ids: Vec<String>,
-        /// How the last attempt at the first one ended.
+        /// The end of the last attempt at the first cell.
         words: String,
     },
     /// Slurm cannot do the cells.
@@ -191,7 +191,7 @@ pub enum RunError {
 
 type Result<T, E = RunError> = std::result::Result<T, E>;
 
-/// Does every cell of `plan` that has no result in `folder`, also those that had failed as is `forgiven` them, by their ids.
+/// Does every cell of `plan` that has no result in `folder`, also those that had failed as is `retryable` them, by their ids.
 /// Returns when no cell is left, also none that another run works on. A cell that has lost its server goes on from its last
 /// checkpoint, if need be for `server_wait`, or fifteen seconds, until there is one.
 ///
@@ -201,12 +201,12 @@ pub fn run(
     plan: &Plan,
     folder: &Folder,
     backend: &mut dyn Backend,
-    forgiven: &HashMap<String, FailureMark>,
+    retryable: &HashMap<String, FailureId>,
     server_wait: Duration,
     stop: &StopFlag,
-    report: &mut dyn FnMut(Announcement<'_>),
+    report: &mut dyn FnMut(ProgressEvent<'_>),
 ) -> Result<RunEnd> {
-    let mut scheduler = Scheduler { server_wait, ..Scheduler::new(plan, folder, backend, forgiven, report) };
+    let mut scheduler = Scheduler { server_wait, ..Scheduler::new(plan, folder, backend, retryable, report) };
     let end = loop {
         match (scheduler.step(Instant::now()), stop.signal()) {
             (Ok(None), None) => std::thread::sleep(TICK),
@@ -220,47 +220,48 @@ pub fn run(
     end
 }
 
-/// What is known of a cell.
+/// The scheduler's state of a cell.
 #[derive(Debug, Default)]
 struct Tracked {
-    phase: Phase,
+    phase: CellPhase,
     /// The number of its group.
     group: usize,
-    /// It was broken off without getting any further: done alone, it can take no others with it.
+    /// Whether the cell runs alone, because an attempt ended without progress. Alone, it cannot end the attempts of
+    /// other cells.
     alone: bool,
-    /// A failure that was there before this run and does not count. One that is recorded later does, whoever tried.
-    forgiven: Option<FailureMark>,
-    /// How often in a row it was broken off without getting any further.
+    /// A failure from before this run, which is retried. Failures that are recorded later count, whoever recorded them.
+    retryable: Option<FailureId>,
+    /// Attempts in a row without progress.
     attempts: u32,
     /// Steps of its training that are in a checkpoint, and that were when the last attempt began its training.
     saved: u64,
     saved_before: Option<u64>,
-    /// How far this attempt is.
+    /// The progress of this attempt.
     progress: TrainingProgress,
     lost_servers: usize,
-    /// How often in a row it had no server, and how long nothing was begun for that.
+    /// Losses of servers in a row, and the time that was waited for them.
     lost_in_a_row: u32,
     waited: Duration,
-    /// How often in a row it had no disk.
+    /// Disk failures in a row.
     faults_in_a_row: u32,
-    /// When something first happened to it in this attempt: before its turn in a job, a cell takes no time; …
+    /// The time of the attempt's first event. A cell that waits in a job takes no time.
     begun: Option<Instant>,
-    /// … had a server (looking for one, of which many may be silent, is not having one) …
+    /// The time at which the attempt first had a server. Searching for a server does not count.
     served: Option<Instant>,
-    /// … and what happened to it last.
+    /// The last event of the attempt.
     last: Option<CellEvent>,
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-enum Phase {
+enum CellPhase {
     #[default]
     Waiting,
     Running,
     /// Others work on it.
-    Elsewhere,
+    LockedByOther,
     Done,
     Failed,
-    /// It was broken off too often.
+    /// The cell had too many attempts.
     GivenUp,
 }
 
@@ -268,7 +269,7 @@ struct Scheduler<'a> {
     plan: &'a Plan,
     folder: &'a Folder,
     backend: &'a mut dyn Backend,
-    report: &'a mut dyn FnMut(Announcement<'_>),
+    report: &'a mut dyn FnMut(ProgressEvent<'_>),
     /// By the cells' places in the plan.
     cells: Vec<Tracked>,
     /// The cells that wait, in order.
@@ -277,7 +278,7 @@ struct Scheduler<'a> {
     rates: Rates,
     paused_until: Option<Instant>,
     server_wait: Duration,
-    look_at: Option<Instant>,
+    next_poll: Option<Instant>,
 }
 
 impl<'a> Scheduler<'a> {
@@ -285,11 +286,11 @@ impl<'a> Scheduler<'a> {
         plan: &'a Plan,
         folder: &'a Folder,
         backend: &'a mut dyn Backend,
-        forgiven: &HashMap<String, FailureMark>,
-        report: &'a mut dyn FnMut(Announcement<'_>),
+        retryable: &HashMap<String, FailureId>,
+        report: &'a mut dyn FnMut(ProgressEvent<'_>),
     ) -> Self {
-        let forgiven = |id| forgiven.get(id).copied();
-        let cells = plan.cells.iter().map(|cell| Tracked { forgiven: forgiven(&cell.id), ..Tracked::default() });
+        let retryable = |id| retryable.get(id).copied();
+        let cells = plan.cells.iter().map(|cell| Tracked { retryable: retryable(&cell.id), ..Tracked::default() });
         let mut scheduler = Self {
             plan,
             folder,
@@ -301,7 +302,7 @@ impl<'a> Scheduler<'a> {
             rates: Rates::default(),
             paused_until: None,
             server_wait: Duration::ZERO,
-            look_at: None,
+            next_poll: None,
         };
         let left: Vec<usize> = (0..plan.cells.len()).filter(|&cell| !scheduler.settled(cell)).collect();
         let groups = plan.groups(&left, scheduler.backend.grouping());
@@ -316,29 +317,29 @@ impl<'a> Scheduler<'a> {
     fn step(&mut self, now: Instant) -> Result<Option<Vec<String>>> {
         for news in self.backend.poll(now)? {
             match news {
-                News::Note(sentence) => (self.report)(Announcement::Note(&sentence)),
-                News::NoServer(reason) => return Err(RunError::NoServer(reason)),
-                News::Returned(cell) if self.settled(cell) => {}
-                News::Returned(cell) => self.wait(cell),
-                News::Event(cell, event) => self.hear(cell, event, now)?,
+                BackendEvent::Note(sentence) => (self.report)(ProgressEvent::Note(&sentence)),
+                BackendEvent::NoServer(reason) => return Err(RunError::NoServer(reason)),
+                BackendEvent::Returned(cell) if self.settled(cell) => {}
+                BackendEvent::Returned(cell) => self.wait(cell),
+                BackendEvent::Event(cell, event) => self.on_event(cell, event, now)?,
             }
         }
-        let looks = self.look_at.is_none_or(|time| now >= time);
+        let looks = self.next_poll.is_none_or(|time| now >= time);
         if looks {
-            self.look(now)?;
+            self.poll_results(now)?;
         }
         self.begin(now)?;
         let end = self.end();
         if looks || matches!(end, Ok(Some(_))) {
             let status = self.status(now);
-            (self.report)(Announcement::Status(&status));
+            (self.report)(ProgressEvent::Status(&status));
         }
         end
     }
 
-    fn hear(&mut self, cell: usize, event: CellEvent, now: Instant) -> Result<()> {
-        let line = Line { cell: self.id(cell).to_owned(), event: event.clone() };
-        (self.report)(Announcement::Line(&line));
+    fn on_event(&mut self, cell: usize, event: CellEvent, now: Instant) -> Result<()> {
+        let line = EventLine { cell: self.id(cell).to_owned(), event: event.clone() };
+        (self.report)(ProgressEvent::Line(&line));
         let tracked = &mut self.cells[cell];
         tracked.last = Some(event.clone());
         tracked.begun.get_or_insert(now);
@@ -351,34 +352,34 @@ impl<'a> Scheduler<'a> {
                     (tracked.saved, tracked.attempts) = (saved, 0);
                 }
             }
-            event if event.is_last() && !self.settled(cell) => self.conclude(cell, event, now)?,
+            event if event.is_last() && !self.settled(cell) => self.on_exit(cell, event, now)?,
             _ => {}
         }
         Ok(())
     }
 
     /// Decides what becomes of a cell whose attempt ended without settling it.
-    fn conclude(&mut self, cell: usize, end: CellEvent, now: Instant) -> Result<()> {
+    fn on_exit(&mut self, cell: usize, end: CellEvent, now: Instant) -> Result<()> {
         let tracked = &mut self.cells[cell];
         match end {
-            CellEvent::Busy => tracked.phase = Phase::Elsewhere,
+            CellEvent::Busy => tracked.phase = CellPhase::LockedByOther,
             CellEvent::Refused { reason } => return Err(RunError::Refused(reason)),
             CellEvent::Failed { reason } => self.record_failure(cell, reason)?,
             CellEvent::LostServer { .. } => {
-                if tracked.served.is_some_and(|since| now - since >= HAD_A_SERVER) {
+                if tracked.served.is_some_and(|since| now - since >= STABLE_CONNECTION) {
                     (tracked.lost_in_a_row, tracked.waited) = (0, Duration::ZERO);
                 }
                 tracked.lost_in_a_row += 1;
                 tracked.lost_servers += 1;
                 let pause = pause(tracked.lost_in_a_row);
                 tracked.waited += pause;
-                let (waited, most) = (tracked.waited, self.server_wait.max(LEAST_WAIT));
+                let (waited, most) = (tracked.waited, self.server_wait.max(MIN_SERVER_WAIT));
                 if waited > most {
                     return Err(RunError::NoServer(format!("{}: {end}", self.id(cell))));
                 } else if self.paused_until.is_none_or(|until| until < now) {
                     let wait = duration((most + pause - waited).as_secs_f64());
                     let words = format!("{}: {end}; waiting for it, at most {wait}", self.id(cell));
-                    (self.report)(Announcement::Note(&words));
+                    (self.report)(ProgressEvent::Note(&words));
                 }
                 self.pause(cell, now + pause);
             }
@@ -388,7 +389,7 @@ impl<'a> Scheduler<'a> {
                 }
                 tracked.faults_in_a_row += 1;
                 let pause = pause(tracked.faults_in_a_row);
-                if tracked.faults_in_a_row >= MOST_FAULTS {
+                if tracked.faults_in_a_row >= MAX_FAULTS {
                     return Err(RunError::FileFault(format!("{}: {end}", self.id(cell))));
                 }
                 self.pause(cell, now + pause);
@@ -396,16 +397,16 @@ impl<'a> Scheduler<'a> {
             end => {
                 tracked.attempts += 1;
                 tracked.alone = tracked.saved_before.is_none_or(|before| tracked.saved <= before);
-                if tracked.attempts < MOST_ATTEMPTS {
+                if tracked.attempts < MAX_ATTEMPTS {
                     self.wait(cell);
-                } else if self.backend.convicts() {
-                    let times = format!("{MOST_ATTEMPTS} attempts in a row have not brought it any further");
+                } else if self.backend.records_crashes_as_failures() {
+                    let times = format!("{MAX_ATTEMPTS} attempts in a row have not brought it any further");
                     self.record_failure(cell, format!("{end}; {times}"))?;
                 } else {
-                    tracked.phase = Phase::GivenUp;
+                    tracked.phase = CellPhase::GivenUp;
                     let id = self.id(cell);
-                    let note = format!("{id} is given up: {MOST_ATTEMPTS} attempts have not brought it any further");
-                    (self.report)(Announcement::Note(&note));
+                    let note = format!("{id} is given up: {MAX_ATTEMPTS} attempts have not brought it any further");
+                    (self.report)(ProgressEvent::Note(&note));
                 }
             }
         }
@@ -415,7 +416,7 @@ impl<'a> Scheduler<'a> {
     /// Begins nothing until then, and this cell first: if it cannot go on, the run ends soon, however many cells it has.
     fn pause(&mut self, cell: usize, until: Instant) {
         self.paused_until = self.paused_until.max(Some(until));
-        self.cells[cell].phase = Phase::Waiting;
+        self.cells[cell].phase = CellPhase::Waiting;
         self.queue.push_front(cell);
     }
 
@@ -423,7 +424,7 @@ impl<'a> Scheduler<'a> {
     fn record_failure(&mut self, cell: usize, reason: String) -> Result<()> {
         let place = self.folder.cell(self.id(cell));
         let Some(_lock) = place.try_lock()? else {
-            self.cells[cell].phase = Phase::Elsewhere;
+            self.cells[cell].phase = CellPhase::LockedByOther;
             return Ok(());
         };
         if !self.settled(cell) {
@@ -431,21 +432,21 @@ impl<'a> Scheduler<'a> {
                 id: self.id(cell).to_owned(),
                 reason,
                 commit: crate::VERSION.into(),
-                begins_anew: false,
+                requires_restart: false,
             })?;
-            self.cells[cell].phase = Phase::Failed;
+            self.cells[cell].phase = CellPhase::Failed;
         }
         Ok(())
     }
 
     /// Whether a cell has a result, or has failed and that counts.
     fn settled(&mut self, cell: usize) -> bool {
-        let Tracked { phase, forgiven, .. } = &mut self.cells[cell];
+        let Tracked { phase, retryable, .. } = &mut self.cells[cell];
         let place = self.folder.cell(&self.plan.cells[cell].id);
-        if matches!(phase, Phase::Done | Phase::Failed) {
+        if matches!(phase, CellPhase::Done | CellPhase::Failed) {
             return true;
         } else if place.is_settled(false) {
-            *phase = Phase::Done;
+            *phase = CellPhase::Done;
             if let Some(timing) = place.timing() {
                 self.durations.add(&self.plan.cells[cell], timing.seconds);
             }
@@ -453,49 +454,49 @@ impl<'a> Scheduler<'a> {
             if let Ok(CellState::Done(result)) = place.state() {
                 self.rates.add(&self.plan.cells[cell], &result);
             }
-        } else if place.failure_mark().is_some_and(|failure| Some(failure) != *forgiven) {
-            *phase = Phase::Failed;
+        } else if place.failure_id().is_some_and(|failure| Some(failure) != *retryable) {
+            *phase = CellPhase::Failed;
         }
-        matches!(phase, Phase::Done | Phase::Failed)
+        matches!(phase, CellPhase::Done | CellPhase::Failed)
     }
 
-    /// Takes note of what is in the folder, whoever did it, and of cells that others have given up.
-    fn look(&mut self, now: Instant) -> Result<()> {
+    /// Reads the results in the folder, and takes over cells that other processes have given up.
+    fn poll_results(&mut self, now: Instant) -> Result<()> {
         let begun = Instant::now();
         let waits = self.backend.tells_ends();
         for cell in 0..self.cells.len() {
             let Tracked { phase, begun, .. } = self.cells[cell];
             // Whoever does it for this run has yet to say so: a result is written before that.
-            let is_to_be_told = waits && phase == Phase::Running && begun.is_some();
+            let is_to_be_told = waits && phase == CellPhase::Running && begun.is_some();
             if !is_to_be_told
                 && !self.settled(cell)
-                && self.cells[cell].phase == Phase::Elsewhere
+                && self.cells[cell].phase == CellPhase::LockedByOther
                 && self.folder.cell(self.id(cell)).try_lock()?.is_some()
             {
                 self.wait(cell);
             }
         }
         // A folder of many cells on a slow file system is not looked at all the time.
-        self.look_at = Some(now + LOOK_INTERVAL.max(begun.elapsed() * 20));
+        self.next_poll = Some(now + POLL_INTERVAL.max(begun.elapsed() * 20));
         Ok(())
     }
 
     fn begin(&mut self, now: Instant) -> Result<()> {
-        let room = self.backend.room();
+        let room = self.backend.free_slots();
         if self.paused_until.is_some_and(|end| now < end) {
             return Ok(());
         }
-        let mut offers: Vec<Vec<Offer>> = Vec::new();
+        let mut offers: Vec<Vec<PendingCell>> = Vec::new();
         let mut places: HashMap<usize, usize> = HashMap::new();
         for cell in self.queue.clone() {
-            let Tracked { forgiven: retry, group, alone, lost_servers, .. } = self.cells[cell];
+            let Tracked { retryable: retry, group, alone, lost_servers, .. } = self.cells[cell];
             let place = places.get(&group).copied().filter(|_| !alone);
             // Another run may have done it meanwhile.
             if (place.is_none() && offers.len() >= room) || self.settled(cell) {
                 continue;
             }
             let seconds = self.durations.seconds(&self.plan.cells[cell]);
-            let offer = Offer { cell, retry, group, lost_servers, seconds };
+            let offer = PendingCell { cell, retry, group, lost_servers, seconds };
             match place {
                 Some(place) => offers[place].push(offer),
                 None => {
@@ -510,56 +511,56 @@ impl<'a> Scheduler<'a> {
         if !offers.is_empty() {
             for cell in self.backend.begin(&offers)? {
                 let tracked = &mut self.cells[cell];
-                tracked.phase = Phase::Running;
+                tracked.phase = CellPhase::Running;
                 (tracked.begun, tracked.served, tracked.last, tracked.saved_before) = (None, None, None, None);
                 tracked.progress = TrainingProgress::default();
             }
         }
-        self.queue.retain(|&cell| self.cells[cell].phase == Phase::Waiting);
+        self.queue.retain(|&cell| self.cells[cell].phase == CellPhase::Waiting);
         Ok(())
     }
 
     fn wait(&mut self, cell: usize) {
-        self.cells[cell].phase = Phase::Waiting;
+        self.cells[cell].phase = CellPhase::Waiting;
         self.queue.push_back(cell);
     }
 
     /// The ids of the cells that failed; `None` while cells are left.
     fn end(&self) -> Result<Option<Vec<String>>> {
         let in_phase = |phase| (0..self.cells.len()).filter(move |&cell| self.cells[cell].phase == phase);
-        let left = [Phase::Waiting, Phase::Running, Phase::Elsewhere];
+        let left = [CellPhase::Waiting, CellPhase::Running, CellPhase::LockedByOther];
         if left.into_iter().flat_map(in_phase).next().is_some() {
             return Ok(None);
         }
         let ids = |phase| in_phase(phase).map(|cell| self.id(cell).to_owned()).collect();
-        let Some(first) = in_phase(Phase::GivenUp).next() else { return Ok(Some(ids(Phase::Failed))) };
+        let Some(first) = in_phase(CellPhase::GivenUp).next() else { return Ok(Some(ids(CellPhase::Failed))) };
         let words = self.cells[first].last.as_ref().map(CellEvent::to_string).unwrap_or_default();
-        Err(RunError::GaveUp { ids: ids(Phase::GivenUp), words })
+        Err(RunError::GaveUp { ids: ids(CellPhase::GivenUp), words })
     }
 
-    fn status(&self, now: Instant) -> Status {
+    fn status(&self, now: Instant) -> RunStatus {
         let (doing, at_a_time) = self.backend.load();
         let number = |phase| self.cells.iter().filter(|cell| cell.phase == phase).count();
         let (mut running, mut left) = (Running::default(), Vec::new());
         for (place, (tracked, cell)) in self.cells.iter().zip(&self.plan.cells).enumerate() {
-            let max_seconds = self.backend.most(place);
+            let max_seconds = self.backend.max_seconds(place);
             match (tracked.phase, &tracked.last, tracked.begun) {
-                (Phase::Running, Some(event), Some(begun)) => {
+                (CellPhase::Running, Some(event), Some(begun)) => {
                     running.add(cell, (!tracked.alone).then_some(tracked.group), event);
                     let rest = rest(cell, event, &tracked.progress);
                     let elapsed_seconds = Some((now - begun).as_secs_f64());
                     left.push(UnfinishedCell { cell, elapsed_seconds, remaining_ratio: rest, max_seconds });
                 }
-                (Phase::Waiting | Phase::Running, ..) => {
+                (CellPhase::Waiting | CellPhase::Running, ..) => {
                     left.push(UnfinishedCell { cell, elapsed_seconds: None, remaining_ratio: None, max_seconds });
                 }
                 _ => {}
             }
         }
-        Status {
+        RunStatus {
             cells: self.cells.len(),
-            done: number(Phase::Done),
-            failed: number(Phase::Failed),
+            done: number(CellPhase::Done),
+            failed: number(CellPhase::Failed),
             running: running.groups,
             doing,
             remaining: remaining_time(&self.durations, &left, at_a_time),
@@ -572,12 +573,12 @@ impl<'a> Scheduler<'a> {
     }
 }
 
-/// How long nothing is begun after so many losses in a row.
+/// Returns the pause after `in_a_row` losses in a row.
 fn pause(in_a_row: u32) -> Duration {
-    LONGEST_PAUSE.min(PAUSE * (1 << (in_a_row - 1).min(16)))
+    MAX_PAUSE.min(FIRST_PAUSE * (1 << (in_a_row - 1).min(16)))
 }
 
-/// What is left of a cell under way, in terms of what was done of it.
+/// Returns the remaining work of a running cell, divided by its finished work.
 fn rest(cell: &Cell, event: &CellEvent, progress: &TrainingProgress) -> Option<f64> {
     let training = generated_episodes(&cell.config, cell.config.common.episodes);
     let testing = test_episodes(cell, None);

@@ -1,4 +1,4 @@
-//! How well the policies do of cells that are done.
+//! Success rates of finished cells.
 
 use std::collections::BTreeMap;
 
@@ -10,9 +10,9 @@ use crate::plan::Cell;
 /// Success of the cells of an environment, a learner and what it was trained on: means over settings and runs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Rate {
-    /// As [`Cell::described`] has it.
+    /// The kind of the cells, see [`Cell::described`].
     pub kind: String,
-    /// How many cells.
+    /// The number of cells.
     pub cells: usize,
     /// By the name of the set that was tested, %.
     pub success: Vec<(String, f64)>,

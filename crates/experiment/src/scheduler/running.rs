@@ -1,4 +1,4 @@
-//! What is being done, in a line for each group of cells.
+//! Running groups, with one line for each.
 
 use std::collections::HashMap;
 use std::fmt;

@@ -68,7 +68,7 @@ impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
         self.grouping
     }
 
-    fn convicts(&self) -> bool {
+    fn records_crashes_as_failures(&self) -> bool {
         CONVICTS
     }
 
@@ -76,19 +76,19 @@ impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
         CONVICTS
     }
 
-    fn poll(&mut self, now: Instant) -> Result<Vec<News>> {
+    fn poll(&mut self, now: Instant) -> Result<Vec<BackendEvent>> {
         self.now = now;
         let mut news = Vec::new();
         let place = self.place;
         for group in &mut self.running {
             group.retain_mut(|(cell, acts)| {
                 match acts.pop_front() {
-                    Some(Say(event) | Act::End(event)) => news.push(News::Event(*cell, event)),
+                    Some(Say(event) | Act::End(event)) => news.push(BackendEvent::Event(*cell, event)),
                     Some(Wait(seconds)) if seconds > 1 => acts.push_front(Wait(seconds - 1)),
                     Some(Wait(_)) => {}
                     Some(Succeeds) => place.write(*cell, "result.json"),
                     Some(Fails) => place.fail(*cell),
-                    Some(Return) => news.push(News::Returned(*cell)),
+                    Some(Return) => news.push(BackendEvent::Returned(*cell)),
                     None => panic!("an attempt at cell {cell} has no end"),
                 }
                 !acts.is_empty()
@@ -98,17 +98,17 @@ impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
         Ok(news)
     }
 
-    fn room(&self) -> usize {
+    fn free_slots(&self) -> usize {
         self.grouping.at_a_time - self.running.len()
     }
 
-    fn begin(&mut self, groups: &[Vec<Offer>]) -> Result<Vec<usize>> {
+    fn begin(&mut self, groups: &[Vec<PendingCell>]) -> Result<Vec<usize>> {
         for group in groups {
             let mut running = Vec::new();
             for offer in group {
                 // As a worker does.
                 if let Some(failure) = offer.retry {
-                    self.place.folder.cell(self.place.id(offer.cell)).forgive(failure).unwrap();
+                    self.place.folder.cell(self.place.id(offer.cell)).clear_failure_if(failure).unwrap();
                 }
                 self.begun.push((offer.cell, (self.now - self.start).as_secs(), offer.lost_servers));
                 let attempt = self.begun.iter().filter(|(cell, ..)| *cell == offer.cell).count();
@@ -145,7 +145,7 @@ struct Ran {
     groups: Vec<Vec<usize>>,
     most_at_a_time: usize,
     notes: Vec<String>,
-    statuses: Vec<Status>,
+    statuses: Vec<RunStatus>,
     /// Cells that were told to be done.
     told: Vec<String>,
 }
@@ -185,7 +185,7 @@ impl Place {
 
     fn fail(&self, cell: usize) {
         let failure =
-            Failure { id: self.id(cell).to_owned(), reason: "NaN".into(), commit: "x".into(), begins_anew: true };
+            Failure { id: self.id(cell).to_owned(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
         self.folder.cell(self.id(cell)).write_failure(&failure).unwrap();
     }
 
@@ -208,7 +208,7 @@ impl Place {
         retry_failed: bool,
         script: &dyn Fn(usize, usize) -> Vec<Act>,
     ) -> Ran {
-        self.run_in::<CONVICTS>(Grouping { most: 1, at_a_time: jobs }, retry_failed, script)
+        self.run_in::<CONVICTS>(Grouping { max_cells: 1, at_a_time: jobs }, retry_failed, script)
     }
 
     /// Runs to the end, in groups.
@@ -224,14 +224,14 @@ impl Place {
         let mut fake =
             Fake::<CONVICTS> { place: self, script, grouping, start, now, running, begun, groups, most_at_a_time };
         let (mut notes, mut statuses, mut told) = (Vec::new(), Vec::new(), Vec::new());
-        let mut report = |report: Announcement<'_>| match report {
-            Announcement::Status(status) => statuses.push(status.clone()),
-            Announcement::Note(note) => notes.push(note.to_owned()),
-            Announcement::Line(line) if line.event == CellEvent::Done => told.push(line.cell.clone()),
-            Announcement::Line(_) => {}
+        let mut report = |report: ProgressEvent<'_>| match report {
+            ProgressEvent::Status(status) => statuses.push(status.clone()),
+            ProgressEvent::Note(note) => notes.push(note.to_owned()),
+            ProgressEvent::Line(line) if line.event == CellEvent::Done => told.push(line.cell.clone()),
+            ProgressEvent::Line(_) => {}
         };
-        let forgiven = if retry_failed { self.folder.failures().unwrap() } else { HashMap::new() };
-        let mut scheduler = Scheduler::new(&self.plan, &self.folder, &mut fake, &forgiven, &mut report);
+        let retryable = if retry_failed { self.folder.failures().unwrap() } else { HashMap::new() };
+        let mut scheduler = Scheduler::new(&self.plan, &self.folder, &mut fake, &retryable, &mut report);
         let end = (0..10_000).find_map(|second| scheduler.step(start + Duration::from_secs(second)).transpose());
         let end = end.expect("it ends").map_err(|error| error.to_string());
         let Fake { begun, groups, most_at_a_time, .. } = fake;
@@ -290,7 +290,7 @@ fn a_killed_cell_waits_until_the_others_had_their_turn() {
 }
 
 #[test]
-fn servers_that_are_lost_in_a_row_are_waited_for_longer_and_longer_and_not_for_ever() {
+fn server_waits_double_and_end() {
     let place = Place::new();
     let ran = place.run(&|_, _| vec![lost()]);
     let message = format!("the run cannot go on without a server: {}: gone; what is done is kept", place.id(0));
@@ -303,7 +303,7 @@ fn servers_that_are_lost_in_a_row_are_waited_for_longer_and_longer_and_not_for_e
 }
 
 #[test]
-fn a_full_disk_is_waited_for_ends_the_run_and_is_no_cells_failure() {
+fn full_disk_ends_the_run_without_a_failed_cell() {
     let place = Place::new();
     let full = || ends(CellEvent::FileFault { reason: "no space left".into() });
     let ran = place.run(&|cell, attempt| if cell == 0 && attempt < 5 { vec![full()] } else { done() });
@@ -362,7 +362,7 @@ fn a_failure_that_another_run_records_meanwhile_counts() {
     // While cell 0 is done, another run tries cell 2 again, in vain.
     let script = |cell, _| {
         if cell == 0 {
-            place.folder.cell(place.id(2)).forget_failure().unwrap();
+            place.folder.cell(place.id(2)).clear_failure().unwrap();
             place.fail(2);
         }
         done()
@@ -430,7 +430,7 @@ fn an_order_that_is_refused_ends_the_run() {
 }
 
 #[test]
-fn machines_may_be_to_blame_then_a_cell_is_given_up_and_the_others_are_done() {
+fn cell_is_given_up_if_machines_may_be_faulty() {
     let place = Place::new();
     let ran = place.run_on::<false>(2, false, &|cell, _| if cell == 1 { vec![killed()] } else { done() });
     let message = format!("1 cell without a result after 3 attempts, the first is {}: signal 9; when", place.id(1));
@@ -467,10 +467,10 @@ fn the_status_says_what_is_done_with_each_cell() {
 /// Six cells of one kind, in groups of three.
 const GROUPS: &str = "environments = ['CartPole']\nversions = ['D']\nruns = 6
     [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
-const THREES: Grouping = Grouping { most: 3, at_a_time: 1 };
+const THREES: Grouping = Grouping { max_cells: 3, at_a_time: 1 };
 
 #[test]
-fn cells_of_a_group_are_begun_together_and_settled_each_by_itself() {
+fn group_begins_together_and_settles_singly() {
     let place = Place::of(GROUPS);
     let script = |cell, _| match cell {
         1 => vec![Fails, ends(CellEvent::Failed { reason: "NaN".into() })],
@@ -507,7 +507,7 @@ fn a_cell_that_kills_its_process_convicts_only_itself() {
 }
 
 #[test]
-fn cells_that_got_further_before_they_were_broken_off_stay_together() {
+fn interrupted_cells_with_progress_stay_together() {
     let place = Place::of(GROUPS);
     let script = |cell, attempt| match (cell, attempt) {
         (0 | 2, 1) => vec![saved(0), saved(50), killed()],
@@ -522,7 +522,7 @@ fn cells_that_got_further_before_they_were_broken_off_stay_together() {
 #[test]
 fn a_server_that_a_group_loses_is_one_loss() {
     let place = Place::of(GROUPS);
-    let ran = place.run_in::<true>(Grouping { most: 6, at_a_time: 1 }, false, &|_, attempt| match attempt {
+    let ran = place.run_in::<true>(Grouping { max_cells: 6, at_a_time: 1 }, false, &|_, attempt| match attempt {
         1..=4 => vec![lost()],
         _ => done(),
     });

@@ -1,5 +1,4 @@
-//! What the recorded episodes of selected policies say: of the worst of them, of success over a parameter, and over the
-//! threshold of success.
+//! Recorded episodes by column, for success over parameters and thresholds and for tail risk.
 
 mod partition;
 mod sweeps;
@@ -20,7 +19,7 @@ pub use worst::{SHARE, conditional_value_at_risk, worst_contexts};
 pub struct PolicyOutcomes {
     /// In the order of [`Outcomes::parameters`].
     pub parameters: Vec<RecordedParameter>,
-    /// What counted as a success; `None` if the server did not say.
+    /// The success criterion; `None` if the server did not say.
     pub success: Option<Criterion>,
     tests: BTreeMap<String, Outcomes>,
 }
@@ -30,33 +29,33 @@ pub struct PolicyOutcomes {
 pub struct Outcomes {
     /// `[P, n]`: requested values of each parameter.
     pub parameters: Vec<Vec<f64>>,
-    /// Which of the set's contexts each episode had, where the set lists them.
+    /// The context of each episode, if the set lists contexts.
     pub contexts: Option<Vec<usize>>,
     /// Undiscounted.
     pub returns: Vec<f64>,
     /// Whether each was a success.
     pub successes: Vec<bool>,
-    /// What each achieved of what the criterion compares; `None` if nothing.
+    /// The quantity of the success criterion in each episode; `None` if it was not reached.
     pub achieved: Vec<Option<f64>>,
 }
 
 impl PolicyOutcomes {
-    /// Of the tests on sets with these names.
-    pub fn of<'a>(records: &Records, names: impl Iterator<Item = &'a str>) -> Self {
-        let tests = names.map(|name| (name.to_owned(), Outcomes::of(records, name))).collect();
+    /// Collects the tests on the sets with these names.
+    pub fn new<'a>(records: &Records, names: impl Iterator<Item = &'a str>) -> Self {
+        let tests = names.map(|name| (name.to_owned(), Outcomes::new(records, name))).collect();
         Self { parameters: records.about.parameters.clone(), success: records.about.success.clone(), tests }
     }
 
-    /// Its test on a set; `None` if there was none.
+    /// Returns the test on a set; `None` if there was none.
     pub fn test(&self, tested_on: &str) -> Option<&Outcomes> {
         self.tests.get(tested_on).filter(|outcomes| !outcomes.returns.is_empty())
     }
 }
 
 impl Outcomes {
-    /// Of the test on the set called `name`; empty if there was none.
-    pub fn of(records: &Records, name: &str) -> Self {
-        let rows = || records.of(name);
+    /// Collects the test on the set called `name`; empty if there was none.
+    pub fn new(records: &Records, name: &str) -> Self {
+        let rows = || records.episodes_on(name);
         let parameter =
             |place: usize| rows().map(|row| row.requested.get(place).copied().unwrap_or(f64::NAN)).collect();
         let listed = |test: &RecordedTest| match &test.set.contexts {

@@ -2,7 +2,7 @@
 
 use super::Outcomes;
 
-/// A part is to have about so many episodes: half of them say how bad it is, to one success in twenty.
+/// Intended number of episodes in a part. Half of them estimate its success, to one success in twenty.
 const EPISODES: f64 = 40.0;
 
 impl Outcomes {

@@ -21,7 +21,7 @@ pub struct Bin {
 /// Successes among episodes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counted {
-    /// Of the episodes.
+    /// The number of successful episodes.
     pub successes: u64,
     /// All.
     pub episodes: u64,
@@ -39,12 +39,12 @@ impl Counted {
         [100.0 * low, 100.0 * high]
     }
 
-    /// The same; `None` without episodes.
+    /// Returns the interval; `None` without episodes.
     pub fn known(self) -> Option<[f64; 2]> {
         (self.episodes > 0).then(|| self.interval())
     }
 
-    fn of(successes: impl Iterator<Item = bool>) -> Self {
+    fn count(successes: impl Iterator<Item = bool>) -> Self {
         successes.fold(Self::default(), |Self { successes, episodes }, success| Self {
             successes: successes + u64::from(success),
             episodes: episodes + 1,
@@ -134,7 +134,7 @@ pub fn thresholds<'a>(tests: impl Iterator<Item = &'a Outcomes>, criterion: &Cri
 /// The episodes of `outcomes`, judged by another threshold.
 pub fn success_at(outcomes: &Outcomes, criterion: &Criterion, threshold: f64) -> Counted {
     let criterion = Criterion { threshold, ..criterion.clone() };
-    Counted::of(outcomes.achieved.iter().map(|achieved| criterion.holds(*achieved)))
+    Counted::count(outcomes.achieved.iter().map(|achieved| criterion.holds(*achieved)))
 }
 
 #[cfg(test)]

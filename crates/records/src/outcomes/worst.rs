@@ -1,13 +1,13 @@
-//! How bad the worst tenth is: of episodes, and of what they were tested on.
+//! Tail risk: the worst tenth of episodes and of test contexts.
 
 use std::collections::BTreeMap;
 
 use super::Outcomes;
 
-/// What counts as the worst.
+/// The share of episodes or contexts that counts as the worst.
 pub const SHARE: f64 = 0.1;
-/// Of fewer parts a tenth cannot be told.
-const LEAST_PARTS: usize = 10;
+/// Minimum number of parts for a tenth to exist.
+const MIN_PARTS: usize = 10;
 
 /// The mean of the ⌈`share` · n⌉ lowest of n returns (Rockafellar and Uryasev, 2000); NaN if there are none.
 pub fn conditional_value_at_risk(returns: &[f64], share: f64) -> f64 {
@@ -19,12 +19,12 @@ pub fn conditional_value_at_risk(returns: &[f64], share: f64) -> f64 {
 
 /// Successes and episodes of a part, in each half.
 #[derive(Clone, Copy, Default)]
-struct Part {
+struct ContextGroup {
     successes: [f64; 2],
     episodes: [f64; 2],
 }
 
-impl Part {
+impl ContextGroup {
     fn rate(&self, half: usize) -> f64 {
         self.successes[half] / self.episodes[half]
     }
@@ -40,15 +40,16 @@ impl Part {
 ///
 /// `None` if there are fewer than ten parts with two episodes, as where all parameters are fixed.
 pub fn worst_contexts(outcomes: &Outcomes) -> Option<f64> {
-    let mut parts: BTreeMap<usize, (Part, usize)> = BTreeMap::new();
+    let mut parts: BTreeMap<usize, (ContextGroup, usize)> = BTreeMap::new();
     for (part, success) in outcomes.parts().into_iter().zip(&outcomes.successes) {
         let (part, seen) = parts.entry(part).or_default();
         part.episodes[*seen % 2] += 1.0;
         part.successes[*seen % 2] += f64::from(u8::from(*success));
         *seen += 1;
     }
-    let mut parts: Vec<Part> = parts.into_values().filter(|(_, seen)| *seen > 1).map(|(part, _)| part).collect();
-    if parts.len() < LEAST_PARTS {
+    let mut parts: Vec<ContextGroup> =
+        parts.into_values().filter(|(_, seen)| *seen > 1).map(|(part, _)| part).collect();
+    if parts.len() < MIN_PARTS {
         return None;
     }
     let mut one_way = |chooses: usize| {
@@ -58,8 +59,9 @@ pub fn worst_contexts(outcomes: &Outcomes) -> Option<f64> {
     Some(50.0 * (one_way(0) + one_way(1)))
 }
 
-/// What the other half says of the worst tenth of `parts`, which are in the order of the half that `chooses`.
-fn judged(parts: &[Part], chooses: usize) -> f64 {
+/// Returns the success of the worst tenth of `parts` in the half of the episodes that did not rank them. `parts` are in
+/// the order of the half `chooses`.
+fn judged(parts: &[ContextGroup], chooses: usize) -> f64 {
     let judges = 1 - chooses;
     let mut wanted = SHARE * parts.iter().map(|part| part.episodes[chooses]).sum::<f64>();
     let (mut successes, mut episodes) = (0.0, 0.0);

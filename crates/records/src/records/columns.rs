@@ -15,7 +15,7 @@ pub enum ColumnValues<'a> {
     Flag(Vec<bool>),
     /// Measured.
     Number(Vec<f64>),
-    /// The same, where some have none.
+    /// Numbers that some rows lack.
     Optional(Vec<Option<f64>>),
 }
 

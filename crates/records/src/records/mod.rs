@@ -25,33 +25,33 @@ pub const ROUNDING: f64 = 1e-9;
 /// The recorded tests of a policy.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Records {
-    /// What they have in common.
-    pub about: About,
+    /// Metadata of all episodes.
+    pub about: RecordsMetadata,
     /// In the order of the tests, within one in that of environment and episode indices.
     pub episodes: Vec<EpisodeRecord>,
 }
 
-/// What the recorded episodes of a policy have in common.
+/// Metadata of a policy's recorded episodes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct About {
+pub struct RecordsMetadata {
     /// The environment's name.
     pub environment: String,
-    /// Its revision.
+    /// The environment's revision.
     pub revision: u32,
-    /// Its parameters, in the order of the requested values.
+    /// The environment's parameters, in the order of the requested values.
     pub parameters: Vec<RecordedParameter>,
     /// The names of the quantities that were read back, in the order of the applied values.
     pub applied: Vec<String>,
     /// Names the policy: its checkpoint's id.
     pub policy: String,
-    /// Episodes in a trial, of which the last is recorded; 1 without trials.
+    /// Episodes in a trial. Only the last one is recorded. 1 without trials.
     pub episodes_per_trial: u32,
-    /// What counted as a success; `None` if the server's word was taken, which did not say what it compares.
+    /// The success criterion; `None` if the server judged and did not say by what.
     pub success: Option<Criterion>,
     /// The rule of the paper's text; `None` in records of programs that knew no other.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub text_success: Option<Criterion>,
-    /// That of the paper's published code; `None` likewise.
+    /// The criterion of the paper's published code; `None` if the server did not say.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub code_success: Option<Criterion>,
     /// The quantity of [`EpisodeRecord::also_achieved`], where the two rules compare different ones.
@@ -64,9 +64,9 @@ pub struct About {
 /// A parameter of recorded episodes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RecordedParameter {
-    /// Its name.
+    /// The parameter's name.
     pub name: String,
-    /// Its unit; "1" if dimensionless.
+    /// The unit; "1" if dimensionless.
     pub unit: String,
     /// The quantity that reads it back; empty if its server did not say.
     pub applied: String,
@@ -75,16 +75,16 @@ pub struct RecordedParameter {
 /// A test.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RecordedTest {
-    /// What the policy was tested on.
+    /// The test set.
     pub set: TestSet,
-    /// Of its environments and actions.
+    /// The seed of the environments and of the actions.
     pub seed: u64,
-    /// Of the test of a heatmap: x and y. `None` of any other, and in records of programs that did not write it yet.
+    /// The axes x and y of a heatmap's test. `None` in other tests and in records of older programs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub axes: Option<[Axis; 2]>,
 }
 
-/// How an episode ended.
+/// The end of an episode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ending {
     /// The task ended it.
@@ -106,29 +106,29 @@ pub struct EpisodeRecord {
     pub environment_index: u32,
     /// Counts the environment's episodes from 0.
     pub episode_index: u64,
-    /// The parameters that were drawn or given, in the order of [`About::parameters`].
+    /// The parameters that were drawn or given, in the order of [`RecordsMetadata::parameters`].
     pub requested: Vec<f64>,
-    /// What was read back from the physics, in the order of [`About::applied`].
+    /// Applied parameters, in the order of [`RecordsMetadata::applied`].
     pub applied: Vec<f64>,
     /// SHA-256 of the model; empty without one.
     pub model_hash: String,
     /// The undiscounted sum of its rewards.
     pub episode_return: f64,
-    /// Its number of steps.
+    /// The number of steps.
     pub length: u32,
     /// Whether it was a success.
     pub success: bool,
-    /// How it ended.
+    /// The end of the episode.
     pub ending: Ending,
-    /// What it achieved of what the criterion compares; `None` if nothing.
+    /// The value of the criterion's quantity; `None` if it was not reached.
     pub achieved: Option<f64>,
-    /// What it achieved of [`About::also`]; `None` if nothing, or if there is no such quantity.
+    /// The value of [`RecordsMetadata::also`]; `None` if it was not reached or there is no such quantity.
     pub also_achieved: Option<f64>,
 }
 
-/// How far requested and applied parameters agree.
+/// Check that requested and applied parameters agree.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Agreement {
+pub struct ParameterCheck {
     /// Episodes in which all parameters were compared.
     pub episodes: u64,
     /// The largest difference; `None` if nothing was compared.
@@ -140,23 +140,23 @@ pub struct Agreement {
 pub struct Difference {
     /// By its name in the catalogue.
     pub parameter: String,
-    /// What was asked for.
+    /// The requested value.
     pub requested: f64,
-    /// What was read back.
+    /// The applied value.
     pub applied: f64,
     /// The difference as a share of the requested value; of a requested 0, itself.
     pub relative: f64,
 }
 
-impl About {
-    /// Of a policy in `environment`, without tests so far.
+impl RecordsMetadata {
+    /// Returns the metadata of a policy in `environment`, without tests so far.
     pub fn new(environment: &proto::Environment, policy: String, episodes_per_trial: u32) -> Self {
         let parameter = |parameter: &proto::Parameter| RecordedParameter {
             name: parameter.name.clone(),
             unit: parameter.unit.clone(),
             applied: parameter.applied.clone(),
         };
-        let (text, code) = (Criterion::of(environment), Criterion::of_code(environment));
+        let (text, code) = (Criterion::from_environment(environment), Criterion::from_environment_code(environment));
         let quantities = text.as_ref().zip(code.as_ref()).map(|(text, code)| (&text.quantity, &code.quantity));
         let also = quantities.filter(|(text, code)| text != code).map(|(_, code)| code.clone());
         Self {
@@ -179,13 +179,13 @@ impl About {
     /// # Errors
     /// [`ValueError`] for one that these episodes cannot be judged by.
     pub fn criterion(&self, rule: &Rule) -> Result<Criterion, ValueError> {
-        rule.of(self.text_success.as_ref().or(self.success.as_ref()), self.code_success.as_ref())
+        rule.criterion(self.text_success.as_ref().or(self.success.as_ref()), self.code_success.as_ref())
     }
 
     /// Has `rule` decide about success in what is to be recorded.
     ///
     /// # Errors
-    /// Those of [`About::criterion`].
+    /// Those of [`RecordsMetadata::criterion`].
     pub fn judge_by(&mut self, rule: &Rule) -> Result<(), ValueError> {
         let criterion = self.criterion(rule)?;
         if self.also.as_ref() == Some(&criterion.quantity) {
@@ -195,7 +195,7 @@ impl About {
         Ok(())
     }
 
-    /// What an episode achieved of what decides about success, and of the environment's other quantity if it has two.
+    /// Returns the values of the criterion's quantity and of the environment's other quantity, if it has two.
     fn achieved(&self, end: &EndedEpisode) -> (Option<f64>, Option<f64>) {
         let text = (end.achieved, self.also.is_some().then_some(end.code_achieved).flatten());
         if self.is_judged_by_code() { (text.1, text.0) } else { text }
@@ -209,8 +209,8 @@ impl About {
 }
 
 impl EpisodeRecord {
-    /// Of a test on `set` whose environments have `seed`.
-    pub fn of(about: &About, set: &str, seed: u64, end: EndedEpisode) -> Self {
+    /// Returns the record of an episode on `set`, whose environments have `seed`.
+    pub fn new(about: &RecordsMetadata, set: &str, seed: u64, end: EndedEpisode) -> Self {
         let (achieved, also_achieved) = about.achieved(&end);
         Self {
             set: set.to_owned(),
@@ -236,7 +236,7 @@ impl EpisodeRecord {
 
 impl Records {
     /// Nothing recorded so far.
-    pub fn new(about: About) -> Self {
+    pub fn new(about: RecordsMetadata) -> Self {
         Self { about, episodes: Vec::new() }
     }
 
@@ -253,7 +253,7 @@ impl Records {
     }
 
     /// The episodes of the test on the set called `name`.
-    pub fn of<'a>(&'a self, name: &'a str) -> impl Iterator<Item = &'a EpisodeRecord> + Clone {
+    pub fn episodes_on<'a>(&'a self, name: &'a str) -> impl Iterator<Item = &'a EpisodeRecord> + Clone {
         self.episodes.iter().filter(move |episode| episode.set == name)
     }
 
@@ -262,7 +262,7 @@ impl Records {
     pub fn result(&self, name: &str, criterion: Option<&Criterion>) -> TestResult {
         let success =
             |episode: &EpisodeRecord| criterion.map_or(episode.success, |c| c.holds(self.achieved(episode, c)));
-        let episodes: Vec<&EpisodeRecord> = self.of(name).collect();
+        let episodes: Vec<&EpisodeRecord> = self.episodes_on(name).collect();
         let n = episodes.len() as u64;
         let successes = episodes.iter().filter(|episode| success(episode)).count() as u64;
         let (low, high) = wilson(successes, n);
@@ -275,10 +275,10 @@ impl Records {
         }
     }
 
-    /// The same episodes with `rule` in the place of what decided about success.
+    /// Judges the episodes by `rule` instead of the recorded rule.
     ///
     /// # Errors
-    /// Those of [`About::criterion`].
+    /// Those of [`RecordsMetadata::criterion`].
     pub fn judged_by(mut self, rule: &Rule) -> Result<Self, ValueError> {
         let criterion = self.about.criterion(rule)?;
         let swaps = self.about.also.as_ref() == Some(&criterion.quantity);
@@ -292,44 +292,44 @@ impl Records {
         Ok(self)
     }
 
-    /// What an episode achieved of what `criterion` compares.
+    /// Returns the value of the quantity that `criterion` compares.
     pub fn achieved(&self, episode: &EpisodeRecord, criterion: &Criterion) -> Option<f64> {
         if self.about.also.as_ref() == Some(&criterion.quantity) { episode.also_achieved } else { episode.achieved }
     }
 
     /// Compares what every episode was asked to run with and what it ran with.
-    pub fn agreement(&self) -> Agreement {
-        let comparison = Comparison::with(&self.about);
+    pub fn agreement(&self) -> ParameterCheck {
+        let comparison = ParameterComparison::with(&self.about);
         let of = |episode: &EpisodeRecord| comparison.largest(&episode.requested, &episode.applied);
         let largest = self.episodes.iter().filter_map(of).max_by(|a, b| a.relative.total_cmp(&b.relative));
         let episodes = if comparison.is_complete() { self.episodes.len() as u64 } else { 0 };
-        Agreement { episodes, largest }
+        ParameterCheck { episodes, largest }
     }
 }
 
 /// Compares requested with applied parameters.
 #[derive(Clone, Debug)]
-pub struct Comparison {
+pub struct ParameterComparison {
     /// The parameters' names, and where the quantity that reads each back is among the applied values; `None` if the
     /// server does not say.
     parameters: Vec<(String, Option<usize>)>,
 }
 
-impl Comparison {
-    fn with(about: &About) -> Self {
+impl ParameterComparison {
+    fn with(about: &RecordsMetadata) -> Self {
         let place = |parameter: &RecordedParameter| about.applied.iter().position(|name| *name == parameter.applied);
         let parameters = about.parameters.iter().map(|parameter| (parameter.name.clone(), place(parameter)));
         Self { parameters: parameters.collect() }
     }
 
     /// For the receipts of `environment`.
-    pub fn of(environment: &proto::Environment) -> Self {
-        Self::with(&About::new(environment, String::new(), 1))
+    pub fn new(environment: &proto::Environment) -> Self {
+        Self::with(&RecordsMetadata::new(environment, String::new(), 1))
     }
 
     /// The largest difference that is more than rounding.
-    pub fn real_difference(&self, requested: &[f64], applied: &[f64]) -> Option<Difference> {
-        self.largest(requested, applied).filter(Difference::is_real)
+    pub fn difference_beyond_rounding(&self, requested: &[f64], applied: &[f64]) -> Option<Difference> {
+        self.largest(requested, applied).filter(Difference::exceeds_tolerance)
     }
 
     /// Whether every parameter is read back.
@@ -364,7 +364,7 @@ fn relative(requested: f64, applied: f64) -> f64 {
 
 impl Difference {
     /// Whether it is more than rounding. NaN is.
-    pub fn is_real(&self) -> bool {
+    pub fn exceeds_tolerance(&self) -> bool {
         self.relative.is_nan() || self.relative > ROUNDING
     }
 }

@@ -20,13 +20,13 @@ use parquet::schema::parser::parse_message_type;
 use parquet::schema::types::Type;
 use perturb_files::{AnyError, FileError, checksum, read_if_there, write_atomically};
 
-use super::{About, ColumnValues, Ending, EpisodeRecord, Records};
+use super::{ColumnValues, Ending, EpisodeRecord, Records, RecordsMetadata};
 
-/// What the file is called beside a result.
+/// The name of the records file beside a result.
 pub const FILE: &str = "episodes.parquet";
-/// The key of [`About`] in the file's metadata.
+/// The key of [`RecordsMetadata`] in the file's metadata.
 const KEY: &str = "perturb";
-/// What every Parquet file begins and ends with.
+/// The first and last bytes of a Parquet file.
 const MAGIC: &[u8] = b"PAR1";
 
 /// Why records cannot be read or written.
@@ -51,13 +51,13 @@ pub enum RecordsError {
     #[error("{} does not hold recorded episodes: {reason}", path.display())]
     Damaged {
         path: PathBuf,
-        /// What is wrong with it.
+        /// The fault.
         reason: String,
     },
 }
 
 impl ColumnValues<'_> {
-    /// What the schema calls their type, before and after the column's name.
+    /// Returns the column's type in the schema, before and after the column's name.
     fn kind(&self) -> (&'static str, &'static str) {
         match self {
             Self::Text(_) => ("required binary", " (STRING)"),
@@ -183,7 +183,7 @@ impl Records {
 
 /// The rows of a part of the file, whose columns are those of [`Records::columns`]: by columns, since row by row takes four times as
 /// long, and a report reads millions.
-fn episodes(about: &About, group: &dyn RowGroupReader) -> Result<Vec<EpisodeRecord>, AnyError> {
+fn episodes(about: &RecordsMetadata, group: &dyn RowGroupReader) -> Result<Vec<EpisodeRecord>, AnyError> {
     let mut columns = Columns { group, place: 0 };
     let mut sets = columns.texts()?;
     let (seeds, environments, indices) =
@@ -245,7 +245,7 @@ impl Columns<'_> {
         Ok((values, there))
     }
 
-    /// Of a column that has a value in each row.
+    /// Reads a column that has a value in each row.
     fn all<T: DataType>(&mut self) -> Result<Vec<T::T>, AnyError> {
         let (values, _) = self.next::<T>(false)?;
         Ok(values)
@@ -256,7 +256,7 @@ impl Columns<'_> {
         texts.iter().map(|text| Ok(text.as_utf8()?.to_owned())).collect()
     }
 
-    /// So many columns.
+    /// Reads `count` columns.
     fn numbers(&mut self, count: usize) -> Result<Vec<Vec<f64>>, AnyError> {
         (0..count).map(|_| self.all::<DoubleType>()).collect()
     }

@@ -1,5 +1,5 @@
-//! What Agarwal et al. (2021, arXiv:2108.13264) say of all environments together. Scores are by environment, then run; all
-//! count alike unless said otherwise.
+//! Aggregate metrics over all environments after Agarwal et al. (2021, arXiv:2108.13264). Scores are by environment,
+//! then run. All scores count equally unless stated otherwise.
 
 /// The mean of what is left when the ⌊n/4⌋ lowest and the ⌊n/4⌋ highest of n scores are taken away; NaN if there are none.
 pub fn interquartile_mean(strata: &[Vec<f64>]) -> f64 {
@@ -10,7 +10,8 @@ pub fn interquartile_mean(strata: &[Vec<f64>]) -> f64 {
     middle.iter().sum::<f64>() / middle.len() as f64
 }
 
-/// How far scores stay below `target` on average; one beyond it counts as the target. NaN if there are none.
+/// Returns the mean distance of scores below `target`. Scores beyond the target count as the target. NaN if there are
+/// none.
 pub fn optimality_gap(strata: &[Vec<f64>], target: f64) -> f64 {
     let count = strata.iter().map(Vec::len).sum::<usize>() as f64;
     target - strata.iter().flatten().map(|score| score.min(target)).sum::<f64>() / count
@@ -49,7 +50,7 @@ mod tests {
     }
 
     #[test]
-    fn a_score_at_a_threshold_is_not_above_it_and_beyond_the_target_is_no_credit() {
+    fn scores_beyond_the_target_give_no_credit() {
         assert_eq!(profile(&[vec![0.0, 50.0], vec![100.0, 50.0]], &[-1.0, 0.0, 50.0, 100.0]), [1.0, 0.75, 0.25, 0.0]);
         assert_eq!(optimality_gap(&[vec![120.0, 40.0]], 100.0), 30.0);
     }

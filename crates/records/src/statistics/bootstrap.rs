@@ -8,11 +8,11 @@ pub const MIN_RUNS_FOR_INTERVAL: usize = 3;
 /// A number with its 95 % interval.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bootstrapped {
-    /// Of the scores as they are.
+    /// The statistic of the scores.
     pub point: f64,
     /// The ends of the interval; `None` with fewer than [`MIN_RUNS_FOR_INTERVAL`] runs.
     pub interval_95: Option<[f64; 2]>,
-    /// Runs of each stratum; of the one that has fewest, if they differ.
+    /// Number of runs in each stratum; the smallest one if they differ.
     pub runs: usize,
 }
 
@@ -28,7 +28,7 @@ impl std::fmt::Display for Bootstrapped {
 
 impl Bootstrapped {
     /// `statistic` of `strata`, see [`bootstrap`].
-    pub fn of(
+    pub fn new(
         strata: &[Vec<f64>],
         resamples: usize,
         seed: u64,
@@ -67,8 +67,8 @@ pub fn bootstrap(
     Some(points.into_iter().zip(estimates).map(with_interval).collect())
 }
 
-/// Draws runs anew, with replacement and as many, within each of the strata that have `sizes` runs, all of which have some.
-/// `each` is given the places of the drawn runs, by stratum, `resamples` times. The same seed draws the same.
+/// Draws runs with replacement in each stratum, as many as the stratum has. `sizes` are the numbers of runs, all above
+/// 0. Calls `each` with the indices of the drawn runs by stratum, `resamples` times. The same seed draws the same runs.
 pub fn resample(sizes: &[usize], resamples: usize, seed: u64, mut each: impl FnMut(&[Vec<usize>])) {
     let mut rng = stream(seed, Purpose::Bootstrap);
     let mut draws: Vec<Vec<usize>> = sizes.iter().map(|&size| vec![0; size]).collect();
@@ -113,12 +113,12 @@ mod tests {
 
     #[test]
     fn an_environment_without_runs_leaves_nothing_to_say() {
-        assert_eq!(Bootstrapped::of(&[], 10, 1, mean), None);
-        assert_eq!(Bootstrapped::of(&[vec![1.0], vec![]], 10, 1, mean), None);
-        let two = Bootstrapped::of(&[vec![5.0; 3], vec![7.0, 9.0]], 10, 1, mean).unwrap();
+        assert_eq!(Bootstrapped::new(&[], 10, 1, mean), None);
+        assert_eq!(Bootstrapped::new(&[vec![1.0], vec![]], 10, 1, mean), None);
+        let two = Bootstrapped::new(&[vec![5.0; 3], vec![7.0, 9.0]], 10, 1, mean).unwrap();
         assert_eq!((two.interval_95, two.runs), (None, 2), "fewer than three runs have no interval");
         assert_eq!(two.to_string(), "6.2");
-        let three = Bootstrapped::of(&[vec![5.0; 3], vec![7.0, 9.0, 8.0]], 10, 1, mean).unwrap();
+        let three = Bootstrapped::new(&[vec![5.0; 3], vec![7.0, 9.0, 8.0]], 10, 1, mean).unwrap();
         assert_eq!((three.interval_95.is_some(), three.runs), (true, 3));
     }
 

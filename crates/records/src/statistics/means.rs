@@ -3,8 +3,8 @@
 /// 97.5 % of a standard normal lies below.
 const Z_95: f64 = 1.959_963_984_540_054;
 
-/// The 95 % confidence interval of a share of which `successes` of `trials` were seen, after Wilson (1927), as (low,
-/// high) in 0 … 1. Unlike the textbook interval it is right near 0 and 1. (0, 1) if nothing was tried.
+/// Returns the 95 % confidence interval of a proportion after Wilson (1927), for `successes` among `trials`, as (low,
+/// high) in 0 … 1. Unlike the textbook interval it is right near 0 and 1. Returns (0, 1) without trials.
 pub fn wilson(successes: u64, trials: u64) -> (f64, f64) {
     if trials == 0 {
         return (0.0, 1.0);

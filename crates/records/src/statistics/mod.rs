@@ -25,13 +25,13 @@ pub struct Summary {
     /// over five runs of 1000 episodes can only be the rates 0.3, 0, 0, 0, 0, whose deviation with n - 1 were 0.13.
     /// `None` of a single run, which has none, and where it is not known.
     pub std: Option<f64>,
-    /// How many there are.
+    /// The number of runs.
     pub runs: usize,
 }
 
 impl Summary {
-    /// Of `numbers`; `None` if there are none.
-    pub fn of(numbers: &[f64]) -> Option<Self> {
+    /// Returns the mean and deviation of `numbers`; `None` if there are none.
+    pub fn from_values(numbers: &[f64]) -> Option<Self> {
         if numbers.is_empty() {
             return None;
         }
@@ -56,14 +56,14 @@ mod tests {
     #[test]
     fn the_deviation_is_the_papers() {
         // RL²-A2C on CartPole: 0.06 ± 0.12 % Interpolation over five runs of 1000 episodes.
-        let summary = Summary::of(&[0.3, 0.0, 0.0, 0.0, 0.0]).unwrap();
+        let summary = Summary::from_values(&[0.3, 0.0, 0.0, 0.0, 0.0]).unwrap();
         assert_eq!(
             (format!("{:.2} ± {:.2}", summary.mean, summary.std.unwrap()), summary.runs),
             ("0.06 ± 0.12".into(), 5)
         );
-        assert_eq!(Summary::of(&[]), None);
-        assert_eq!(Summary::of(&[7.0]).unwrap().to_string(), "7.0", "one run does not deviate from itself");
-        assert_eq!(Summary::of(&[7.0, 7.0]).unwrap().to_string(), "7.0 ± 0.0");
+        assert_eq!(Summary::from_values(&[]), None);
+        assert_eq!(Summary::from_values(&[7.0]).unwrap().to_string(), "7.0", "one run does not deviate from itself");
+        assert_eq!(Summary::from_values(&[7.0, 7.0]).unwrap().to_string(), "7.0 ± 0.0");
     }
 }
 

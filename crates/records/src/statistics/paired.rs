@@ -3,15 +3,15 @@
 use perturb_policy::random::{Purpose, stream};
 use rand::Rng;
 
-/// Up to so many pairs all signs are tried …
-const MOST_EXACT: usize = 16;
-/// … and of more pairs so many choices of them.
+/// Maximum number of pairs for which all signs are tried.
+const MAX_EXACT_PAIRS: usize = 16;
+/// Number of random choices of signs for more pairs.
 const CHOICES: u32 = 100_000;
 
-/// How likely it is, were each pair as likely to differ the other way round, that differences have a sum at least as far
-/// from 0 as these: Fisher's two-sided randomisation test (The Design of Experiments, 1935). All choices of signs are tried
-/// or, of more than 16 pairs that differ, 100 000 random ones beside the one that was seen, after Phipson and Smyth (2010).
-/// 1 if no pair differs. Of n pairs it is 2¹⁻ⁿ at least.
+/// Returns the p-value of Fisher's two-sided randomisation test for paired differences (The Design of Experiments,
+/// 1935): the probability that the sum of the differences is at least as far from 0 if each sign is random. Up to 16
+/// pairs that differ, all signs are tried. Beyond that, 100 000 random choices are drawn beside the observed one, after
+/// Phipson and Smyth (2010). Returns 1 if no pair differs. The smallest value with n pairs is 2¹⁻ⁿ.
 pub fn sign_flip_p(differences: &[f64], seed: u64) -> f64 {
     let differences: Vec<f64> = differences.iter().copied().filter(|difference| *difference != 0.0).collect();
     let seen: f64 = differences.iter().sum::<f64>().abs();
@@ -22,7 +22,7 @@ pub fn sign_flip_p(differences: &[f64], seed: u64) -> f64 {
         let sum: f64 = differences.iter().enumerate().map(|(place, difference)| sign(place) * difference).sum();
         sum.abs() >= seen - rounding
     };
-    if differences.len() <= MOST_EXACT {
+    if differences.len() <= MAX_EXACT_PAIRS {
         let all = 1_u64 << differences.len();
         return (0..all).filter(|&signs| is_as_far(signs)).count() as f64 / all as f64;
     }
@@ -31,8 +31,8 @@ pub fn sign_flip_p(differences: &[f64], seed: u64) -> f64 {
     (1 + as_far) as f64 / f64::from(1 + CHOICES)
 }
 
-/// The p-values of a family of comparisons, corrected after Holm (1979) in their order: whoever takes those up to α for
-/// real errs in any of them with probability α at most, however they depend on each other.
+/// Returns the p-values of a family of comparisons, corrected after Holm (1979), in their order. Accepting those up to
+/// α has an error of any kind with probability at most α, whatever their dependence.
 pub fn holm(p: &[f64]) -> Vec<f64> {
     let mut order: Vec<usize> = (0..p.len()).collect();
     order.sort_by(|&a, &b| p[a].total_cmp(&p[b]));

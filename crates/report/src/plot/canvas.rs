@@ -1,4 +1,4 @@
-//! What pictures are drawn on: texts, lines and areas in units.
+//! The canvas of pictures: texts, lines and areas in units.
 
 use plotters::coord::Shift;
 use plotters::prelude::*;
@@ -15,7 +15,7 @@ const TEXT: u32 = 17;
 pub(super) const LINE: f64 = 18.0;
 /// Beside everything.
 pub(super) const MARGIN: f64 = 8.0;
-/// Where texts begin and end.
+/// Width between the left and the right margin, units.
 pub(super) const INSIDE: f64 = WIDTH as f64 - 2.0 * MARGIN;
 /// See [`LineStyle::dashes`].
 const DASHES: [Option<(u32, u32)>; 3] = [None, Some((8, 4)), Some((2, 3))];
@@ -23,9 +23,9 @@ const DASHES: [Option<(u32, u32)>; 3] = [None, Some((8, 4)), Some((2, 3))];
 pub(super) const TICK: LineStyle = LineStyle { colour: FRAME, width: 1, dashes: None };
 
 /// A place, from the upper left corner.
-pub(super) type Place = (f64, f64);
+pub(super) type CanvasPoint = (f64, f64);
 
-/// How a line looks; widths and lengths are in units.
+/// The style of a line; widths and lengths are in units.
 #[derive(Clone, Copy)]
 pub(super) struct LineStyle {
     pub(super) colour: RGBColor,
@@ -35,21 +35,21 @@ pub(super) struct LineStyle {
 }
 
 impl LineStyle {
-    /// Of the `index`th of several lines.
+    /// Returns the style of the `index`th of several lines.
     pub(super) fn nth(index: usize) -> Self {
         Self { colour: LINES[index % LINES.len()], width: 2, dashes: DASHES[index % DASHES.len()] }
     }
 }
 
-/// Where a text's place is: its side or middle.
+/// The part of a text that is at its position.
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Side {
+pub(super) enum TextAnchor {
     Left,
     Middle,
     Right,
 }
 
-/// How wide a text is.
+/// Returns the width of a text, units.
 pub(super) fn text_width(text: &str) -> f64 {
     let known = load_font().ok().and_then(|()| font(1).font.box_size(text).ok());
     known.map_or(0.6 * f64::from(TEXT) * text.chars().count() as f64, |(width, _)| f64::from(width))
@@ -78,13 +78,13 @@ fn font(scale: u32) -> TextStyle<'static> {
     (FAMILY, TEXT * scale).into_font().color(&INK)
 }
 
-/// What is drawn on.
-pub(super) struct Canvas<'a, DB: DrawingBackend> {
+/// A canvas of a backend.
+pub(super) struct PlotCanvas<'a, DB: DrawingBackend> {
     pub(super) area: &'a DrawingArea<DB, Shift>,
     pub(super) scale: u32,
 }
 
-impl<'a, DB: DrawingBackend> Canvas<'a, DB> {
+impl<'a, DB: DrawingBackend> PlotCanvas<'a, DB> {
     /// An empty one.
     pub(super) fn new(area: &'a DrawingArea<DB, Shift>, scale: u32) -> Result<Self, PlotError> {
         area.fill(&PAPER).map_err(drawing)?;
@@ -92,46 +92,46 @@ impl<'a, DB: DrawingBackend> Canvas<'a, DB> {
     }
 
     /// In the backend's steps.
-    pub(super) fn at(&self, (x, y): Place) -> (i32, i32) {
+    pub(super) fn at(&self, (x, y): CanvasPoint) -> (i32, i32) {
         let step = |units: f64| (units * f64::from(self.scale)).round() as i32;
         (step(x), step(y))
     }
 
     /// A text in one line, whose middle is at this height.
-    pub(super) fn text(&self, text: &str, at: Place, side: Side) -> Result<(), PlotError> {
+    pub(super) fn text(&self, text: &str, at: CanvasPoint, side: TextAnchor) -> Result<(), PlotError> {
         let h = [HPos::Left, HPos::Center, HPos::Right][side as usize];
         // The library's middle of a line of text is that of its letters in an SVG, and lies above them in a PNG.
         self.styled(text, font(self.scale).pos(Pos::new(h, VPos::Center)), (at.0, at.1 + 1.0))
     }
 
-    /// The same from below to above, with its middle there.
-    pub(super) fn upright(&self, text: &str, at: Place) -> Result<(), PlotError> {
+    /// Writes a text upwards, with its middle at the position.
+    pub(super) fn upright(&self, text: &str, at: CanvasPoint) -> Result<(), PlotError> {
         let turned = font(self.scale).transform(FontTransform::Rotate270);
         self.styled(text, turned.pos(Pos::new(HPos::Center, VPos::Center)), at)
     }
 
-    fn styled(&self, text: &str, style: TextStyle<'_>, at: Place) -> Result<(), PlotError> {
+    fn styled(&self, text: &str, style: TextStyle<'_>, at: CanvasPoint) -> Result<(), PlotError> {
         self.area.draw_text(text, &style, self.at(at)).map_err(drawing)
     }
 
-    /// Lines of text below each other, the first of which begins at `top`; where the next one would.
-    pub(super) fn lines(&self, lines: &[String], (x, top): Place, side: Side) -> Result<f64, PlotError> {
+    /// Writes lines of text below each other, the first at `top`, and returns the position of the next one.
+    pub(super) fn lines(&self, lines: &[String], (x, top): CanvasPoint, side: TextAnchor) -> Result<f64, PlotError> {
         for (index, line) in lines.iter().enumerate() {
             self.text(line, (x, top + LINE * (index as f64 + 0.5)), side)?;
         }
         Ok(top + LINE * lines.len() as f64)
     }
 
-    pub(super) fn rectangle(&self, corners: [Place; 2], style: ShapeStyle) -> Result<(), PlotError> {
+    pub(super) fn rectangle(&self, corners: [CanvasPoint; 2], style: ShapeStyle) -> Result<(), PlotError> {
         self.area.draw(&Rectangle::new(corners.map(|corner| self.at(corner)), style)).map_err(drawing)
     }
 
-    pub(super) fn polygon(&self, corners: &[Place], style: ShapeStyle) -> Result<(), PlotError> {
+    pub(super) fn polygon(&self, corners: &[CanvasPoint], style: ShapeStyle) -> Result<(), PlotError> {
         let corners: Vec<_> = corners.iter().map(|corner| self.at(*corner)).collect();
         self.area.draw(&Polygon::new(corners, style)).map_err(drawing)
     }
 
-    pub(super) fn line(&self, points: &[Place], style: LineStyle) -> Result<(), PlotError> {
+    pub(super) fn line(&self, points: &[CanvasPoint], style: LineStyle) -> Result<(), PlotError> {
         match style.dashes {
             None => self.whole_line(points, style),
             Some((dash, gap)) => {
@@ -141,12 +141,12 @@ impl<'a, DB: DrawingBackend> Canvas<'a, DB> {
         }
     }
 
-    fn whole_line(&self, points: &[Place], style: LineStyle) -> Result<(), PlotError> {
+    fn whole_line(&self, points: &[CanvasPoint], style: LineStyle) -> Result<(), PlotError> {
         let points: Vec<_> = points.iter().map(|point| self.at(*point)).collect();
         self.area.draw(&PathElement::new(points, self.stroke(style.colour, style.width))).map_err(drawing)
     }
 
-    pub(super) fn circle(&self, at: Place, radius: f64, style: ShapeStyle) -> Result<(), PlotError> {
+    pub(super) fn circle(&self, at: CanvasPoint, radius: f64, style: ShapeStyle) -> Result<(), PlotError> {
         let radius = (radius * f64::from(self.scale)).round() as i32;
         self.area.draw(&Circle::new(self.at(at), radius, style)).map_err(drawing)
     }

@@ -3,8 +3,8 @@
 
 use plotters::style::RGBColor;
 
-/// What is drawn on, and what texts are drawn in. A page in the dark exchanges them, see `report/style.css`, as well as
-/// [`GRID`]; all others are seen on both.
+/// Background colour, and below it the colour of texts. A dark page exchanges both, see `report/style.css`, as well as
+/// [`GRID`]. All other colours are visible on both.
 pub(super) const PAPER: RGBColor = RGBColor(255, 255, 255);
 /// See [`PAPER`].
 pub(super) const INK: RGBColor = RGBColor(34, 34, 34);

@@ -2,60 +2,60 @@
 
 use std::ops::Range;
 
-use perturb_experiment::{Curve, EnvironmentCurves, Footing, Point, distinct};
+use perturb_experiment::{BudgetAxis, Curve, CurvePoint, EnvironmentCurves, distinct};
 use perturb_protocol::Version;
 use perturb_records::statistics::Summary;
 use perturb_records::versions;
 use perturb_settings::Method;
 
-use super::panels::{Panel, PanelLine, PanelPoint, Panels, RATES, index_of};
+use super::panels::{PanelLine, PanelPoint, Panels, PlotPanel, RATES, index_of};
 
-/// What a picture shows over episodes or steps.
+/// The quantity that a picture shows over episodes or steps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Quantity {
+pub enum CurveQuantity {
     /// The mean undiscounted return.
     Return,
     /// The success rate, %.
     Success,
 }
 
-impl Quantity {
+impl CurveQuantity {
     /// Both.
-    pub const ALL: [Quantity; 2] = [Quantity::Return, Quantity::Success];
+    pub const ALL: [CurveQuantity; 2] = [CurveQuantity::Return, CurveQuantity::Success];
 
-    fn of(self, point: &Point) -> Summary {
+    fn summary(self, point: &CurvePoint) -> Summary {
         match self {
-            Quantity::Return => point.episode_return,
-            Quantity::Success => point.success,
+            CurveQuantity::Return => point.episode_return,
+            CurveQuantity::Success => point.success,
         }
     }
 }
 
-impl std::fmt::Display for Quantity {
+impl std::fmt::Display for CurveQuantity {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.pad(match self {
-            Quantity::Return => "return",
-            Quantity::Success => "success",
+            CurveQuantity::Return => "return",
+            CurveQuantity::Success => "success",
         })
     }
 }
 
 /// The picture of training curves, a panel for each version that is trained on.
-pub fn draw_curves(curves: &EnvironmentCurves, quantity: Quantity, by: Footing) -> Panels {
+pub fn draw_curves(curves: &EnvironmentCurves, quantity: CurveQuantity, by: BudgetAxis) -> Panels {
     draw(curves, None, quantity, by)
 }
 
 /// The picture of tests of what was trained on a version, a panel for each version that is tested on.
-pub(crate) fn draw_tests(curves: &EnvironmentCurves, trained_on: Version, quantity: Quantity) -> Panels {
-    draw(curves, Some(trained_on), quantity, Footing::Episodes)
+pub(crate) fn draw_tests(curves: &EnvironmentCurves, trained_on: Version, quantity: CurveQuantity) -> Panels {
+    draw(curves, Some(trained_on), quantity, BudgetAxis::Episodes)
 }
 
 /// `trained_on` is `None` of training curves.
-fn draw(curves: &EnvironmentCurves, trained_on: Option<Version>, quantity: Quantity, by: Footing) -> Panels {
+fn draw(curves: &EnvironmentCurves, trained_on: Option<Version>, quantity: CurveQuantity, by: BudgetAxis) -> Panels {
     let methods = distinct(curves.curves.iter().map(|curve| curve.method.clone()));
     let what = match quantity {
-        Quantity::Return => "mean return",
-        Quantity::Success => "success rate, %",
+        CurveQuantity::Return => "mean return",
+        CurveQuantity::Success => "success rate, %",
     };
     let environment = &curves.environment;
     let shown = what.trim_end_matches(", %");
@@ -65,7 +65,7 @@ fn draw(curves: &EnvironmentCurves, trained_on: Option<Version>, quantity: Quant
     };
     let (x, y) = ranges(&curves.curves, quantity, by);
     let versions = versions(|version| curves.curves.iter().any(|curve| curve.version == version));
-    let panel = |version: Version| Panel {
+    let panel = |version: Version| PlotPanel {
         caption: format!("{} {version}", if trained_on.is_some() { "tested on" } else { "trained on" }),
         x_name: by.to_string(),
         x: x.clone(),
@@ -87,9 +87,9 @@ fn draw(curves: &EnvironmentCurves, trained_on: Option<Version>, quantity: Quant
     }
 }
 
-fn line(curve: &Curve, quantity: Quantity, by: Footing, methods: &[Method]) -> PanelLine {
-    let point = |point: &Point| {
-        let Summary { mean, std, .. } = quantity.of(point);
+fn line(curve: &Curve, quantity: CurveQuantity, by: BudgetAxis, methods: &[Method]) -> PanelLine {
+    let point = |point: &CurvePoint| {
+        let Summary { mean, std, .. } = quantity.summary(point);
         let std = std.unwrap_or_default();
         PanelPoint { x: point.progress, y: mean, low: mean - std, high: mean + std }
     };
@@ -97,13 +97,13 @@ fn line(curve: &Curve, quantity: Quantity, by: Footing, methods: &[Method]) -> P
 }
 
 /// The values that all panels share.
-fn ranges(curves: &[Curve], quantity: Quantity, by: Footing) -> (Range<f64>, Range<f64>) {
+fn ranges(curves: &[Curve], quantity: CurveQuantity, by: BudgetAxis) -> (Range<f64>, Range<f64>) {
     let longest = curves.iter().map(|curve| curve.total(by)).fold(0.0, f64::max);
     let x = 0.0..if longest > 0.0 { longest } else { 1.0 };
-    if quantity == Quantity::Success {
+    if quantity == CurveQuantity::Success {
         return (x, RATES);
     }
-    let values = curves.iter().flat_map(|curve| curve.points(by)).map(|point| quantity.of(point));
+    let values = curves.iter().flat_map(|curve| curve.points(by)).map(|point| quantity.summary(point));
     let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), summary| {
         let std = summary.std.unwrap_or_default();
         (low.min(summary.mean - std), high.max(summary.mean + std))

@@ -5,7 +5,7 @@ use std::ops::Range;
 use plotters::prelude::*;
 
 use super::PlotError;
-use super::canvas::{Canvas, LINE, LineStyle, Place, Side, TICK, text_width};
+use super::canvas::{CanvasPoint, LINE, LineStyle, PlotCanvas, TICK, TextAnchor, text_width};
 use super::colours::GRID;
 use super::ticks::round_ticks;
 
@@ -16,15 +16,15 @@ const SPACE: f64 = 4.6;
 /// A number goes so far beyond its frame, which may have a neighbour.
 const BEYOND: f64 = 2.0;
 /// The most ticks at an axis.
-const MOST: usize = 6;
+const MAX_TICKS: usize = 6;
 /// Lines at ticks.
 const BEHIND: LineStyle = LineStyle { colour: GRID, width: 1, dashes: None };
-/// How high the numbers of the x axis are, with their ticks.
+/// Height of the x axis' numbers with their ticks.
 pub(super) const NUMBERS: f64 = LINE + 5.0;
-/// How wide the name of a y axis is, and the gap to its numbers.
+/// Width of a y axis' name and the gap to its numbers.
 pub(super) const NAME: f64 = LINE + 2.0;
 
-/// Where something is drawn, and what its axes reach over.
+/// The position of a plot and the ranges of its axes.
 #[derive(Clone, Debug)]
 pub(super) struct Frame {
     pub(super) left: f64,
@@ -44,7 +44,7 @@ impl Frame {
         self.top + self.height
     }
 
-    pub(super) fn middle(&self) -> Place {
+    pub(super) fn middle(&self) -> CanvasPoint {
         (self.left + self.width / 2.0, self.top + self.height / 2.0)
     }
 
@@ -58,7 +58,7 @@ impl Frame {
 
     /// With their numbers, all or as many as have room: the first and the last, or the last alone.
     fn x_ticks(&self) -> Vec<(f64, Option<String>)> {
-        let sets: Vec<_> = (2..=MOST).rev().map(|most| round_ticks(&self.x, most)).collect();
+        let sets: Vec<_> = (2..=MAX_TICKS).rev().map(|most| round_ticks(&self.x, most)).collect();
         // A single number would not say how far it is to the next.
         let several = || sets.iter().filter(|ticks| ticks.len() > 1);
         let mut all = several().filter(|ticks| ticks.windows(2).all(|pair| self.gap(&pair[0], &pair[1]) >= BETWEEN));
@@ -86,7 +86,7 @@ impl Frame {
     }
 
     fn y_ticks(&self) -> Vec<(f64, String)> {
-        round_ticks(&self.y, ((self.height / (LINE + 2.0)) as usize).clamp(2, MOST))
+        round_ticks(&self.y, ((self.height / (LINE + 2.0)) as usize).clamp(2, MAX_TICKS))
     }
 }
 
@@ -95,7 +95,7 @@ fn numbered(ticks: &[(f64, String)], has_number: impl Fn(usize) -> bool) -> Vec<
     ticks.iter().enumerate().map(of).collect()
 }
 
-/// How much the numbers of a y axis of this height take.
+/// Returns the width of the numbers of a y axis of this height.
 pub(super) fn y_numbers_width(y: &Range<f64>, height: f64) -> f64 {
     let frame = Frame { left: 0.0, top: 0.0, width: 0.0, height, x: 0.0..1.0, y: y.clone() };
     frame.y_ticks().iter().map(|(_, number)| text_width(number)).fold(0.0, f64::max) + 6.0
@@ -106,7 +106,7 @@ fn share(range: &Range<f64>, value: f64) -> f64 {
     if span > 0.0 { (value - range.start) / span } else { 0.5 }
 }
 
-impl<DB: DrawingBackend> Canvas<'_, DB> {
+impl<DB: DrawingBackend> PlotCanvas<'_, DB> {
     /// The frame's edges; with lines behind what will be drawn, at the ticks.
     pub(super) fn frame(&self, frame: &Frame, with_lines: bool) -> Result<(), PlotError> {
         let Frame { left, top, .. } = *frame;
@@ -129,7 +129,7 @@ impl<DB: DrawingBackend> Canvas<'_, DB> {
             let x = frame.x(value);
             self.line(&[(x, bottom), (x, bottom + 4.0)], TICK)?;
             if let Some(number) = number.filter(|_| numbers) {
-                self.text(&number, (frame.number(value, &number), bottom + 5.0 + LINE / 2.0), Side::Middle)?;
+                self.text(&number, (frame.number(value, &number), bottom + 5.0 + LINE / 2.0), TextAnchor::Middle)?;
             }
         }
         Ok(())
@@ -141,7 +141,7 @@ impl<DB: DrawingBackend> Canvas<'_, DB> {
             let y = frame.y(value);
             self.line(&[(frame.left - 4.0, y), (frame.left, y)], TICK)?;
             if numbers {
-                self.text(&number, (frame.left - 6.0, y), Side::Right)?;
+                self.text(&number, (frame.left - 6.0, y), TextAnchor::Right)?;
             }
         }
         Ok(())
@@ -159,7 +159,7 @@ mod tests {
     #[case(210.0, &["0.005", "0.010"])]
     #[case(85.0, &["0.002", "", "", "", "0.010"])]
     #[case(61.0, &["", "0.010"])]
-    fn an_x_axis_has_two_numbers_where_they_fit_and_all_of_one_style(#[case] width: f64, #[case] expected: &[&str]) {
+    fn x_axis_has_two_numbers_of_one_style(#[case] width: f64, #[case] expected: &[&str]) {
         let frame = Frame { left: 76.0, top: 0.0, width, height: 96.0, x: 0.0001..0.01, y: 0.0001..0.01 };
         let ticks = frame.x_ticks();
         let numbers: Vec<&str> = ticks.iter().map(|(_, number)| number.as_deref().unwrap_or_default()).collect();

@@ -11,26 +11,26 @@ use perturb_records::{Axis, Heatmap, HeatmapPoint};
 use plotters::coord::Shift;
 use plotters::prelude::*;
 
-use super::canvas::{Canvas, INSIDE, LINE, LineStyle, MARGIN, Place, Side, TICK, text_width, wrapped};
+use super::canvas::{CanvasPoint, INSIDE, LINE, LineStyle, MARGIN, PlotCanvas, TICK, TextAnchor, text_width, wrapped};
 use super::colours::viridis;
 use super::frame::{Frame, NAME, NUMBERS, y_numbers_width};
 use super::{Plot, PlotError, WIDTH, drawing};
 pub use scale::common_returns;
 
 /// The most panels in a row; if there are more, rows have fewer.
-const MOST: usize = 4;
+const MAX_COLUMNS: usize = 4;
 const FEWER: usize = 3;
 /// Widest, lowest and highest panel.
 const WIDEST: f64 = 210.0;
 const HEIGHTS: Range<f64> = 96.0..150.0;
 /// Between panels, and between what stands below each other.
 const GAP: f64 = 9.0;
-/// How high the colours are in their scale.
+/// Height of the colour scale.
 const BAR: f64 = 10.0;
 /// The outlines of R's box and of E's, each within another, so that they are seen on every colour.
 const RANDOM: [LineStyle; 2] = [outline(BLACK, 4), outline(WHITE, 2)];
 const EXTREME: [LineStyle; 2] = [outline(WHITE, 4), outline(RGBColor(200, 30, 30), 2)];
-/// As much as a box stays inside, so that it is seen whole.
+/// Inset that keeps a box inside the frame.
 const WITHIN: f64 = 2.0;
 /// The legend's samples.
 const SAMPLE: (f64, f64) = (24.0, 14.0);
@@ -52,23 +52,23 @@ pub struct HeatmapPanels {
     pub columns: Vec<HeatmapColumn>,
 }
 
-/// One of several heatmaps.
+/// A column of a picture of heatmaps.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeatmapColumn {
-    /// What it is of.
+    /// The caption of the column.
     pub caption: String,
-    /// What is shown, or why nothing is.
+    /// The heatmap, or the reason why there is none.
     pub content: Result<Heatmap, String>,
 }
 
-/// What is shown.
-struct Quantity {
+/// The quantity of a row of heatmaps.
+struct HeatmapQuantity {
     name: &'static str,
     range: Range<f64>,
     value: fn(&HeatmapPoint) -> f64,
 }
 
-/// What the legend has.
+/// The entries of the legend.
 const KEY: [&str; 3] = ["box of R, random", "box of E, extreme", "D, default"];
 
 impl Plot for HeatmapPanels {
@@ -79,12 +79,12 @@ impl Plot for HeatmapPanels {
     }
 
     fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError> {
-        let canvas = Canvas::new(area, scale)?;
-        let mut top = canvas.lines(&self.title_lines(), (MARGIN, MARGIN), Side::Left)?;
+        let canvas = PlotCanvas::new(area, scale)?;
+        let mut top = canvas.lines(&self.title_lines(), (MARGIN, MARGIN), TextAnchor::Left)?;
         let [x, y] = &self.axes;
         let quantities = [
-            Quantity { name: "mean return", range: self.returns.clone(), value: |point| point.mean_return },
-            Quantity { name: "success rate, %", range: 0.0..100.0, value: |point| point.success_percent },
+            HeatmapQuantity { name: "mean return", range: self.returns.clone(), value: |point| point.mean_return },
+            HeatmapQuantity { name: "success rate, %", range: 0.0..100.0, value: |point| point.success_percent },
         ];
         for quantity in &quantities {
             top += GAP;
@@ -95,7 +95,7 @@ impl Plot for HeatmapPanels {
                 for (column, (of, caption)) in row.iter().zip(&captions).enumerate() {
                     let frame = self.frame(column, top + LINE * most(&captions));
                     let first = frame.top - LINE * caption.len() as f64;
-                    canvas.lines(caption, (frame.middle().0, first), Side::Middle)?;
+                    canvas.lines(caption, (frame.middle().0, first), TextAnchor::Middle)?;
                     match &of.content {
                         Ok(heatmap) => self.panel(&canvas, &frame, heatmap, quantity)?,
                         Err(why) => canvas.apology(&frame, why)?,
@@ -111,7 +111,7 @@ impl Plot for HeatmapPanels {
             }
         }
         let middle = self.frame(0, 0.0).left + self.row_width() / 2.0;
-        canvas.text(&label(x), (middle, top - GAP + LINE / 2.0), Side::Middle)?;
+        canvas.text(&label(x), (middle, top - GAP + LINE / 2.0), TextAnchor::Middle)?;
         self.key(&canvas, top + LINE)
     }
 
@@ -136,7 +136,7 @@ impl HeatmapPanels {
     }
 
     fn per_row(&self) -> usize {
-        if self.columns.len() > MOST { FEWER } else { self.columns.len().max(1) }
+        if self.columns.len() > MAX_COLUMNS { FEWER } else { self.columns.len().max(1) }
     }
 
     fn rows(&self) -> std::slice::Chunks<'_, HeatmapColumn> {
@@ -153,7 +153,7 @@ impl HeatmapPanels {
         (width.min(WIDEST), width.clamp(HEIGHTS.start, HEIGHTS.end))
     }
 
-    /// Of a panel in a row.
+    /// Returns the frame of a panel in a row.
     fn frame(&self, column: usize, top: f64) -> Frame {
         let [x, y] = &self.axes;
         let (width, height) = self.size();
@@ -176,17 +176,17 @@ impl HeatmapPanels {
 
     fn panel<DB: DrawingBackend>(
         &self,
-        canvas: &Canvas<'_, DB>,
+        canvas: &PlotCanvas<'_, DB>,
         frame: &Frame,
         heatmap: &Heatmap,
-        quantity: &Quantity,
+        quantity: &HeatmapQuantity,
     ) -> Result<(), PlotError> {
         canvas.surface(frame, heatmap, quantity)?;
         let [x, y] = &self.axes;
         for (lines, x_pairs, y_pairs) in [(EXTREME, &x.extreme, &y.extreme), (RANDOM, &x.random, &y.random)] {
             for &(left, right) in x_pairs {
                 for &(bottom, top) in y_pairs {
-                    let inside = |(x, y): Place| {
+                    let inside = |(x, y): CanvasPoint| {
                         let x = x.clamp(frame.left + WITHIN, frame.right() - WITHIN);
                         (x, y.clamp(frame.top + WITHIN, frame.bottom() - WITHIN))
                     };
@@ -199,8 +199,8 @@ impl HeatmapPanels {
         if shown(x) && shown(y) { canvas.mark((frame.x(x.default), frame.y(y.default))) } else { Ok(()) }
     }
 
-    /// Where the legend's samples are, from its top, and how high it is.
-    fn key_places(&self) -> ([Place; 3], f64) {
+    /// Returns the positions of the legend's samples from its top, and its height.
+    fn key_places(&self) -> ([CanvasPoint; 3], f64) {
         let (mut x, mut y) = (MARGIN, GAP);
         let places = KEY.map(|name| {
             let width = SAMPLE.0 + 6.0 + text_width(name) + 14.0;
@@ -214,7 +214,7 @@ impl HeatmapPanels {
         (places, y + LINE)
     }
 
-    fn key<DB: DrawingBackend>(&self, canvas: &Canvas<'_, DB>, top: f64) -> Result<(), PlotError> {
+    fn key<DB: DrawingBackend>(&self, canvas: &PlotCanvas<'_, DB>, top: f64) -> Result<(), PlotError> {
         for (index, (name, (x, y))) in KEY.into_iter().zip(self.key_places().0).enumerate() {
             let (left, above) = (x, top + y + (LINE - SAMPLE.1) / 2.0);
             let corners = [(left, above), (left + SAMPLE.0, above + SAMPLE.1)];
@@ -226,15 +226,15 @@ impl HeatmapPanels {
                 1 => canvas.outline(corners, EXTREME)?,
                 _ => canvas.mark(middle)?,
             }
-            canvas.text(name, (left + SAMPLE.0 + 6.0, middle.1), Side::Left)?;
+            canvas.text(name, (left + SAMPLE.0 + 6.0, middle.1), TextAnchor::Left)?;
         }
         Ok(())
     }
 }
 
-impl<DB: DrawingBackend> Canvas<'_, DB> {
+impl<DB: DrawingBackend> PlotCanvas<'_, DB> {
     /// The colours of a heatmap: neighbours of one colour are one rectangle.
-    fn surface(&self, frame: &Frame, heatmap: &Heatmap, quantity: &Quantity) -> Result<(), PlotError> {
+    fn surface(&self, frame: &Frame, heatmap: &Heatmap, quantity: &HeatmapQuantity) -> Result<(), PlotError> {
         let ((left, top), (right, bottom)) =
             (self.at((frame.left, frame.top)), self.at((frame.right(), frame.bottom())));
         let (width, height, grid) = (right - left, bottom - top, heatmap.grid as i32);
@@ -265,7 +265,7 @@ impl<DB: DrawingBackend> Canvas<'_, DB> {
         Ok(())
     }
 
-    /// In place of a panel that there is not.
+    /// Writes the reason in the place of a missing panel.
     fn apology(&self, frame: &Frame, why: &str) -> Result<(), PlotError> {
         let (right, bottom) = (frame.right(), frame.bottom());
         self.line(&[(frame.left, frame.top), (right, frame.top), (right, bottom)], TICK)?;
@@ -274,11 +274,15 @@ impl<DB: DrawingBackend> Canvas<'_, DB> {
             lines = vec!["missing".into()]; // the caption of its figure says why
         }
         let first = frame.middle().1 - LINE * lines.len() as f64 / 2.0;
-        self.lines(&lines, (frame.middle().0, first), Side::Middle).map(|_| ())
+        self.lines(&lines, (frame.middle().0, first), TextAnchor::Middle).map(|_| ())
     }
 
     /// A box, in one line within another.
-    fn outline(&self, [(left, top), (right, bottom)]: [Place; 2], lines: [LineStyle; 2]) -> Result<(), PlotError> {
+    fn outline(
+        &self,
+        [(left, top), (right, bottom)]: [CanvasPoint; 2],
+        lines: [LineStyle; 2],
+    ) -> Result<(), PlotError> {
         for line in lines {
             // Each side by itself, with the corners: a path around would not be closed, in a PNG.
             let half = f64::from(line.width) / 2.0;
@@ -293,15 +297,15 @@ impl<DB: DrawingBackend> Canvas<'_, DB> {
     }
 
     /// The default: a ring in black within a white one.
-    fn mark(&self, at: Place) -> Result<(), PlotError> {
+    fn mark(&self, at: CanvasPoint) -> Result<(), PlotError> {
         [(WHITE, 5), (BLACK, 2)]
             .into_iter()
             .try_for_each(|(colour, width)| self.circle(at, 4.0, self.stroke(colour, width)))
     }
 
-    /// What is shown, and beside it the scale of its colours.
-    fn colours(&self, quantity: &Quantity, left: f64, top: f64) -> Result<(), PlotError> {
-        self.text(quantity.name, (left, top + LINE / 2.0), Side::Left)?;
+    /// Draws the quantity's name and the scale of its colours.
+    fn colours(&self, quantity: &HeatmapQuantity, left: f64, top: f64) -> Result<(), PlotError> {
+        self.text(quantity.name, (left, top + LINE / 2.0), TextAnchor::Left)?;
         let from = left + text_width("success rate, %") + 14.0;
         let frame = Frame {
             left: from,

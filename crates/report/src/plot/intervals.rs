@@ -5,32 +5,32 @@ use std::ops::Range;
 use plotters::coord::Shift;
 use plotters::prelude::*;
 
-use super::canvas::{Canvas, INSIDE, LINE, LineStyle, MARGIN, Place, Side, text_width, wrapped};
+use super::canvas::{CanvasPoint, INSIDE, LINE, LineStyle, MARGIN, PlotCanvas, TextAnchor, text_width, wrapped};
 use super::colours::{INK, PAPER};
 use super::frame::{Frame, NUMBERS};
 use super::{Plot, PlotError, WIDTH};
 
-/// How much of the width names have at most.
+/// Maximum width of names.
 const NAMES: f64 = 150.0;
 /// Around what belongs to a row, and a group.
 const GAP: f64 = 5.0;
-/// How far from its row's middle a number is, if there is one to compare it with on the other side.
+/// Distance of a number from the middle of its row, if a number to compare with is on the other side.
 const APART: f64 = 4.5;
-/// Of a marker.
+/// Radius of a marker.
 const RADIUS: f64 = 4.0;
 /// An interval has caps of this height on both sides.
 const CAP: f64 = 3.5;
 
 /// Rows in groups that share their x axis.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Intervals {
+pub struct IntervalPlot {
     /// Above all.
     pub(crate) title: String,
-    /// Of the axis.
+    /// The name of the axis.
     pub(crate) x_name: String,
     pub(crate) x: Range<f64>,
     pub(crate) groups: Vec<Group>,
-    /// What a number is, its interval, and one to compare with, for the legend; the last two if there are any.
+    /// The legend's texts for a number, its interval, and the number to compare with; the last two may be empty.
     pub(crate) legend: [String; 3],
     /// Below all.
     pub(crate) note: String,
@@ -47,15 +47,15 @@ pub(crate) struct Group {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct IntervalRow {
     pub(crate) name: String,
-    /// Its colour's.
+    /// The index of the colour.
     pub(crate) index: usize,
     pub(crate) point: Option<f64>,
     pub(crate) interval: Option<[f64; 2]>,
-    /// What it is compared with.
+    /// The number to compare with.
     pub(crate) other: Option<f64>,
 }
 
-impl Plot for Intervals {
+impl Plot for IntervalPlot {
     fn height(&self) -> u32 {
         let rows: f64 = self.groups.iter().flat_map(|group| &group.rows).map(|row| self.row_height(row)).sum();
         let texts = self.title_lines().len() + self.groups.len() + 1 + self.entries().len() + self.note_lines().len();
@@ -64,18 +64,18 @@ impl Plot for Intervals {
     }
 
     fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError> {
-        let canvas = Canvas::new(area, scale)?;
-        let mut top = canvas.lines(&self.title_lines(), (MARGIN, MARGIN), Side::Left)? + GAP;
+        let canvas = PlotCanvas::new(area, scale)?;
+        let mut top = canvas.lines(&self.title_lines(), (MARGIN, MARGIN), TextAnchor::Left)? + GAP;
         for (index, group) in self.groups.iter().enumerate() {
             let frame = self.frame(group, top + LINE);
-            canvas.text(&group.name, (frame.left, top + LINE / 2.0), Side::Left)?;
+            canvas.text(&group.name, (frame.left, top + LINE / 2.0), TextAnchor::Left)?;
             canvas.frame(&frame, true)?;
             let mut above = frame.top;
             for row in &group.rows {
                 let names = self.name_lines(row);
                 let height = self.row_height(row);
                 let first = above + (height - LINE * names.len() as f64) / 2.0;
-                canvas.lines(&names, (frame.left - 6.0, first), Side::Right)?;
+                canvas.lines(&names, (frame.left - 6.0, first), TextAnchor::Right)?;
                 self.draw_row(&canvas, &frame, row, above + height / 2.0)?;
                 above += height;
             }
@@ -84,7 +84,7 @@ impl Plot for Intervals {
             top = frame.bottom() + GAP;
             if is_last {
                 let below = frame.bottom() + NUMBERS + LINE / 2.0;
-                canvas.text(&self.x_name, (frame.middle().0, below), Side::Middle)?;
+                canvas.text(&self.x_name, (frame.middle().0, below), TextAnchor::Middle)?;
                 top = below + LINE / 2.0 + GAP;
             }
         }
@@ -92,11 +92,11 @@ impl Plot for Intervals {
             self.draw_entry(&canvas, which, text, top + LINE / 2.0)?;
             top += LINE;
         }
-        canvas.lines(&self.note_lines(), (MARGIN, top), Side::Left).map(|_| ())
+        canvas.lines(&self.note_lines(), (MARGIN, top), TextAnchor::Left).map(|_| ())
     }
 }
 
-impl Intervals {
+impl IntervalPlot {
     fn title_lines(&self) -> Vec<String> {
         wrapped(&self.title, INSIDE)
     }
@@ -117,7 +117,7 @@ impl Intervals {
         (LINE * self.name_lines(row).len() as f64).max(LINE + 2.0) + GAP
     }
 
-    /// As wide as the names leave it.
+    /// Returns the frame beside the names.
     fn frame(&self, group: &Group, top: f64) -> Frame {
         let names = self.rows().flat_map(|row| self.name_lines(row));
         let left = MARGIN + names.map(|name| text_width(&name)).fold(0.0, f64::max) + 6.0;
@@ -128,7 +128,7 @@ impl Intervals {
 
     fn draw_row<DB: DrawingBackend>(
         &self,
-        canvas: &Canvas<'_, DB>,
+        canvas: &PlotCanvas<'_, DB>,
         frame: &Frame,
         row: &IntervalRow,
         y: f64,
@@ -142,14 +142,14 @@ impl Intervals {
             Some(point) => canvas.circle((frame.x(point), y - apart), RADIUS, style.colour.filled())?,
             // Where the paper's mark is not.
             None if row.other.is_some_and(|other| frame.x(other) < frame.middle().0) => {
-                canvas.text("missing", (frame.right() - 6.0, y), Side::Right)?;
+                canvas.text("missing", (frame.right() - 6.0, y), TextAnchor::Right)?;
             }
-            None => canvas.text("missing", (frame.left + 6.0, y), Side::Left)?,
+            None => canvas.text("missing", (frame.left + 6.0, y), TextAnchor::Left)?,
         }
         row.other.map_or(Ok(()), |other| draw_other(canvas, (frame.x(other), y + apart)))
     }
 
-    /// What the legend has.
+    /// Returns the entries of the legend.
     fn entries(&self) -> Vec<(usize, &str)> {
         let is_there =
             [true, self.rows().any(|row| row.interval.is_some()), self.rows().any(|row| row.other.is_some())];
@@ -159,7 +159,7 @@ impl Intervals {
 
     fn draw_entry<DB: DrawingBackend>(
         &self,
-        canvas: &Canvas<'_, DB>,
+        canvas: &PlotCanvas<'_, DB>,
         which: usize,
         text: &str,
         y: f64,
@@ -171,12 +171,12 @@ impl Intervals {
             1 => draw_interval(canvas, [left, right], y, LineStyle { colour: INK, width: 2, dashes: None })?,
             _ => draw_other(canvas, middle)?,
         }
-        canvas.text(text, (right + 8.0, y), Side::Left)
+        canvas.text(text, (right + 8.0, y), TextAnchor::Left)
     }
 }
 
 fn draw_interval<DB: DrawingBackend>(
-    canvas: &Canvas<'_, DB>,
+    canvas: &PlotCanvas<'_, DB>,
     [low, high]: [f64; 2],
     y: f64,
     style: LineStyle,
@@ -186,7 +186,7 @@ fn draw_interval<DB: DrawingBackend>(
 }
 
 /// A hollow diamond.
-fn draw_other<DB: DrawingBackend>(canvas: &Canvas<'_, DB>, (x, y): Place) -> Result<(), PlotError> {
+fn draw_other<DB: DrawingBackend>(canvas: &PlotCanvas<'_, DB>, (x, y): CanvasPoint) -> Result<(), PlotError> {
     let corners = [(x, y - 5.0), (x + 5.0, y), (x, y + 5.0), (x - 5.0, y)];
     canvas.polygon(&corners, PAPER.filled())?;
     let around = [corners[0], corners[1], corners[2], corners[3], corners[0], corners[1]];
@@ -198,7 +198,7 @@ pub(crate) mod tests {
     use super::*;
     use crate::plot::svg;
 
-    pub(crate) fn example() -> Intervals {
+    pub(crate) fn example() -> IntervalPlot {
         let row = |name: &str, index: usize, point: f64| IntervalRow {
             name: name.into(),
             index,
@@ -210,7 +210,7 @@ pub(crate) mod tests {
             name: name.into(),
             rows: vec![row("ppo ff", 0, 75.0), row("rl2-ppo rc N=5 (paper, sees the parameters)", 1, 20.0)],
         };
-        Intervals {
+        IntervalPlot {
             title: "CartPole: success rate where policies were trained, and elsewhere".into(),
             x_name: "success rate, %".into(),
             x: 0.0..100.0,
@@ -221,7 +221,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_number_stands_at_its_place_and_its_interval_reaches_over_it() {
+    fn number_and_interval_are_drawn_at_their_values() {
         let plot = example();
         let shown = svg(&plot).unwrap();
         let frame = plot.frame(&plot.groups[0], 0.0);

@@ -23,22 +23,22 @@ use plotters::style::{FontStyle, register_font};
 
 pub use colours::{is_dark, shade};
 pub(crate) use curves::draw_tests;
-pub use curves::{Quantity, draw_curves};
+pub use curves::{CurveQuantity, draw_curves};
 pub use heatmap::{HeatmapColumn, HeatmapPanels, common_returns};
-pub use intervals::Intervals;
+pub use intervals::IntervalPlot;
 pub use panels::Panels;
 use perturb_experiment::FolderError;
 use perturb_files::{FileError, write_atomically};
 
 /// DejaVu Sans, cut down to the letters that pictures have; its licence is beside it.
 const FONT: &[u8] = include_bytes!("../../data/fonts/DejaVuSans-subset.ttf");
-/// What the font is called in an SVG.
+/// The font family in an SVG.
 pub const FAMILY: &str = "sans-serif";
-/// How wide a picture is, in units. An SVG is shown with a pixel of CSS for each, and printed in a column of 85 mm.
+/// Width of a picture, units. An SVG shows a unit as one CSS pixel, and prints the picture in a column of 85 mm.
 pub const WIDTH: u32 = 360;
-/// SVG has so many steps in a unit, so that lines are smooth in print, too.
+/// Steps of an SVG in a unit. More steps make lines smooth in print.
 const SVG_SCALE: u32 = 4;
-/// PNG has so many pixels for one unit: 320 an inch in a column.
+/// Pixels of a PNG in a unit: 320 an inch in a column.
 pub const PNG_SCALE: u32 = 3;
 
 /// Why a picture could not be made.
@@ -56,9 +56,9 @@ pub enum PlotError {
     Folder(#[from] FolderError),
 }
 
-/// What any backend can draw, [`WIDTH`] wide. Everything is in units times `scale`.
+/// A picture that any backend can draw, [`WIDTH`] wide. All lengths are units times `scale`.
 pub trait Plot {
-    /// Its height.
+    /// Returns the height, units.
     fn height(&self) -> u32;
 
     /// Draws it.
@@ -67,7 +67,7 @@ pub trait Plot {
     /// The backend's.
     fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError>;
 
-    /// What becomes of its SVG.
+    /// Post-processes the SVG.
     fn finish(&self, svg: String) -> String {
         svg
     }
@@ -133,7 +133,7 @@ pub fn load_font() -> Result<(), PlotError> {
     if *loaded { Ok(()) } else { Err(PlotError::Draw("the font is damaged".into())) }
 }
 
-/// What a backend of the plotting library refused.
+/// Returns the error for a failure of the plotting library.
 pub fn drawing(error: impl std::fmt::Display) -> PlotError {
     PlotError::Draw(error.to_string())
 }

@@ -6,16 +6,16 @@ use perturb_text::Table;
 use plotters::coord::Shift;
 use plotters::prelude::*;
 
-use super::canvas::{Canvas, INSIDE, LINE, LineStyle, MARGIN, Side, text_width, wrapped};
+use super::canvas::{INSIDE, LINE, LineStyle, MARGIN, PlotCanvas, TextAnchor, text_width, wrapped};
 use super::colours::FRAME;
 use super::frame::{Frame, NAME, NUMBERS, y_numbers_width};
 use super::{Plot, PlotError, WIDTH};
 
-/// Of a panel's frame.
+/// Height of a panel's frame.
 const HEIGHT: f64 = 128.0;
 /// Between two panels, and around the legend.
 const GAP: f64 = 8.0;
-/// How long a sample of a line is in the legend, and what stands between its columns.
+/// Length of a line's sample in the legend, and the gap between columns below it.
 const SAMPLE: f64 = 30.0;
 const BETWEEN: f64 = 16.0;
 /// Radius of a line's only point.
@@ -32,23 +32,23 @@ pub struct Panels {
     /// Above all.
     pub(crate) title: String,
     /// From above to below.
-    pub(crate) panels: Vec<Panel>,
-    /// What lines are called, by their index.
+    pub(crate) panels: Vec<PlotPanel>,
+    /// The names of the lines by index.
     pub(crate) legend: Vec<String>,
-    /// What a line and a band is; below the legend.
+    /// The explanation of lines and bands, below the legend.
     pub(crate) note: String,
 }
 
 /// A chart.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Panel {
+pub(crate) struct PlotPanel {
     pub(crate) caption: String,
     pub(crate) x_name: String,
     pub(crate) x: Range<f64>,
     pub(crate) y_name: String,
     pub(crate) y: Range<f64>,
     pub(crate) lines: Vec<PanelLine>,
-    /// Of x.
+    /// A marked value of x.
     pub(crate) mark: Option<f64>,
 }
 
@@ -78,20 +78,24 @@ impl Plot for Panels {
     }
 
     fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError> {
-        let canvas = Canvas::new(area, scale)?;
-        let mut top = canvas.lines(&self.title_lines(), (MARGIN, MARGIN), Side::Left)?;
+        let canvas = PlotCanvas::new(area, scale)?;
+        let mut top = canvas.lines(&self.title_lines(), (MARGIN, MARGIN), TextAnchor::Left)?;
         for (index, panel) in self.panels.iter().enumerate() {
             let frame = self.frame(panel, top + LINE);
-            canvas.text(&panel.caption, (frame.left, top + LINE / 2.0), Side::Left)?;
+            canvas.text(&panel.caption, (frame.left, top + LINE / 2.0), TextAnchor::Left)?;
             panel.draw(&canvas, &frame, self.has_x_axis(index))?;
             top = frame.bottom() + GAP;
             if self.has_x_axis(index) {
-                canvas.text(&panel.x_name, (frame.middle().0, frame.bottom() + NUMBERS + LINE / 2.0), Side::Middle)?;
+                canvas.text(
+                    &panel.x_name,
+                    (frame.middle().0, frame.bottom() + NUMBERS + LINE / 2.0),
+                    TextAnchor::Middle,
+                )?;
                 top += NUMBERS + LINE;
             }
         }
         let below = self.draw_legend(&canvas, top)?;
-        canvas.lines(&self.note_lines(), (MARGIN, below), Side::Left).map(|_| ())
+        canvas.lines(&self.note_lines(), (MARGIN, below), TextAnchor::Left).map(|_| ())
     }
 }
 
@@ -106,19 +110,19 @@ impl Panels {
 
     /// Whether the panel below has another.
     fn has_x_axis(&self, index: usize) -> bool {
-        let axis = |panel: &Panel| (panel.x_name.clone(), panel.x.clone());
+        let axis = |panel: &PlotPanel| (panel.x_name.clone(), panel.x.clone());
         self.panels.get(index + 1).is_none_or(|next| axis(next) != axis(&self.panels[index]))
     }
 
     /// All frames are as far from the left.
-    fn frame(&self, panel: &Panel, top: f64) -> Frame {
+    fn frame(&self, panel: &PlotPanel, top: f64) -> Frame {
         let numbers = self.panels.iter().map(|panel| y_numbers_width(&panel.y, HEIGHT)).fold(0.0, f64::max);
         let left = MARGIN + NAME + numbers;
         let width = f64::from(WIDTH) - left - MARGIN - 4.0; // half of the last number is beyond the frame
         Frame { left, top, width, height: HEIGHT, x: panel.x.clone(), y: panel.y.clone() }
     }
 
-    /// Where in the legend a line is: its left end, and its line; and how many lines there are.
+    /// Returns the left end and the row of each line in the legend, and the number of rows.
     fn legend_places(&self) -> (Vec<(f64, usize)>, usize) {
         let widest = self.legend.iter().map(|name| text_width(name)).fold(0.0, f64::max) + SAMPLE + 8.0 + BETWEEN;
         let columns = (((INSIDE + BETWEEN) / widest) as usize).clamp(1, self.legend.len().max(1));
@@ -135,21 +139,21 @@ impl Panels {
         (places, line)
     }
 
-    /// Where it ends.
-    fn draw_legend<DB: DrawingBackend>(&self, canvas: &Canvas<'_, DB>, top: f64) -> Result<f64, PlotError> {
+    /// Draws the legend and returns its lower end.
+    fn draw_legend<DB: DrawingBackend>(&self, canvas: &PlotCanvas<'_, DB>, top: f64) -> Result<f64, PlotError> {
         let (places, lines) = self.legend_places();
         for (index, (name, (x, line))) in self.legend.iter().zip(places).enumerate() {
             let line_top = top + LINE * line as f64;
             let y = line_top + LINE / 2.0;
             canvas.line(&[(x, y), (x + SAMPLE, y)], LineStyle::nth(index))?;
-            canvas.lines(&wrapped(name, INSIDE - SAMPLE - 8.0), (x + SAMPLE + 8.0, line_top), Side::Left)?;
+            canvas.lines(&wrapped(name, INSIDE - SAMPLE - 8.0), (x + SAMPLE + 8.0, line_top), TextAnchor::Left)?;
         }
         Ok(top + LINE * lines as f64)
     }
 
     /// All that is drawn: a line for each point, with the names of the axes in `x_name` and `y_name`.
     pub(crate) fn table(&self) -> Table {
-        let of_panel = |panel: &'_ Panel| {
+        let of_panel = |panel: &'_ PlotPanel| {
             let of_line = |line: &PanelLine| {
                 let index = line.index;
                 line.points.iter().map(move |point| (index, *point)).collect::<Vec<_>>()
@@ -158,7 +162,7 @@ impl Panels {
             points.into_iter().map(|(index, point)| (panel.clone_names(), index, point)).collect::<Vec<_>>()
         };
         let points: Vec<([String; 3], usize, PanelPoint)> = self.panels.iter().flat_map(of_panel).collect();
-        Table::of("", &points)
+        Table::builder("", &points)
             .text("panel", |([caption, ..], ..)| caption)
             .text("line", |(_, index, _)| self.legend.get(*index).cloned().unwrap_or_default())
             .text("x_name", |([_, x, _], ..)| x)
@@ -171,12 +175,17 @@ impl Panels {
     }
 }
 
-impl Panel {
+impl PlotPanel {
     fn clone_names(&self) -> [String; 3] {
         [self.caption.clone(), self.x_name.clone(), self.y_name.clone()]
     }
 
-    fn draw<DB: DrawingBackend>(&self, canvas: &Canvas<'_, DB>, frame: &Frame, numbers: bool) -> Result<(), PlotError> {
+    fn draw<DB: DrawingBackend>(
+        &self,
+        canvas: &PlotCanvas<'_, DB>,
+        frame: &Frame,
+        numbers: bool,
+    ) -> Result<(), PlotError> {
         canvas.frame(frame, true)?;
         canvas.x_ticks(frame, numbers)?;
         canvas.y_ticks(frame, true)?;
@@ -206,7 +215,7 @@ impl Panel {
     }
 }
 
-/// What several lines are, in order, without repetitions.
+/// Returns the index of `one` in `all`.
 pub(crate) fn index_of<T: PartialEq>(all: &[T], one: &T) -> usize {
     all.iter().position(|known| known == one).unwrap_or_default()
 }

@@ -3,7 +3,7 @@ use std::collections::HashSet;
 use rstest::rstest;
 
 use super::canvas::{INSIDE, LineStyle, text_width, wrapped};
-use super::panels::{Panel, PanelLine, PanelPoint};
+use super::panels::{PanelLine, PanelPoint, PlotPanel};
 use super::*;
 use crate::fixture;
 
@@ -31,7 +31,7 @@ fn a_text_is_broken_where_a_line_ends() {
 /// A picture of each kind.
 fn pictures() -> Vec<String> {
     let point = |x: f64| PanelPoint { x, y: x, low: x - 5.0, high: x + 5.0 };
-    let panel = Panel {
+    let panel = PlotPanel {
         caption: "trained on D".into(),
         x_name: "episodes".into(),
         x: 0.0..100.0,
@@ -60,7 +60,7 @@ fn pictures() -> Vec<String> {
 
 #[test]
 fn a_line_of_one_point_is_seen() {
-    let panel = |lines: Vec<PanelLine>| Panel {
+    let panel = |lines: Vec<PanelLine>| PlotPanel {
         caption: String::new(),
         x_name: "mass, kg".into(),
         x: 0.0..1.0,
@@ -92,7 +92,7 @@ fn attribute<'a>(element: &'a str, name: &str) -> Option<&'a str> {
 
 /// 85 mm are 241 pt.
 #[test]
-fn texts_have_nine_points_in_a_column_and_stay_inside_the_picture() {
+fn texts_have_nine_points_and_stay_inside() {
     for picture in pictures() {
         let view: Vec<f64> =
             attribute(&picture, "viewBox").unwrap().split(' ').map(|number| number.parse().unwrap()).collect();

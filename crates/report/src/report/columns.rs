@@ -26,14 +26,14 @@ impl<'r, R: 'r> MethodColumns<'r, R> for TableBuilder<'r, R> {
     fn method_as(self, prefix: &str, method: impl Fn(&'r R) -> &'r Method) -> Self {
         let any = |is: fn(&Method) -> bool| self.sources().iter().any(|row| is(method(row)));
         let (presets, observes) = (any(|it| !it.preset.is_default()), any(|it| !it.observe.is_default()));
-        let elsewhere = any(|it| it.elsewhere);
+        let elsewhere = any(|it| it.external);
         let table = self
             .text(format!("{prefix}algorithm"), |row| &method(row).algorithm)
             .text(format!("{prefix}architecture"), |row| &method(row).architecture)
             .text(format!("{prefix}episodes_per_trial"), |row| or_empty(method(row).episodes_per_trial));
         let table = if presets { table.text(format!("{prefix}preset"), |row| method(row).preset) } else { table };
         let table = if observes { table.text(format!("{prefix}observe"), |row| method(row).observe) } else { table };
-        if elsewhere { table.text(format!("{prefix}elsewhere"), |row| method(row).elsewhere) } else { table }
+        if elsewhere { table.text(format!("{prefix}elsewhere"), |row| method(row).external) } else { table }
     }
 
     fn summary(self, summary: impl Fn(&'r R) -> Option<Summary>) -> Self {

@@ -7,25 +7,25 @@ use perturb_settings::Method;
 use perturb_text::Table;
 
 use super::columns::MethodColumns;
-use super::scope::Scope;
+use super::index::ReportIndex;
 use super::{MISSING, Report};
 
 /// Resamples of a bootstrap; there are hundreds of comparisons, of two numbers each.
 const RESAMPLES: usize = 10_000;
-/// Of fewer runs nothing can be said about other runs.
-const LEAST_RUNS: usize = 2;
-/// What stands for all environments together.
+/// Minimum number of runs for a comparison.
+const MIN_RUNS: usize = 2;
+/// The name of all environments together.
 const ALL: &str = "all";
 
 /// Two methods by a metric, over the runs that both have in each of the environments.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Comparison {
-    /// Its name, or [`ALL`].
+pub(super) struct MethodComparison {
+    /// The environment's name, or [`ALL`].
     environment: String,
     x: Method,
     y: Method,
     metric: Metric,
-    /// Of x less y, percentage points, mean over environments and runs.
+    /// The difference x − y, percentage points, mean over environments and runs.
     difference: Bootstrapped,
     /// The probability that a run of x is better than one of y.
     improvement: Bootstrapped,
@@ -36,20 +36,25 @@ pub(super) struct Comparison {
 }
 
 /// All comparisons over all environments, then, if there are several, those in each of them.
-pub(super) fn comparisons(scope: &Scope<'_>, selections: &[MethodResults<'_>]) -> Vec<Comparison> {
+pub(super) fn comparisons(scope: &ReportIndex<'_>, selections: &[MethodResults<'_>]) -> Vec<MethodComparison> {
     let environments = &scope.averaged;
     if let [environment] = environments[..] {
-        return of(scope, selections, environment, &[environment]);
+        return family(scope, selections, environment, &[environment]);
     }
-    let each = environments.iter().flat_map(|environment| of(scope, selections, environment, &[environment]));
-    of(scope, selections, ALL, environments).into_iter().chain(each).collect()
+    let each = environments.iter().flat_map(|environment| family(scope, selections, environment, &[environment]));
+    family(scope, selections, ALL, environments).into_iter().chain(each).collect()
 }
 
 /// The family of comparisons over some environments. Reference lines are not in it: each would cost the others' p-values; nor
 /// are agents that were trained elsewhere, whose runs have no seeds in common with others.
-fn of(scope: &Scope<'_>, selections: &[MethodResults<'_>], name: &str, environments: &[&str]) -> Vec<Comparison> {
+fn family(
+    scope: &ReportIndex<'_>,
+    selections: &[MethodResults<'_>],
+    name: &str,
+    environments: &[&str],
+) -> Vec<MethodComparison> {
     let mut methods = scope.methods.clone();
-    methods.retain(|method| !method.is_reference() && !method.elsewhere);
+    methods.retain(|method| !method.is_reference() && !method.external);
     let found = |method: &Method| -> Option<Vec<&MethodResults<'_>>> {
         let of = |environment| selections.iter().find(|of| of.environment == environment && of.method == *method);
         environments.iter().map(|environment| of(*environment)).collect()
@@ -69,12 +74,12 @@ fn of(scope: &Scope<'_>, selections: &[MethodResults<'_>], name: &str, environme
 }
 
 /// `scores` are those of x in each environment, then those of y.
-fn compare(environment: &str, [x, y]: [&Method; 2], metric: Metric, scores: &[Vec<f64>]) -> Option<Comparison> {
+fn compare(environment: &str, [x, y]: [&Method; 2], metric: Metric, scores: &[Vec<f64>]) -> Option<MethodComparison> {
     let (of_x, of_y) = scores.split_at(scores.len() / 2);
     let difference = |(x, y): (&Vec<f64>, &Vec<f64>)| x.iter().zip(y).map(|(x, y)| x - y).collect();
     let differences: Vec<Vec<f64>> = of_x.iter().zip(of_y).map(difference).collect();
     let pairs = differences.concat();
-    if differences.first()?.len() < LEAST_RUNS {
+    if differences.first()?.len() < MIN_RUNS {
         return None;
     }
     let improvement = |strata: &[Vec<f64>]| {
@@ -82,13 +87,13 @@ fn compare(environment: &str, [x, y]: [&Method; 2], metric: Metric, scores: &[Ve
         probability_of_improvement(x, y)
     };
     let p = sign_flip_p(&pairs, 1);
-    Some(Comparison {
+    Some(MethodComparison {
         environment: environment.into(),
         x: x.clone(),
         y: y.clone(),
         metric,
         difference: mean_with_t_interval(&differences)?,
-        improvement: Bootstrapped::of(scores, RESAMPLES, 1, improvement)?,
+        improvement: Bootstrapped::new(scores, RESAMPLES, 1, improvement)?,
         pairs: pairs.len(),
         p,
         corrected: p,
@@ -106,7 +111,7 @@ impl Report<'_> {
             if first.environment == ALL { "all environments" } else { &first.environment },
             of_all.len()
         );
-        let table = Table::of(title, of_all)
+        let table = Table::builder(title, of_all)
             .text("X", |row| &row.x)
             .text("Y", |row| &row.y)
             .text("metric", |row| row.metric)
@@ -123,7 +128,7 @@ impl Report<'_> {
         let end = |number: &Bootstrapped, end: usize| {
             number.interval_95.map(|interval| interval[end].to_string()).unwrap_or_default()
         };
-        Table::of("comparisons.csv", &self.comparisons)
+        Table::builder("comparisons.csv", &self.comparisons)
             .text("environment", |row| &row.environment)
             .method_as("x_", |row| &row.x)
             .method_as("y_", |row| &row.y)
@@ -181,7 +186,7 @@ mod tests {
                 |cell: &perturb_experiment::Cell| 10.0 * f64::from(cell.run) + cell.method().to_string().len() as f64;
             let results = crate::fixture::results(&plan, |cell| Some(([rate(cell); 3], 1.0)));
             let selections = results.select();
-            comparisons(&Scope::of(&plan, &selections), &selections)
+            comparisons(&ReportIndex::new(&plan, &selections), &selections)
         };
         let without = of(learners.into());
         assert_eq!(without.len(), Metric::ALL.len());

@@ -1,4 +1,4 @@
-//! The numbers of a report as lines of files; an empty field is a number that there is not.
+//! CSV files of a report. An empty field is a missing number.
 
 use perturb_protocol::Version;
 use perturb_records::statistics::Bootstrapped;
@@ -6,12 +6,27 @@ use perturb_records::{Metric, Scenario};
 use perturb_text::Table;
 
 use super::columns::MethodColumns;
+use super::index::has_scenarios_of;
 use super::numbers::{MethodMetrics, counted, or_empty};
-use super::scope::has_scenarios_of;
 use super::{Cell, Report};
 
+/// New and old names of files. The old names are written as well until version 0.3.
+const RENAMED: [(&str, &str); 5] = [
+    ("cvar.csv", "worst.csv"),
+    ("evaluations.csv", "marks.csv"),
+    ("external.csv", "elsewhere.csv"),
+    ("sample_efficiency.csv", "footing.csv"),
+    ("train_r_vs_d.csv", "gains.csv"),
+];
+
+/// Returns the name that a file of a report had before version 0.2, if it was another one.
+pub fn old_file_name(name: &str) -> Option<&'static str> {
+    RENAMED.iter().find(|(new, _)| *new == name).map(|(_, old)| *old)
+}
+
 impl Report<'_> {
-    /// The files that a report has beside its documents, by their titles.
+    /// Returns the files that a report has beside its documents, by their titles. Write each also under its
+    /// [`old_file_name`].
     pub fn files(&self) -> Vec<Table> {
         let sets = (!self.set_tests.is_empty()).then(|| self.sets_file());
         let tuned = (!self.tuned.is_empty()).then(|| self.tuned_file());
@@ -37,7 +52,7 @@ impl Report<'_> {
     fn metrics_file(&self) -> Table {
         let rows = self.metrics.iter().chain(&self.averages);
         let lines: Vec<_> = rows.flat_map(|row| Metric::ALL.map(|metric| (row, metric))).collect();
-        let mut table = Table::of("metrics.csv", &lines)
+        let mut table = Table::builder("metrics.csv", &lines)
             .text("environment", |(row, _)| row.environment)
             .method(|(row, _)| &row.method)
             .text("metric", |(_, metric)| metric)
@@ -66,7 +81,7 @@ impl Report<'_> {
         let reselected = |line: &(&MethodMetrics<'_>, Metric, _, _), which: usize| {
             line.0.reselected.get(&line.1).map(|both| both[which])
         };
-        Table::of("iqm.csv", &lines)
+        Table::builder("iqm.csv", &lines)
             .method(|(row, ..)| &row.method)
             .text("metric", |(_, metric, ..)| metric)
             .number("runs", |(.., iqm, _)| iqm.map_or(0, |iqm| iqm.runs))
@@ -85,10 +100,10 @@ impl Report<'_> {
 
     fn scenarios_file(&self) -> Table {
         let (trained, tested) = (self.trained_versions(), self.tested_versions());
-        let of_selection = |selection| Scenario::of(&trained, &tested).map(move |scenario| (selection, scenario));
+        let of_selection = |selection| Scenario::pairs(&trained, &tested).map(move |scenario| (selection, scenario));
         let lines = self.with_scenarios().into_iter().flat_map(of_selection);
         let lines: Vec<_> = lines.filter(|(row, scenario)| has_scenarios_of(row, scenario.train)).collect();
-        Table::of("scenarios.csv", &lines)
+        Table::builder("scenarios.csv", &lines)
             .text("environment", |(selection, _)| selection.environment)
             .method(|(selection, _)| &selection.method)
             .text("train", |(_, scenario)| scenario.train)
@@ -101,7 +116,7 @@ impl Report<'_> {
     }
 
     fn sets_file(&self) -> Table {
-        Table::of("sets.csv", &self.set_tests)
+        Table::builder("sets.csv", &self.set_tests)
             .text("environment", |test| test.environment)
             .method(|test| test.method)
             .text("train", |test| test.trained_on)
@@ -112,7 +127,7 @@ impl Report<'_> {
     }
 
     fn marks_file(&self) -> Table {
-        Table::of("marks.csv", &self.marks)
+        Table::builder("evaluations.csv", &self.marks)
             .text("environment", |test| test.environment)
             .method(|test| test.method)
             .text("train", |test| test.trained_on)
@@ -124,7 +139,7 @@ impl Report<'_> {
     }
 
     fn tuned_file(&self) -> Table {
-        Table::of("tuning.csv", &self.tuned)
+        Table::builder("tuning.csv", &self.tuned)
             .text("environment", |tuned| tuned.environment)
             .method(|tuned| &tuned.method)
             .text("train", |tuned| tuned.trained_on)
@@ -146,7 +161,7 @@ impl Report<'_> {
     }
 
     fn selected_file(&self) -> Table {
-        Table::of("selected.csv", &self.selected())
+        Table::builder("selected.csv", &self.selected())
             .text("environment", |selected| &selected.result.training.environment)
             .method(|selected| &selected.result.training.method)
             .text("train", |selected| selected.cell.trained_on())

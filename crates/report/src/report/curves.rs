@@ -1,6 +1,6 @@
 //! Training curves as lines of a file.
 
-use perturb_experiment::{EnvironmentCurves, Footing};
+use perturb_experiment::{BudgetAxis, EnvironmentCurves};
 use perturb_text::Table;
 
 use super::columns::MethodColumns;
@@ -8,11 +8,11 @@ use super::columns::MethodColumns;
 /// A line for each point.
 pub fn curves_table(all: &[EnvironmentCurves]) -> Table {
     let curves = all.iter().flat_map(|of| of.curves.iter().map(|curve| (&of.environment, curve)));
-    let by = curves.flat_map(|(environment, curve)| Footing::ALL.map(|by| (environment, curve, by)));
+    let by = curves.flat_map(|(environment, curve)| BudgetAxis::ALL.map(|by| (environment, curve, by)));
     let lines: Vec<_> = by
         .flat_map(|(environment, curve, by)| curve.points(by).iter().map(move |point| (environment, curve, by, point)))
         .collect();
-    Table::of("curves.csv", &lines)
+    Table::builder("curves.csv", &lines)
         .text("environment", |(environment, ..)| environment)
         .method(|(_, curve, ..)| &curve.method)
         .text("train", |(_, curve, ..)| curve.version)

@@ -1,21 +1,21 @@
 //! A picture as a report's page shows it.
 
-/// A picture as it is shown, or the place of one that is missing.
+/// A picture on the page, or the note about a missing one.
 #[derive(Clone, Debug)]
 pub struct Figure {
     /// Figures of one environment stand together.
     pub environment: String,
-    /// What its files are called, without their endings.
+    /// The names of the files, without extension.
     pub file: String,
     /// A few words for those who do not see it.
     pub name: String,
-    /// What the picture shows, or why it is missing.
+    /// The caption, or the reason why the picture is missing.
     pub caption: String,
     /// Complete in itself.
     pub picture: FigureData,
 }
 
-/// What is shown of a picture.
+/// The content of a figure.
 #[derive(Clone, Debug)]
 pub enum FigureData {
     /// Both are complete in themselves.

@@ -1,9 +1,9 @@
 //! The pictures of a report, and what is said of those that are missing.
 
-use perturb_experiment::{EnvironmentCurves, Footing, MethodResults, NoHeatmap};
+use perturb_experiment::{BudgetAxis, EnvironmentCurves, MethodResults, NoHeatmap};
 
-use crate::against_training::{against_training, test_curves};
-use crate::plot::{Panels, PlotError, Quantity, draw_curves, draw_tests, svg};
+use crate::generalization_curves::{generalization_curves, test_curves};
+use crate::plot::{CurveQuantity, Panels, PlotError, draw_curves, draw_tests, svg};
 
 use super::figure::{Figure, FigureData};
 use super::{HeatmapPicture, Picture, Report};
@@ -11,29 +11,29 @@ use super::{HeatmapPicture, Picture, Report};
 /// All pictures of a report.
 #[derive(Clone, Debug, Default)]
 pub struct Figures {
-    /// What the page opens with.
+    /// The first figures of the page.
     pub finding: Vec<Figure>,
-    /// The same of each environment, if the page opens with all together.
+    /// The first figures for each environment, if the page begins with all together.
     pub metrics: Vec<Figure>,
-    /// Of all environments together.
+    /// Performance profiles over all environments.
     pub profiles: Vec<Figure>,
-    /// Of all environments together.
+    /// Paired differences over all environments.
     pub gains: Vec<Figure>,
-    /// One for each environment and version that was trained on.
+    /// Success over parameters: a figure for each environment and training version.
     pub parameters: Vec<Figure>,
-    /// One for each environment.
+    /// Success over thresholds: a figure for each environment.
     pub thresholds: Vec<Figure>,
-    /// One for each setting of a grid.
+    /// A figure for each setting of a grid.
     pub settings: Vec<Figure>,
-    /// One for each environment, quantity and footing.
+    /// Training curves: a figure for each environment, quantity and axis.
     pub curves: Vec<Figure>,
-    /// Of tests of the policies of earlier moments: one for each environment, version that was trained on, and quantity.
+    /// Tests of intermediate policies: a figure for each environment, training version and quantity.
     pub marks: Vec<Figure>,
-    /// What is said of curves that are missing.
+    /// Notes about missing curves.
     pub no_curves: Vec<String>,
-    /// One for each environment, pair of parameters, and method.
+    /// Heatmaps: a figure for each environment, pair of parameters, and method.
     pub heatmaps: Vec<Figure>,
-    /// What to do about heatmaps that are missing.
+    /// Advice about missing heatmaps.
     pub no_heatmaps: Vec<String>,
 }
 
@@ -66,9 +66,9 @@ impl Figures {
     }
 
     fn add_marks(&mut self, selections: &[MethodResults<'_>]) -> Result<(), PlotError> {
-        for (trained_on, curves) in test_curves(&against_training(selections)) {
+        for (trained_on, curves) in test_curves(&generalization_curves(selections)) {
             let environment = &curves.environment;
-            for quantity in Quantity::ALL {
+            for quantity in CurveQuantity::ALL {
                 let name =
                     format!("{environment}, trained on {trained_on}: {quantity} in tests after so many episodes");
                 self.marks.push(Figure {
@@ -90,7 +90,9 @@ impl Figures {
                 self.no_curves.push(format!("{environment}: no training with a result has its monitor.csv."));
                 continue;
             }
-            for (by, quantity) in Footing::ALL.into_iter().flat_map(|by| Quantity::ALL.map(|quantity| (by, quantity))) {
+            for (by, quantity) in
+                BudgetAxis::ALL.into_iter().flat_map(|by| CurveQuantity::ALL.map(|quantity| (by, quantity)))
+            {
                 self.curves.push(Figure {
                     environment: environment.clone(),
                     file: format!("{environment}-{quantity}-over-{by}"),
@@ -111,7 +113,7 @@ fn figure_data(panels: &Panels) -> Result<FigureData, PlotError> {
     Ok(FigureData::Svg { svg: svg(panels)?, csv: panels.table().to_csv() })
 }
 
-/// What to do about the heatmaps that are missing.
+/// Returns advice about the missing heatmaps.
 fn advice(heatmaps: &[HeatmapPicture]) -> Vec<String> {
     let all: usize = heatmaps.iter().map(|picture| picture.wanted).sum();
     let missing: Vec<NoHeatmap> = heatmaps.iter().flat_map(|picture| picture.missing.iter().copied()).collect();

@@ -1,4 +1,5 @@
-//! What an experiment found, as one figure: Default, Interpolation and Extrapolation with intervals, beside the paper's.
+//! The main result of an experiment in one figure: Default, Interpolation and Extrapolation with intervals, beside the
+//! paper's numbers.
 
 use perturb_experiment::{Selection, distinct};
 use perturb_records::statistics::Bootstrapped;
@@ -7,24 +8,25 @@ use perturb_text::{Table, count};
 
 use super::columns::MethodColumns;
 use super::numbers::{AVERAGE, MethodMetrics, or_empty};
-use super::pictures::{Drawing, Picture};
+use super::pictures::{Picture, PictureDrawing};
 use super::{MISSING, Report};
 use crate::plot::intervals::{Group, IntervalRow};
-use crate::plot::{Intervals, panels};
+use crate::plot::{IntervalPlot, panels};
 
 impl<'a> Report<'a> {
-    /// What the page opens with: all environments together; where nothing can be said of these, or there is one alone, each.
+    /// Returns the first pictures of the page: one of all environments together, or one for each environment if there
+    /// is only one or the average is not known.
     pub(super) fn finding_pictures(&self) -> Vec<Picture> {
         self.opening_rows().into_iter().map(|rows| self.finding_picture(rows)).collect()
     }
 
-    /// The same in words: a sentence or two for each picture.
+    /// Returns a sentence or two for each of these pictures.
     pub(super) fn finding_sentences(&self) -> Vec<String> {
         let rows = self.opening_rows().into_iter();
         rows.filter_map(|rows| Some(format!("{}: {}", self.finding_of(rows), finding_sentence(rows)?))).collect()
     }
 
-    /// Of each environment, where the page opens with all together.
+    /// Returns the pictures of each environment, if the page begins with all together.
     pub(super) fn environment_pictures(&self) -> Vec<Picture> {
         if !self.has_average() {
             return Vec::new();
@@ -44,7 +46,7 @@ impl<'a> Report<'a> {
         self.metrics.chunk_by(|a, b| a.environment == b.environment)
     }
 
-    /// What rows are of: an environment, or the average of several.
+    /// Returns the name of the rows' environment, or of the average of several.
     fn finding_of(&self, rows: &[MethodMetrics<'_>]) -> String {
         if rows[0].environment != AVERAGE {
             return rows[0].environment.to_owned();
@@ -84,7 +86,7 @@ impl<'a> Report<'a> {
             name: metric.to_string(),
             rows: rows.iter().map(|row| self.finding_row(row, metric)).collect(),
         };
-        let drawing = Intervals {
+        let drawing = IntervalPlot {
             title: format!("{of}: where policies were trained, and elsewhere"),
             x_name: "success rate, %".into(),
             x: panels::RATES,
@@ -105,7 +107,7 @@ impl<'a> Report<'a> {
             ),
             data: finding_table(&format!("{file}.csv"), &rows.iter().collect::<Vec<_>>()),
             file,
-            drawing: Drawing::Intervals(drawing),
+            drawing: PictureDrawing::Intervals(drawing),
         }
     }
 
@@ -120,9 +122,10 @@ impl<'a> Report<'a> {
     }
 }
 
-/// Who extrapolates best, by how much, and what Extrapolation is beside Default; `None` if no method has it. Those whose
-/// numbers are written alike are first together, and none is best. A number of one run alone says so, and where
-/// there is one, nothing is called best. Of the random policy, which has learned nothing that could be lost, nothing is said.
+/// Names the method that extrapolates best, its lead, and its Extrapolation relative to Default. Returns `None` if no
+/// method has Extrapolation. Methods whose rounded numbers are equal share the first place, and none is called best. A
+/// number of one run is marked, and then no method is called best. The random policy is left out, since it has learned
+/// nothing.
 fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     let learned: Vec<_> = rows.iter().filter(|row| !row.method.is_random()).collect();
     let mean = |row: &MethodMetrics<'_>, metric| row.means.get(&metric).copied();
@@ -169,7 +172,8 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     ))
 }
 
-/// Whose Extrapolation is 0 although it has successes elsewhere, and by what; empty if it is so of none.
+/// Names the methods whose Extrapolation is 0 although they have successes elsewhere, with the responsible scenarios.
+/// Empty if there are none.
 fn zero_sentence<'a, 'm: 'a>(rows: impl Iterator<Item = &'a MethodMetrics<'m>>) -> String {
     let by = |row: &MethodMetrics<'_>| {
         let zeros: Vec<String> = row.zeros.iter().map(Scenario::to_string).collect();
@@ -190,7 +194,7 @@ fn shown(mean: Bootstrapped) -> String {
     }
 }
 
-/// As it is shown, without a negative zero.
+/// Rounds to the shown digits, without a negative zero.
 fn rounded(points: f64) -> f64 {
     (10.0 * points).round() / 10.0 + 0.0
 }
@@ -201,7 +205,7 @@ fn finding_table(name: &str, rows: &[&MethodMetrics<'_>]) -> Table {
     let end = move |line: &(&MethodMetrics<'_>, Metric), which: usize| {
         or_empty(mean(line).and_then(|mean| Some(mean.interval_95?[which])))
     };
-    Table::of(name, &lines)
+    Table::builder(name, &lines)
         .text("environment", |(row, _)| row.environment)
         .method(|(row, _)| &row.method)
         .text("metric", |(_, metric)| metric)
@@ -213,7 +217,7 @@ fn finding_table(name: &str, rows: &[&MethodMetrics<'_>]) -> Table {
         .build()
 }
 
-/// Which numbers have no interval; `None` if all have.
+/// Names the numbers that have no interval; `None` if all have one.
 fn too_few(rows: &[MethodMetrics<'_>]) -> Option<String> {
     let all: Vec<&Bootstrapped> = rows.iter().flat_map(|row| row.means.values()).collect();
     let without: Vec<_> = all.iter().filter(|mean| mean.interval_95.is_none()).collect();
@@ -226,7 +230,7 @@ fn too_few(rows: &[MethodMetrics<'_>]) -> Option<String> {
     }
 }
 
-/// As a sentence has them.
+/// Joins names for a sentence.
 pub(super) fn listed(names: &[impl AsRef<str>]) -> String {
     match names {
         [] => MISSING.to_owned(),

@@ -42,13 +42,13 @@ fn written(table: &Table, columns: &[&str]) -> Vec<Vec<String>> {
     rows
 }
 
-fn intervals(picture: &Picture) -> &Intervals {
-    let Drawing::Intervals(intervals) = &picture.drawing else { unreachable!("numbers with intervals") };
+fn intervals(picture: &Picture) -> &IntervalPlot {
+    let PictureDrawing::Intervals(intervals) = &picture.drawing else { unreachable!("numbers with intervals") };
     intervals
 }
 
 #[test]
-fn the_findings_numbers_are_those_of_the_tables_and_of_what_is_drawn() {
+fn finding_numbers_match_tables_and_pictures() {
     with_report(&plan("'CartPole', 'Pendulum'", 5), |report| {
         let file = |name: &str| report.files().into_iter().find(|file| file.title == name).unwrap();
         let (finding, metrics) = (file("finding.csv"), file("metrics.csv"));
@@ -193,7 +193,7 @@ fn of_one_run_nothing_is_claimed(#[case] rows: &[(&str, f64, f64)], #[case] runs
     is: for ppo ff (paper) DE and RE.")]
 #[case::by_all([[90.0, 0.0, 0.0], [90.0, 60.0, 0.0]], "CartPole: of 2 methods none extrapolates: each has Extrapolation of 0.0 %. \
     Extrapolation less Default is -90.0 to +0.0 points.")]
-fn a_geometric_mean_that_is_0_because_one_of_its_three_is_says_so(#[case] rates: [[f64; 3]; 2], #[case] said: &str) {
+fn zero_geometric_mean_is_explained(#[case] rates: [[f64; 3]; 2], #[case] said: &str) {
     let [on_d, on_r] = rates;
     let plan = plan("'CartPole'", 2);
     let results = fixture::results(&plan, |cell| {
@@ -205,7 +205,7 @@ fn a_geometric_mean_that_is_0_because_one_of_its_three_is_says_so(#[case] rates:
 }
 
 #[test]
-fn the_page_opens_with_title_plan_shared_settings_and_the_finding() {
+fn page_begins_with_title_plan_settings_finding() {
     let page = |plan: &Plan| with_report(plan, |report| html(report, &Figures::draw(report, &[], &[]).unwrap()));
     let of_plan = plan("'CartPole'", 4);
     let opened = page(&of_plan);

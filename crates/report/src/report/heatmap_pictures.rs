@@ -18,20 +18,20 @@ use super::figure::{Figure, FigureData};
 use super::pictures::file_name;
 use crate::plot::{HeatmapColumn, HeatmapPanels, PlotError, common_returns, save, svg};
 
-/// What a method's policies do over two parameters: a column for each thing that they were trained on, the mean over runs.
+/// A method's heatmaps over two parameters, with a column for each training distribution. Each is the mean over runs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeatmapPicture {
     /// The environment's name.
     pub environment: String,
-    /// What its files are called, without their endings.
+    /// The names of the files, without extension.
     pub file: String,
     /// A few words for those who do not see it.
     pub name: String,
-    /// What it shows, or why it is missing.
+    /// The caption, or the reason why the picture is missing.
     pub caption: String,
     /// `None` if nothing is there.
     pub panels: Option<HeatmapPanels>,
-    /// What is shown, as `FILE.csv`.
+    /// The numbers, as `FILE.csv`.
     pub figures: Table,
     /// Heatmaps that it could be of.
     pub wanted: usize,
@@ -44,13 +44,13 @@ struct Draft<'a> {
     environment: &'a str,
     method: &'a Method,
     kind: Option<&'a HeatmapKind>,
-    columns: Vec<Column<'a>>,
+    columns: Vec<PictureColumn<'a>>,
 }
 
 /// The policies that were trained on the same.
-struct Column<'a> {
+struct PictureColumn<'a> {
     trained_on: TrainedOn<'a>,
-    /// Policies that there are, with a heatmap or without.
+    /// Number of policies, with and without a heatmap.
     policies: usize,
     origins: Vec<Origin>,
     missing: Vec<(u32, NoHeatmap)>,
@@ -59,22 +59,22 @@ struct Column<'a> {
 
 /// A policy's heatmap, or why there is none.
 #[derive(Clone)]
-struct Shown<'a> {
+struct ShownPolicy<'a> {
     trained_on: TrainedOn<'a>,
     run: u32,
     content: Result<(Heatmap, Origin), NoHeatmap>,
 }
 
-/// How a heatmap was made.
+/// The origin of a heatmap.
 #[derive(Clone)]
 struct Origin {
     seed: u64,
-    /// Of the program; `None` if that is not known.
+    /// The program's version and commit; `None` if it is not known.
     commit: Option<String>,
 }
 
-/// Those of the cells that belong to `selections`, which are in `folder`, and of the agents among them that were trained
-/// elsewhere; without pictures where cells have none.
+/// Returns the pictures of the cells in `folder` that belong to `selections`, and of externally trained agents among
+/// them. Without heatmaps of cells there are no pictures.
 ///
 /// # Errors
 /// [`FolderError`] if a file is there that cannot be read.
@@ -100,11 +100,11 @@ pub fn heatmap_pictures(
         for kind in kinds {
             for places in places.chunk_by(|a, b| a.method == b.method) {
                 let shown = places.iter().map(|place| shown(place, folder, kind)).collect::<Result<Vec<_>, _>>()?;
-                drafts.push(Draft::of((environment, places[0].method), kind, shown));
+                drafts.push(Draft::new((environment, places[0].method), kind, shown));
             }
             for (method, shown) in &elsewhere {
                 let shown = shown.iter().filter(|(of, _)| Some(of) == kind).map(|(_, shown)| shown.clone());
-                drafts.push(Draft::of((environment, method), kind, shown.collect()));
+                drafts.push(Draft::new((environment, method), kind, shown.collect()));
             }
         }
         drafts.retain(|draft| !draft.columns.is_empty());
@@ -120,25 +120,25 @@ fn shown<'a>(
     place: &HeatmapPlace<'a>,
     folder: Option<&Folder>,
     kind: Option<&HeatmapKind>,
-) -> Result<Shown<'a>, FolderError> {
+) -> Result<ShownPolicy<'a>, FolderError> {
     let read = match folder.zip(kind) {
         Some((folder, kind)) => place.read(folder, kind)?,
         None => Err(if place.selected.is_some() { NoHeatmap::NotMade } else { NoHeatmap::NoResult }),
     };
     let origin = |record: HeatmapRecord| Origin { seed: record.options.seed, commit: Some(record.commit) };
     let content = read.map(|stored| (stored.heatmap, origin(stored.record)));
-    Ok(Shown { trained_on: place.trained_on, run: place.run, content })
+    Ok(ShownPolicy { trained_on: place.trained_on, run: place.run, content })
 }
 
 /// The heatmaps of an agent that was trained elsewhere, in the order of cells' ones; of a row of cells none.
-fn shown_elsewhere<'a>(row: &MethodResults<'a>) -> Vec<(HeatmapKind, Shown<'a>)> {
+fn shown_elsewhere<'a>(row: &MethodResults<'a>) -> Vec<(HeatmapKind, ShownPolicy<'a>)> {
     let mut all = Vec::new();
     for (&run, of_run) in &row.runs {
         for (&trained_on, reported) in &of_run.selected {
-            let Some(Reported::Elsewhere(_, policy)) = reported else { continue };
-            let Some(heatmap) = Heatmap::recorded(&policy.records) else { continue };
+            let Some(Reported::External(_, policy)) = reported else { continue };
+            let Some(heatmap) = Heatmap::from_recorded_test(&policy.records) else { continue };
             let origin = Origin { seed: policy.known.seed, commit: None };
-            all.push((heatmap.kind(), Shown { trained_on, run, content: Ok((heatmap, origin)) }));
+            all.push((heatmap.kind(), ShownPolicy { trained_on, run, content: Ok((heatmap, origin)) }));
         }
     }
     all.sort_by_key(|(_, shown)| (shown.trained_on, shown.run));
@@ -146,15 +146,19 @@ fn shown_elsewhere<'a>(row: &MethodResults<'a>) -> Vec<(HeatmapKind, Shown<'a>)>
 }
 
 impl<'a> Draft<'a> {
-    /// Of policies in the order of what they were trained on.
-    fn of((environment, method): (&'a str, &'a Method), kind: Option<&'a HeatmapKind>, shown: Vec<Shown<'a>>) -> Self {
-        let mut columns: Vec<Column<'a>> = Vec::new();
+    /// Returns a draft of policies, ordered by their training distribution.
+    fn new(
+        (environment, method): (&'a str, &'a Method),
+        kind: Option<&'a HeatmapKind>,
+        shown: Vec<ShownPolicy<'a>>,
+    ) -> Self {
+        let mut columns: Vec<PictureColumn<'a>> = Vec::new();
         // All of a picture have the points of its first.
         let mut first: Option<Heatmap> = None;
         for shown in shown.chunk_by(|a, b| a.trained_on == b.trained_on) {
             let (trained_on, policies) = (shown[0].trained_on, shown.len());
             let (mut origins, mut missing, mut heatmaps) = (Vec::new(), Vec::new(), Vec::new());
-            for Shown { run, content, .. } in shown.iter().cloned() {
+            for ShownPolicy { run, content, .. } in shown.iter().cloned() {
                 match content {
                     Ok((heatmap, origin)) => {
                         let alike = [first.get_or_insert_with(|| heatmap.clone()).clone(), heatmap.clone()];
@@ -168,7 +172,7 @@ impl<'a> Draft<'a> {
                     Err(why) => missing.push((run, why)),
                 }
             }
-            columns.push(Column { trained_on, policies, origins, missing, mean: Heatmap::mean(&heatmaps) });
+            columns.push(PictureColumn { trained_on, policies, origins, missing, mean: Heatmap::mean(&heatmaps) });
         }
         Self { environment, method, kind, columns }
     }
@@ -193,7 +197,7 @@ impl<'a> Draft<'a> {
             title: vec![format!("{environment}, {method}"), format!("{tested} of each policy; {}", heatmap.others())],
             axes: heatmap.axes.clone(),
             returns: returns.clone(),
-            columns: columns.iter().map(Column::panel).collect(),
+            columns: columns.iter().map(PictureColumn::panel).collect(),
         });
         HeatmapPicture {
             environment: (*environment).to_owned(),
@@ -216,7 +220,7 @@ impl<'a> Draft<'a> {
         let origins = || self.columns.iter().flat_map(|column| &column.origins);
         let seeds: BTreeSet<u64> = origins().map(|origin| origin.seed).collect();
         let commits: BTreeSet<&str> = origins().filter_map(|origin| origin.commit.as_deref()).collect();
-        let columns: Vec<String> = self.columns.iter().map(Column::told).collect();
+        let columns: Vec<String> = self.columns.iter().map(PictureColumn::told).collect();
         format!(
             "{of}. Means over runs: {}. {tested} of each policy, test {} {}.{}",
             columns.join("; "),
@@ -228,14 +232,14 @@ impl<'a> Draft<'a> {
 
     /// A line for each column and point.
     fn figures(&self) -> Table {
-        let of_column = |column: &'_ Column<'a>| {
+        let of_column = |column: &'_ PictureColumn<'a>| {
             let (trained_on, runs) = (column.trained_on.to_string(), column.origins.len());
             let points = column.mean.iter().flat_map(|mean| mean.points.clone());
             points.map(move |point| (trained_on.clone(), runs, point)).collect::<Vec<_>>()
         };
         let lines: Vec<(String, usize, HeatmapPoint)> = self.columns.iter().flat_map(of_column).collect();
         let [x, y] = self.kind.map_or_else(Default::default, |kind| kind.parameters.clone());
-        Table::of(self.environment, &lines)
+        Table::builder(self.environment, &lines)
             .text("train", |(trained_on, ..)| trained_on)
             .number("runs", |(_, runs, _)| runs)
             .number(x, |(.., point)| point.x)
@@ -246,13 +250,13 @@ impl<'a> Draft<'a> {
     }
 }
 
-impl Column<'_> {
+impl PictureColumn<'_> {
     fn panel(&self) -> HeatmapColumn {
         let content = self.mean.clone().ok_or_else(|| said(self.missing.iter()));
         HeatmapColumn { caption: format!("trained on {}, {}", self.trained_on, self.runs()), content }
     }
 
-    /// How many runs are there.
+    /// Returns the number of runs in words.
     fn runs(&self) -> String {
         match (self.origins.len(), self.policies) {
             (there, all) if there == all => count(all, "run"),
@@ -271,7 +275,7 @@ impl Column<'_> {
 }
 
 impl HeatmapPicture {
-    /// As the page shows it.
+    /// Returns the figure for the page.
     pub(super) fn figure(&self) -> Result<Figure, PlotError> {
         let Self { environment, file, name, caption, panels, figures, .. } = self.clone();
         let picture = match panels {

@@ -1,6 +1,6 @@
 use perturb_experiment::{Cell, Plan, add_assessed, store_heatmap};
 use perturb_protocol::Version;
-use perturb_records::{Assessed, AssessedPolicy, HeatmapOptions, RecordedTest};
+use perturb_records::{ExternalEvaluation, ExternalPolicy, HeatmapOptions, RecordedTest};
 use perturb_settings::sets::{Context, Contexts, TestSet};
 
 use super::*;
@@ -104,7 +104,7 @@ fn a_picture_is_of_the_mean_over_runs_and_says_how_many() {
 }
 
 #[test]
-fn returns_have_the_environments_scale_or_that_of_all_that_is_shown_of_another() {
+fn returns_use_the_environments_scale() {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
     let of = |cell: &Cell| match cell.config.common.environment.as_str() {
         "Pendulum" if cell.method().algorithm == "a2c" => -1600.0,
@@ -138,7 +138,7 @@ fn returns_have_the_environments_scale_or_that_of_all_that_is_shown_of_another()
 }
 
 #[test]
-fn only_heatmaps_of_the_same_points_and_as_many_episodes_are_in_a_mean() {
+fn mean_needs_equal_points_and_episodes() {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
     let first = fixture::heatmap(2, |_, _| (0.0, 0.0));
     for other in [fixture::heatmap(3, |_, _| (9.0, 9.0)), Heatmap { episodes: 5, ..first.clone() }] {
@@ -171,24 +171,24 @@ fn of_an_experiment_without_heatmaps_it_is_said_why() {
 
 /// An agent whose policies were tested over mass and length, four episodes a point: of each what it was trained on, and how
 /// many of the four were successes.
-fn agent(policies: &[(Version, u32)]) -> Assessed {
+fn agent(policies: &[(Version, u32)]) -> ExternalEvaluation {
     let trained_on: Vec<_> = policies.iter().map(|(version, _)| Some(*version)).collect();
     let tested = fixture::assessed("pushes", "Pendulum", &trained_on, [1; 3]);
-    let with_heatmap = |(policy, (_, successes)): (&AssessedPolicy, &(Version, u32))| {
+    let with_heatmap = |(policy, (_, successes)): (&ExternalPolicy, &(Version, u32))| {
         let axes = fixture::heatmap(2, |_, _| (0.0, 0.0)).axes;
         let contexts = Contexts::Listed(Heatmap::contexts(&axes, 2, &Context::new()));
         let set = TestSet { name: Heatmap::SET.into(), version: Version::D, contexts };
         let mut records = policy.records.clone();
         let episode = |index| fixture::episode(Heatmap::SET, index, 0.0, 1, index / 4 < *successes);
         records.add(RecordedTest { set, seed: 9, axes: Some(axes) }, (0..16).map(episode).collect());
-        AssessedPolicy::new(policy.known.clone(), records)
+        ExternalPolicy::new(policy.known.clone(), records)
     };
     let policies = tested.policies().iter().zip(policies).map(with_heatmap).collect();
-    Assessed::new(tested.name.clone(), tested.agent.clone(), policies).unwrap()
+    ExternalEvaluation::new(tested.name.clone(), tested.agent.clone(), policies).unwrap()
 }
 
 #[test]
-fn agents_that_were_trained_elsewhere_have_pictures_beside_cells_ones() {
+fn external_agents_have_heatmap_pictures() {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
     let directory = folder(&plan, |cell| is_of(cell, "Pendulum", "a2c").then(|| trained(cell)));
     let results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
@@ -215,7 +215,7 @@ fn agents_that_were_trained_elsewhere_have_pictures_beside_cells_ones() {
     // What was tested on other sets has none.
     let mut others = assessed[1].policies()[0].clone();
     others.records.about.tests.iter_mut().for_each(|test| test.axes = None);
-    let others = [Assessed::new(String::new(), "other".into(), vec![others]).unwrap()];
+    let others = [ExternalEvaluation::new(String::new(), "other".into(), vec![others]).unwrap()];
     let mut selections = Vec::new();
     add_assessed(&mut selections, &others);
     assert_eq!(heatmap_pictures(&selections, None).unwrap(), []);

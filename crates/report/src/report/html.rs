@@ -26,10 +26,10 @@ const WORST: &str = "Mean return of the worst tenth of a test's episodes, and su
 const FOOTING: &str = "How long the selected trainings were, of all environments together, and the success rate in training \
                        after as many steps, and as many episodes, as the trainings of all methods have.";
 const SCENARIOS: &str = "The darker, the higher the success rate.";
-/// A text of so many bytes is broken into lines.
+/// Length from which a text is broken into lines, bytes.
 const LONG: usize = 60;
 
-/// What has a heading, and a place in the list of contents.
+/// A section with a heading and an entry in the list of contents.
 struct Section {
     id: &'static str,
     title: &'static str,
@@ -259,7 +259,7 @@ fn cell(entry: &Entry, column: &Column, starts: bool, shaded: bool) -> Markup {
     html! { td class=[class] style=[style] { (entry.text) } }
 }
 
-/// Those names that apply; `None` if none does.
+/// Returns the names that apply; `None` if none does.
 fn classes(names: &[(&str, bool)]) -> Option<String> {
     let applying: Vec<&str> = names.iter().filter(|(_, applies)| *applies).map(|(name, _)| *name).collect();
     (!applying.is_empty()).then(|| applying.join(" "))
@@ -313,7 +313,7 @@ fn prose(text: &str) -> Markup {
     html! { @for (i, part) in text.split('`').enumerate() { @if i % 2 == 1 { code { (part) } } @else { (part) } } }
 }
 
-/// What comes before a title's details.
+/// Returns the part of a title before its details.
 fn short(title: &str) -> &str {
     let end = [": ", " over "].iter().filter_map(|separator| title.find(separator)).min();
     &title[..end.unwrap_or(title.len())]

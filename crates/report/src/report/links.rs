@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-/// What stands for itself in an address; everything else is written in hexadecimal digits.
+/// Characters that are not encoded in an address. All others are written in hexadecimal digits.
 const PLAIN: &[u8] = b"-_.~!*'();:@=+$,/?";
 
 /// An address that has `content` in it.

@@ -7,91 +7,92 @@ mod columns;
 mod comparisons;
 mod csv;
 mod curves;
-mod elsewhere;
-mod facts;
+mod external;
 mod figure;
 mod figures;
 mod finding;
-mod footing;
-mod gains;
 mod heatmap_pictures;
 mod html;
+mod index;
 mod links;
+mod metadata;
 mod numbers;
+mod paired_difference;
 mod pictures;
 mod profiles;
-mod scope;
+mod sample_efficiency;
 mod settings;
 mod sources;
 mod sweep_pictures;
 mod sweeps;
 mod tables;
+mod tail_risk;
 mod tested;
-mod worst;
 
 use std::collections::BTreeSet;
 
-use crate::against_training::{MarkTest, against_training};
-use comparisons::Comparison;
-use elsewhere::Elsewhere;
-use footing::Trainings;
-use gains::Gain;
+use crate::generalization_curves::{GeneralizationPoint, generalization_curves};
+use comparisons::MethodComparison;
+use external::ExternalRow;
+use index::ReportIndex;
 use numbers::{MethodMetrics, SetTest};
+use paired_difference::PairedDifference;
 use profiles::Profile;
-use scope::Scope;
+use sample_efficiency::SampleEfficiency;
 use settings::{GridTests, grid_tests};
-use sweeps::{AtParameter, AtThreshold, Swept};
-use worst::Worst;
+use sweeps::{AtParameter, AtThreshold, SweepPoint};
+use tail_risk::TailRisk;
 
+pub use csv::old_file_name;
 pub use curves::curves_table;
 pub use figure::{Figure, FigureData};
 pub use figures::Figures;
 pub use heatmap_pictures::{HeatmapPicture, heatmap_pictures, save_heatmaps};
 pub use html::html;
 use perturb_experiment::{
-    Cell, EnvironmentCurves, Failure, MethodResults, Plan, Recorded, Reported, Reselection, Results, Selected,
-    Selection, Tuned, elsewhere as elsewhere_in,
+    Cell, EnvironmentCurves, Failure, MethodResults, Plan, Recorded, Reported, Results, Selected, Selection,
+    SelectionBootstrap, Tuned, elsewhere as elsewhere_in,
 };
 use perturb_text::{Table, count};
-pub use pictures::{Drawing, Picture};
-pub use sources::{ReportError, Sources, Whole};
+pub use pictures::{Picture, PictureDrawing};
+pub use sources::{ReportBundle, ReportError, ReportInputs};
 
 /// The paper's budgets.
 const PAPER_EPISODES: u64 = 15_000;
 const PAPER_TEST_EPISODES: u64 = 1000;
-/// What stands for a number that there is not.
+/// The text for a missing number.
 const MISSING: &str = "missing";
 
-/// What is reported of an experiment.
+/// The report of an experiment.
 pub struct Report<'a> {
     plan: &'a Plan,
-    scope: Scope<'a>,
+    scope: ReportIndex<'a>,
     selections: &'a [MethodResults<'a>],
     /// Sentences, with `names` between backticks.
     overview: Vec<String>,
     metrics: Vec<MethodMetrics<'a>>,
     averages: Vec<MethodMetrics<'a>>,
-    comparisons: Vec<Comparison>,
-    gains: Vec<Gain<'a>>,
+    comparisons: Vec<MethodComparison>,
+    gains: Vec<PairedDifference<'a>>,
     profiles: Vec<Profile>,
-    worst: Vec<Worst<'a>>,
-    over_parameters: Vec<Swept<'a, AtParameter<'a>>>,
-    over_thresholds: Vec<Swept<'a, AtThreshold<'a>>>,
+    worst: Vec<TailRisk<'a>>,
+    over_parameters: Vec<SweepPoint<'a, AtParameter<'a>>>,
+    over_thresholds: Vec<SweepPoint<'a, AtThreshold<'a>>>,
     set_tests: Vec<SetTest<'a>>,
-    trainings: Vec<Trainings<'a>>,
-    /// Of policies of earlier moments, and at the end; nothing without `evaluate_at`.
-    marks: Vec<MarkTest<'a>>,
-    /// Of every point of a grid.
+    trainings: Vec<SampleEfficiency<'a>>,
+    /// Tests of intermediate and final policies; empty without `evaluate_at`.
+    marks: Vec<GeneralizationPoint<'a>>,
+    /// Tests of every point of a grid.
     grid_tests: GridTests<'a>,
     /// By the clean rule, what was selected; otherwise nothing.
     tuned: Vec<Tuned<'a>>,
     failures: Vec<&'a Failure>,
-    elsewhere: Vec<Elsewhere<'a>>,
+    elsewhere: Vec<ExternalRow<'a>>,
 }
 
 impl<'a> Report<'a> {
-    /// Of `results`, from which `selections` were made, and of what is there of these: recorded episodes and training
-    /// `curves`.
+    /// Returns the report of `results`. `selections` were made from them, and `recorded` and `curves` are their
+    /// recorded episodes and training curves.
     pub fn new(
         results: &'a Results<'a>,
         selections: &'a [MethodResults<'a>],
@@ -100,32 +101,32 @@ impl<'a> Report<'a> {
     ) -> Self {
         let plan = results.plan;
         let tuned = if plan.selection == Selection::Clean { results.tuned() } else { Vec::new() };
-        let scope = Scope::of(plan, selections);
-        let averages = numbers::averages(&scope, selections, &Reselection::of(results));
+        let scope = ReportIndex::new(plan, selections);
+        let averages = numbers::averages(&scope, selections, &SelectionBootstrap::new(results));
         Self {
             plan,
             selections,
             overview: overview(results, selections, recorded, &tuned),
             metrics: numbers::metrics(selections),
             comparisons: comparisons::comparisons(&scope, selections),
-            gains: gains::gains(&scope, selections),
+            gains: paired_difference::gains(&scope, selections),
             profiles: profiles::profiles(&scope, selections, &averages),
             averages,
-            worst: worst::worst(&scope, selections, recorded),
+            worst: tail_risk::worst(&scope, selections, recorded),
             over_parameters: sweeps::over_parameters(&scope, selections, recorded),
             over_thresholds: sweeps::over_thresholds(&scope, selections, recorded),
-            trainings: footing::trainings(selections, curves),
+            trainings: sample_efficiency::trainings(selections, curves),
             set_tests: numbers::set_tests(&scope, selections),
-            marks: against_training(selections),
+            marks: generalization_curves(selections),
             grid_tests: grid_tests(results),
             tuned,
             failures: results.failures().collect(),
-            elsewhere: elsewhere::all(selections),
+            elsewhere: external::all(selections),
             scope,
         }
     }
 
-    /// For a terminal of so many columns, without what goes into details; `report.md` has them.
+    /// Renders the tables for a terminal of `width` columns, without details. `report.md` has the details.
     pub fn text(&self, width: usize) -> String {
         let tables = self.number_tables().chain(self.failure_table()).chain(self.elsewhere_table());
         let shown = tables.map(|table| format!("\n{}\n{}\n", table.title, table.to_text_within(width)));
@@ -143,7 +144,7 @@ impl<'a> Report<'a> {
         format!("# Results\n\n{}\n{}", self.opening().join("\n\n"), shown.collect::<String>())
     }
 
-    /// What was found, and of what.
+    /// Returns the sentences with the main result and its scope.
     fn opening(&self) -> Vec<String> {
         self.finding_sentences().into_iter().chain(self.overview.iter().cloned()).collect()
     }
@@ -177,10 +178,10 @@ fn overview(
         lines.extend(selected(tuned));
         lines.extend(budgets(results.plan));
     }
-    lines.extend(elsewhere::overview(results, selections));
+    lines.extend(external::overview(results, selections));
     let incomplete = selections.iter().filter(|selection| selection.done < selection.cells).count();
     if incomplete > 0 {
-        let rows = selections.iter().filter(|row| !row.method.elsewhere).count();
+        let rows = selections.iter().filter(|row| !row.method.external).count();
         let (lack, their) = if incomplete == 1 { ("lacks", "its") } else { ("lack", "their") };
         let selected = match results.plan.selection {
             Selection::Paper if results.plan.selects() => {
@@ -251,7 +252,7 @@ fn range(cells: &[Cell], of: fn(&Cell) -> u64) -> String {
     }
 }
 
-/// What is to be known of the selected configurations beside their numbers.
+/// Returns notes about the selected configurations.
 fn selected(tuned: &[Tuned<'_>]) -> Vec<String> {
     let all = tuned.len();
     let name = |tuned: &Tuned<'_>| format!("{} {} on {}", tuned.environment, tuned.method, tuned.trained_on);
@@ -272,7 +273,7 @@ fn selected(tuned: &[Tuned<'_>]) -> Vec<String> {
     told.map(|(what, names)| format!("{} of {all} selections {what}: {}.", names.len(), names.join(", "))).collect()
 }
 
-/// How far requested and applied parameters agreed in all tests.
+/// Describes the check of requested and applied parameters in all tests.
 fn agreement(results: &Results<'_>, selections: &[MethodResults<'_>]) -> Option<String> {
     let of_cells: u64 = results.done().flat_map(|result| result.results.values()).map(|test| test.episodes).sum();
     let others: Vec<_> = elsewhere_in(selections).into_iter().map(|(_, policy, _)| &policy.records).collect();

@@ -3,22 +3,22 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use perturb_experiment::{
-    MethodResults, Reselection, SelectedRun, TieRange, average, average_tie_range, interquartile, scores,
+    MethodResults, SelectedRun, SelectionBootstrap, TieRange, average, average_tie_range, interquartile, scores,
 };
 use perturb_records::outcomes::Counted;
 use perturb_records::statistics::{Bootstrapped, Summary, interquartile_mean, mean_with_t_interval, optimality_gap};
 use perturb_records::{Metric, Scenario, TestResult, TrainedOn, paper};
 use perturb_settings::Method;
 
-use super::scope::{Scope, has_scenarios, version};
+use super::index::{ReportIndex, has_scenarios, version};
 
 /// Resamples of a bootstrap, as many as rliable takes.
 const RESAMPLES: usize = 50_000;
-/// Of one that selects anew, hundreds of times in each of them.
-const RESELECTIONS: usize = 10_000;
+/// Number of bootstrap resamples with a selection in each, which costs hundreds of times more.
+const N_BOOTSTRAP_SELECTION: usize = 10_000;
 /// The best success rate, %, from which the optimality gap is.
-const BEST: f64 = 100.0;
-/// What stands for all environments together, here and in the paper.
+const MAX_SUCCESS: f64 = 100.0;
+/// The name of all environments together, here and in the paper.
 pub(super) const AVERAGE: &str = "Average";
 
 /// A method's metrics in an environment, or over all; a metric that is not known is not there.
@@ -26,18 +26,18 @@ pub(super) struct MethodMetrics<'a> {
     pub(super) environment: &'a str,
     pub(super) method: Method,
     pub(super) ours: BTreeMap<Metric, Summary>,
-    /// How far `ours` depend on the choice among tied configurations.
+    /// The range of `ours` over the choices among tied configurations.
     pub(super) ties: BTreeMap<Metric, TieRange>,
     pub(super) papers: BTreeMap<Metric, Summary>,
     /// Whether one can be compared with the other.
     pub(super) comparable: bool,
     /// The means of `ours` again, with intervals where there are enough runs for one.
     pub(super) means: BTreeMap<Metric, Bootstrapped>,
-    /// Of the three that Extrapolation is the geometric mean of, those that alone make it 0 in a run.
+    /// Scenarios that alone make Extrapolation 0 in a run.
     pub(super) zeros: BTreeSet<Scenario>,
-    /// Of all environments only.
+    /// Interquartile means, over all environments only.
     pub(super) iqms: BTreeMap<Metric, Bootstrapped>,
-    /// Likewise.
+    /// Optimality gaps, over all environments only.
     pub(super) gaps: BTreeMap<Metric, Bootstrapped>,
     /// Both once more, with every selection made anew in each resample.
     pub(super) reselected: BTreeMap<Metric, [Bootstrapped; 2]>,
@@ -62,18 +62,18 @@ impl MethodMetrics<'_> {
         Some(self.ours.get(&metric)?.mean - self.papers.get(&metric)?.mean)
     }
 
-    /// How many runs all metrics have.
+    /// Returns the number of runs that have all metrics.
     pub(super) fn runs(&self) -> usize {
         least(|metric| self.ours.get(&metric).map(|summary| summary.runs))
     }
 
-    /// How many runs all interquartile means have.
+    /// Returns the number of runs that have all interquartile means.
     pub(super) fn iqm_runs(&self) -> usize {
         least(|metric| self.iqms.get(&metric).map(|iqm| iqm.runs))
     }
 }
 
-/// Of each selection.
+/// Returns the metrics of each selection.
 pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics<'a>> {
     let of_selection = |selection: &MethodResults<'a>| MethodMetrics {
         environment: selection.environment,
@@ -95,9 +95,9 @@ pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics
 
 /// Averaged over the plan's environments.
 pub(super) fn averages<'a>(
-    scope: &Scope<'_>,
+    scope: &ReportIndex<'_>,
     selections: &[MethodResults<'a>],
-    reselection: &Reselection<'a>,
+    reselection: &SelectionBootstrap<'a>,
 ) -> Vec<MethodMetrics<'static>> {
     let environments = &scope.averaged;
     let is_everywhere = |method: &Method| {
@@ -108,10 +108,10 @@ pub(super) fn averages<'a>(
         let is_averaged = |row: &&MethodResults<'_>| environments.contains(&row.environment);
         let found: Vec<_> = selections.iter().filter(|row| row.method == method).filter(is_averaged).collect();
         let everywhere = is_everywhere(&method);
-        let gap = |strata: &[Vec<f64>]| optimality_gap(strata, BEST);
+        let gap = |strata: &[Vec<f64>]| optimality_gap(strata, MAX_SUCCESS);
         let both = |strata: &[Vec<f64>]| vec![interquartile_mean(strata), gap(strata)];
-        let reselected = |metric| reselection.bootstrap(&found, metric, RESELECTIONS, both)?.try_into().ok();
-        let gap = |metric| Bootstrapped::of(&scores(&found, metric), RESAMPLES, 1, gap);
+        let reselected = |metric| reselection.bootstrap(&found, metric, N_BOOTSTRAP_SELECTION, both)?.try_into().ok();
+        let gap = |metric| Bootstrapped::new(&scores(&found, metric), RESAMPLES, 1, gap);
         MethodMetrics {
             environment: AVERAGE,
             ours: known(|metric| average(&found, metric).filter(|_| everywhere)),
@@ -122,19 +122,19 @@ pub(super) fn averages<'a>(
             zeros: zeros(&found),
             iqms: known(|metric| interquartile(&found, metric, RESAMPLES).filter(|_| everywhere)),
             gaps: known(|metric| gap(metric).filter(|_| everywhere)),
-            reselected: known(|metric| reselected(metric).filter(|_| everywhere && !method.elsewhere)),
+            reselected: known(|metric| reselected(metric).filter(|_| everywhere && !method.external)),
             done: found.iter().map(|selection| selection.done).sum(),
             cells: found.iter().map(|selection| selection.cells).sum(),
             method,
         }
     };
     // An agent that was tested in some environments has no average over all.
-    let methods = scope.methods.iter().filter(|method| !method.elsewhere || is_everywhere(method));
+    let methods = scope.methods.iter().filter(|method| !method.external || is_everywhere(method));
     methods.cloned().map(of_method).collect()
 }
 
 /// In the order of `selections`, of what they were trained on, and of the plan's tests.
-pub(super) fn set_tests<'a>(scope: &Scope<'a>, selections: &'a [MethodResults<'a>]) -> Vec<SetTest<'a>> {
+pub(super) fn set_tests<'a>(scope: &ReportIndex<'a>, selections: &'a [MethodResults<'a>]) -> Vec<SetTest<'a>> {
     let mut tests = Vec::new();
     for selection in selections {
         // A run of an agent that was trained elsewhere may lack what another one has.
@@ -143,7 +143,7 @@ pub(super) fn set_tests<'a>(scope: &Scope<'a>, selections: &'a [MethodResults<'a
         for trained_on in trained {
             let is_of_set = !matches!(trained_on, TrainedOn::Version(_));
             let names = scope.tested_on.iter().filter(|name| is_of_set || version(name).is_none());
-            let is_wanted = |test: &SetTest<'_>| !test.method.elsewhere || test.success.is_some();
+            let is_wanted = |test: &SetTest<'_>| !test.method.external || test.success.is_some();
             tests.extend(
                 names
                     .map(|&tested_on| SetTest {
@@ -184,11 +184,11 @@ fn known<T>(of: impl Fn(Metric) -> Option<T>) -> BTreeMap<Metric, T> {
 /// The mean over environments and the runs that all of them have, with its t interval within 0 … 100 %.
 fn mean_with_interval(selections: &[&MethodResults<'_>], metric: Metric) -> Option<Bootstrapped> {
     let mean = mean_with_t_interval(&scores(selections, metric))?;
-    let interval_95 = mean.interval_95.map(|interval| interval.map(|end| end.clamp(0.0, BEST)));
+    let interval_95 = mean.interval_95.map(|interval| interval.map(|end| end.clamp(0.0, MAX_SUCCESS)));
     Some(Bootstrapped { interval_95, ..mean })
 }
 
-/// What has no success in a run where another of the three has.
+/// Returns the scenarios without success in a run where another of the three has some.
 fn zeros(selections: &[&MethodResults<'_>]) -> BTreeSet<Scenario> {
     let of_run = |run: &SelectedRun<'_>| {
         let zero = |scenario: &Scenario| Some((*scenario, run.rate(*scenario)? == 0.0));

@@ -1,4 +1,4 @@
-//! Pictures of a report's numbers, which are drawn for its page and as files of their own.
+//! Pictures of a report's numbers, for its page and as separate files.
 
 use std::path::Path;
 
@@ -10,35 +10,35 @@ use plotters::prelude::{DrawingArea, DrawingBackend};
 
 use super::Report;
 use super::figure::{Figure, FigureData};
-use crate::plot::{Intervals, Panels, Plot, PlotError, save, svg};
+use crate::plot::{IntervalPlot, Panels, Plot, PlotError, save, svg};
 
 /// A picture.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Picture {
-    /// What it is of; empty if of all environments.
+    /// The environment; empty for all together.
     pub environment: String,
-    /// What its files are called, without their endings.
+    /// The names of the files, without extension.
     pub file: String,
     /// A few words for those who do not see it.
     pub name: String,
-    /// What it shows.
+    /// The caption.
     pub caption: String,
-    /// What is drawn.
-    pub drawing: Drawing,
+    /// The drawing.
+    pub drawing: PictureDrawing,
     /// The numbers of it.
     pub data: Table,
 }
 
-/// What is drawn of a report's numbers.
+/// A drawing of a report's numbers.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Drawing {
+pub enum PictureDrawing {
     /// Lines.
     Panels(Panels),
     /// Numbers with intervals.
-    Intervals(Intervals),
+    Intervals(IntervalPlot),
 }
 
-impl Plot for Drawing {
+impl Plot for PictureDrawing {
     fn height(&self) -> u32 {
         match self {
             Self::Panels(panels) => panels.height(),
@@ -55,7 +55,7 @@ impl Plot for Drawing {
 }
 
 impl Picture {
-    /// As the page shows it.
+    /// Returns the figure for the page.
     pub(super) fn figure(&self) -> Result<Figure, PlotError> {
         let Self { environment, file, name, caption, drawing, data } = self.clone();
         let picture = FigureData::Svg { svg: svg(&drawing)?, csv: data.to_csv() };

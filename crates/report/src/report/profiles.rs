@@ -8,10 +8,10 @@ use perturb_text::Table;
 
 use super::Report;
 use super::columns::MethodColumns;
+use super::index::ReportIndex;
 use super::numbers::MethodMetrics;
-use super::pictures::{Drawing, Picture};
-use super::scope::Scope;
-use crate::plot::panels::{Panel, PanelLine, PanelPoint, Panels, RATES, index_of};
+use super::pictures::{Picture, PictureDrawing};
+use crate::plot::panels::{PanelLine, PanelPoint, Panels, PlotPanel, RATES, index_of};
 
 /// Resamples of the bootstrap.
 const RESAMPLES: usize = 10_000;
@@ -26,9 +26,9 @@ pub(super) struct Profile {
     shares: Vec<Bootstrapped>,
 }
 
-/// Of the methods that have runs in all environments over which is averaged, as `averages` says.
+/// Returns the profiles of the methods in `averages`, which have runs in all averaged environments.
 pub(super) fn profiles(
-    scope: &Scope<'_>,
+    scope: &ReportIndex<'_>,
     selections: &[MethodResults<'_>],
     averages: &[MethodMetrics<'_>],
 ) -> Vec<Profile> {
@@ -53,7 +53,7 @@ impl Report<'_> {
         let end = move |line: &(&Profile, usize), end: usize| {
             number(line).interval_95.map(|interval| interval[end].to_string()).unwrap_or_default()
         };
-        Table::of("profiles.csv", &lines)
+        Table::builder("profiles.csv", &lines)
             .method(|(profile, _)| &profile.method)
             .text("metric", |(profile, _)| profile.metric)
             .number("runs", move |line| number(line).runs)
@@ -76,7 +76,7 @@ impl Report<'_> {
             let index = index_of(methods, &profile.method);
             PanelLine { index, points: profile.shares.iter().enumerate().map(point).collect() }
         };
-        let panel = |metric: Metric| Panel {
+        let panel = |metric: Metric| PlotPanel {
             caption: metric.to_string(),
             x_name: "success rate, %".into(),
             x: 0.0..100.0,
@@ -92,7 +92,7 @@ impl Report<'_> {
             caption: "Performance profiles: the share of runs, over all environments, whose success rate is above that at the \
                       axis. Bands are 95 % stratified bootstrap intervals at each point; there are none of a single run."
                 .into(),
-            drawing: Drawing::Panels(Panels {
+            drawing: PictureDrawing::Panels(Panels {
                 title: "All environments: share of runs above a success rate".into(),
                 panels: Metric::ALL.map(panel).into_iter().filter(|panel| !panel.lines.is_empty()).collect(),
                 legend: methods.iter().map(ToString::to_string).collect(),

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use perturb_checkpoint::Counters;
 use perturb_experiment::{CellFolder, CellState, Folder, read_curves};
 use perturb_protocol::{Version, proto};
-use perturb_records::{About, EpisodeRecord, RecordedTest, Records};
+use perturb_records::{EpisodeRecord, RecordedTest, Records, RecordsMetadata};
 
 use super::*;
 use crate::fixture;
@@ -64,7 +64,7 @@ fn records(cell: &Cell) -> Records {
         step_limit: 500,
         ..Default::default()
     };
-    let mut records = Records::new(About::new(&environment, String::new(), 1));
+    let mut records = Records::new(RecordsMetadata::new(&environment, String::new(), 1));
     for version in Version::ALL {
         let episodes = (0..EPISODES).map(|index| episode(cell, version, index)).collect();
         records.add(RecordedTest { set: version.into(), seed: 7, axes: None }, episodes);
@@ -96,7 +96,7 @@ fn with_report(check: impl Fn(&Report<'_>)) {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
     let results = results(&plan);
     let selections = results.select();
-    let mut recorded = Recorded::of(&selections);
+    let mut recorded = Recorded::new(&selections);
     for (cell, result) in plan.cells.iter().zip(results.done()) {
         recorded.add(result, &records(cell));
     }
@@ -140,12 +140,12 @@ fn the_worst_tenth_is_of_each_test_and_over_runs() {
          ppo ff  D           102.5 ± 42.5  57.0 ± 42.5  29.2 ± 29.2    25.0 ± 25.0      0.0 ± 0.0
          ppo ff  R           102.5 ± 42.5  57.0 ± 42.5  29.2 ± 29.2    25.0 ± 25.0      0.0 ± 0.0
         ");
-        assert_eq!(file(report, "worst.csv").len(), 1 + 2 * 2 * 3);
+        assert_eq!(file(report, "cvar.csv").len(), 1 + 2 * 2 * 3);
     });
 }
 
 #[test]
-fn success_over_a_parameter_has_a_line_for_each_part_of_its_range() {
+fn success_over_parameter_has_a_row_for_each_bin() {
     with_report(|report| {
         let lines = file(report, "parameters.csv");
         let of = |start: &str| lines.iter().filter(|line| line.starts_with(start)).cloned().collect::<Vec<_>>();

@@ -1,5 +1,5 @@
-//! What settings do: tests of every point of a grid, selected or not, by configuration and by the value of each setting
-//! that differs.
+//! Effects of settings: tests of every point of a grid, selected or not, by configuration and by the value of each
+//! setting that differs.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,12 +11,12 @@ use perturb_text::{Table, TableBuilder};
 
 use super::columns::MethodColumns;
 use super::numbers::or_empty;
-use super::pictures::{Drawing, Picture, file_name};
+use super::pictures::{Picture, PictureDrawing, file_name};
 use super::{MISSING, Report};
-use crate::plot::panels::{Panel, PanelLine, PanelPoint, Panels, RATES};
+use crate::plot::panels::{PanelLine, PanelPoint, Panels, PlotPanel, RATES};
 
 /// A method's trainings on something, of all configurations, where there are several.
-struct Grid<'a> {
+struct SettingsGrid<'a> {
     environment: &'a str,
     method: Method,
     trained_on: TrainedOn<'a>,
@@ -57,7 +57,8 @@ pub(super) struct GridTests<'a> {
     pub(super) settings: Vec<GridTest<'a>>,
 }
 
-/// Of the cells of `results` that their plan lists; those of a second stage, which has one configuration, are not among them.
+/// Returns the tests of the cells that the plan lists. Cells of a second stage are left out, since they have one
+/// configuration.
 pub(super) fn grid_tests<'a>(results: &'a Results<'a>) -> GridTests<'a> {
     let mut tests = GridTests::default();
     for grid in grids(results) {
@@ -78,12 +79,12 @@ pub(super) fn grid_tests<'a>(results: &'a Results<'a>) -> GridTests<'a> {
     tests
 }
 
-fn grids<'a>(results: &'a Results<'a>) -> Vec<Grid<'a>> {
-    let mut grids: Vec<Grid<'a>> = Vec::new();
+fn grids<'a>(results: &'a Results<'a>) -> Vec<SettingsGrid<'a>> {
+    let mut grids: Vec<SettingsGrid<'a>> = Vec::new();
     for (cell, state) in results.plan.cells.iter().zip(&results.states).filter(|(cell, _)| cell.tuned_as.is_none()) {
         let (environment, method) = (cell.config.common.environment.as_str(), cell.method());
         let trained_on = cell.trained_on();
-        let is_of = |grid: &&mut Grid<'a>| {
+        let is_of = |grid: &&mut SettingsGrid<'a>| {
             (grid.environment, &grid.method, grid.trained_on) == (environment, &method, trained_on)
         };
         let settings = cell.config.complete_table().into_iter().filter(|(name, _)| name != "seed");
@@ -92,14 +93,14 @@ fn grids<'a>(results: &'a Results<'a>) -> Vec<Grid<'a>> {
         let cell = GridCell { cell, settings, result };
         match grids.iter_mut().find(is_of) {
             Some(grid) => grid.cells.push(cell),
-            None => grids.push(Grid { environment, method, trained_on, cells: vec![cell] }),
+            None => grids.push(SettingsGrid { environment, method, trained_on, cells: vec![cell] }),
         }
     }
     grids.retain(|grid| !grid.varied().is_empty());
     grids
 }
 
-impl<'a> Grid<'a> {
+impl<'a> SettingsGrid<'a> {
     /// Settings that differ between configurations.
     fn varied(&self) -> Vec<&str> {
         let names: BTreeSet<&String> = self.cells.iter().flat_map(|of| of.settings.keys()).collect();
@@ -110,7 +111,7 @@ impl<'a> Grid<'a> {
         names.into_iter().filter(differs).map(String::as_str).collect()
     }
 
-    /// Of `cells`, which have `what` in common, on each set that they are tested on and at each moment.
+    /// Returns the tests of `cells`, which share `what`, on each test set and after each number of episodes.
     fn tests(&self, what: &(String, String), cells: &[&GridCell<'a>]) -> Vec<GridTest<'a>> {
         let budgets: BTreeSet<u64> = cells.iter().map(|of| of.cell.config.common.episodes).collect();
         let one_end = if budgets.len() == 1 { budgets.first().copied() } else { None };
@@ -128,7 +129,7 @@ impl<'a> Grid<'a> {
                 rates.map(|rates| mean(rates.into_iter()))
             };
             let rates: Vec<f64> = runs.iter().filter_map(rate).collect();
-            let Some(success) = Summary::of(&rates) else { continue };
+            let Some(success) = Summary::from_values(&rates) else { continue };
             let over_runs = mean_with_t_interval(&[rates]);
             tests.push(GridTest {
                 environment: self.environment,
@@ -152,7 +153,7 @@ impl<'a> GridCell<'a> {
         self.cell.tests.marks.iter().copied().chain([self.cell.config.common.episodes])
     }
 
-    /// After so many episodes, or at the end.
+    /// Returns the test after `episodes` episodes, or at the end.
     fn test(&self, episodes: Option<u64>, tested_on: &str) -> Option<&'a TestResult> {
         let result = self.result?;
         let mark = episodes.filter(|&episodes| episodes != self.cell.config.common.episodes);
@@ -186,7 +187,7 @@ impl Report<'_> {
         let title = "What settings do: success at the end, in each run the mean over all configurations with that value, with \
                      the 95 % t interval over runs (settings.csv and configurations.csv have every moment and \
                      configuration)";
-        let mut table = Table::of(title, &of_value)
+        let mut table = Table::builder(title, &of_value)
             .text("environment", |tests| tests[0].environment)
             .text("method", |tests| &tests[0].method)
             .text("trained on", |tests| tests[0].trained_on)
@@ -215,8 +216,8 @@ impl Report<'_> {
         file("configurations.csv", &self.grid_tests.configurations, ["configuration", "settings"]).build()
     }
 
-    /// One for each setting of a method that differs, where policies of several moments are tested: a panel for each
-    /// version or set that is tested on.
+    /// Returns a picture for each setting of a method that differs, if intermediate policies were tested. The picture
+    /// has a panel for each test set.
     pub(super) fn settings_pictures(&self) -> Vec<Picture> {
         let same = |a: &GridTest<'_>, b: &GridTest<'_>| a.is_of_grid(b) && a.what.0 == b.what.0;
         let of_settings = self.grid_tests.settings.chunk_by(same);
@@ -226,7 +227,7 @@ impl Report<'_> {
 }
 
 fn file<'r, 'a>(name: &str, tests: &'r [GridTest<'a>], what: [&str; 2]) -> TableBuilder<'r, GridTest<'a>> {
-    Table::of(name, tests)
+    Table::builder(name, tests)
         .text("environment", |test| test.environment)
         .method(|test| &test.method)
         .text("train", |test| test.trained_on)
@@ -239,7 +240,7 @@ fn file<'r, 'a>(name: &str, tests: &'r [GridTest<'a>], what: [&str; 2]) -> Table
         .number("high_95", |test| or_empty(test.interval.map(|interval| interval[1])))
 }
 
-/// Of one setting.
+/// Returns the picture of one setting.
 fn picture(tests: &[GridTest<'_>]) -> Picture {
     let GridTest { environment, method, trained_on, what: (setting, _), .. } = &tests[0];
     let values = distinct(tests.iter().map(|test| &test.what.1));
@@ -249,7 +250,7 @@ fn picture(tests: &[GridTest<'_>]) -> Picture {
         let of = tests.iter().filter(|test| test.what.1 == **value && test.tested_on == name);
         PanelLine { index, points: of.filter_map(GridTest::point).collect() }
     };
-    let panel = |name: &&str| Panel {
+    let panel = |name: &&str| PlotPanel {
         caption: format!("tested on {name}"),
         x_name: "episodes".into(),
         x: 0.0..longest as f64,
@@ -274,7 +275,7 @@ fn picture(tests: &[GridTest<'_>]) -> Picture {
              value and over runs, bands their 95 % t interval over runs."
         ),
         data: panels.table(),
-        drawing: Drawing::Panels(panels),
+        drawing: PictureDrawing::Panels(panels),
     }
 }
 

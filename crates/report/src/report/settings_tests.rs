@@ -1,4 +1,4 @@
-use perturb_experiment::{MarkResult, Plan, Recorded};
+use perturb_experiment::{IntermediateEvaluation, Plan, Recorded};
 
 use super::*;
 use crate::fixture;
@@ -28,7 +28,7 @@ fn csv(table: &Table) -> Vec<String> {
 }
 
 #[test]
-fn a_value_is_judged_by_all_configurations_that_have_it_in_the_runs_that_all_of_them_have() {
+fn value_is_averaged_over_configurations_and_runs() {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
     // The last configuration, of 15 steps without normalisation, has no result in the third run.
     let results = fixture::results(&plan, |cell| {
@@ -59,7 +59,7 @@ fn a_value_is_judged_by_all_configurations_that_have_it_in_the_runs_that_all_of_
 }
 
 #[test]
-fn nothing_is_said_of_settings_that_do_not_differ_nor_of_what_was_trained_anew() {
+fn constant_settings_and_final_cells_are_left_out() {
     let one = PLAN.replace("[5, 15]", "[5]").replace("[true, false]", "[true]");
     let plan = Plan::parse("test", one).unwrap();
     let results = fixture::results(&plan, |cell| Some(([rate(cell), 0.0, 0.0], 1.0)));
@@ -86,9 +86,9 @@ fn pictures_follow_a_setting_over_the_training() {
     let mut results = fixture::results(&plan, |cell| Some(([rate(cell), 0.0, 60.0], 1.0)));
     for state in &mut results.states {
         let CellState::Done(result) = state else { unreachable!("all are done") };
-        let agreement = perturb_records::Agreement { episodes: 1, largest: None };
+        let agreement = perturb_records::ParameterCheck { episodes: 1, largest: None };
         let at_mark = [("E".to_owned(), TestResult { success_percent: 80.0, ..result.results["E"].clone() })].into();
-        result.marks.insert(20, MarkResult { counters: Default::default(), results: at_mark, agreement });
+        result.marks.insert(20, IntermediateEvaluation { counters: Default::default(), results: at_mark, agreement });
     }
     let selections = results.select();
     let recorded = Recorded::default();
@@ -96,7 +96,7 @@ fn pictures_follow_a_setting_over_the_training() {
     let pictures = report.settings_pictures();
     let files: Vec<&str> = pictures.iter().map(|picture| picture.file.as_str()).collect();
     assert_eq!(files, ["CartPole-a2c-ff-D-n_steps", "CartPole-a2c-ff-D-normalize_observations"]);
-    let Drawing::Panels(panels) = &pictures[0].drawing else { unreachable!("lines") };
+    let PictureDrawing::Panels(panels) = &pictures[0].drawing else { unreachable!("lines") };
     assert_eq!(panels.legend, ["n_steps = 5", "n_steps = 15"]);
     assert_eq!(panels.panels.len(), 2, "tested on D and E");
     let line: Vec<(f64, f64)> = panels.panels[1].lines[1].points.iter().map(|point| (point.x, point.y)).collect();
@@ -117,12 +117,12 @@ fn the_end_is_each_trainings_own() {
     let mut results = fixture::results(&plan, |cell| Some(([episodes(cell) as f64, 0.0, 0.0], 1.0)));
     for state in &mut results.states {
         let CellState::Done(result) = state else { unreachable!("all are done") };
-        let agreement = perturb_records::Agreement { episodes: 1, largest: None };
+        let agreement = perturb_records::ParameterCheck { episodes: 1, largest: None };
         let results = result
             .results
             .iter()
             .map(|(name, test)| (name.clone(), TestResult { success_percent: 7.0, ..test.clone() }));
-        let mark = MarkResult { counters: Default::default(), results: results.collect(), agreement };
+        let mark = IntermediateEvaluation { counters: Default::default(), results: results.collect(), agreement };
         result.marks.insert(20, mark);
     }
     let selections = results.select();

@@ -6,21 +6,21 @@ use perturb_experiment::{
     EnvironmentCurves, Folder, FolderError, Plan, PlanError, Recorded, Results, Selection, VerifyError, add_assessed,
     judged_as_in, read_curves, verify,
 };
-use perturb_records::{Assessed, AssessedError};
+use perturb_records::{ExternalEvaluation, ExternalEvaluationError};
 use perturb_settings::ValueError;
 
 use super::{Figures, HeatmapPicture, Report, heatmap_pictures, html};
 use crate::plot::PlotError;
 
-/// What a report is of.
+/// The inputs of a report.
 #[derive(Clone, Debug, Default)]
-pub struct Sources {
+pub struct ReportInputs {
     /// An experiment; `None` for assessments alone.
     pub folder: Option<Folder>,
     /// In the place of its plan's.
     pub rule: Option<Selection>,
     /// In the order of their rows.
-    pub assessed: Vec<Assessed>,
+    pub assessed: Vec<ExternalEvaluation>,
 }
 
 /// Why there is no report.
@@ -29,7 +29,7 @@ pub struct Sources {
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum ReportError {
     #[error(transparent)]
-    Assessed(#[from] AssessedError),
+    ExternalEvaluation(#[from] ExternalEvaluationError),
     #[error(transparent)]
     Folder(#[from] FolderError),
     #[error(transparent)]
@@ -53,24 +53,24 @@ pub enum ReportError {
 }
 
 /// A report with what is drawn beside its own numbers.
-pub struct Whole<'a> {
+pub struct ReportBundle<'a> {
     /// The numbers.
     pub report: Report<'a>,
-    /// Of trainings.
+    /// The training curves.
     pub curves: &'a [EnvironmentCurves],
-    /// Of those that there are.
+    /// The heatmaps.
     pub heatmaps: &'a [HeatmapPicture],
 }
 
-impl Sources {
+impl ReportInputs {
     /// Adds what is in the folder `path`.
     ///
     /// # Errors
     /// [`ReportError`] if there is nothing, or a second experiment.
     pub fn add(&mut self, path: &Path) -> Result<(), ReportError> {
         let folder = Folder::new(path);
-        if Assessed::is_in(path) {
-            self.assessed.push(Assessed::read(path)?);
+        if ExternalEvaluation::is_in(path) {
+            self.assessed.push(ExternalEvaluation::read(path)?);
         } else if folder.require_plan().is_err() {
             return Err(ReportError::Neither { path: path.to_owned() });
         } else if let Some(first) = self.folder.replace(folder) {
@@ -93,7 +93,7 @@ impl Sources {
     ///
     /// # Errors
     /// [`ReportError`], and those of `make`.
-    pub fn read<T, E: From<ReportError>>(self, make: impl FnOnce(Whole<'_>) -> Result<T, E>) -> Result<T, E> {
+    pub fn read<T, E: From<ReportError>>(self, make: impl FnOnce(ReportBundle<'_>) -> Result<T, E>) -> Result<T, E> {
         let Self { folder, rule, assessed } = self;
         let plan = match &folder {
             None => Plan::without_cells(),
@@ -106,7 +106,7 @@ impl Sources {
             Some(folder) => Results::read(&plan, folder).map_err(ReportError::from)?,
         };
         let mut selections = results.select();
-        let mut recorded = Recorded::of(&selections);
+        let mut recorded = Recorded::new(&selections);
         let mut curves = Vec::new();
         if let Some(folder) = &folder {
             verify(&results, folder, |result, records| recorded.add(result, records)).map_err(ReportError::from)?;
@@ -115,11 +115,11 @@ impl Sources {
         add_assessed(&mut selections, &assessed);
         let heatmaps = heatmap_pictures(&selections, folder.as_ref()).map_err(ReportError::from)?;
         let report = Report::new(&results, &selections, &recorded, &curves);
-        make(Whole { report, curves: &curves, heatmaps: &heatmaps })
+        make(ReportBundle { report, curves: &curves, heatmaps: &heatmaps })
     }
 }
 
-impl Whole<'_> {
+impl ReportBundle<'_> {
     /// Everything as one HTML page that needs nothing else.
     ///
     /// # Errors
@@ -132,5 +132,5 @@ impl Whole<'_> {
 fn plan_of(folder: &Folder, rule: Option<Selection>) -> Result<Plan, ReportError> {
     let plan = Plan::load(&folder.require_plan()?)?;
     let rule = rule.unwrap_or(plan.selection);
-    Ok(plan.by(rule)?.in_folder(folder)?)
+    Ok(plan.with_rule(rule)?.with_selected_cells(folder)?)
 }

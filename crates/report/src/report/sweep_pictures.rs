@@ -5,23 +5,24 @@ use perturb_protocol::Version;
 use perturb_records::{RecordedParameter, Scenario, TrainedOn};
 
 use super::Report;
-use super::pictures::{Drawing, Picture};
-use super::sweeps::{AtParameter, AtThreshold, Swept, side};
-use crate::plot::panels::{Panel, PanelLine, Panels, RATES, index_of};
+use super::pictures::{Picture, PictureDrawing};
+use super::sweeps::{AtParameter, AtThreshold, SweepPoint, side};
+use crate::plot::panels::{PanelLine, Panels, PlotPanel, RATES, index_of};
 
-/// What a band is.
+/// The explanation of a band.
 const WILSON: &str = "All runs together; bands: 95 % Wilson intervals.";
 
 impl Report<'_> {
-    /// One for each environment and what was trained on: a panel for each parameter.
+    /// Returns a picture for each environment and training distribution, with a panel for each parameter.
     pub(super) fn parameter_pictures(&self) -> Vec<Picture> {
         let all = self.over_parameters.iter();
         let all: Vec<_> = all.filter(|row| Version::ALL.iter().any(|it| it.to_string() == row.tested_on)).collect();
         let mut pictures = Vec::new();
         for environment in self.scope.environments.iter().copied() {
             for trained_on in Version::KNOWN.map(TrainedOn::Version).into_iter().chain([TrainedOn::Unknown]) {
-                let is_of =
-                    |row: &&&Swept<'_, AtParameter<'_>>| row.environment == environment && row.trained_on == trained_on;
+                let is_of = |row: &&&SweepPoint<'_, AtParameter<'_>>| {
+                    row.environment == environment && row.trained_on == trained_on
+                };
                 let rows: Vec<_> = all.iter().filter(is_of).copied().collect();
                 if !rows.is_empty() {
                     pictures.push(self.parameter_picture(environment, trained_on, &rows));
@@ -35,7 +36,7 @@ impl Report<'_> {
         &self,
         environment: &str,
         trained_on: TrainedOn<'_>,
-        rows: &[&Swept<'_, AtParameter<'_>>],
+        rows: &[&SweepPoint<'_, AtParameter<'_>>],
     ) -> Picture {
         let trained = match trained_on {
             TrainedOn::Unknown => "whose training's parameters are not known".to_owned(),
@@ -47,16 +48,16 @@ impl Report<'_> {
             let rows: Vec<_> = rows.iter().copied().filter(|row| row.at.parameter.name == **name).collect();
             let RecordedParameter { name, unit, .. } = rows[0].at.parameter;
             // A line ends where a test ends, and where it draws nothing.
-            let joined = |a: &&Swept<'_, AtParameter<'_>>, b: &&Swept<'_, AtParameter<'_>>| {
+            let joined = |a: &&SweepPoint<'_, AtParameter<'_>>, b: &&SweepPoint<'_, AtParameter<'_>>| {
                 (a.method, a.tested_on, a.at.bin.high) == (b.method, b.tested_on, b.at.bin.low)
             };
-            let line = |rows: &[&Swept<'_, AtParameter<'_>>]| PanelLine {
+            let line = |rows: &[&SweepPoint<'_, AtParameter<'_>>]| PanelLine {
                 index: index_of(methods, rows[0].method),
                 points: rows.iter().map(|row| row.point((row.at.bin.low + row.at.bin.high) / 2.0)).collect(),
             };
             let low = rows.iter().map(|row| row.at.bin.low).fold(f64::INFINITY, f64::min);
             let high = rows.iter().map(|row| row.at.bin.high).fold(f64::NEG_INFINITY, f64::max);
-            Panel {
+            PlotPanel {
                 caption: name.clone(),
                 x_name: if unit == "1" { name.clone() } else { format!("{name}, {unit}") },
                 x: low..high,
@@ -82,21 +83,21 @@ impl Report<'_> {
                  intervals."
             ),
             data: panels.table(),
-            drawing: Drawing::Panels(panels),
+            drawing: PictureDrawing::Panels(panels),
         }
     }
 
-    /// One for each environment: a panel for each scenario that a metric needs.
+    /// Returns a picture for each environment, with a panel for each scenario of a metric.
     pub(super) fn threshold_pictures(&self) -> Vec<Picture> {
         let of_environments = self.over_thresholds.chunk_by(|a, b| a.environment == b.environment);
         of_environments.map(|rows| self.threshold_picture(rows)).collect()
     }
 
-    fn threshold_picture(&self, rows: &[Swept<'_, AtThreshold<'_>>]) -> Picture {
+    fn threshold_picture(&self, rows: &[SweepPoint<'_, AtThreshold<'_>>]) -> Picture {
         use Version::{D, E, R};
         let methods = &self.scope.methods;
         let (environment, criterion) = (rows[0].environment, rows[0].at.criterion);
-        let ends = |row: &[Swept<'_, AtThreshold<'_>>]| {
+        let ends = |row: &[SweepPoint<'_, AtThreshold<'_>>]| {
             row.first().map(|a| a.at.threshold).zip(row.last().map(|b| b.at.threshold))
         };
         let of_lines =
@@ -104,14 +105,14 @@ impl Report<'_> {
         let (low, high) = of_lines().next().and_then(ends).unwrap_or_default();
         let unit = if criterion.unit == "1" { String::new() } else { format!(", {}", criterion.unit) };
         let panel = |scenario: Scenario| {
-            let is_of = |row: &Swept<'_, AtThreshold<'_>>| {
+            let is_of = |row: &SweepPoint<'_, AtThreshold<'_>>| {
                 row.trained_on == TrainedOn::Version(scenario.train) && row.tested_on == scenario.test.to_string()
             };
-            let line = |rows: &[Swept<'_, AtThreshold<'_>>]| PanelLine {
+            let line = |rows: &[SweepPoint<'_, AtThreshold<'_>>]| PanelLine {
                 index: index_of(methods, rows[0].method),
                 points: rows.iter().map(|row| row.point(row.at.threshold)).collect(),
             };
-            Panel {
+            PlotPanel {
                 caption: format!("trained on {}, tested on {}", scenario.train, scenario.test),
                 x_name: format!("{} {} …{unit}", criterion.quantity, side(criterion)),
                 x: low..if high > low { high } else { low + 1.0 },
@@ -137,7 +138,7 @@ impl Report<'_> {
                  runs together; bands are 95 % Wilson intervals."
             ),
             data: panels.table(),
-            drawing: Drawing::Panels(panels),
+            drawing: PictureDrawing::Panels(panels),
         }
     }
 }

@@ -9,12 +9,12 @@ use perturb_text::{Table, TableBuilder};
 
 use super::Report;
 use super::columns::MethodColumns;
-use super::scope::Scope;
-use super::tested::{Trained, trained};
+use super::index::ReportIndex;
+use super::tested::{PolicyGroup, trained};
 use crate::plot::panels::PanelPoint;
 
 /// Successes of all runs together at one place of a sweep.
-pub(super) struct Swept<'a, P> {
+pub(super) struct SweepPoint<'a, P> {
     pub(super) environment: &'a str,
     pub(super) method: &'a Method,
     pub(super) trained_on: TrainedOn<'a>,
@@ -38,21 +38,21 @@ pub(super) struct AtThreshold<'a> {
     pub(super) threshold: f64,
 }
 
-impl<'a> Trained<'a> {
-    fn swept<P>(&self, tested_on: &'a str, at: P, counted: impl Iterator<Item = Counted>) -> Option<Swept<'a, P>> {
+impl<'a> PolicyGroup<'a> {
+    fn swept<P>(&self, tested_on: &'a str, at: P, counted: impl Iterator<Item = Counted>) -> Option<SweepPoint<'a, P>> {
         let counted: Vec<Counted> = counted.collect();
         let (runs, counted): (_, Counted) = (counted.len(), counted.into_iter().sum());
         let &Self { environment, method, trained_on, .. } = self;
-        (counted.episodes > 0).then_some(Swept { environment, method, trained_on, tested_on, at, runs, counted })
+        (counted.episodes > 0).then_some(SweepPoint { environment, method, trained_on, tested_on, at, runs, counted })
     }
 }
 
 /// Success over each parameter that varies in a test.
 pub(super) fn over_parameters<'a>(
-    scope: &Scope<'a>,
+    scope: &ReportIndex<'a>,
     selections: &'a [MethodResults<'a>],
     recorded: &'a Recorded,
-) -> Vec<Swept<'a, AtParameter<'a>>> {
+) -> Vec<SweepPoint<'a, AtParameter<'a>>> {
     let mut all = Vec::new();
     for of_environment in trained(selections, recorded) {
         let Some(parameters) = of_environment.first().map(|trained| &trained.policies[0].parameters) else { continue };
@@ -75,10 +75,10 @@ pub(super) fn over_parameters<'a>(
 
 /// Success over the threshold, in environments whose success compares something with one.
 pub(super) fn over_thresholds<'a>(
-    scope: &Scope<'a>,
+    scope: &ReportIndex<'a>,
     selections: &'a [MethodResults<'a>],
     recorded: &'a Recorded,
-) -> Vec<Swept<'a, AtThreshold<'a>>> {
+) -> Vec<SweepPoint<'a, AtThreshold<'a>>> {
     let mut all = Vec::new();
     for of_environment in trained(selections, recorded) {
         let first = of_environment.first().and_then(|trained| trained.policies[0].success.as_ref());
@@ -120,7 +120,7 @@ impl Report<'_> {
     }
 }
 
-impl<P> Swept<'_, P> {
+impl<P> SweepPoint<'_, P> {
     /// With its Wilson interval.
     pub(super) fn point(&self, x: f64) -> PanelPoint {
         let [low, high] = self.counted.interval();
@@ -128,15 +128,15 @@ impl<P> Swept<'_, P> {
     }
 }
 
-fn swept<'r, 'a, P>(name: &str, rows: &'r [Swept<'a, P>]) -> TableBuilder<'r, Swept<'a, P>> {
-    Table::of(name, rows)
+fn swept<'r, 'a, P>(name: &str, rows: &'r [SweepPoint<'a, P>]) -> TableBuilder<'r, SweepPoint<'a, P>> {
+    Table::builder(name, rows)
         .text("environment", |row| row.environment)
         .method(|row| row.method)
         .text("train", |row| row.trained_on)
         .text("test", |row| row.tested_on)
 }
 
-fn counted<'r, 'a, P>(table: TableBuilder<'r, Swept<'a, P>>) -> Table {
+fn counted<'r, 'a, P>(table: TableBuilder<'r, SweepPoint<'a, P>>) -> Table {
     table
         .number("runs", |row| row.runs)
         .number("episodes", |row| row.counted.episodes)

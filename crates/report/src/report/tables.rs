@@ -9,11 +9,11 @@ use perturb_records::{Metric, Scenario, TrainedOn, versions};
 use perturb_settings::Method;
 use perturb_text::{Column, Entry, Table};
 
+use super::index::{has_scenarios, has_scenarios_of};
 use super::numbers::{MethodMetrics, counted};
-use super::scope::{has_scenarios, has_scenarios_of};
-use super::{MISSING, MarkTest, Report};
+use super::{GeneralizationPoint, MISSING, Report};
 
-/// What stands for a number that the paper does not have.
+/// The text for a number that the paper does not have.
 const NOT_GIVEN: &str = "–";
 
 impl Report<'_> {
@@ -30,7 +30,7 @@ impl Report<'_> {
     }
 
     fn metrics_table(&self, title: String, rows: &[MethodMetrics<'_>]) -> Table {
-        let mut table = Table::of(title, rows).text("method", |row| &row.method);
+        let mut table = Table::builder(title, rows).text("method", |row| &row.method);
         for metric in Metric::ALL {
             let column = |name: &str| Column { name: name.into(), group: Some(metric.to_string()), is_number: true };
             table = table
@@ -42,7 +42,7 @@ impl Report<'_> {
         }
         table
             .number("runs", |row| self.runs(&row.method, row.runs()))
-            .number("cells", |row| match row.method.elsewhere {
+            .number("cells", |row| match row.method.external {
                 true => NOT_GIVEN.to_owned(),
                 false => format!("{}/{}", row.done, row.cells),
             })
@@ -62,7 +62,7 @@ impl Report<'_> {
         rows.first()?;
         let title = "Means over configurations that tie in the selecting test, and their range from the lowest to the \
                      highest choice in every run";
-        let table = Table::of(title, &rows)
+        let table = Table::builder(title, &rows)
             .text("environment", |(row, ..)| row.environment)
             .text("method", |(row, ..)| &row.method)
             .text("metric", |(_, metric, _)| metric)
@@ -92,7 +92,7 @@ impl Report<'_> {
         numbers: for<'m> fn(&'m MethodMetrics<'_>) -> &'m BTreeMap<Metric, Bootstrapped>,
         reselected: usize,
     ) -> Option<Table> {
-        let mut table = Table::of(title, &self.averages).text("method", |row| &row.method);
+        let mut table = Table::builder(title, &self.averages).text("method", |row| &row.method);
         for metric in Metric::ALL {
             let interval = move |row: &MethodMetrics<'_>| {
                 let [low, high] = row.reselected.get(&metric)?[reselected].interval_95?;
@@ -113,7 +113,7 @@ impl Report<'_> {
                 "{}: Extrapolation and the three that it is the geometric mean of, with 95 % Wilson intervals",
                 selections[0].environment
             );
-            let mut table = Table::of(title, selections).text("method", |selection| &selection.method);
+            let mut table = Table::builder(title, selections).text("method", |selection| &selection.method);
             for scenario in Metric::EXTRAPOLATION {
                 table = table.number(scenario.to_string(), move |selection| {
                     let counted = counted(selection, scenario);
@@ -138,7 +138,7 @@ impl Report<'_> {
             let pairs = selections.iter().flat_map(|row| trained.iter().map(move |&train| (*row, train)));
             let rows: Vec<(&MethodResults<'_>, Version)> =
                 pairs.filter(|(row, train)| has_scenarios_of(row, *train)).collect();
-            let mut table = Table::of(format!("{}: the nine scenarios{more}", rows[0].0.environment), &rows)
+            let mut table = Table::builder(format!("{}: the nine scenarios{more}", rows[0].0.environment), &rows)
                 .text("method", |(selection, _)| &selection.method)
                 .text("trained on", |(_, train)| train);
             for &test in &tested {
@@ -169,7 +169,7 @@ impl Report<'_> {
     /// `None` if the plan has no sets of its own.
     pub(super) fn set_table(&self) -> Option<Table> {
         let title = "Tests that are no scenario: on own sets of parameters, or of policies trained on one, or on what is not known";
-        let table = Table::of(title, &self.set_tests)
+        let table = Table::builder(title, &self.set_tests)
             .text("environment", |test| test.environment)
             .text("method", |test| test.method)
             .text("trained on", |test| test.trained_on)
@@ -183,12 +183,12 @@ impl Report<'_> {
 
     /// `None` if only the last policies were tested.
     pub(super) fn marks_table(&self) -> Option<Table> {
-        let title = "Generalisation against training: success after so many episodes (marks.csv has the returns)";
-        let of_moment = |a: &MarkTest<'_>, b: &MarkTest<'_>| {
+        let title = "Generalisation against training: success after so many episodes (evaluations.csv has the returns)";
+        let of_moment = |a: &GeneralizationPoint<'_>, b: &GeneralizationPoint<'_>| {
             (a.environment, a.method, a.trained_on, a.episodes) == (b.environment, b.method, b.trained_on, b.episodes)
         };
-        let moments: Vec<&[MarkTest<'_>]> = self.marks.chunk_by(of_moment).collect();
-        let mut table = Table::of(title, &moments)
+        let moments: Vec<&[GeneralizationPoint<'_>]> = self.marks.chunk_by(of_moment).collect();
+        let mut table = Table::builder(title, &moments)
             .text("environment", |tests| tests[0].environment)
             .text("method", |tests| tests[0].method)
             .text("trained on", |tests| tests[0].trained_on)
@@ -205,7 +205,7 @@ impl Report<'_> {
     /// `None` if nothing was tuned.
     pub(super) fn tuned_table(&self) -> Option<Table> {
         let title = "What was selected, by selection episodes on tuning seeds (tuning.csv has the configurations)";
-        let table = Table::of(title, &self.tuned)
+        let table = Table::builder(title, &self.tuned)
             .text("environment", |tuned| tuned.environment)
             .text("method", |tuned| &tuned.method)
             .text("trained on", |tuned| tuned.trained_on)
@@ -228,7 +228,7 @@ impl Report<'_> {
         }
         let title =
             "Where the numbers come from: the selected cell of each run (selected.csv has its settings and command)";
-        let table = Table::of(title, &self.selected())
+        let table = Table::builder(title, &self.selected())
             .text("environment", |selected| &selected.result.training.environment)
             .text("method", |selected| &selected.result.training.method)
             .text("trained on", |selected| selected.cell.trained_on())
@@ -244,7 +244,7 @@ impl Report<'_> {
 
     /// `None` if no cell failed.
     pub(super) fn failure_table(&self) -> Option<Table> {
-        let table = Table::of("Failed cells", &self.failures)
+        let table = Table::builder("Failed cells", &self.failures)
             .text("cell", |failure| &failure.id)
             .text("reason", |failure| &failure.reason)
             .build();
@@ -253,7 +253,7 @@ impl Report<'_> {
 
     fn runs(&self, method: &Method, runs: usize) -> String {
         let all = self.plan.runs;
-        if method.elsewhere || runs == all as usize { runs.to_string() } else { format!("{runs} of {all}") }
+        if method.external || runs == all as usize { runs.to_string() } else { format!("{runs} of {all}") }
     }
 }
 

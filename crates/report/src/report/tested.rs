@@ -9,22 +9,22 @@ use perturb_settings::Method;
 
 /// The policies of a method that were trained on something, those that were selected and have recorded episodes.
 #[derive(Clone)]
-pub(super) struct Trained<'a> {
+pub(super) struct PolicyGroup<'a> {
     pub(super) environment: &'a str,
     pub(super) method: &'a Method,
     pub(super) trained_on: TrainedOn<'a>,
     pub(super) policies: Vec<&'a PolicyOutcomes>,
 }
 
-impl<'a> Trained<'a> {
-    /// Of each run.
+impl<'a> PolicyGroup<'a> {
+    /// Returns the tests of each run.
     pub(super) fn tests(&self, tested_on: &'a str) -> impl Iterator<Item = &'a Outcomes> + use<'a> {
         self.policies.clone().into_iter().filter_map(move |policy| policy.test(tested_on))
     }
 }
 
 /// All that have recorded episodes, by environment, in the order of `selections`.
-pub(super) fn trained<'a>(selections: &'a [MethodResults<'a>], recorded: &'a Recorded) -> Vec<Vec<Trained<'a>>> {
+pub(super) fn trained<'a>(selections: &'a [MethodResults<'a>], recorded: &'a Recorded) -> Vec<Vec<PolicyGroup<'a>>> {
     let of_selection = |selection: &'a MethodResults<'a>| {
         // A run of an agent that was trained elsewhere may lack what another one has.
         let all: BTreeSet<TrainedOn<'a>> =
@@ -32,7 +32,7 @@ pub(super) fn trained<'a>(selections: &'a [MethodResults<'a>], recorded: &'a Rec
         all.into_iter().map(|trained_on| {
             let selected = selection.runs.values().filter_map(|run| run.trained_on(trained_on));
             let policies = selected.filter_map(|selected| recorded.policy(&selected)).collect();
-            Trained { environment: selection.environment, method: &selection.method, trained_on, policies }
+            PolicyGroup { environment: selection.environment, method: &selection.method, trained_on, policies }
         })
     };
     let of_environment = |selections: &'a [MethodResults<'a>]| {

@@ -1,6 +1,6 @@
-use perturb_experiment::{CellState, Failure, Folder, MarkResult, SELECTION_TEST};
+use perturb_experiment::{CellState, Failure, Folder, IntermediateEvaluation, SELECTION_TEST};
 use perturb_protocol::Version;
-use perturb_records::{Agreement, Difference, Metric, TestResult};
+use perturb_records::{Difference, Metric, ParameterCheck, TestResult};
 use rstest::rstest;
 
 use super::*;
@@ -47,8 +47,12 @@ fn results(plan: &Plan) -> Results<'_> {
         known.then(|| (easier.map(|rate| rate + f64::from(cell.run)), 1.0))
     });
     let (id, commit) = (plan.cells[0].id.clone(), String::new());
-    results.states[0] =
-        CellState::Failed(Failure { id, reason: "NaN in <loss> | after\n9 updates".into(), commit, begins_anew: true });
+    results.states[0] = CellState::Failed(Failure {
+        id,
+        reason: "NaN in <loss> | after\n9 updates".into(),
+        commit,
+        requires_restart: true,
+    });
     results
 }
 
@@ -96,7 +100,7 @@ fn a_report_has_all_its_numbers(#[case] name: &str, #[case] document: fn(&Report
 }
 
 #[test]
-fn tests_on_own_sets_have_a_table_and_leave_the_papers_numbers_alone() {
+fn custom_sets_have_a_table_of_their_own() {
     let plan = Plan::parse("test", SETS.into()).unwrap();
     let mut results = fixture::results(&plan, |_| Some(([90.0, 40.0, 20.0], 1.0)));
     for (state, relative) in results.states.iter_mut().zip([0.0, 2e-16]) {
@@ -106,7 +110,7 @@ fn tests_on_own_sets_have_a_table_and_leave_the_papers_numbers_alone() {
             result.results.insert(name.into(), TestResult { success_percent, ..test.clone() });
         }
         let largest = Difference { parameter: "length".into(), requested: 0.7, applied: 0.7, relative };
-        result.agreement = Some(Agreement { episodes: 4000, largest: Some(largest) });
+        result.agreement = Some(ParameterCheck { episodes: 4000, largest: Some(largest) });
     }
     let selections = results.select();
     let recorded = Recorded::default();
@@ -138,8 +142,12 @@ fn tests_at_marks_have_a_table_with_the_end_as_its_last_line() {
     for mark in [5, 20] {
         let success_percent = mark as f64;
         let test = TestResult { success_percent, mean_return: -success_percent, ..result.results["D"].clone() };
-        let agreement = Agreement { episodes: 1, largest: None };
-        let of_mark = MarkResult { counters: Default::default(), results: [("E".to_owned(), test)].into(), agreement };
+        let agreement = ParameterCheck { episodes: 1, largest: None };
+        let of_mark = IntermediateEvaluation {
+            counters: Default::default(),
+            results: [("E".to_owned(), test)].into(),
+            agreement,
+        };
         result.marks.insert(mark, of_mark);
     }
     let selections = results.select();
@@ -151,7 +159,7 @@ fn tests_at_marks_have_a_table_with_the_end_as_its_last_line() {
      CartPole     ppo ff  R                 20     missing     missing        20.0
      CartPole     ppo ff  R                 50  90.0 ± 0.0  40.0 ± 0.0  21.5 ± 0.5
     ");
-    let marks = report.files().into_iter().find(|table| table.title == "marks.csv").unwrap();
+    let marks = report.files().into_iter().find(|table| table.title == "evaluations.csv").unwrap();
     let marks = String::from_utf8(marks.to_csv()).unwrap();
     assert!(
         marks.contains("CartPole,ppo,ff,,R,20,E,1,20,,-20\n") && marks.contains("R,50,E,2,21.5,0.5,1\n"),
@@ -173,7 +181,7 @@ fn tests_at_marks_have_a_table_with_the_end_as_its_last_line() {
 /// Two configurations and two tuning seeds. One cell of what is selected failed; what is trained on E waits, and on R nothing
 /// can be selected.
 #[test]
-fn a_clean_report_names_its_rule_its_seeds_and_what_was_selected() {
+fn clean_report_names_rule_seeds_and_selection() {
     let text = "environments = ['CartPole']\nselection = 'clean'\ntuning_runs = 2\nruns = 2\nselection_episodes = 70
         [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\ngrid = { n_steps = [64, 128] }";
     let plan = Plan::parse("test", text.into()).unwrap();
@@ -190,7 +198,7 @@ fn a_clean_report_names_its_rule_its_seeds_and_what_was_selected() {
                     id: cell.id.clone(),
                     reason: "NaN".into(),
                     commit: "x".into(),
-                    begins_anew: true,
+                    requires_restart: true,
                 })
                 .unwrap();
         } else if (version, selected, seed) != (Version::E, true, 2) {
@@ -201,7 +209,7 @@ fn a_clean_report_names_its_rule_its_seeds_and_what_was_selected() {
             place.write_result(&result).unwrap();
         }
     }
-    let plan = plan.in_folder(&folder).unwrap();
+    let plan = plan.with_selected_cells(&folder).unwrap();
     let results = Results::read(&plan, &folder).unwrap();
     let selections = results.select();
     let recorded = Recorded::default();
@@ -281,7 +289,7 @@ fn what_is_not_done_is_missing_and_has_no_colour() {
 
 /// What is trained on both is a line to compare with.
 #[test]
-fn what_is_trained_on_r_and_e_is_a_row_of_scenarios_and_in_none_of_the_papers_numbers() {
+fn training_on_r_plus_e_is_a_scenario_row_only() {
     let plan = |versions: &str| {
         let text = format!(
             "environments = ['CartPole']\nversions = ['D', 'R', 'E'{versions}]\ntest_versions = ['D', 'R', 'E']\n\
@@ -354,7 +362,7 @@ fn every_rule_of_the_style_is_closed() {
 }
 
 #[test]
-fn robots_of_another_engine_have_the_papers_numbers_beside_them_and_no_difference() {
+fn other_engines_have_no_difference_to_the_paper() {
     let plan = |environments: &str| {
         let rest = "runs = 2\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\n";
         Plan::parse("test", format!("environments = {environments}\n{rest}")).unwrap()
@@ -367,7 +375,7 @@ fn robots_of_another_engine_have_the_papers_numbers_beside_them_and_no_differenc
         let plan = plan(environments);
         let results = fixture::results(&plan, |_| Some(([90.0, 70.0, 50.0], 1.0)));
         let selections = results.select();
-        let recorded = perturb_experiment::Recorded::of(&selections);
+        let recorded = perturb_experiment::Recorded::new(&selections);
         let report = Report::new(&results, &selections, &recorded, &[]);
         let rows: Vec<_> = report.metrics.iter().chain(&report.averages).collect();
         assert!(rows.iter().all(|row| row.papers.contains_key(&Metric::Default)));

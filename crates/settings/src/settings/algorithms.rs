@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{SettingError, is_zero};
 
-/// How a learning rate moves.
+/// The schedule of a learning rate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Schedule {
@@ -36,7 +36,7 @@ impl Schedule {
 pub struct A2cConfig {
     /// Step size of RMSProp, above 0 (default: `7e-4`). Larger learns faster, until the policy collapses.
     pub learning_rate: f64,
-    /// How the learning rate moves: "linear" to 0 over the training, or "constant" (default: `"linear"`).
+    /// The schedule of the learning rate: "linear" to 0 over the training, or "constant" (default: `"linear"`).
     pub learning_rate_schedule: Schedule,
     /// T: steps of each environment between two updates, at least 1 (default: `5`). More makes returns less biased, their
     /// variance larger and updates rarer.
@@ -108,7 +108,7 @@ impl A2cConfig {
 pub struct PpoConfig {
     /// Step size of Adam, above 0 (default: `3e-4`). Larger learns faster, until the policy collapses.
     pub learning_rate: f64,
-    /// How the learning rate moves: "constant", or "linear" to 0 over the training (default: `"constant"`).
+    /// The schedule of the learning rate: "constant", or "linear" to 0 over the training (default: `"constant"`).
     pub learning_rate_schedule: Schedule,
     /// T: steps of each environment between two updates, at least 1 (default: `128`).
     pub n_steps: usize,
@@ -121,10 +121,10 @@ pub struct PpoConfig {
     pub gamma: f64,
     /// λ of generalised advantage estimation, 0 … 1 (default: `0.95`). Smaller trusts the values more than the returns.
     pub gae_lambda: f64,
-    /// How far the ratio of new to old probability may gain from moving away from 1, above 0 (default: `0.2`).
+    /// Clipping range of the ratio of new to old probabilities, above 0 (default: `0.2`).
     pub clip_range: f64,
-    /// How far a value may gain from moving away from the rollout's, in units of the normalised reward; 0 = as far as it
-    /// wants (default: `0.2`).
+    /// Clipping range of the value's change from the rollout's, in units of the normalised reward; 0 = no clipping
+    /// (default: `0.2`).
     pub clip_range_vf: f64,
     /// Whether advantages get mean 0 and standard deviation 1 in every minibatch (default: `true`).
     pub normalize_advantage: bool,
@@ -208,16 +208,16 @@ pub struct EpoptConfig {
     pub epsilon: f64,
     /// Iterations at the start that learn from all episodes, ε = 1 (default: `100`).
     pub full_iterations: u64,
-    /// What the worst episodes are the worst by: "raw", the undiscounted return, or "normalized", the sum of the rewards as
-    /// the policy learns from them (default: `"raw"`; paper: `"normalized"`). What divides them changes while an iteration
-    /// is collected, so that of equal episodes normalised ones rank by when they were.
+    /// The quantity that ranks episodes: "raw", the undiscounted return, or "normalized", the sum of the rewards as the
+    /// policy learns from them (default: `"raw"`; paper: `"normalized"`). The divisor of normalised rewards changes
+    /// during an iteration, so the rank of equal episodes depends on their order.
     pub rank_by: Ranking,
     /// Whether each kept episode has an update of its own, one after the other, in place of one update on all (default:
     /// `false`; paper: `true` with RC). PPO takes all its epochs over the row of episodes.
     pub update_per_episode: bool,
 }
 
-/// What EPOpt ranks episodes by.
+/// The quantity by which EPOpt ranks episodes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Ranking {

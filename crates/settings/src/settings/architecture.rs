@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// Which networks the policy has.
+/// The policy's network architecture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Architecture {
@@ -17,7 +17,7 @@ pub enum Architecture {
 impl Architecture {
     /// All.
     pub const ALL: [Self; 2] = [Self::Ff, Self::Rc];
-    /// As they are typed.
+    /// The names in settings and options.
     pub const NAMES: [&str; 2] = ["ff", "rc"];
 }
 

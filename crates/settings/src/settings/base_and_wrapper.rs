@@ -6,11 +6,11 @@ use toml::Table;
 use super::{A2cConfig, Architecture, ConfigError, EpoptConfig, PpoConfig, Rl2Config};
 use crate::value_error::{ValueError, require};
 
-/// What EPOpt's base has no use for: an iteration is complete episodes, and one batch.
+/// Settings of the base algorithm that EPOpt does not use: its iterations are complete episodes in one batch.
 const NOT_WITH_EPISODES: [&str; 2] = ["n_steps", "n_minibatches"];
 
 /// The most samples of a rollout: some gigabytes.
-const MOST_SAMPLES: u128 = 1 << 26;
+const MAX_SAMPLES: u128 = 1 << 26;
 
 /// Steps of each environment in a long rollout: with fewer, a policy's weights take longer to send than the observations
 /// and actions that several trainings send together.
@@ -19,13 +19,13 @@ const LONG_ROLLOUT: usize = 64;
 /// The settings of an algorithm, which say which one it is.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
-    /// What updates the policy.
+    /// The algorithm that updates the policy.
     pub base: Base,
-    /// What is wrapped around it.
+    /// The algorithm around the base algorithm.
     pub wrapper: Wrapper,
 }
 
-/// What updates the policy.
+/// An algorithm that updates the policy.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(untagged)]
 pub enum Base {
@@ -37,7 +37,7 @@ pub enum Base {
     Random,
 }
 
-/// What is wrapped around it.
+/// An algorithm around a base algorithm.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(untagged)]
 pub enum Wrapper {
@@ -49,9 +49,9 @@ pub enum Wrapper {
     Rl2(Rl2Config),
 }
 
-/// What a training learns from, as far as it matters to others that are trained with it.
+/// The way in which rollouts are collected. Trainings in one batch must collect alike.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Rollouts {
+pub enum CollectionMode {
     /// Nothing: a random policy.
     None,
     /// Few steps, whose messages several trainings share.
@@ -85,18 +85,18 @@ impl Settings {
         Self::all().map(|settings| settings.name())
     }
 
-    /// How long rollouts are.
-    pub(super) fn rollouts(&self) -> Rollouts {
+    /// Returns how rollouts are collected.
+    pub(super) fn rollouts(&self) -> CollectionMode {
         let n_steps = match (&self.wrapper, &self.base) {
-            (_, Base::Random) => return Rollouts::None,
-            (Wrapper::Epopt(_), _) => return Rollouts::Long,
+            (_, Base::Random) => return CollectionMode::None,
+            (Wrapper::Epopt(_), _) => return CollectionMode::Long,
             (_, Base::A2c(a2c)) => a2c.n_steps,
             (_, Base::Ppo(ppo)) => ppo.n_steps,
         };
-        if n_steps < LONG_ROLLOUT { Rollouts::Short } else { Rollouts::Long }
+        if n_steps < LONG_ROLLOUT { CollectionMode::Short } else { CollectionMode::Long }
     }
 
-    /// The algorithm's name, as it is typed.
+    /// Returns the algorithm's name in settings and options.
     pub fn name(&self) -> &'static str {
         match (&self.wrapper, &self.base) {
             (_, Base::Random) => "random",
@@ -201,8 +201,8 @@ impl Settings {
 
 /// Whether a rollout is one that a machine can hold.
 fn check_size(n_steps: usize, num_envs: usize) -> Result<(), ValueError> {
-    let fits = n_steps as u128 * num_envs as u128 <= MOST_SAMPLES;
-    let expected = format!("at most {} with {num_envs} environments", MOST_SAMPLES / num_envs as u128);
+    let fits = n_steps as u128 * num_envs as u128 <= MAX_SAMPLES;
+    let expected = format!("at most {} with {num_envs} environments", MAX_SAMPLES / num_envs as u128);
     require(fits, "n_steps", n_steps, expected)
 }
 

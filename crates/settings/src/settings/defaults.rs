@@ -7,7 +7,7 @@ use super::preset::{self, Preset};
 use super::{Architecture, Base, Common, Settings, TrainConfig, Wrapper};
 
 /// The defaults of the algorithm that `settings` are of, whose parts have their own, without an environment.
-pub(super) fn of(mut settings: Settings, architecture: Architecture, preset: Preset) -> TrainConfig {
+pub(super) fn defaults_for(mut settings: Settings, architecture: Architecture, preset: Preset) -> TrainConfig {
     tune(&mut settings, architecture);
     let num_envs = match (&settings.wrapper, &settings.base, architecture) {
         (Wrapper::Epopt(_), _, _) => 25,

@@ -20,9 +20,9 @@ pub enum ConfigError {
     UnknownKey {
         origin: String,
         key: String,
-        /// Which key was probably meant, or what else has this one.
+        /// The probable key, or the algorithm that has this key.
         hint: String,
-        /// Whose keys were looked through.
+        /// The algorithm whose keys were searched.
         algorithm: &'static str,
         keys: String,
     },
@@ -59,6 +59,6 @@ pub struct SettingError {
     pub name: &'static str,
     /// The value that was given.
     pub got: String,
-    /// What is accepted.
+    /// The accepted values.
     pub expected: &'static str,
 }

@@ -1,4 +1,4 @@
-//! What is trained: an algorithm with its architecture.
+//! Methods: algorithms with their architecture.
 
 use std::fmt;
 
@@ -15,24 +15,24 @@ pub struct Method {
     pub architecture: String,
     /// `None` of algorithms without trials.
     pub episodes_per_trial: Option<u32>,
-    /// Whose defaults the settings have.
+    /// The preset, which decides about the default settings.
     #[serde(default, skip_serializing_if = "Preset::is_default")]
     pub preset: Preset,
-    /// What its policies see.
+    /// The observation of the policies.
     #[serde(default, skip_serializing_if = "Observe::is_default")]
     pub observe: Observe,
     /// Whether it is an agent that no cell trained: `algorithm` is what its assessment calls it, and no more is known.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub elsewhere: bool,
+    #[serde(alias = "elsewhere", default, skip_serializing_if = "std::ops::Not::not")]
+    pub external: bool,
 }
 
 impl Method {
     /// Whether it learns nothing.
     pub fn is_random(&self) -> bool {
-        self.algorithm == "random" && !self.elsewhere
+        self.algorithm == "random" && !self.external
     }
 
-    /// Whether it is a line to compare with: it learns nothing, or sees what others have to find out.
+    /// Tells whether the method is a reference: it learns nothing, or observes what others have to infer.
     pub fn is_reference(&self) -> bool {
         self.is_random() || self.observe.sees_parameters()
     }
@@ -42,7 +42,7 @@ impl fmt::Display for Method {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if self.is_random() {
             f.write_str("random policy (reference)")?;
-        } else if self.elsewhere {
+        } else if self.external {
             f.write_str(&self.algorithm)?;
         } else {
             write!(f, "{} {}", self.algorithm, self.architecture)?;
@@ -50,7 +50,7 @@ impl fmt::Display for Method {
         self.episodes_per_trial.map_or(Ok(()), |episodes| write!(f, " N={episodes}"))?;
         let preset = (!self.preset.is_default()).then(|| self.preset.to_string());
         let sees = self.observe.note().map(str::to_owned);
-        let elsewhere = self.elsewhere.then(|| "trained elsewhere".to_owned());
+        let elsewhere = self.external.then(|| "trained elsewhere".to_owned());
         let notes = preset.into_iter().chain(elsewhere).chain(sees).collect::<Vec<_>>().join(", ");
         if notes.is_empty() { Ok(()) } else { write!(f, " ({notes})") }
     }
@@ -68,7 +68,7 @@ mod tests {
             episodes_per_trial: Some(2),
             preset: Preset::Perturb,
             observe: Observe::State,
-            elsewhere: false,
+            external: false,
         };
         assert_eq!(rl2.to_string(), "rl2-ppo rc N=2");
         let seeing = |preset| Method { preset, observe: Observe::Parameters, ..rl2.clone() }.to_string();

@@ -16,7 +16,7 @@ mod base_and_wrapper;
 
 pub use algorithms::{A2cConfig, EpoptConfig, PpoConfig, Ranking, Rl2Config, Schedule};
 pub use architecture::Architecture;
-pub use base_and_wrapper::{Base, Rollouts, Settings, Wrapper};
+pub use base_and_wrapper::{Base, CollectionMode, Settings, Wrapper};
 pub use error::{ConfigError, SettingError};
 pub use method::Method;
 pub use observe::Observe;
@@ -37,7 +37,7 @@ use crate::sets::Parameters;
 use crate::value_error::{ValueError, require};
 
 /// The most environments of one training.
-const MOST_ENVS: usize = 65_536;
+const MAX_ENVS: usize = 65_536;
 /// The key of [`Common::parameters`].
 const PARAMETERS: &str = "parameters";
 /// The key of [`Settings::name`].
@@ -50,7 +50,7 @@ const OBSERVE: &str = "observe";
 const ARCHITECTURE: &str = "architecture";
 
 impl Common {
-    /// What it is trained on, e.g. "D", or "D with length [0.3, 0.4]".
+    /// Describes the training distribution, e.g. "D", or "D with length [0.3, 0.4]".
     pub fn trained_on(&self) -> String {
         let own = self.parameters.iter().map(|(name, values)| format!("{name} {values}"));
         match own.collect::<Vec<_>>() {
@@ -64,30 +64,30 @@ impl Common {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Table", into = "Table")]
 pub struct TrainConfig {
-    /// What every training has.
+    /// The settings that every training has.
     pub common: Common,
-    /// What the algorithm has.
+    /// The settings of the algorithm.
     pub settings: Settings,
 }
 
 /// Settings that every training has.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Common {
-    /// Which defaults the other settings have: "perturb" or "paper" (default: `"perturb"`).
+    /// The preset, which decides about the defaults of the other settings: "perturb" or "paper" (default: `"perturb"`).
     pub preset: Preset,
     /// The environment's name in the catalogue. Has no default.
     pub environment: String,
-    /// Where its parameters come from while training.
+    /// The distribution of the environment's parameters in training.
     pub version: Version,
-    /// What replaces the version's distributions of some parameters while training, e.g. `length = "0.8..1.0"` in the
-    /// table `[parameters]` (default: nothing).
+    /// Distributions in training that replace those of the version, e.g. `length = "0.8..1.0"` in the table
+    /// `[parameters]` (default: nothing).
     #[serde(default, skip_serializing_if = "Parameters::is_empty")]
     pub parameters: Parameters,
-    /// What acts.
+    /// The network architecture of the policy.
     pub architecture: Architecture,
-    /// What the policy sees: "state", or "parameters" for the environment's present parameters beside it, in training
-    /// and in tests (default: `"state"`). It is written only where it is not the default: settings from before it stay
-    /// what they were.
+    /// The policy's observation: "state", or "parameters" for the state and the environment's present parameters, in
+    /// training and in tests (default: `"state"`). The setting is written only if it is not the default, so that older
+    /// settings keep their bytes.
     #[serde(default, skip_serializing_if = "Observe::is_default")]
     pub observe: Observe,
     /// Training ends after the iteration in which this many episodes have ended, at least 1 (default: `15000`). EPOpt
@@ -195,12 +195,12 @@ impl TrainConfig {
         table
     }
 
-    /// What it learns from.
-    pub fn rollouts(&self) -> Rollouts {
-        if self.common.observation_noise > 0.0 { Rollouts::Noisy } else { self.settings.rollouts() }
+    /// Returns how rollouts are collected.
+    pub fn rollouts(&self) -> CollectionMode {
+        if self.common.observation_noise > 0.0 { CollectionMode::Noisy } else { self.settings.rollouts() }
     }
 
-    /// What trains.
+    /// Returns the method.
     pub fn method(&self) -> Method {
         let Self { common, settings } = self;
         Method {
@@ -209,7 +209,7 @@ impl TrainConfig {
             episodes_per_trial: settings.has_trials().then(|| settings.episodes_per_trial()),
             preset: common.preset,
             observe: common.observe,
-            elsewhere: false,
+            external: false,
         }
     }
 
@@ -220,7 +220,7 @@ impl TrainConfig {
         }
         for (key, value, most) in [
             ("episodes", episodes, u64::MAX),
-            ("num_envs", num_envs as u64, MOST_ENVS as u64),
+            ("num_envs", num_envs as u64, MAX_ENVS as u64),
             ("log_interval", log_interval, u64::MAX),
             ("checkpoint_interval", checkpoint_interval, u64::MAX),
         ] {
@@ -261,7 +261,7 @@ impl From<TrainConfig> for Table {
     }
 }
 
-/// A flag as it was typed, but for its values.
+/// Returns a flag as it was typed. The values of tables are left out.
 fn flag(key: &str, value: &Value) -> String {
     let name = if key == "environment" { "env".to_owned() } else { key.replace('_', "-") };
     match value {
@@ -307,7 +307,7 @@ pub fn spelled(origin: &str, table: Table) -> Result<Table, ConfigError> {
 
 /// The keys of all algorithms.
 static ALL_KEYS: LazyLock<Vec<String>> = LazyLock::new(|| {
-    let of = |settings| defaults_of(&defaults::of(settings, Architecture::Rc, Preset::default()));
+    let of = |settings| defaults_of(&defaults::defaults_for(settings, Architecture::Rc, Preset::default()));
     let keys: BTreeSet<String> = Settings::all().into_iter().flat_map(of).map(|(key, _)| key).collect();
     keys.into_iter().collect()
 });
@@ -361,7 +361,7 @@ fn resolve(mut layers: Vec<(String, Table)>) -> Result<TrainConfig, ConfigError>
         None => Preset::default(),
         Some(value) => Preset::ALL[choice(PRESET, value, &Preset::NAMES)?],
     };
-    let config = defaults::of(algorithm, architecture, preset);
+    let config = defaults::defaults_for(algorithm, architecture, preset);
     let defaults = defaults_of(&config);
     for (origin, table) in &layers {
         for (key, value) in table {
@@ -431,7 +431,7 @@ fn check(origin: &str, key: &str, value: &Value, defaults: &Table, algorithm: &'
 /// "; it is a setting of rl2-a2c, rl2-ppo", if it is one of some algorithms.
 fn others_setting(key: &str) -> Option<String> {
     let has = |settings: &Settings| {
-        defaults_of(&defaults::of(settings.clone(), Architecture::Rc, Preset::default())).contains_key(key)
+        defaults_of(&defaults::defaults_for(settings.clone(), Architecture::Rc, Preset::default())).contains_key(key)
     };
     let having = Settings::all().into_iter().filter(has);
     let names: Vec<&str> = having.map(|settings| settings.name()).collect();

@@ -1,10 +1,10 @@
-//! What a policy gets to see.
+//! The observation of a policy.
 
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// What a policy observes.
+/// The observation of a policy.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Observe {
@@ -17,7 +17,7 @@ pub enum Observe {
 }
 
 impl Observe {
-    /// As they are typed.
+    /// The names in settings and options.
     pub const NAMES: [&'static str; 2] = ["state", "parameters"];
 
     /// Whether it is what stands if nothing is said.
@@ -30,7 +30,7 @@ impl Observe {
         self == Self::Parameters
     }
 
-    /// What is said of a policy that does not see what is usual.
+    /// A note for reports, if the observation is not the usual one.
     pub fn note(self) -> Option<&'static str> {
         self.sees_parameters().then_some("sees parameters")
     }

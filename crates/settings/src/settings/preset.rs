@@ -1,4 +1,4 @@
-//! What settings are if nobody says otherwise: as we recommend, or as the paper's authors published them.
+//! Presets of default settings: our recommendation, or the paper's published settings.
 
 use std::fmt;
 
@@ -7,16 +7,16 @@ use toml::Table;
 
 use super::{Architecture, Base, Ranking, TrainConfig, Wrapper};
 
-/// Which defaults settings have. Every setting that they differ in can also be given by itself; docs/algorithms.md has them
-/// in a table, with their places in the authors' code.
+/// The preset, which decides about default settings. Every setting in which presets differ can also be given alone.
+/// docs/algorithms.md lists them, with their places in the authors' code.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Preset {
-    /// Those that we recommend.
+    /// The recommended settings.
     #[default]
     Perturb,
-    /// Those of Packer et al. (2018), as far as they can be had: sunblaze-ucb/rl-generalization at 5e05aa1 with
-    /// openai/baselines at 2b0283b.
+    /// The settings of Packer et al. (2018) as far as they were published: sunblaze-ucb/rl-generalization at 5e05aa1
+    /// with openai/baselines at 2b0283b.
     Paper,
 }
 

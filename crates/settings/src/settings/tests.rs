@@ -167,7 +167,7 @@ fn each_preset_has_the_documents_values() {
 
 /// What was found on seed 1, and what each algorithm has of its own, in both presets.
 #[test]
-fn each_algorithm_has_the_rates_and_lengths_that_were_chosen_for_it() {
+fn each_algorithm_has_its_recommended_rates_and_lengths() {
     let (ff, rc) = (Architecture::Ff, Architecture::Rc);
     for (algorithm, architecture, learning_rate, n_steps, ent_coef, gae_lambda) in [
         ("a2c", ff, 7e-3, Some(15), 1e-3, None),
@@ -219,7 +219,7 @@ fn the_command_lines_preset_beats_the_files() {
 
 /// Results of earlier programs are found by what cells are named by.
 #[test]
-fn a_table_without_the_papers_preset_has_no_younger_settings_that_are_as_before() {
+fn default_preset_omits_younger_settings_with_old_values() {
     for (algorithm, architecture) in pairs() {
         let younger = ["preset", "reward_return_runs_on", "rank_by", "update_per_episode"];
         let table = of("perturb", algorithm, architecture, &[]).table();
@@ -295,7 +295,7 @@ fn pairs() -> impl Iterator<Item = (&'static str, Architecture)> {
 }
 
 #[test]
-fn there_are_ten_pairs_of_algorithm_and_architecture_and_no_others() {
+fn ten_pairs_of_algorithm_and_architecture_are_valid() {
     assert_eq!(pairs().count(), 10);
     for algorithm in ["rl2-a2c", "rl2-ppo"] {
         let message = refusal(None, &[&format!("algorithm={algorithm}"), "architecture=ff"]);
@@ -326,7 +326,7 @@ fn names_are_typed_as_they_are_written() {
 }
 
 #[test]
-fn a_wrapper_brings_its_keys_and_takes_away_those_that_it_has_no_use_for() {
+fn wrapper_adds_its_keys_and_removes_unused_ones() {
     let config = load(None, &["algorithm=epopt-ppo", "epsilon=0.2"], "environment = 'CartPole'").unwrap();
     let expected = EpoptConfig { epsilon: 0.2, ..EpoptConfig::default() };
     assert_eq!(config.settings.wrapper, Wrapper::Epopt(expected));

@@ -1,54 +1,55 @@
-//! Which cells one job does: enough for minutes, since every job costs Slurm and its node seconds.
+//! Division of cells into jobs. A job takes minutes, since every job costs seconds of Slurm and of its node.
 
-use super::MOST_CELLS_PER_JOB;
+use super::MAX_CELLS_PER_JOB;
 
-/// How long a job is meant to take. Estimates are for episodes that go on to the step limit; most end earlier.
+/// Intended duration of a job. Estimates assume that episodes last until the step limit; most end earlier.
 pub(super) const JOB_SECONDS: f64 = 300.0;
 
-/// How large jobs are.
+/// The size of jobs.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Size {
-    /// So many cells.
+pub(super) enum JobSize {
+    /// A number of cells.
     Cells(usize),
-    /// So many seconds.
+    /// A number of seconds.
     Seconds(f64),
 }
 
 /// A cell that is to be submitted.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct CellLoad {
-    /// Its place in the plan.
+    /// The index in the plan.
     pub(super) cell: usize,
-    /// How long it may take.
+    /// The estimated duration.
     pub(super) seconds: f64,
 }
 
-/// Cuts `groups` into at most `most_jobs` jobs, in their order; a job's cells are of one group. If that is too few for
-/// jobs of so many seconds, jobs become longer; what still has no place is left out, for a later submission.
-pub(super) fn batches(groups: &[Vec<CellLoad>], mut size: Size, most_jobs: usize) -> Vec<Vec<usize>> {
+/// Cuts `groups` into at most `most_jobs` jobs, in their order. The cells of a job are of one group. If the number of
+/// jobs is too small for jobs of this duration, jobs become longer. Cells that still have no job wait for a later
+/// submission.
+pub(super) fn batches(groups: &[Vec<CellLoad>], mut size: JobSize, max_jobs: usize) -> Vec<Vec<usize>> {
     let all: f64 = groups.iter().flatten().map(|load| load.seconds).sum();
     loop {
         let mut jobs: Vec<Vec<usize>> = groups.iter().flat_map(|group| cut(group, size)).collect();
         match &mut size {
-            Size::Seconds(seconds) if jobs.len() > most_jobs && *seconds < all => *seconds *= 1.5,
+            JobSize::Seconds(seconds) if jobs.len() > max_jobs && *seconds < all => *seconds *= 1.5,
             _ => {
-                jobs.truncate(most_jobs);
+                jobs.truncate(max_jobs);
                 return jobs;
             }
         }
     }
 }
 
-fn cut(group: &[CellLoad], size: Size) -> Vec<Vec<usize>> {
+fn cut(group: &[CellLoad], size: JobSize) -> Vec<Vec<usize>> {
     let mut jobs: Vec<Vec<usize>> = Vec::new();
     let mut filling = 0.0;
     for load in group {
         let (weight, room) = match size {
-            Size::Cells(cells) => (1.0, cells as f64),
-            Size::Seconds(seconds) => (load.seconds, seconds),
+            JobSize::Cells(cells) => (1.0, cells as f64),
+            JobSize::Seconds(seconds) => (load.seconds, seconds),
         };
         match jobs.last_mut() {
-            Some(job) if job.len() < MOST_CELLS_PER_JOB && filling + weight <= room => {
+            Some(job) if job.len() < MAX_CELLS_PER_JOB && filling + weight <= room => {
                 job.push(load.cell);
                 filling += weight;
             }
@@ -73,28 +74,32 @@ mod tests {
     #[test]
     fn jobs_take_minutes_and_keep_the_order() {
         let loads = loads(&[100.0, 150.0, 60.0, 400.0, 10.0, 290.0]);
-        let jobs = batches(&loads, Size::Seconds(300.0), 1000);
+        let jobs = batches(&loads, JobSize::Seconds(300.0), 1000);
         assert_eq!(jobs, [vec![0, 1], vec![2], vec![3], vec![4, 5]]);
-        assert_eq!(batches(&loads, Size::Cells(4), 1000), [vec![0, 1, 2, 3], vec![4, 5]]);
-        assert!(batches(&[], Size::Cells(4), 1000).is_empty());
+        assert_eq!(batches(&loads, JobSize::Cells(4), 1000), [vec![0, 1, 2, 3], vec![4, 5]]);
+        assert!(batches(&[], JobSize::Cells(4), 1000).is_empty());
     }
 
     #[test]
     fn jobs_become_longer_if_there_may_not_be_so_many() {
         let loads = loads(&[300.0; 40]);
-        assert_eq!(batches(&loads, Size::Seconds(300.0), 40).len(), 40);
-        let jobs = batches(&loads, Size::Seconds(300.0), 10);
+        assert_eq!(batches(&loads, JobSize::Seconds(300.0), 40).len(), 40);
+        let jobs = batches(&loads, JobSize::Seconds(300.0), 10);
         assert!(jobs.len() <= 10 && jobs.len() > 5, "{jobs:?}");
         assert_eq!(jobs.concat(), (0..40).collect::<Vec<_>>());
-        assert_eq!(batches(&loads, Size::Cells(3), 10).concat(), (0..30).collect::<Vec<_>>(), "the rest comes later");
+        assert_eq!(
+            batches(&loads, JobSize::Cells(3), 10).concat(),
+            (0..30).collect::<Vec<_>>(),
+            "the rest comes later"
+        );
     }
 
     #[test]
     fn a_job_has_no_more_cells_than_fit_in_an_argument() {
         let loads = loads(&vec![0.0; 2500]);
-        let jobs = batches(&loads, Size::Seconds(300.0), 2);
+        let jobs = batches(&loads, JobSize::Seconds(300.0), 2);
         assert_eq!(jobs.iter().map(Vec::len).collect::<Vec<_>>(), [1000, 1000]);
-        let jobs = batches(&loads, Size::Seconds(300.0), 3);
+        let jobs = batches(&loads, JobSize::Seconds(300.0), 3);
         assert_eq!(jobs.iter().map(Vec::len).collect::<Vec<_>>(), [1000, 1000, 500]);
     }
 
@@ -102,8 +107,8 @@ mod tests {
     fn a_job_has_cells_of_one_group() {
         let all = &loads(&[1.0; 6])[0];
         let groups = [all[..2].to_vec(), all[2..3].to_vec(), all[3..].to_vec()];
-        assert_eq!(batches(&groups, Size::Cells(2), 1000), [vec![0, 1], vec![2], vec![3, 4], vec![5]]);
-        assert_eq!(batches(&groups, Size::Seconds(9.0), 1000), [vec![0, 1], vec![2], vec![3, 4, 5]]);
-        assert_eq!(batches(&groups, Size::Seconds(9.0), 2).len(), 2, "it ends, though they cannot be put together");
+        assert_eq!(batches(&groups, JobSize::Cells(2), 1000), [vec![0, 1], vec![2], vec![3, 4], vec![5]]);
+        assert_eq!(batches(&groups, JobSize::Seconds(9.0), 1000), [vec![0, 1], vec![2], vec![3, 4, 5]]);
+        assert_eq!(batches(&groups, JobSize::Seconds(9.0), 2).len(), 2, "it ends, though they cannot be put together");
     }
 }

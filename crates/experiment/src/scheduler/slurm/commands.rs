@@ -14,11 +14,11 @@ use super::job::QueuedJob;
 use super::options::{OptionError, SlurmOptions, text_of};
 use super::submission::Submission;
 
-/// How long Slurm may take to answer.
+/// Timeout of Slurm's commands.
 const LIMIT: Duration = Duration::from_secs(60);
-/// How often it is looked whether it has.
+/// Interval at which a running command is checked.
 const TICK: Duration = Duration::from_millis(20);
-/// What separates the fields of squeue's lines.
+/// The format of squeue's lines.
 const FIELDS: &str = "%F|%K|%T|%r|%N|%j";
 
 /// Slurm on this machine.
@@ -62,11 +62,11 @@ impl Slurm {
         text.lines().filter(|line| !line.trim().is_empty()).map(parse_job).collect()
     }
 
-    /// How many jobs an array may have.
+    /// Returns the maximum number of jobs in an array.
     ///
     /// # Errors
     /// What scontrol says, or that it says nothing.
-    pub(super) fn most_jobs(&self, stop: &StopFlag) -> Result<usize, SlurmError> {
+    pub(super) fn max_jobs(&self, stop: &StopFlag) -> Result<usize, SlurmError> {
         let text = self.call("scontrol", ["show", "config"], stop)?;
         match parse_setting(&text, "MaxArraySize").map(str::parse::<usize>) {
             Some(Ok(0)) => Err(SlurmError::NoArrays),
@@ -135,7 +135,7 @@ impl Slurm {
     }
 }
 
-/// What is in a file that others have written.
+/// Reads a file from its start.
 fn content(file: &mut File) -> std::io::Result<String> {
     let mut bytes = Vec::new();
     file.rewind()?;
@@ -192,7 +192,7 @@ fn not_understood(program: &'static str, expected: &'static str, got: &str) -> S
 
 #[cfg(test)]
 mod tests {
-    use super::super::submission::Names;
+    use super::super::submission::SlurmNames;
     use super::super::tests::options;
     use super::*;
 
@@ -221,7 +221,7 @@ mod tests {
     #[test]
     fn sbatch_hears_everything_that_was_asked_for() {
         let mut options = options();
-        let names = Names { name: "perturb-x-1".into(), job: None };
+        let names = SlurmNames { name: "perturb-x-1".into(), job: None };
         let jobs = vec![vec!["a".into()]; 3];
         let submission = Submission { number: 1, path: "/shared/100%/slurm/1".into(), jobs, names };
         let text = sbatch_arguments(&submission, &options).unwrap().join(" ");

@@ -26,7 +26,7 @@ pub enum SlurmError {
     #[error("{program} did not answer within {} s; is Slurm's controller up? The same command goes on", limit.as_secs())]
     Silent {
         program: &'static str,
-        /// How long it was waited for.
+        /// The time that was waited.
         limit: Duration,
     },
     /// Slurm said something else than expected.
@@ -44,7 +44,7 @@ pub enum SlurmError {
     /// The operating system refused a file.
     #[error(transparent)]
     File(#[from] FileError),
-    /// It cannot be found out what cells cost.
+    /// The cost of cells cannot be estimated.
     #[error("cannot estimate what cells cost, which says how many a job does: {0}; give --cells-per-job instead")]
     Cost(AnyError),
     /// Somebody cancelled everything.
@@ -55,7 +55,7 @@ pub enum SlurmError {
     )]
     Cancelled {
         arrays: Vec<String>,
-        /// How many cells are missing.
+        /// The number of cells without a result.
         missing: usize,
     },
 }

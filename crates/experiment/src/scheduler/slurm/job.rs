@@ -21,18 +21,18 @@ pub struct QueuedJob {
     pub array: String,
     /// The job's index in it.
     pub index: usize,
-    /// Its state, e.g. RUNNING.
+    /// The state, e.g. RUNNING.
     pub state: String,
     /// Why it is in this state; "None" often.
     pub reason: String,
-    /// Where it runs or ran; empty while it waits.
+    /// The node that runs or ran the job; empty while it waits.
     pub node: String,
     /// The array's name.
     pub name: String,
 }
 
 impl QueuedJob {
-    /// As it is when it was just submitted.
+    /// Returns a job that was just submitted.
     pub(super) fn pending(array: &str, index: usize, name: &str) -> Self {
         let [array, state, name] = [array, "PENDING", name].map(str::to_owned);
         Self { array, index, state, reason: String::new(), node: String::new(), name }

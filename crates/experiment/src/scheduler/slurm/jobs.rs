@@ -9,8 +9,8 @@ use perturb_files::interrupt::StopFlag;
 use perturb_files::{AnyError, Lock, create_folder, io};
 
 use super::super::event::{last_words, read_lines};
-use super::super::{Backend, CellEvent, News, Offer, Result, RunError, count};
-use super::batch::{CellLoad, JOB_SECONDS, Size, batches};
+use super::super::{Backend, BackendEvent, CellEvent, PendingCell, Result, RunError, count};
+use super::batch::{CellLoad, JOB_SECONDS, JobSize, batches};
 use super::commands::Slurm;
 use super::error::SlurmError;
 use super::job::QueuedJob;
@@ -37,13 +37,13 @@ pub struct Jobs<'a> {
     /// Slurm's last answer, and how many there were.
     queue: Vec<QueuedJob>,
     answers: u32,
-    /// What jobs have told, by their submission's number and their index.
-    told: HashMap<(u32, usize), Told>,
+    /// Positions in the jobs' event files, by submission and index.
+    told: HashMap<(u32, usize), LogCursor>,
     /// Submissions that this process has seen in the queue.
     watched: HashSet<u32>,
     /// Cells that were taken and not given back.
     taken: HashSet<usize>,
-    /// Of these, those that Slurm's last answer did not have.
+    /// Cells that were taken and were not in Slurm's last answer.
     suspects: HashSet<usize>,
     /// Locked while this process decides, from the question what is in the queue to the submission.
     deciding: Option<Lock>,
@@ -51,19 +51,19 @@ pub struct Jobs<'a> {
     /// Why Slurm cannot be asked, or takes nothing.
     trouble: Option<String>,
     /// For the next call.
-    news: Vec<News>,
+    news: Vec<BackendEvent>,
 }
 
 /// Up to where it was read what a job tells, and the cells whose turn has come by that.
 #[derive(Default)]
-struct Told {
+struct LogCursor {
     offset: u64,
     cells: HashSet<usize>,
 }
 
 impl<'a> Jobs<'a> {
-    /// Of `folder`, for `plan`. `costs` gives, by a cell's place in the plan, the seconds it may take; it is called once
-    /// at most, when something is to be submitted.
+    /// Returns the jobs of `folder`. `costs` estimates the duration of each cell by index, s; it is called at most
+    /// once, before the first submission.
     pub fn new(
         plan: &'a Plan,
         folder: &'a Folder,
@@ -125,7 +125,7 @@ impl<'a> Jobs<'a> {
     fn put_up_with(&mut self, error: &RunError) {
         let words = error.to_string();
         if self.trouble.as_ref() != Some(&words) {
-            self.news.push(News::Note(format!("{words}; results are still looked for, and it is tried again")));
+            self.news.push(BackendEvent::Note(format!("{words}; results are still looked for, and it is tried again")));
             self.trouble = Some(words);
         }
     }
@@ -140,13 +140,13 @@ impl<'a> Jobs<'a> {
             }
             if self.watched.insert(submission.number) {
                 let jobs = count(jobs.len(), "job");
-                self.news.push(News::Note(format!("Slurm job {} is in the queue, with {jobs}", first.array)));
+                self.news.push(BackendEvent::Note(format!("Slurm job {} is in the queue, with {jobs}", first.array)));
             }
         }
         Ok(())
     }
 
-    /// What job `index` of a submission has told since the last call.
+    /// Reads the new events of job `index`.
     fn read(&mut self, submission: usize, index: usize) -> Result<()> {
         let submission = &self.submissions[submission];
         let path = submission.events(index);
@@ -163,7 +163,7 @@ impl<'a> Jobs<'a> {
             }
             // An attempt that ended is the job's own affair, as long as the job goes on.
             if !line.event.is_last() {
-                self.news.push(News::Event(cell, line.event));
+                self.news.push(BackendEvent::Event(cell, line.event));
             }
         }
         Ok(())
@@ -194,8 +194,8 @@ impl<'a> Jobs<'a> {
             // A job that did other cells is no fault of one that had no turn.
             let had_its_turn = told.is_none_or(|cells| cells.is_empty() || cells.contains(&cell));
             self.news.push(match had_its_turn {
-                true => News::Event(cell, CellEvent::Killed { reason: self.how_it_ended(cell) }),
-                false => News::Returned(cell),
+                true => BackendEvent::Event(cell, CellEvent::Killed { reason: self.how_it_ended(cell) }),
+                false => BackendEvent::Returned(cell),
             });
         }
         self.suspects = &missing - &sure.into_iter().collect();
@@ -226,7 +226,7 @@ impl<'a> Jobs<'a> {
             how.push("and others".into());
         }
         let cells = count(cells.len(), "cell");
-        self.news.push(News::Note(format!("{cells} left Slurm's queue without a result ({})", how.join(", "))));
+        self.news.push(BackendEvent::Note(format!("{cells} left Slurm's queue without a result ({})", how.join(", "))));
     }
 
     /// Names the last job that had a cell, and the state that it ended in.
@@ -238,7 +238,7 @@ impl<'a> Jobs<'a> {
         (format!("{array}_{index}"), job.map_or("gone", |job| &job.state))
     }
 
-    /// How the last job that had a cell ended, and what it said last.
+    /// Describes the end of a cell's last job, with the job's last output.
     fn how_it_ended(&self, cell: usize) -> String {
         let (job, state) = self.end_of(cell);
         let log = self.last.get(&cell).map(|&(submission, index)| self.submissions[submission].log(index));
@@ -251,12 +251,12 @@ impl<'a> Jobs<'a> {
     }
 
     /// Submits the cells of `groups`, as far as Slurm takes them, and gives these.
-    fn submit(&mut self, groups: &[Vec<Offer>]) -> Result<Vec<usize>> {
-        let most_jobs = match self.slurm.most_jobs(self.stop) {
+    fn submit(&mut self, groups: &[Vec<PendingCell>]) -> Result<Vec<usize>> {
+        let max_jobs = match self.slurm.max_jobs(self.stop) {
             Ok(number) => number,
             Err(error) => return self.put_off(error.into()),
         };
-        let jobs = batches(&self.loads(groups)?, self.size(), most_jobs);
+        let jobs = batches(&self.loads(groups)?, self.size(), max_jobs);
         let cells = jobs.concat();
         let ids = jobs.iter().map(|job| job.iter().map(|&cell| self.id(cell).to_owned()).collect()).collect();
         let text = |path: &Path| Ok(script(&self.options.task, self.folder.path(), path)?);
@@ -271,7 +271,7 @@ impl<'a> Jobs<'a> {
         };
         submission.accepted(&array)?;
         let most = jobs.iter().map(Vec::len).max().unwrap_or_default();
-        self.news.push(News::Note(format!(
+        self.news.push(BackendEvent::Note(format!(
             "submitted {} as Slurm job {array}: {} of at most {}",
             count(cells.len(), "cell"),
             count(jobs.len(), "job"),
@@ -293,22 +293,22 @@ impl<'a> Jobs<'a> {
         Ok(Vec::new())
     }
 
-    fn size(&self) -> Size {
+    fn size(&self) -> JobSize {
         let limit = self.options.time.as_ref().map_or(f64::INFINITY, |limit| limit.seconds() as f64 / 2.0);
         match self.options.cells_per_job {
-            Some(number) => Size::Cells(number),
-            None => Size::Seconds(JOB_SECONDS.min(limit) * self.options.task.jobs as f64),
+            Some(number) => JobSize::Cells(number),
+            None => JobSize::Seconds(JOB_SECONDS.min(limit) * self.options.task.jobs as f64),
         }
     }
 
-    /// How long each cell may take: as long as others of its kind took, or as measured.
-    fn loads(&mut self, groups: &[Vec<Offer>]) -> Result<Vec<Vec<CellLoad>>> {
+    /// Estimates the duration of each cell, by finished cells of its kind or by measurement.
+    fn loads(&mut self, groups: &[Vec<PendingCell>]) -> Result<Vec<Vec<CellLoad>>> {
         let unknown = groups.iter().flatten().any(|offer| offer.seconds.is_none());
         if self.options.cells_per_job.is_none() && unknown && self.known_costs.is_none() {
             self.known_costs = Some((self.costs)().map_err(SlurmError::Cost)?);
         }
         let known = self.known_costs.as_deref().unwrap_or_default();
-        let load = |&Offer { cell, seconds, .. }: &Offer| CellLoad {
+        let load = |&PendingCell { cell, seconds, .. }: &PendingCell| CellLoad {
             cell,
             seconds: seconds.or(known.get(cell).copied()).unwrap_or_default(),
         };
@@ -337,7 +337,7 @@ impl Backend for Jobs<'_> {
         Grouping::BY_KIND
     }
 
-    fn convicts(&self) -> bool {
+    fn records_crashes_as_failures(&self) -> bool {
         false
     }
 
@@ -346,7 +346,7 @@ impl Backend for Jobs<'_> {
         false
     }
 
-    fn poll(&mut self, now: Instant) -> Result<Vec<News>> {
+    fn poll(&mut self, now: Instant) -> Result<Vec<BackendEvent>> {
         self.deciding = None;
         if self.ask_at.is_none_or(|time| now >= time) {
             self.ask_at = Some(now + self.options.queue_interval);
@@ -369,11 +369,11 @@ impl Backend for Jobs<'_> {
         Ok(std::mem::take(&mut self.news))
     }
 
-    fn room(&self) -> usize {
+    fn free_slots(&self) -> usize {
         if self.deciding.is_some() { usize::MAX } else { 0 }
     }
 
-    fn begin(&mut self, groups: &[Vec<Offer>]) -> Result<Vec<usize>> {
+    fn begin(&mut self, groups: &[Vec<PendingCell>]) -> Result<Vec<usize>> {
         let queued = self.queued();
         let (mut taken, mut missing) = (Vec::new(), Vec::new());
         for group in groups {
@@ -382,8 +382,8 @@ impl Backend for Jobs<'_> {
                 let place = self.folder.cell(self.id(offer.cell));
                 match offer.retry {
                     // The job that had it then is through with it, also if it has others to do.
-                    Some(failure) if place.failure_mark() == Some(failure) => {
-                        if place.forgive(failure)? {
+                    Some(failure) if place.failure_id() == Some(failure) => {
+                        if place.clear_failure_if(failure)? {
                             left.push(*offer);
                         }
                     }
@@ -404,7 +404,7 @@ impl Backend for Jobs<'_> {
         Ok(taken)
     }
 
-    fn most(&self, cell: usize) -> Option<f64> {
+    fn max_seconds(&self, cell: usize) -> Option<f64> {
         self.known_costs.as_ref()?.get(cell).copied()
     }
 

@@ -27,10 +27,10 @@ pub use commands::Slurm;
 pub use error::SlurmError;
 pub use job::QueuedJob;
 pub use jobs::Jobs;
-pub use options::{OptionError, SlurmOptions, Task, TimeLimit};
+pub use options::{JobCommand, OptionError, SlurmOptions, TimeLimit};
 
 /// The most cells of a job: their ids must fit in one argument of a command, which Linux limits to 128 KiB.
-pub const MOST_CELLS_PER_JOB: usize = 1000;
+pub const MAX_CELLS_PER_JOB: usize = 1000;
 
 #[cfg(test)]
 mod tests;

@@ -1,31 +1,31 @@
-//! What may be asked of Slurm, checked before anything is submitted.
+//! Options for Slurm, which are checked before anything is submitted.
 
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::Duration;
 
-use super::MOST_CELLS_PER_JOB;
+use super::MAX_CELLS_PER_JOB;
 
-/// How cells are submitted.
+/// Options of a submission.
 #[derive(Clone, Debug)]
 pub struct SlurmOptions {
     /// The partition; `None` leaves it to Slurm.
     pub partition: Option<String>,
-    /// How long a job may take; `None` leaves it to the partition.
+    /// Time limit of a job; `None` for the partition's limit.
     pub time: Option<TimeLimit>,
-    /// How many jobs of an array may run at a time, at least 1; `None` for as many as there is room for.
+    /// Maximum number of running jobs of an array, at least 1; `None` for no limit.
     pub array_limit: Option<u32>,
-    /// How many cells a job does, 1 to [`MOST_CELLS_PER_JOB`]; `None` for as many as take some minutes.
+    /// Number of cells of a job, 1 to [`MAX_CELLS_PER_JOB`]; `None` for some minutes of work.
     pub cells_per_job: Option<usize>,
-    /// What a job runs.
-    pub task: Task,
-    /// How often Slurm is asked for its queue. A cell that is lost is noticed by two answers in succession.
+    /// The command of a job.
+    pub task: JobCommand,
+    /// Interval of requests to Slurm. A cell counts as lost after two answers in a row.
     pub queue_interval: Duration,
 }
 
-/// What a job runs on its node.
+/// The command of a job on its node.
 #[derive(Clone, Debug)]
-pub struct Task {
+pub struct JobCommand {
     /// The program `perturb`, at a place that all nodes see.
     pub program: PathBuf,
     /// Groups of cells at a time, at least 1.
@@ -37,11 +37,11 @@ pub struct Task {
     pub workers: usize,
     /// Addresses of servers that all jobs share; empty for a private one in each job.
     pub servers: Vec<String>,
-    /// How long each job waits for servers that were lost, s.
+    /// Time that a job waits for lost servers, s.
     pub server_wait: u32,
 }
 
-impl Task {
+impl JobCommand {
     /// The cores that a job asks for. A group's trainings and their environments take turns, so that one does for both;
     /// further threads of its server have a core each.
     pub fn cores(&self) -> usize {
@@ -61,13 +61,13 @@ pub enum OptionError {
     )]
     Time { got: String },
     /// A number of cells that cannot be.
-    #[error("{got} cells a job: expected 1 to {MOST_CELLS_PER_JOB}")]
+    #[error("{got} cells a job: expected 1 to {MAX_CELLS_PER_JOB}")]
     CellsPerJob { got: usize },
     /// A path that cannot stand in a script and in Slurm's options.
     #[error("{path:?} cannot be handed to Slurm: {reason}; use another folder")]
     Path {
         path: PathBuf,
-        /// What is wrong with it.
+        /// The fault.
         reason: &'static str,
     },
 }
@@ -78,7 +78,7 @@ impl SlurmOptions {
     /// # Errors
     /// [`OptionError`].
     pub fn check(&self, folder: &Path) -> Result<(), OptionError> {
-        if let Some(got) = self.cells_per_job.filter(|number| !(1..=MOST_CELLS_PER_JOB).contains(number)) {
+        if let Some(got) = self.cells_per_job.filter(|number| !(1..=MAX_CELLS_PER_JOB).contains(number)) {
             return Err(OptionError::CellsPerJob { got });
         }
         text_of(folder)?;
@@ -109,12 +109,12 @@ pub struct TimeLimit {
 }
 
 impl TimeLimit {
-    /// As it was written.
+    /// Returns the limit as it was written.
     pub fn text(&self) -> &str {
         &self.text
     }
 
-    /// How long it is.
+    /// Returns the limit in seconds.
     pub fn seconds(&self) -> u64 {
         self.seconds
     }
@@ -188,8 +188,9 @@ mod tests {
 
     #[test]
     fn a_job_asks_for_the_cores_that_it_uses() {
-        let task = Task { program: "/x".into(), jobs: 2, group: 36, workers: 3, servers: Vec::new(), server_wait: 0 };
+        let task =
+            JobCommand { program: "/x".into(), jobs: 2, group: 36, workers: 3, servers: Vec::new(), server_wait: 0 };
         assert_eq!(task.cores(), 6);
-        assert_eq!(Task { servers: vec!["a:1".into()], ..task }.cores(), 2);
+        assert_eq!(JobCommand { servers: vec!["a:1".into()], ..task }.cores(), 2);
     }
 }

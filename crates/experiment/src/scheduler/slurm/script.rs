@@ -1,13 +1,13 @@
-//! What every job of an array runs.
+//! The script of the jobs of an array.
 
 use std::path::Path;
 
-use super::options::{OptionError, Task, text_of};
+use super::options::{JobCommand, OptionError, text_of};
 
 /// The script of the submission in `submission`, for the experiment in `folder`.
 ///
 /// `exec` makes the program the process that Slurm signals: it then finishes its iterations and writes checkpoints.
-pub(super) fn script(task: &Task, folder: &Path, submission: &Path) -> Result<String, OptionError> {
+pub(super) fn script(task: &JobCommand, folder: &Path, submission: &Path) -> Result<String, OptionError> {
     let cells = quoted(text_of(&submission.join("cells.txt"))?);
     let plan = quoted(text_of(&submission.join("plan.toml"))?);
     let (folder, program) = (quoted(text_of(folder)?), quoted(text_of(&task.program)?));
@@ -37,7 +37,7 @@ exec "$program" run {plan} --json --out {folder} --cell "$cells" --jobs {jobs} -
     ))
 }
 
-/// A word that the shell takes as it is.
+/// Quotes a word for the shell.
 fn quoted(text: &str) -> String {
     format!("'{}'", text.replace('\'', r"'\''"))
 }
@@ -49,7 +49,7 @@ mod tests {
     use super::*;
 
     /// Runs a script whose program prints its arguments.
-    fn run(task: &Task, directory: &Path, index: &str) -> (bool, String) {
+    fn run(task: &JobCommand, directory: &Path, index: &str) -> (bool, String) {
         let text = script(task, &directory.join("it's $HOME"), directory).unwrap();
         let path = directory.join("job.sh");
         std::fs::write(&path, text).unwrap();
@@ -64,8 +64,14 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         std::fs::write(directory.path().join("cells.txt"), "a,b\nc\n").unwrap();
         let program = directory.path().join("a program");
-        let mut task =
-            Task { program: program.clone(), jobs: 2, group: 9, workers: 3, servers: Vec::new(), server_wait: 60 };
+        let mut task = JobCommand {
+            program: program.clone(),
+            jobs: 2,
+            group: 9,
+            workers: 3,
+            servers: Vec::new(),
+            server_wait: 60,
+        };
         let (succeeded, said) = run(&task, directory.path(), "0");
         assert!(!succeeded && said.contains("n1 finds no program") && said.contains("a program"), "{said}");
 

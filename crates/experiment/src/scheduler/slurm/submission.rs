@@ -1,4 +1,4 @@
-//! What was submitted, as it is kept in the folder.
+//! Submissions in the experiment's folder.
 
 use std::path::{Path, PathBuf};
 
@@ -18,18 +18,18 @@ const DOCUMENT: &str = "submission.json";
 pub(super) struct Submission {
     /// From 1.
     pub(super) number: u32,
-    /// Where it is kept.
+    /// The folder of the submission.
     pub(super) path: PathBuf,
     /// The ids of each job's cells, by the job's index in the array.
     pub(super) jobs: Vec<Vec<String>>,
     /// Names in Slurm.
-    pub(super) names: Names,
+    pub(super) names: SlurmNames,
 }
 
 /// `submission.json`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Names {
+pub(super) struct SlurmNames {
     /// The array's name in the queue, which is known before Slurm accepts it: should this process end before it hears
     /// the number, the next one finds the array by its name.
     pub(super) name: String,
@@ -37,7 +37,7 @@ pub(super) struct Names {
     pub(super) job: Option<String>,
 }
 
-/// Where submissions are kept.
+/// Returns the folder of all submissions.
 pub(super) fn directory(folder: &Folder) -> PathBuf {
     folder.path().join("slurm")
 }
@@ -84,7 +84,7 @@ pub(super) fn create(
     write_atomically(&path.join("job.sh"), script(&path)?.as_bytes())?;
     // Folders of different places have different names in one queue.
     let place = crc32c::crc32c(path.as_os_str().as_encoded_bytes());
-    let names = Names { name: format!("perturb-{place:08x}-{number}"), job: None };
+    let names = SlurmNames { name: format!("perturb-{place:08x}-{number}"), job: None };
     let submission = Submission { number, path, jobs, names };
     submission.write()?;
     Ok(submission)
@@ -107,7 +107,7 @@ impl Submission {
         self.path.join(format!("{index}.jsonl"))
     }
 
-    /// What else it said.
+    /// Returns the path of the job's log.
     pub(super) fn log(&self, index: usize) -> PathBuf {
         self.path.join(format!("{index}.log"))
     }

@@ -12,9 +12,9 @@ use std::time::{Duration, Instant};
 use perturb_files::interrupt::StopFlag;
 use tempfile::TempDir;
 
-use super::super::{Announcement, Backend, RunEnd, RunError, Scheduler};
+use super::super::{Backend, ProgressEvent, RunEnd, RunError, Scheduler};
 use super::submission::{self, Submission};
-use super::{Jobs, Slurm, SlurmOptions, Task};
+use super::{JobCommand, Jobs, Slurm, SlurmOptions};
 use crate::folder::{Failure, Folder};
 use crate::plan::Plan;
 
@@ -52,7 +52,14 @@ pub(super) fn options() -> SlurmOptions {
         time: None,
         array_limit: None,
         cells_per_job: Some(1),
-        task: Task { program: "/bin/true".into(), jobs: 1, group: 36, workers: 1, servers: Vec::new(), server_wait: 0 },
+        task: JobCommand {
+            program: "/bin/true".into(),
+            jobs: 1,
+            group: 36,
+            workers: 1,
+            servers: Vec::new(),
+            server_wait: 0,
+        },
         queue_interval: Duration::from_secs(15),
     }
 }
@@ -117,15 +124,15 @@ impl Fake {
     }
 
     /// Runs, a second at each step; `watch` hears every sentence.
-    fn run_with(&self, stop: &StopFlag, watch: &mut dyn FnMut(Announcement<'_>)) -> Result<RunEnd, RunError> {
+    fn run_with(&self, stop: &StopFlag, watch: &mut dyn FnMut(ProgressEvent<'_>)) -> Result<RunEnd, RunError> {
         let costs = || {
             self.costs.set(self.costs.get() + 1);
             Ok(vec![100.0; self.plan.cells.len()])
         };
         let slurm = self.slurm();
         let mut jobs = Jobs::new(&self.plan, &self.folder, &slurm, &self.options, &costs, stop);
-        let forgiven = if self.retry_failed { self.folder.failures().unwrap() } else { HashMap::new() };
-        let mut scheduler = Scheduler::new(&self.plan, &self.folder, &mut jobs, &forgiven, watch);
+        let retryable = if self.retry_failed { self.folder.failures().unwrap() } else { HashMap::new() };
+        let mut scheduler = Scheduler::new(&self.plan, &self.folder, &mut jobs, &retryable, watch);
         let start = Instant::now();
         for second in 0..1000 {
             let stepped = scheduler.step(start + Duration::from_secs(second))?;
@@ -147,7 +154,7 @@ impl Fake {
         let stop = StopFlag::default();
         let raised = stop.clone();
         self.run_with(&stop, &mut |report| match report {
-            Announcement::Note(sentence) if sentence.contains(words) => raised.raise(2),
+            ProgressEvent::Note(sentence) if sentence.contains(words) => raised.raise(2),
             _ => {}
         })
     }
@@ -218,7 +225,7 @@ fn what_slurm_lost_is_submitted_again() {
     ));
     let mut said = Vec::new();
     let end = fake.run_with(&StopFlag::default(), &mut |report| {
-        if let Announcement::Note(sentence) = report {
+        if let ProgressEvent::Note(sentence) = report {
             said.push(sentence.to_owned());
         }
     });
@@ -241,7 +248,7 @@ fn a_job_has_cells_of_one_kind() {
 }
 
 #[test]
-fn a_job_that_got_further_until_its_time_was_up_is_submitted_as_it_was_and_another_in_single_cells() {
+fn job_with_progress_is_resubmitted_whole() {
     for (saved, again) in [(2, 1), (1, 2)] {
         let mut fake = Fake::new();
         (fake.options.cells_per_job, fake.plan) = (Some(2), of_one_kind());
@@ -263,7 +270,7 @@ fn a_job_that_got_further_until_its_time_was_up_is_submitted_as_it_was_and_anoth
 }
 
 #[test]
-fn a_cell_that_gets_no_further_is_given_up_and_the_others_are_done() {
+fn cell_without_progress_is_given_up() {
     let fake = Fake::new();
     let ids = fake.ids();
     fake.hook(&format!(
@@ -320,8 +327,8 @@ fn slurms_refusal_is_shown_and_leaves_nothing_behind() {
     let (stop, refusal) = (StopFlag::default(), fake.bin().join("refusal"));
     let raised = stop.clone();
     let end = fake.run_with(&stop, &mut |report| match report {
-        Announcement::Note(sentence) if sentence.contains("MaxSubmit") => fs::remove_file(&refusal).unwrap(),
-        Announcement::Note(sentence) if sentence.contains("submitted 2 cells") => raised.raise(2),
+        ProgressEvent::Note(sentence) if sentence.contains("MaxSubmit") => fs::remove_file(&refusal).unwrap(),
+        ProgressEvent::Note(sentence) if sentence.contains("submitted 2 cells") => raised.raise(2),
         _ => {}
     });
     assert_eq!(end.unwrap(), stopped(&["1", "2"]));
@@ -343,8 +350,8 @@ fn a_silent_slurm_is_no_reason_to_submit_again() {
     // It falls silent while it is watched: results are found all the same.
     fake.command("squeue", "cat queue");
     let end = fake.run_with(&StopFlag::default(), &mut |report| match report {
-        Announcement::Note(sentence) if sentence.contains("is in the queue") => fake.command("squeue", silent),
-        Announcement::Note(sentence) if sentence.contains("did not answer") => {
+        ProgressEvent::Note(sentence) if sentence.contains("is in the queue") => fake.command("squeue", silent),
+        ProgressEvent::Note(sentence) if sentence.contains("did not answer") => {
             fake.ids().iter().for_each(|id| fake.finish(id));
         }
         _ => {}
@@ -354,7 +361,7 @@ fn a_silent_slurm_is_no_reason_to_submit_again() {
 }
 
 #[test]
-fn what_somebody_cancelled_is_submitted_again_by_the_next_call_only() {
+fn cancelled_job_is_resubmitted_by_the_next_call_only() {
     let fake = Fake::new();
     fake.hook("sed -i s/PENDING/CANCELLED/ queue");
     let message = fake.run().unwrap_err().to_string();
@@ -386,7 +393,7 @@ fn failed_cells_are_tried_again_on_request_only() {
     ids[1..].iter().for_each(|id| fake.finish(id));
     let failed = fake.folder.cell(&ids[0]);
     fs::create_dir_all(failed.training()).unwrap();
-    let failure = Failure { id: ids[0].clone(), reason: "NaN".into(), commit: "x".into(), begins_anew: true };
+    let failure = Failure { id: ids[0].clone(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
     failed.write_failure(&failure).unwrap();
     assert_eq!(fake.run().unwrap(), RunEnd::Finished { failed: vec![ids[0].clone()] });
     assert!(fake.submissions().is_empty());
@@ -399,12 +406,12 @@ fn failed_cells_are_tried_again_on_request_only() {
 }
 
 #[test]
-fn a_cell_that_failed_in_an_array_of_before_is_tried_again_while_the_array_goes_on() {
+fn failed_cell_is_retried_while_its_array_runs() {
     let mut fake = Fake::new();
     (fake.options.cells_per_job, fake.plan) = (Some(4), of_one_kind());
     let ids = fake.ids();
     assert_eq!(fake.run_until("submitted 4 cells as Slurm job 1: 1 job").unwrap(), stopped(&["1"]));
-    let failure = Failure { id: ids[0].clone(), reason: "NaN".into(), commit: "x".into(), begins_anew: true };
+    let failure = Failure { id: ids[0].clone(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
     fake.folder.cell(&ids[0]).write_failure(&failure).unwrap();
     fake.retry_failed = true;
     assert_eq!(fake.run_until("submitted 1 cell as Slurm job 2").unwrap(), stopped(&["1", "2"]));

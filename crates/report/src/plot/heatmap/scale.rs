@@ -1,4 +1,4 @@
-//! What the colours of mean returns reach over.
+//! Ranges of the colours of mean returns.
 
 use std::ops::Range;
 
@@ -57,7 +57,7 @@ mod tests {
     }
 
     #[test]
-    fn the_scale_of_another_is_that_of_all_rounded_outwards_and_never_empty() {
+    fn scale_of_unknown_environment_is_rounded_outwards() {
         let [a, b] = [-5.0, 3.0].map(|value| fixture::heatmap(2, |mass, _| (value + mass, 0.0)));
         assert_eq!(common_returns("Ball", [&a, &b].into_iter()), -6.0..6.0);
         assert_eq!(common_returns("Ball", std::iter::once(&fixture::heatmap(2, |_, _| (7.0, 0.0)))), 6.0..7.0);

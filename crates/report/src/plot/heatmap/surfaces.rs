@@ -9,7 +9,7 @@ pub(super) fn as_paths(svg: &str) -> String {
     let mut shown = String::new();
     let mut surface: BTreeMap<&str, String> = BTreeMap::new();
     for line in svg.split_inclusive('\n') {
-        match Rectangle::of(line) {
+        match Rectangle::parse(line) {
             Some(Rectangle { colour, x, y, width, height }) => {
                 // The end of a path is where it began.
                 let path = surface.entry(colour).or_default();
@@ -41,7 +41,7 @@ struct Rectangle<'a> {
 }
 
 impl<'a> Rectangle<'a> {
-    fn of(line: &'a str) -> Option<Self> {
+    fn parse(line: &'a str) -> Option<Self> {
         let attributes = line.trim_end().strip_prefix("<rect ")?.strip_suffix("/>")?;
         let is_whole = attributes.contains("stroke=\"none\"") && attributes.contains("opacity=\"1\"");
         let value = |name: &str| {
@@ -64,7 +64,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn neighbouring_rectangles_are_a_path_for_each_colour_and_all_else_stays() {
+    fn neighbouring_rectangles_merge_by_colour() {
         let rect = |x: i32, colour: &str, stroke: &str| {
             format!(
                 "<rect x=\"{x}\" y=\"7\" width=\"2\" height=\"3\" opacity=\"1\" fill=\"{colour}\" stroke=\"{stroke}\"/>\n"

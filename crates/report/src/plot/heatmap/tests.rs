@@ -16,7 +16,7 @@ fn surfaces(shown: &str, width: i32) -> Vec<(&str, &str)> {
 }
 
 #[test]
-fn a_perfect_policy_has_the_top_colour_everywhere_and_the_worst_the_last() {
+fn perfect_and_worst_policies_have_the_end_colours() {
     for (figures, colour) in [((-120.0, 100.0), "#FDE725"), ((-1700.0, 0.0), "#440154")] {
         let panels = panels(&[fixture::heatmap(5, |_, _| figures)]);
         let shown = svg(&panels).unwrap();
@@ -56,7 +56,7 @@ fn a_point_has_the_colour_of_its_share_of_the_scale() {
 }
 
 #[test]
-fn d_r_and_e_stand_side_by_side_with_one_scale_and_unbroken_boxes() {
+fn d_r_e_share_one_scale_and_whole_boxes() {
     let of = [-1600.0, -900.0, -200.0].map(|value| fixture::heatmap(4, |_, _| (value, 50.0)));
     let three = panels(&of);
     let tops: Vec<f64> = (0..3).map(|column| three.frame(column, 7.0).top).collect();
@@ -86,7 +86,7 @@ fn boxes_are_whole_in_a_png() {
     {
         let area =
             BitMapBackend::with_buffer(&mut pixels, (SIZE.0 * PNG_SCALE, SIZE.1 * PNG_SCALE)).into_drawing_area();
-        Canvas::new(&area, PNG_SCALE).unwrap().outline([(10.0, 10.0), (50.0, 40.0)], RANDOM).unwrap();
+        PlotCanvas::new(&area, PNG_SCALE).unwrap().outline([(10.0, 10.0), (50.0, 40.0)], RANDOM).unwrap();
         area.present().unwrap();
     }
     let at = |x: u32, y: u32| {

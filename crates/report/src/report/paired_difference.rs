@@ -1,4 +1,4 @@
-//! What it brings on E to have been trained on R: policies of the same seed, one trained on R, one on D.
+//! Paired differences in success on E: trained on R minus trained on D, same seed.
 
 use std::collections::BTreeMap;
 
@@ -12,28 +12,28 @@ use perturb_text::Table;
 use super::Report;
 use super::columns::MethodColumns;
 use super::comparisons::shown as shown_p;
+use super::index::ReportIndex;
 use super::numbers::or_empty;
-use super::pictures::{Drawing, Picture};
-use super::scope::Scope;
+use super::pictures::{Picture, PictureDrawing};
 use crate::plot::intervals::{Group, IntervalRow};
-use crate::plot::{Intervals, panels};
+use crate::plot::{IntervalPlot, panels};
 
-/// One pair says nothing about others.
-const LEAST_PAIRS: usize = 2;
-/// What stands for all environments together, in files; a reader is told "all environments".
+/// Minimum number of pairs for an interval.
+const MIN_PAIRS: usize = 2;
+/// The name of all environments together in files. Readers see "all environments".
 const ALL: &str = "all";
-/// The axis ends at a multiple of so many points.
+/// Step to which the axis is rounded, percentage points.
 const STEP: f64 = 10.0;
 
 const TITLE: &str = "Success on E of policies trained on R, less that of those trained on D";
 
-/// Of a method in an environment, or over all.
+/// The paired difference of a method in an environment, or over all.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Gain<'a> {
-    /// Its name, or [`ALL`].
+pub(super) struct PairedDifference<'a> {
+    /// The environment's name, or [`ALL`].
     environment: &'a str,
     method: Method,
-    /// Of runs, all environments together.
+    /// The number of pairs of runs, over all environments.
     pairs: usize,
     /// Percentage points, mean over environments and runs, with its t interval.
     points: Bootstrapped,
@@ -44,11 +44,12 @@ pub(super) struct Gain<'a> {
 }
 
 /// Over all environments, if there are several, then those in each of them; of reference lines none, as in comparisons.
-pub(super) fn gains<'a>(scope: &Scope<'a>, selections: &[MethodResults<'a>]) -> Vec<Gain<'a>> {
-    let learners: Vec<_> = scope.methods.iter().filter(|method| !method.is_reference() && !method.elsewhere).collect();
-    let of = |environments: &[&'a str], name: &'a str| -> Vec<Gain<'a>> {
+pub(super) fn gains<'a>(scope: &ReportIndex<'a>, selections: &[MethodResults<'a>]) -> Vec<PairedDifference<'a>> {
+    let learners: Vec<_> = scope.methods.iter().filter(|method| !method.is_reference() && !method.external).collect();
+    let of = |environments: &[&'a str], name: &'a str| -> Vec<PairedDifference<'a>> {
         let gain = |method: &&Method| gain(selections, method, environments, name);
-        let mut gains: Vec<Gain<'a>> = learners.iter().copied().filter_map(|method| gain(&method)).collect();
+        let mut gains: Vec<PairedDifference<'a>> =
+            learners.iter().copied().filter_map(|method| gain(&method)).collect();
         let corrected = holm(&gains.iter().map(|gain| gain.p).collect::<Vec<_>>());
         gains.iter_mut().zip(corrected).for_each(|(gain, corrected)| gain.corrected = corrected);
         gains
@@ -63,19 +64,19 @@ fn gain<'a>(
     method: &Method,
     environments: &[&'a str],
     name: &'a str,
-) -> Option<Gain<'a>> {
+) -> Option<PairedDifference<'a>> {
     let row = |environment: &&str| selections.iter().find(|it| it.environment == *environment && it.method == *method);
     let of_each: Vec<_> =
         environments.iter().map(|environment| row(environment).map(differences)).collect::<Option<_>>()?;
     let is_everywhere = |run: &&u32| of_each.iter().all(|runs| runs.contains_key(*run));
     let runs: Vec<u32> = of_each.first()?.keys().filter(is_everywhere).copied().collect();
-    if runs.len() < LEAST_PAIRS {
+    if runs.len() < MIN_PAIRS {
         return None;
     }
     let strata: Vec<Vec<f64>> = of_each.iter().map(|of| runs.iter().map(|run| of[run]).collect()).collect();
     let points = mean_with_t_interval(&strata)?;
     let (pairs, p) = (strata.iter().map(Vec::len).sum(), sign_flip_p(&strata.concat(), 1));
-    Some(Gain { environment: name, method: method.clone(), pairs, points, p, corrected: p })
+    Some(PairedDifference { environment: name, method: method.clone(), pairs, points, p, corrected: p })
 }
 
 /// By the numbers of the runs in which both policies were tested on E.
@@ -96,7 +97,7 @@ impl<'a> Report<'a> {
             "{TITLE}: percentage points with 95 % t intervals, pairs of the same seed, p of sign flips, \
              corrected after Holm for the methods of an environment"
         );
-        let table = Table::of(title, &self.gains)
+        let table = Table::builder(title, &self.gains)
             .text("environment", |row| shown(row.environment))
             .text("method", |row| &row.method)
             .number("R − D", |row| row.points)
@@ -108,8 +109,9 @@ impl<'a> Report<'a> {
     }
 
     pub(super) fn gains_file(&self) -> Table {
-        let end = |row: &Gain<'_>, end: usize| or_empty(row.points.interval_95.map(|interval| interval[end]));
-        Table::of("gains.csv", &self.gains)
+        let end =
+            |row: &PairedDifference<'_>, end: usize| or_empty(row.points.interval_95.map(|interval| interval[end]));
+        Table::builder("train_r_vs_d.csv", &self.gains)
             .text("environment", |row| row.environment)
             .method(|row| &row.method)
             .number("pairs", |row| row.pairs)
@@ -127,7 +129,7 @@ impl<'a> Report<'a> {
         let ends = self.gains.iter().flat_map(|row| row.points.interval_95.unwrap_or([row.points.point; 2]));
         let most = ends.fold(0.0_f64, |most, end| most.max(end.abs()));
         let reach = STEP * (most / STEP).ceil().max(1.0);
-        let row = |gain: &Gain<'_>| IntervalRow {
+        let row = |gain: &PairedDifference<'_>| IntervalRow {
             name: gain.method.to_string(),
             index: panels::index_of(&self.scope.methods, &gain.method),
             point: Some(gain.points.point),
@@ -138,7 +140,7 @@ impl<'a> Report<'a> {
             name: shown(environment).into(),
             rows: self.gains.iter().filter(|gain| gain.environment == environment).map(row).collect(),
         };
-        let drawing = Intervals {
+        let drawing = IntervalPlot {
             title: TITLE.into(),
             x_name: "percentage points".into(),
             x: -reach..reach,
@@ -155,7 +157,7 @@ impl<'a> Report<'a> {
                  helped."
             ),
             data: self.gains_file(),
-            drawing: Drawing::Intervals(drawing),
+            drawing: PictureDrawing::Intervals(drawing),
         })
     }
 }
@@ -179,10 +181,10 @@ mod tests {
         let plan = Plan::parse("test", file.into()).unwrap();
         let results = crate::fixture::results(&plan, |cell| known(cell).map(|rates| (rates, 1.0)));
         let selections = results.select();
-        let shown = |it: Gain<'_>| {
+        let shown = |it: PairedDifference<'_>| {
             (it.environment.to_owned(), it.method.to_string(), it.pairs, it.points.point, it.points.interval_95)
         };
-        gains(&Scope::of(&plan, &selections), &selections).into_iter().map(shown).collect()
+        gains(&ReportIndex::new(&plan, &selections), &selections).into_iter().map(shown).collect()
     }
 
     fn is_r(cell: &Cell) -> bool {

@@ -10,15 +10,15 @@ use perturb_text::{Column, Entry, Table};
 
 use super::Report;
 use super::columns::MethodColumns;
+use super::index::ReportIndex;
 use super::numbers::or_empty;
-use super::scope::Scope;
-use super::tested::{Trained, trained};
+use super::tested::{PolicyGroup, trained};
 
 /// Stands for a number that cannot be had.
 const NONE: &str = "–";
 
-/// How bad the worst of a test is, over runs.
-pub(super) struct Worst<'a> {
+/// Tail risk of a test, over runs.
+pub(super) struct TailRisk<'a> {
     environment: &'a str,
     method: &'a Method,
     trained_on: TrainedOn<'a>,
@@ -32,15 +32,15 @@ pub(super) struct Worst<'a> {
 
 /// In the order of `selections`, of what they were trained on, and of the plan's tests.
 pub(super) fn worst<'a>(
-    scope: &Scope<'a>,
+    scope: &ReportIndex<'a>,
     selections: &'a [MethodResults<'a>],
     recorded: &'a Recorded,
-) -> Vec<Worst<'a>> {
-    let of = |trained: &Trained<'a>, tested_on: &'a str| {
+) -> Vec<TailRisk<'a>> {
+    let of = |trained: &PolicyGroup<'a>, tested_on: &'a str| {
         let over_runs = |number: fn(&Outcomes) -> Option<f64>| {
-            Summary::of(&trained.tests(tested_on).filter_map(number).collect::<Vec<_>>())
+            Summary::from_values(&trained.tests(tested_on).filter_map(number).collect::<Vec<_>>())
         };
-        Some(Worst {
+        Some(TailRisk {
             environment: trained.environment,
             method: trained.method,
             trained_on: trained.trained_on,
@@ -55,14 +55,14 @@ pub(super) fn worst<'a>(
 }
 
 impl Report<'_> {
-    /// Of each environment that has recorded episodes.
+    /// Returns a table for each environment with recorded episodes.
     pub(super) fn worst_tables(&self) -> Vec<Table> {
         let of_environments = self.worst.chunk_by(|a, b| a.environment == b.environment);
         of_environments.map(worst_table).collect()
     }
 
     pub(super) fn worst_file(&self) -> Table {
-        Table::of("worst.csv", &self.worst)
+        Table::builder("cvar.csv", &self.worst)
             .text("environment", |row| row.environment)
             .method(|row| row.method)
             .text("train", |row| row.trained_on)
@@ -77,15 +77,15 @@ impl Report<'_> {
     }
 }
 
-fn worst_table(rows: &[Worst<'_>]) -> Table {
-    let of_policy: Vec<&[Worst<'_>]> =
+fn worst_table(rows: &[TailRisk<'_>]) -> Table {
+    let of_policy: Vec<&[TailRisk<'_>]> =
         rows.chunk_by(|a, b| (a.method, a.trained_on) == (b.method, b.trained_on)).collect();
     let title = format!("{}: the worst tenth", rows[0].environment);
-    let mut table = Table::of(title, &of_policy)
+    let mut table = Table::builder(title, &of_policy)
         .text("method", |rows| rows[0].method)
         .text("trained on", |rows| rows[0].trained_on);
     let column = |name: String, group: &str| Column { name, group: Some(group.into()), is_number: true };
-    let test = |rows: &&[Worst<'_>], version: Version, number: fn(&Worst<'_>) -> Option<Summary>| {
+    let test = |rows: &&[TailRisk<'_>], version: Version, number: fn(&TailRisk<'_>) -> Option<Summary>| {
         rows.iter().find(|row| row.tested_on == version.to_string()).and_then(number)
     };
     for version in Version::ALL {

@@ -11,7 +11,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use perturb_files::checksum::Sealed;
+use perturb_files::checksum::WithChecksum;
 use perturb_files::{self as files, FileError, checksum, read_if_there};
 use perturb_protocol::Version;
 use perturb_settings::{Method, Observe, Preset, ValueError};
@@ -23,37 +23,37 @@ use crate::results::TestResult;
 use crate::scenarios::TrainedOn;
 use crate::success::Rule;
 
-/// What says what the files beside it are.
+/// The file that lists the other files of an evaluation.
 pub const ASSESSMENT: &str = "assessment.json";
-/// Of `assessment.json`; raised when older programs could misread it.
+/// Format of `assessment.json`; raised when older programs could misread it.
 const FORMAT_VERSION: u32 = 1;
 
 /// The tests of an agent in one environment.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Assessed {
-    /// What reports call where it comes from: the name of its folder; empty if it was never saved.
+pub struct ExternalEvaluation {
+    /// The evaluation's name in reports: the name of its folder, or empty if it was never saved.
     pub name: String,
-    /// What reports call the agent, e.g. "PPO".
+    /// The agent's name in reports, e.g. "PPO".
     pub agent: String,
     /// At least one, all of one environment, each trained on something else.
-    policies: Vec<AssessedPolicy>,
+    policies: Vec<ExternalPolicy>,
 }
 
 /// A policy and its recorded tests.
 #[derive(Clone, Debug, PartialEq)]
-pub struct AssessedPolicy {
-    /// What is known of it beside its records.
-    pub known: Known,
+pub struct ExternalPolicy {
+    /// Metadata that is not in the records.
+    pub known: PolicyMetadata,
     /// Every episode.
     pub records: Records,
     results: BTreeMap<String, TestResult>,
     outcomes: PolicyOutcomes,
 }
 
-/// What is known of a policy beside its records.
+/// Metadata of a policy that is not in its records.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Known {
-    /// Where parameters came from in its training; `None` if that is not known, or was none of the versions.
+pub struct PolicyMetadata {
+    /// The distribution of parameters in training; `None` if it is not known or none of the versions.
     pub trained_on: Option<Version>,
     /// Steps of its training, of all environments together; `None` if not known.
     pub timesteps: Option<u64>,
@@ -61,7 +61,7 @@ pub struct Known {
     pub seed: u64,
     /// Episodes of each test, as they were asked for.
     pub episodes: u64,
-    /// What it saw.
+    /// The observation of the policy.
     pub observe: Observe,
     /// Whether it took the mode of its actions' distribution. `None` if that was its own business.
     pub deterministic: Option<bool>,
@@ -70,25 +70,25 @@ pub struct Known {
 /// `assessment.json`.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Document {
+struct EvaluationDocument {
     format_version: u32,
     environment: String,
     agent: String,
-    policies: Vec<Entry>,
+    policies: Vec<PolicyEntry>,
 }
 
 #[derive(Serialize, Deserialize)]
-struct Entry {
+struct PolicyEntry {
     file: String,
     #[serde(flatten)]
-    known: Known,
+    known: PolicyMetadata,
 }
 
 /// Why an assessment cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
-pub enum AssessedError {
+pub enum ExternalEvaluationError {
     /// The operating system refused a file.
     #[error(transparent)]
     File(#[from] FileError),
@@ -98,39 +98,39 @@ pub enum AssessedError {
     /// There is none.
     #[error("{} holds no assessment: {ASSESSMENT} is not there; give the folder of Assessment.save", path.display())]
     Missing { path: PathBuf },
-    /// It is damaged, or of a program that is too different.
+    /// The document is damaged, or was written by an incompatible program.
     #[error("{} is damaged: {reason}", path.display())]
     Damaged {
         path: PathBuf,
-        /// What is wrong with it.
+        /// The fault.
         reason: String,
     },
-    /// It has another format.
+    /// The document has an unknown format.
     #[error("{} has format {got}; this program reads {FORMAT_VERSION}", path.display())]
     Format { path: PathBuf, got: u64 },
     /// Policies that are not those of one agent in one environment.
     #[error("an assessment is of policies in one environment, each trained on something else: {got}")]
     Mixed {
-        /// What is not so.
+        /// The violated condition.
         got: String,
     },
     /// Something is there.
     #[error("{} is not empty; {instead}", path.display())]
     NotEmpty {
         path: PathBuf,
-        /// What to do.
+        /// Advice for the user.
         instead: &'static str,
     },
 }
 
-type Result<T> = std::result::Result<T, AssessedError>;
+type Result<T> = std::result::Result<T, ExternalEvaluationError>;
 
-impl AssessedPolicy {
-    /// Of its records.
-    pub fn new(known: Known, records: Records) -> Self {
+impl ExternalPolicy {
+    /// Returns a policy with the results of its recorded tests.
+    pub fn new(known: PolicyMetadata, records: Records) -> Self {
         let names = || records.about.tests.iter().map(|test| test.set.name.as_str());
         let results = names().map(|name| (name.to_owned(), records.result(name, None))).collect();
-        let outcomes = PolicyOutcomes::of(&records, names());
+        let outcomes = PolicyOutcomes::new(&records, names());
         Self { known, records, results, outcomes }
     }
 
@@ -139,7 +139,7 @@ impl AssessedPolicy {
         self.results.get(tested_on)
     }
 
-    /// Its episodes.
+    /// Returns the episodes by test.
     pub fn outcomes(&self) -> &PolicyOutcomes {
         &self.outcomes
     }
@@ -150,38 +150,38 @@ impl AssessedPolicy {
         self.known.trained_on.map_or_else(|| FILE.to_owned(), of)
     }
 
-    /// What it was trained on.
+    /// Returns the training distribution.
     pub fn trained_on<'a>(&self) -> TrainedOn<'a> {
         self.known.trained_on.map_or(TrainedOn::Unknown, TrainedOn::Version)
     }
 }
 
-impl Assessed {
-    /// Of at least one policy.
+impl ExternalEvaluation {
+    /// Returns an evaluation of at least one policy.
     ///
     /// # Errors
-    /// [`AssessedError::Mixed`].
-    pub fn new(name: String, agent: String, policies: Vec<AssessedPolicy>) -> Result<Self> {
+    /// [`ExternalEvaluationError::Mixed`].
+    pub fn new(name: String, agent: String, policies: Vec<ExternalPolicy>) -> Result<Self> {
         let environments: BTreeSet<&str> = policies.iter().map(|it| it.records.about.environment.as_str()).collect();
-        let trained: BTreeSet<_> = policies.iter().map(AssessedPolicy::trained_on).collect();
+        let trained: BTreeSet<_> = policies.iter().map(ExternalPolicy::trained_on).collect();
         if environments.len() != 1 {
             let listed = environments.into_iter().collect::<Vec<_>>().join(" and ");
             let got = if listed.is_empty() { "there is none".into() } else { format!("they are of {listed}") };
-            return Err(AssessedError::Mixed { got });
+            return Err(ExternalEvaluationError::Mixed { got });
         }
         if trained.len() != policies.len() {
-            return Err(AssessedError::Mixed { got: "two were trained on the same".into() });
+            return Err(ExternalEvaluationError::Mixed { got: "two were trained on the same".into() });
         }
         Ok(Self { name, agent, policies })
     }
 
-    /// In what it was tested.
+    /// Returns the environment.
     pub fn environment(&self) -> &str {
         &self.policies[0].records.about.environment
     }
 
-    /// Its policies.
-    pub fn policies(&self) -> &[AssessedPolicy] {
+    /// Returns the policies.
+    pub fn policies(&self) -> &[ExternalPolicy] {
         &self.policies
     }
 
@@ -193,7 +193,7 @@ impl Assessed {
             episodes_per_trial: None,
             preset: Preset::default(),
             observe: self.policies[0].known.observe,
-            elsewhere: true,
+            external: true,
         }
     }
 
@@ -205,28 +205,32 @@ impl Assessed {
     /// Reads what is in the folder `path`.
     ///
     /// # Errors
-    /// [`AssessedError`], which names the file.
+    /// [`ExternalEvaluationError`], which names the file.
     pub fn read(path: &Path) -> Result<Self> {
         let json = path.join(ASSESSMENT);
-        let Some(text) = read_if_there(&json)? else { return Err(AssessedError::Missing { path: path.to_owned() }) };
-        let broken = |reason: String| AssessedError::Damaged { path: json.clone(), reason };
+        let Some(text) = read_if_there(&json)? else {
+            return Err(ExternalEvaluationError::Missing { path: path.to_owned() });
+        };
+        let broken = |reason: String| ExternalEvaluationError::Damaged { path: json.clone(), reason };
         let damaged = |error: serde_json::Error| broken(error.to_string());
         let mut value: serde_json::Value = serde_json::from_slice(&text).map_err(damaged)?;
         match value.get("format_version").and_then(serde_json::Value::as_u64) {
-            Some(got) if got != u64::from(FORMAT_VERSION) => return Err(AssessedError::Format { path: json, got }),
+            Some(got) if got != u64::from(FORMAT_VERSION) => {
+                return Err(ExternalEvaluationError::Format { path: json, got });
+            }
             _ => {}
         }
         checksum::open(&mut value).map_err(|reason| broken(reason.into()))?;
-        let document: Document = serde_json::from_value(value).map_err(damaged)?;
+        let document: EvaluationDocument = serde_json::from_value(value).map_err(damaged)?;
         let mut policies = Vec::new();
-        for Entry { file, known } in document.policies {
+        for PolicyEntry { file, known } in document.policies {
             // A file's name is that of one beside this, whatever is said of its folder.
             let file = Path::new(&file).file_name().unwrap_or_default();
-            let policy = AssessedPolicy::new(known, Records::read(&path.join(file))?);
+            let policy = ExternalPolicy::new(known, Records::read(&path.join(file))?);
             if file != policy.file_name().as_str() {
                 let reason =
                     format!("the records of its policy are in {}, expected {}", file.display(), policy.file_name());
-                return Err(AssessedError::Damaged { path: json, reason });
+                return Err(ExternalEvaluationError::Damaged { path: json, reason });
             }
             policies.push(policy);
         }
@@ -238,40 +242,40 @@ impl Assessed {
     /// Of that one the records go, and nothing else that is in the folder.
     ///
     /// # Errors
-    /// [`AssessedError`]. Nothing is deleted before all is written: what was overwritten in part has the former
+    /// [`ExternalEvaluationError`]. Nothing is deleted before all is written: what was overwritten in part has the former
     /// `assessment.json`, and in a new folder there is none.
     pub fn write(&self, path: &Path, overwrite: bool) -> Result<()> {
         let (json, is_one) = (path.join(ASSESSMENT), Self::is_in(path));
         let replaced = overwrite && is_one;
         if !replaced && !files::list(path)?.is_empty() {
             let instead = if is_one { "overwrite=True replaces it" } else { "name another folder" };
-            return Err(AssessedError::NotEmpty { path: path.to_owned(), instead });
+            return Err(ExternalEvaluationError::NotEmpty { path: path.to_owned(), instead });
         }
         let former = records_named_in(&json)?;
         let mut entries = Vec::new();
         for policy in &self.policies {
             let file = policy.file_name();
             policy.records.write(&path.join(&file))?;
-            entries.push(Entry { file, known: policy.known.clone() });
+            entries.push(PolicyEntry { file, known: policy.known.clone() });
         }
         let (environment, agent) = (self.environment().to_owned(), self.agent.clone());
-        let document = Document { format_version: FORMAT_VERSION, environment, agent, policies: entries };
-        let sealed = Sealed::new(&document).map_err(|error| files::io("write", &json)(error.into()))?;
+        let document = EvaluationDocument { format_version: FORMAT_VERSION, environment, agent, policies: entries };
+        let sealed = WithChecksum::new(&document).map_err(|error| files::io("write", &json)(error.into()))?;
         files::write_json(&json, &sealed)?;
         let is_kept = |file: &str| document.policies.iter().any(|entry| entry.file == file);
         let gone = former.iter().filter(|file| !is_kept(file));
         Ok(gone.map(|file| path.join(file)).try_for_each(|path| files::delete(&path))?)
     }
 
-    /// The same with success judged by `rule`.
+    /// Judges success by `rule` instead of the recorded rule.
     ///
     /// # Errors
     /// [`ValueError`] if the episodes cannot be judged by it.
     pub fn judged_by(self, rule: &Rule) -> std::result::Result<Self, ValueError> {
-        let judge = |policy: AssessedPolicy| {
+        let judge = |policy: ExternalPolicy| {
             let same = policy.records.about.criterion(rule).ok() == policy.records.about.success;
             let records = if same { policy.records } else { policy.records.judged_by(rule)? };
-            Ok(AssessedPolicy::new(policy.known, records))
+            Ok(ExternalPolicy::new(policy.known, records))
         };
         let Self { name, agent, policies } = self;
         let policies = policies
@@ -289,12 +293,13 @@ fn records_named_in(json: &Path) -> Result<BTreeSet<String>> {
     let mut value = serde_json::from_slice(&text).unwrap_or_default();
     // What was changed names its files all the same.
     let _ = checksum::open(&mut value);
-    let entries = serde_json::from_value(value).map_or_else(|_| Vec::new(), |document: Document| document.policies);
+    let entries =
+        serde_json::from_value(value).map_or_else(|_| Vec::new(), |document: EvaluationDocument| document.policies);
     let names = entries.iter().filter_map(|entry| Path::new(&entry.file).file_name()?.to_str());
     let is_records = |name: &&str| name.starts_with("episodes") && name.ends_with(".parquet");
     Ok(names.filter(is_records).map(str::to_owned).collect())
 }
 
 #[cfg(test)]
-#[path = "assessed_tests.rs"]
+#[path = "external_evaluation_tests.rs"]
 mod tests;

@@ -2,7 +2,7 @@
 //! episodes, as all of them have.
 
 use perturb_checkpoint::Counters;
-use perturb_experiment::{Curve, EnvironmentCurves, Footing, MethodResults, Point};
+use perturb_experiment::{BudgetAxis, Curve, CurvePoint, EnvironmentCurves, MethodResults};
 use perturb_protocol::Version;
 use perturb_records::TrainedOn;
 use perturb_records::statistics::Summary;
@@ -14,30 +14,33 @@ use super::numbers::or_empty;
 use super::{MISSING, Report};
 
 /// The selected trainings of a method on a version.
-pub(super) struct Trainings<'a> {
+pub(super) struct SampleEfficiency<'a> {
     environment: &'a str,
     method: &'a Method,
     version: Version,
     counters: Vec<Counters>,
     /// By episodes and by steps: the least that a method's trainings of the same version have, and the part of these
     /// trainings that has it in its middle or next after it. `None` without their logs.
-    equal: [Option<(f64, Point)>; 2],
+    equal: [Option<(f64, CurvePoint)>; 2],
 }
 
-/// Those with results, in the order of `selections`.
-pub(super) fn trainings<'a>(selections: &'a [MethodResults<'a>], curves: &[EnvironmentCurves]) -> Vec<Trainings<'a>> {
+/// Returns the trainings with results in the order of `selections`.
+pub(super) fn trainings<'a>(
+    selections: &'a [MethodResults<'a>],
+    curves: &[EnvironmentCurves],
+) -> Vec<SampleEfficiency<'a>> {
     let of = |selection: &'a MethodResults<'a>, version: Version| {
         let selected = selection.runs.values().filter_map(|run| run.cell_trained_on(TrainedOn::Version(version)));
         let counters: Vec<Counters> = selected.map(|selected| selected.result.training.counters).collect();
         let of_environment = curves.iter().find(|of| of.environment == selection.environment);
         let same = || of_environment.into_iter().flat_map(|of| &of.curves).filter(|curve| curve.version == version);
         let own = same().find(|curve| curve.method == selection.method);
-        let equal = |by: Footing| {
+        let equal = |by: BudgetAxis| {
             let least = same().map(|curve: &Curve| curve.total(by)).fold(f64::INFINITY, f64::min);
             own.and_then(|curve| Some((least, *curve.at(by, least)?)))
         };
-        let (environment, method, equal) = (selection.environment, &selection.method, Footing::ALL.map(equal));
-        (!counters.is_empty()).then_some(Trainings { environment, method, version, counters, equal })
+        let (environment, method, equal) = (selection.environment, &selection.method, BudgetAxis::ALL.map(equal));
+        (!counters.is_empty()).then_some(SampleEfficiency { environment, method, version, counters, equal })
     };
     selections
         .iter()
@@ -45,14 +48,14 @@ pub(super) fn trainings<'a>(selections: &'a [MethodResults<'a>], curves: &[Envir
         .collect()
 }
 
-impl Trainings<'_> {
+impl SampleEfficiency<'_> {
     /// Mean over runs.
     fn mean(&self, count: fn(&Counters) -> u64) -> f64 {
         let counts: Vec<f64> = self.counters.iter().map(|counters| count(counters) as f64).collect();
-        Summary::of(&counts).map_or(f64::NAN, |summary| summary.mean)
+        Summary::from_values(&counts).map_or(f64::NAN, |summary| summary.mean)
     }
 
-    fn equal(&self, by: Footing) -> Option<(f64, Point)> {
+    fn equal(&self, by: BudgetAxis) -> Option<(f64, CurvePoint)> {
         self.equal[by as usize]
     }
 }
@@ -63,13 +66,13 @@ fn generated(counters: &Counters) -> u64 {
 }
 
 impl Report<'_> {
-    /// Of each environment.
+    /// Returns a table for each environment.
     pub(super) fn footing_tables(&self) -> Vec<Table> {
         self.trainings.chunk_by(|a, b| a.environment == b.environment).map(footing_table).collect()
     }
 
     pub(super) fn footing_file(&self) -> Table {
-        let mut table = Table::of("footing.csv", &self.trainings)
+        let mut table = Table::builder("sample_efficiency.csv", &self.trainings)
             .text("environment", |row| row.environment)
             .method(|row| row.method)
             .text("train", |row| row.version)
@@ -79,7 +82,7 @@ impl Report<'_> {
             .number("generated_episodes", |row| row.mean(generated))
             .number("episodes", |row| row.mean(|counters| counters.episodes))
             .number("iterations", |row| row.mean(|counters| counters.iterations));
-        for by in Footing::ALL {
+        for by in BudgetAxis::ALL {
             table = table
                 .number(format!("equal_{by}"), move |row| or_empty(row.equal(by).map(|(least, _)| least)))
                 .number(format!("success_at_equal_{by}_mean"), move |row| {
@@ -93,15 +96,15 @@ impl Report<'_> {
     }
 }
 
-fn footing_table(rows: &[Trainings<'_>]) -> Table {
+fn footing_table(rows: &[SampleEfficiency<'_>]) -> Table {
     let title = format!("{}: trainings on an equal footing", rows[0].environment);
-    let mut table = Table::of(title, rows)
+    let mut table = Table::builder(title, rows)
         .text("method", |row| row.method)
         .text("trained on", |row| row.version)
         .number("steps", |row| whole(row.mean(|counters| counters.timesteps)))
         .number("episodes", |row| whole(row.mean(generated)))
         .number("iterations", |row| whole(row.mean(|counters| counters.iterations)));
-    for by in Footing::ALL {
+    for by in BudgetAxis::ALL {
         let missing = || MISSING.to_owned();
         table = table
             .number(format!("{by} that all have"), move |row| {

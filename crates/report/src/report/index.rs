@@ -1,4 +1,4 @@
-//! What a report has rows and columns of: what its plan says, and agents that were trained elsewhere.
+//! Rows and columns of a report, from its plan and from externally trained agents.
 
 use perturb_experiment::{MethodResults, Plan, distinct, elsewhere};
 use perturb_protocol::Version;
@@ -7,7 +7,7 @@ use perturb_settings::Method;
 
 /// Environments, methods and tests of a report, in its order.
 #[derive(Clone, Debug)]
-pub(super) struct Scope<'a> {
+pub(super) struct ReportIndex<'a> {
     /// Over which methods are averaged: the plan's; of a report without one all.
     pub(super) averaged: Vec<&'a str>,
     /// All that have rows.
@@ -18,8 +18,8 @@ pub(super) struct Scope<'a> {
     pub(super) tested_on: Vec<&'a str>,
 }
 
-impl<'a> Scope<'a> {
-    pub(super) fn of(plan: &'a Plan, selections: &[MethodResults<'a>]) -> Self {
+impl<'a> ReportIndex<'a> {
+    pub(super) fn new(plan: &'a Plan, selections: &[MethodResults<'a>]) -> Self {
         let environments = distinct(selections.iter().map(|row| row.environment));
         let averaged = if plan.cells.is_empty() { environments.clone() } else { plan.environments() };
         let of_plan = plan.cells.iter().take(1).flat_map(|cell| &cell.tests.sets);
@@ -38,12 +38,12 @@ pub(super) fn version(name: &str) -> Option<Version> {
 
 /// Whether a row has places among the scenarios: nobody knows what some agents were trained on.
 pub(super) fn has_scenarios(row: &MethodResults<'_>) -> bool {
-    !row.method.elsewhere || Version::KNOWN.into_iter().any(|version| is_trained_on(row, version))
+    !row.method.external || Version::KNOWN.into_iter().any(|version| is_trained_on(row, version))
 }
 
 /// Whether a row of tables of scenarios is wanted: of agents that were trained elsewhere what was trained on is all.
 pub(super) fn has_scenarios_of(row: &MethodResults<'_>, version: Version) -> bool {
-    !row.method.elsewhere || is_trained_on(row, version)
+    !row.method.external || is_trained_on(row, version)
 }
 
 fn is_trained_on(row: &MethodResults<'_>, version: Version) -> bool {

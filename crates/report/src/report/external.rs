@@ -1,29 +1,29 @@
-//! What is known of agents that were trained elsewhere.
+//! Externally trained agents in reports.
 
 use std::collections::BTreeMap;
 
 use perturb_experiment::{MethodResults, Results, distinct, elsewhere};
-use perturb_records::{Assessed, AssessedPolicy};
+use perturb_records::{ExternalEvaluation, ExternalPolicy};
 use perturb_text::Table;
 
 use super::numbers::or_empty;
 use super::{MISSING, Report};
 
 /// A policy that no cell trained.
-pub(super) struct Elsewhere<'a> {
-    agent: &'a Assessed,
-    policy: &'a AssessedPolicy,
+pub(super) struct ExternalRow<'a> {
+    agent: &'a ExternalEvaluation,
+    policy: &'a ExternalPolicy,
     run: u32,
 }
 
 /// In the order of `selections`.
-pub(super) fn all<'a>(selections: &[MethodResults<'a>]) -> Vec<Elsewhere<'a>> {
-    elsewhere(selections).into_iter().map(|(agent, policy, run)| Elsewhere { agent, policy, run }).collect()
+pub(super) fn all<'a>(selections: &[MethodResults<'a>]) -> Vec<ExternalRow<'a>> {
+    elsewhere(selections).into_iter().map(|(agent, policy, run)| ExternalRow { agent, policy, run }).collect()
 }
 
-/// What is to be known of them before their numbers.
+/// Returns the notes that precede the agents' numbers.
 pub(super) fn overview(results: &Results<'_>, selections: &[MethodResults<'_>]) -> Vec<String> {
-    let agents = distinct(selections.iter().filter(|row| row.method.elsewhere).map(|row| row.method.clone()));
+    let agents = distinct(selections.iter().filter(|row| row.method.external).map(|row| row.method.clone()));
     if agents.is_empty() {
         return Vec::new();
     }
@@ -60,8 +60,8 @@ pub(super) fn overview(results: &Results<'_>, selections: &[MethodResults<'_>]) 
     distinct(lines.into_iter())
 }
 
-impl Elsewhere<'_> {
-    /// What counted as a success.
+impl ExternalRow<'_> {
+    /// Returns the success criterion in words.
     fn success(&self) -> String {
         self.policy.records.about.success.as_ref().map_or_else(|| MISSING.to_owned(), ToString::to_string)
     }
@@ -70,8 +70,8 @@ impl Elsewhere<'_> {
 impl Report<'_> {
     /// `None` without such agents.
     pub(super) fn elsewhere_table(&self) -> Option<Table> {
-        let title = "Trained elsewhere: policies that were only tested (elsewhere.csv has the seeds of their tests)";
-        let table = Table::of(title, &self.elsewhere)
+        let title = "Trained elsewhere: policies that were only tested (external.csv has the seeds of their tests)";
+        let table = Table::builder(title, &self.elsewhere)
             .text("environment", |row| row.agent.environment())
             .text("agent", |row| &row.agent.agent)
             .text("trained on", |row| row.policy.trained_on())
@@ -80,7 +80,7 @@ impl Report<'_> {
                 row.policy.known.timesteps.map_or("not known".into(), |it| it.to_string())
             })
             .text("policy", |row| &row.policy.records.about.policy)
-            .text("success", Elsewhere::success)
+            .text("success", ExternalRow::success)
             .number("episodes of a test", |row| row.policy.known.episodes)
             .text("assessment", |row| if row.agent.name.is_empty() { "not saved" } else { &row.agent.name })
             .build();
@@ -88,7 +88,7 @@ impl Report<'_> {
     }
 
     pub(super) fn elsewhere_file(&self) -> Table {
-        Table::of("elsewhere.csv", &self.elsewhere)
+        Table::builder("external.csv", &self.elsewhere)
             .text("environment", |row| row.agent.environment())
             .text("agent", |row| &row.agent.agent)
             .text("train", |row| row.policy.trained_on())
@@ -97,7 +97,7 @@ impl Report<'_> {
             .text("policy", |row| &row.policy.records.about.policy)
             .text("observe", |row| row.policy.known.observe)
             .text("deterministic", |row| or_empty(row.policy.known.deterministic))
-            .text("success", Elsewhere::success)
+            .text("success", ExternalRow::success)
             .number("revision", |row| row.policy.records.about.revision)
             .number("seed", |row| row.policy.known.seed)
             .number("episodes", |row| row.policy.known.episodes)
@@ -107,5 +107,5 @@ impl Report<'_> {
 }
 
 #[cfg(test)]
-#[path = "elsewhere_tests.rs"]
+#[path = "external_tests.rs"]
 mod tests;

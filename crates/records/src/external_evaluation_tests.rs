@@ -12,7 +12,7 @@ fn what_is_written_is_read_and_replaced_only_on_request() {
     let path = directory.path().join("mine");
     let assessed = fixture::assessed("PPO", "CartPole", &[Some(D), Some(R), None], [200, 190, 100]);
     assessed.write(&path, false).unwrap();
-    assert_eq!(Assessed::read(&path).unwrap(), assessed);
+    assert_eq!(ExternalEvaluation::read(&path).unwrap(), assessed);
     let refused = assessed.write(&path, false).unwrap_err().to_string();
     assert!(refused.contains("overwrite=True replaces it"), "{refused}");
     fs::write(path.join("episodes-mine.parquet"), "not the assessment's").unwrap();
@@ -22,7 +22,7 @@ fn what_is_written_is_read_and_replaced_only_on_request() {
     fs::remove_file(path.join(ASSESSMENT)).unwrap();
     let refused = assessed.write(&path, true).unwrap_err().to_string();
     assert!(refused.contains("name another folder"), "{refused}");
-    let refused = Assessed::read(&path).unwrap_err().to_string();
+    let refused = ExternalEvaluation::read(&path).unwrap_err().to_string();
     assert!(refused.contains("holds no assessment"), "{refused}");
 }
 
@@ -33,7 +33,7 @@ fn an_assessment_is_there_until_another_one_is_written() {
     former.write(directory.path(), false).unwrap();
     fs::create_dir(directory.path().join("episodes-E.parquet")).unwrap(); // so that this one cannot be written
     fixture::assessed("PPO", "CartPole", &[Some(E)], [100; 3]).write(directory.path(), true).unwrap_err();
-    assert_eq!(Assessed::read(directory.path()).unwrap().policies(), former.policies());
+    assert_eq!(ExternalEvaluation::read(directory.path()).unwrap().policies(), former.policies());
 }
 
 #[test]
@@ -42,7 +42,7 @@ fn what_is_damaged_can_be_overwritten() {
     fs::write(directory.path().join(ASSESSMENT), "{").unwrap();
     let assessed = fixture::assessed("PPO", "CartPole", &[Some(D)], [200; 3]);
     assessed.write(directory.path(), true).unwrap();
-    assert_eq!(Assessed::read(directory.path()).unwrap().policies(), assessed.policies());
+    assert_eq!(ExternalEvaluation::read(directory.path()).unwrap().policies(), assessed.policies());
 }
 
 #[test]
@@ -53,7 +53,7 @@ fn what_was_changed_is_refused_and_can_be_overwritten() {
     let json = directory.path().join(ASSESSMENT);
     let written = fs::read_to_string(&json).unwrap();
     fs::write(&json, written.replace("\"PPO\"", "\"A2C\"")).unwrap();
-    let refused = Assessed::read(directory.path()).unwrap_err().to_string();
+    let refused = ExternalEvaluation::read(directory.path()).unwrap_err().to_string();
     assert!(refused.contains("its checksum is another"), "{refused}");
     let less = fixture::assessed("PPO", "CartPole", &[Some(D)], [200; 3]);
     less.write(directory.path(), true).unwrap();
@@ -72,18 +72,18 @@ fn what_is_no_assessment_is_refused(#[case] document: &str, #[case] words: &str)
     let directory = tempfile::tempdir().unwrap();
     fixture::assessed("PPO", "CartPole", &[Some(D)], [200; 3]).write(directory.path(), false).unwrap();
     fs::write(directory.path().join(ASSESSMENT), document).unwrap();
-    let refused = Assessed::read(directory.path()).unwrap_err().to_string();
+    let refused = ExternalEvaluation::read(directory.path()).unwrap_err().to_string();
     assert!(refused.contains(words), "{refused}");
 }
 
 #[test]
-fn policies_of_one_agent_are_told_apart_by_what_they_were_trained_on() {
+fn policies_of_an_agent_differ_in_training_distribution() {
     let one = |name: &str, trained_on| fixture::assessed("PPO", name, &[trained_on], [200; 3]).policies;
     for (policies, words) in [
         ([one("CartPole", Some(D)), one("Pendulum", Some(R))].concat(), "they are of CartPole and Pendulum"),
         ([one("CartPole", None), one("CartPole", None)].concat(), "trained on the same"),
     ] {
-        let refused = Assessed::new(String::new(), "PPO".into(), policies).unwrap_err().to_string();
+        let refused = ExternalEvaluation::new(String::new(), "PPO".into(), policies).unwrap_err().to_string();
         assert!(refused.contains(words), "{refused}");
     }
 }

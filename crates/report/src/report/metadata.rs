@@ -1,4 +1,4 @@
-//! What stands above the figures: title, date, plan, and the settings that all cells share.
+//! The head of a report: title, date, plan, and the settings that all cells share.
 
 use std::collections::BTreeSet;
 
@@ -8,7 +8,7 @@ use perturb_records::success::Rule;
 use super::finding::listed;
 use super::{Cell, PAPER_EPISODES, PAPER_TEST_EPISODES, Plan, Report, Selection, range, seeds};
 
-/// So many methods are named in a title.
+/// Maximum number of methods in a title.
 const NAMED: usize = 3;
 
 impl Report<'_> {
@@ -30,7 +30,7 @@ impl Report<'_> {
         opening_comment(&self.plan.text)
     }
 
-    /// Names and what there is to say, without those of which there is nothing.
+    /// Returns names and values of the metadata, without empty ones.
     pub(super) fn facts(&self) -> Vec<(&'static str, String)> {
         let cells = &self.plan.cells;
         let mut facts = vec![("date", self.plan.date.clone())];
@@ -97,7 +97,7 @@ fn opening_comment(text: &str) -> Vec<String> {
     paragraphs.map(|lines| lines.iter().map(|line| line.trim()).collect::<Vec<_>>().join(" ")).collect()
 }
 
-/// What is said where it is the paper's budget.
+/// Marks a budget that is the paper's.
 fn with_papers(budget: String, papers: u64) -> String {
     let said = if budget == papers.to_string() { "as the paper".to_owned() } else { format!("the paper: {papers}") };
     format!("{budget} episodes ({said})")
@@ -126,10 +126,7 @@ mod tests {
     #[case::paragraphs("#\n# One.\n#\n#\n#Two.\n\n# later", &["One.", "Two."])]
     #[case::commands("\n# One.\n#\n#   perturb run\n#\tperturb report\n#\n# Two.", &["One.", "Two."])]
     #[case::a_list("# One:\n# - two\n#   lines", &["One: - two lines"])]
-    fn an_abstract_is_what_is_said_before_the_first_key_without_commands(
-        #[case] text: &str,
-        #[case] paragraphs: &[&str],
-    ) {
+    fn abstract_is_the_comment_before_the_first_key(#[case] text: &str, #[case] paragraphs: &[&str]) {
         assert_eq!(opening_comment(text), paragraphs);
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use perturb_experiment::{Curve, EnvironmentCurves, Footing, MethodResults, Point, Selected, distinct};
+use perturb_experiment::{BudgetAxis, Curve, CurvePoint, EnvironmentCurves, MethodResults, Selected, distinct};
 use perturb_protocol::Version;
 use perturb_records::statistics::Summary;
 use perturb_records::{TestResult, TrainedOn};
@@ -10,11 +10,11 @@ use perturb_settings::Method;
 
 /// A policy's test at one moment of its training.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct MarkTest<'a> {
+pub(crate) struct GeneralizationPoint<'a> {
     pub(crate) environment: &'a str,
     pub(crate) method: &'a Method,
     pub(crate) trained_on: TrainedOn<'a>,
-    /// Of the training's budget.
+    /// Episodes of the training's budget.
     pub(crate) episodes: u64,
     pub(crate) tested_on: &'a str,
     /// %, over runs.
@@ -25,7 +25,7 @@ pub(crate) struct MarkTest<'a> {
 
 /// In the order of `selections`, of what they were trained on, of moments, and of the tests; nothing of
 /// trainings without marks.
-pub(crate) fn against_training<'a>(selections: &'a [MethodResults<'a>]) -> Vec<MarkTest<'a>> {
+pub(crate) fn generalization_curves<'a>(selections: &'a [MethodResults<'a>]) -> Vec<GeneralizationPoint<'a>> {
     let mut tests = Vec::new();
     for selection in selections {
         let trained_on: BTreeSet<TrainedOn<'a>> =
@@ -41,9 +41,9 @@ pub(crate) fn against_training<'a>(selections: &'a [MethodResults<'a>]) -> Vec<M
                 tests.extend(names.iter().map(|tested_on| {
                     let over_runs = |figure: fn(&TestResult) -> f64| {
                         let figures = selected.iter().filter_map(|of| test(of, episodes, tested_on).map(figure));
-                        Summary::of(&figures.collect::<Vec<_>>())
+                        Summary::from_values(&figures.collect::<Vec<_>>())
                     };
-                    MarkTest {
+                    GeneralizationPoint {
                         environment: selection.environment,
                         method: &selection.method,
                         trained_on,
@@ -59,14 +59,14 @@ pub(crate) fn against_training<'a>(selections: &'a [MethodResults<'a>]) -> Vec<M
     tests
 }
 
-/// Curves of `tests` over the training's budget, for each environment and version that was trained on; a curve's version
-/// is the one that was tested on.
-pub(crate) fn test_curves(tests: &[MarkTest<'_>]) -> Vec<(Version, EnvironmentCurves)> {
+/// Returns the curves of `tests` over the training's budget, for each environment and training version. The version of
+/// a curve is that of the test.
+pub(crate) fn test_curves(tests: &[GeneralizationPoint<'_>]) -> Vec<(Version, EnvironmentCurves)> {
     let known = |name: &str| Version::KNOWN.into_iter().find(|version| version.to_string() == name);
     let mut all = Vec::new();
     for environment in distinct(tests.iter().map(|test| test.environment)) {
         for trained_on in Version::KNOWN {
-            let of = |test: &&MarkTest<'_>| {
+            let of = |test: &&GeneralizationPoint<'_>| {
                 test.environment == environment && test.trained_on == TrainedOn::Version(trained_on)
             };
             let mut curves: Vec<Curve> = Vec::new();
@@ -76,13 +76,13 @@ pub(crate) fn test_curves(tests: &[MarkTest<'_>]) -> Vec<(Version, EnvironmentCu
                 else {
                     continue;
                 };
-                let point = Point { progress: test.episodes as f64, episode_return, success };
+                let point = CurvePoint { progress: test.episodes as f64, episode_return, success };
                 let same = |curve: &&mut Curve| curve.method == *test.method && curve.version == version;
                 match curves.iter_mut().find(same) {
-                    Some(curve) => curve.add(Footing::Episodes, point),
+                    Some(curve) => curve.add(BudgetAxis::Episodes, point),
                     None => {
                         let mut curve = Curve::new(test.method, version);
-                        curve.add(Footing::Episodes, point);
+                        curve.add(BudgetAxis::Episodes, point);
                         curves.push(curve);
                     }
                 }

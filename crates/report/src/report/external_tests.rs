@@ -1,19 +1,19 @@
 use perturb_experiment::Plan;
 use perturb_protocol::Version;
-use perturb_records::Assessed;
+use perturb_records::ExternalEvaluation;
 
 use super::*;
 use crate::fixture;
-use crate::report::{Report, ReportError, Sources};
+use crate::report::{Report, ReportError, ReportInputs};
 
 const PLAN: &str = "environments = ['CartPole', 'Pendulum']\nruns = 2
     [[algorithm]]\nname = 'ppo'\narchitectures = ['ff', 'rc']";
 
 /// What a report of `plan`'s results beside `assessed` says, by `of`.
-fn report<T>(plan: &Plan, assessed: &[Assessed], of: impl Fn(&Report<'_>) -> T) -> T {
+fn report<T>(plan: &Plan, assessed: &[ExternalEvaluation], of: impl Fn(&Report<'_>) -> T) -> T {
     let results = fixture::results(plan, |cell| Some(([f64::from(cell.run) + 90.0, 70.0, 50.0], 1.0)));
     let mut selections = results.select();
-    let recorded = perturb_experiment::Recorded::of(&selections);
+    let recorded = perturb_experiment::Recorded::new(&selections);
     perturb_experiment::add_assessed(&mut selections, assessed);
     of(&Report::new(&results, &selections, &recorded, &[]))
 }
@@ -48,7 +48,7 @@ fn an_agent_stands_in_the_tables_and_changes_no_other_row() {
 }
 
 #[test]
-fn an_agent_whose_training_is_not_known_has_tests_but_no_scenario() {
+fn agent_of_unknown_training_has_no_scenario() {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
     let agent = fixture::assessed("PPO", "Pendulum", &[None], [200, 190, 100]);
     let text = report(&plan, &[agent], |report| report.markdown());
@@ -70,11 +70,11 @@ fn what_only_a_later_run_was_trained_on_has_its_rows() {
 }
 
 #[test]
-fn agents_are_averaged_where_they_have_all_environments_and_files_tell_them_apart() {
+fn agents_with_all_environments_are_averaged() {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
     let everywhere = ["CartPole", "Pendulum"]
         .map(|name| fixture::assessed("PPO", name, &[Some(Version::D), Some(Version::R)], [200, 190, 100]));
-    let lines = |assessed: &[Assessed], file: &str| {
+    let lines = |assessed: &[ExternalEvaluation], file: &str| {
         report(&plan, assessed, |report| {
             let table = report.files().into_iter().find(|table| table.title == file).unwrap();
             String::from_utf8(table.to_csv()).unwrap()
@@ -96,10 +96,11 @@ fn agents_are_averaged_where_they_have_all_environments_and_files_tell_them_apar
 }
 
 #[test]
-fn assessments_alone_have_a_page_with_their_curves_and_no_word_of_cells() {
+fn evaluations_alone_have_a_page_without_cells() {
     let assessed = vec![fixture::assessed("P<PO", "CartPole", &[Some(Version::D)], [200, 190, 100])];
-    let page =
-        Sources { assessed, ..Sources::default() }.read(|whole| whole.page().map_err(ReportError::from)).unwrap();
+    let page = ReportInputs { assessed, ..ReportInputs::default() }
+        .read(|whole| whole.page().map_err(ReportError::from))
+        .unwrap();
     for there in
         ["P&lt;PO (trained elsewhere)", "id=\"scenarios\"", "id=\"elsewhere\"", "<svg", "Success over parameters"]
     {
@@ -113,7 +114,7 @@ fn assessments_alone_have_a_page_with_their_curves_and_no_word_of_cells() {
 #[test]
 fn a_folder_is_an_experiment_or_an_assessment() {
     let directory = tempfile::tempdir().unwrap();
-    let mut sources = Sources::default();
+    let mut sources = ReportInputs::default();
     let refused = sources.add(directory.path()).unwrap_err().to_string();
     assert!(refused.contains("neither an experiment"), "{refused}");
     let agent = fixture::assessed("PPO", "CartPole", &[None], [200; 3]);
