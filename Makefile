@@ -16,8 +16,9 @@ QEMU := qemu-user
 FAKETIME := libfaketime
 # What encodes the .mp4 files of `perturb video`, some 60 MB; everything else but the site runs without it.
 FFMPEG := ffmpeg
-# Packages that perturb-server and perturb compile in two versions: ring, ahash and tempfile each need another getrandom.
-TWICE := getrandom
+# Packages that perturb-server and perturb compile in two versions: ring, ahash and tempfile each need another getrandom, and
+# prometheus-client, whose version 0.25.0 does not escape labels, needs syn 3.
+TWICE := getrandom|syn
 CARGO_DENY_VERSION := 0.20.2
 TARGET := $(or $(CARGO_TARGET_DIR),target)
 PROGRAMS := $(TARGET)/release

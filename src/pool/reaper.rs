@@ -5,7 +5,8 @@ use crate::priority::lower;
 use std::{
     io,
     sync::{
-        Mutex,
+        Arc, Mutex,
+        atomic::{AtomicUsize, Ordering},
         mpsc::{self, RecvTimeoutError},
     },
     thread::{self, JoinHandle},
@@ -22,7 +23,11 @@ pub(super) type DeferredDrop = Box<dyn FnMut() -> bool + Send>;
 const REAP_INTERVAL: Duration = Duration::from_millis(1);
 
 /// The way to the thread that frees, until it is closed.
-pub(super) struct Reaper(Mutex<Option<mpsc::Sender<DeferredDrop>>>);
+pub(super) struct Reaper {
+    drops: Mutex<Option<mpsc::Sender<DeferredDrop>>>,
+    /// The number of batches that are not freed yet.
+    pending: Arc<AtomicUsize>,
+}
 
 impl Reaper {
     /// Starts the thread.
@@ -31,29 +36,39 @@ impl Reaper {
     /// If the operating system starts no thread.
     pub(super) fn start() -> io::Result<(Self, JoinHandle<()>)> {
         let (drops, received) = mpsc::channel::<DeferredDrop>();
+        let pending = Arc::<AtomicUsize>::default();
+        let counted = Arc::clone(&pending);
         let freeing = move || {
             lower(REAPER_NICENESS);
-            reap(&received);
+            reap(&received, &counted);
         };
         let thread = thread::Builder::new().name("free".into()).spawn(freeing)?;
-        Ok((Self(Mutex::new(Some(drops))), thread))
+        Ok((Self { drops: Mutex::new(Some(drops)), pending }, thread))
     }
 
     /// Frees what a session leaves behind, elsewhere.
     pub(super) fn drop_later(&self, deferred: DeferredDrop) {
-        if let Some(drops) = &*lock(&self.0) {
+        if let Some(drops) = &*lock(&self.drops) {
+            self.pending.fetch_add(1, Ordering::AcqRel);
             let _ = drops.send(deferred); // its thread ends only with the pool
+        }
+    }
+
+    /// Waits until everything that sessions have left behind so far is freed.
+    pub(super) async fn idle(&self) {
+        while self.pending.load(Ordering::Acquire) > 0 {
+            tokio::time::sleep(REAP_INTERVAL).await;
         }
     }
 
     /// Ends the thread when it has nothing left to free.
     pub(super) fn close(&self) {
-        *lock(&self.0) = None;
+        *lock(&self.drops) = None;
     }
 }
 
 /// Frees what comes, as soon as it can be freed, until the pool ends.
-fn reap(received: &mpsc::Receiver<DeferredDrop>) {
+fn reap(received: &mpsc::Receiver<DeferredDrop>, pending: &AtomicUsize) {
     let mut left: Vec<DeferredDrop> = Vec::new();
     loop {
         let next = match left.is_empty() {
@@ -65,6 +80,12 @@ fn reap(received: &mpsc::Receiver<DeferredDrop>) {
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => return,
         }
-        left.retain_mut(|deferred| !deferred());
+        left.retain_mut(|deferred| {
+            let is_freed = deferred();
+            if is_freed {
+                pending.fetch_sub(1, Ordering::AcqRel);
+            }
+            !is_freed
+        });
     }
 }

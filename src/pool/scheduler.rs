@@ -99,6 +99,11 @@ impl Pool {
         &self.shared.waits
     }
 
+    /// Waits until the environments of all batches that were dropped so far are freed.
+    pub async fn freed(&self) {
+        self.shared.reaper.idle().await;
+    }
+
     pub(super) fn queue(&self) -> Arc<StepScheduler> {
         Arc::clone(&self.shared)
     }

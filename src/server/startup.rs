@@ -121,6 +121,10 @@ pub async fn run(
     }
     shut_down(config, &controller, &health, &sources.requests, servers).await;
     if let Some(ledger) = &guards.ledger {
+        // The end of a session's draws is recorded when its environments are freed.
+        if timeout(CONNECTION_CLOSE_TIMEOUT, state.pool.freed()).await.is_err() {
+            tracing::warn!("the ledger ends before all environments are freed");
+        }
         ledger.close().await;
     }
     Ok(())
