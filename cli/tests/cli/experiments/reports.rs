@@ -57,7 +57,7 @@ fn reports_do_not_depend_on_interruptions() {
     assert_eq!(page.matches(".csv\" href=\"data:text/csv").count(), 18, "and its numbers");
     let metrics = String::from_utf8_lossy(&whole["metrics.csv"]).into_owned();
     // Nothing was trained on R: Interpolation and Extrapolation are empty, not 0.
-    assert!(metrics.lines().any(|line| line == "CartPole,a2c,ff,,Interpolation,0,,,100,0,"), "{metrics}");
+    assert!(metrics.lines().any(|line| line == "CartPole,a2c,ff,,Interpolation,0,,,1,,,100,0,"), "{metrics}");
 }
 
 #[test]
