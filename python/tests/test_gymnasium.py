@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import gymnasium
@@ -22,6 +21,17 @@ MODES = list(AutoresetMode)
 
 def equal(a: object, b: object) -> bool:
     return data_equivalence(a, b, exact=True)
+
+
+def with_hashes_as_rows(infos: dict[str, Any]) -> dict[str, Any]:
+    """Return infos of Gymnasium's vector with the tuples of `model_hash` as a batch has them: uint8, a row each."""
+    rows = dict(infos)
+    for key, value in infos.items():
+        if isinstance(value, dict):
+            rows[key] = with_hashes_as_rows(value)
+        elif key == "model_hash":
+            rows[key] = np.array([hash_ or (0,) * 32 for hash_ in value], dtype=np.uint8)
+    return rows
 
 
 @pytest.mark.filterwarnings("ignore")  # CartPole's unbounded observations, Pendulum's torque of ±2
@@ -79,8 +89,7 @@ def test_batch_equals_gymnasiums_vector_of_singles(name: str, mode: AutoresetMod
     ended = 0
     for step, (a, b) in enumerate(zip(run(ours, steps), run(theirs, steps), strict=True)):
         assert equal(a[0], b[0]), step
-        # Copied, what is filled when somebody looks is a plain dictionary.
-        assert equal(copy.deepcopy(a[-1]), b[-1]), (step, a[-1], b[-1])
+        assert equal(a[-1], with_hashes_as_rows(b[-1])), (step, a[-1], b[-1])
         if len(a) == 5:
             assert equal(a[1].astype(np.float64), b[1]), step
             assert equal(a[2], b[2]), step
