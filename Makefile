@@ -138,7 +138,7 @@ install-recurrent: recurrent install ## install perturb-recurrent too, which tra
 	install -D --target-directory $(PREFIX)/bin $(PROGRAMS)/perturb-recurrent
 	strip $(PREFIX)/bin/perturb-recurrent
 
-demo: build opengl ## train Hopper on default and on random physics, and see what still works; a minute or two
+demo: build opengl ## train Hopper on default and on random physics, and see what still works; minutes
 	$(PROGRAMS)/perturb demo $(DEMO_ARGS)
 
 all-pairs: recurrent ## train and test every algorithm and architecture on every environment, shortly
