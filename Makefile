@@ -10,6 +10,9 @@ TORCH_PACKAGES := libtorch-dev libopenblas0-pthread
 OPENGL := libegl1 libgl1-mesa-dri
 # A whole Slurm on one machine, for its test.
 SLURM_PACKAGES := slurmctld slurmd slurm-client munge
+# The clients in C++ and Go in examples/clients, for their test.
+LANGUAGE_PACKAGES := g++ pkg-config protobuf-compiler protobuf-compiler-grpc libgrpc++-dev golang-go golang-google-grpc-dev \
+	golang-github-golang-protobuf-1-5-dev protoc-gen-go protoc-gen-go-grpc
 # Emulates other processors, for the test that all compute the same.
 QEMU := qemu-user
 # Has clocks jump, for a test.
@@ -90,7 +93,7 @@ endef
 .PHONY: help deps all-deps opengl toolchain build generate recurrent build-all install install-recurrent demo all-pairs report-check serve-test test slurm-test kill-test \
 	load-test bounds-test attack-test faults-test asan-test qemu-test simulation-test slurm-acceptance lint proto-lint proto-baseline bench fuzz fuzz-keep \
 	bench-peers audit cargo-deny metrics-test otel-test python-test interrupts-test wheel wheel-test python-acceptance \
-	bench-python python-venv docs docs-test docker docker-base docker-test
+	bench-python python-venv languages-test docs docs-test docker docker-base docker-test
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -192,6 +195,11 @@ kill-test: build-all ## kill servers a hundred times while policies are trained,
 qemu-test: build-all ## train on emulated processors, to the same weights as on this one
 	@$(call install,$(QEMU))
 	PERTURB_QEMU_REQUIRED=1 cargo test $(ALL) --test cli processors::
+
+languages-test: build ## build the clients in C++ and Go, and compare all their replies with the Rust client's; a minute or two
+	@$(call install,$(LANGUAGE_PACKAGES))
+	cargo build $(ALL) --example client
+	examples/clients/compare.sh $(PROGRAMS) $(TARGET)/languages
 
 generate: all-deps ## write the generated files anew, after an edit of a .proto file or of crates/mujoco/src/shim.h
 	cargo run --release --locked --package perturb-generate

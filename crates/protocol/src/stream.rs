@@ -331,3 +331,30 @@ impl Stream {
         ClientError::Protocol { address: self.address().clone(), request: A::NAME, got, expected }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use prost::Message as _;
+    use prost_types::FileDescriptorSet;
+
+    use crate::proto::DESCRIPTORS;
+
+    /// The contract says so, and clients in other languages rely on it.
+    #[test]
+    fn reply_has_the_number_of_its_request() {
+        let files = FileDescriptorSet::decode(DESCRIPTORS).unwrap().file;
+        let contract = files.iter().find(|file| file.package() == "perturb.v1").unwrap();
+        let numbers = |message: &str| -> BTreeMap<i32, String> {
+            let message = contract.message_type.iter().find(|other| other.name() == message).unwrap();
+            message.field.iter().map(|field| (field.number(), field.name().to_owned())).collect()
+        };
+        let (requests, mut replies) = (numbers("SessionRequest"), numbers("SessionResponse"));
+        assert_eq!(replies.remove(&15).as_deref(), Some("error"));
+        assert!(requests.keys().eq(replies.keys()), "{requests:?} {replies:?}");
+        for (request, reply) in requests.values().zip(replies.values()) {
+            assert!(reply.starts_with(request), "{request} is answered with {reply}");
+        }
+    }
+}

@@ -275,7 +275,8 @@ pub mod session_request {
         Resume(super::Resume),
     }
 }
-/// The response to one request: the variant of the same name, or `error`.
+/// The response to one request: `error`, or the reply whose field has the number of the request's field. Most replies
+/// are called after the request, some by its past participle: `open` is answered with `opened`, `reset` with `reset`.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SessionResponse {
     /// The response.
@@ -330,7 +331,8 @@ pub mod session_response {
 pub struct Error {
     /// A gRPC status code: 3 INVALID_ARGUMENT a bad value; 5 NOT_FOUND an unknown name; 7 PERMISSION_DENIED not allowed
     /// with this token; 8 RESOURCE_EXHAUSTED the server is full; 9 FAILED_PRECONDITION a request out of order; 11
-    /// OUT_OF_RANGE a reply number that does not exist; 13 INTERNAL a bug of the server.
+    /// OUT_OF_RANGE a reply number that does not exist; 13 INTERNAL a bug of the server; 14 UNAVAILABLE the server cannot
+    /// record the request in its ledger now.
     #[prost(int32, tag = "1")]
     pub code: i32,
     /// A sentence: the value that was received, the expected value, and a remedy.
@@ -390,8 +392,8 @@ pub struct Open {
     /// then, and episodes that end in an `act` have no receipts.
     #[prost(bool, tag = "13")]
     pub receipt_arrays: bool,
-    /// W, the maximal number of requests that the client sends without having received their replies, 1 … 64; 0 means no
-    /// lease. With a lease, the session outlives the loss of its stream for a while (`Opened.lease_seconds`), and a new
+    /// A number, unlike `Opened.lease`, which is the granted lease. It is W, the maximal number of requests that the client
+    /// sends without having received their replies, 1 … 64; 0 means no lease. With a lease, the session outlives the loss of its stream for a while (`Opened.lease_seconds`), and a new
     /// stream may resume it (`Resume`). The server stores the last W replies. A request tells it that all replies but the
     /// last W - 1 were received.
     #[prost(uint32, tag = "14")]
@@ -437,7 +439,8 @@ pub struct Opened {
     /// The autoreset mode, as requested.
     #[prost(enumeration = "AutoresetMode", tag = "4")]
     pub autoreset_mode: i32,
-    /// Whether this server knows `groups`, `release`, `act` and `save_player`.
+    /// Whether this server knows `groups`, `release`, `act` and `save_player`. This describes the server: true also in a
+    /// session that could not `act`, e.g. because its autoreset mode is another, or in which no policy plays.
     #[prost(bool, tag = "5")]
     pub acts: bool,
     /// Whether observations end with the parameters, as requested; false from older servers.
@@ -446,7 +449,7 @@ pub struct Opened {
     /// Whether steps have receipts as arrays, as requested; false from older servers.
     #[prost(bool, tag = "7")]
     pub receipt_arrays: bool,
-    /// The name of the lease, 16 random bytes for `Resume`. Keep it secret: any client that has it and the same bearer
+    /// The granted lease, 16 random bytes for `Resume`, unlike `Open.lease`, which is a number. Keep it secret: any client that has it and the same bearer
     /// token may resume the session. Empty without `Open.lease`, and from servers that grant none (`--lease-seconds 0`, or
     /// older).
     #[prost(bytes = "bytes", tag = "8")]
@@ -465,7 +468,7 @@ pub struct Opened {
 /// A server that shuts down resumes none (UNAVAILABLE).
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Resume {
-    /// `Opened.lease`.
+    /// `Opened.lease`, the bytes.
     #[prost(bytes = "bytes", tag = "1")]
     pub lease: ::prost::bytes::Bytes,
     /// The number of the last reply that the client received. `opened` is 0, and each response after it one more, errors
@@ -517,11 +520,12 @@ pub struct Stepped {
     /// float32 \[N, number of terms\], if requested at `open`.
     #[prost(bytes = "bytes", tag = "8")]
     pub reward_terms: ::prost::bytes::Bytes,
-    /// uint64 \[M, 5\], with `receipt_arrays`: slot, environment_index, trial_index, episode_index, episode_in_trial of each
-    /// of the K episodes that ended, in the order of `ended`, then of each that began by autoreset, in order of slots.
+    /// uint64 \[K + B, 5\], with `receipt_arrays`: slot, environment_index, trial_index, episode_index, episode_in_trial of
+    /// each of the K episodes that ended, in the order of `ended`, then of each of the B episodes that began by autoreset,
+    /// in order of slots.
     #[prost(bytes = "bytes", tag = "9")]
     pub receipt_episodes: ::prost::bytes::Bytes,
-    /// float64 \[M, length of `requested` + length of `applied`\], with `receipt_arrays`: `Receipt.requested`, then
+    /// float64 \[K + B, length of `requested` + length of `applied`\], with `receipt_arrays`: `Receipt.requested`, then
     /// `Receipt.applied` of the same episodes. The model's hash is that of `Opened.environment`.
     #[prost(bytes = "bytes", tag = "10")]
     pub receipt_values: ::prost::bytes::Bytes,
@@ -704,7 +708,8 @@ pub struct Release {
 pub struct Released {}
 /// Lets the server play: it chooses the actions of all environments with a policy, steps them, and sends the rollout,
 /// with the same bytes as if the client had acted, on any processor. Only in AUTORESET_MODE_SAME_STEP, and if all
-/// environments have the same number of episodes in a trial. I is the length of the policy's inputs: O, and with
+/// environments have the same number of episodes in a trial. T is the number of steps in a reply, H the width of the
+/// policy's LSTM, 0 without one. I is the length of the policy's inputs: O, and with
 /// `Policy.outcomes` also the last action (n one-hot, or A numbers), its reward and whether it ended an episode.
 ///
 /// A task is begun by `steps` or `episodes`. It may be cut over several requests until `finished`; the later ones name
@@ -759,17 +764,18 @@ pub struct Policy {
     /// Width of the LSTM, 1 … 1024; 0 means a feed-forward policy.
     #[prost(uint32, tag = "2")]
     pub lstm: u32,
-    /// Whether an input also has the last action, its reward and whether it ended an episode (RL²).
+    /// Whether an input also has the last action, its reward and whether it ended an episode (RL²). `PlayerState.outcomes`
+    /// has these numbers.
     #[prost(bool, tag = "3")]
     pub outcomes: bool,
-    /// Statistics for the normalisation of observations; absent: no normalisation. Parameters that
+    /// Statistics for the normalisation of observations, not observations themselves; absent: no normalisation. Parameters that
     /// `Open.observe_parameters` appends to an observation are scaled already, and are never normalised.
     #[prost(message, optional, tag = "4")]
     pub observations: ::core::option::Option<Moments>,
-    /// Statistics for the normalisation of rewards; absent: no normalisation.
+    /// Statistics for the normalisation of rewards, not rewards themselves; absent: no normalisation.
     #[prost(message, optional, tag = "5")]
     pub rewards: ::core::option::Option<RewardMoments>,
-    /// The state to continue from; only in training. Absent: a trial begins in every environment with its present
+    /// The player's state to continue from, not that of the environments; only in training. Absent: a trial begins in every environment with its present
     /// observation, which is added to running statistics even if the task then resets all environments, and discounted
     /// returns begin at 0.
     #[prost(message, optional, tag = "8")]
@@ -843,7 +849,7 @@ pub struct TestStreams {
     #[prost(uint64, tag = "1")]
     pub seed: u64,
 }
-/// The state of a player, with finite numbers. S is twice the LSTM's width, 0 without one; E = I - O.
+/// The state of a player, with finite numbers; the state of the environments is in their snapshots.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct PlayerState {
     /// float32 \[N, O\]: normalised observations that the next actions are chosen on.
@@ -852,10 +858,10 @@ pub struct PlayerState {
     /// uint8 \[N\]: 1 where these are the first of a trial.
     #[prost(bytes = "bytes", tag = "2")]
     pub starts: ::prost::bytes::Bytes,
-    /// float32 \[N, E\]: the last action, its reward and whether it ended an episode.
+    /// float32 \[N, I - O\]: the last action, its reward and whether it ended an episode; empty without `Policy.outcomes`.
     #[prost(bytes = "bytes", tag = "3")]
     pub outcomes: ::prost::bytes::Bytes,
-    /// float32 \[N, S\]: the LSTM's outputs and cell states.
+    /// float32 \[N, 2H\]: the LSTM's H outputs, then its H cell states.
     #[prost(bytes = "bytes", tag = "4")]
     pub memory: ::prost::bytes::Bytes,
 }
@@ -865,7 +871,7 @@ pub struct Acted {
     /// T, the number of steps.
     #[prost(uint32, tag = "1")]
     pub steps: u32,
-    /// float32 \[T, N, I\]: inputs that the actions were chosen on, normalised.
+    /// float32 \[T, N, I\]: the policy's inputs that the actions were chosen on, normalised.
     #[prost(bytes = "bytes", tag = "2")]
     pub observations: ::prost::bytes::Bytes,
     /// uint8 \[T, N\]: 1 where an input is the first of a trial: the policy's memory was emptied before it.
@@ -901,7 +907,7 @@ pub struct Acted {
     /// float32 \[N\]: values of the observations after the last step, 0 after complete episodes; only when finished.
     #[prost(bytes = "bytes", tag = "13")]
     pub last_values: ::prost::bytes::Bytes,
-    /// float32 \[N, S\]: the policy's memory before the task's first step; only in the task's first reply.
+    /// float32 \[N, 2H\]: the policy's memory before the task's first step; only in the task's first reply.
     #[prost(bytes = "bytes", tag = "14")]
     pub memory: ::prost::bytes::Bytes,
 }
@@ -1166,11 +1172,12 @@ pub mod perturb_client {
         /// exactly one response, in order; requests may be sent without waiting for earlier responses. A wrong request gets an
         /// `Error` and changes nothing, and the session continues. An `act` that meets numbers that are not finite on its way
         /// is the only exception: it ends the policy's play. The stream itself ends with a status only when the transport
-        /// fails, a message is larger than the server accepts (OUT_OF_RANGE), the server is full (RESOURCE_EXHAUSTED), it
-        /// shuts down (UNAVAILABLE), or the session was idle for longer than the server allows (DEADLINE_EXCEEDED). When the
-        /// stream ends, its environments are freed. A session with a lease (`Open.lease`) is different: it ends when its
-        /// client closes its side of the stream. After any other loss a new stream may resume it (`resume`) until the lease
-        /// ends. A stream whose session was resumed by another ends with ABORTED.
+        /// fails, a message is larger than the server accepts (OUT_OF_RANGE), the server is full (RESOURCE_EXHAUSTED), the
+        /// bearer token is missing, wrong or revoked (UNAUTHENTICATED), the server shuts down (UNAVAILABLE), or the session
+        /// was idle or a message unfinished for longer than the server allows (DEADLINE_EXCEEDED). When the stream ends, its
+        /// environments are freed. A session with a lease (`Open.lease`) is different: it ends when its client closes its side
+        /// of the stream, or when the server ends it with one of these statuses. After a failure of the transport a new stream
+        /// may resume it (`resume`) until the lease ends. A stream whose session was resumed by another ends with ABORTED.
         pub async fn session(
             &mut self,
             request: impl tonic::IntoStreamingRequest<Message = super::SessionRequest>,
@@ -1228,11 +1235,12 @@ pub mod perturb_server {
         /// exactly one response, in order; requests may be sent without waiting for earlier responses. A wrong request gets an
         /// `Error` and changes nothing, and the session continues. An `act` that meets numbers that are not finite on its way
         /// is the only exception: it ends the policy's play. The stream itself ends with a status only when the transport
-        /// fails, a message is larger than the server accepts (OUT_OF_RANGE), the server is full (RESOURCE_EXHAUSTED), it
-        /// shuts down (UNAVAILABLE), or the session was idle for longer than the server allows (DEADLINE_EXCEEDED). When the
-        /// stream ends, its environments are freed. A session with a lease (`Open.lease`) is different: it ends when its
-        /// client closes its side of the stream. After any other loss a new stream may resume it (`resume`) until the lease
-        /// ends. A stream whose session was resumed by another ends with ABORTED.
+        /// fails, a message is larger than the server accepts (OUT_OF_RANGE), the server is full (RESOURCE_EXHAUSTED), the
+        /// bearer token is missing, wrong or revoked (UNAUTHENTICATED), the server shuts down (UNAVAILABLE), or the session
+        /// was idle or a message unfinished for longer than the server allows (DEADLINE_EXCEEDED). When the stream ends, its
+        /// environments are freed. A session with a lease (`Open.lease`) is different: it ends when its client closes its side
+        /// of the stream, or when the server ends it with one of these statuses. After a failure of the transport a new stream
+        /// may resume it (`resume`) until the lease ends. A stream whose session was resumed by another ends with ABORTED.
         async fn session(
             &self,
             request: tonic::Request<tonic::Streaming<super::SessionRequest>>,

@@ -202,8 +202,8 @@ fn state(
     }
     let check_floats = |field, bytes, size, shape| check_length(field, bytes, n * size, shape);
     check_floats("act.policy.state.observations", &given.observations, sizes.observation, "float32 [N, O]")?;
-    check_floats("act.policy.state.outcomes", &given.outcomes, extra, "float32 [N, E]")?;
-    check_floats("act.policy.state.memory", &given.memory, memory_size, "float32 [N, S]")?;
+    check_floats("act.policy.state.outcomes", &given.outcomes, extra, "float32 [N, I - O]")?;
+    check_floats("act.policy.state.memory", &given.memory, memory_size, "float32 [N, 2H]")?;
     player_state(given, actions).map_err(in_message("act.policy.state"))
 }
 
