@@ -3,11 +3,13 @@
 //! - [`cycles`]: import cycles between sibling modules, in each crate and in the Python package;
 //! - [`doc_comments`]: doc comments that open without a subject;
 //! - [`names`]: type names defined twice, superlative constants, constructors called `of`, long test names.
+//! - [`glossary`]: public types of the server, the pool and the learner that the glossary does not explain.
 //!
 //! [`limits`] compares the counts with the file `crates/lint/limits.toml`.
 
 pub mod cycles;
 pub mod doc_comments;
+pub mod glossary;
 pub mod imports;
 pub mod lexer;
 pub mod limits;

@@ -8,9 +8,10 @@ use std::fmt::{self, Write as _};
 
 use crate::cycles;
 use crate::doc_comments;
+use crate::glossary;
 use crate::imports;
 use crate::names::{self, Definition};
-use crate::source::{SourceTree, folder_of};
+use crate::source::{GLOSSARY, SourceTree, folder_of};
 
 /// Share of doc comments without a subject that every folder may have, in percent.
 pub const SHARE_LIMIT: f64 = 2.0;
@@ -33,17 +34,20 @@ pub enum Check {
     FunctionsCalledOf,
     /// Number of tests with names of more than 60 characters, by folder.
     LongTestNames,
+    /// Number of public types that the glossary does not explain, by folder.
+    TypesWithoutGlossaryEntry,
 }
 
 impl Check {
     /// All checks in the order in which they are reported.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 7] = [
         Self::ImportCycles,
         Self::DocComments,
         Self::TypesDefinedTwice,
         Self::SuperlativeConstants,
         Self::FunctionsCalledOf,
         Self::LongTestNames,
+        Self::TypesWithoutGlossaryEntry,
     ];
 
     /// Returns the section's name.
@@ -55,6 +59,7 @@ impl Check {
             Self::SuperlativeConstants => "superlative-constants",
             Self::FunctionsCalledOf => "functions-called-of",
             Self::LongTestNames => "long-test-names",
+            Self::TypesWithoutGlossaryEntry => "types-without-glossary-entry",
         }
     }
 
@@ -76,6 +81,10 @@ impl Check {
             }
             Self::FunctionsCalledOf => "functions called `of`; call them `new`, `from_*` or after what they return",
             Self::LongTestNames => "test names of more than 60 characters; shorten them to a rule",
+            Self::TypesWithoutGlossaryEntry => {
+                "public types without an entry in docs/glossary.md; explain them there, or give the reason why nobody \
+                 needs it in crates/lint/commonplace-types.toml"
+            }
         }
     }
 }
@@ -97,9 +106,14 @@ pub struct Finding {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LimitTable(BTreeMap<String, BTreeMap<String, f64>>);
 
-/// Names that may be defined more than once, each with its reason.
+/// Names that a check leaves out, each with its reason.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Exemptions(BTreeMap<String, String>);
+pub struct Exemptions {
+    /// Type names that may be defined more than once.
+    duplicates: BTreeMap<String, String>,
+    /// Public types that need no entry in the glossary.
+    commonplaces: BTreeMap<String, String>,
+}
 
 impl LimitTable {
     /// Parses the file of limits.
@@ -164,21 +178,35 @@ impl fmt::Display for LimitTable {
 }
 
 impl Exemptions {
-    /// Parses the file of exemptions.
+    /// Parses the file of type names that may be defined more than once.
     ///
     /// # Errors
     ///
     /// A sentence that names the line which is not `Name = "reason"`, or whose reason is empty.
     pub fn parse(text: &str) -> Result<Self, String> {
-        let mut exemptions = Self::default();
-        for entry in entries(text)? {
-            if entry.value.is_empty() {
-                return Err(format!("line {}: {} has no reason", entry.line, entry.key));
-            }
-            exemptions.0.insert(entry.key, entry.value);
-        }
-        Ok(exemptions)
+        Ok(Self { duplicates: reasons(text)?, commonplaces: BTreeMap::new() })
     }
+
+    /// Adds the file of public types that need no entry in the glossary.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`Exemptions::parse`].
+    pub fn with_commonplaces(self, text: &str) -> Result<Self, String> {
+        Ok(Self { commonplaces: reasons(text)?, ..self })
+    }
+}
+
+/// Reads names with their reasons.
+fn reasons(text: &str) -> Result<BTreeMap<String, String>, String> {
+    let mut reasons = BTreeMap::new();
+    for entry in entries(text)? {
+        if entry.value.is_empty() {
+            return Err(format!("line {}: {} has no reason", entry.line, entry.key));
+        }
+        reasons.insert(entry.key, entry.value);
+    }
+    Ok(reasons)
 }
 
 struct KeyValue {
@@ -224,6 +252,11 @@ pub fn check(tree: &SourceTree, exemptions: &Exemptions) -> Vec<Finding> {
     findings.extend(by_folder(Check::SuperlativeConstants, &names.superlatives));
     findings.extend(by_folder(Check::FunctionsCalledOf, &names.called_of));
     findings.extend(by_folder(Check::LongTestNames, &names.long_tests));
+    if let Some(text) = tree.get(GLOSSARY) {
+        let is_commonplace = |name: &str| exemptions.commonplaces.contains_key(name);
+        let unexplained = glossary::unexplained(&names.public_types, text, is_commonplace);
+        findings.extend(by_folder(Check::TypesWithoutGlossaryEntry, unexplained));
+    }
     findings
 }
 
@@ -250,7 +283,7 @@ fn types_defined_twice(types: &[Definition], exemptions: &Exemptions) -> Finding
     let twice = names::defined_twice(types);
     let places: Vec<_> = twice
         .iter()
-        .filter(|(name, _)| !exemptions.0.contains_key(**name))
+        .filter(|(name, _)| !exemptions.duplicates.contains_key(**name))
         .map(|(name, definitions)| {
             let places: Vec<_> = definitions.iter().map(|place| format!("{}:{}", place.file, place.line)).collect();
             format!("{name}: {}", places.join(", "))
@@ -259,7 +292,7 @@ fn types_defined_twice(types: &[Definition], exemptions: &Exemptions) -> Finding
     Finding { check: Check::TypesDefinedTwice, folder: "all".to_owned(), count: places.len() as f64, places }
 }
 
-fn by_folder(check: Check, definitions: &[Definition]) -> Vec<Finding> {
+fn by_folder<'a>(check: Check, definitions: impl IntoIterator<Item = &'a Definition>) -> Vec<Finding> {
     let mut folders: BTreeMap<&str, Vec<String>> = BTreeMap::new();
     for place in definitions {
         folders
@@ -306,12 +339,20 @@ pub fn judge(tree: &SourceTree, findings: &[Finding], limits: &LimitTable, exemp
             }
         }
     }
-    let types = names::read(tree).types;
-    let twice: BTreeSet<_> = names::defined_twice(&types).into_keys().collect();
-    for name in exemptions.0.keys().filter(|name| !twice.contains(name.as_str())) {
+    let names = names::read(tree);
+    let twice: BTreeSet<_> = names::defined_twice(&names.types).into_keys().collect();
+    for name in exemptions.duplicates.keys().filter(|name| !twice.contains(name.as_str())) {
         verdict
             .warnings
             .push(format!("crates/lint/duplicate-names.toml: {name} is not defined twice; remove the entry"));
+    }
+    let types: BTreeSet<_> = names.types.iter().map(|definition| definition.name.as_str()).collect();
+    for name in exemptions.commonplaces.keys().filter(|name| !types.contains(name.as_str())) {
+        verdict.warnings.push(format!("crates/lint/commonplace-types.toml: there is no type {name}; remove the entry"));
+    }
+    let explained = tree.get(GLOSSARY).map(glossary::explained_types).unwrap_or_default();
+    for name in explained.iter().filter(|name| !types.contains(**name)) {
+        verdict.warnings.push(format!("{}: there is no type {name}; remove the entry", GLOSSARY));
     }
     verdict
 }

@@ -9,6 +9,7 @@ use perturb_lint::source::SourceTree;
 
 const LIMITS: &str = "crates/lint/limits.toml";
 const EXEMPTIONS: &str = "crates/lint/duplicate-names.toml";
+const COMMONPLACES: &str = "crates/lint/commonplace-types.toml";
 const USAGE: &str = "usage: perturb-lint [--list FOLDER | --lower-limits]
   --list FOLDER   print every finding of a folder, such as src/server, or of `all`
   --lower-limits  lower the limits in crates/lint/limits.toml to the present numbers; no limit rises";
@@ -42,7 +43,8 @@ fn limits() -> Result<LimitTable, String> {
 }
 
 fn exemptions() -> Result<Exemptions, String> {
-    Exemptions::parse(&read(EXEMPTIONS)?).map_err(|error| format!("{EXEMPTIONS}, {error}"))
+    let exemptions = Exemptions::parse(&read(EXEMPTIONS)?).map_err(|error| format!("{EXEMPTIONS}, {error}"))?;
+    exemptions.with_commonplaces(&read(COMMONPLACES)?).map_err(|error| format!("{COMMONPLACES}, {error}"))
 }
 
 /// Prints errors and warnings; returns whether there was no error.

@@ -28,6 +28,8 @@ pub struct Definition {
 pub struct NameDefinitions {
     /// Structs, enums, traits, classes and type aliases of modules, without tests, benchmarks and examples.
     pub types: Vec<Definition>,
+    /// Those of `types` in Rust that are `pub` without a restriction.
+    pub public_types: Vec<Definition>,
     /// Constants and statics whose first word is one of [`SUPERLATIVES`], without tests.
     pub superlatives: Vec<Definition>,
     /// Functions called `of`, without tests.
@@ -122,6 +124,9 @@ fn read_rust(file: &str, source: &str, names: &mut NameDefinitions) {
                         && !is_benchmark_or_example(file) =>
                 {
                     names.types.push(define(name));
+                    if position > 0 && tokens[position - 1].is_word("pub") {
+                        names.public_types.push(define(name));
+                    }
                 }
                 ("const" | "static", Some(name)) if is_superlative(name) && !is_test_code && test_module.is_none() => {
                     names.superlatives.push(define(name));

@@ -4,6 +4,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
 
+/// Path of the glossary, which is read beside the sources.
+pub const GLOSSARY: &str = "docs/glossary.md";
+
 /// Source files by their path from the repository's root, with `/` as separator.
 #[derive(Clone, Debug, Default)]
 pub struct SourceTree {
@@ -16,7 +19,7 @@ impl SourceTree {
         Self { files: files.into_iter().map(|(path, text)| (path.into(), text.into())).collect() }
     }
 
-    /// Reads the Rust, Python, `.proto` and `Cargo.toml` files of a git checkout. Files that git ignores are left out.
+    /// Reads the Rust, Python, `.proto` and `Cargo.toml` files of a git checkout, and the glossary. Files that git ignores are left out.
     ///
     /// # Errors
     ///
@@ -33,7 +36,7 @@ impl SourceTree {
         }
         let mut files = BTreeMap::new();
         for path in String::from_utf8_lossy(&output.stdout).split('\0') {
-            if ![".rs", ".py", ".proto", "Cargo.toml"].iter().any(|end| path.ends_with(end)) {
+            if ![".rs", ".py", ".proto", "Cargo.toml", GLOSSARY].iter().any(|end| path.ends_with(end)) {
                 continue;
             }
             // A file that was deleted but is still in the index is not part of the tree.

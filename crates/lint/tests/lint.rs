@@ -358,3 +358,31 @@ fn files_are_counted_for_their_folder() {
         assert_eq!(is_test(path), expected, "{path}");
     }
 }
+
+#[test]
+fn public_types_need_a_glossary_entry() {
+    let glossary = "| type | meaning |\n|---|---|\n| `Pool`, `Shard` | Not `Fresh`. |\n| `DE` | No type. |\n";
+    let pool = "pub struct Pool;\npub struct Fresh;\npub type Common = u8;\npub enum FreshError {}\n\
+                pub(crate) struct Inner;\nstruct Own;\n#[cfg(test)]\nmod tests {\n    pub struct Tested;\n}\n";
+    let files =
+        [("docs/glossary.md", glossary), ("src/pool/pool.rs", pool), ("src/env/other.rs", "pub struct Other;\n")];
+    let tree = SourceTree::from_files(files);
+    let exemptions = Exemptions::default().with_commonplaces("Common = \"a number\"\nGone = \"was one\"\n").unwrap();
+    let findings = limits::check(&tree, &exemptions);
+    let found: Vec<_> = findings.iter().filter(|finding| finding.check == Check::TypesWithoutGlossaryEntry).collect();
+    assert_eq!(found.len(), 1);
+    assert_eq!(
+        (found[0].folder.as_str(), &found[0].places[..]),
+        ("src/pool", &["src/pool/pool.rs:2: Fresh".into()][..])
+    );
+    let verdict = limits::judge(&tree, &findings, &LimitTable::default(), &exemptions);
+    assert_eq!(verdict.errors.len(), 1);
+    assert_eq!(
+        verdict.warnings,
+        [
+            "crates/lint/commonplace-types.toml: there is no type Gone; remove the entry",
+            "docs/glossary.md: there is no type Shard; remove the entry",
+        ]
+    );
+    assert!(Exemptions::default().with_commonplaces("Common = \"\"\n").is_err(), "a commonplace needs a reason");
+}
