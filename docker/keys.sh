@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# keys.sh DIR: makes what guarded.yaml needs, in DIR/server and DIR/learner: an authority, certificates of both that it
-# has signed, good for a year, a token and its entry in the file of tokens. Only the caller comes
-# into DIR; what is in it is readable, because containers have users of their own. Remove DIR to have others.
+# keys.sh DIR: makes the keys of guarded.yaml in DIR: an authority, its certificates for servers (DIR/server) and learners
+# (DIR/learner) for a year, a token and its entry in the file of tokens. Only the caller can enter DIR. Files in it are
+# readable for everybody, because containers have users of their own. To make new keys, remove DIR.
 set -euo pipefail
 [ $# = 1 ] || { echo "expected a folder: keys.sh DIR" >&2; exit 2; }
 [ ! -e "$1" ] || { echo "$1 is there already; remove it to have other keys" >&2; exit 1; }
@@ -19,7 +19,7 @@ signed() {
     quietly openssl x509 -req -in authority/csr -CA authority/ca.pem -CAkey authority/ca.key -CAcreateserial -days 365 \
         -out "$1.pem" -extfile <(printf "basicConstraints = CA:FALSE\n%s\n" "${3-}")
 }
-# By the first name learners come, by the others the server asks for its own health.
+# Learners use the first name, the server's health check the others.
 signed server/server server "subjectAltName = DNS:server, DNS:localhost, IP:127.0.0.1"
 signed learner/learner learner
 cp authority/ca.pem server/clients.pem
@@ -31,7 +31,7 @@ cat >server/tokens.toml <<TOKENS
 name = "learner"
 sha256 = "$(printf %s "$token" | sha256sum | cut -d ' ' -f 1)"
 
-# What tokens may have, and draw parameters from: docs/access.md#tokens.
+# docs/access.md#tokens describes quotas and roles.
 TOKENS
 chmod 644 server/* learner/*
 echo "made $PWD: server for servers, learner for learners, authority for nobody"

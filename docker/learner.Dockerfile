@@ -29,8 +29,8 @@ ARG PERTURB_COMMIT="unknown commit"
 RUN cargo build --package perturb-cli $([ "$RECURRENT" = 0 ] || echo --package perturb-recurrent) --release --locked \
     && mkdir /programs /libraries \
     && cp target/release/perturb $([ "$RECURRENT" = 0 ] || echo target/release/perturb-recurrent) /programs
-# The shared libraries that the programs load: some 280, nearly all of them because libtorch does. Debian's packages
-# would bring 360 MB more, which nobody loads. The C library is left out: the image has its own.
+# The shared libraries that the programs load: some 280, nearly all of them dependencies of libtorch. Debian's packages
+# would add 360 MB of files that are not loaded. The C library is left out, because the image has its own.
 RUN ldd /programs/* | awk '$3 ~ "^/" { print $3 }' | sort -u | grep -vE '/lib(c|m|dl|pthread|rt|resolv)\.so' \
     | xargs --no-run-if-empty cp --dereference --target-directory /libraries
 
@@ -39,7 +39,7 @@ COPY --from=build /libraries /usr/local/lib/
 RUN ldconfig && useradd --uid 10001 --user-group --no-create-home --home-dir / --shell /usr/sbin/nologin perturb
 COPY --from=build /programs /usr/local/bin/
 COPY experiments /experiments
-# The learner's threads are its own; more inside matrix products only get in their way.
+# The learner has threads of its own. More threads inside matrix products only slow it down.
 ENV OPENBLAS_NUM_THREADS=1
 USER perturb
 STOPSIGNAL SIGTERM

@@ -11,7 +11,7 @@ inspect() { docker inspect --format "$1" "${@:2}"; }
 results() { find "$work/runs/$1" -name result.json | wc -l; }
 sessions() { docker logs "$1" 2>&1 | grep -c 'a session ended' || true; }
 
-# Waits for all learners, which must end well.
+# Waits for all learners, which must end with status 0.
 learners_end() {
     local codes
     codes=$(compose ps --quiet learner | xargs docker wait)

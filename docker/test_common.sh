@@ -1,4 +1,4 @@
-# What test.sh and test_guarded.sh share: Compose, a folder for what comes of it, an end that leaves nothing behind.
+# Functions of test.sh and test_guarded.sh: Compose, a temporary folder, and cleaning up at the end.
 
 if docker compose version >/dev/null 2>&1; then
     program=(docker compose)
@@ -13,7 +13,7 @@ compose() { "${program[@]}" "${files[@]}" --project-name "perturb-test-$$" "$@";
 
 work=$(mktemp -d)
 mkdir "$work/runs"
-# Learners run as whoever calls this script, but never as root.
+# Learners run as the caller of this script, but never as root.
 user=$(id -u):$(id -g)
 [ "$(id -u)" != 0 ] || { user=1000:1000; chown "$user" "$work/runs"; chmod 755 "$work"; }
 export PERTURB_RUNS=$work/runs PERTURB_USER=$user PERTURB_PLAN=/runs/plan.toml PERTURB_LOG=info,perturb=debug
@@ -32,7 +32,7 @@ trap clean_up EXIT
 
 fail() { echo "FAILED: $*" >&2; exit 1; }
 say() { printf '%4d s  %s\n' $((SECONDS - begun)) "$*"; }
-# wait_for WHAT COMMAND…: until the command succeeds, for ten minutes at most.
+# wait_for WHAT COMMAND…: waits until the command succeeds, for ten minutes at most.
 wait_for() {
     local what=$1 deadline=$((SECONDS + 600))
     shift

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Runs a small experiment with compose.yaml and guarded.yaml: servers that encrypt, learners that show certificates and
-# tokens. Who has a wrong certificate, an expired one, a wrong token or a wrong role is refused with a sentence. Needs the
-# two images, which `make docker` builds.
+# tokens. A learner with a wrong or expired certificate, a wrong token or a wrong role is refused with a sentence. Needs
+# the two images, which `make docker` builds.
 set -euo pipefail
 cd "$(dirname "$0")"
 
@@ -48,7 +48,7 @@ codes=$(compose ps --quiet learner | xargs docker wait)
 [ "$(find "$work/runs/guarded" -name result.json | wc -l)" = 2 ] || fail "not both cells have a result"
 say "two servers and two learners with certificates and tokens: the report is there"
 
-# refused SENTENCE VERSION [VARIABLE=VALUE…]: a learner with these variables fails and says so.
+# refused SENTENCE VERSION [VARIABLE=VALUE…]: a learner with these variables must fail with the sentence.
 refused() {
     local sentence=$1 version=$2 status=0 words arguments=()
     shift 2

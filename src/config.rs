@@ -13,12 +13,12 @@ use std::{
 use tracing_subscriber::filter::{LevelFilter, Targets};
 
 const ENV_PREFIX: &str = "PERTURB_SERVER";
-/// A day. The transport adds the interval to the present, which must not overflow.
-const MOST_SECONDS: u64 = 86_400;
-/// Less than one session's pictures need.
-const LEAST_MEMORY: usize = 1 << 20;
-/// The settings of `--private`. The limits guard shared servers; the memory is the program's own affair. Between two
-/// steps it may compute for long: its death closes the socket and the pipe anyway.
+/// Upper limit of timeouts and intervals, a day: the transport adds them to the present, which must not overflow.
+const MAX_SECONDS: u64 = 86_400;
+/// Lower limit of the memory for bytes in flight. Pictures need more.
+const MIN_MEMORY: usize = 1 << 20;
+/// The settings of `--private`. Limits protect shared servers only. The program may compute for long between two steps;
+/// its death closes the socket and the pipe anyway.
 const PRIVATE: &str = "
     exit_with_stdin = true
     grace_seconds = 1
@@ -33,8 +33,8 @@ const PRIVATE: &str = "
 
 /// Serves reinforcement-learning environments whose physics can be changed, over gRPC.
 ///
-/// Every flag may also stand in the TOML file given by --config (`max_envs = 64`) or in an environment variable
-/// (`PERTURB_SERVER_MAX_ENVS=64`). A flag beats a variable, a variable beats the file.
+/// Every flag can also be set in the TOML file of --config (`max_envs = 64`) or by an environment variable
+/// (`PERTURB_SERVER_MAX_ENVS=64`). Flags override variables, variables override the file.
 #[derive(Debug, Default, Parser, Serialize)]
 #[command(name = "perturb-server", version = crate::VERSION)]
 pub struct Arguments {
@@ -42,76 +42,75 @@ pub struct Arguments {
     #[arg(long, value_name = "FILE", env = "PERTURB_SERVER_CONFIG")]
     #[serde(skip)]
     pub config: Option<PathBuf>,
-    /// Where to listen: unix:/path/to/socket, or tcp://address:port; port 0 takes a free one. Repeatable. The addresses
-    /// in use are printed on standard output. [default: tcp://127.0.0.1:7447]
+    /// Address to listen on: unix:/path/to/socket, or tcp://address:port; port 0 takes a free one. Repeatable. The server
+    /// prints its addresses on standard output. [default: tcp://127.0.0.1:7447]
     #[arg(long, value_name = "ADDRESS")]
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub listen: Vec<String>,
-    /// Physics threads. [default: one a core]
+    /// Number of physics threads. [default: one for each core]
     #[arg(long, value_name = "N")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub workers: Option<usize>,
-    /// The most environments, over all sessions. [default: 16384]
+    /// Maximum number of environments, over all sessions. [default: 16384]
     #[arg(long, value_name = "N")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_envs: Option<usize>,
-    /// The most sessions at a time. [default: 1024]
+    /// Maximum number of sessions at a time. [default: 1024]
     #[arg(long, value_name = "N")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_sessions: Option<usize>,
-    /// The largest request, in bytes. [default: 67108864]
+    /// Maximum size of a request, in bytes. [default: 67108864]
     #[arg(long, value_name = "BYTES")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_message_bytes: Option<usize>,
-    /// The most bytes of what is in flight over all sessions: requests, replies, pictures, policies that play. What is
-    /// beyond is refused. [default: a quarter of the machine's memory, or of what a container may have]
+    /// Maximum number of bytes in flight over all sessions: requests, replies, pictures, policies that act. Requests
+    /// beyond it are refused. [default: a quarter of the memory of the machine, or of the container's limit]
     #[arg(long, value_name = "BYTES")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_memory: Option<usize>,
-    /// The most sessions of one machine, or of one user by a Unix socket; 0 = as many as there may be. [default: 0]
+    /// Maximum number of sessions of one machine, or of one user of a Unix socket; 0 = --max-sessions. [default: 0]
     #[arg(long, value_name = "N")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_peer_sessions: Option<usize>,
-    /// How long a connection may take to begin, and a session to be opened. [default: 10]
+    /// Timeout for a connection to begin, and for a session to be opened. [default: 10]
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub handshake_seconds: Option<u64>,
-    /// How long a client may leave a request unfinished or a large reply unread before it is ended; 0 = for ever.
-    /// [default: 300]
+    /// Timeout for a client to finish a request, or to read a reply; 0 = never. [default: 300]
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stall_seconds: Option<u64>,
-    /// How long running sessions may go on after SIGTERM. [default: 30]
+    /// Time that running sessions have after SIGTERM. [default: 30]
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub grace_seconds: Option<u64>,
-    /// Ends sessions that send nothing for so long; 0 = never. [default: 0]
+    /// Time after which sessions that send nothing are ended; 0 = never. [default: 0]
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub idle_seconds: Option<u64>,
-    /// How long a session whose client asked for a lease stays when its connection is lost, so that it can be taken up
-    /// again; 0 = no leases. [default: 60]
+    /// Time that a session with a lease survives without a connection, so that its client can resume it; 0 = no leases.
+    /// [default: 60]
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lease_seconds: Option<u64>,
-    /// How often a silent connection is asked whether it lives; one that does not answer within this time is closed and
-    /// its environments are freed. [default: 60]
+    /// Interval of keepalive pings on silent connections. A connection that does not answer within this time is closed,
+    /// and its environments are freed. [default: 60]
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keepalive_seconds: Option<u64>,
-    /// A TOML file of tokens, one of which every call by TCP must show: for each a name, sha256 (or token), and if need
-    /// be max_sessions, max_envs, max_steps_per_second, max_bytes and a role, which says what may be drawn from. It is
+    /// TOML file of tokens. Every call over TCP must show one. Each has a name and sha256 (or token), and optionally
+    /// max_sessions, max_envs, max_steps_per_second, max_bytes, and a role that says what it may draw from. The file is
     /// read again when it changes.
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tokens: Option<PathBuf>,
-    /// Write into this file what every token draws from (distribution, seed, indices, episodes), before it does, in
-    /// lines that are chained to each other; `perturb audit --ledger` reads it. An old one is gone on with.
+    /// File that records what every token draws from (distribution, seed, indices, episodes), before it does, in lines
+    /// that are chained by hashes. `perturb audit --ledger` reads it. An existing file is continued.
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ledger: Option<PathBuf>,
-    /// The server's certificate for TLS on its TCP addresses, in PEM, with those between it and its authority's. The
-    /// files of TLS are read again when they change.
+    /// The server's certificate for TLS on its TCP addresses, in PEM, with the intermediate certificates. The files of
+    /// TLS are read again when they change.
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls_cert: Option<PathBuf>,
@@ -119,47 +118,46 @@ pub struct Arguments {
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls_key: Option<PathBuf>,
-    /// The authorities, as certificates in PEM, one of which must have signed a client's certificate. Without it
-    /// clients need none.
+    /// Certificates in PEM of the authorities that may sign clients' certificates. Without it clients need no
+    /// certificate.
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls_client_ca: Option<PathBuf>,
-    /// Where to tell metrics, as Prometheus scrapes them, at the path /metrics: tcp://127.0.0.1:port or unix:/path.
-    /// Whoever can connect may read them. [default: nowhere]
+    /// Address of the metrics for Prometheus, at the path /metrics: tcp://127.0.0.1:port or unix:/path. Everybody who
+    /// can connect can read them. [default: none]
     #[arg(long, value_name = "ADDRESS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub metrics: Option<String>,
-    /// Let other machines use this server without asking who they are, or without encryption.
+    /// Let other machines use this server without tokens, or without encryption.
     #[arg(long)]
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub insecure: bool,
-    /// Who may connect to Unix sockets: their files' mode, octal, such as 0660 for the group. [default: 0600]
+    /// Octal mode of the files of Unix sockets: 0660 admits the group, 0666 everybody. [default: 0600]
     #[arg(long, value_name = "MODE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub socket_mode: Option<String>,
-    /// What to log on standard error: error, warn, info, debug, trace, or a filter such as perturb=debug.
+    /// Level of the log on standard error: error, warn, info, debug, trace, or a filter such as perturb=debug.
     /// [default: info]
     #[arg(long, value_name = "FILTER")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub log: Option<String>,
-    /// Shut down when standard input closes: a program that starts a server through a pipe takes it along, however it
-    /// ends itself.
+    /// Shut down when standard input closes. A server that a program starts through a pipe then ends with the program,
+    /// however that ends.
     #[arg(long)]
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub exit_with_stdin: bool,
-    /// Serve the one program that starts this server: --exit-with-stdin, no limits (they guard shared servers), time to
-    /// compute for an hour between two requests, a second to end. Only flags count then, neither file nor variables,
-    /// which are for servers that people run themselves.
+    /// Serve only the program that starts this server: --exit-with-stdin, no limits, an hour of silence between two
+    /// requests, a second to end. The server then ignores variables and files, which are for servers that people run.
     #[arg(long)]
     #[serde(skip)]
     pub private: bool,
-    /// A folder with an MJCF model and a file task.toml, which is served as an environment like the built-in ones; see
-    /// docs/tasks.md. Repeatable.
+    /// Folder with an MJCF model and a file task.toml, which is served as another environment; see docs/tasks.md.
+    /// Repeatable.
     #[arg(long = "task", value_name = "FOLDER")]
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub tasks: Vec<PathBuf>,
-    /// Start no server, but load the folders of --task, each in a process of its own, and print what they are:
-    /// observations, actions, rewards, parameters, sizes, speed, and edits without an effect.
+    /// Start no server, but load the folders of --task, each in a process of its own, and describe them: observations,
+    /// actions, rewards, parameters, sizes, speed, and edits without an effect.
     #[arg(long, group = "instead")]
     #[serde(skip)]
     pub check: bool,
@@ -167,31 +165,31 @@ pub struct Arguments {
     #[arg(long, group = "instead")]
     #[serde(skip)]
     pub task_schema: bool,
-    /// Load this folder under limits of memory and processor time, and print what it is: what a server starts before it
-    /// loads a folder itself.
+    /// Load this folder under limits of memory and processor time, and describe it. A server starts itself with this flag
+    /// before it loads a folder.
     #[arg(long, value_name = "FOLDER", group = "instead", hide = true)]
     #[serde(skip)]
     pub check_task: Option<PathBuf>,
-    /// Say how fast the folder of --check-task is, too.
+    /// Also measure the speed of the folder of --check-task.
     #[arg(long, hide = true, requires = "check_task")]
     #[serde(skip)]
     pub measure_task: bool,
-    /// Start no server, but ask the one that runs with these settings, at its first address, whether it takes sessions:
-    /// exit status 0 if so, else 1. For the health checks of containers.
+    /// Start no server, but ask the running one with these settings, at its first address, whether it accepts sessions.
+    /// The exit status is 0 if it does, else 1. For health checks of containers.
     #[arg(long, group = "instead")]
     #[serde(skip)]
     pub health: bool,
-    /// Start no server, but print what it would serve, as JSON: the environments with their spaces, parameters and
-    /// rules of success, and the limits that clients keep to.
+    /// Start no server, but print as JSON what it would serve: the environments with their spaces, parameters and
+    /// success rules, and the limits that clients must keep.
     #[arg(long, group = "instead")]
     #[serde(skip)]
     pub catalogue: bool,
-    /// Start no server, but print a new token on standard output, and on standard error its entry for the file of
-    /// --tokens.
+    /// Start no server, but print a new token on standard output, and its entry for the file of --tokens on standard
+    /// error.
     #[arg(long, value_name = "NAME", group = "instead")]
     #[serde(skip)]
     pub new_token: Option<String>,
-    /// Start no server, but print what lets a shell complete these flags.
+    /// Start no server, but print the completions of these flags for a shell.
     #[arg(long, value_name = "SHELL", group = "instead")]
     #[serde(skip)]
     pub completions: Option<clap_complete::Shell>,
@@ -201,49 +199,49 @@ pub struct Arguments {
     pub man: bool,
 }
 
-/// The configuration in force, validated.
+/// The validated configuration.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// Where to listen, at least one.
+    /// The addresses to listen on, at least one.
     pub listen: Vec<ListenAddress>,
-    /// Physics threads, 1 … 1024.
+    /// The number of physics threads, 1 … 1024.
     pub workers: usize,
-    /// The most environments, over all sessions, 1 … 2^24.
+    /// Maximum number of environments, over all sessions, 1 … 2^24.
     pub max_envs: usize,
-    /// The most sessions at a time, at least 1.
+    /// Maximum number of sessions at a time, at least 1.
     pub max_sessions: usize,
-    /// The largest request in bytes, at least 1024.
+    /// Maximum size of a request in bytes, at least 1024.
     pub max_message_bytes: usize,
-    /// The most bytes in flight, at least 1 MiB.
+    /// Maximum number of bytes in flight, at least 1 MiB.
     pub max_memory: usize,
-    /// The most sessions of a peer; 0 = as many as there may be.
+    /// Maximum number of sessions of a peer; 0 = `max_sessions`.
     pub max_peer_sessions: usize,
-    /// How long a connection may take to begin, and a session to be opened, s, 1 … 86400.
+    /// Timeout for a connection to begin, and for a session to be opened, s, 1 … 86400.
     pub handshake_seconds: u64,
-    /// How long a client may leave a request unfinished or a large reply unread, s, at most 86400; 0 = for ever.
+    /// Timeout for a client to finish a request, or to read a reply, s, at most 86400; 0 = never.
     pub stall_seconds: u64,
-    /// How long running sessions may go on after SIGTERM, s.
+    /// Time that running sessions have after SIGTERM, s.
     pub grace_seconds: u64,
-    /// Ends sessions that send nothing for so long, s; 0 = never.
+    /// Time after which sessions that send nothing are ended, s; 0 = never.
     pub idle_seconds: u64,
-    /// How long a session with a lease stays without a connection, s, at most 86400; 0 = no leases.
+    /// Time that a session with a lease survives without a connection, s, at most 86400; 0 = no leases.
     pub lease_seconds: u64,
-    /// How often a silent connection is asked whether it lives, s, 1 … 86400.
+    /// Interval of keepalive pings on silent connections, s, 1 … 86400.
     pub keepalive_seconds: u64,
     /// The file of tokens that callers must show.
     pub tokens: Option<PathBuf>,
-    /// The file of what is drawn.
+    /// The file that records all draws.
     pub ledger: Option<PathBuf>,
     /// The server's certificate for TLS.
     pub tls_cert: Option<PathBuf>,
-    /// Its private key.
+    /// The private key of `tls_cert`.
     pub tls_key: Option<PathBuf>,
-    /// Whose certificates clients must show.
+    /// The authorities that may sign clients' certificates.
     pub tls_client_ca: Option<PathBuf>,
-    /// Where to tell metrics.
+    /// The address of the metrics.
     pub metrics: Option<ListenAddress>,
-    /// Whether other machines may use this server unasked or unencrypted.
+    /// Whether other machines may use this server without tokens or without encryption.
     pub insecure: bool,
     /// The mode of Unix sockets' files.
     pub socket_mode: SocketMode,
@@ -263,7 +261,7 @@ impl Default for Config {
             max_envs: DEFAULT_MAX_ENVS,
             max_sessions: 1024,
             max_message_bytes: DEFAULT_MAX_MESSAGE_BYTES,
-            max_memory: usual_memory(),
+            max_memory: default_memory(),
             max_peer_sessions: 0,
             handshake_seconds: 10,
             stall_seconds: 300,
@@ -286,25 +284,27 @@ impl Default for Config {
     }
 }
 
-/// A quarter of the machine's memory, or of what this process's container or service may have.
-fn usual_memory() -> usize {
+/// Returns a quarter of the machine's memory, or of the limit of this process's container or service, in bytes.
+fn default_memory() -> usize {
     let rustix::system::Sysinfo { totalram, mem_unit, .. } = rustix::system::sysinfo();
     let machine = (totalram as usize).saturating_mul(mem_unit as usize);
     let groups = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
     let group = group_memory(Path::new("/sys/fs/cgroup"), &groups);
-    (group.unwrap_or(machine).min(machine) / 4).max(LEAST_MEMORY)
+    (group.unwrap_or(machine).min(machine) / 4).max(MIN_MEMORY)
 }
 
-/// The least that this process's control group, or one around it, may have, in bytes; `groups` is `/proc/self/cgroup`.
+/// Returns the lowest memory limit of this process's control group and those around it, in bytes; `groups` is the text of
+/// `/proc/self/cgroup`.
 fn group_memory(root: &Path, groups: &str) -> Option<usize> {
     let own = groups.lines().find_map(|line| line.strip_prefix("0::/")).unwrap_or_default();
     let around = Path::new(own).ancestors().map(|group| root.join(group).join("memory.max"));
     around.filter_map(|file| std::fs::read_to_string(file).ok()?.trim().parse().ok()).min()
 }
 
-/// The environment variables that are settings.
+/// Returns the environment variables that are settings.
 fn variables() -> Environment {
-    // Other programs' variables need not be UTF-8. A setting that is not is refused with its odd characters replaced.
+    // Other programs' variables need not be UTF-8. A setting that is not UTF-8 is refused, with its invalid characters
+    // replaced.
     let text = std::env::vars_os().map(|(k, v)| (k.to_string_lossy().into_owned(), v.to_string_lossy().into_owned()));
     // The variable that names the file is no setting.
     let settings = text.filter(|(name, _)| !name.eq_ignore_ascii_case("PERTURB_SERVER_CONFIG"));
@@ -317,7 +317,7 @@ fn variables() -> Environment {
         .source(Some(settings.collect()))
 }
 
-/// Where to listen.
+/// An address to listen on.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Deserialize)]
 #[serde(try_from = "String")]
 pub enum ListenAddress {
@@ -344,7 +344,7 @@ impl TryFrom<String> for ListenAddress {
 }
 
 impl ListenAddress {
-    /// As `--listen` takes it.
+    /// Returns the address as `--listen` takes it.
     pub fn written(&self) -> String {
         match self {
             Self::Tcp(address) => format!("tcp://{address}"),
@@ -362,13 +362,13 @@ impl fmt::Display for ListenAddress {
     }
 }
 
-/// The mode of a Unix socket's file: who may connect are those who may write.
+/// The mode of a Unix socket's file. Users who may write to the file may connect.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
 pub struct SocketMode(u32);
 
 impl SocketMode {
-    /// As the system takes it.
+    /// Returns the mode's bits.
     pub fn bits(self) -> u32 {
         self.0
     }
@@ -384,9 +384,11 @@ impl TryFrom<String> for SocketMode {
     type Error = String;
 
     fn try_from(text: String) -> Result<Self, String> {
-        // The owner may read and write, nobody execute; a number that was not octal is none of these.
+        // The owner must be able to read and write, and nobody to execute.
         let bits = u32::from_str_radix(&text, 8).ok().filter(|bits| bits & !0o066 == 0o600);
-        bits.map(Self).ok_or_else(|| format!("{text:?} is no mode of a socket; expected 0600, 0660, 0666, or so"))
+        bits.map(Self).ok_or_else(|| {
+            format!("{text:?} is no mode of a socket; expected an octal mode such as 0600, 0660 or 0666")
+        })
     }
 }
 
@@ -399,23 +401,23 @@ pub enum Error {
     Source(#[from] config::ConfigError),
     /// Other machines could use the server, or read along.
     #[error(
-        "{address} can be reached by other machines, and {lacks}: give --tls-cert, --tls-key and --tokens (or \
-         --tls-client-ca); or give --insecure, where everybody who reaches that address may use the server and read along"
+        "{address} can be reached by other machines, and {lacks}: pass --tls-cert, --tls-key and --tokens (or \
+         --tls-client-ca); or pass --insecure if everybody who reaches that address may use the server and read along"
     )]
     Insecure {
-        /// Where it would listen.
+        /// The address that the server would listen on.
         address: String,
-        /// What is missing.
+        /// The missing protection.
         lacks: &'static str,
     },
     /// Other machines could read the metrics.
     #[error(
-        "{address} of --metrics can be reached by other machines, and metrics are neither encrypted nor is anybody asked \
-         who reads them: give --metrics tcp://127.0.0.1:PORT or unix:/path; or give --insecure, where everybody who \
-         reaches that address may read them"
+        "{address} of --metrics can be reached by other machines, and metrics need no token and are not encrypted: pass \
+         --metrics tcp://127.0.0.1:PORT or unix:/path; or pass --insecure if everybody who reaches that address may \
+         read them"
     )]
     InsecureMetrics {
-        /// Where they would be told.
+        /// The address of the metrics.
         address: String,
     },
     /// A value is out of its range.
@@ -423,9 +425,9 @@ pub enum Error {
     Value {
         /// The setting.
         key: &'static str,
-        /// What came.
+        /// The value that was given.
         got: String,
-        /// What would be right.
+        /// The values that are accepted.
         expected: &'static str,
     },
 }
@@ -465,19 +467,19 @@ impl Config {
         if self.max_message_bytes < 1024 {
             return refuse("max_message_bytes", &self.max_message_bytes, "at least 1024");
         }
-        if !(1..=MOST_SECONDS).contains(&self.keepalive_seconds) {
+        if !(1..=MAX_SECONDS).contains(&self.keepalive_seconds) {
             return refuse("keepalive_seconds", &self.keepalive_seconds, "1 … 86400");
         }
-        if self.max_memory < LEAST_MEMORY {
+        if self.max_memory < MIN_MEMORY {
             return refuse("max_memory", &self.max_memory, "at least 1048576");
         }
-        if !(1..=MOST_SECONDS).contains(&self.handshake_seconds) {
+        if !(1..=MAX_SECONDS).contains(&self.handshake_seconds) {
             return refuse("handshake_seconds", &self.handshake_seconds, "1 … 86400");
         }
-        if self.stall_seconds > MOST_SECONDS {
+        if self.stall_seconds > MAX_SECONDS {
             return refuse("stall_seconds", &self.stall_seconds, "at most 86400");
         }
-        if self.lease_seconds > MOST_SECONDS {
+        if self.lease_seconds > MAX_SECONDS {
             return refuse("lease_seconds", &self.lease_seconds, "at most 86400");
         }
         match (&self.tls_cert, &self.tls_key, &self.tls_client_ca) {
@@ -512,8 +514,8 @@ impl Config {
         Ok(self)
     }
 
-    /// The filter in full. A level is that of this program's own lines: what its libraries say mostly follows from what
-    /// clients send, and of that only errors are logged unless a filter asks for more.
+    /// Returns the complete filter. A level applies to this program's own lines. Lines of its libraries mostly follow from
+    /// what clients send, so only their errors are logged, unless a filter asks for more.
     pub fn filter(&self) -> Targets {
         match self.log.parse::<LevelFilter>() {
             Ok(level) => Targets::new().with_default(level.min(LevelFilter::ERROR)).with_target("perturb", level),
@@ -521,7 +523,7 @@ impl Config {
         }
     }
 
-    /// The files of TLS, if it is asked for.
+    /// Returns the files of TLS, if TLS is requested.
     pub fn tls(&self) -> Option<TlsFiles> {
         let (cert, key) = self.tls_cert.clone().zip(self.tls_key.clone())?;
         Some(TlsFiles { cert, key, client_ca: self.tls_client_ca.clone() })
@@ -536,16 +538,16 @@ impl Config {
 /// The files of TLS, in PEM.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TlsFiles {
-    /// The server's certificate, and those between it and its authority's.
+    /// The server's certificate, and the intermediate certificates.
     pub cert: PathBuf,
-    /// Its private key.
+    /// The private key of `cert`.
     pub key: PathBuf,
-    /// The authorities one of which must have signed a client's certificate; none: clients need none.
+    /// The authorities that may sign clients' certificates; if `None`, clients need no certificate.
     pub client_ca: Option<PathBuf>,
 }
 
 impl TlsFiles {
-    /// In the order in which the server reads them.
+    /// Returns the paths in the order in which the server reads the files.
     pub fn paths(&self) -> Vec<PathBuf> {
         [Some(&self.cert), Some(&self.key), self.client_ca.as_ref()].into_iter().flatten().cloned().collect()
     }
@@ -556,7 +558,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_service_has_what_the_narrowest_group_around_it_may_have() {
+    fn service_has_the_lowest_memory_limit_around_it() {
         let root = tempfile::tempdir().unwrap();
         let service = root.path().join("system.slice/perturb.service");
         std::fs::create_dir_all(&service).unwrap();
@@ -572,7 +574,7 @@ mod tests {
     }
 
     #[test]
-    fn a_level_is_that_of_our_own_lines_and_a_filter_stays_as_it_is() {
+    fn level_applies_to_own_lines_and_filter_stays() {
         for (log, filter) in [
             ("info", "error,perturb=info"),
             ("debug", "error,perturb=debug"),

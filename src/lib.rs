@@ -6,9 +6,9 @@
 //! - [`pool`]: batches of environments, stepped by worker threads.
 //! - [`env`](mod@env): the trait of an environment, parameters, episodes, trials, receipts, random streams.
 //! - [`tasks`]: the environments, one folder each, and their catalogue.
-//! - [`scene`]: what a picture shows, and [`render`]: drawing it, by a thread of its own.
+//! - [`scene`]: the content of pictures as data, and [`render`]: the thread that draws it.
 //!
-//! [`config`] is the server's configuration, [`meters`] what is counted on the way, and [`proto`] the protocol.
+//! [`config`] is the server's configuration, [`meters`] has the counters of steps and times, and [`proto`] the protocol.
 #![forbid(unsafe_code)]
 #![deny(clippy::disallowed_methods)]
 

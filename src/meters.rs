@@ -1,4 +1,4 @@
-//! What is counted on the way of a step: atomics, so that counting takes neither a lock nor memory.
+//! Counters of steps, episodes and times. They are atomics, so counting takes neither a lock nor memory.
 
 use std::{
     array,
@@ -9,12 +9,12 @@ use std::{
     time::Duration,
 };
 
-/// The number of bounds of a [`Histogram`]: 1 µs, and each twice the one before, up to 8.4 s.
+/// Number of bounds of a [`Histogram`]. The first is 1 µs, each further one is twice the one before, and the last is 8.4 s.
 pub const N_BOUNDS: usize = 24;
 
-/// How long something took, how often.
+/// A histogram of durations.
 pub struct Histogram {
-    /// For each bound those that took at most so long and longer than the bound before; at last the longer ones.
+    /// For each bound the number of durations up to it and longer than the bound before; then the number of longer ones.
     counts: [AtomicU64; N_BOUNDS + 1],
     nanos: AtomicU64,
 }
@@ -26,7 +26,7 @@ impl Default for Histogram {
 }
 
 impl Histogram {
-    /// Adds one that took so long.
+    /// Adds a duration.
     pub fn observe(&self, time: Duration) {
         let nanos = u64::try_from(time.as_nanos()).unwrap_or(u64::MAX);
         let place = nanos.div_ceil(1000).max(1).next_power_of_two().trailing_zeros() as usize;
@@ -34,13 +34,14 @@ impl Histogram {
         self.nanos.fetch_add(nanos, Ordering::Relaxed);
     }
 
-    /// For each bound, in s, and at last for infinity, how many there are up to it and beyond the one before.
+    /// Returns for each bound, in s, and finally for infinity, the number of durations up to it and longer than the bound
+    /// before.
     pub fn counts(&self) -> [(f64, u64); N_BOUNDS + 1] {
         let bound = |place| if place < N_BOUNDS { (1u64 << place) as f64 / 1e6 } else { f64::INFINITY };
         array::from_fn(|place| (bound(place), self.counts[place].load(Ordering::Relaxed)))
     }
 
-    /// The sum of all times, s.
+    /// Returns the sum of all durations, s.
     pub fn seconds(&self) -> f64 {
         self.nanos.load(Ordering::Relaxed) as f64 / 1e9
     }
@@ -50,50 +51,51 @@ impl Histogram {
 const BATCH_SIZE_CLASSES: [(usize, &str); 5] =
     [(1, "1"), (16, "2-16"), (256, "17-256"), (4096, "257-4096"), (usize::MAX, "4097+")];
 
-/// What happens in the environments of one kind.
+/// Counters of all environments of one name.
 #[derive(Default)]
 pub struct Meter {
-    /// Steps of an environment.
+    /// Steps, counted for each environment.
     pub steps: AtomicU64,
-    /// Episodes that ended.
+    /// Ended episodes.
     pub episodes: AtomicU64,
     times: [Histogram; BATCH_SIZE_CLASSES.len()],
 }
 
 impl Meter {
-    /// How long a step of a batch of this size takes: of all its environments, from the request's check to its reply.
+    /// Returns the histogram of steps of batches of this size: the time of a step of all its environments, from the
+    /// validation of the request to the reply.
     pub fn times(&self, size: usize) -> &Histogram {
         &self.times[BATCH_SIZE_CLASSES.iter().position(|(greatest, _)| size <= *greatest).unwrap_or_default()]
     }
 
-    /// The same for each class of sizes.
+    /// Returns the histogram of each class of batch sizes, with the class's label.
     pub fn classes(&self) -> impl Iterator<Item = (&'static str, &Histogram)> {
         BATCH_SIZE_CLASSES.iter().map(|(_, name)| *name).zip(&self.times)
     }
 }
 
-/// What happens in a batch, counted for it and for its kind of environment.
+/// Counters of one batch, which also count for all environments of its name.
 pub struct Tally {
-    /// That of its kind.
+    /// The counters of all environments of the name.
     pub meter: Arc<Meter>,
-    /// Its own.
+    /// The batch's own steps.
     steps: AtomicU64,
 }
 
 impl Tally {
-    /// Of a batch in which nothing has happened.
+    /// Makes the counters of a new batch, all 0.
     pub fn new(meter: Arc<Meter>) -> Self {
         Self { meter, steps: AtomicU64::new(0) }
     }
 
-    /// Adds what a part of the batch did.
+    /// Adds steps and ended episodes of a part of the batch.
     pub fn add(&self, steps: usize, episodes: usize) {
         self.steps.fetch_add(steps as u64, Ordering::Relaxed);
         self.meter.steps.fetch_add(steps as u64, Ordering::Relaxed);
         self.meter.episodes.fetch_add(episodes as u64, Ordering::Relaxed);
     }
 
-    /// Steps of an environment so far.
+    /// Returns the batch's steps so far, counted for each environment.
     pub fn steps(&self) -> u64 {
         self.steps.load(Ordering::Relaxed)
     }

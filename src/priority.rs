@@ -1,9 +1,9 @@
-//! The priority of threads: the transport comes first, whatever the process was started with.
+//! Priorities of threads. The transport comes before all others, at any niceness of the process.
 
 use std::sync::OnceLock;
 
-/// Sets this thread's niceness to so much above the process's. Where the system refuses, the thread takes turns with the
-/// others. Of the first call it must be the thread's first, since that is where the process's is read.
+/// Raises this thread's niceness by `by` above the process's. If the system refuses, the thread keeps its niceness. The
+/// first call in the process reads the process's niceness, so it must come from a thread that has not changed its own.
 pub(crate) fn lower(by: i32) {
     static NICENESS: OnceLock<i32> = OnceLock::new();
     let niceness = *NICENESS.get_or_init(|| rustix::process::getpriority_process(None).unwrap_or(0));

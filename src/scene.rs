@@ -1,4 +1,4 @@
-//! What a picture of an environment shows, as data: environments tell it, and who draws it knows none of them.
+//! The content of an environment's picture, as data. Environments describe it; renderers know no environment.
 
 /// A point in m, y upwards. An infinite coordinate is the picture's edge.
 pub type Point = [f64; 2];
@@ -23,7 +23,7 @@ pub mod colour {
     pub const PALE_GREEN: Colour = [224, 240, 234];
 }
 
-/// What a picture shows.
+/// The content of a picture.
 #[derive(Debug, Clone)]
 pub enum Scene {
     /// Shapes in a plane.
@@ -33,14 +33,14 @@ pub enum Scene {
     Model(PosedModel),
 }
 
-/// Shapes, the hindmost first. Numbers may be absurdly large.
+/// Shapes, from back to front. Numbers may be very large.
 #[derive(Debug, Clone)]
 pub struct Drawing {
-    /// The lower left corner of what has to be seen.
+    /// The lower left corner of the rectangle that must be visible.
     pub low: Point,
-    /// Its upper right corner.
+    /// The upper right corner of that rectangle.
     pub high: Point,
-    /// What is drawn.
+    /// The shapes, from back to front.
     pub shapes: Vec<Shape>,
 }
 
@@ -49,52 +49,52 @@ pub struct Drawing {
 pub enum Shape {
     /// A filled polygon.
     Polygon {
-        /// In order.
+        /// The corners in order.
         corners: Vec<Point>,
-        /// Of its inside.
+        /// The colour of the inside.
         colour: Colour,
     },
     /// A filled disc.
     Disc {
-        /// Its middle.
+        /// The centre.
         centre: Point,
-        /// In m.
+        /// The radius, m.
         radius: f64,
-        /// Of its inside.
+        /// The colour of the inside.
         colour: Colour,
     },
     /// A line through points, with round ends.
     Line {
-        /// In order.
+        /// The points in order.
         points: Vec<Point>,
-        /// In m.
+        /// The width, m.
         width: f64,
-        /// Of the line.
+        /// The colour.
         colour: Colour,
     },
     /// A dashed line through points.
     Dashes {
-        /// In order.
+        /// The points in order.
         points: Vec<Point>,
-        /// In m.
+        /// The width, m.
         width: f64,
-        /// Of the dashes.
+        /// The colour.
         colour: Colour,
     },
     /// The line of a graph.
     Graph {
         /// The line's course.
         graph: Graph,
-        /// In m.
+        /// The width, m.
         width: f64,
-        /// Of the line.
+        /// The colour.
         colour: Colour,
     },
-    /// All that is below a graph.
+    /// The area below a graph.
     Ground {
-        /// The upper side.
+        /// The upper edge.
         graph: Graph,
-        /// Of the ground.
+        /// The colour.
         colour: Colour,
     },
 }
@@ -102,16 +102,16 @@ pub enum Shape {
 /// A height as a function of x.
 #[derive(Debug, Clone, Copy)]
 pub struct Graph {
-    /// In m, both.
+    /// The height at x, both in m.
     pub height: fn(f64) -> f64,
-    /// The least x.
+    /// The minimum of x, m.
     pub from: f64,
-    /// The greatest x, which may be infinite.
+    /// The maximum of x, m; may be infinite.
     pub to: f64,
 }
 
 impl Drawing {
-    /// A blank drawing of which at least the rectangle from `low` to `high` has to be seen.
+    /// Makes a blank drawing, of which at least the rectangle from `low` to `high` must be visible.
     pub fn new(low: Point, high: Point) -> Self {
         Self { low, high, shapes: Vec::new() }
     }
@@ -146,7 +146,7 @@ impl Drawing {
         self.shapes.push(Shape::Graph { graph, width, colour });
     }
 
-    /// Fills all that is below a graph.
+    /// Fills the area below a graph.
     pub fn ground(&mut self, graph: Graph, colour: Colour) {
         self.shapes.push(Shape::Ground { graph, colour });
     }
@@ -164,7 +164,7 @@ impl Drawing {
     }
 }
 
-/// The point at a distance from `from`, in the direction of an angle from +x.
+/// Returns the point at a distance from `from`, in the direction of an angle from +x, rad.
 #[expect(clippy::disallowed_methods, reason = "a picture need not be the same everywhere")]
 pub fn polar(from: Point, distance: f64, angle: f64) -> Point {
     let (sin, cos) = angle.sin_cos();
@@ -175,13 +175,13 @@ pub fn polar(from: Point, distance: f64, angle: f64) -> Point {
 #[cfg(feature = "mujoco")]
 #[derive(Debug, Clone)]
 pub struct PosedModel {
-    /// What does not move.
+    /// The model and its look, which do not change.
     pub look: &'static Look,
-    /// `[Q]`
+    /// The positions, `[Q]`.
     pub qpos: Vec<f64>,
 }
 
-/// How a MuJoCo model is shown.
+/// The look of a MuJoCo model in pictures.
 #[cfg(feature = "mujoco")]
 #[derive(Debug, Clone, Copy)]
 pub struct Look {
@@ -191,13 +191,13 @@ pub struct Look {
     pub mjcf: &'static str,
     /// The files that the MJCF names, with their bytes.
     pub files: &'static [(String, Vec<u8>)],
-    /// What pictures add to the model; `None` if the model has its own ground, light and colours.
+    /// Ground, light and colours that pictures add; `None` if the model has its own.
     pub scenery: Option<Scenery>,
-    /// From where it is seen.
-    pub view: View,
+    /// The camera.
+    pub view: ModelView,
 }
 
-/// What pictures add to a MuJoCo model that has no colours, lights and textures.
+/// Ground, light and colours that pictures add to a MuJoCo model that has none.
 #[cfg(feature = "mujoco")]
 #[derive(Debug, Clone, Copy)]
 pub struct Scenery {
@@ -209,10 +209,10 @@ pub struct Scenery {
     pub colours: &'static [(&'static str, [f32; 3])],
 }
 
-/// From where a MuJoCo model is seen.
+/// The camera of a MuJoCo model's pictures.
 #[cfg(feature = "mujoco")]
 #[derive(Debug, Clone, Copy)]
-pub enum View {
+pub enum ModelView {
     /// Beside a robot that runs along x.
     Beside {
         /// The body that the camera follows.
@@ -226,11 +226,11 @@ pub enum View {
     Camera(usize),
     /// By a camera that is placed.
     Placed {
-        /// The point that it looks at, m.
+        /// The point that the camera looks at, m.
         look_at: [f64; 3],
-        /// Its distance, m.
+        /// The camera's distance from that point, m.
         distance: f64,
-        /// The direction of its view, turned from +x about +z, degrees.
+        /// The direction of view, turned from +x about +z, degrees.
         azimuth: f64,
         /// The direction's slope, negative if it looks down, degrees.
         elevation: f64,

@@ -1,5 +1,5 @@
-//! Traces for OpenTelemetry: each request's span, with what was logged in it, goes to a collector. Only in builds with the
-//! feature `otel`, and where the variable `OTEL_EXPORTER_OTLP_ENDPOINT` says to which.
+//! Traces for OpenTelemetry: each request's span, with its log lines, is sent to a collector. Needs a build with the
+//! feature `otel`, and the variable `OTEL_EXPORTER_OTLP_ENDPOINT` with the collector's address.
 
 use opentelemetry::trace::TracerProvider;
 use opentelemetry_otlp::SpanExporter;
@@ -15,13 +15,13 @@ use tracing_subscriber::{
     Layer, filter::Targets, fmt, layer::SubscriberExt, registry::LookupSpan, util::SubscriberInitExt,
 };
 
-/// Where the collector is, as OpenTelemetry names the variable.
+/// OpenTelemetry's variable with the address of the collector.
 pub const ENDPOINT: &str = "OTEL_EXPORTER_OTLP_ENDPOINT";
-/// What the server is called there, unless `OTEL_SERVICE_NAME` says otherwise.
+/// The server's name at the collector, if `OTEL_SERVICE_NAME` is not set.
 const SERVICE: &str = "perturb-server";
 const SERVICE_VARIABLE: &str = "OTEL_SERVICE_NAME";
 
-/// Sends spans until it is dropped; then those that are left.
+/// Sends spans. When it is dropped, sends the remaining ones.
 pub struct Traces {
     provider: SdkTracerProvider,
     _end: oneshot::Sender<()>,
@@ -35,7 +35,7 @@ impl Drop for Traces {
     }
 }
 
-/// Logs on standard error what the filter lets through, and sends spans, by a thread of its own, if a collector is named.
+/// Starts the log on standard error with this filter, and if a collector is named, a thread that sends spans.
 ///
 /// # Errors
 /// If the variables are wrong, or the system starts no thread.
@@ -46,7 +46,7 @@ pub fn init(filter: Targets) -> Result<Option<Traces>, Box<dyn Error>> {
     Ok(traces)
 }
 
-/// A layer whose spans are sent.
+/// Returns a layer whose spans are sent; `None` if no collector is named.
 fn start<S>() -> Result<Option<(Traces, impl Layer<S>)>, Box<dyn Error>>
 where
     S: Subscriber + for<'a> LookupSpan<'a>,
@@ -54,7 +54,7 @@ where
     if std::env::var_os(ENDPOINT).is_none() {
         return Ok(None);
     }
-    // Not on the thread that talks to clients.
+    // Spans are sent on a thread of their own, not on the transport thread.
     let runtime = Builder::new_current_thread().enable_all().build()?;
     let exporter = runtime.block_on(async { SpanExporter::builder().with_tonic().build() })?;
     let (end, ended) = oneshot::channel::<()>();

@@ -24,7 +24,7 @@ pub(crate) struct CachedLoader<T> {
 /// Result of the last load.
 #[derive(Debug)]
 struct LoadedValue<T> {
-    value: Result<T, LoadError>,
+    value: Result<T, CachedLoadError>,
     /// Time at which the load ended.
     at: Instant,
     duration: Duration,
@@ -32,7 +32,7 @@ struct LoadedValue<T> {
 
 /// Why there is no value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum LoadError {
+pub(crate) enum CachedLoadError {
     /// The loading function has panicked, which is a fault of this program.
     Panicked,
     /// The load takes too long, for example because a file system does not answer.
@@ -69,7 +69,7 @@ impl<T: Clone + Send + 'static> CachedLoader<T> {
         &self,
         permits: &Arc<Semaphore>,
         load: impl FnOnce() -> T + Send + 'static,
-    ) -> Result<T, LoadError> {
+    ) -> Result<T, CachedLoadError> {
         self.get_within(LOAD_TIMEOUT, permits, load).await
     }
 
@@ -78,9 +78,9 @@ impl<T: Clone + Send + 'static> CachedLoader<T> {
         timeout: Duration,
         permits: &Arc<Semaphore>,
         load: impl FnOnce() -> T + Send + 'static,
-    ) -> Result<T, LoadError> {
+    ) -> Result<T, CachedLoadError> {
         if self.is_overdue.load(Ordering::Relaxed) {
-            return Err(LoadError::TimedOut);
+            return Err(CachedLoadError::TimedOut);
         }
         let last = Arc::clone(&self.last);
         let is_overdue = Arc::clone(&self.is_overdue);
@@ -106,14 +106,14 @@ impl<T: Clone + Send + 'static> CachedLoader<T> {
             };
             let value = loaded.map_err(|error| {
                 tracing::error!("reading the files of a page failed: {error}");
-                LoadError::Panicked
+                CachedLoadError::Panicked
             });
             *last = Some(LoadedValue { value: value.clone(), at: Instant::now(), duration: start.elapsed() });
             value
         });
         match tokio::time::timeout(timeout, task).await {
-            Ok(value) => value.unwrap_or(Err(LoadError::Panicked)),
-            Err(_) => Err(LoadError::TimedOut),
+            Ok(value) => value.unwrap_or(Err(CachedLoadError::Panicked)),
+            Err(_) => Err(CachedLoadError::TimedOut),
         }
     }
 }
@@ -156,12 +156,16 @@ mod tests {
         let whole = CachedLoader::default();
         let permits = permits();
         for _ in 0..5 {
-            assert_eq!(broken.get(&permits, || panic!("as intended")).await, Err(LoadError::Panicked));
+            assert_eq!(broken.get(&permits, || panic!("as intended")).await, Err(CachedLoadError::Panicked));
         }
         assert_eq!(whole.get(&permits, || 7).await, Ok(7));
-        assert_eq!(broken.get(&permits, || 8).await, Err(LoadError::Panicked), "there is a pause after a panic, too");
+        assert_eq!(
+            broken.get(&permits, || 8).await,
+            Err(CachedLoadError::Panicked),
+            "there is a pause after a panic, too"
+        );
         // Printing the panic's backtrace counts as part of the load.
-        while broken.get(&permits, || 8).await == Err(LoadError::Panicked) {
+        while broken.get(&permits, || 8).await == Err(CachedLoadError::Panicked) {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
         assert_eq!(broken.get(&permits, || 8).await, Ok(8));
@@ -176,12 +180,12 @@ mod tests {
             let _ = ended.recv();
             1
         });
-        assert_eq!(value.await, Err(LoadError::TimedOut));
+        assert_eq!(value.await, Err(CachedLoadError::TimedOut));
         assert!(overdue.is_loading() && !other.is_loading());
         assert_eq!(other.get(&permits, || 2).await, Ok(2), "the permit is free again");
-        assert_eq!(overdue.get(&permits, || 3).await, Err(LoadError::TimedOut), "later callers do not wait");
+        assert_eq!(overdue.get(&permits, || 3).await, Err(CachedLoadError::TimedOut), "later callers do not wait");
         drop(end);
-        while overdue.get(&permits, || 3).await == Err(LoadError::TimedOut) {
+        while overdue.get(&permits, || 3).await == Err(CachedLoadError::TimedOut) {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
         assert_eq!(overdue.get(&permits, || 3).await, Ok(1), "the overdue load's value is kept");

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 
 use perturb_files::FileError;
 
-use crate::cached_loader::LoadError;
+use crate::cached_loader::CachedLoadError;
 
 /// The server cannot start.
 #[derive(Debug, thiserror::Error)]
@@ -44,5 +44,5 @@ pub(crate) enum ViewError {
     /// The served folder cannot be listed, for this reason.
     Unlisted(String),
     /// The run's files could not be read.
-    Load(LoadError),
+    Load(CachedLoadError),
 }

@@ -43,7 +43,7 @@ use paths::Root;
 
 /// Options of the server.
 #[derive(Clone, Debug)]
-pub struct Options {
+pub struct ServeOptions {
     /// The folder with the runs.
     pub folder: PathBuf,
     /// Address to listen at; port 0 takes a free port.
@@ -65,7 +65,7 @@ impl Server {
     ///
     /// # Errors
     /// [`ServeError`] if the folder cannot be read or the address cannot be used.
-    pub async fn bind(options: &Options) -> Result<Self, ServeError> {
+    pub async fn bind(options: &ServeOptions) -> Result<Self, ServeError> {
         let root = Root::open(&options.folder)?;
         let failed = |source| ServeError::Address { address: options.address, source };
         let listener = TcpListener::bind(options.address).await.map_err(failed)?;

@@ -31,7 +31,7 @@ use tracing_subscriber::{layer::SubscriberExt, util::SubscriberInitExt};
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
     if let Some(page) = about(&arguments) {
-        // Whoever reads it may have read enough.
+        // The reader may close the pipe early.
         let _ = io::stdout().write_all(&page);
         return ExitCode::SUCCESS;
     }
@@ -101,12 +101,12 @@ fn main() -> ExitCode {
     }
 }
 
-/// Says what is wrong. That nobody reads it is no reason to end otherwise.
+/// Prints an error. Failures of printing are ignored.
 fn complain(words: impl std::fmt::Display) {
     let _ = writeln!(io::stderr(), "perturb-server: {words}");
 }
 
-/// What shells and manuals say of the program, if it is asked for.
+/// Returns the text that the command line asks for instead of a server: completions, the schema of tasks, or the manual page.
 fn about(arguments: &Arguments) -> Option<Vec<u8>> {
     let (mut command, mut page) = (Arguments::command(), Vec::new());
     if let Some(shell) = arguments.completions {
@@ -123,7 +123,7 @@ fn about(arguments: &Arguments) -> Option<Vec<u8>> {
 
 /// Why the program fails.
 enum Failure {
-    /// An address cannot be had, or a file or folder that the settings name cannot be used.
+    /// An address is not available, or a file or folder of the settings cannot be used.
     Setting(Box<dyn Error>),
     Other(Box<dyn Error>),
 }
@@ -140,8 +140,8 @@ impl<E: Into<Box<dyn Error>>> From<E> for Failure {
     }
 }
 
-/// The folders of a private server's sockets, which it has listened at: whoever made them may have been killed. What has
-/// files in it stays.
+/// Removes the folders of a private server's sockets, because the program that made them may have been killed. Folders
+/// with files stay.
 fn remove_folders(config: &Config) {
     for address in &config.listen {
         if let ListenAddress::Unix(path) = address {
@@ -150,8 +150,8 @@ fn remove_folders(config: &Config) {
     }
 }
 
-/// The environments that are served: the built-in ones and those of the settings' folders, each of which is first loaded
-/// in a process of its own. If `measured`, the reports say how fast folders are.
+/// Returns the environments that are served: the built-in ones and those of the settings' folders. Each folder is first
+/// loaded in a process of its own. If `measured`, the reports have the folders' speed.
 #[cfg(feature = "mujoco")]
 fn environments(config: &Config, measured: bool) -> Result<Environments, Failure> {
     let mut environments = Environments { catalogue: tasks::catalogue(), folders: Vec::new(), reports: Vec::new() };
@@ -187,7 +187,7 @@ struct Environments {
     reports: Vec<String>,
 }
 
-/// Logs, once for each folder, that its files changed. Sessions, also new ones, keep what was loaded.
+/// Logs, once for each folder, that its files changed. Old and new sessions use the files that were loaded.
 #[cfg(feature = "mujoco")]
 async fn watch_folders(mut folders: Vec<folder::Folder>) {
     const FILES_CHECK_INTERVAL: std::time::Duration = std::time::Duration::from_secs(5);
@@ -206,7 +206,7 @@ async fn watch_folders(mut folders: Vec<folder::Folder>) {
     }
 }
 
-/// Loads the folders of the settings in processes of their own and prints what they are.
+/// Loads the folders of the settings in processes of their own, and prints descriptions of them.
 #[cfg(feature = "mujoco")]
 fn check(config: &Config) -> Result<(), Failure> {
     if config.tasks.is_empty() {
@@ -221,7 +221,7 @@ fn check(config: &Config) -> Result<(), Failure> {
     environments(config, true).map(|_| ())
 }
 
-/// Loads a folder under limits and prints what it is.
+/// Loads a folder under limits, and prints its description.
 #[cfg(feature = "mujoco")]
 fn check_task(path: &std::path::Path, measured: bool) -> ExitCode {
     let report = folder::child::limit_this_process()
@@ -248,11 +248,11 @@ fn task_schema() -> Vec<u8> {
 
 fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
     raise_descriptors();
-    // One thread for I/O: physics has threads of its own, and a hand-over between runtime threads doubles latency.
+    // I/O has one thread: physics has threads of its own, and a hand-over between runtime threads doubles latency.
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let guards = Security::load(config, &environments.catalogue).map_err(Failure::setting)?;
     let result = runtime.block_on(async {
-        // Before the addresses are told: who reads them may send a signal at once.
+        // This comes before the addresses are printed, because their reader may send a signal at once.
         let shutdown = shutdown(config.exit_with_stdin)?;
         let mut listeners = Vec::new();
         let metrics = match &config.metrics {
@@ -264,7 +264,7 @@ fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
         };
         for address in &config.listen {
             let listener = Listener::bind(address, config.socket_mode).await.map_err(Failure::setting)?;
-            // Whoever started the server need not read on.
+            // The program that started the server need not read on.
             let _ = writeln!(io::stdout(), "listening on {}", told(&listener.address()?, config));
             listeners.push(listener);
         }
@@ -276,12 +276,12 @@ fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
         server::run(listeners, metrics, config, &guards, environments.catalogue.clone(), shutdown).await?;
         Ok(())
     });
-    // Connections that did not close by themselves must not keep the program.
+    // Connections that did not close by themselves must not delay the end of the program.
     runtime.shutdown_background();
     result
 }
 
-/// How clients write the address.
+/// The address as clients write it.
 fn told(address: &ListenAddress, config: &Config) -> String {
     match address {
         ListenAddress::Tcp(tcp) if config.tls_cert.is_some() => format!("https://{tcp}"),
@@ -289,7 +289,7 @@ fn told(address: &ListenAddress, config: &Config) -> String {
     }
 }
 
-/// Takes all the file descriptors that the system lets the process have: each connection needs one.
+/// Raises the limit of file descriptors to the system's hard limit, because each connection needs one.
 fn raise_descriptors() {
     let limit = getrlimit(Resource::Nofile);
     if let Err(error) = setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit }) {
@@ -297,14 +297,14 @@ fn raise_descriptors() {
     }
 }
 
-/// Prints what would be served.
+/// Prints the catalogue that a server would serve.
 fn print_catalogue(environments: &Environments, config: &Config) -> Result<(), Failure> {
     let listing = server::listing(&environments.catalogue, config)?;
     writeln!(io::stdout(), "{:#}", perturb_protocol::catalogue::to_json(&listing))?;
     Ok(())
 }
 
-/// Asks the server that runs with the same settings.
+/// Asks the running server with the same settings for its health.
 fn health(config: &Config) -> Result<(), Failure> {
     let listen = config.listen.first().ok_or("no address is given")?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
@@ -317,7 +317,7 @@ fn shutdown(exit_with_stdin: bool) -> io::Result<impl Future<Output = ()>> {
     let (closed, stdin) = oneshot::channel::<()>();
     if exit_with_stdin {
         std::thread::Builder::new().name("stdin".into()).spawn(move || {
-            // Whatever is written there means nothing; its end, or an error, does.
+            // Input is ignored; its end, or an error, is the signal.
             let _ = io::copy(&mut io::stdin().lock().by_ref(), &mut io::sink());
             drop(closed);
         })?;

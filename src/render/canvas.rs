@@ -4,11 +4,11 @@ use super::Size;
 use crate::scene::{Colour, Drawing, Graph, Point, Shape, colour};
 use tiny_skia::{Color, FillRule, LineCap, LineJoin, Paint, Path, PathBuilder, Pixmap, Stroke, StrokeDash, Transform};
 
-/// Parts of a graph.
+/// Number of segments of a drawn graph.
 const SMOOTH: usize = 64;
-/// Farther from the picture, in pixels, nothing is drawn exactly: absurd numbers must not overflow.
+/// Distance from the picture, in pixels, at which coordinates are clamped, so that large numbers do not overflow.
 const FAR: f64 = 1e5;
-/// Nothing is thinner, in pixels.
+/// Minimum thickness of lines, in pixels.
 const THINNEST: f64 = 1.0;
 
 /// The pixels of a drawing, `[height, width, 3]`.
@@ -21,7 +21,7 @@ pub(super) fn draw(drawing: &Drawing, size: Size) -> Vec<u8> {
     canvas.pixmap.data().as_chunks::<4>().0.iter().flat_map(rgb).collect()
 }
 
-/// A picture in the making.
+/// A picture that is being drawn.
 struct Canvas {
     pixmap: Pixmap,
     /// Pixels in a metre.
@@ -32,7 +32,7 @@ struct Canvas {
 }
 
 impl Canvas {
-    /// A blank picture that shows at least the rectangle from `low` to `high`, in its middle, as large as can be.
+    /// Makes a blank picture that shows at least the rectangle from `low` to `high`, in its middle, as large as possible.
     fn new(size: Size, low: Point, high: Point) -> Self {
         let (width, height) = (f64::from(size.width), f64::from(size.height));
         let mut pixmap = Pixmap::new(size.width.into(), size.height.into()).expect("sizes are at least 16");

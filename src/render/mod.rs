@@ -1,11 +1,11 @@
 //! Pictures of environments.
 //!
-//! One thread for a server draws them all, so that neither the physics' workers nor the transport's thread ever draws
-//! or waits for OpenGL: a session hands over a [`Scene`] and gets pixels back.
+//! One thread of a server draws all pictures, so that neither the physics' workers nor the transport thread ever draws
+//! or waits for OpenGL. A session hands over a [`Scene`] and gets pixels back.
 //!
-//! - `turns` puts those that wait in order.
+//! - `turns` is the queue of pictures that wait.
 //! - `canvas` draws shapes in a plane: paths in metres, anti-aliased, by a library in Rust.
-//! - `model` draws MuJoCo's models, each on one of its own with colours, floor, light and sky.
+//! - `model` draws MuJoCo's models, with colours, floor, light and sky.
 
 mod canvas;
 #[cfg(feature = "mujoco")]
@@ -23,17 +23,17 @@ use std::{
 use tokio::{sync::oneshot, time::Instant};
 use turns::Turns;
 
-/// The thread's niceness. Its driver's threads inherit it: physics comes first.
+/// Niceness of the drawing thread, which the driver's threads inherit. Physics has priority.
 const NICENESS: i32 = 5;
-/// How long the end of a server waits for the picture under way.
-const FAREWELL: Duration = Duration::from_secs(1);
+/// Time that the end of a server waits for the picture that is being drawn.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// A picture's size in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Size {
-    /// From left to right, within [`PICTURE_PIXELS`](perturb_protocol::limits::PICTURE_PIXELS).
+    /// The width, within [`PICTURE_PIXELS`](perturb_protocol::limits::PICTURE_PIXELS).
     pub width: u16,
-    /// From top to bottom, within [`PICTURE_PIXELS`](perturb_protocol::limits::PICTURE_PIXELS).
+    /// The height, within [`PICTURE_PIXELS`](perturb_protocol::limits::PICTURE_PIXELS).
     pub height: u16,
 }
 
@@ -46,7 +46,7 @@ pub enum Error {
     Missing {
         /// The environment.
         environment: &'static str,
-        /// What is missing, and how to get it.
+        /// The missing part, and how to install it.
         reason: String,
     },
     /// The drawing failed.
@@ -54,65 +54,65 @@ pub enum Error {
     Failed {
         /// The environment.
         environment: &'static str,
-        /// Why.
+        /// The reason.
         reason: String,
     },
     /// The operating system gives no thread to draw with.
     #[error("no thread could be started to draw with ({reason}); try again when the machine is less busy")]
     NoThread {
-        /// What it says.
+        /// The system's error.
         reason: String,
     },
     /// The drawing thread panicked: a defect of the server.
-    #[error("the drawing failed from a defect of the server; report what its log says")]
+    #[error("drawing failed because of a bug of the server; report it with the server's log")]
     Defect,
 }
 
-/// Draws pictures on a thread of its own, which starts with the first. Dropping it ends the thread after the picture
-/// under way, for which it waits a second at most.
+/// Draws pictures on a thread of its own, which starts with the first picture. Dropping it ends the thread after the
+/// picture that is being drawn, and waits a second for that at most.
 #[derive(Default)]
 pub struct Renderer {
     thread: Mutex<Option<DrawingThread>>,
     times: Arc<Histogram>,
 }
 
-/// The thread, and what waits for it.
+/// The drawing thread and its queue.
 struct DrawingThread {
-    jobs: Arc<Turns<Job>>,
+    jobs: Arc<Turns<PictureJob>>,
     handle: JoinHandle<()>,
 }
 
-struct Job {
+struct PictureJob {
     scene: Scene,
     size: Size,
     reply: oneshot::Sender<Result<Vec<u8>, Error>>,
 }
 
 impl Renderer {
-    /// A renderer whose thread has not started.
+    /// Makes a renderer without a thread yet.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// How long each picture was drawn.
+    /// Returns the histogram of the time that drawing a picture took.
     pub fn times(&self) -> Arc<Histogram> {
         Arc::clone(&self.times)
     }
 
-    /// A picture, `[height, width, 3]`: red, green, blue, the uppermost row first. Pictures are drawn one after the
-    /// other, in an order that lets nobody wait for more pixels than are fair. The same scene and size give the same bytes.
+    /// Draws a picture, `[height, width, 3]`: red, green, blue, the uppermost row first. Pictures are drawn one at a
+    /// time, in the fair order of [`Turns`]. The same scene and size give the same bytes.
     ///
     /// # Errors
     /// [`Error`].
     pub async fn draw(&self, scene: Scene, size: Size) -> Result<Bytes, Error> {
         let (reply, picture) = oneshot::channel();
         let pixels = u64::from(size.width) * u64::from(size.height);
-        self.jobs()?.push(pixels, Job { scene, size, reply }, |job| !job.reply.is_closed());
-        // The thread ends only when this is dropped.
+        self.jobs()?.push(pixels, PictureJob { scene, size, reply }, |job| !job.reply.is_closed());
+        // The thread ends only when the renderer is dropped.
         picture.await.map_err(|_| Error::Defect)?.map(Bytes::from)
     }
 
-    fn jobs(&self) -> Result<Arc<Turns<Job>>, Error> {
+    fn jobs(&self) -> Result<Arc<Turns<PictureJob>>, Error> {
         let mut running = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(thread) = &*running {
             return Ok(Arc::clone(&thread.jobs));
@@ -133,8 +133,8 @@ impl Drop for Renderer {
         let running = self.thread.get_mut().unwrap_or_else(PoisonError::into_inner);
         if let Some(DrawingThread { jobs, handle }) = running.take() {
             jobs.close();
-            // A driver should not be drawing while the process ends; one that hangs must not keep it from ending.
-            for _ in 0..FAREWELL.as_millis() {
+            // A driver should not be drawing while the process ends, but one that hangs must not block the end.
+            for _ in 0..SHUTDOWN_TIMEOUT.as_millis() {
                 if handle.is_finished() {
                     break;
                 }
@@ -144,11 +144,11 @@ impl Drop for Renderer {
     }
 }
 
-/// The thread: draws what is asked for until nobody can ask any more.
-fn work(jobs: &Turns<Job>, times: &Histogram) {
+/// Runs on the drawing thread until the queue is closed.
+fn work(jobs: &Turns<PictureJob>, times: &Histogram) {
     lower(NICENESS);
     let mut cache = Cache::default();
-    while let Some(Job { scene, size, reply }) = jobs.pop() {
+    while let Some(PictureJob { scene, size, reply }) = jobs.pop() {
         if reply.is_closed() {
             continue; // its session is gone
         }
@@ -161,13 +161,13 @@ fn work(jobs: &Turns<Job>, times: &Histogram) {
             times.observe(start.elapsed());
         }
         if matches!(drawn, Err(Error::Failed { .. } | Error::Defect)) {
-            cache = Cache::default(); // what a failed drawing leaves behind is not to be trusted
+            cache = Cache::default(); // a failed drawing may have left it in any state
         }
         let _ = reply.send(drawn); // the session may be gone by now
     }
 }
 
-/// What the thread keeps from one picture to the next.
+/// The drawing thread's models, which are compiled once.
 #[derive(Default)]
 struct Cache {
     #[cfg(feature = "mujoco")]

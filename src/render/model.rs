@@ -1,24 +1,24 @@
 //! Pictures of MuJoCo's models, by MuJoCo and OpenGL.
 //!
-//! The models that run the physics have no colours, no textures and no lights, which would make each simulation larger.
-//! So pictures are of a model of their own: the same MJCF, with scenery. Only positions pass from one to the other; the
-//! parameters (power, density, friction) cannot be seen.
+//! The models that run the physics have no colours, textures and lights, which would make each simulation larger. So
+//! pictures show another model: the same MJCF with scenery. Only positions are copied to it; the parameters (power,
+//! density, friction) cannot be seen.
 
 use super::{Error, Size};
-use crate::scene::{Look, PosedModel, Scenery, View};
+use crate::scene::{Look, ModelView, PosedModel, Scenery};
 use perturb_mujoco::{self as mujoco, Camera, Kind};
 use std::ptr;
 
 const END_OF_MODEL: &str = "</mujoco>";
-/// A model may rise or sink by so many m before the camera follows, so that a hop looks like one.
+/// Height in m by which a model may rise or sink before the camera follows, so that a hop is visible.
 const FREE_RISE: f64 = 0.6;
 
 /// The models that were drawn so far.
 #[derive(Default)]
 pub(super) struct Models {
     drawn: Vec<ShownModel>,
-    /// That there is no library of OpenGL, once that is known: it does not come while the server runs. Anything else that
-    /// it lacks, as descriptors, may.
+    /// The error of a missing OpenGL library, which stays missing while the server runs. Other failures, such as missing
+    /// file descriptors, may pass and are not stored.
     missing: Option<String>,
 }
 
@@ -67,9 +67,9 @@ impl ShownModel {
         let scenery = look.scenery.map_or("", |scenery| scenery.mjcf);
         let model = mujoco::Model::from_files(&format!("{own}{scenery}{END_OF_MODEL}"), &files)?;
         let followed = match look.view {
-            View::Beside { followed, .. } => Some(model.id(Kind::Body, followed)?),
-            View::Placed { followed, .. } => followed,
-            View::Camera(_) => None,
+            ModelView::Beside { followed, .. } => Some(model.id(Kind::Body, followed)?),
+            ModelView::Placed { followed, .. } => followed,
+            ModelView::Camera(_) => None,
         };
         let mut painted = Vec::new();
         if let Some(Scenery { hidden, colours, .. }) = look.scenery {
@@ -95,17 +95,17 @@ impl ShownModel {
         simulation.kinematics()?;
         let moved = self.followed.map(|(body, initial)| (simulation.xpos(body), initial));
         let view = match self.look.view {
-            View::Camera(number) => mujoco::View::Fixed(number),
-            View::Beside { distance, height, .. } => {
+            ModelView::Camera(number) => mujoco::CameraView::Fixed(number),
+            ModelView::Beside { distance, height, .. } => {
                 let ([x, _, z], [_, _, initial_z]) = moved.unwrap_or_default();
                 let rise = z - initial_z;
                 let look_at = [x, 0.0, height + rise - rise.clamp(-FREE_RISE, FREE_RISE)];
-                mujoco::View::Free(Camera { look_at, distance, azimuth: 90.0, elevation: -12.0 })
+                mujoco::CameraView::Free(Camera { look_at, distance, azimuth: 90.0, elevation: -12.0 })
             }
-            View::Placed { look_at, distance, azimuth, elevation, .. } => {
+            ModelView::Placed { look_at, distance, azimuth, elevation, .. } => {
                 let (now, initial) = moved.unwrap_or_default();
                 let look_at = std::array::from_fn(|i| look_at[i] + now[i] - initial[i]);
-                mujoco::View::Free(Camera { look_at, distance, azimuth, elevation })
+                mujoco::CameraView::Free(Camera { look_at, distance, azimuth, elevation })
             }
         };
         self.renderer.draw(view, (size.width, size.height))

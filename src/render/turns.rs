@@ -1,41 +1,41 @@
-//! The order in which pictures are drawn: turns by pixels. Each is due when it would be finished if all that wait were drawn
-//! at once, pixel by pixel in turn: fair queueing, Demers, Keshav and Shenker (1989). So a small one comes before large ones
-//! that wait, however many they are, and nobody is passed for ever.
+//! The queue of pictures: fair queueing by pixels (Demers, Keshav and Shenker, 1989). A picture is due when it would be
+//! finished if all waiting pictures were drawn at once, pixel by pixel in turn. So a small picture comes before any number
+//! of waiting large ones, and no picture waits for ever.
 
 use std::{
     collections::BTreeMap,
     sync::{Condvar, Mutex, MutexGuard, PoisonError},
 };
 
-/// So many that wait are looked through for those that nobody waits for any more.
-const MANY: usize = 256;
+/// Length of the queue from which entries that nobody waits for are removed.
+const MIN_CLEANUP_LENGTH: usize = 256;
 
-/// What waits for its turn.
+/// A fair queue.
 pub(super) struct Turns<T> {
     queue: Mutex<Queue<T>>,
     ready: Condvar,
 }
 
 struct Queue<T> {
-    /// By when each is due, and the order in which they came; with its pixels.
+    /// Each entry with its pixels, by the clock at which it is due, then by its number of arrival.
     waiting: BTreeMap<(u64, u64), (u64, T)>,
-    /// Pixels that one which waits all the time would have had of those that were drawn.
+    /// The fair share of the drawn pixels that an entry which waits all the time would have had.
     clock: u64,
     came: u64,
     closed: bool,
 }
 
 impl<T> Turns<T> {
-    /// Nothing waits.
+    /// Makes an empty queue.
     pub(super) fn new() -> Self {
         let queue = Queue { waiting: BTreeMap::new(), clock: 0, came: 0, closed: false };
         Self { queue: Mutex::new(queue), ready: Condvar::new() }
     }
 
-    /// Adds what takes so many pixels. What is not `wanted` any more goes, where many wait.
+    /// Adds an entry of so many pixels. If the queue is long, removes entries that are not `wanted` any more.
     pub(super) fn push(&self, pixels: u64, item: T, wanted: impl Fn(&T) -> bool) {
         let mut queue = self.lock();
-        if queue.waiting.len() >= MANY {
+        if queue.waiting.len() >= MIN_CLEANUP_LENGTH {
             queue.waiting.retain(|_, (_, item)| wanted(item));
         }
         queue.came += 1;
@@ -44,7 +44,7 @@ impl<T> Turns<T> {
         self.ready.notify_one();
     }
 
-    /// The next, for which it waits; none once it is closed.
+    /// Waits for the next entry and returns it; `None` once the queue is closed.
     pub(super) fn pop(&self) -> Option<T> {
         let mut queue = self.lock();
         loop {
@@ -60,7 +60,7 @@ impl<T> Turns<T> {
         }
     }
 
-    /// Drops what waits, and has nothing wait any more.
+    /// Drops all entries and closes the queue.
     pub(super) fn close(&self) {
         let mut queue = self.lock();
         queue.closed = true;
@@ -84,12 +84,12 @@ mod tests {
     }
 
     #[test]
-    fn a_small_picture_comes_before_large_ones_and_equal_ones_in_their_order() {
+    fn small_picture_comes_first_and_equal_ones_in_order() {
         assert_eq!(order(&[(400, "a"), (400, "b"), (400, "c"), (1, "small")]), ["small", "a", "b", "c"]);
     }
 
     #[test]
-    fn a_small_picture_does_not_wait_for_large_ones_that_came_before_it_while_the_first_is_drawn() {
+    fn small_picture_overtakes_waiting_large_ones() {
         let turns = Turns::new();
         (0..40).for_each(|i| turns.push(4000, i, |_| true));
         assert_eq!((turns.pop(), turns.pop()), (Some(0), Some(1)));
@@ -115,10 +115,10 @@ mod tests {
     #[test]
     fn what_nobody_waits_for_goes_and_a_closed_queue_is_empty() {
         let turns = Turns::new();
-        for i in 0..MANY + 1 {
-            turns.push(1, i, |&item| item >= MANY - 1);
+        for i in 0..MIN_CLEANUP_LENGTH + 1 {
+            turns.push(1, i, |&item| item >= MIN_CLEANUP_LENGTH - 1);
         }
-        assert_eq!(turns.pop(), Some(MANY - 1));
+        assert_eq!(turns.pop(), Some(MIN_CLEANUP_LENGTH - 1));
         turns.close();
         turns.push(1, 0, |_| true);
         assert_eq!(turns.pop(), None);

@@ -1,5 +1,5 @@
-//! What the analytic tasks share. Their dynamics are Gymnasium 1.4's in f64, with libm's sine and cosine: those of the C
-//! library have other last digits on a processor with other instructions.
+//! Functions of the analytic tasks. Their dynamics are those of Gymnasium 1.4 in f64, with the crate libm's sine and
+//! cosine: the C library's results differ in the last digits between processors.
 
 use crate::env::{Action, Error, Stream};
 
@@ -11,8 +11,8 @@ pub(super) fn choice(action: Action<'_>) -> u32 {
     }
 }
 
-/// Takes over the state that the dynamics computed, or keeps the last one if that cannot be observed as f32: then the
-/// dynamics diverged, which absurd parameters or states can bring about. Returns whether they did.
+/// Takes over the state that the dynamics computed. If it cannot be observed as f32, keeps the last one: the dynamics
+/// diverged, which extreme parameters or states can cause. Returns whether they diverged.
 pub(super) fn advance<const N: usize>(state: &mut [f64; N], next: [f64; N]) -> bool {
     let diverged = !observable(&next);
     if !diverged {
@@ -25,7 +25,7 @@ fn observable(state: &[f64]) -> bool {
     state.iter().all(|&x| (x as f32).is_finite())
 }
 
-/// Takes back a saved state of exactly `N` finite numbers, each between the ends that the dynamics keep it within.
+/// Loads a saved state of exactly `N` finite numbers, each within the limits of the dynamics.
 pub(super) fn load<const N: usize>(state: &[f64], most: [f64; N]) -> Result<[f64; N], Error> {
     match <[f64; N]>::try_from(state) {
         Ok(state) if !observable(&state) => Err(Error::Snapshot { reason: "its state is not finite".into() }),

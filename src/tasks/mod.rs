@@ -1,8 +1,8 @@
-//! The environments, one folder each, and their catalogue. Those that a server is given as an MJCF model and a TOML file
-//! are in `folder`.
+//! The built-in environments, one folder each, and their catalogue. The module `folder` reads environments that are an
+//! MJCF model and a TOML file.
 //!
-//! A folder has everything of its environment. The files have the same parts in the same order: spec with parameters,
-//! derived quantities, reset, dynamics, reward and termination; and what a picture shows.
+//! The files of a folder have the same parts in the same order: specification with parameters, derived quantities, reset,
+//! dynamics, reward and termination; and the content of pictures.
 
 mod analytic;
 #[cfg(feature = "mujoco")]
@@ -23,7 +23,7 @@ use crate::env::Catalogue;
 #[cfg(feature = "mujoco")]
 use std::path::PathBuf;
 
-/// The environments that are built in.
+/// The built-in environments.
 pub fn catalogue() -> Catalogue {
     let analytic = [&cart_pole::SPEC, &mountain_car::SPEC, &acrobot::SPEC, &pendulum::SPEC];
     #[cfg(feature = "mujoco")]
@@ -33,7 +33,7 @@ pub fn catalogue() -> Catalogue {
     Catalogue::new(analytic.into_iter().chain(robots).collect())
 }
 
-/// The environments that are built in, and those of folders, in order.
+/// Returns the catalogue of the built-in environments, then those of folders, in order.
 ///
 /// # Errors
 /// [`folder::LoadError`] if a folder is refused, or has the name of an environment before it.

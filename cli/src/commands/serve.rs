@@ -5,12 +5,12 @@ use std::io::Write;
 use super::args::ServeArgs;
 use super::display::{note, say};
 use super::error::{Result, system};
-use perturb_serve::{Options, Server};
+use perturb_serve::{ServeOptions, Server};
 
 pub(super) fn run(args: &ServeArgs) -> Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(system("wait for requests"))?;
-    let options = Options { folder: args.dir.clone(), address: args.address, server: args.server.clone() };
+    let options = ServeOptions { folder: args.dir.clone(), address: args.address, server: args.server.clone() };
     runtime.block_on(async {
         let server = Server::bind(&options).await?;
         let address = server.address();

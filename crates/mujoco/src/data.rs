@@ -197,7 +197,7 @@ impl Simulation {
         self.run_with(|model, data| unsafe { sys::perturb_mj_step_pairs(model, pairs.as_ptr(), data) })
     }
 
-    /// Whether [`step_without_search`](Self::step_without_search) does without.
+    /// Tells whether [`step_without_search`](Self::step_without_search) omits the search.
     pub fn has_pairs(&self) -> bool {
         self.pairs.is_some()
     }
@@ -255,12 +255,12 @@ impl Simulation {
         self.array_mut(start, length).fill(0.0);
     }
 
-    /// Whether a fatal error made it unusable for good.
+    /// Tells whether a fatal error made the simulation unusable.
     pub fn is_poisoned(&self) -> bool {
         self.status == Status::Poisoned
     }
 
-    /// How often MuJoCo raised a warning since the last reset.
+    /// Returns the number of times that MuJoCo raised a warning since the last reset.
     pub fn warnings(&self, warning: Warning) -> usize {
         self.raw().warning[warning as usize].number as usize
     }
@@ -299,7 +299,7 @@ impl Simulation {
 
     // ---- state
 
-    /// All that what follows depends on besides the model, [`Model::n_state`] numbers: time in s, positions `[Q]`,
+    /// Writes the complete state, on which all later results depend beside the model, [`Model::n_state`] numbers: time in s, positions `[Q]`,
     /// velocities `[V]`, activations `[n_act]`, where the constraint solver starts `[V]`, controls `[U]`.
     pub fn state(&self, out: &mut [f64]) {
         assert_eq!(out.len(), self.model.n_state(), "the state of another model");

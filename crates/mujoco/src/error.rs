@@ -1,4 +1,4 @@
-//! What can go wrong in MuJoCo.
+//! Errors and warnings of MuJoCo.
 
 use std::fmt;
 
@@ -17,7 +17,7 @@ pub enum Error {
     /// The MJCF text cannot be compiled into a model.
     #[error("the model cannot be compiled: {reason}")]
     Compile {
-        /// What MuJoCo says, with the line.
+        /// MuJoCo's message, with the line.
         reason: String,
     },
     /// The model has no element of this name.
@@ -25,13 +25,13 @@ pub enum Error {
     UnknownName {
         /// The kind of element.
         kind: &'static str,
-        /// What was asked for.
+        /// The name that was requested.
         name: String,
     },
     /// MuJoCo raised a fatal error. The data it worked on is unusable from now on.
     #[error("MuJoCo raised a fatal error: {message}")]
     Fatal {
-        /// What MuJoCo says.
+        /// MuJoCo's message.
         message: String,
     },
     /// An earlier fatal error left the data in an undefined state.
@@ -40,20 +40,20 @@ pub enum Error {
     /// There is no OpenGL to draw with.
     #[error("OpenGL without a display is missing: {reason}; install the Debian packages libegl1 and libgl1-mesa-dri")]
     NoOpenGl {
-        /// What failed.
+        /// The call that failed.
         reason: String,
-        /// Whether its library is there, so that it may succeed another time.
+        /// Whether the library is installed, so that another attempt may succeed.
         is_installed: bool,
     },
     /// The state cannot be trusted any more. MuJoCo may have put the initial state in its place.
     #[error("the simulation diverged: {warning}; reset it")]
     Diverged {
-        /// What MuJoCo noticed.
+        /// MuJoCo's warning.
         warning: Warning,
     },
 }
 
-/// What MuJoCo warns of, in its own order.
+/// MuJoCo's warnings, in MuJoCo's order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Warning {
     /// The inertia matrix is nearly singular.
@@ -75,7 +75,7 @@ pub enum Warning {
 }
 
 impl Warning {
-    /// All of them, in the order of `mjtWarning`.
+    /// All warnings, in the order of `mjtWarning`.
     pub const ALL: [Self; 8] = [
         Self::Inertia,
         Self::ContactsFull,

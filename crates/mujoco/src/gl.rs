@@ -14,8 +14,8 @@ use std::{
 type Egl = egl::DynamicInstance<egl::EGL1_4>;
 
 const LIBRARY: &str = "libEGL.so.1";
-/// More than any machine has graphics cards.
-const MOST_DEVICES: usize = 32;
+/// Maximum number of graphics cards that are looked at.
+const MAX_DEVICES: usize = 32;
 
 // Of EGL_EXT_platform_device and EGL_MESA_platform_surfaceless in the EGL registry.
 const PLATFORM_DEVICE: c_uint = 0x313F;
@@ -66,12 +66,12 @@ fn displays(egl: &Egl) -> Vec<egl::Display> {
     if let Some(function) = egl.get_proc_address("eglGetPlatformDisplayEXT") {
         // SAFETY: the extension's function of the EGL registry's type.
         let get_platform_display = unsafe { mem::transmute::<extern "system" fn(), GetPlatformDisplay>(function) };
-        let (mut devices, mut n) = ([ptr::null_mut(); MOST_DEVICES], 0);
+        let (mut devices, mut n) = ([ptr::null_mut(); MAX_DEVICES], 0);
         if let Some(function) = egl.get_proc_address("eglQueryDevicesEXT") {
             // SAFETY: the extension's function of the EGL registry's type.
             let query_devices = unsafe { mem::transmute::<extern "system" fn(), QueryDevices>(function) };
             // SAFETY: room for as many devices as it is told of.
-            unsafe { query_devices(MOST_DEVICES as c_int, devices.as_mut_ptr(), &raw mut n) };
+            unsafe { query_devices(MAX_DEVICES as c_int, devices.as_mut_ptr(), &raw mut n) };
         }
         let devices = devices.iter().take(usize::try_from(n).unwrap_or(0)).map(|&device| (PLATFORM_DEVICE, device));
         for (platform, native) in devices.chain([(PLATFORM_SURFACELESS, ptr::null_mut())]) {

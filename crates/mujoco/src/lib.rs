@@ -4,7 +4,7 @@
 //! - [`Simulation`]: a model of its own and the data that MuJoCo computes on it; stepped, edited, read.
 //! - [`Field`], [`Index`], [`Flags`] and [`Reading`]: the arrays of models and simulations, by name.
 //! - [`Renderer`]: pictures of a model, drawn without a display.
-//! - [`Error`], [`Warning`]: what can go wrong. No failure of MuJoCo ends the process or is passed over.
+//! - [`Error`], [`Warning`]: failures of MuJoCo. None ends the process, and none is ignored.
 //!
 //! ```
 //! use perturb_mujoco::{Kind, Model, Simulation};
@@ -44,4 +44,4 @@ pub use data::Simulation;
 pub use error::{Error, Warning};
 pub use fields::{Field, Flags, Index, Options, Reading};
 pub use model::{FloatArray, Kind, Model};
-pub use render::{Camera, Renderer, View};
+pub use render::{Camera, CameraView, Renderer};

@@ -43,7 +43,7 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// MJCF's word for it.
+    /// MJCF's word for the kind.
     pub fn name(self) -> &'static str {
         match self {
             Self::Body => "body",
@@ -92,7 +92,7 @@ unsafe impl Sync for Model {}
 pub struct FloatArray {
     /// MuJoCo's name of the field, e.g. `body_mass`.
     pub name: &'static str,
-    /// Its elements, row-major; single precision is widened.
+    /// The elements, row-major; single precision is widened.
     pub values: Vec<f64>,
 }
 
@@ -276,12 +276,12 @@ impl Model {
         self.array(self.raw().geom_friction, 3 * self.n_geom())
     }
 
-    /// Where each joint's coordinates begin in `qpos`, `[J]`.
+    /// The index in `qpos` of each joint's first coordinate, `[J]`.
     pub fn joint_qpos_address(&self) -> impl ExactSizeIterator<Item = usize> {
         self.array(self.raw().jnt_qposadr, self.n_joint()).iter().map(|&id| id as usize)
     }
 
-    /// Where each joint's velocities begin in `qvel`, `[J]`.
+    /// The index in `qvel` of each joint's first velocity, `[J]`.
     pub fn joint_dof_address(&self) -> impl ExactSizeIterator<Item = usize> {
         self.array(self.raw().jnt_dofadr, self.n_joint()).iter().map(|&id| id as usize)
     }

@@ -12,14 +12,14 @@ const MIN_SCENE_GEOMS: usize = 200;
 /// Room for the geoms of a scene of any model.
 const MAX_SCENE_GEOMS: usize = 20_000;
 
-/// From where a picture is taken.
+/// The position and direction of a camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
-    /// What is in the middle of the picture: a point in m, world frame.
+    /// The point in the middle of the picture, m, world frame.
     pub look_at: [f64; 3],
-    /// How far the camera is from there, m.
+    /// The camera's distance from that point, m.
     pub distance: f64,
-    /// The direction of its view, turned from +x about +z, degrees.
+    /// The direction of view, turned from +x about +z, degrees.
     pub azimuth: f64,
     /// The direction's slope, negative if it looks down, degrees.
     pub elevation: f64,
@@ -27,7 +27,7 @@ pub struct Camera {
 
 /// A camera of the model, or one that is placed for a picture.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum View {
+pub enum CameraView {
     /// A placed camera.
     Free(Camera),
     /// The model's camera of this number.
@@ -43,7 +43,7 @@ pub struct Renderer {
     scene: Box<sys::mjvScene>,
     /// Made by mjr_makeContext for the model in `gl`, freed in drop; a default one before.
     context: Box<sys::mjrContext>,
-    /// Of the context's buffer, pixels; (0, 0) while there is no context to be freed.
+    /// The size of the context's buffer, pixels; (0, 0) while there is no context to be freed.
     size: (u16, u16),
 }
 
@@ -97,13 +97,13 @@ impl Renderer {
     ///
     /// # Errors
     /// [`Error::Fatal`].
-    pub fn draw(&mut self, view: View, (width, height): (u16, u16)) -> Result<Vec<u8>, Error> {
+    pub fn draw(&mut self, view: CameraView, (width, height): (u16, u16)) -> Result<Vec<u8>, Error> {
         let (most_wide, most_high) = self.size;
         if width > most_wide || height > most_high {
             self.make_room((width.max(most_wide), height.max(most_high)))?;
         }
         let mut camera = match view {
-            View::Free(Camera { look_at, distance, azimuth, elevation }) => sys::mjvCamera {
+            CameraView::Free(Camera { look_at, distance, azimuth, elevation }) => sys::mjvCamera {
                 type_: sys::mjtCamera__mjCAMERA_FREE as c_int,
                 fixedcamid: -1,
                 trackbodyid: -1,
@@ -112,7 +112,7 @@ impl Renderer {
                 azimuth,
                 elevation,
             },
-            View::Fixed(number) => {
+            CameraView::Fixed(number) => {
                 if number >= self.simulation.model().count(Kind::Camera) {
                     return Err(Error::Fatal { message: format!("the model has no camera number {number}") });
                 }

@@ -3,7 +3,7 @@
 use crate::act::Actor;
 use crate::differentiator::Differentiator;
 use crate::error::Result;
-use crate::gradient::{Batch, GradientBackend};
+use crate::gradient::{GradientBackend, GradientBatch};
 use crate::losses::Losses;
 use crate::objective::Objective;
 use crate::recurrent::{RecurrentDifferentiator, recurrent_differentiator};
@@ -26,24 +26,24 @@ pub fn gradient_backend(spec: &PolicySpec, threads: usize) -> Result<Box<dyn Gra
 struct RecurrentBackend(Box<dyn RecurrentDifferentiator>);
 
 impl GradientBackend for RecurrentBackend {
-    fn batch<'a>(&self, sequences: &SequenceSamples<'a>) -> Result<Batch<'a>> {
-        Ok(Batch::Recurrent(self.0.batch(sequences)?))
+    fn batch<'a>(&self, sequences: &SequenceSamples<'a>) -> Result<GradientBatch<'a>> {
+        Ok(GradientBatch::Recurrent(self.0.batch(sequences)?))
     }
 
-    fn remember_acting(&mut self, weights: &[f32], batch: &mut Batch<'_>) -> Result<()> {
-        let Batch::Recurrent(batch) = batch else { unreachable!("a feed-forward policy's batch") };
+    fn remember_acting(&mut self, weights: &[f32], batch: &mut GradientBatch<'_>) -> Result<()> {
+        let GradientBatch::Recurrent(batch) = batch else { unreachable!("a feed-forward policy's batch") };
         batch.remember_acting(weights)
     }
 
     fn gradient(
         &mut self,
         weights: &[f32],
-        batch: &Batch<'_>,
+        batch: &GradientBatch<'_>,
         sequences: &[u32],
         objective: &Objective,
         gradient: &mut [f32],
     ) -> Result<Losses> {
-        let Batch::Recurrent(batch) = batch else { unreachable!("a feed-forward policy's batch") };
+        let GradientBatch::Recurrent(batch) = batch else { unreachable!("a feed-forward policy's batch") };
         batch.gradient(weights, sequences, objective, gradient)
     }
 

@@ -7,7 +7,7 @@ use pulp::Simd;
 use crate::act::Actor;
 use crate::act_ff::{Activations, BLOCK, Networks};
 use crate::error::{Error, Result, check_length};
-use crate::gradient::{ActingOutputs, Batch, GradientBackend};
+use crate::gradient::{ActingOutputs, GradientBackend, GradientBatch};
 use crate::kernel::{Kernel, call, run};
 use crate::losses::Losses;
 use crate::objective::{Acting, Gaussian, Objective, Outputs, Sample};
@@ -238,12 +238,14 @@ impl Differentiator {
 }
 
 impl GradientBackend for Differentiator {
-    fn batch<'a>(&self, sequences: &SequenceSamples<'a>) -> Result<Batch<'a>> {
-        Ok(Batch::FeedForward { samples: sequences.samples, indices: sequences.indices(), acting: None })
+    fn batch<'a>(&self, sequences: &SequenceSamples<'a>) -> Result<GradientBatch<'a>> {
+        Ok(GradientBatch::FeedForward { samples: sequences.samples, indices: sequences.indices(), acting: None })
     }
 
-    fn remember_acting(&mut self, weights: &[f32], batch: &mut Batch<'_>) -> Result<()> {
-        let Batch::FeedForward { samples, acting, .. } = batch else { unreachable!("a recurrent policy's batch") };
+    fn remember_acting(&mut self, weights: &[f32], batch: &mut GradientBatch<'_>) -> Result<()> {
+        let GradientBatch::FeedForward { samples, acting, .. } = batch else {
+            unreachable!("a recurrent policy's batch")
+        };
         self.load_if_changed(weights)?;
         let mut outputs = Vec::new();
         self.outputs(samples.observations, &mut outputs)?;
@@ -254,12 +256,14 @@ impl GradientBackend for Differentiator {
     fn gradient(
         &mut self,
         weights: &[f32],
-        batch: &Batch<'_>,
+        batch: &GradientBatch<'_>,
         sequences: &[u32],
         objective: &Objective,
         gradient: &mut [f32],
     ) -> Result<Losses> {
-        let Batch::FeedForward { samples, acting, .. } = batch else { unreachable!("a recurrent policy's batch") };
+        let GradientBatch::FeedForward { samples, acting, .. } = batch else {
+            unreachable!("a recurrent policy's batch")
+        };
         self.load_if_changed(weights)?;
         let acting = acting.as_ref().map(|it| Acting { outputs: &it.outputs, log_std: &it.log_std });
         self.gradient_at(weights, &Samples { acting, ..*samples }, sequences, objective, gradient)

@@ -14,13 +14,13 @@ pub trait GradientBackend {
     ///
     /// # Errors
     /// Arrays whose lengths do not fit, or what libtorch refuses.
-    fn batch<'a>(&self, sequences: &SequenceSamples<'a>) -> Result<Batch<'a>>;
+    fn batch<'a>(&self, sequences: &SequenceSamples<'a>) -> Result<GradientBatch<'a>>;
 
     /// Takes the policy with `weights` `[P]` for the one that acted in `batch`. The KL divergence is measured from it.
     ///
     /// # Errors
     /// A batch of other observations, or another number of weights.
-    fn remember_acting(&mut self, weights: &[f32], batch: &mut Batch<'_>) -> Result<()>;
+    fn remember_acting(&mut self, weights: &[f32], batch: &mut GradientBatch<'_>) -> Result<()>;
 
     /// Writes the gradient of `objective` with `weights` `[P]` over `sequences` of `batch` to `gradient` `[P]`. Returns the
     /// losses.
@@ -30,7 +30,7 @@ pub trait GradientBackend {
     fn gradient(
         &mut self,
         weights: &[f32],
-        batch: &Batch<'_>,
+        batch: &GradientBatch<'_>,
         sequences: &[u32],
         objective: &Objective,
         gradient: &mut [f32],
@@ -46,7 +46,7 @@ pub trait GradientBackend {
 
 /// A rollout as M sequences, each of which the policy must see whole. A recurrent policy needs the steps of an environment
 /// in order: M = N. A feed-forward one takes every sample by itself: M = T·N, or those of them that are samples.
-pub enum Batch<'a> {
+pub enum GradientBatch<'a> {
     /// A batch of a feed-forward policy.
     FeedForward {
         /// The rollout.
@@ -69,7 +69,7 @@ pub struct ActingOutputs {
     pub log_std: Vec<f32>,
 }
 
-impl Batch<'_> {
+impl GradientBatch<'_> {
     /// The indices of all sequences.
     pub fn sequences(&self) -> Vec<u32> {
         match self {

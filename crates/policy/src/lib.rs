@@ -37,7 +37,7 @@ pub use backend::gradient_backend;
 pub use collect_until::{CollectUntil, EpisodeQuotas, RemainingRollout};
 pub use differentiator::Differentiator;
 pub use error::{Error, Result, check_length};
-pub use gradient::{ActingOutputs, Batch, GradientBackend};
+pub use gradient::{ActingOutputs, GradientBackend, GradientBatch};
 pub use initial::initial_weights;
 pub use inputs::Inputs;
 pub use losses::Losses;

@@ -1,7 +1,7 @@
 //! Proximal policy optimisation.
 
 use perturb_policy::random::{Purpose, stream, uniform};
-use perturb_policy::{Batch, CollectUntil, Losses, Objective, Optimiser, Surrogate, UpdateRule};
+use perturb_policy::{CollectUntil, GradientBatch, Losses, Objective, Optimiser, Surrogate, UpdateRule};
 use perturb_settings::{PpoConfig, SettingError};
 use rand_chacha::ChaCha8Rng;
 
@@ -83,7 +83,7 @@ impl BaseAlgorithm for Ppo {
             check_rollout(rollout, policy, self.config.n_steps)?;
             estimates.push(gae(&rollout.trajectories()?, gamma, gae_lambda, bootstrap_truncation));
         }
-        let mut batches: Vec<(Batch<'_>, Vec<u32>)> = Vec::with_capacity(rollouts.len());
+        let mut batches: Vec<(GradientBatch<'_>, Vec<u32>)> = Vec::with_capacity(rollouts.len());
         for (rollout, estimates) in rollouts.iter().zip(&estimates) {
             let mut batch = policy.backend.batch(&rollout.sequences(estimates))?;
             if kl_coef > 0.0 {

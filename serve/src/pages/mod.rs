@@ -18,7 +18,7 @@ use perturb_experiment::runs::RunKind;
 use perturb_text::shortened;
 use serde_json::{Map, Value, json};
 
-use crate::cached_loader::LoadError;
+use crate::cached_loader::CachedLoadError;
 use crate::error::ViewError;
 use crate::paths::{RelativePath, Root};
 
@@ -86,11 +86,11 @@ fn describe(error: &ViewError) -> (StatusCode, String) {
     match error {
         ViewError::RunNotFound => (StatusCode::NOT_FOUND, "There is no run here, or not any more.".into()),
         ViewError::Unlisted(reason) => (StatusCode::NOT_FOUND, format!("The runs cannot be listed: {reason}.")),
-        ViewError::Load(LoadError::Panicked) => {
+        ViewError::Load(CachedLoadError::Panicked) => {
             let message = "The server cannot show this because of a fault of its own. Its console has the details.";
             (StatusCode::INTERNAL_SERVER_ERROR, message.into())
         }
-        ViewError::Load(LoadError::TimedOut) => {
+        ViewError::Load(CachedLoadError::TimedOut) => {
             let message = "Reading these files takes too long; perhaps their disk or network does not answer.";
             (StatusCode::SERVICE_UNAVAILABLE, message.into())
         }

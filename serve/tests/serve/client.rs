@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use perturb_checkpoint::Counters;
 use perturb_experiment::{CellResult, Folder, Plan, Training};
 use perturb_records::TestResult;
-use perturb_serve::{Options, Server};
+use perturb_serve::{ServeOptions, Server};
 use perturb_settings::TrainConfig;
 use tempfile::TempDir;
 
@@ -131,7 +131,7 @@ fn connect(address: SocketAddr) -> TcpStream {
 
 /// Serves `folder` until the test program ends.
 pub fn serve(folder: &Path) -> SocketAddr {
-    let options = Options { folder: folder.to_owned(), address: ([127, 0, 0, 1], 0).into(), server: None };
+    let options = ServeOptions { folder: folder.to_owned(), address: ([127, 0, 0, 1], 0).into(), server: None };
     let (sender, receiver) = std::sync::mpsc::channel();
     std::thread::spawn(move || {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();

@@ -15,7 +15,7 @@ use crate::{
 };
 use std::f64::consts::PI;
 
-/// What is fixed about Acrobot.
+/// The specification of Acrobot.
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "Acrobot",
     revision: 1,
@@ -77,7 +77,7 @@ const MAX_VELOCITY_2: f64 = 9.0 * PI;
 const HEIGHT: f64 = 1.0;
 const RESET_RANGE: f64 = 0.1;
 
-/// Both links.
+/// The two links.
 #[derive(Debug, Clone)]
 pub struct Acrobot {
     link_length: f64,
@@ -88,7 +88,7 @@ pub struct Acrobot {
 }
 
 impl Acrobot {
-    /// With default parameters, hanging.
+    /// Makes an Acrobot with default parameters, hanging.
     pub fn new() -> Self {
         let [link_length, link_mass, link_moi] = [0, 1, 2].map(|i: usize| SPEC.parameters[i].default);
         Self { link_length, link_mass, link_moi, state: [0.0; 4] }
@@ -130,8 +130,8 @@ impl Default for Acrobot {
     }
 }
 
-/// Brings an angle into [-π, π] by whole turns: by a loop as in Gymnasium, since a remainder rounds otherwise, unless
-/// absurd parameters turned a joint so far in one step that the loop would not end.
+/// Brings an angle into [-π, π] by whole turns. A loop as in Gymnasium does this, because a remainder rounds differently.
+/// If extreme parameters turned a joint so far in one step that the loop would not end, a remainder is used.
 fn wrap(mut angle: f64) -> f64 {
     if angle.abs() > 1000.0 * PI {
         return (angle + PI).rem_euclid(2.0 * PI) - PI;

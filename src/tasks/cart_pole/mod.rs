@@ -13,8 +13,8 @@ use crate::{
     scene::Scene,
 };
 
-/// What is fixed about CartPole. The last observation of an episode lies beyond the limits that ended it, which is why
-/// the observation has no bounds.
+/// The specification of CartPole. The observation has no bounds, because the last one of an episode lies beyond the
+/// limits that ended it.
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "CartPole",
     revision: 1,
@@ -59,7 +59,8 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
         comparison: Comparison::AtLeast,
         threshold: 195.0,
     },
-    // It asks after each step for 195 of them, but an environment whose episode has ended is reset before it asks.
+    // The paper's code compares with 195 steps after each step, but an environment whose episode has ended is reset
+    // before the comparison.
     code_success: Some(Success {
         description: "the episode lasted at least 196 steps",
         achievement: Achievement::Length,
@@ -82,8 +83,8 @@ pub struct CartPole {
     force: f64,
     half_pole_length: f64,
     pole_mass: f64,
-    // Derived, by `set_parameters` alone. The reciprocal saves three divisions a step, half of its time, for a
-    // difference of some 1e-16 from Gymnasium.
+    // Derived quantities, which only `set_parameters` sets. The reciprocal saves three divisions a step, half of its
+    // time, for a difference of some 1e-16 from Gymnasium.
     pole_mass_length: f64,
     inverse_total_mass: f64,
     /// Position, velocity, angle, angular velocity.
@@ -91,7 +92,7 @@ pub struct CartPole {
 }
 
 impl CartPole {
-    /// With default parameters, at rest.
+    /// Makes a CartPole with default parameters, at rest.
     pub fn new() -> Self {
         let mut cart_pole = Self {
             force: 0.0,

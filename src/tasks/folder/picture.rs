@@ -1,7 +1,7 @@
 //! The view of a folder's pictures.
 
 use super::{elements::Elements, error::Result, table::Table};
-use crate::scene::View;
+use crate::scene::ModelView;
 use perturb_mujoco::{Field, Kind, Model};
 
 const PICTURE: &[&str] = &["camera", "look_at", "distance", "azimuth", "elevation", "follow"];
@@ -9,7 +9,7 @@ const AZIMUTH: f64 = 90.0;
 const ELEVATION: f64 = -15.0;
 
 /// Reads the table of the picture. Without one the whole model is seen from its side.
-pub(super) fn view(table: Option<&Table<'_>>, model: &Model, elements: &Elements) -> Result<View> {
+pub(super) fn view(table: Option<&Table<'_>>, model: &Model, elements: &Elements) -> Result<ModelView> {
     // The statistics hold the extent and the centre of the model at the places 3 and 4 to 6.
     let statistic = model.field(Field::Statistic);
     let centre = std::array::from_fn(|i| statistic[4 + i]);
@@ -20,7 +20,7 @@ pub(super) fn view(table: Option<&Table<'_>>, model: &Model, elements: &Elements
             if let Some(other) = PICTURE[1..].iter().find(|key| table.has(key)) {
                 return Err(table.error(format_args!("give either camera or {other}, not both")));
             }
-            return Ok(View::Camera(elements.find(Kind::Camera, &camera)?));
+            return Ok(ModelView::Camera(elements.find(Kind::Camera, &camera)?));
         }
         if let Some(value) = table.get("look_at") {
             view.0 = value.numbers()?.try_into().map_err(|_| value.error("expected three numbers: x, y and z in m"))?;
@@ -34,5 +34,5 @@ pub(super) fn view(table: Option<&Table<'_>>, model: &Model, elements: &Elements
         }
     }
     let (look_at, distance, azimuth, elevation, followed) = view;
-    Ok(View::Placed { look_at, distance, azimuth, elevation, followed })
+    Ok(ModelView::Placed { look_at, distance, azimuth, elevation, followed })
 }

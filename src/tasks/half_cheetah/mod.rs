@@ -1,17 +1,17 @@
 //! HalfCheetah: run forward on two legs.
 
 use super::locomotion::{
-    Posture, SCENERY, Task, Walker,
+    Posture, Robot, SCENERY, Walker,
     channels::{APPLIED, CONTROL_TIMESTEP, DENSITY, FRICTION, Names, REWARD_TERMS, SUCCESS, names, power},
     colours::*,
 };
 use crate::{
     env::{ActionSpace, EnvironmentSpec, Error},
-    scene::{Look, Scenery, View},
+    scene::{Look, ModelView, Scenery},
 };
 use std::sync::OnceLock;
 
-/// What is fixed about HalfCheetah.
+/// The specification of HalfCheetah.
 ///
 /// | observation | value, clipped to ±5 |
 /// |---|---|
@@ -48,7 +48,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
 
 const NAMES: Names = names!(joints: ["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"], contacts: ["ffoot", "fshin", "fthigh", "bfoot", "bshin", "bthigh"]);
 
-static TASK: Task = Task {
+static ROBOT: Robot = Robot {
     spec: &SPEC,
     look: Look {
         name: SPEC.name,
@@ -68,19 +68,19 @@ static TASK: Task = Task {
                 ("ffoot", ORANGE),
             ],
         }),
-        view: View::Beside { followed: "torso", distance: 3.0, height: 0.55 },
+        view: ModelView::Beside { followed: "torso", distance: 3.0, height: 0.55 },
     },
     names: NAMES,
     alive,
     pristine: OnceLock::new(),
 };
 
-/// A half cheetah with default parameters.
+/// Makes a half cheetah with default parameters.
 ///
 /// # Errors
 /// [`Error::Model`] if MuJoCo is of another version or has no memory.
 pub fn half_cheetah() -> Result<Walker, Error> {
-    Walker::new(&TASK)
+    Walker::new(&ROBOT)
 }
 
 fn alive(posture: &Posture<'_>) -> bool {

@@ -1,17 +1,17 @@
 //! Hopper: hop forward on one leg.
 
 use super::locomotion::{
-    Posture, SCENERY, Task, Walker,
+    Posture, Robot, SCENERY, Walker,
     channels::{APPLIED, CONTROL_TIMESTEP, DENSITY, FRICTION, Names, REWARD_TERMS, SUCCESS, names, power},
     colours::*,
 };
 use crate::{
     env::{ActionSpace, EnvironmentSpec, Error},
-    scene::{Look, Scenery, View},
+    scene::{Look, ModelView, Scenery},
 };
 use std::sync::OnceLock;
 
-/// What is fixed about Hopper.
+/// The specification of Hopper.
 ///
 /// | observation | value, clipped to ±5 |
 /// |---|---|
@@ -48,7 +48,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
 
 const NAMES: Names = names!(joints: ["thigh", "leg", "foot"], contacts: ["foot"]);
 
-static TASK: Task = Task {
+static ROBOT: Robot = Robot {
     spec: &SPEC,
     look: Look {
         name: SPEC.name,
@@ -59,19 +59,19 @@ static TASK: Task = Task {
             hidden: "floor",
             colours: &[("torso", BLUE), ("thigh", SKY_BLUE), ("leg", ORANGE), ("foot", VERMILLION)],
         }),
-        view: View::Beside { followed: "torso", distance: 3.0, height: 0.75 },
+        view: ModelView::Beside { followed: "torso", distance: 3.0, height: 0.75 },
     },
     names: NAMES,
     alive,
     pristine: OnceLock::new(),
 };
 
-/// A hopper with default parameters.
+/// Makes a hopper with default parameters.
 ///
 /// # Errors
 /// [`Error::Model`] if MuJoCo is of another version or has no memory.
 pub fn hopper() -> Result<Walker, Error> {
-    Walker::new(&TASK)
+    Walker::new(&ROBOT)
 }
 
 fn alive(posture: &Posture<'_>) -> bool {

@@ -1,13 +1,13 @@
-//! The parts that the specs of Hopper and HalfCheetah share: channels, reward terms, quantities.
+//! Channels, reward terms and quantities that the specifications of Hopper and HalfCheetah share.
 
 use crate::env::{Achievement, Channel, Comparison, Parameter, Quantity, RewardTerm, Success};
 
-/// Observations are clipped to ± this.
+/// Limit of the numbers of an observation, which are clipped to ± this.
 pub const CLIP: f64 = 5.0;
 /// Simulated seconds in one step.
 pub const CONTROL_TIMESTEP: f64 = 0.0165;
 
-/// Everything about a robot that goes by its joints' and geoms' names.
+/// The channels of a robot, by the names of its joints and geoms.
 pub struct Names {
     /// Joints with motors, in the order of observations and actions.
     pub joints: &'static [&'static str],
@@ -17,7 +17,7 @@ pub struct Names {
     pub observation: &'static [Channel],
     /// The entries of an action.
     pub action: &'static [Channel],
-    /// The entries of an exact state. The bounds are far beyond any episode and keep absurd numbers out.
+    /// The entries of an exact state. The bounds are far beyond any episode, and keep out numbers that would overflow.
     pub state: &'static [Channel],
 }
 
@@ -86,7 +86,7 @@ pub const DENSITY: Parameter = Parameter::new("density", "kg/m³", "density of t
 pub const FRICTION: Parameter = Parameter::new("friction", "1", "sliding friction of the robot's geoms", (0.0, 10.0))
     .versions(0.8, (0.5, 1.1), (0.2, 1.4));
 
-/// What receipts read back.
+/// The quantities that receipts read back.
 pub const APPLIED: &[Quantity] = &[
     Quantity { name: "torso_mass", unit: "kg" },
     Quantity { name: "friction", unit: "1" },
@@ -94,7 +94,7 @@ pub const APPLIED: &[Quantity] = &[
     Quantity { name: "density", unit: "kg/m³" },
 ];
 
-/// The same goal for both.
+/// The success rule of both robots.
 pub const SUCCESS: Success = Success {
     description: "the torso's x reached 20 m at any step, the last one included",
     achievement: Achievement::Own(Quantity { name: "distance", unit: "m" }),

@@ -1,7 +1,7 @@
-//! What Hopper and HalfCheetah share: Roboschool's task (Brockman et al., 2016; Schulman et al., 2017) on MuJoCo 2.2.2.
+//! The task that Hopper and HalfCheetah share, Roboschool's (Brockman et al., 2016; Schulman et al., 2017) on MuJoCo 2.2.2.
 //!
-//! [`Walker`] is the task; environments take turns in a simulation of their thread (`shared.rs`). The robots' folders say
-//! what differs. The models are in `models/`, with the source of each number.
+//! [`Walker`] is the task. Environments take turns in a simulation of their thread (`shared.rs`). The robots' folders
+//! have the differences. The models are in `models/`, with the source of each number.
 
 pub(super) mod channels;
 pub(super) mod colours;
@@ -18,22 +18,22 @@ use perturb_mujoco::Error;
 use pristine::Pristine;
 use std::sync::OnceLock;
 
-/// Follows a robot's own elements in its MJCF. The floor of the physics ends 40 m from the start, as a picture; the
-/// ground here does not. The line is where the task is done.
+/// MJCF that pictures add to a robot's own elements. The drawn floor of the physics ends 40 m from the start, but this
+/// ground does not. The line marks the goal.
 pub(super) const SCENERY: &str = include_str!("../../../models/scenery.xml");
 
-/// What differs between the robots.
-pub(super) struct Task {
+/// A robot: its specification, model, names of joints and geoms, and the rule whether it is alive.
+pub(super) struct Robot {
     pub spec: &'static EnvironmentSpec,
-    /// The model, and how it is shown.
+    /// The model and its look in pictures.
     pub look: Look,
     pub names: Names,
     pub alive: fn(&Posture<'_>) -> bool,
-    /// Compiled once in the process.
+    /// The compiled model, which is compiled once in the process.
     pub pristine: OnceLock<Result<Pristine, Error>>,
 }
 
-/// What decides whether a robot is alive.
+/// The values that decide whether a robot is alive.
 pub(super) struct Posture<'a> {
     /// The torso's centre of mass above the floor, m.
     pub height: f64,

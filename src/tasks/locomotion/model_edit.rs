@@ -1,4 +1,4 @@
-//! Changes of the physics, always from the pristine compiled model: nothing accumulates.
+//! Changes of the physics. Each starts from the unchanged compiled model, so changes do not accumulate.
 //!
 //! The result equals that of compiling an edited MJCF to 4e-13 in every array, at a hundredth of the cost.
 
@@ -7,38 +7,38 @@ use perturb_mujoco::{Error, Kind, Model, Simulation};
 /// The torso's density in the MJCF, kg/m³.
 const COMPILED_DENSITY: f64 = 1000.0;
 
-/// Which elements of a model the parameters change.
+/// The elements of a model that the parameters change.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Targets {
+pub(super) struct EditedElements {
     torso_body: usize,
     torso_geom: usize,
     floor: usize,
 }
 
-/// A change of the model: the parameters, and the [constants](Simulation::constants) that come of them.
+/// A change of the model: the parameters, and the [constants](Simulation::constants) that result from them.
 #[derive(Debug)]
-pub(super) struct Edit {
-    /// Of the torso, kg/m³.
+pub(super) struct RobotEdit {
+    /// The torso's density, kg/m³.
     pub(super) density: f64,
     /// The sliding friction of every geom but the floor.
     pub(super) friction: f64,
     pub(super) constants: Box<[f64]>,
 }
 
-impl Edit {
+impl RobotEdit {
     /// Edits a simulation of the compiled model, whose constants before any edit are `compiled_constants`. The state of the
     /// simulation is undefined afterwards.
     ///
     /// # Errors
     /// MuJoCo's fatal ones.
     pub(super) fn new(
-        targets: Targets,
+        targets: EditedElements,
         compiled_constants: &[f64],
         simulation: &mut Simulation,
         density: f64,
         friction: f64,
     ) -> Result<Self, Error> {
-        let Targets { torso_body, floor, .. } = targets;
+        let EditedElements { torso_body, floor, .. } = targets;
         simulation.set_constants(compiled_constants);
         let scale = density / COMPILED_DENSITY;
         simulation.body_mass_mut()[torso_body] *= scale;
@@ -57,14 +57,14 @@ impl Edit {
         Ok(Self { density, friction, constants })
     }
 
-    /// Whether it is the change to these parameters.
+    /// Tells whether this is the change to these parameters.
     pub(super) fn is_of(&self, density: f64, friction: f64) -> bool {
         (self.density, self.friction) == (density, friction)
     }
 }
 
-impl Targets {
-    pub(super) fn of(model: &Model) -> Result<Self, Error> {
+impl EditedElements {
+    pub(super) fn new(model: &Model) -> Result<Self, Error> {
         Ok(Self {
             torso_body: model.id(Kind::Body, "torso")?,
             torso_geom: model.id(Kind::Geom, "torso")?,
@@ -77,7 +77,7 @@ impl Targets {
         model.body_mass()[self.torso_body]
     }
 
-    /// The torso's density in kg/m³, as its mass tells.
+    /// Returns the torso's density in kg/m³, computed from its mass.
     pub(super) fn density(self, model: &Model, pristine: &Model) -> f64 {
         self.torso_mass(model) / (self.torso_mass(pristine) / COMPILED_DENSITY)
     }

@@ -1,29 +1,29 @@
-//! A robot's model as compiled, and where its parts are.
+//! A robot's compiled model, and the positions of its parts in MuJoCo's arrays.
 
-use super::{Task, model_edit::Targets};
+use super::{Robot, model_edit::EditedElements};
 use perturb_mujoco::{Error, Kind, Model, Simulation};
 use sha2::{Digest, Sha256};
 use std::fmt::Write;
 
 const TIMESTEP: f64 = 0.004125;
-/// Joints before the motors': root_x, root_z, root_pitch.
+/// Number of joints before those with motors: root_x, root_z, root_pitch.
 const N_ROOT: usize = 3;
-/// Room for the larger robot.
-pub(super) const MOST_JOINTS: usize = 6;
-/// Room for the larger robot's [state](Simulation::state).
-pub(super) const MOST_STATE: usize = 1 + 3 * (N_ROOT + MOST_JOINTS) + MOST_JOINTS;
+/// Maximum number of joints with motors, that of HalfCheetah.
+pub(super) const MAX_JOINTS: usize = 6;
+/// Maximum length of a robot's [state](Simulation::state).
+pub(super) const MAX_STATE: usize = 1 + 3 * (N_ROOT + MAX_JOINTS) + MAX_JOINTS;
 
-/// A model as compiled: nothing changes it.
+/// A compiled model, which nothing changes.
 pub struct Pristine {
     pub(super) model: Model,
     pub(super) constants: Vec<f64>,
     /// The initial state.
     pub(super) state: Vec<f64>,
     pub(super) hash: String,
-    pub(super) targets: Targets,
+    pub(super) targets: EditedElements,
     pub(super) torso: usize,
     pub(super) joints: Vec<Joint>,
-    /// For each geom the contact flag that it raises, if any.
+    /// For each geom the contact flag that it sets, if any.
     flag_of_geom: Vec<Option<usize>>,
 }
 
@@ -44,13 +44,13 @@ impl Joint {
 }
 
 impl Pristine {
-    pub(super) fn compile(task: &Task) -> Result<Self, Error> {
-        let model = Model::from_xml(task.look.mjcf)?;
+    pub(super) fn compile(robot: &Robot) -> Result<Self, Error> {
+        let model = Model::from_xml(robot.look.mjcf)?;
         assert_eq!(model.timestep(), TIMESTEP, "the control timestep is four of these");
         assert_eq!(
             (model.n_q(), model.n_act()),
-            (N_ROOT + task.names.joints.len(), 0),
-            "the model does not fit the task"
+            (N_ROOT + robot.names.joints.len(), 0),
+            "the model does not fit the robot"
         );
         let (qpos, dof) = (model.joint_qpos_address(), model.joint_dof_address());
         let all: Vec<Joint> = qpos
@@ -59,16 +59,16 @@ impl Pristine {
             .map(|((qpos, dof), (low, high))| Joint { qpos, dof, low, high })
             .collect();
         let joints =
-            task.names.joints.iter().map(|name| Ok(all[model.id(Kind::Joint, name)?])).collect::<Result<_, _>>()?;
+            robot.names.joints.iter().map(|name| Ok(all[model.id(Kind::Joint, name)?])).collect::<Result<_, _>>()?;
         let mut flag_of_geom = vec![None; model.n_geom()];
-        for (flag, name) in task.names.contacts.iter().enumerate() {
+        for (flag, name) in robot.names.contacts.iter().enumerate() {
             flag_of_geom[model.id(Kind::Geom, name)?] = Some(flag);
         }
-        let hash = Sha256::digest(task.look.mjcf).iter().fold(String::new(), |mut hex, byte| {
+        let hash = Sha256::digest(robot.look.mjcf).iter().fold(String::new(), |mut hex, byte| {
             let _ = write!(hex, "{byte:02x}"); // writing to a String cannot fail
             hex
         });
-        let (targets, torso) = (Targets::of(&model)?, model.id(Kind::Body, "torso")?);
+        let (targets, torso) = (EditedElements::new(&model)?, model.id(Kind::Body, "torso")?);
         let (mut constants, mut state) = (vec![0.0; model.n_constants()], vec![0.0; model.n_state()]);
         let simulation = Simulation::new(model.try_clone()?)?;
         simulation.constants(&mut constants);
@@ -88,9 +88,9 @@ impl Pristine {
         (1..n_body).map(|body| simulation.xipos(body)[0]).sum::<f64>() / (n_body - 1) as f64
     }
 
-    /// Which of the observed geoms touch anything, in the task's order.
-    pub(super) fn touching(&self, simulation: &Simulation) -> [bool; MOST_JOINTS] {
-        let mut touching = [false; MOST_JOINTS];
+    /// Returns for each of the observed geoms whether it touches anything, in the task's order.
+    pub(super) fn touching(&self, simulation: &Simulation) -> [bool; MAX_JOINTS] {
+        let mut touching = [false; MAX_JOINTS];
         for (a, b) in simulation.contacts() {
             for flag in [a, b].into_iter().filter_map(|geom| self.flag_of_geom[geom]) {
                 touching[flag] = true;

@@ -1,27 +1,26 @@
-//! The simulations that environments take turns in: each thread has one of a robot.
+//! The simulations that environments take turns in. Each thread has one simulation of each robot.
 //!
-//! A model with MuJoCo's data is 129 kB; what tells one hopper from another is some hundred bytes. Environments of so few
-//! bytes stay in the caches. What one did cannot be seen by the next: all that anything follows from is written into the
+//! A model with MuJoCo's data is 129 kB, but the difference between two hoppers is some hundred bytes. Environments of so
+//! few bytes stay in the caches. An environment cannot see what another one did: its whole state is written into the
 //! simulation before it runs.
 
-use super::{model_edit::Edit, pristine::Pristine};
+use super::{model_edit::RobotEdit, pristine::Pristine};
 use perturb_mujoco::{Error, Simulation};
 use std::{cell::RefCell, ptr, sync::Arc};
 
 thread_local! {
-    /// Those that nobody uses at the moment.
+    /// The simulations that are not in use at the moment.
     static IDLE: RefCell<Vec<Shared>> = const { RefCell::new(Vec::new()) };
 }
 
-/// A simulation, and what its model was last given.
+/// A simulation, and the last change of its model.
 pub(super) struct Shared {
     pristine: &'static Pristine,
     simulation: Simulation,
-    edit: Option<Arc<Edit>>,
+    edit: Option<Arc<RobotEdit>>,
 }
 
-/// Runs `work` with this thread's simulation of the robot, which is made when it is first needed, and made anew after a
-/// fatal error.
+/// Runs `work` with this thread's simulation of the robot, which is made when it is first needed and after a fatal error.
 ///
 /// # Errors
 /// Those of `work`, and [`Error::Fatal`] without memory for a simulation.
@@ -45,15 +44,15 @@ pub(super) fn with<T>(
 }
 
 impl Shared {
-    /// Changes the pristine model; the state is undefined then.
+    /// Changes the model, starting from the compiled one. The state is undefined afterwards.
     ///
     /// # Errors
     /// MuJoCo's fatal ones.
-    pub(super) fn edit(&mut self, density: f64, friction: f64) -> Result<Arc<Edit>, Error> {
+    pub(super) fn edit(&mut self, density: f64, friction: f64) -> Result<Arc<RobotEdit>, Error> {
         match &self.edit {
             Some(edit) if edit.is_of(density, friction) => Ok(Arc::clone(edit)),
             _ => {
-                let edit = Arc::new(Edit::new(
+                let edit = Arc::new(RobotEdit::new(
                     self.pristine.targets,
                     &self.pristine.constants,
                     &mut self.simulation,
@@ -66,8 +65,8 @@ impl Shared {
         }
     }
 
-    /// The simulation with the changed model; its state is undefined.
-    pub(super) fn edited(&mut self, edit: &Arc<Edit>) -> &mut Simulation {
+    /// Returns the simulation with the changed model. Its state is undefined.
+    pub(super) fn edited(&mut self, edit: &Arc<RobotEdit>) -> &mut Simulation {
         if !self.edit.as_ref().is_some_and(|held| held.is_of(edit.density, edit.friction)) {
             self.simulation.set_constants(&edit.constants);
             self.edit = Some(Arc::clone(edit));
@@ -75,11 +74,12 @@ impl Shared {
         &mut self.simulation
     }
 
-    /// The simulation with the changed model, in this [state](Simulation::state); nothing is computed from it yet.
+    /// Returns the simulation with the changed model in this [state](Simulation::state). Poses and contacts are not computed
+    /// yet.
     ///
     /// # Errors
     /// MuJoCo's fatal ones.
-    pub(super) fn at(&mut self, edit: &Arc<Edit>, state: &[f64]) -> Result<&mut Simulation, Error> {
+    pub(super) fn at(&mut self, edit: &Arc<RobotEdit>, state: &[f64]) -> Result<&mut Simulation, Error> {
         let simulation = self.edited(edit);
         simulation.set_state(state)?;
         Ok(simulation)
@@ -90,11 +90,11 @@ impl Shared {
 mod tests {
     use crate::{
         env::{Action, Environment},
-        scene::{Look, Scenery, View},
+        scene::{Look, ModelView, Scenery},
         tasks::{
             hopper,
             locomotion::{
-                SCENERY, Task, Walker,
+                Robot, SCENERY, Walker,
                 channels::{Names, names},
             },
         },
@@ -104,23 +104,23 @@ mod tests {
     const NAMES: Names = names!(joints: ["thigh", "leg", "foot"], contacts: ["foot"]);
 
     /// A hopper whose memory suffices in flight, where there is no constraint, and not on the floor.
-    static WITH_A_SMALL_STACK: OnceLock<Task> = OnceLock::new();
+    static WITH_A_SMALL_STACK: OnceLock<Robot> = OnceLock::new();
 
     fn walker() -> Walker {
-        let task = WITH_A_SMALL_STACK.get_or_init(|| Task {
+        let robot = WITH_A_SMALL_STACK.get_or_init(|| Robot {
             spec: &hopper::SPEC,
             look: Look {
                 name: "Hopper",
                 mjcf: include_str!("../../../models/hopper.xml").replace("20000", "200").leak(),
                 files: &[],
                 scenery: Some(Scenery { mjcf: SCENERY, hidden: "floor", colours: &[] }),
-                view: View::Beside { followed: "torso", distance: 1.0, height: 1.0 },
+                view: ModelView::Beside { followed: "torso", distance: 1.0, height: 1.0 },
             },
             names: NAMES,
             alive: |_| true,
             pristine: OnceLock::new(),
         });
-        Walker::new(task).unwrap()
+        Walker::new(robot).unwrap()
     }
 
     /// In the air, with its joints within their limits.

@@ -1,10 +1,10 @@
 //! The task that Hopper and HalfCheetah share: a planar robot runs along +x.
 
 use super::{
-    Posture, Task,
+    Posture, Robot,
     channels::{CLIP, CONTROL_TIMESTEP},
-    model_edit::Edit,
-    pristine::{MOST_JOINTS, MOST_STATE, Pristine},
+    model_edit::RobotEdit,
+    pristine::{MAX_JOINTS, MAX_STATE, Pristine},
     shared,
 };
 use crate::{
@@ -20,19 +20,19 @@ const ELECTRICITY_COST: f64 = 2.0;
 const STALL_TORQUE_COST: f64 = 0.1;
 const JOINT_LIMIT_COST: f64 = 0.2;
 const AT_LIMIT: f64 = 0.99;
-/// Costs end here: actions may be as large as an f32, and their squares must not make a reward that is not.
-const MOST_COST: f64 = 1e30;
+/// Limit of each cost. Actions may be as large as an f32 allows, and a reward with their squares must still fit one.
+const MAX_COST: f64 = 1e30;
 
-/// Entries of an observation before the joints'.
+/// Number of an observation's entries before those of the joints.
 const N_TORSO: usize = 8;
-/// Room for the larger robot.
-const MOST_OBSERVATION: usize = N_TORSO + 2 * MOST_JOINTS + MOST_JOINTS;
+/// Maximum length of a robot's observation.
+const MAX_OBSERVATION: usize = N_TORSO + 2 * MAX_JOINTS + MAX_JOINTS;
 
 /// A planar robot that is paid for running along +x.
 ///
 /// A step sets the controls to `power` × the action clipped to ±1 and holds them for four timesteps of 4.125 ms. Then,
-/// in this order: observation, alive, progress, contact flags, costs; so the flags that are observed and that decide
-/// about life are those of the step before. The reward is the sum of
+/// in this order: observation, alive, progress, contact flags, costs. So the observed flags, which also decide whether the
+/// robot is alive, are those of the step before. The reward is the sum of
 ///
 /// | term | value |
 /// |---|---|
@@ -48,44 +48,44 @@ const MOST_OBSERVATION: usize = N_TORSO + 2 * MOST_JOINTS + MOST_JOINTS;
 /// and no other term, and the observation stays that of the step before; after a reset to a state that diverges at
 /// once it is zeros.
 ///
-/// It has no simulation of its own: it is what a simulation of its robot is given before it runs for it, and what is
-/// kept of it afterwards.
+/// A walker has no simulation of its own. It holds the parameters and the state that a shared simulation of its robot is
+/// given before it runs for this walker, and the results that are kept afterwards.
 pub struct Walker {
-    task: &'static Task,
+    robot: &'static Robot,
     pristine: &'static Pristine,
     /// The model's part of the parameters.
-    edit: Arc<Edit>,
+    edit: Arc<RobotEdit>,
     power: f64,
-    /// As [`Simulation::state`] has it. Undefined once the physics diverged.
-    state: [f64; MOST_STATE],
-    /// The flags that the next step observes, in the task's order, where they are not those of the state's contacts: at
-    /// the start of an episode they are down.
-    contacts: Option<[bool; MOST_JOINTS]>,
-    observation: [f32; MOST_OBSERVATION],
+    /// The state as of [`Simulation::state`]. Undefined once the physics diverged.
+    state: [f64; MAX_STATE],
+    /// The flags that the next step observes, in the task's order, if they differ from those of the state's contacts: at
+    /// the start of an episode all are 0.
+    contacts: Option<[bool; MAX_JOINTS]>,
+    observation: [f32; MAX_OBSERVATION],
     /// The torso's height at the reset, m.
     initial_height: f64,
     /// The robot's place along the track, m.
     x: f64,
     /// The torso's greatest x in the episode, m.
     greatest_x: f64,
-    /// Until the next reset.
+    /// Whether the physics diverged; until the next reset.
     diverged: bool,
 }
 
 impl Walker {
-    pub(in crate::tasks) fn new(task: &'static Task) -> Result<Self, Error> {
-        let refuse = |error: &SimulationError| Error::Model { environment: task.spec.name, reason: error.to_string() };
-        let pristine = task.pristine.get_or_init(|| Pristine::compile(task)).as_ref().map_err(refuse)?;
-        let [power, density, friction] = std::array::from_fn(|i| task.spec.parameters[i].default);
+    pub(in crate::tasks) fn new(robot: &'static Robot) -> Result<Self, Error> {
+        let refuse = |error: &SimulationError| Error::Model { environment: robot.spec.name, reason: error.to_string() };
+        let pristine = robot.pristine.get_or_init(|| Pristine::compile(robot)).as_ref().map_err(refuse)?;
+        let [power, density, friction] = std::array::from_fn(|i| robot.spec.parameters[i].default);
         let edit = shared::with(pristine, |shared| shared.edit(density, friction)).map_err(|error| refuse(&error))?;
         let mut walker = Self {
-            task,
+            robot,
             pristine,
             edit,
             power,
-            state: [0.0; MOST_STATE],
+            state: [0.0; MAX_STATE],
             contacts: None,
-            observation: [0.0; MOST_OBSERVATION],
+            observation: [0.0; MAX_OBSERVATION],
             initial_height: 0.0,
             x: 0.0,
             greatest_x: 0.0,
@@ -96,7 +96,8 @@ impl Walker {
         Ok(walker)
     }
 
-    /// Shows a simulation with the parameters and the state in force, from which nothing is computed yet.
+    /// Calls a function with a simulation that has the current parameters and state. Poses and contacts are not computed
+    /// yet.
     ///
     /// # Errors
     /// MuJoCo's fatal ones.
@@ -106,7 +107,7 @@ impl Walker {
 
     /// The model's MJCF text, with default parameters.
     pub fn mjcf(&self) -> &'static str {
-        self.task.look.mjcf
+        self.robot.look.mjcf
     }
 
     // ---- state
@@ -134,9 +135,9 @@ impl Walker {
 
     /// Begins an episode at the state.
     fn start(&mut self) {
-        let contacts = [false; MOST_JOINTS];
+        let contacts = [false; MAX_JOINTS];
         self.contacts = Some(contacts);
-        self.observation = [0.0; MOST_OBSERVATION];
+        self.observation = [0.0; MAX_OBSERVATION];
         self.greatest_x = 0.0;
         let pristine = self.pristine;
         let seen = shared::with(pristine, |shared| {
@@ -151,7 +152,7 @@ impl Walker {
 
     // ---- dynamics
 
-    /// One step; none if what follows cannot be observed.
+    /// Advances by one step. Returns `None` if the new state cannot be observed.
     fn advance(
         &mut self,
         simulation: &mut Simulation,
@@ -173,7 +174,7 @@ impl Walker {
         simulation.state(self.state_mut());
         self.contacts = None;
         let alive =
-            (self.task.alive)(&Posture { height, pitch, contacts: &contacts[..self.task.names.contacts.len()] });
+            (self.robot.alive)(&Posture { height, pitch, contacts: &contacts[..self.robot.names.contacts.len()] });
         let x = self.pristine.track_position(simulation);
         let progress = (x - self.x) / CONTROL_TIMESTEP;
         self.x = x;
@@ -181,19 +182,19 @@ impl Walker {
         let alive_bonus = if alive { 1.0 } else { -1.0 };
         reward_terms.copy_from_slice(&[alive_bonus, progress, electricity, stall_torque, joint_limits]);
         self.greatest_x = self.greatest_x.max(self.pristine.torso(simulation).0);
-        let goal = self.task.spec.success.holds(self.achieved());
+        let goal = self.robot.spec.success.holds(self.achieved());
         Ok(Some(Transition { terminated: !alive, goal, diverged: false }))
     }
 
     // ---- observation
 
     /// Computes the observation and keeps it if it is finite. Returns height and pitch.
-    fn perceive(&mut self, simulation: &Simulation, contacts: &[bool; MOST_JOINTS]) -> Option<(f64, f64)> {
+    fn perceive(&mut self, simulation: &Simulation, contacts: &[bool; MAX_JOINTS]) -> Option<(f64, f64)> {
         let torso = self.pristine.torso;
         let height = simulation.xipos(torso)[2];
         let [_, _, _, vx, vy, vz] = simulation.body_velocity(torso);
         let pitch = (-simulation.xmat(torso)[6]).clamp(-1.0, 1.0).asin();
-        let mut new = [0.0; MOST_OBSERVATION];
+        let mut new = [0.0; MAX_OBSERVATION];
         // In the plane the target lies straight ahead, and yaw and roll are 0.
         new[..N_TORSO].copy_from_slice(&[
             height - self.initial_height,
@@ -210,7 +211,7 @@ impl Walker {
         for (entry, joint) in joints.chunks_exact_mut(2).zip(&self.pristine.joints) {
             entry.copy_from_slice(&[joint.scaled(qpos[joint.qpos]), 0.1 * qvel[joint.dof]]);
         }
-        for (entry, &touching) in flags.iter_mut().zip(&contacts[..self.task.names.contacts.len()]) {
+        for (entry, &touching) in flags.iter_mut().zip(&contacts[..self.robot.names.contacts.len()]) {
             *entry = f64::from(u8::from(touching));
         }
         if !new.iter().all(|value| value.is_finite()) {
@@ -234,10 +235,10 @@ impl Walker {
         }
         let n = self.pristine.joints.len() as f64;
         [ELECTRICITY_COST * (power / n), STALL_TORQUE_COST * (torque / n), JOINT_LIMIT_COST * at_limit]
-            .map(|cost| -cost.min(MOST_COST))
+            .map(|cost| -cost.min(MAX_COST))
     }
 
-    /// What a step gives after divergence.
+    /// Returns the transition of a step whose physics diverged.
     fn fail(&mut self, reward_terms: &mut [f64]) -> Transition {
         self.diverged = true;
         reward_terms.copy_from_slice(&[-1.0, 0.0, 0.0, 0.0, 0.0]);
@@ -245,15 +246,15 @@ impl Walker {
     }
 
     fn n_saved(&self) -> usize {
-        1 + self.pristine.state.len() + 1 + self.task.names.contacts.len() + self.task.spec.observation.len() + 1
+        1 + self.pristine.state.len() + 1 + self.robot.names.contacts.len() + self.robot.spec.observation.len() + 1
     }
 
     /// The flags that the next step observes.
-    fn contacts(&self) -> [bool; MOST_JOINTS] {
+    fn contacts(&self) -> [bool; MAX_JOINTS] {
         let computed = || {
             shared::with(self.pristine, |shared| {
                 let simulation = shared.at(&self.edit, self.state())?;
-                let _ = simulation.step1(); // whatever it may warn of, the next step will: the contacts are there
+                let _ = simulation.step1(); // the contacts are there; the next step repeats any warning
                 Ok(self.pristine.touching(simulation))
             })
         };
@@ -261,12 +262,12 @@ impl Walker {
     }
 }
 
-/// A worker that panics of it loses the batch, not the server.
+/// Proof of an `expect`. A worker that panics loses its batch, not the server.
 const NO_MEMORY: &str = "there is memory for the one simulation of this thread";
 
 impl Environment for Walker {
     fn spec(&self) -> &'static EnvironmentSpec {
-        self.task.spec
+        self.robot.spec
     }
 
     fn set_parameters(&mut self, values: &[f64]) {
@@ -275,7 +276,7 @@ impl Environment for Walker {
         };
         self.power = power;
         let edit = || shared::with(self.pristine, |shared| shared.edit(density, friction));
-        // After a fatal error once more, with a new simulation.
+        // A fatal error needs a second attempt, with a new simulation.
         self.edit = edit().or_else(|_| edit()).expect(NO_MEMORY);
     }
 
@@ -318,12 +319,12 @@ impl Environment for Walker {
     }
 
     fn observe(&self, out: &mut [f32]) {
-        out.copy_from_slice(&self.observation[..self.task.spec.observation.len()]);
+        out.copy_from_slice(&self.observation[..self.robot.spec.observation.len()]);
     }
 
     fn scene(&self) -> Option<Scene> {
         let qpos = &self.state[1..][..self.pristine.model.n_q()];
-        (!self.diverged).then(|| Scene::Model(PosedModel { look: &self.task.look, qpos: qpos.to_vec() }))
+        (!self.diverged).then(|| Scene::Model(PosedModel { look: &self.robot.look, qpos: qpos.to_vec() }))
     }
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
@@ -347,18 +348,18 @@ impl Environment for Walker {
         out.extend_from_slice(self.state());
         out.push(self.initial_height);
         if self.diverged {
-            out[physics..].fill(0.0); // nothing follows from it any more, and it may not be finite
+            out[physics..].fill(0.0); // the state is not used any more, and may not be finite
         }
         let contacts = self.contacts();
-        out.extend(contacts[..self.task.names.contacts.len()].iter().map(|&flag| f64::from(u8::from(flag))));
-        // It holds the flags of the step before, which nothing else remembers.
-        out.extend(self.observation[..self.task.spec.observation.len()].iter().map(|&value| f64::from(value)));
+        out.extend(contacts[..self.robot.names.contacts.len()].iter().map(|&flag| f64::from(u8::from(flag))));
+        // The observation has the flags of the step before, which are stored nowhere else.
+        out.extend(self.observation[..self.robot.spec.observation.len()].iter().map(|&value| f64::from(value)));
         out.push(self.greatest_x);
     }
 
     fn load(&mut self, state: &[f64]) -> Result<(), Error> {
         let refuse = |reason: String| Err(Error::Snapshot { reason });
-        // States that were saved before it ended with the observation.
+        // Older snapshots end with the observation.
         let has_greatest_x = state.len() == self.n_saved();
         if !has_greatest_x && state.len() + 1 != self.n_saved() {
             return refuse(format!("its state has {} numbers, expected {}", state.len(), self.n_saved()));
@@ -380,13 +381,13 @@ impl Environment for Walker {
         self.diverged = diverged;
         self.x = x;
         self.initial_height = take(1)[0];
-        let mut contacts = [false; MOST_JOINTS];
-        for (flag, &saved) in contacts.iter_mut().zip(take(self.task.names.contacts.len())) {
+        let mut contacts = [false; MAX_JOINTS];
+        for (flag, &saved) in contacts.iter_mut().zip(take(self.robot.names.contacts.len())) {
             *flag = saved != 0.0;
         }
         self.contacts = Some(contacts);
-        self.observation = [0.0; MOST_OBSERVATION];
-        for (value, &saved) in self.observation.iter_mut().zip(take(self.task.spec.observation.len())) {
+        self.observation = [0.0; MAX_OBSERVATION];
+        for (value, &saved) in self.observation.iter_mut().zip(take(self.robot.spec.observation.len())) {
             *value = saved.clamp(-CLIP, CLIP) as f32;
         }
         self.greatest_x = if has_greatest_x { take(1)[0] } else { torso_x };

@@ -18,7 +18,7 @@ const STATE: &[Channel] = &[
     Channel::new("velocity", "m/step", -MAX_SPEED, MAX_SPEED),
 ];
 
-/// What is fixed about MountainCar.
+/// The specification of MountainCar.
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "MountainCar",
     revision: 1,
@@ -71,7 +71,7 @@ pub struct MountainCar {
 }
 
 impl MountainCar {
-    /// With default parameters, at the valley's bottom.
+    /// Makes a MountainCar with default parameters, at the valley's bottom.
     pub fn new() -> Self {
         let [force, gravity] = [0, 1].map(|i: usize| SPEC.parameters[i].default);
         Self { force, gravity, state: [-0.5, 0.0] }

@@ -6,8 +6,8 @@ use std::f64::consts::{FRAC_PI_2, PI};
 
 const ROD: f64 = 0.16;
 const RADIUS: f64 = 0.36;
-const MOST_TURN: f64 = 0.75 * PI;
-/// Parts of an arc.
+const MAX_TURN: f64 = 0.75 * PI;
+/// Number of segments of an arc.
 const SMOOTH: usize = 64;
 
 fn arc(centre: Point, radius: f64, from: f64, to: f64) -> Vec<Point> {
@@ -25,11 +25,11 @@ pub(super) fn drawing(angle: f64, length: f64, torque: Option<f64>) -> Drawing {
     drawing.polygon(&held, colour::PALE_GREEN);
     drawing.dashes(&[pivot, [0.0, length + ROD]], 0.02, colour::GREEN);
     drawing.rod(pivot, polar(pivot, length, FRAC_PI_2 + angle), ROD, colour::VERMILLION);
-    // None is drawn of a torque that is next to nothing: its arrow would have a head all the same.
+    // A very small torque has no arrow, because the arrow's head has a fixed size.
     let share = torque.map(|torque| torque / MAX_TORQUE);
     if let Some(share) = share.filter(|share| share.abs() > 0.01) {
         // From below the pivot, in the direction of the turn, as far as the torque is large.
-        let turn = MOST_TURN * share;
+        let turn = MAX_TURN * share;
         let (start, end) = (-FRAC_PI_2 - 0.5 * turn, -FRAC_PI_2 + 0.5 * turn);
         drawing.line(&arc(pivot, RADIUS, start, end), 0.035, colour::BLUE);
         let forward = turn.signum() * 0.3;

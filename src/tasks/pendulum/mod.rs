@@ -15,7 +15,7 @@ use crate::{
 };
 use std::f64::consts::PI;
 
-/// What is fixed about Pendulum.
+/// The specification of Pendulum.
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "Pendulum",
     revision: 1,
@@ -32,7 +32,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     ],
     action: ActionSpace::Continuous(&[Channel::new("torque", "N m", -MAX_TORQUE, MAX_TORQUE)]),
     state: &[
-        Channel::new("theta", "rad", -MOST_INITIAL_ANGLE, MOST_INITIAL_ANGLE),
+        Channel::new("theta", "rad", -MAX_INITIAL_ANGLE, MAX_INITIAL_ANGLE),
         Channel::new("theta_velocity", "rad/s", -MAX_SPEED, MAX_SPEED),
     ],
     reward_terms: &[
@@ -64,9 +64,9 @@ const GRAVITY: f64 = 10.0;
 const MAX_SPEED: f64 = 8.0;
 const MAX_TORQUE: f64 = 2.0;
 const STEP_LIMIT: u32 = 200;
-const MOST_INITIAL_ANGLE: f64 = 10_000.0;
-/// The angle is not wrapped: that of an episode that turned all the time; rounded up.
-const MOST_ANGLE: f64 = MOST_INITIAL_ANGLE + (STEP_LIMIT + 1) as f64 * MAX_SPEED * DT;
+const MAX_INITIAL_ANGLE: f64 = 10_000.0;
+/// Limit of the angle, rad, which is not wrapped: the angle after an episode at full speed, rounded up.
+const MAX_ANGLE: f64 = MAX_INITIAL_ANGLE + (STEP_LIMIT + 1) as f64 * MAX_SPEED * DT;
 const UPRIGHT: f64 = PI / 3.0;
 
 /// The rod.
@@ -76,12 +76,12 @@ pub struct Pendulum {
     mass: f64,
     /// Angle from upright, not wrapped, and its velocity.
     state: [f64; 2],
-    /// The torque that led to this state, if a step did. Only pictures show it.
+    /// The torque of the last step, if a step led to this state. Only pictures show it.
     torque: Option<f64>,
 }
 
 impl Pendulum {
-    /// With default parameters, upright.
+    /// Makes a Pendulum with default parameters, upright.
     pub fn new() -> Self {
         let [length, mass] = [0, 1].map(|i: usize| SPEC.parameters[i].default);
         Self { length, mass, state: [0.0; 2], torque: None }
@@ -161,7 +161,7 @@ impl Environment for Pendulum {
     }
 
     fn load(&mut self, state: &[f64]) -> Result<(), Error> {
-        self.state = analytic::load(state, [MOST_ANGLE, MAX_SPEED])?;
+        self.state = analytic::load(state, [MAX_ANGLE, MAX_SPEED])?;
         self.torque = None;
         Ok(())
     }

@@ -40,7 +40,7 @@ fn fall(simulation: &mut Simulation) -> Result<(), Error> {
 }
 
 #[test]
-fn fatal_errors_in_several_threads_at_once_are_returned_and_survived() {
+fn fatal_errors_in_several_threads_are_returned() {
     const THREADS: usize = 4;
     let model = Model::from_xml(SMALL_STACK).unwrap();
     let barrier = Barrier::new(THREADS);

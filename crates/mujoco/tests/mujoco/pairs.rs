@@ -68,7 +68,7 @@ fn robots_step_to_the_same_bytes() {
 }
 
 #[test]
-fn contacts_with_several_geoms_of_the_world_come_in_mujocos_order() {
+fn contacts_with_the_world_come_in_mujocos_order() {
     assert!(simulation(CORNER).has_pairs());
     assert!(compare(CORNER, 4.0) > 1000);
 }

@@ -1,6 +1,6 @@
 //! Pictures. They need OpenGL in software: Debian's libegl1 and libgl1-mesa-dri.
 
-use perturb_mujoco::{Camera, Error, Model, Renderer, View};
+use perturb_mujoco::{Camera, CameraView, Error, Model, Renderer};
 use std::{sync::Barrier, thread};
 
 /// A red ball to the right of, and above, a blue one, before the camera of [`CAMERA`].
@@ -23,10 +23,10 @@ fn pixel(picture: &[u8], (width, x, y): (usize, usize, usize)) -> [u8; 3] {
 }
 
 #[test]
-fn the_first_row_is_the_uppermost_and_every_width_and_height_are_whole() {
+fn first_row_is_the_uppermost_at_every_size() {
     let mut renderer = renderer((100, 100));
     for (width, height) in [(100, 100), (101, 100), (99, 101), (102, 97)] {
-        let picture = renderer.draw(View::Free(CAMERA), (width, height)).unwrap();
+        let picture = renderer.draw(CameraView::Free(CAMERA), (width, height)).unwrap();
         let (width, height) = (usize::from(width), usize::from(height));
         assert_eq!(picture.len(), 3 * width * height);
         let [red, blue] =
@@ -39,25 +39,25 @@ fn the_first_row_is_the_uppermost_and_every_width_and_height_are_whole() {
 #[test]
 fn pictures_follow_the_positions_and_the_camera() {
     let mut renderer = renderer((64, 64));
-    let before = renderer.draw(View::Free(CAMERA), (64, 64)).unwrap();
+    let before = renderer.draw(CameraView::Free(CAMERA), (64, 64)).unwrap();
     renderer.simulation().qpos_mut()[0] = -0.2;
     assert_eq!(
-        renderer.draw(View::Free(CAMERA), (64, 64)).unwrap(),
+        renderer.draw(CameraView::Free(CAMERA), (64, 64)).unwrap(),
         before,
         "nothing was computed from the new position yet"
     );
     renderer.simulation().kinematics().unwrap();
-    assert_ne!(renderer.draw(View::Free(CAMERA), (64, 64)).unwrap(), before);
+    assert_ne!(renderer.draw(CameraView::Free(CAMERA), (64, 64)).unwrap(), before);
     renderer.simulation().qpos_mut()[0] = 0.0;
     renderer.simulation().kinematics().unwrap();
-    assert_eq!(renderer.draw(View::Free(CAMERA), (64, 64)).unwrap(), before);
-    assert_ne!(renderer.draw(View::Free(Camera { azimuth: 80.0, ..CAMERA }), (64, 64)).unwrap(), before);
+    assert_eq!(renderer.draw(CameraView::Free(CAMERA), (64, 64)).unwrap(), before);
+    assert_ne!(renderer.draw(CameraView::Free(Camera { azimuth: 80.0, ..CAMERA }), (64, 64)).unwrap(), before);
 }
 
 #[test]
-fn renderers_on_one_thread_and_on_many_do_not_disturb_each_other() {
+fn renderers_do_not_disturb_each_other() {
     const THREADS: usize = 3;
-    let expected = renderer((80, 60)).draw(View::Free(CAMERA), (80, 60)).unwrap();
+    let expected = renderer((80, 60)).draw(CameraView::Free(CAMERA), (80, 60)).unwrap();
     let barrier = Barrier::new(THREADS);
     thread::scope(|scope| {
         for _ in 0..THREADS {
@@ -66,9 +66,9 @@ fn renderers_on_one_thread_and_on_many_do_not_disturb_each_other() {
                 for size in [(80, 60), (200, 200), (16, 16)] {
                     let (mut one, mut other) = (renderer(size), renderer((80, 60)));
                     for _ in 0..5 {
-                        assert!(one.draw(View::Free(CAMERA), (80, 60)).unwrap() == expected);
-                        one.draw(View::Free(CAMERA), (300, 20)).unwrap();
-                        assert!(other.draw(View::Free(CAMERA), (80, 60)).unwrap() == expected);
+                        assert!(one.draw(CameraView::Free(CAMERA), (80, 60)).unwrap() == expected);
+                        one.draw(CameraView::Free(CAMERA), (300, 20)).unwrap();
+                        assert!(other.draw(CameraView::Free(CAMERA), (80, 60)).unwrap() == expected);
                     }
                 }
             });
@@ -78,6 +78,6 @@ fn renderers_on_one_thread_and_on_many_do_not_disturb_each_other() {
 
 #[test]
 fn what_opengl_cannot_draw_is_an_error() {
-    let error = renderer((16, 16)).draw(View::Free(CAMERA), (u16::MAX, u16::MAX)).unwrap_err();
+    let error = renderer((16, 16)).draw(CameraView::Free(CAMERA), (u16::MAX, u16::MAX)).unwrap_err();
     assert!(matches!(error, Error::Fatal { .. }), "{error}");
 }

@@ -56,7 +56,7 @@ fn throw(simulation: &mut Simulation, number: usize) {
 }
 
 #[test]
-fn states_that_take_turns_in_one_simulation_go_where_each_goes_alone() {
+fn states_in_one_simulation_evolve_as_each_alone() {
     const N: usize = 4;
     let mut alone: Vec<Simulation> = (0..N).map(|_| simulation()).collect();
     let mut shared = simulation();
