@@ -33,6 +33,8 @@ DM_ENV_RPC := $(TARGET)/dm_env_rpc
 GYMNASIUM := $(TARGET)/gymnasium
 # The Python environment with buf, which checks the contract.
 BUF := $(TARGET)/buf
+# The Python environment with the schemas of Kubernetes.
+KUBERNETES := $(TARGET)/kubernetes
 # The site and what builds it.
 DOCS := $(TARGET)/docs
 # What perturb's training is compared with. PUREJAXRL is an address that git can clone, or where GitHub is out of reach the
@@ -92,7 +94,7 @@ endef
 .DEFAULT_GOAL := help
 .PHONY: help deps all-deps opengl toolchain build generate recurrent build-all install install-recurrent demo all-pairs report-check serve-test test slurm-test kill-test \
 	load-test bounds-test attack-test faults-test asan-test qemu-test simulation-test slurm-acceptance lint proto-lint proto-baseline bench fuzz fuzz-keep \
-	bench-peers audit cargo-deny metrics-test otel-test python-test interrupts-test wheel wheel-test python-acceptance \
+	bench-peers audit cargo-deny metrics-test kubernetes-check otel-test python-test interrupts-test wheel wheel-test python-acceptance \
 	bench-python python-venv languages-test docs docs-test docker docker-base docker-test
 
 help: ## this list
@@ -158,6 +160,10 @@ serve-test: build opengl ## watch a training and an experiment on the live page 
 metrics-test: build opengl ## have a Prometheus, which it installs, watch a server, and ask it for all that Grafana's dashboard shows
 	@$(call install,prometheus python3)
 	python3 docker/grafana/check.py $(PROGRAMS)
+
+kubernetes-check: $(KUBERNETES)/installed ## check the Kubernetes manifests against Kubernetes' schemas and the server's documents
+	@$(call install,prometheus)
+	$(KUBERNETES)/bin/python docker/kubernetes/check.py
 
 otel-test: all-deps ## build the server with traces, and test that they come to a collector
 	cargo test $(ALL) --features perturb/otel --test server traces::
@@ -247,8 +253,8 @@ python-test interrupts-test wheel python-acceptance bench-python: export PERTURB
 
 python-test: $(VENV)/installed opengl ## lint, type-check and test the Python package
 	cd python && $(abspath $(VENV))/bin/ruff check . && $(abspath $(VENV))/bin/ruff format --check .
-	$(VENV)/bin/ruff check --config python/pyproject.toml benches/peers docker/grafana
-	$(VENV)/bin/ruff format --check --config python/pyproject.toml benches/peers docker/grafana
+	$(VENV)/bin/ruff check --config python/pyproject.toml benches/peers docker/grafana docker/kubernetes
+	$(VENV)/bin/ruff format --check --config python/pyproject.toml benches/peers docker/grafana docker/kubernetes
 	cd python && $(abspath $(VENV))/bin/mypy
 	cd python && $(abspath $(VENV))/bin/pytest -q
 
@@ -324,6 +330,11 @@ $(DM_ENV_RPC)/installed: tests/server/dm_env_rpc/requirements.txt | python-venv
 $(GYMNASIUM)/installed: tests/server/folder/requirements.txt | python-venv
 	python3 -m venv $(GYMNASIUM)/venv
 	$(GYMNASIUM)/venv/bin/pip install -q --disable-pip-version-check --no-deps --upgrade --target $(GYMNASIUM) -r $<
+	touch $@
+
+$(KUBERNETES)/installed: docker/kubernetes/requirements.txt | python-venv
+	python3 -m venv $(KUBERNETES)
+	$(KUBERNETES)/bin/pip install -q --disable-pip-version-check -r $<
 	touch $@
 
 $(BUF)/installed: proto/requirements.txt | python-venv
