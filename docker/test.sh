@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Runs a small experiment with compose.yaml twice: on one server with one learner, and on two servers with three
-# learners, of which one server is stopped in mid-run. Both must end with the same report. Needs the two images, which
-# `make docker` builds.
+# learners, of which one server is stopped in mid-run. Both must end with the same report. Then runs one over two tasks from
+# a mounted folder. Needs the two images, which `make docker` builds.
 set -euo pipefail
 cd "$(dirname "$0")"
 
@@ -100,4 +100,26 @@ for result in "$work"/runs/whole/cells/*/result.json; do
     cmp "$result" "${result/whole/broken}" || fail "results differ"
 done
 say "the report, its tables and all results are the same bytes as without the stop"
+compose down --timeout 2 >/dev/null 2>&1
+
+cat >"$work/runs/plan.toml" <<'PLAN'
+environments = ["ReachingArm", "Quadruped"]
+versions = ["D", "R"]
+test_episodes = 20
+settings = { episodes = 40, num_envs = 4 }
+[[algorithm]]
+name = "ppo"
+architectures = ["ff"]
+PLAN
+begun=$SECONDS
+PERTURB_TASKS=$(realpath ../examples/tasks)
+export PERTURB_NAME=tasks PERTURB_TASKS PERTURB_TASK_FOLDERS=/tasks/reaching_arm,/tasks/quadruped
+files+=(--file tasks.yaml)
+compose up --detach --no-build --scale server=2 --scale learner=2 >/dev/null 2>&1
+say "two servers with two task folders, two learners"
+learners_end
+[ "$(results tasks)" = 4 ] || fail "$(results tasks) of 4 cells have a result"
+hashes=$(grep -ho '"model_hash": *"[0-9a-f]*"' "$work"/runs/tasks/cells/*/result.json | sort -u | wc -l)
+[ "$hashes" = 2 ] || fail "results of two tasks have $hashes model hashes"
+say "all cells of both tasks are done"
 echo "docker-test passed"

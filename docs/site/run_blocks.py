@@ -23,7 +23,13 @@ import time
 import traceback
 from pathlib import Path
 
-PAGES = ["README.md", "docs/index.md", *sorted(map(str, Path("docs/tutorials").glob("*.md"))), "docs/checkpoints.md"]
+PAGES = [
+    "README.md",
+    "docs/index.md",
+    *sorted(map(str, Path("docs/tutorials").glob("*.md"))),
+    "docs/checkpoints.md",
+    "docs/coming-from.md",
+]
 BLOCK = re.compile(r"^(?:<!-- not run: (.*?) -->\n)?```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 

@@ -8,7 +8,7 @@ use std::process::ExitCode;
 
 use serde_json::{Value, json};
 
-use perturb_experiment::Folder;
+use perturb_experiment::{Folder, Plan};
 use perturb_files as files;
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::Checkpoint;
@@ -16,14 +16,17 @@ use perturb_learner::client::Servers;
 use perturb_learner::evaluation::{Audit, audit};
 use perturb_records::{ExternalEvaluation, FILE, Records};
 
-use super::args::AuditArgs;
+use super::args::{AuditArgs, ServerArgs};
 use super::display::{Display, say};
 use super::error::{CommandError, Result, system};
 use super::rescore::records_file;
-use super::{plan_in, reconnecting_servers};
+use super::{plan_in, reconnecting_servers, with_tasks_of};
 
 /// Maximum number of printed differences of each policy.
 const MAX_SHOWN: usize = 3;
+
+/// Number of folders from that of a cell up to that of its experiment.
+const MAX_DEPTH: usize = 3;
 
 /// Recorded episodes and their policy.
 #[derive(Clone)]
@@ -40,7 +43,7 @@ pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
         return ledgers::prove(args, &policies);
     }
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let servers = reconnecting_servers(&args.server, args.wait)?;
+    let servers = reconnecting_servers(&server_args(args)?, args.wait)?;
     let max_episodes = if args.all { usize::MAX } else { args.episodes };
     let mut audits = Vec::new();
     for policy in &policies {
@@ -64,6 +67,16 @@ pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
         writeln!(std::io::stdout(), "{same} of {replayed} episodes of {count} have the same bytes")?;
     }
     Ok(if different == 0 && finished().count() == policies.len() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// Returns the servers' arguments. Records of an experiment or of its cells need the tasks of its plan.
+fn server_args(args: &AuditArgs) -> Result<ServerArgs> {
+    let path = std::path::absolute(&args.dir).map_err(system("find the absolute path of the records"))?;
+    let mut folders = path.ancestors().take(MAX_DEPTH).map(|path| Folder::new(path).plan_path());
+    match folders.find(|plan| plan.is_file()) {
+        Some(plan) => with_tasks_of(&args.server, &Plan::load(&plan)?),
+        None => Ok(args.server.clone()),
+    }
 }
 
 /// Result of a policy, or the reason why its episodes could not be replayed.

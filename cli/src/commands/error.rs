@@ -11,6 +11,7 @@ use perturb_learner::client::ClientError;
 use perturb_learner::evaluation::{AuditError, HeatmapError, TestError};
 use perturb_learner::measure::MeasureError;
 use perturb_learner::training::{RunDirectoryError, TrainError};
+use perturb_protocol::names::UnknownEnvironment;
 use perturb_records::{ExternalEvaluationError, RecordsError};
 use perturb_report::ReportError;
 use perturb_report::plot::PlotError;
@@ -43,7 +44,7 @@ pub(super) enum CommandError {
     Audit(#[from] AuditError),
     #[error("{}", with_searched_folders(.0))]
     Checkpoint(#[from] CheckpointError),
-    #[error(transparent)]
+    #[error("{}", with_task_hint(.0))]
     Client(#[from] ClientError),
     #[error(transparent)]
     Config(#[from] ConfigError),
@@ -120,7 +121,7 @@ impl CommandError {
             | Self::Checkpoint(CheckpointError::Missing { .. } | CheckpointError::Several { .. })
             | Self::Records(RecordsError::Missing { .. } | RecordsError::Other { .. })
             | Self::Audit(AuditError::Policy { .. })
-            | Self::Folder(FolderError::NoPlan { .. })
+            | Self::Folder(FolderError::NoPlan { .. } | FolderError::OtherModel { .. })
             | Self::Slurm(SlurmError::NotInstalled { .. })
             | Self::Video(VideoError::Extension { .. } | VideoError::NoFfmpeg { .. })
             | Self::Test(TestError::Value(_))
@@ -158,6 +159,16 @@ fn with_searched_folders(error: &CheckpointError) -> String {
     }
 }
 
+/// Adds how a task of a folder is served to the error about an unknown environment.
+fn with_task_hint(error: &ClientError) -> String {
+    match error {
+        ClientError::NoEnvironment(UnknownEnvironment::Name { .. }) => {
+            format!("{error}; a task of a folder needs --task DIR, here or at the server")
+        }
+        _ => error.to_string(),
+    }
+}
+
 /// Makes an error of an operating system call. `action` completes the sentence "cannot …".
 pub(super) fn system(action: &'static str) -> impl FnOnce(std::io::Error) -> CommandError {
     move |source| CommandError::System { action, source }
@@ -175,6 +186,8 @@ fn is_wrong_server(error: &ClientError) -> bool {
             | ClientError::NoEnvironment(_)
             | ClientError::NoParameters { .. }
             | ClientError::Disagreement { .. }
+            | ClientError::Models { .. }
+            | ClientError::Tasks { .. }
     )
 }
 

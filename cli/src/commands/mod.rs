@@ -116,10 +116,10 @@ fn signal_code(number: i32) -> ExitCode {
 
 /// Connects to the servers that were named, or starts a private one.
 fn servers(args: &ServerArgs) -> Result<Servers> {
+    check_server_args(args)?;
     let servers = if args.server.is_empty() {
-        Servers::local(args.workers)?
+        Servers::local(args.workers, &args.task)?
     } else {
-        refuse_workers(args)?;
         Servers::connect(&args.server)?
     };
     let kind = if args.server.is_empty() { "a private server" } else { "a server given by --server" };
@@ -136,12 +136,12 @@ fn reconnecting_servers(args: &ServerArgs, wait: WaitArgs) -> Result<Servers> {
 /// private one for each process. A server's single transport thread serves all its clients, so processes with short
 /// steps would wait for each other.
 fn servers_of_jobs(args: &ServerArgs, jobs: usize) -> Result<(Vec<PrivateServer>, Vec<Address>)> {
+    check_server_args(args)?;
     if !args.server.is_empty() {
-        refuse_workers(args)?;
         return Ok((Vec::new(), args.server.clone()));
     }
     let workers = args.workers.unwrap_or_else(|| workers_of_each(jobs, cores()));
-    let start = |_| PrivateServer::start(Some(workers));
+    let start = |_| PrivateServer::start_with_tasks(Some(workers), &args.task);
     let servers = (0..jobs.max(1)).map(start).collect::<std::result::Result<Vec<_>, _>>()?;
     let addresses = servers.iter().map(|server| server.address().clone()).collect();
     Ok((servers, addresses))
@@ -165,6 +165,11 @@ fn playing_servers(args: &PlayArgs) -> Result<Servers> {
 /// Returns the plan of an experiment's folder, with the cells that its tuning has selected so far.
 fn plan_in(folder: &Folder) -> Result<Plan> {
     Ok(Plan::load(&folder.require_plan()?)?.with_selected_cells(folder)?)
+}
+
+/// Refuses servers whose models are others than those of the results in `folder`.
+fn check_models(servers: &Servers, plan: &Plan, folder: &Folder) -> Result<()> {
+    plan.environments().into_iter().try_for_each(|name| Ok(folder.check_model(plan, &servers.environment(name)?)?))
 }
 
 /// Refuses a missing file and a folder, with a remedy. Pipes are accepted.
@@ -212,13 +217,46 @@ fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 
-/// Refuses --workers together with --server, because running servers have their threads already.
-fn refuse_workers(args: &ServerArgs) -> Result<()> {
-    if args.workers.is_some() {
-        let message = "--workers is for a private server; give it to perturb-server instead";
-        return Err(CommandError::Usage(message.into()));
+/// Refuses options of private servers together with --server, and folders that are none of a task.
+fn check_server_args(args: &ServerArgs) -> Result<()> {
+    if !args.server.is_empty() {
+        let given = [(args.workers.is_some(), "--workers"), (!args.task.is_empty(), "--task")];
+        return match given.iter().find(|(is_given, _)| *is_given) {
+            Some((_, option)) => {
+                let message = format!("{option} is for a private server; give it to perturb-server instead");
+                Err(CommandError::Usage(message))
+            }
+            None => Ok(()),
+        };
+    }
+    for folder in &args.task {
+        let wrong = match folder.join("task.toml").is_file() {
+            true => continue,
+            false if folder.is_dir() => "has no file task.toml",
+            false if folder.exists() => "is no folder",
+            false => "does not exist",
+        };
+        return Err(CommandError::Usage(format!(
+            "--task {} {wrong}: give the folder of a task, which docs/tasks.md describes",
+            folder.display()
+        )));
     }
     Ok(())
+}
+
+/// Returns the servers' arguments with the folders of tasks that `plan` names, unless --task or --server replaces them.
+fn with_tasks_of(args: &ServerArgs, plan: &Plan) -> Result<ServerArgs> {
+    if !args.server.is_empty() || !args.task.is_empty() {
+        return Ok(args.clone());
+    }
+    let missing = plan.tasks.iter().find(|folder| !folder.join("task.toml").is_file());
+    match missing {
+        None => Ok(ServerArgs { task: plan.tasks.clone(), ..args.clone() }),
+        Some(folder) => Err(CommandError::Usage(format!(
+            "the experiment's tasks name {}, which has no file task.toml: bring the folder back, or give --task DIR",
+            folder.display()
+        ))),
+    }
 }
 
 #[cfg(test)]

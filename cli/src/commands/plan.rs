@@ -15,7 +15,7 @@ use serde_json::json;
 
 use super::args::PlanArgs;
 use super::error::{CommandError, Result, system};
-use super::{cores, load_plan, recurrent, servers_of_jobs};
+use super::{cores, load_plan, recurrent, servers_of_jobs, with_tasks_of};
 
 pub(super) fn run(args: &PlanArgs) -> Result<()> {
     let plan = load_plan(&args.file)?;
@@ -53,7 +53,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     let groups = known.groups(&all, grouping);
     let groups_shown = groups_line(&groups, grouping);
     let grouping = Grouping { at_a_time: grouping.at_a_time.min(groups.len()), ..grouping };
-    let (_private, addresses) = servers_of_jobs(&args.server, grouping.at_a_time)?;
+    let (_private, addresses) = servers_of_jobs(&with_tasks_of(&args.server, &plan)?, grouping.at_a_time)?;
     // The run itself reports servers that do not answer.
     let (servers, _) = Servers::connect_to_some(&addresses)?;
     let limits = step_limits(&servers, &known)?;

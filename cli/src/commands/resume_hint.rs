@@ -5,13 +5,18 @@ use std::path::Path;
 use perturb_learner::training::{LastCheckpoint, TrainError};
 use perturb_text::quoted;
 
-use super::args::{PlayArgs, WaitArgs};
+use super::args::{PlayArgs, ServerArgs, WaitArgs};
 use super::error::CommandError;
 
 /// Returns the command line of this process.
 pub(super) fn this_command() -> String {
     let words = std::env::args_os().skip(1).map(quoted);
     ["perturb".to_owned()].into_iter().chain(words).collect::<Vec<_>>().join(" ")
+}
+
+/// Returns the options `--task` of a command, for another command with the same environments; empty without any.
+pub(super) fn task_options(server: &ServerArgs) -> String {
+    server.task.iter().map(|task| format!(" --task {}", quoted(task))).collect()
 }
 
 /// Returns the command that resumes the run in `path` with the same servers.
@@ -21,6 +26,7 @@ pub(super) fn resume_command(path: &Path, play: &PlayArgs) -> String {
     if !servers.is_empty() {
         command += &format!(" --server {}", quoted(servers.join(",")));
     }
+    command += &task_options(&play.server);
     if play.act == "client" {
         command += " --act client";
     }
@@ -45,12 +51,15 @@ pub(super) fn with_resume_command(error: TrainError, play: &PlayArgs) -> Command
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::commands::args::ServerArgs;
 
     #[test]
     fn the_command_has_the_same_servers() {
         let play = |servers: &[&str], act: &str| PlayArgs {
-            server: ServerArgs { server: servers.iter().map(|text| text.parse().unwrap()).collect(), workers: None },
+            server: ServerArgs {
+                server: servers.iter().map(|text| text.parse().unwrap()).collect(),
+                workers: None,
+                task: Vec::new(),
+            },
             act: act.into(),
             wait: WaitArgs { server_wait: WaitArgs::DEFAULT_SECONDS },
         };
@@ -59,5 +68,9 @@ mod tests {
             resume_command(Path::new("my runs/a"), &play(&["unix:/x", "h:7"], "client")),
             "perturb train --resume 'my runs/a' --server 'unix:/x,http://h:7' --act client"
         );
+        let mut with_task = play(&[], "server");
+        with_task.server.task = vec!["my robot".into()];
+        let command = resume_command(Path::new("runs/a"), &with_task);
+        assert_eq!(command, "perturb train --resume runs/a --task 'my robot'");
     }
 }

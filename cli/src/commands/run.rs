@@ -23,7 +23,7 @@ use super::cells::PlanRunner;
 use super::display::{is_quiet, note, say};
 use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
-use super::{cores, load_plan, recurrent, refuse_file, servers_of_jobs, slurm};
+use super::{check_models, cores, load_plan, recurrent, refuse_file, servers_of_jobs, slurm, with_tasks_of};
 
 /// Time of measurement for each group of trainings.
 const MEASURE_TIME: Duration = Duration::from_secs(1);
@@ -131,11 +131,12 @@ fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Re
     recurrent::prepare_for(&plan)?;
     let grouping = Grouping { max_cells: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
     let unfinished = unfinished_cells(args, &plan.with_expected_cells(Some(folder))?, folder).len();
-    let (local, addresses) = servers_of_jobs(&args.server, grouping.at_a_time.min(unfinished))?;
+    let (local, addresses) = servers_of_jobs(&with_tasks_of(&args.server, &plan)?, grouping.at_a_time.min(unfinished))?;
     let local: Vec<Mutex<PrivateServer>> = local.into_iter().map(Mutex::new).collect();
     let (servers, errors) = Servers::connect_to_some(&addresses)?;
     errors.iter().for_each(|error| say(format_args!("perturb: {error}; continuing with the other servers")));
     step_limits(&servers, &plan)?;
+    check_models(&servers, &plan, folder)?;
     let addresses: Vec<String> = addresses.iter().map(Address::to_string).collect();
     let command = |worker_index: usize| match local.len() {
         0 => worker_command(args, folder, &addresses.join(",")),

@@ -1,5 +1,6 @@
 //! `perturb run --engine slurm`.
 
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -15,7 +16,7 @@ use super::cells::PlanRunner;
 use super::display::note;
 use super::error::{Result, system};
 use super::plan::step_limits;
-use super::{recurrent, refuse_workers, servers_of_jobs};
+use super::{check_models, check_server_args, recurrent, servers_of_jobs, with_tasks_of};
 
 /// Time of measurement for each group of trainings.
 const MEASURE_TIME: Duration = Duration::from_secs(2);
@@ -27,15 +28,23 @@ pub(super) fn run(args: &RunArgs, plan: Plan, stop: &StopFlag) -> Result<ExitCod
     recurrent::prepare_for(&plan)?;
     let path = std::path::absolute(&args.out).map_err(system("find the absolute path of --out"))?;
     let folder = Folder::new(&path);
-    let options = options(args)?;
+    check_server_args(&args.server)?;
+    // Also beside --server: the private servers that check the plan here need the tasks, too.
+    let ServerArgs { task, .. } = with_tasks_of(&ServerArgs { server: Vec::new(), ..args.server.clone() }, &plan)?;
+    let absolute = |folder: &PathBuf| std::path::absolute(folder).map_err(system("find the absolute path of --task"));
+    let tasks = task.iter().map(absolute).collect::<Result<Vec<_>>>()?;
+    let options = options(args, tasks.clone())?;
     options.check(&path)?;
     let slurm = Slurm::default();
     slurm.check(stop)?;
     // Environments and durations are checked here with private servers like those of a job, because the servers that
     // jobs share may be unreachable from this machine.
-    step_limits(&Servers::local(args.server.workers)?, &plan)?;
+    let checking = Servers::local(args.server.workers, &tasks)?;
+    step_limits(&checking, &plan)?;
+    check_models(&checking, &plan, &folder)?;
+    drop(checking);
     let grouping = Grouping { max_cells: args.group, at_a_time: options.task.jobs };
-    let job_servers = ServerArgs { server: Vec::new(), workers: Some(options.task.workers) };
+    let job_servers = ServerArgs { server: Vec::new(), workers: Some(options.task.workers), task: tasks };
     let mut runner = PlanRunner::begin(args, plan, &folder, stop)?;
     while let Some(plan) = runner.next_round()? {
         let costs = || {
@@ -48,17 +57,15 @@ pub(super) fn run(args: &RunArgs, plan: Plan, stop: &StopFlag) -> Result<ExitCod
     runner.finish()
 }
 
-fn options(args: &RunArgs) -> Result<SlurmOptions> {
+fn options(args: &RunArgs, tasks: Vec<PathBuf>) -> Result<SlurmOptions> {
     let named = &args.server.server;
-    if !named.is_empty() {
-        refuse_workers(&args.server)?;
-    }
     let jobs = args.jobs.unwrap_or(1);
     let task = JobCommand {
         program: recurrent::perturb_program()?,
         jobs,
         group: args.group,
         workers: args.server.workers.unwrap_or(1),
+        tasks,
         servers: named.iter().map(Address::to_string).collect(),
         server_wait: args.wait.server_wait,
     };

@@ -20,4 +20,5 @@ mod servers;
 mod sets;
 mod silence;
 mod slurm;
+mod tasks;
 mod video;

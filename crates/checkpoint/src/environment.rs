@@ -27,11 +27,21 @@ pub struct EnvironmentSummary {
     pub model_hash: String,
 }
 
+/// The name of the property that is the hash of a model.
+const MODEL: &str = "model";
+
+/// Returns how to mend a difference in the property `what`, as the beginning of a sentence's last part; empty unless the files
+/// of a task's folder may have changed.
+pub fn task_remedy(what: &str) -> &'static str {
+    if what == MODEL { "for a task of a folder serve its files as they were; otherwise " } else { "" }
+}
+
 /// An environment is no longer what a policy was trained in.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "the checkpoint was trained in {environment} with {what} {trained}, the server's has {served}: test with the version \
-     of perturb that trained it, or train again"
+    "the checkpoint was trained in {environment} with {what} {trained}, the server's has {served}: {}test with the version \
+     of perturb that trained it, or train again",
+    task_remedy(what)
 )]
 pub struct Changed {
     /// The environment.
@@ -70,7 +80,7 @@ impl EnvironmentSummary {
         };
         match (self, served) {
             (a, b) if a.revision != b.revision => both("revision", &a.revision, &b.revision),
-            (a, b) if a.model_hash != b.model_hash => both("model", &a.model_hash, &b.model_hash),
+            (a, b) if a.model_hash != b.model_hash => both(MODEL, &a.model_hash, &b.model_hash),
             (a, b) if a.observation != b.observation => both("observations", &a.observation, &b.observation),
             (a, b) if a.action != b.action => both("actions", &a.action, &b.action),
             (a, b) if a.parameters != b.parameters => both("parameters", &a.parameters, &b.parameters),

@@ -24,7 +24,7 @@ use serde::{Deserialize, Serialize};
 pub use self::arrays::{Array, Arrays, encode};
 use self::arrays::{decode_weights, encode_weights};
 pub use self::counters::Counters;
-pub use self::environment::{Changed, EnvironmentSummary};
+pub use self::environment::{Changed, EnvironmentSummary, task_remedy};
 use self::files::remove_others;
 pub use self::files::{ArraysFile, damaged};
 

@@ -23,7 +23,7 @@ use std::path::{Path, PathBuf};
 use perturb_checkpoint::Counters;
 use perturb_files::checksum::WithChecksum;
 use perturb_files::{self as files, FileError, Lock, checksum, write_atomically};
-use perturb_protocol::Version;
+use perturb_protocol::{Version, proto};
 use perturb_records::{ParameterCheck, TestResult};
 use perturb_settings::Method;
 use serde::de::DeserializeOwned;
@@ -183,6 +183,18 @@ pub enum FolderError {
         /// The fault.
         reason: String,
     },
+    /// A result is of another model than the servers have.
+    #[error(
+        "cell {cell} was trained in {environment} with the model {trained}, the server's has {served}: serve the task's \
+         files as they were, or give another --out"
+    )]
+    OtherModel { cell: String, environment: String, trained: String, served: String },
+    /// Results of one environment are of different models.
+    #[error(
+        "cells {cells:?} were trained in {environment} with different models, {hashes:?}, so their results cannot be \
+         compared: delete those of one model, and have them done again"
+    )]
+    Models { environment: String, cells: [String; 2], hashes: [String; 2] },
     /// There is no experiment.
     #[error("{} holds no experiment: expected plan.toml in it; give the --out of `perturb run`", path.display())]
     NoPlan { path: PathBuf },
@@ -234,6 +246,33 @@ impl Folder {
             }
         }
         Ok(earlier.is_some() && !same)
+    }
+
+    /// Refuses an environment whose model is another one than that of the plan's first result in it. The other results
+    /// have the model of the first: [`Results::read`](crate::Results::read) refuses a mixture.
+    ///
+    /// # Errors
+    /// [`FolderError::OtherModel`], and those of [`CellFolder::state`].
+    pub fn check_model(&self, plan: &Plan, environment: &proto::Environment) -> Result<()> {
+        for cell in plan.cells.iter().filter(|cell| cell.config.common.environment == environment.name) {
+            let place = self.cell(&cell.id);
+            if !place.is_settled(false) {
+                continue;
+            }
+            let CellState::Done(result) = place.state()? else { continue };
+            let trained = result.training.model_hash;
+            if trained == environment.model_hash {
+                return Ok(());
+            }
+            let served = environment.model_hash.clone();
+            return Err(FolderError::OtherModel {
+                cell: result.id,
+                environment: environment.name.clone(),
+                trained,
+                served,
+            });
+        }
+        Ok(())
     }
 
     /// Returns the failure records by the cells' ids, also of cells that are in no plan.

@@ -86,10 +86,29 @@ impl<'a> Results<'a> {
     /// Reads all cells of `plan`, see [`Plan::with_selected_cells`], in `folder`.
     ///
     /// # Errors
-    /// [`FolderError`] if a file is there that cannot be read.
+    /// [`FolderError`] if a file is there that cannot be read, or if results of an environment are of different models.
     pub fn read(plan: &'a Plan, folder: &Folder) -> Result<Self, FolderError> {
         let states = plan.cells.iter().map(|cell| folder.state(cell)).collect::<Result<_, _>>()?;
-        Ok(Self { plan, states })
+        let results = Self { plan, states };
+        results.check_models()?;
+        Ok(results)
+    }
+
+    /// Refuses results of one environment with different models.
+    fn check_models(&self) -> Result<(), FolderError> {
+        let mut first: BTreeMap<&str, &CellResult> = BTreeMap::new();
+        for result in self.done() {
+            let training = &result.training;
+            let known = first.entry(&training.environment).or_insert(result);
+            if known.training.model_hash != training.model_hash {
+                return Err(FolderError::Models {
+                    environment: training.environment.clone(),
+                    cells: [known.id.clone(), result.id.clone()],
+                    hashes: [known.training.model_hash.clone(), training.model_hash.clone()],
+                });
+            }
+        }
+        Ok(())
     }
 
     /// Returns the results in the plan's order.

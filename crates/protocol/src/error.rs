@@ -58,6 +58,12 @@ pub enum ClientError {
     /// Servers of one run must serve the same environment.
     #[error("the servers at {first} and {other} describe {environment} differently: run one version of perturb-server")]
     Disagreement { first: Address, other: Address, environment: String },
+    /// Servers of one run must serve the same model.
+    #[error(
+        "the servers at {first} and {other} have different models of {environment}, with the hashes {hashes:?}: give both \
+         the same files of the task, and restart them"
+    )]
+    Models { first: Address, other: Address, environment: String, hashes: [String; 2] },
     /// The server has no such environment.
     #[error(transparent)]
     NoEnvironment(#[from] UnknownEnvironment),
@@ -82,6 +88,12 @@ pub enum ClientError {
     /// The private server did not start.
     #[error("the private server {} did not start: {reason}", program.display())]
     Start { program: PathBuf, reason: String },
+    /// The private server refused folders of tasks.
+    #[error(
+        "perturb-server refused a task of {}, for the reason above; `perturb-server --task DIR --check` checks a folder",
+        list(tasks)
+    )]
+    Tasks { tasks: Vec<PathBuf> },
     /// The operating system refused something that a client needs.
     #[error("cannot {action}: {source}")]
     System { action: &'static str, source: std::io::Error },
@@ -110,7 +122,7 @@ impl ClientError {
     pub fn can_be_retried(&self) -> bool {
         match self {
             Self::Refused { code, .. } => *code == Code::ResourceExhausted, // full until other sessions end
-            Self::Snapshots { .. } | Self::NoEnvironment(_) | Self::Unsafe { .. } => false,
+            Self::Snapshots { .. } | Self::NoEnvironment(_) | Self::Unsafe { .. } | Self::Tasks { .. } => false,
             Self::Connect { .. }
             | Self::NotPerturb { .. } // a name may resolve to another machine later
             | Self::NoneConnects { .. }
@@ -118,6 +130,7 @@ impl ClientError {
             | Self::TimedOut { .. }
             | Self::Protocol { .. } // a server of another version
             | Self::Disagreement { .. }
+            | Self::Models { .. }
             | Self::NoParameters { .. } // a server of another version
             | Self::NoServerProgram { .. }
             | Self::Start { .. }
@@ -143,6 +156,11 @@ impl ClientError {
             _ => false,
         }
     }
+}
+
+/// Paths, separated by commas.
+fn list(paths: &[PathBuf]) -> String {
+    paths.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
 }
 
 /// The time of an error: "during a step", "when it was to save a player".

@@ -21,6 +21,10 @@ const PROGRAM: &str = "perturb-server";
 const VARIABLE: &str = "PERTURB_SERVER";
 /// Timeout of a start.
 const START_TIMEOUT: Duration = Duration::from_secs(20);
+/// Additional timeout of a start for each task folder, which the server first loads in a process of its own.
+const TASK_TIMEOUT: Duration = Duration::from_secs(120);
+/// Exit status of a server that refused its settings.
+const REFUSED_STATUS: i32 = 2;
 /// Time that a server has to end before it is killed.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(5);
 /// Time to wait for a server's last lines after its end.
@@ -38,6 +42,8 @@ pub struct PrivateServer {
     process: Process,
     address: Address,
     workers: Option<usize>,
+    /// Folders of tasks that it serves beside the built-in environments.
+    tasks: Vec<PathBuf>,
     /// The directory of the socket, which only its owner may enter.
     directory: TempDir,
 }
@@ -50,6 +56,15 @@ impl PrivateServer {
     /// [`ClientError::NoServerProgram`] if the program is missing, [`ClientError::Start`] if it ends or does not listen within
     /// 20 s.
     pub fn start(workers: Option<usize>) -> Result<Self, ClientError> {
+        Self::start_with_tasks(workers, &[])
+    }
+
+    /// Starts a server like [`PrivateServer::start`] that also serves the tasks in the folders `tasks`.
+    ///
+    /// # Errors
+    /// Those of [`PrivateServer::start`], with two more minutes for each folder; [`ClientError::Tasks`] if the server refuses a
+    /// folder, after it wrote the reason to standard error.
+    pub fn start_with_tasks(workers: Option<usize>, tasks: &[PathBuf]) -> Result<Self, ClientError> {
         let program = find_program()?;
         let system = |action| move |source| ClientError::System { action, source };
         let directory =
@@ -68,8 +83,8 @@ impl PrivateServer {
                 ),
             })?;
 
-        let process = spawn(&program, &address, workers)?;
-        Ok(Self { process, address, workers, directory })
+        let process = spawn(&program, &address, workers, tasks)?;
+        Ok(Self { process, address, workers, tasks: tasks.to_vec(), directory })
     }
 
     /// Passes every line that servers started from now on write to standard error to `handler`. Without it they write to this
@@ -87,7 +102,7 @@ impl PrivateServer {
         self.process.end();
         let again = |source| ClientError::System { action: "create the server's private directory again", source };
         own_directory(self.directory.path()).map_err(again)?;
-        self.process = spawn(&find_program()?, &self.address, self.workers)?;
+        self.process = spawn(&find_program()?, &self.address, self.workers, &self.tasks)?;
         Ok(())
     }
 
@@ -131,6 +146,11 @@ impl Process {
         self.kill();
     }
 
+    /// The exit status as a number; `None` while the process runs, or after a signal.
+    fn exit_code(&mut self) -> Option<i32> {
+        self.child.try_wait().ok().flatten().and_then(|status| status.code())
+    }
+
     fn kill(&mut self) {
         // An error means that it has ended.
         let _ = self.child.kill();
@@ -154,11 +174,14 @@ fn own_directory(path: &Path) -> std::io::Result<()> {
 }
 
 /// Starts `program`, and waits until it listens.
-fn spawn(program: &Path, address: &Address, workers: Option<usize>) -> Result<Process, ClientError> {
+fn spawn(program: &Path, address: &Address, workers: Option<usize>, tasks: &[PathBuf]) -> Result<Process, ClientError> {
     let mut command = Command::new(program);
     command.arg("--listen").arg(address.to_string()).args(["--private", "--log", "warn"]);
     if let Some(workers) = workers {
         command.args(["--workers", &workers.to_string()]);
+    }
+    for task in tasks {
+        command.arg("--task").arg(task);
     }
     let fail = |reason| ClientError::Start { program: program.to_owned(), reason };
     let mut child = command
@@ -173,13 +196,19 @@ fn spawn(program: &Path, address: &Address, workers: Option<usize>) -> Result<Pr
         thread::spawn(move || forward_stderr(stderr, handler, &sender));
         done
     });
-    let ready = wait_until_ready(&mut child);
+    let timeout = START_TIMEOUT + TASK_TIMEOUT * u32::try_from(tasks.len()).unwrap_or(u32::MAX);
+    let ready = wait_until_ready(&mut child, timeout);
     let mut process = Process { child, stderr_done };
     match ready {
         Ok(()) => Ok(process),
         Err(reason) => {
+            let is_refusal = process.exit_code() == Some(REFUSED_STATUS);
             process.kill();
-            Err(fail(reason))
+            Err(if is_refusal && !tasks.is_empty() {
+                ClientError::Tasks { tasks: tasks.to_vec() }
+            } else {
+                fail(reason)
+            })
         }
     }
 }
@@ -193,15 +222,15 @@ fn forward_stderr(stderr: ChildStderr, handler: &fn(String), _done: &Sender<()>)
 }
 
 /// Waits until `child` prints that it listens.
-fn wait_until_ready(child: &mut Child) -> Result<(), String> {
+fn wait_until_ready(child: &mut Child, timeout: Duration) -> Result<(), String> {
     let lines = child.stdout.take().map(read_lines).ok_or("its output cannot be read")?;
-    let deadline = Instant::now() + START_TIMEOUT;
+    let deadline = Instant::now() + timeout;
     loop {
         match lines.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
             Ok(line) if line.starts_with("listening on ") => return Ok(()),
             Ok(_) => {}
             Err(RecvTimeoutError::Timeout) => {
-                return Err(format!("it did not listen within {} s", START_TIMEOUT.as_secs()));
+                return Err(format!("it did not listen within {} s", timeout.as_secs()));
             }
             Err(RecvTimeoutError::Disconnected) => {
                 let status = child.wait().map_or_else(|error| error.to_string(), |status| status.to_string());

@@ -7,6 +7,7 @@ use perturb_experiment::scheduler::CellEvent;
 use perturb_experiment::{Cell, CellFolder, CellResult, IntermediateEvaluation, Tests, Training};
 use perturb_files::interrupt::StopFlag;
 use perturb_protocol::Distribution;
+use perturb_records::paper::ENVIRONMENTS;
 use perturb_records::{RecordedTest, Records, TestResult};
 use perturb_settings::sets::{Parameters, TestSet};
 
@@ -109,7 +110,8 @@ fn parameters(parameters: &Parameters) -> String {
     texts.collect::<Vec<_>>().join(" ")
 }
 
-/// The command that reproduces a cell's numbers without the plan.
+/// The command that reproduces a cell's numbers without the plan. RUN and TASK stand for the folders of the run and, unless
+/// the environment is built in, of the task.
 fn command(cell: &Cell) -> String {
     let common = &cell.config.common;
     let mut text = format!(
@@ -121,6 +123,8 @@ fn command(cell: &Cell) -> String {
         common.episodes,
         common.seed
     );
+    let task = if ENVIRONMENTS.contains(&common.environment.as_str()) { "" } else { " --task TASK" };
+    text += task;
     if !common.parameters.is_empty() {
         let _ = write!(text, " --parameters {}", parameters(&common.parameters));
     }
@@ -132,7 +136,7 @@ fn command(cell: &Cell) -> String {
     let Tests { episodes, sets, success, .. } = &cell.tests;
     let success = success.as_ref().map(|threshold| format!(" --success {threshold}")).unwrap_or_default();
     let mut evaluate = |how: String, episodes: u64| {
-        let _ = write!(text, " && perturb evaluate --checkpoint RUN {how} --episodes {episodes}{success}");
+        let _ = write!(text, " && perturb evaluate --checkpoint RUN {how} --episodes {episodes}{success}{task}");
     };
     let versions: Vec<String> = sets.iter().filter_map(TestSet::plain).map(|version| version.to_string()).collect();
     if !versions.is_empty() {
@@ -179,6 +183,15 @@ mod tests {
         }
         table.insert("algorithm".into(), "a2c".into());
         assert_eq!(table, cell.config.table());
+    }
+
+    #[test]
+    fn the_command_of_a_task_folder_names_the_folder() {
+        let mut cell = cell();
+        cell.config.common.environment = "Walker".into();
+        let command = command(&cell);
+        assert!(command.contains(" --seed 1 --task TASK --set "), "{command}");
+        assert!(command.ends_with(" --episodes 9 --task TASK"), "{command}");
     }
 
     #[test]

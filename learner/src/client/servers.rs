@@ -1,6 +1,7 @@
 //! Connections to one or several servers.
 
 use std::io::ErrorKind;
+use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -55,12 +56,13 @@ impl Servers {
         self.act
     }
 
-    /// Starts a private server with `workers` physics threads (`None`: one a core), and connects to it.
+    /// Starts a private server with `workers` physics threads (`None`: one a core) that also serves the tasks in the folders
+    /// `tasks`, and connects to it.
     ///
     /// # Errors
-    /// Those of [`PrivateServer::start`] and of [`Servers::connect`].
-    pub fn local(workers: Option<usize>) -> Result<Self, ClientError> {
-        let server = PrivateServer::start(workers)?;
+    /// Those of [`PrivateServer::start_with_tasks`] and of [`Servers::connect`].
+    pub fn local(workers: Option<usize>, tasks: &[PathBuf]) -> Result<Self, ClientError> {
+        let server = PrivateServer::start_with_tasks(workers, tasks)?;
         let mut servers = Self::connect(std::slice::from_ref(server.address()))?;
         servers.local = Some(Mutex::new(server));
         Ok(servers)
@@ -215,8 +217,8 @@ impl Servers {
     /// The entry `name` of the catalogues, in any [spelling](perturb_protocol::names). It must be the same in all of them.
     ///
     /// # Errors
-    /// [`ClientError::NoEnvironment`] with the names that there are, [`ClientError::Disagreement`], and those of
-    /// [`Servers::catalogue`].
+    /// [`ClientError::NoEnvironment`] with the names that there are, [`ClientError::Models`], [`ClientError::Disagreement`],
+    /// and those of [`Servers::catalogue`].
     pub fn environment(&self, name: &str) -> Result<proto::Environment, ClientError> {
         let connections = self.connections();
         let Some((first, others)) = connections.split_first() else {
@@ -227,11 +229,18 @@ impl Servers {
         };
         let environment = self.environment_of(first, name)?;
         for other in others {
-            if self.environment_of(other, name)? != environment {
-                let first = first.address().clone();
-                let other = other.address().clone();
-                return Err(ClientError::Disagreement { first, other, environment: name.into() });
+            let got = self.environment_of(other, name)?;
+            if got == environment {
+                continue;
             }
+            let first = first.address().clone();
+            let other = other.address().clone();
+            let name = environment.name;
+            if got.model_hash != environment.model_hash {
+                let hashes = [environment.model_hash, got.model_hash];
+                return Err(ClientError::Models { first, other, environment: name, hashes });
+            }
+            return Err(ClientError::Disagreement { first, other, environment: name });
         }
         Ok(environment)
     }

@@ -93,6 +93,7 @@ pub fn heatmap_again(
     if got != records.about.policy {
         return Err(HeatmapError::Policy { recorded: records.about.policy.clone(), got });
     }
+    checkpoint.state.check_unchanged(environment).map_err(TestError::from)?;
     let axes = axes(environment, parameters)?;
     Heatmap::from_records(records, axes).ok_or(HeatmapError::NotOfAxes)
 }

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use perturb_checkpoint::task_remedy;
 use perturb_files::FileError;
 use perturb_records::Difference;
 
@@ -62,8 +63,9 @@ pub enum TrainError {
     },
     /// The environment has changed since the run began.
     #[error(
-        "the run was trained in {environment} with {what} {trained}, the server's has {served}; resume with the version \
-         of perturb-server that it began with, or train again"
+        "the run was trained in {environment} with {what} {trained}, the server's has {served}; {}resume with the \
+         version of perturb-server that it began with, or train again",
+        task_remedy(what)
     )]
     Changed {
         /// The environment.

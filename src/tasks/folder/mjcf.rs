@@ -16,6 +16,9 @@ use std::{collections::BTreeMap, fmt::Write};
 const MAX_DEPTH: usize = 200;
 /// Limit of the elements, attributes and texts of one file.
 const MAX_NODES: u32 = 2_000_000;
+/// Limit of the elements of a composite. Each has a degree of freedom at least, but those inside a box, so that more would
+/// be beyond the limit of these anyway, after minutes of compilation.
+const MAX_COMPOSITE_ELEMENTS: f64 = 10_000.0;
 /// Attributes that name files, by element. `true`: the physics needs the file.
 const FILE_ATTRIBUTES: [(&str, &[&str], bool); 4] = [
     ("mesh", &["file"], true),
@@ -169,6 +172,18 @@ fn check_root(name: &str, root: &Node<'_, '_>) -> Result<()> {
     }
 }
 
+/// Refuses a composite of so many elements that MuJoCo would compile it for minutes.
+fn check_composite(name: &str, node: &Node<'_, '_>) -> Result<()> {
+    let count = node.attribute("count").unwrap_or_default();
+    // MuJoCo itself refuses what is no number.
+    let elements: f64 = count.split_whitespace().filter_map(|number| number.parse::<f64>().ok()).product();
+    if elements <= MAX_COMPOSITE_ELEMENTS {
+        return Ok(());
+    }
+    let problem = format_args!("this composite has {elements} elements; give at most {MAX_COMPOSITE_ELEMENTS}");
+    Err(at(name, node, problem))
+}
+
 /// A file of the model.
 struct Part<'a> {
     name: &'a str,
@@ -252,6 +267,9 @@ impl Writer<'_> {
         }
         if tag == "include" {
             return self.include(node, kept, depth);
+        }
+        if tag == "composite" {
+            check_composite(name, &node)?;
         }
         let kept = if is_visual(&node) { Kept::PictureOnly } else { kept };
         let (mut physics, mut picture) = (format!("<{tag}"), format!("<{tag}"));

@@ -14,11 +14,25 @@ use perturb_mujoco::{Flags, Index, Kind, Model, Simulation};
 /// Kinds of terms, by the key that names them.
 pub(super) const KINDS: [&str; 10] =
     ["value", "rate", "squared", "norm", "within", "near", "power", "limits", "healthy", "constant"];
-pub(super) const OPTIONS: [&str; 11] =
-    ["name", "description", "weight", "mean", "target", "at_least", "at_most", "range", "margin", "sigma", "otherwise"];
+pub(super) const OPTIONS: [&str; 12] = [
+    "name",
+    "description",
+    "weight",
+    "mean",
+    "target",
+    "at_least",
+    "at_most",
+    "range",
+    "margin",
+    "shape",
+    "sigma",
+    "otherwise",
+];
 /// Limit of the absolute value of a term: actions may be as large as an f32 can be, and their squares must not make a
 /// reward that is not finite.
 const MAX_TERM: f64 = 1e30;
+/// The natural logarithm of 0.1.
+const LN_0_1: f64 = -std::f64::consts::LN_10;
 /// The part of a joint's range beyond which it is at its limit.
 const AT_LIMIT: f64 = 0.99;
 
@@ -46,6 +60,7 @@ enum TermKind {
         low: f64,
         high: f64,
         margin: f64,
+        shape: MarginShape,
     },
     Near {
         reading: Reading,
@@ -59,6 +74,15 @@ enum TermKind {
         otherwise: f64,
     },
     Constant,
+}
+
+/// The way in which [`TermKind::Within`] falls over its margin.
+#[derive(Debug, Clone, Copy)]
+enum MarginShape {
+    /// Falls from 1 to 0 at the margin, and is 0 beyond.
+    Linear,
+    /// Falls as dm_control's tolerance: exp(ln(0.1) × (distance / margin)²), which is 0.1 at the margin.
+    Gaussian,
 }
 
 /// Values that terms follow from, beside the simulation.
@@ -84,6 +108,7 @@ impl Term {
             ("target", &["squared", "norm", "near"][..]),
             ("range", &["within"]),
             ("margin", &["within"]),
+            ("shape", &["within"]),
             ("sigma", &["near"]),
             ("otherwise", &["healthy"]),
             ("mean", &["value", "rate", "squared", "power", "limits"]),
@@ -104,7 +129,15 @@ impl Term {
                 if margin < 0.0 {
                     return Err(table.error(format_args!("margin is {margin}; expected 0 or more")));
                 }
-                TermKind::Within { reading: reading()?, low, high, margin }
+                let shape = match table.get("shape").map(|value| Ok((value.text()?, value))).transpose()? {
+                    None | Some(("linear", _)) => MarginShape::Linear,
+                    Some(("gaussian", _)) => MarginShape::Gaussian,
+                    Some((other, value)) => {
+                        let problem = format!("{:?} is no shape; expected \"linear\" or \"gaussian\"", escaped(other));
+                        return Err(value.error(problem));
+                    }
+                };
+                TermKind::Within { reading: reading()?, low, high, margin, shape }
             }
             "near" => {
                 let sigma = table.require("sigma", "0.1")?;
@@ -221,14 +254,13 @@ impl Term {
             }
             TermKind::Squared(_) => self.total(self.differences(numbers).map(|x| x * x)),
             TermKind::Norm(_) => self.differences(numbers).map(|x| x * x).sum::<f64>().sqrt(),
-            TermKind::Within { low, high, margin, .. } => {
+            TermKind::Within { low, high, margin, shape, .. } => {
                 let outside = numbers.iter().map(|&x| (low - x).max(x - high).max(0.0)).fold(0.0, f64::max);
-                if outside == 0.0 {
-                    1.0
-                } else if outside < *margin {
-                    1.0 - outside / margin
-                } else {
-                    0.0
+                match shape {
+                    _ if outside == 0.0 => 1.0,
+                    _ if *margin == 0.0 => 0.0,
+                    MarginShape::Linear => (1.0 - outside / margin).max(0.0),
+                    MarginShape::Gaussian => libm::exp(LN_0_1 * (outside / margin) * (outside / margin)),
                 }
             }
             TermKind::Near { sigma, .. } => {

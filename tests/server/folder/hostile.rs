@@ -29,6 +29,13 @@ fn a_height_field_of_gigabytes_is_refused() {
 }
 
 #[test]
+fn a_composite_of_millions_is_refused_before_it_is_compiled() {
+    let composite = r#"<body name="block" pos="0 0 5"><composite type="box" count="200 200 200" spacing="0.1"><geom size="0.01"/></composite></body></worldbody>"#;
+    let errors = refused(&CART.replace("</worldbody>", composite));
+    assert!(errors.contains("this composite has 8000000 elements; give at most 10000"), "{errors}");
+}
+
+#[test]
 fn entities_are_not_expanded() {
     let bomb =
         format!("<!DOCTYPE x [<!ENTITY a \"{0}\"><!ENTITY b \"{1}\">]>\n{CART}", "a".repeat(1000), "&a;".repeat(1000));

@@ -125,6 +125,10 @@ pub struct ServerArgs {
     /// servers; 1 in a Slurm job].
     #[arg(long, value_name = "N", value_parser = |text: &str| within(text, 1..=MAX_WORKERS))]
     pub workers: Option<usize>,
+    /// Folder of a task with an MJCF model and a file task.toml, which private servers then also serve. Can be given
+    /// several times. A running server serves the folders of its own --task.
+    #[arg(long, value_name = "DIR")]
+    pub task: Vec<PathBuf>,
 }
 
 /// Waiting for lost servers.
@@ -248,8 +252,9 @@ mod tests {
             .map(|argument| argument.get_id().as_str())
             .collect();
         for argument in train.get_arguments().map(|argument| argument.get_id().as_str()) {
-            let accepted = ["resume", "extend", "json", "server", "server_wait", "workers", "act", "threads", "help"]
-                .contains(&argument);
+            let accepted =
+                ["resume", "extend", "json", "server", "server_wait", "workers", "task", "act", "threads", "help"]
+                    .contains(&argument);
             assert_ne!(refused.contains(&argument), accepted, "--{argument}");
         }
     }

@@ -10,12 +10,12 @@ use perturb_records::Records;
 use perturb_records::ledger::{Head, Ledgers, Proof};
 
 use super::super::{args::AuditArgs, error::CommandError, error::Result, reconnecting_servers};
-use super::RecordedPolicy;
+use super::{RecordedPolicy, server_args};
 
 /// Prints what the ledgers prove about each policy.
 pub(super) fn prove(args: &AuditArgs, recorded: &[RecordedPolicy]) -> Result<ExitCode> {
     let ledgers = Ledgers::read(&args.ledger, &args.head).map_err(CommandError::Failed)?;
-    let servers = reconnecting_servers(&args.server, args.wait)?;
+    let servers = reconnecting_servers(&server_args(args)?, args.wait)?;
     let mut proofs = Vec::new();
     let mut out = std::io::stdout();
     for policy in recorded {

@@ -15,10 +15,10 @@ use perturb_records::HeatmapKind;
 use perturb_report::{heatmap_pictures, save_heatmaps};
 
 use super::{axes, options, test};
-use crate::commands::args::HeatmapArgs;
+use crate::commands::args::{HeatmapArgs, PlayArgs};
 use crate::commands::display::{note, say};
 use crate::commands::error::{CommandError, Result, system};
-use crate::commands::{plan_in, playing_servers};
+use crate::commands::{plan_in, playing_servers, with_tasks_of};
 
 /// Numbers of heatmaps.
 #[derive(Default)]
@@ -40,6 +40,7 @@ pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
     let places = heatmap_places(&selections);
     let selected: Vec<&HeatmapPlace<'_>> =
         places.iter().filter(|place| args.runs.is_none_or(|runs| place.run <= runs)).collect();
+    let play = PlayArgs { server: with_tasks_of(&args.play.server, &plan)?, ..args.play.clone() };
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let mut connected = None;
     let mut counts = HeatmapCounts::default();
@@ -51,7 +52,7 @@ pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
         }
         let servers = match &mut connected {
             Some(servers) => servers,
-            none => none.insert(playing_servers(&args.play)?),
+            none => none.insert(playing_servers(&play)?),
         };
         let environment = servers.environment(places[0].environment)?;
         if let Some(reason) = missing_parameter(args, &environment) {

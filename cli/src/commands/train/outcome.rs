@@ -13,7 +13,7 @@ use serde_json::json;
 use super::super::args::TrainArgs;
 use super::super::display::note;
 use super::super::error::Result;
-use super::super::resume_hint::{resume_command, with_resume_command};
+use super::super::resume_hint::{resume_command, task_options, with_resume_command};
 use super::super::signal_code;
 
 /// Prints the end of a training and returns the exit status.
@@ -80,7 +80,8 @@ pub(super) fn print_result(
     }
     let mut out = std::io::stdout();
     writeln!(out, "trained policy: {}", directory.checkpoint().display())?;
-    let command = format!("perturb evaluate --checkpoint {}", quoted(directory.path()));
+    let tasks = task_options(&args.play.server);
+    let command = format!("perturb evaluate --checkpoint {}{tasks}", quoted(directory.path()));
     Ok(writeln!(out, "test it: {command}")?)
 }
 

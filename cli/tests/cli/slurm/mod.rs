@@ -49,12 +49,14 @@ struct Experiment {
 
 impl Experiment {
     fn new() -> Self {
+        let text = |path| fs::read_to_string(&path).unwrap_or_else(|error| panic!("{path:?}: {error}"));
+        Self::with_plan(&std::env::var_os(PLAN_FILE).map_or_else(|| PLAN.to_owned(), text))
+    }
+
+    fn with_plan(text: &str) -> Self {
         let directory = tempfile::tempdir().expect("a directory");
         let file = directory.path().join("file.toml");
-        match std::env::var_os(PLAN_FILE) {
-            Some(path) => drop(fs::copy(&path, &file).unwrap_or_else(|error| panic!("{path:?}: {error}"))),
-            None => fs::write(&file, PLAN).expect("written"),
-        }
+        fs::write(&file, text).expect("written");
         let plan = Plan::load(&file).unwrap_or_else(|error| panic!("{error}"));
         Self { directory, file, plan }
     }
@@ -177,6 +179,7 @@ fn a_plan_survives_the_loss_of_a_node() {
         experiment.jobs("slurm").len(),
     ));
     shared_server(&experiment, &cluster);
+    task_folders(&cluster);
 }
 
 /// Ctrl-C leaves the jobs alone, and the same command finds them again.
@@ -283,6 +286,24 @@ fn refusals(experiment: &Experiment, cluster: &Cluster) {
         assert!(stderr(&output).contains(words), "{}", stderr(&output));
     }
     assert!(!experiment.out("refused/slurm/1").exists());
+}
+
+/// Jobs' private servers serve the tasks of a plan, to the same results as on this machine.
+fn task_folders(cluster: &Cluster) {
+    let tasks = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/tasks");
+    let experiment = Experiment::with_plan(&format!(
+        "tasks = ['{0}/reaching_arm', '{0}/quadruped']\nenvironments = ['ReachingArm', 'Quadruped']\nversions = ['R']
+        test_episodes = 10\nsettings = {{ episodes = 20, num_envs = 4 }}
+        [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']",
+        tasks.display()
+    ));
+    let whole = end(experiment.run("whole", &[]).spawn().expect("started"));
+    assert!(whole.status.success(), "{}", stderr(&whole));
+    let output = end(experiment.on(cluster, "slurm", &["--cells-per-job", "1"]).spawn().expect("started"));
+    assert!(output.status.success(), "{}\n{}", stderr(&output), cluster.logs());
+    assert_eq!(experiment.results("slurm").len(), 2);
+    assert!(experiment.results("slurm") == experiment.results("whole"), "results differ");
+    say("a plan over two tasks from folders has the same results on Slurm");
 }
 
 /// Jobs share a server on the remaining node. The number of cells in a job is estimated.

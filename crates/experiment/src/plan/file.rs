@@ -10,7 +10,7 @@ use perturb_records::success::Rule;
 use perturb_settings::{Preset, ValueError, require, spelled};
 use serde::de::{DeserializeOwned, Error, IntoDeserializer};
 use serde::{Deserialize, Deserializer};
-use toml::Table;
+use toml::{Spanned, Table};
 
 use super::SELECTION_TEST;
 use super::{Selection, distinct};
@@ -31,6 +31,10 @@ pub(super) struct File {
     /// Preset, which decides about default settings: "perturb" or "paper" (default: `"perturb"`).
     #[serde(default, deserialize_with = "preset")]
     preset: Option<Preset>,
+    /// Folders of tasks that private servers also serve, relative to this file's folder (default: none). Servers of
+    /// `--server` must serve them already.
+    #[serde(default)]
+    pub(super) tasks: Vec<Spanned<String>>,
     /// Names of the catalogue.
     pub(super) environments: Vec<String>,
     /// Training distributions: "D", "R", "E", "R+E", or names of `sets` (default: `["D", "R", "E"]`).

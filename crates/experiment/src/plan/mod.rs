@@ -9,9 +9,10 @@ mod expansion;
 mod file;
 mod groups;
 mod sets;
+mod tasks;
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use perturb_protocol::{names, proto};
 use serde::{Deserialize, Serialize};
@@ -27,7 +28,7 @@ use perturb_settings::{Method, TrainConfig, ValueError, require};
 /// Everything that an experiment file asks for.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// The file, as it was written.
+    /// The file as it was written, but for absolute paths of `tasks`, so that a copy elsewhere names the same folders.
     pub text: String,
     /// The heading of reports; empty if the file has none.
     pub title: String,
@@ -35,6 +36,8 @@ pub struct Plan {
     pub date: String,
     /// The files beside it that its sets name, with their content.
     pub beside: BTreeMap<String, Vec<u8>>,
+    /// The folders of tasks that private servers also serve, absolute.
+    pub tasks: Vec<PathBuf>,
     /// The revisions of environments that it asks for, `perturb/CartPole-v1`; any of those that are missing.
     pub revisions: BTreeMap<String, u32>,
     /// By which rule configurations are selected.
@@ -163,9 +166,9 @@ impl Plan {
     /// Returns an empty plan, for reports without an experiment.
     pub fn without_cells() -> Self {
         let (selection, cells, candidates) = (Selection::Paper, Vec::new(), Vec::new());
-        let (text, beside, revisions) = (String::new(), BTreeMap::new(), BTreeMap::new());
+        let (text, beside, tasks, revisions) = (String::new(), BTreeMap::new(), Vec::new(), BTreeMap::new());
         let (title, date) = Default::default();
-        Self { text, title, date, beside, revisions, selection, runs: 0, tuning_runs: 0, cells, candidates }
+        Self { text, title, date, beside, tasks, revisions, selection, runs: 0, tuning_runs: 0, cells, candidates }
     }
 
     /// Reads and expands the file at `path`.
@@ -208,12 +211,14 @@ impl Plan {
         let revisions = file.spell()?;
         file.check()?;
         let mut beside = BTreeMap::new();
-        let sets = sets::read(&file.sets, Path::new(path).parent().unwrap_or(Path::new("")), &mut beside)?;
+        let folder = Path::new(path).parent().unwrap_or(Path::new(""));
+        let (text, tasks) = tasks::resolve(text, &file.tasks, folder)?;
+        let sets = sets::read(&file.sets, folder, &mut beside)?;
         let (cells, candidates) = expansion::expand(&file, &sets)?;
         let (selection, runs, tuning_runs) = (file.selection, file.runs, file.tuning_runs());
         let title = file.title.unwrap_or_default();
         let date = file.date.map(|date| date.to_string()).unwrap_or_default();
-        Ok(Self { selection, runs, tuning_runs, cells, candidates, title, date, beside, text, revisions })
+        Ok(Self { selection, runs, tuning_runs, cells, candidates, title, date, beside, tasks, text, revisions })
     }
 
     /// Whether `environment` has the revision, the parameters and thresholds that the plan's cells name for it.

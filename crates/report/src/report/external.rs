@@ -57,6 +57,22 @@ pub(super) fn overview(results: &Results<'_>, selections: &[MethodResults<'_>]) 
             ));
         }
     }
+    let mut models: BTreeMap<&str, &str> = BTreeMap::new();
+    for result in results.done() {
+        models.entry(&result.training.environment).or_insert(&result.training.model_hash);
+    }
+    for (agent, policy, _) in elsewhere(selections) {
+        let Some(episode) = policy.records.episodes.first() else { continue };
+        let (name, got) = (agent.environment(), episode.model_hash.as_str());
+        let known = *models.entry(name).or_insert(got);
+        if known != got {
+            lines.push(format!(
+                "{} was tested with the model {got} of {name}, others with {known}: their numbers are of different \
+                 environments.",
+                agent.agent
+            ));
+        }
+    }
     distinct(lines.into_iter())
 }
 

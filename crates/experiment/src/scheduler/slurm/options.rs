@@ -35,6 +35,8 @@ pub struct JobCommand {
     /// Physics threads of each of the `jobs` servers that the job starts on its node, at least 1; without meaning if there
     /// are `servers`.
     pub workers: usize,
+    /// Folders of tasks that these servers also serve, absolute.
+    pub tasks: Vec<PathBuf>,
     /// Addresses of servers that all jobs share; empty for a private one in each job.
     pub servers: Vec<String>,
     /// Time that a job waits for lost servers, s.
@@ -83,6 +85,7 @@ impl SlurmOptions {
         }
         text_of(folder)?;
         text_of(&self.task.program)?;
+        self.task.tasks.iter().try_for_each(|task| text_of(task).map(drop))?;
         Ok(())
     }
 }
@@ -188,8 +191,15 @@ mod tests {
 
     #[test]
     fn a_job_asks_for_the_cores_that_it_uses() {
-        let task =
-            JobCommand { program: "/x".into(), jobs: 2, group: 36, workers: 3, servers: Vec::new(), server_wait: 0 };
+        let task = JobCommand {
+            program: "/x".into(),
+            jobs: 2,
+            group: 36,
+            workers: 3,
+            tasks: Vec::new(),
+            servers: Vec::new(),
+            server_wait: 0,
+        };
         assert_eq!(task.cores(), 6);
         assert_eq!(JobCommand { servers: vec!["a:1".into()], ..task }.cores(), 2);
     }

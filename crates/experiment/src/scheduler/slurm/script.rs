@@ -12,7 +12,11 @@ pub(super) fn script(task: &JobCommand, folder: &Path, submission: &Path) -> Res
     let plan = quoted(text_of(&submission.join("plan.toml"))?);
     let (folder, program) = (quoted(text_of(folder)?), quoted(text_of(&task.program)?));
     let servers = if task.servers.is_empty() {
-        format!("--workers {}", task.workers)
+        let mut words = format!("--workers {}", task.workers);
+        for folder in &task.tasks {
+            words += &format!(" --task {}", quoted(text_of(folder)?));
+        }
+        words
     } else {
         format!("--server {}", quoted(&task.servers.join(",")))
     };
@@ -69,6 +73,7 @@ mod tests {
             jobs: 2,
             group: 9,
             workers: 3,
+            tasks: vec![directory.path().join("it's a task")],
             servers: Vec::new(),
             server_wait: 60,
         };
@@ -79,7 +84,7 @@ mod tests {
         let (succeeded, said) = run(&task, directory.path(), "0");
         let shown = directory.path().display();
         let expected = format!(
-            "[run][{shown}/plan.toml][--json][--out][{shown}/it's $HOME][--cell][a,b][--jobs][2][--group][9][--server-wait][60][--workers][3]"
+            "[run][{shown}/plan.toml][--json][--out][{shown}/it's $HOME][--cell][a,b][--jobs][2][--group][9][--server-wait][60][--workers][3][--task][{shown}/it's a task]"
         );
         assert!(succeeded && said.starts_with(&expected), "{said}");
         assert!(said.contains("job 7_0 on n1, restarted 0 times"), "{said}");

@@ -53,6 +53,7 @@ pub(super) fn options() -> SlurmOptions {
         array_limit: None,
         cells_per_job: Some(1),
         task: JobCommand {
+            tasks: Vec::new(),
             program: "/bin/true".into(),
             jobs: 1,
             group: 36,
