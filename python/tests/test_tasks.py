@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import perturb.tasks
-from perturb.tasks import GYMNASIUM_TASKS, from_gymnasium
+from perturb.tasks import DM_CONTROL_TASKS, GYMNASIUM_TASKS, from_dm_control, from_gymnasium
 
 
 @pytest.mark.parametrize("name", GYMNASIUM_TASKS)
@@ -16,6 +16,30 @@ def test_a_folder_has_the_task_the_model_and_the_licence(name: str, tmp_path: Pa
     assert "<mujoco" in (folder / model).read_text(encoding="utf-8")
     assert "MIT" in (folder / "LICENSE.gymnasium").read_text(encoding="utf-8")
     assert f'name = "{name.replace("-v5", "V5")}"' in task
+
+
+@pytest.mark.parametrize("name", DM_CONTROL_TASKS)
+def test_a_folder_of_dm_control_has_model_and_includes(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The package dm_control is no dependency, so its files are stand-ins."""
+    package = tmp_path / "dm_control"
+    (package / "suite/common").mkdir(parents=True)
+    model = name.split("-")[0] + ".xml"
+    for file in (model, "common/visual.xml", "common/skybox.xml", "common/materials.xml"):
+        (package / "suite" / file).write_text(f"<mujoco><!-- {file} --></mujoco>")
+    monkeypatch.setattr(perturb.tasks, "_package", lambda _: package)
+    folder = from_dm_control(name, tmp_path / "task")
+    assert model in (folder / model).read_text()
+    assert "skybox" in (folder / "common/skybox.xml").read_text()
+    assert "Apache" in (folder / "LICENSE.dm_control").read_text()
+    own = "".join(part.capitalize() for part in name.replace("-", "_").split("_"))
+    assert f'name = "{own}"' in (folder / "task.toml").read_text()
+    (package / "suite" / model).unlink()
+    with pytest.raises(FileNotFoundError, match=f"{model} is missing; install dm_control 1.0, which has {name}"):
+        from_dm_control(name, tmp_path / "another")
+    with pytest.raises(ValueError, match="cheetah-run"):
+        from_dm_control("walker-walk", tmp_path)
 
 
 def test_an_unknown_id_is_refused_with_those_that_there_are(tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ from .policy import Actor, Policy, load_policy
 from .registration import register_all as _register_all
 from .requests import Version
 from .results import Audit, Bin, Bin2D, Context, Result
+from .tasks import register_ids as _register_tasks
 from .vector import PerturbVectorEnv
 
 __version__ = _version("perturb")
@@ -79,6 +80,7 @@ __all__ = [
 ]
 
 _register_all()
+_register_tasks()
 
 # Names of version 0.1, by which the same things are still found in version 0.2.
 _DEPRECATED = {"assess": "evaluate", "Part": "Bin", "Cell": "Bin2D"}

@@ -284,7 +284,15 @@ class Assessment:
             Path(path).write_text(page, "utf-8")
         return page
 
-    def audit(self, policy: Any, *, normalizer: Any = None, server: str | None = None, timeout: float = 60.0) -> Audit:
+    def audit(
+        self,
+        policy: Any,
+        *,
+        normalizer: Any = None,
+        server: str | None = None,
+        task: str | os.PathLike[str] | None = None,
+        timeout: float = 60.0,
+    ) -> Audit:
         """Test the same policy again in all recorded episodes, and compare all results.
 
         Use it for policies that only Python can load; `perturb audit` replays those of perturb, on any machine. A
@@ -294,6 +302,7 @@ class Assessment:
             policy: what was tested: a policy, or a mapping of all by what they were trained on.
             normalizer: as in `evaluate`.
             server: as in `evaluate`.
+            task: as in `evaluate`. A folder whose files changed gives other episodes.
             timeout: as in `evaluate`.
 
         Raises:
@@ -301,7 +310,7 @@ class Assessment:
             InvalidArgumentError: for a mapping with other keys than what was trained on.
             ServerConnectionError, ServerTimeoutError, ServerStartError: as in `evaluate`.
         """
-        return replay(self._assessed, self.agent, policy, normalizer, server, timeout)
+        return replay(self._assessed, self.agent, policy, normalizer, server, task, timeout)
 
     def _find(self, scenario: str) -> tuple[Result, _native.Records]:
         result = self[scenario]

@@ -62,6 +62,8 @@ class Description:
     parameters: Mapping[str, Range] = field(default_factory=dict, compare=False)
     # An episode is truncated after so many steps; None if that is not known.
     step_limit: int | None = field(default=None, compare=False)
+    # SHA-256 of the model in hexadecimal digits; empty without a model.
+    model_hash: str = field(default="", compare=False)
 
     @classmethod
     def read(cls, entry: Mapping[str, Any]) -> Description:
@@ -82,6 +84,7 @@ class Description:
             success=None if success is None else Success(**success),
             parameters={it["name"]: (it["low"], it["high"]) for it in entry.get("parameters", [])},
             step_limit=entry.get("step_limit"),
+            model_hash=entry.get("model_hash", ""),
         )
 
     def observing_parameters(self) -> Description:
@@ -116,6 +119,14 @@ class Description:
         if served != self:
             raise ProtocolError(f"the server describes {self.name} as {served}, this package as {self}")
 
+    def require_same_model(self, served: Description) -> None:
+        """Raise ProtocolError if the server's model is not this one."""
+        if served.model_hash != self.model_hash:
+            raise ProtocolError(
+                f"the files of {self.name} changed since it was made: its model was {self.model_hash}, the server's is "
+                f"{served.model_hash}; make it anew"
+            )
+
 
 def _box(ranges: tuple[Range, ...]) -> spaces.Box:
     low, high = np.array(ranges, dtype=np.float32).T
@@ -143,20 +154,40 @@ def find(name: str) -> Description:
     Raises:
         InvalidArgumentError: with the names that there are.
     """
-    written, revision = str(name), None
+    for description in CATALOGUE.values():
+        if is_spelled(name, description):
+            return description
+    meant = difflib.get_close_matches(_name_and_revision(name)[0], CATALOGUE, n=1)
+    hint = (
+        f" (did you mean {meant[0]!r}?)"
+        if meant
+        else "; a task of a folder needs task='DIR', or a server that serves it"
+    )
+    raise InvalidArgumentError(f"environment={name!r} is none of {', '.join(CATALOGUE)}{hint}")
+
+
+def is_spelled(name: str, description: Description) -> bool:
+    """Whether a name or id stands for this environment.
+
+    Raises:
+        InvalidArgumentError: for an id of another revision.
+    """
+    written, revision = _name_and_revision(name)
+    if _letters(description.name) != _letters(written):
+        return False
+    if revision not in (None, description.revision):
+        current = f"{NAMESPACE}{description.name}-v{description.revision}"
+        raise InvalidArgumentError(f"environment={name!r} is another revision than this package's {current}")
+    return True
+
+
+def _name_and_revision(name: str) -> tuple[str, int | None]:
+    written = str(name)
     if written.lower().startswith(NAMESPACE):
         written = written[len(NAMESPACE) :]
         if matched := re.fullmatch(r"(.*)-v(\d+)", written):
-            written, revision = matched[1], int(matched[2])
-    for description in CATALOGUE.values():
-        if _letters(description.name) == _letters(written):
-            if revision not in (None, description.revision):
-                current = f"{NAMESPACE}{description.name}-v{description.revision}"
-                raise InvalidArgumentError(f"environment={name!r} is another revision than this package's {current}")
-            return description
-    meant = difflib.get_close_matches(written, CATALOGUE, n=1)
-    hint = f" (did you mean {meant[0]!r}?)" if meant else ""
-    raise InvalidArgumentError(f"environment={name!r} is none of {', '.join(CATALOGUE)}{hint}")
+            return matched[1], int(matched[2])
+    return written, None
 
 
 def _letters(name: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from . import catalogue, local_server, requests
 from .address import parse_address
 from .errors import InvalidArgumentError, OutOfOrderError, ProtocolError
 from .session import Session
+from .task_folder import describe, find_folder
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -47,10 +49,11 @@ class Client:
     def __init__(
         self,
         *,
-        environment: str,
+        environment: str | None,
         version: requests.Version,
         num_envs: int,
         server: str | None,
+        task: str | os.PathLike[str] | None = None,
         parameters: requests.Parameters | None,
         first_environment_index: int,
         episodes_per_trial: int,
@@ -68,15 +71,16 @@ class Client:
         requests.render_mode(render_mode)
         self._drawn = render_mode is not None
         self._width, self._height = requests.pixels(width, "width"), requests.pixels(height, "height")
-        self.description = catalogue.find(environment)
+        self._timeout = requests.seconds(timeout, "timeout")
+        self._server = None if server is None else parse_address(server)
+        self._task = find_folder(task, server)
+        self.description = describe(environment, self._task, self._server, self._timeout)
         observe_parameters = requests.observes_parameters(observe)
         if observe_parameters:
             self.description = self.description.observing_parameters()
         self.num_envs = requests.count(num_envs, "num_envs", 1)
-        self._server = None if server is None else parse_address(server)
         if server is None:
             local_server.find_program()  # so that a missing program is reported now, not at the first reset
-        self._timeout = requests.seconds(timeout, "timeout")
         self._single = single
         self._parameters = requests.distributions(parameters)
         # Parameters of each environment that replace the batch's; empty if no environment has any.
@@ -136,7 +140,9 @@ class Client:
                 )
             self._session.close()
             self._session = None
-        session = Session(self._server, self._timeout, self.description, self.num_envs, single=self._single)
+        session = Session(
+            self._server, self._timeout, self.description, self.num_envs, single=self._single, task=self._task
+        )
         try:
             seed = seeds[0] if seeds else int(generator.integers(2**63))
             opened = session.open(**self._request, parameters=self._parameters, seed=seed)
@@ -145,7 +151,10 @@ class Client:
                     "the server does not know observe='parameters': it is older than this package; "
                     "run the perturb-server of the package's version, or leave it out"
                 )
-            self.description.require_equal(catalogue.Description.read(json.loads(opened.environment)))
+            served = catalogue.Description.read(json.loads(opened.environment))
+            self.description.require_equal(served)
+            if self._task is not None:
+                self.description.require_same_model(served)
             begun = OpenedSession(opened, opened.observations, opened.events)
             if any(self._own):
                 begun = self._give_own(session, opened, seed)

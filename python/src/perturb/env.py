@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
@@ -28,10 +29,12 @@ class PerturbEnv(CheckedAttributes, gymnasium.Env[NDArray[np.float32], Any]):
     """A single environment of a perturb-server.
 
     Args:
-        environment: a name of docs/environments.md, such as `CartPole`.
+        environment: a name of docs/environments.md, such as `CartPole`; with `task` its name, or None.
         version: where parameters come from: `D` their defaults, `R` random, `E` extreme, `R+E` one of
             both, each in half of the trials.
         server: `unix:/path` or `host:port`; None starts a server of this process's own.
+        task: the folder of a task, which the server of this process's own then serves; see docs/tasks.md. The
+            environment is that of the folder.
         parameters: replaces the version's set of the named parameters: a value, an interval `(low, high)`, or several
             `[(low, high), …]`.
         environment_index: fixes all randomness, together with the seed. Environment i of a vector with the same
@@ -56,10 +59,11 @@ class PerturbEnv(CheckedAttributes, gymnasium.Env[NDArray[np.float32], Any]):
 
     def __init__(
         self,
-        environment: str,
+        environment: str | None = None,
         *,
         version: requests.Version = "D",
         server: str | None = None,
+        task: str | os.PathLike[str] | None = None,
         parameters: requests.Parameters | None = None,
         environment_index: int = 0,
         episodes_per_trial: int = 1,
@@ -78,6 +82,7 @@ class PerturbEnv(CheckedAttributes, gymnasium.Env[NDArray[np.float32], Any]):
             version=version,
             num_envs=1,
             server=server,
+            task=task,
             parameters=parameters,
             first_environment_index=environment_index,
             episodes_per_trial=episodes_per_trial,

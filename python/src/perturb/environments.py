@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from .catalogue import CATALOGUE, CATALOGUE_ENTRIES
+from .catalogue import CATALOGUE, CATALOGUE_ENTRIES, Description
+from .task_folder import entry, find_folder
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -56,6 +58,7 @@ class Environment:
         parameters: by their names, in the order of receipts.
         success: the rule of success; None if there is none.
         model_hash: SHA-256 of the model in hexadecimal digits; empty without a model.
+        heatmap_axes: the two parameters of usual heatmaps, or none.
     """
 
     name: str
@@ -68,28 +71,38 @@ class Environment:
     parameters: dict[str, Parameter]
     success: Success | None
     model_hash: str = ""
+    heatmap_axes: tuple[str, ...] = ()
+    _description: Description | None = field(default=None, repr=False, compare=False)
 
     @property
     def observation_space(self) -> spaces.Box:
         """A float32 Box [O]."""
-        return CATALOGUE[self.name].observation_space()
+        return (self._description or CATALOGUE[self.name]).observation_space()
 
     @property
     def action_space(self) -> spaces.Discrete | spaces.Box:
         """Discrete from 0, or a float32 Box [A]."""
-        return CATALOGUE[self.name].action_space()
+        return (self._description or CATALOGUE[self.name]).action_space()
 
 
-def environments() -> dict[str, Environment]:
+def environments(*, task: str | os.PathLike[str] | None = None) -> dict[str, Environment]:
     """Every environment that this package knows, by name: those of the server that it was built with.
 
     They are compared with a server's whenever a session opens.
+
+    Args:
+        task: the folder of a task, whose environment is then the last one; see docs/tasks.md.
+
+    Raises:
+        InvalidArgumentError: for what is no such folder, with the reason.
     """
-    return {entry["name"]: _environment(entry) for entry in CATALOGUE_ENTRIES}
+    folder = find_folder(task)
+    entries = CATALOGUE_ENTRIES if folder is None else (*CATALOGUE_ENTRIES, entry(folder))
+    return {known["name"]: _environment(known) for known in entries}
 
 
 def _environment(entry: Mapping[str, Any]) -> Environment:
-    description = CATALOGUE[entry["name"]]
+    description = CATALOGUE.get(entry["name"]) or Description.read(entry)
     parameters = {parameter["name"]: _parameter(parameter) for parameter in entry["parameters"]}
     return Environment(
         name=description.name,
@@ -102,6 +115,8 @@ def _environment(entry: Mapping[str, Any]) -> Environment:
         parameters=parameters,
         success=description.success,
         model_hash=entry.get("model_hash", ""),
+        heatmap_axes=tuple(entry.get("heatmap_axes") or ()),
+        _description=description,
     )
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from . import catalogue, requests
+from . import requests
+from .address import parse_address
 from .assessment import Assessment
 from .client import TIMEOUT
 from .errors import InvalidArgumentError
 from .sets import Set
+from .task_folder import describe, find_folder
 from .testing import Settings, play, policies
 
 if TYPE_CHECKING:
@@ -22,7 +25,7 @@ DRAWN, LISTED = "parameters", "contexts"
 
 def evaluate(
     policy: Any,
-    environment: str,
+    environment: str | None = None,
     *,
     versions: Sequence[Version | Set] | None = None,
     episodes: int = 1000,
@@ -37,6 +40,7 @@ def evaluate(
     normalizer: Any = None,
     name: str | None = None,
     server: str | None = None,
+    task: str | os.PathLike[str] | None = None,
     timeout: float = TIMEOUT,
 ) -> Assessment:
     """Test a policy, or policies trained on D, R and E, in episodes that no training has seen.
@@ -59,7 +63,7 @@ def evaluate(
               numbers [N, n], of which the greatest counts, or integers [N]; otherwise numbers [N, A];
             - a mapping of such by the version that each was trained on, `{"D": …, "R": …, "E": …}`: all pairs are
               tested, with all three the paper's nine scenarios.
-        environment: a name of docs/environments.md, such as `CartPole`.
+        environment: a name of docs/environments.md, such as `CartPole`; with `task` its name, or None.
         versions: the versions to test on, `D`, `R`, `E` and `R+E`, and sets of `perturb.sets`. By default D, R and E,
             or none if parameters or contexts are given.
         episodes: episodes of each test, at least 1. A policy that was trained over trials plays so many trials, and the
@@ -83,6 +87,7 @@ def evaluate(
         name: the policy's name in records and reports. By default records have its id, its kind with a checksum of its
             weights, or its function, and reports have its kind.
         server: `unix:/path` or `host:port`; None starts a server of this process's own.
+        task: the folder of a task, which the server of this process's own then serves; see docs/tasks.md.
         timeout: how long a reply may take, s.
 
     While a policy that is not perturb's acts, NumPy's global random numbers and torch's are seeded by the test;
@@ -96,13 +101,15 @@ def evaluate(
         ProtocolError: if episodes ran with other parameters than they were to run with.
         ServerConnectionError, ServerTimeoutError, ServerStartError: and nothing was recorded.
     """
-    environment = catalogue.find(environment).name
+    requests.seconds(timeout, "timeout")
+    address = None if server is None else parse_address(server)
+    environment = describe(environment, find_folder(task, server), address, timeout).name
     requests.count(episodes, "episodes", 1)
     tested = policies(policy, trained_on, normalizer)
     sets = _sets(versions, parameters, contexts, base)
     assessed, agents = [], []
     for trained, one, own_normalizer in tested:
-        settings = Settings(environment, sets, episodes, seed, success, observe, deterministic, server, timeout)
+        settings = Settings(environment, sets, episodes, seed, success, observe, deterministic, server, task, timeout)
         agent, recorded = play(one, settings, trained, own_normalizer, name)
         agents.append(agent)
         assessed.append(recorded)

@@ -1,7 +1,8 @@
 """A perturb-server of this process's own, on a private Unix socket.
 
-All environments that were made without `server=` share it. It starts with the first and ends with the last. It also
-ends with this process, however that ends, for this process holds the other end of the server's standard input.
+All environments that were made without `server=` share it, those of each `task=` another one. It starts with the first
+and ends with the last. It also ends with this process, however that ends, for this process holds the other end of the
+server's standard input.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import tempfile
 import threading
 import time
 import weakref
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
@@ -30,6 +32,8 @@ VARIABLE = "PERTURB_SERVER"
 BUNDLED = Path(__file__).with_name("_programs") / PROGRAM
 # Limit for the start of a server, s.
 START_LIMIT = 20.0
+# Further limit for the start of a server that loads a task's folder, s.
+TASK_LIMIT = 120.0
 # Limit for the end of a server, after which it is killed, s.
 END_LIMIT = 5.0
 
@@ -60,10 +64,22 @@ def find_program() -> Path:
     return Path(found)
 
 
+@dataclass(frozen=True)
+class TaskFolder:
+    """A folder with a task.toml, as its files are at a moment. Equal ones can share a server."""
+
+    # Absolute path.
+    path: str
+    # Digest of the names, sizes and times of the files that a task can have read.
+    files: str
+
+
 class LocalServer:
     """A running server. It lives no longer than this object, and no longer than this process."""
 
-    def __init__(self) -> None:
+    def __init__(self, task: TaskFolder | None = None) -> None:
+        self.task = task
+        self.users = 0
         program = find_program()
         self._owner = os.getpid()
         try:
@@ -83,7 +99,7 @@ class LocalServer:
             )
         try:
             self.address: Address = parse_address(f"unix:{socket}")
-            self.process = _spawn(program, self.address)
+            self.process = _spawn(program, self.address, task)
         except (PerturbError, OSError) as error:
             shutil.rmtree(directory, ignore_errors=True)
             raise ServerStartError(f"the private server {program} did not start: {error}") from error
@@ -112,12 +128,13 @@ class LocalServer:
         lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         # Reads to the end of the output, so that the server never waits for a reader.
         threading.Thread(target=_read, args=(self.process.stdout, lines), daemon=True).start()
-        deadline = time.monotonic() + START_LIMIT
+        limit = START_LIMIT if self.task is None else START_LIMIT + TASK_LIMIT
+        deadline = time.monotonic() + limit
         while True:
             try:
                 line = lines.get(timeout=max(0.0, deadline - time.monotonic()))
             except queue.Empty:
-                reason = f"it did not listen within {START_LIMIT:.0f} s"
+                reason = f"it did not listen within {limit:.0f} s"
             else:
                 if line is not None and line.startswith("listening on "):
                     return
@@ -128,9 +145,10 @@ class LocalServer:
             raise ServerStartError(f"the private server {program} did not start: {reason}")
 
 
-def _spawn(program: Path, address: Address) -> subprocess.Popen[bytes]:
+def _spawn(program: Path, address: Address, task: TaskFolder | None) -> subprocess.Popen[bytes]:
+    folder = [] if task is None else ["--task", task.path]
     return subprocess.Popen(
-        [program, "--private", "--log", "error", "--listen", str(address)],
+        [program, "--private", "--log", "error", "--listen", str(address), *folder],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         bufsize=0,
@@ -162,41 +180,41 @@ def _end(process: subprocess.Popen[bytes], directory: str, owner: int) -> None:
 # Every server whose pipe this process holds.
 _running: weakref.WeakSet[LocalServer] = weakref.WeakSet()
 _lock = threading.Lock()
-_shared: LocalServer | None = None
-_users = 0
+# The servers that run, by their task's folder; None for the server without one.
+_shared: dict[TaskFolder | None, LocalServer] = {}
 
 
-def acquire() -> LocalServer:
-    """Share this process's server; start it if it does not run.
+def acquire(task: TaskFolder | None = None) -> LocalServer:
+    """Share this process's server for a task, or for none; start it if it does not run.
 
     Raises:
         ServerStartError: if there is no program, or it does not start.
     """
-    global _shared, _users
     with _lock:
-        if _shared is None or _shared.exit_status() is not None:
-            _shared, _users = LocalServer(), 0
-        _users += 1
-        return _shared
+        server = _shared.get(task)
+        if server is None or server.exit_status() is not None:
+            server = LocalServer(task)
+            _shared[task] = server
+        server.users += 1
+        return server
 
 
 def release(server: LocalServer) -> None:
     """Give a share back; the last ends the server."""
-    global _shared, _users
     with _lock:
-        if server is not _shared:
+        if server is not _shared.get(server.task):
             return  # it died and was replaced
-        _users -= 1
-        if _users > 0:
+        server.users -= 1
+        if server.users > 0:
             return
-        _shared = None
+        del _shared[server.task]
     server.end()
 
 
 def _after_fork_in_child() -> None:
-    global _lock, _shared, _users
+    global _lock
     _lock = threading.Lock()
-    _shared, _users = None, 0
+    _shared.clear()
     for server in list(_running):
         server.forget_in_child()
     _running.clear()

@@ -11,17 +11,18 @@ _OLD_SUFFIXES = {"D": "", "R": "RandomNormal", "E": "RandomExtreme"}
 
 
 def register_all() -> None:
-    """Register `perturb/CartPole-v1` and so on, and the paper's ids, such as `SunblazeCartPoleRandomNormal-v0`.
+    """Register `perturb/CartPole-v1` and so on and the paper's ids, such as `SunblazeCartPoleRandomNormal-v0`.
 
     Step limits are the server's: a limit here would go wrong when a snapshot is restored.
     """
     for name, description in CATALOGUE.items():
-        _register(f"perturb/{name}-v{description.revision}", environment=name)
+        register_id(f"perturb/{name}-v{description.revision}", environment=name)
         for version, suffix in _OLD_SUFFIXES.items():
-            _register(f"Sunblaze{name}{suffix}-v0", environment=name, version=version)
+            register_id(f"Sunblaze{name}{suffix}-v0", environment=name, version=version)
 
 
-def _register(identifier: str, **settings: str) -> None:
+def register_id(identifier: str, **settings: str) -> None:
+    """Register an id with the settings that environments are made with, unless it is registered."""
     if identifier not in gymnasium.registry:
         gymnasium.register(
             identifier,

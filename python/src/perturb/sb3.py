@@ -40,15 +40,17 @@ _METHODS = {"snapshot": 0, "restore": 1, "render": 0, "set_parameters": 1}
 _FIXED = ("autoreset_mode", "copy")
 
 
-def make_vec_env(environment: str, num_envs: int = 1, *, seed: int | None = None, **settings: Any) -> PerturbVecEnv:
+def make_vec_env(
+    environment: str | None = None, num_envs: int = 1, *, seed: int | None = None, **settings: Any
+) -> PerturbVecEnv:
     """Make N environments of one session, as a stable-baselines3 VecEnv.
 
     Args:
-        environment: a name of docs/environments.md, such as `CartPole`.
+        environment: a name of docs/environments.md, such as `CartPole`; with `task` its name, or None.
         num_envs: N.
         seed: environment i begins with the seed s + i. By default seeds are random.
-        **settings: those of `PerturbVectorEnv`, such as `version`, `parameters`, `contexts` and `server`, but for
-            `autoreset_mode` and `copy`.
+        **settings: those of `PerturbVectorEnv`, such as `version`, `parameters`, `contexts`, `server` and `task`,
+            but for `autoreset_mode` and `copy`.
 
     Raises:
         InvalidArgumentError: for settings that are wrong or not known.

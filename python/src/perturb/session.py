@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
     from .address import Address
     from .catalogue import Description
+    from .local_server import TaskFolder
 
     Intervals: TypeAlias = dict[str, list[tuple[float, float]]]
 
@@ -55,18 +56,25 @@ DEADLINE_EXCEEDED, RESOURCE_EXHAUSTED, OUT_OF_RANGE, UNIMPLEMENTED, UNAUTHENTICA
 
 
 class Session:
-    """The stream. `server` is an address, or None for this process's own server.
+    """The stream. `server` is an address, or None for this process's own server, which serves `task`, too.
 
     A session that is lost (the server died, a reply took too long, the wait for it was interrupted) stays lost.
     """
 
     def __init__(
-        self, server: Address | None, timeout: float, description: Description, num_envs: int, *, single: bool
+        self,
+        server: Address | None,
+        timeout: float,
+        description: Description,
+        num_envs: int,
+        *,
+        single: bool,
+        task: TaskFolder | None = None,
     ) -> None:
         _close_unclosed()
         self._local: local_server.LocalServer | None = None
         if server is None:
-            self._local = local_server.acquire()
+            self._local = local_server.acquire(task)
             server = self._local.address
         self.address: Address = server
         self._owner = os.getpid()

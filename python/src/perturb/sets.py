@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from . import _native, catalogue, requests
-from .catalogue import CATALOGUE_ENTRIES
-from .environments import environments
+from . import _native, requests
+from .environments import Environment, environments
 from .errors import InvalidArgumentError, UnknownNameError
 from .policy import native
+from .task_folder import describe, find_folder
 
 __all__ = ["Set", "drawn", "grid", "heatmap", "listed", "read", "read_csv", "sampled"]
 
@@ -92,16 +92,24 @@ def listed(name: str, contexts: Sequence[Mapping[str, float]], *, base: requests
     return Set(_name(name), requests.version(base, "base"), {}, tuple(requests.contexts(contexts)))
 
 
-def sampled(name: str, environment: str, count: int, *, version: requests.Version = "R", seed: int = 1) -> Set:
+def sampled(
+    name: str,
+    environment: str,
+    count: int,
+    *,
+    version: requests.Version = "R",
+    seed: int = 1,
+    task: str | os.PathLike[str] | None = None,
+) -> Set:
     """Make a list of contexts drawn from R or E once: for training on a chosen number of them, or for testing.
 
     Each parameter is uniform over its intervals. The same seed gives the same contexts, of which those of a smaller
-    count are the first.
+    count are the first. `task` is the folder of the environment's task, if it has one.
 
     Raises:
         InvalidArgumentError: for an environment that there is not, another version than R and E, or a count below 1.
     """
-    parameters = environments()[catalogue.find(environment).name].parameters
+    parameters = _environment(environment, task).parameters
     version = requests.version(version)
     if version not in ("R", "E"):
         raise InvalidArgumentError(f"version={version!r}; expected 'R' or 'E', which contexts are drawn from")
@@ -129,6 +137,7 @@ def heatmap(
     points: int = 10,
     base: requests.Version = "D",
     fixed: Mapping[str, float] | None = None,
+    task: str | os.PathLike[str] | None = None,
 ) -> Set:
     """Make the set of a heatmap over two parameters, which reports draw of whoever was tested on it.
 
@@ -142,13 +151,14 @@ def heatmap(
         points: along each axis, 2 … 100. Each point has equally many of a test's episodes, at least 1.
         base: where other parameters come from.
         fixed: values of others.
+        task: the folder of the environment's task, if it has one.
 
     Raises:
         UnknownNameError: for an environment or a parameter that there is not.
         InvalidArgumentError: for other numbers of points, one parameter twice, or where it is not known what to show.
     """
-    known = environments()[catalogue.find(environment).name]
-    usual = next(entry["heatmap_axes"] for entry in CATALOGUE_ENTRIES if entry["name"] == known.name) or (None, None)
+    known = _environment(environment, task)
+    usual = known.heatmap_axes or (None, None)
     axes = (usual[0] if x is None else x, usual[1] if y is None else y)
     ranges = []
     for name in axes:
@@ -201,6 +211,10 @@ def contexts_of(
             f"version={version!r} and parameters={parameters!r}: give the same version, and no parameters"
         )
     return chosen.contexts
+
+
+def _environment(name: str, task: str | os.PathLike[str] | None) -> Environment:
+    return environments(task=task)[describe(name, find_folder(task)).name]
 
 
 def _made(name: str, base: str, texts: Mapping[str, str]) -> Set:

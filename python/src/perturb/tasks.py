@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shutil
 from importlib import metadata, resources, util
 from pathlib import Path
 from typing import Final
+
+import gymnasium
+
+from .registration import register_id
+from .task_folder import entry, find_folder
 
 #: The tasks of Gymnasium that this package has task files for: ids and files.
 GYMNASIUM_TASKS: Final[dict[str, str]] = {
@@ -20,6 +27,15 @@ GYMNASIUM_TASKS: Final[dict[str, str]] = {
     "Reacher-v5": "reacher_v5.toml",
     "Swimmer-v5": "swimmer_v5.toml",
     "Walker2d-v5": "walker2d_v5.toml",
+}
+
+#: The tasks of dm_control's suite that this package has task files for: domain and task, and files.
+DM_CONTROL_TASKS: Final[dict[str, str]] = {
+    "acrobot-swingup": "dm_acrobot_swingup.toml",
+    "acrobot-swingup_sparse": "dm_acrobot_swingup_sparse.toml",
+    "ball_in_cup-catch": "dm_ball_in_cup_catch.toml",
+    "cheetah-run": "dm_cheetah_run.toml",
+    "pendulum-swingup": "dm_pendulum_swingup.toml",
 }
 
 
@@ -41,15 +57,77 @@ def from_gymnasium(id: str, folder: str | Path) -> Path:  # noqa: A002 - Gymnasi
     """
     if id not in GYMNASIUM_TASKS:
         raise ValueError(f"there is no task file for {id!r}; there are {', '.join(GYMNASIUM_TASKS)}")
-    task = (resources.files("perturb") / "task_files" / GYMNASIUM_TASKS[id]).read_text(encoding="utf-8")
-    model = _assets() / _model(task)
-    if not model.is_file():
-        raise FileNotFoundError(f"{model} is missing; install gymnasium 1.1 or later, which has the model of {id}")
-    target = Path(folder)
-    target.mkdir(parents=True, exist_ok=True)
+    return _write(
+        GYMNASIUM_TASKS[id], _assets(), Path(folder), "gymnasium", [], f"gymnasium 1.1 or later, which has {id}"
+    )
+
+
+def from_dm_control(task: str, folder: str | os.PathLike[str]) -> Path:
+    """Writes a folder of a task of dm_control's suite: the task file, dm_control's model and dm_control's licence.
+
+    The model comes from the installed package dm_control, whose dependencies are not needed: `pip install --no-deps
+    dm_control`. Observations and rewards are dm_control's; comments in the task file say what is not.
+
+    Args:
+        task: domain and task, such as "cheetah-run"; see `DM_CONTROL_TASKS`.
+        folder: where to write; it is made if need be. Files of the same names are overwritten.
+
+    Returns:
+        The folder, for `task=` and `perturb-server --task`.
+
+    Raises:
+        ValueError: there is no task file for this task.
+        FileNotFoundError: the installed dm_control has no such model, or none is installed.
+    """
+    if task not in DM_CONTROL_TASKS:
+        raise ValueError(f"there is no task file for {task!r}; there are {', '.join(DM_CONTROL_TASKS)}")
+    common = ["common/visual.xml", "common/skybox.xml", "common/materials.xml"]
+    suite = _package("dm_control") / "suite"
+    return _write(
+        DM_CONTROL_TASKS[task], suite, Path(folder), "dm_control", common, f"dm_control 1.0, which has {task}"
+    )
+
+
+def register(folder: str | os.PathLike[str]) -> str:
+    """Registers the task of a folder, so that `gymnasium.make` finds it by the returned id, `perturb/MyRobot-v0`.
+
+    `gymnasium.make("perturb/Task-v0", task=folder)` makes it without this call.
+
+    Raises:
+        InvalidArgumentError: for what is no such folder, with the reason.
+    """
+    task = find_folder(folder)
+    assert task is not None
+    told = entry(task)
+    identifier = f"perturb/{told['name']}-v{told['revision']}"
+    gymnasium.registry.pop(identifier, None)  # it may be of another folder
+    register_id(identifier, environment=told["name"], task=task.path)
+    return identifier
+
+
+def register_ids() -> None:
+    """Registers the ids of tasks that are made with `task=`: `perturb/Task-v0` for any, and those of the files here."""
+    register_id("perturb/Task-v0")
+    for name in GYMNASIUM_TASKS:
+        own = name.replace("-v5", "V5")
+        register_id(f"perturb/{own}-v0", environment=own)
+    for name in DM_CONTROL_TASKS:
+        own = "".join(part.capitalize() for part in name.replace("-", "_").split("_"))
+        register_id(f"perturb/{own}-v0", environment=own)
+
+
+def _write(file: str, models: Path, target: Path, package: str, included: list[str], remedy: str) -> Path:
+    """Write a task file, its model with what it includes from a package's folder, and the package's licence."""
+    task = (resources.files("perturb") / "task_files" / file).read_text(encoding="utf-8")
+    model = _model(task)
+    for name in [model, *included]:
+        if not (models / name).is_file():
+            raise FileNotFoundError(f"{models / name} is missing; install {remedy}")
+    for name in [model, *included]:
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(models / name, target / name)
     (target / "task.toml").write_text(task, encoding="utf-8")
-    shutil.copyfile(model, target / model.name)
-    (target / "LICENSE.gymnasium").write_text(_licence(), encoding="utf-8")
+    (target / f"LICENSE.{package}").write_text(_licence(package), encoding="utf-8")
     return target
 
 
@@ -60,18 +138,29 @@ def _model(task: str) -> str:
 
 
 def _assets() -> Path:
-    """The folder of Gymnasium's models. Importing its MuJoCo environments would need MuJoCo."""
-    found = util.find_spec("gymnasium")
+    """The folder of Gymnasium's models."""
+    return _package("gymnasium") / "envs" / "mujoco" / "assets"
+
+
+def _package(name: str) -> Path:
+    """The folder of a package. Importing its MuJoCo environments would need MuJoCo."""
+    found = util.find_spec(name)
     if found is None or not found.submodule_search_locations:
-        raise FileNotFoundError("the package gymnasium is missing; install it with: pip install gymnasium")
-    return Path(found.submodule_search_locations[0]) / "envs" / "mujoco" / "assets"
+        raise FileNotFoundError(f"the package {name} is missing; install it with: pip install {name}")
+    return Path(found.submodule_search_locations[0])
 
 
-def _licence() -> str:
-    """The licence of the installed package gymnasium."""
-    for file in metadata.files("gymnasium") or []:
-        if file.name.upper().startswith("LICENSE"):
-            return file.read_text(encoding="utf-8")
-    return (
-        "This model is a part of Gymnasium, which has the MIT licence: https://github.com/Farama-Foundation/Gymnasium\n"
-    )
+def _licence(package: str) -> str:
+    """The licence of an installed package."""
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        for file in metadata.files(package) or []:
+            if file.name.upper().startswith("LICENSE"):
+                return file.read_text(encoding="utf-8")
+    return f"This model is a part of {package}, which has {_LICENCES[package]}\n"
+
+
+# Licences of the packages, and where they stand.
+_LICENCES = {
+    "gymnasium": "the MIT licence: https://github.com/Farama-Foundation/Gymnasium",
+    "dm_control": "the Apache License 2.0: https://github.com/google-deepmind/dm_control",
+}

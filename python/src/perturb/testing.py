@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -11,12 +12,14 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from . import _native, catalogue, players, requests
+from . import _native, players, requests
+from .address import parse_address
 from .catalogue import DEFAULT_PIXELS
 from .client import Client
 from .errors import InvalidArgumentError, PolicyError
 from .policy import Policy, native
 from .results import Audit, PolicyMetadata, PolicyRecords
+from .task_folder import describe, find_folder
 
 
 @dataclass(frozen=True)
@@ -31,11 +34,18 @@ class Settings:
     observe: str | None
     deterministic: bool | None
     server: str | None
+    task: str | os.PathLike[str] | None
     timeout: float
 
 
 def replay(
-    recorded: Sequence[PolicyRecords], agent: str, policy: Any, normalizer: Any, server: str | None, timeout: float
+    recorded: Sequence[PolicyRecords],
+    agent: str,
+    policy: Any,
+    normalizer: Any,
+    server: str | None,
+    task: str | os.PathLike[str] | None,
+    timeout: float,
 ) -> Audit:
     """Play all recorded tests again; see `Assessment.audit`."""
     given = {trained: (one, own) for trained, one, own in policies(policy, None, normalizer)}
@@ -61,6 +71,7 @@ def replay(
             known.observe,
             known.deterministic,
             server,
+            task,
             timeout,
         )
         _, tested = play(acts, settings, known.trained_on, own_normalizer, name, records.policy)
@@ -95,7 +106,8 @@ def play(
 ) -> tuple[str, PolicyRecords]:
     """Test one policy, which records call as expected: what reports call the agent, and its records."""
     environment, observe = settings.environment, settings.observe
-    description = catalogue.find(environment)
+    address = None if settings.server is None else parse_address(settings.server)
+    description = describe(environment, find_folder(settings.task, settings.server), address, settings.timeout)
     seen = observe or "state"
     if isinstance(policy, Policy):
         seen = _of_loaded(policy, environment, trained_on, observe)
@@ -112,7 +124,13 @@ def play(
     trials = 1 if tested.loaded is None else tested.loaded.episodes_per_trial
     tests = native(_native.Tests, settings.sets, settings.episodes, seed, settings.success, tested.name, trials)
     for place, one_set in enumerate(settings.sets):
-        client = {"environment": environment, "server": settings.server, "observe": seen, "timeout": settings.timeout}
+        client = {
+            "environment": environment,
+            "server": settings.server,
+            "task": settings.task,
+            "observe": seen,
+            "timeout": settings.timeout,
+        }
         _test(tests, place, one_set, tested, client, trials)
     known = PolicyMetadata(trained_on, tested.timesteps, seed, settings.episodes, seen, tested.deterministic)
     return tested.agent, PolicyRecords(known, tests.records())

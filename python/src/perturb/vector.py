@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -32,11 +33,13 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
     """N environments of a perturb-server.
 
     Args:
-        environment: a name of docs/environments.md, such as `CartPole`.
+        environment: a name of docs/environments.md, such as `CartPole`; with `task` its name, or None.
         num_envs: N.
         version: where parameters come from: `D` their defaults, `R` random, `E` extreme, `R+E` one of
             both, each in half of the trials.
         server: `unix:/path` or `host:port`; None starts a server of this process's own.
+        task: the folder of a task, which the server of this process's own then serves; see docs/tasks.md. The
+            environment is that of the folder.
         parameters: replaces the version's set of the named parameters: a value, an interval `(low, high)`, or several
             `[(low, high), …]`.
         autoreset_mode: Gymnasium's mode, which decides what happens to environments whose episode has ended.
@@ -65,11 +68,12 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
 
     def __init__(
         self,
-        environment: str,
+        environment: str | None = None,
         num_envs: int = 1,
         *,
         version: requests.Version = "D",
         server: str | None = None,
+        task: str | os.PathLike[str] | None = None,
         parameters: requests.Parameters | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         first_environment_index: int = 0,
@@ -95,6 +99,7 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
             version=version,
             num_envs=num_envs,
             server=server,
+            task=task,
             parameters=parameters,
             first_environment_index=first_environment_index,
             episodes_per_trial=episodes_per_trial,

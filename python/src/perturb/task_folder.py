@@ -1,0 +1,127 @@
+"""Descriptions of environments: built-in ones, tasks of a folder, and tasks that a running server has."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import subprocess
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from . import _native, catalogue, local_server
+from .catalogue import Description
+from .errors import InvalidArgumentError, ServerStartError
+from .local_server import TaskFolder
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from .address import Address
+
+# Ends of the names of files that a task can have read.
+_SUFFIXES = {".toml", ".xml", ".mjcf", ".stl", ".obj", ".msh", ".png", ".skn", ".bin", ".hf"}
+# Limit for a server to describe a folder, s. It loads the folder within a minute of processor time first.
+_LIMIT = 120.0
+
+
+def find_folder(task: str | os.PathLike[str] | None, server: object = None) -> TaskFolder | None:
+    """Find the folder that `task=` names; None if it names none.
+
+    Raises:
+        InvalidArgumentError: for what is no such folder, and beside a server, which serves what it was started with.
+    """
+    if task is None:
+        return None
+    if not isinstance(task, str | os.PathLike):
+        raise InvalidArgumentError(f"task={task!r}; expected the path of a folder with a task.toml")
+    if server is not None:
+        raise InvalidArgumentError(
+            f"task={os.fspath(task)!r} is for a server of this process's own, and server={str(server)!r} is another's: "
+            "leave server= out, or start that server with `perturb-server --task DIR` and leave task= out"
+        )
+    path = Path(task).absolute()
+    if not (path / "task.toml").is_file():
+        wrong = "has no file task.toml" if path.is_dir() else "is no folder" if path.exists() else "does not exist"
+        raise InvalidArgumentError(
+            f"task={os.fspath(task)!r}: {path} {wrong}; docs/tasks.md describes folders of tasks, and "
+            "perturb.tasks.from_gymnasium writes some"
+        )
+    return TaskFolder(str(path), _fingerprint(path))
+
+
+@functools.lru_cache(maxsize=64)
+def entry(task: TaskFolder) -> Mapping[str, Any]:
+    """What a server that serves the folder tells of the task, as in catalogue.json.
+
+    Raises:
+        InvalidArgumentError: if the server refuses the folder, with its sentence.
+        ServerStartError: if there is no program, or it fails.
+    """
+    program = local_server.find_program()
+    command = [program, "--private", "--log", "error", "--catalogue", "--task", task.path]
+    try:
+        told = subprocess.run(command, capture_output=True, timeout=_LIMIT, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise ServerStartError(f"{program} does not describe task={task.path!r}: {error}") from error
+    words = told.stderr.decode(errors="replace").strip().removeprefix("perturb-server: --task ")
+    if told.returncode == 2:
+        raise InvalidArgumentError(f"task={words}")
+    if told.returncode != 0:
+        raise ServerStartError(f"{program} does not describe task={task.path!r}: status {told.returncode}, {words}")
+    known = {known["name"] for known in catalogue.CATALOGUE_ENTRIES}
+    entries = json.loads(told.stdout)["environments"]
+    own: Mapping[str, Any] = next(own for own in reversed(entries) if own["name"] not in known)
+    return own
+
+
+def _fingerprint(path: Path) -> str:
+    digest = hashlib.sha256()
+    for folder, subfolders, names in os.walk(path):
+        subfolders.sort()
+        for name in sorted(names):
+            if Path(name).suffix.lower() in _SUFFIXES:
+                file = Path(folder, name)
+                status = file.stat() if file.exists() else None
+                digest.update(repr((str(file), status and (status.st_size, status.st_mtime_ns))).encode())
+    return digest.hexdigest()
+
+
+def describe(
+    environment: str | None, task: TaskFolder | None, server: Address | None = None, timeout: float = 60.0
+) -> Description:
+    """Describe an environment: that of a task's folder, a built-in one, or one that the server has.
+
+    Raises:
+        InvalidArgumentError: for a name that there is not.
+    """
+    if task is not None:
+        known = Description.read(entry(task))
+        if environment is not None and not catalogue.is_spelled(environment, known):
+            raise InvalidArgumentError(
+                f"environment={environment!r} is not the task in {task.path}, which is {known.name!r}: leave one "
+                "of both out"
+            )
+        return known
+    if environment is None:
+        raise InvalidArgumentError("there is neither environment= nor task=: give the name of an environment")
+    try:
+        return catalogue.find(environment)
+    except InvalidArgumentError:
+        if server is None or not isinstance(environment, str):
+            raise
+        served = _served(server, timeout)
+        for description in served:
+            if catalogue.is_spelled(environment, description):
+                return description
+        raise
+
+
+def _served(server: Address, timeout: float) -> list[Description]:
+    """The environments of a server; none if it does not answer, which the next request to it tells."""
+    try:
+        told = _native.catalogue(str(server), timeout)
+    except _native.Failure:
+        return []
+    return [Description.read(served) for served in json.loads(told)["environments"]]
