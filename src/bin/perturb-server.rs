@@ -29,6 +29,7 @@ use tokio::{
 use tracing_subscriber::{layer::SubscriberExt, util::SubscriberInitExt};
 
 fn main() -> ExitCode {
+    let _ = perturb_system::ignore_sigxfsz(); // without it, only a limit of file sizes ends the program
     let arguments = Arguments::parse();
     if let Some(page) = about(&arguments) {
         // The reader may close the pipe early.

@@ -46,6 +46,7 @@ use tracing_subscriber::util::SubscriberInitExt;
 
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
+    let _ = perturb_system::ignore_sigxfsz(); // without it, only a limit of file sizes ends the program
     let cli = Cli::from_process(|warning| {
         // A program that replaces itself by perturb-recurrent has printed the warning already.
         if !recurrent::is_replacement() {

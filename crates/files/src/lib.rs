@@ -9,13 +9,15 @@ use std::time::Duration;
 
 use serde::Serialize;
 
+use perturb_system::plain::nonblocking_flag;
 use perturb_text::quoted;
 
 pub mod checksum;
 pub mod interrupt;
 mod plain;
 
-pub use self::plain::{Stamp, leads_out, open_plain, read_plain, read_plain_text};
+pub use self::plain::{Stamp, leads_out, read_plain, read_plain_text};
+pub use perturb_system::open_plain;
 
 /// The prefix of files that a write has not finished.
 pub const TEMPORARY_PREFIX: &str = ".tmp-";
@@ -226,7 +228,7 @@ impl Lock {
         } else {
             // NFS wants both: to read for asking who has it, to write for having it.
             let mut options = File::options();
-            options.create(true).truncate(false).read(true).write(true).custom_flags(plain::nonblocking()).open(path)
+            options.create(true).truncate(false).read(true).write(true).custom_flags(nonblocking_flag()).open(path)
         };
         let file = file.map_err(io("open", path))?;
         for _ in 0..MAX_LOCK_TRIES {
@@ -250,7 +252,7 @@ impl Lock {
 /// Whether somebody has the lock of the folder or file at `path`. It is shared for a moment, which
 /// [keeps nobody from taking it](Lock::try_take).
 pub fn is_locked(path: &Path) -> bool {
-    let Ok(file) = File::options().read(true).custom_flags(plain::nonblocking()).open(path) else { return false };
+    let Ok(file) = File::options().read(true).custom_flags(nonblocking_flag()).open(path) else { return false };
     matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock))
 }
 

@@ -1,11 +1,9 @@
 //! Files that anybody may have put where they are: opened without waiting, read to a limit, and told from what they were.
 
-use std::fs::{File, Metadata};
-use std::io::{Error, ErrorKind, Read};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::fs::Metadata;
+use std::io::{Error, ErrorKind};
+use std::os::unix::fs::MetadataExt;
 use std::path::Path;
-
-use rustix::fs::OFlags;
 
 use super::{Result, if_there, io};
 
@@ -53,50 +51,12 @@ impl Stamp {
     }
 }
 
-/// Opens a plain file for reading. What is none is refused: a pipe would be waited for, a device might never end.
-///
-/// # Errors
-/// The operating system's; [`ErrorKind::InvalidInput`] for what is no plain file.
-pub fn open_plain(path: &Path) -> std::io::Result<(File, Metadata)> {
-    require_plain(std::fs::metadata(path)?)?; // a device may do something when it is opened
-    let file = File::options().read(true).custom_flags(nonblocking()).open(path)?;
-    let metadata = require_plain(file.metadata()?)?; // it may have become another one meanwhile
-    Ok((file, metadata))
-}
-
-/// The flag with which opening a pipe does not wait for its other end.
-pub(super) fn nonblocking() -> i32 {
-    OFlags::NONBLOCK.bits().cast_signed()
-}
-
-fn require_plain(metadata: Metadata) -> std::io::Result<Metadata> {
-    match metadata.is_file() {
-        true => Ok(metadata),
-        false if metadata.is_dir() => Err(Error::new(ErrorKind::IsADirectory, "it is a folder, expected a file")),
-        false => Err(Error::new(ErrorKind::InvalidInput, "it is a pipe or a device, expected a plain file; delete it")),
-    }
-}
-
 /// Reads a plain file of at most `most` bytes; `None` if it is not there.
 ///
 /// # Errors
 /// The operating system's; a file that is not plain, or longer.
 pub fn read_plain(path: &Path, most: u64) -> Result<Option<Vec<u8>>> {
-    let read = || {
-        let (file, metadata) = open_plain(path)?;
-        let mut content = Vec::new();
-        let mut rest = file.take(most.saturating_add(1)); // it may grow meanwhile
-        if metadata.len() <= most {
-            rest.read_to_end(&mut content)?;
-        }
-        let length = metadata.len().max(content.len() as u64);
-        if length > most {
-            let words = format!("it has {length} bytes, expected {most} at most");
-            return Err(Error::new(ErrorKind::InvalidData, words));
-        }
-        Ok(content)
-    };
-    if_there(read()).map_err(io("read", path))
+    if_there(perturb_system::read_plain(path, most)).map_err(io("read", path))
 }
 
 /// Reads the text in a plain file of at most `most` bytes.
