@@ -60,7 +60,7 @@ def entry(task: TaskFolder) -> Mapping[str, Any]:
         ServerStartError: if there is no program, or it fails.
     """
     program = local_server.find_program()
-    command = [program, "--private", "--log", "error", "--catalogue", "--task", task.path]
+    command = [str(program), "--private", "--log", "error", "--catalogue", "--task", task.path]
     try:
         told = subprocess.run(command, capture_output=True, timeout=_LIMIT, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:

@@ -139,11 +139,17 @@ fn say(sentence: &str) {
     let _ = writeln!(std::io::stderr(), "{sentence}");
 }
 
+/// Whether Slurm is not installed, which a test may only find where it is not required.
+fn is_missing() -> bool {
+    let Some(missing) = Cluster::missing() else { return false };
+    assert!(std::env::var_os(REQUIRED).is_none(), "{missing}, but {REQUIRED} is set: use `make slurm-test`");
+    say(&format!("the test with a real Slurm is skipped: {missing}; `make slurm-test` installs it"));
+    true
+}
+
 #[test]
 fn a_plan_survives_the_loss_of_a_node() {
-    if let Some(missing) = Cluster::missing() {
-        assert!(std::env::var_os(REQUIRED).is_none(), "{missing}, but {REQUIRED} is set: use `make slurm-test`");
-        say(&format!("the test with a real Slurm is skipped: {missing}; `make slurm-test` installs it"));
+    if is_missing() {
         return;
     }
     let experiment = Experiment::new();
@@ -179,7 +185,6 @@ fn a_plan_survives_the_loss_of_a_node() {
         experiment.jobs("slurm").len(),
     ));
     shared_server(&experiment, &cluster);
-    task_folders(&cluster);
 }
 
 /// Ctrl-C leaves the jobs alone, and the same command finds them again.
@@ -288,8 +293,12 @@ fn refusals(experiment: &Experiment, cluster: &Cluster) {
     assert!(!experiment.out("refused/slurm/1").exists());
 }
 
-/// Jobs' private servers serve the tasks of a plan, to the same results as on this machine.
-fn task_folders(cluster: &Cluster) {
+#[test]
+fn jobs_serve_the_task_folders_of_a_plan() {
+    if is_missing() {
+        return;
+    }
+    let cluster = Cluster::start();
     let tasks = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/tasks");
     let experiment = Experiment::with_plan(&format!(
         "tasks = ['{0}/reaching_arm', '{0}/quadruped']\nenvironments = ['ReachingArm', 'Quadruped']\nversions = ['R']
@@ -299,7 +308,7 @@ fn task_folders(cluster: &Cluster) {
     ));
     let whole = end(experiment.run("whole", &[]).spawn().expect("started"));
     assert!(whole.status.success(), "{}", stderr(&whole));
-    let output = end(experiment.on(cluster, "slurm", &["--cells-per-job", "1"]).spawn().expect("started"));
+    let output = end(experiment.on(&cluster, "slurm", &["--cells-per-job", "1"]).spawn().expect("started"));
     assert!(output.status.success(), "{}\n{}", stderr(&output), cluster.logs());
     assert_eq!(experiment.results("slurm").len(), 2);
     assert!(experiment.results("slurm") == experiment.results("whole"), "results differ");

@@ -29,7 +29,7 @@ pub(super) fn resolve(
     let tasks = written.iter().map(|name| absolute(name.get_ref())).collect::<Result<Vec<_>, _>>()?;
     for (place, task) in tasks.iter().enumerate() {
         let got = format!("`{}` twice", task.display());
-        require(!tasks[..place].contains(task), KEY, got, "each folder once")?;
+        require(!tasks[..place].contains(task), KEY, got, "a list without repetitions")?;
     }
     // From the last one on, so that the places of those before it stay.
     for (name, task) in written.iter().zip(&tasks).rev() {
@@ -69,7 +69,7 @@ mod tests {
     fn task_folders_are_named_once() {
         let refused = |tasks: &str| Plan::parse("/p/plan.toml", plan(tasks)).unwrap_err().to_string();
         let twice = refused("['a', '/p/a']");
-        assert_eq!(twice, "/p/plan.toml: tasks is `/p/a` twice, expected each folder once");
+        assert_eq!(twice, "/p/plan.toml: tasks is `/p/a` twice, but must be a list without repetitions");
         assert!(refused("['']").contains("a folder with a file task.toml"));
     }
 }
