@@ -17,7 +17,7 @@ const LIBRARY: &str = "libEGL.so.1";
 /// Maximum number of graphics cards that are looked at.
 const MAX_DEVICES: usize = 32;
 
-// Of EGL_EXT_platform_device and EGL_MESA_platform_surfaceless in the EGL registry.
+// These numbers are those of EGL_EXT_platform_device and EGL_MESA_platform_surfaceless in the EGL registry.
 const PLATFORM_DEVICE: c_uint = 0x313F;
 const PLATFORM_SURFACELESS: c_uint = 0x31DD;
 #[rustfmt::skip]
@@ -52,17 +52,17 @@ fn open(name: &str) -> Result<Egl, Error> {
     // functions have the types of the EGL registry.
     unsafe { Egl::load_required_from_filename(name) }.map_err(|error| {
         let reason = error.to_string();
-        // As the dynamic loader puts it; where it has no room or no descriptors, it has other words.
+        // These are the dynamic loader's words for a missing file. Without memory or descriptors it has others.
         let is_installed = !reason.contains("No such file or directory");
         Error::NoOpenGl { reason, is_installed }
     })
 }
 
-/// Displays that need no screen, the likeliest first: each graphics card and the software renderer, then whatever the
-/// platform offers.
+/// Returns displays that need no screen, the likeliest first: each graphics card and the software renderer, then the
+/// platform's default.
 fn displays(egl: &Egl) -> Vec<egl::Display> {
     let mut displays = Vec::new();
-    // Not `Egl::get_platform_display`, which panics where EGL knows the platform and has no display of it.
+    // `Egl::get_platform_display` would panic if EGL knows the platform and has no display of it.
     if let Some(function) = egl.get_proc_address("eglGetPlatformDisplayEXT") {
         // SAFETY: the extension's function of the EGL registry's type.
         let get_platform_display = unsafe { mem::transmute::<extern "system" fn(), GetPlatformDisplay>(function) };
@@ -91,7 +91,8 @@ fn displays(egl: &Egl) -> Vec<egl::Display> {
 /// An OpenGL context without a display. It belongs to the thread that made it.
 pub(crate) struct Gl {
     egl: &'static Egl,
-    // Of `egl`, valid as long as this lives; the display for ever. They hold raw pointers, which keep it on its thread.
+    // Surface and context belong to `egl` and are valid as long as this value; the display is valid for ever. They hold raw
+    // pointers, which keep this value on its thread.
     display: egl::Display,
     surface: egl::Surface,
     context: Option<egl::Context>,

@@ -165,7 +165,8 @@ fn friction(
             model.field(Field::GeomFriction)[3 * contact.other + column]
         }
     };
-    // What stands still is what robots walk on: the largest friction there counts. Otherwise the smallest of what moves.
+    // Robots walk on geoms that are fixed, of which the largest friction counts. Without one the smallest friction of moving
+    // geoms counts.
     let fixed = others.clone().filter(|contact| contact.other_is_fixed).max_by(|a, b| limit(a).total_cmp(&limit(b)));
     let moving = others.min_by(|a, b| limit(a).total_cmp(&limit(b)));
     let counts = |contact: &&Contact| contact.dimension >= needed;

@@ -149,7 +149,7 @@ impl FolderEnvironment {
         let task = self.task;
         let started = template::with(&task.template, |shared| {
             let (simulation, numbers) = shared.at(&self.edit, &self.state)?;
-            // What an environment before left there must not be seen. Sensors may compute it anew.
+            // Forces that another environment left must not be seen. Sensors may compute them again.
             simulation.clear_external_forces();
             simulation.forward()?;
             simulation.state(&mut self.state);
@@ -220,7 +220,8 @@ impl FolderEnvironment {
         for _ in 0..task.frame_skip {
             simulation.step_without_search()?;
         }
-        // Before poses are computed anew, which would change where the solver starts, and normalise quaternions.
+        // The state is saved before poses are computed again, because that changes where the solver starts and normalises
+        // quaternions.
         simulation.state(&mut self.state);
         if task.poses == Poses::After {
             match task.needs.stage {
@@ -285,7 +286,7 @@ impl Environment for FolderEnvironment {
     fn set_parameters(&mut self, values: &[f64]) {
         let task = self.task;
         let edit = || template::with(&task.template, |shared| shared.edit(&task.parameters, values));
-        // After a fatal error once more, with a new simulation.
+        // A fatal error needs a second attempt, with a new simulation.
         self.edit = edit().or_else(|_| edit()).expect(NO_MEMORY);
     }
 
