@@ -9,7 +9,7 @@ use super::{EnvironmentSpec, Error, shorten};
 pub struct Catalogue(Vec<&'static EnvironmentSpec>);
 
 impl Catalogue {
-    /// The catalogue of these environments, whose names must differ.
+    /// Makes a catalogue of these environments, whose names must differ.
     pub(crate) fn new(specs: Vec<&'static EnvironmentSpec>) -> Self {
         Self(specs)
     }
@@ -17,8 +17,8 @@ impl Catalogue {
     /// Adds one more environment at the end.
     ///
     /// # Errors
-    /// [`Error::NameTaken`] if a client that asks for its name could mean another environment, too: names that differ
-    /// in case, hyphens and underscores alone are one name.
+    /// [`Error::NameTaken`] if another environment has the same name. Names that differ only in case, hyphens and
+    /// underscores are the same.
     pub fn with(mut self, spec: &'static EnvironmentSpec) -> Result<Self, Error> {
         let taken = self.names().find(|name| is_spelled(spec.name, name));
         if let Some(taken) = taken {
@@ -28,17 +28,17 @@ impl Catalogue {
         Ok(self)
     }
 
-    /// All of them.
+    /// Returns all environments.
     pub fn specs(&self) -> impl Iterator<Item = &'static EnvironmentSpec> {
         self.0.iter().copied()
     }
 
-    /// Their names.
+    /// Returns the names of all environments.
     pub fn names(&self) -> impl Iterator<Item = &'static str> {
         self.specs().map(|spec| spec.name)
     }
 
-    /// The environment of that name, or of that id in Gymnasium, however it is [spelled](perturb_protocol::names).
+    /// Returns the environment of a name or of an id in Gymnasium, in any [spelling](perturb_protocol::names).
     ///
     /// # Errors
     /// [`Error::UnknownEnvironment`].

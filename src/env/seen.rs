@@ -4,16 +4,16 @@ use super::{Environment, EnvironmentSpec, Parameter};
 
 /// The parameters of one environment as they are observed.
 pub(super) struct SeenParameters {
-    /// Each with its place among what is read back from the physics.
+    /// Each parameter with the position of its quantity in [`EnvironmentSpec::applied`].
     parameters: Vec<(&'static Parameter, usize)>,
-    /// Scratch of [`EnvironmentSpec::applied`]'s length.
+    /// Buffer for the values of [`EnvironmentSpec::applied`].
     applied: Vec<f64>,
     /// The entries, one for each parameter.
     entries: Vec<f32>,
 }
 
 impl SeenParameters {
-    /// Those that an environment has now.
+    /// Reads the parameters that an environment has now.
     pub(super) fn of(environment: &dyn Environment) -> Self {
         let EnvironmentSpec { parameters, applied, .. } = environment.spec();
         let place = |parameter: &'static Parameter| {
@@ -29,7 +29,7 @@ impl SeenParameters {
         seen
     }
 
-    /// Reads them back from the physics, after they were set.
+    /// Reads the parameters back from the physics, after they were set.
     pub(super) fn read(&mut self, environment: &dyn Environment) {
         environment.applied(&mut self.applied);
         for (entry, (parameter, place)) in self.entries.iter_mut().zip(&self.parameters) {
@@ -37,7 +37,7 @@ impl SeenParameters {
         }
     }
 
-    /// One for each parameter.
+    /// Returns the entries, one for each parameter.
     pub(super) fn entries(&self) -> &[f32] {
         &self.entries
     }

@@ -1,47 +1,47 @@
-//! When an episode is a success.
+//! Success rules of episodes.
 
 use super::Quantity;
 
-/// When an episode is a success (the paper, section "Experimental methodology"): when it achieved something, and that
-/// compares with the threshold.
+/// A success rule (the paper, section "Experimental methodology"): the value that an episode achieved is compared with
+/// a threshold. An episode that achieved no value is no success.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Success {
     /// The rule, as a sentence.
     pub description: &'static str,
-    /// What is compared.
+    /// The value that is compared.
     pub achievement: Achievement,
-    /// How it is compared.
+    /// The comparison.
     pub comparison: Comparison,
-    /// With what.
+    /// The threshold, in the unit of [`Success::quantity`].
     pub threshold: f64,
 }
 
-/// What an episode can achieve.
+/// A value that an episode can achieve.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Achievement {
-    /// Its number of steps.
+    /// The number of steps.
     Length,
-    /// The first step after which the goal held, counted from 1; nothing if it never did.
+    /// The first step after which the goal held, counted from 1; no value if it never held.
     FirstGoal,
-    /// The number of last steps after all of which the goal held.
+    /// The number of successive steps up to the last one after all of which the goal held.
     LastGoals,
-    /// The most successive steps after all of which the goal held.
+    /// The largest number of successive steps after all of which the goal held.
     LongestGoals,
-    /// What the environment says: [`Environment::achieved`](super::Environment::achieved).
+    /// The value of [`Environment::achieved`](super::Environment::achieved).
     Own(Quantity),
 }
 
-/// How what was achieved compares with the threshold in a success.
+/// The comparison of the achieved value with the threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Comparison {
-    /// It is the threshold or more.
+    /// A success achieved the threshold or more.
     AtLeast,
-    /// It is the threshold or less.
+    /// A success achieved the threshold or less.
     AtMost,
 }
 
 impl Success {
-    /// What is compared.
+    /// Returns the quantity that is compared.
     pub const fn quantity(&self) -> Quantity {
         match self.achievement {
             Achievement::Own(quantity) => quantity,
@@ -50,7 +50,7 @@ impl Success {
         }
     }
 
-    /// Whether an episode that achieved this is a success.
+    /// Tells whether an episode that achieved this value is a success.
     pub fn holds(&self, achieved: Option<f64>) -> bool {
         achieved.is_some_and(|achieved| match self.comparison {
             Comparison::AtLeast => achieved >= self.threshold,
