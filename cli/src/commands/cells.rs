@@ -5,7 +5,7 @@ use std::io::Write;
 use std::process::ExitCode;
 
 use perturb_experiment::scheduler::{Backend, ProgressEvent, Rate, RunEnd, RunError, run as run_plan, write_line};
-use perturb_experiment::{FailureId, Folder, Plan};
+use perturb_experiment::{CellState, CellStates, DoneCells, FailureId, Folder, LayeredStates, Plan};
 use perturb_files::interrupt::StopFlag;
 use perturb_report::ReportInputs;
 use perturb_text::{count, quoted};
@@ -24,6 +24,8 @@ const MAX_RATES: usize = 24;
 pub(super) struct PlanRunner<'a> {
     args: &'a RunArgs,
     folder: &'a Folder,
+    /// Cells that --done has.
+    done: Option<&'a DoneCells<'a>>,
     stop: &'a StopFlag,
     /// The plan with all cells that are known so far.
     plan: Plan,
@@ -39,20 +41,27 @@ pub(super) struct PlanRunner<'a> {
 
 impl<'a> PlanRunner<'a> {
     /// Writes the plan to its folder.
-    pub(super) fn begin(args: &'a RunArgs, plan: Plan, folder: &'a Folder, stop: &'a StopFlag) -> Result<Self> {
+    pub(super) fn begin(
+        args: &'a RunArgs,
+        plan: Plan,
+        folder: &'a Folder,
+        done: Option<&'a DoneCells<'a>>,
+        stop: &'a StopFlag,
+    ) -> Result<Self> {
         let events = args.json.as_deref().map(json::event_writer).transpose()?;
         keep_plan(args, &plan, folder)?;
         let retryable = if args.retry_failed { folder.failures()? } else { HashMap::new() };
-        Ok(Self { args, folder, stop, plan, retryable, end: None, rates: Vec::new(), events })
+        Ok(Self { args, folder, done, stop, plan, retryable, end: None, rates: Vec::new(), events })
     }
 
     /// Returns the next plan to run: the given one, then the one with the selected cells. Returns `None` at the end.
+    /// Cells that --done has are left out.
     pub(super) fn next_round(&mut self) -> Result<Option<Plan>> {
         match self.end {
             None => {}
             Some(RunEnd::Stopped { .. }) => return Ok(None),
             Some(RunEnd::Finished { .. }) => {
-                let plan = self.plan.with_selected_cells(self.folder)?;
+                let plan = self.plan.with_selected_cells(&layered(self.folder, self.done))?;
                 let new = plan.cells.len() - self.plan.cells.len();
                 if new == 0 {
                     return Ok(None);
@@ -61,7 +70,12 @@ impl<'a> PlanRunner<'a> {
                 self.plan = Plan { candidates: Vec::new(), ..plan };
             }
         }
-        Ok(Some(self.plan.clone()))
+        let left = without_done(self.plan.clone(), self.done)?;
+        if let Some(file) = self.args.done.as_deref().filter(|_| self.done.is_some()) {
+            let (all, done) = (self.plan.cells.len(), self.plan.cells.len() - left.cells.len());
+            note(format_args!("{done} of {} are done in {}", count(all, "cell"), file.display()));
+        }
+        Ok(Some(left))
     }
 
     /// Runs all cells of `plan` with `backend`, and shows the progress.
@@ -128,6 +142,24 @@ impl<'a> PlanRunner<'a> {
             folder.path().join("cells").join(first).join("failure.json").display()
         )))
     }
+}
+
+/// Returns the states in `folder`, and those of `done` for cells that are missing there.
+pub(super) fn layered<'a>(folder: &'a Folder, done: Option<&'a DoneCells<'a>>) -> LayeredStates<'a> {
+    LayeredStates { first: folder, then: done.map(|done| done as &dyn CellStates) }
+}
+
+/// Returns `plan` without the cells that are in `done`.
+pub(super) fn without_done(mut plan: Plan, done: Option<&DoneCells<'_>>) -> Result<Plan> {
+    let Some(done) = done else { return Ok(plan) };
+    let mut left = Vec::new();
+    for cell in std::mem::take(&mut plan.cells) {
+        if !matches!(done.state(&cell)?, CellState::Done(_)) {
+            left.push(cell);
+        }
+    }
+    plan.cells = left;
+    Ok(plan)
 }
 
 /// Copies the plan into its folder, and prints a note if it replaces another one. With --cell an existing plan is kept,

@@ -4,7 +4,7 @@ use std::io::ErrorKind;
 
 use perturb_experiment::scheduler::RunError;
 use perturb_experiment::scheduler::slurm::{OptionError, SlurmError};
-use perturb_experiment::{FolderError, PlanError, VerifyError};
+use perturb_experiment::{ExportError, FolderError, PlanError, VerifyError};
 use perturb_files::FileError;
 use perturb_learner::checkpoint::CheckpointError;
 use perturb_learner::client::ClientError;
@@ -12,7 +12,7 @@ use perturb_learner::evaluation::{AuditError, HeatmapError, TestError};
 use perturb_learner::measure::MeasureError;
 use perturb_learner::training::{RunDirectoryError, TrainError};
 use perturb_protocol::names::UnknownEnvironment;
-use perturb_records::{ExternalEvaluationError, RecordsError};
+use perturb_records::{ExternalEvaluationError, RecordsError, TableError};
 use perturb_report::ReportError;
 use perturb_report::plot::PlotError;
 use perturb_serve::ServeError;
@@ -51,6 +51,8 @@ pub(super) enum CommandError {
     #[error(transparent)]
     Directory(#[from] RunDirectoryError),
     #[error(transparent)]
+    Export(#[from] ExportError),
+    #[error(transparent)]
     File(#[from] FileError),
     #[error(transparent)]
     Folder(#[from] FolderError),
@@ -74,6 +76,8 @@ pub(super) enum CommandError {
     Serve(#[from] ServeError),
     #[error(transparent)]
     Slurm(#[from] SlurmError),
+    #[error(transparent)]
+    Table(#[from] TableError),
     #[error(transparent)]
     Test(#[from] TestError),
     #[error(transparent)]

@@ -1,5 +1,5 @@
-//! The command line: `perturb envs | ls | serve | train | evaluate | demo | plan | run | report | curves | heatmap |
-//! video | audit | rescore | completions | man`.
+//! The command line: `perturb envs | ls | serve | train | evaluate | demo | plan | run | export | report | curves |
+//! heatmap | video | audit | rescore | completions | man`.
 //!
 //! Results go to standard output, everything else to standard error. Exit status: 0 success; 1 failure, for `audit`
 //! also a different episode; 2 an argument or file is missing or wrong, and nothing was begun; 128 + N if signal N
@@ -13,6 +13,7 @@ mod display;
 mod envs;
 mod error;
 mod evaluate;
+mod export;
 mod heatmap;
 mod json;
 mod ls;
@@ -74,8 +75,14 @@ pub fn main() -> ExitCode {
         .log_internal_errors(false);
     tracing_subscriber::registry().with(lines).with(filter).init();
     PrivateServer::set_stderr_handler(display::say);
-    if matches!(cli.command, CliCommand::Envs(_) | CliCommand::Report(_) | CliCommand::Curves(_) | CliCommand::Serve(_))
-    {
+    if matches!(
+        cli.command,
+        CliCommand::Envs(_)
+            | CliCommand::Export(_)
+            | CliCommand::Report(_)
+            | CliCommand::Curves(_)
+            | CliCommand::Serve(_)
+    ) {
         // These commands have nothing to finish. The others check a flag.
         // Without a handler, signals end them as they end any program.
         let _ = end_on_signals();
@@ -90,6 +97,7 @@ pub fn main() -> ExitCode {
         CliCommand::Demo(args) => demo::run(&args),
         CliCommand::Plan(args) => plan::run(&args).map(success),
         CliCommand::Run(args) => run::run(&args),
+        CliCommand::Export(args) => export::run(&args).map(success),
         CliCommand::Report(args) => report::run(&args).map(success),
         CliCommand::Curves(args) => report::curves(&args).map(success),
         CliCommand::Heatmap(args) => heatmap::run(&args).map(success),

@@ -5,7 +5,8 @@ use std::io::Write;
 use std::time::Duration;
 
 use perturb_experiment::{
-    Cell, CellDurations, Estimate, Folder, Grouping, Measurement, Plan, Selection, benchmark_cells, estimates,
+    Cell, CellDurations, CellStates, Estimate, Folder, Grouping, Measurement, Plan, Selection, benchmark_cells,
+    estimates,
 };
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::client::Servers;
@@ -47,7 +48,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     }
     let timings_from = args.timings_from.as_deref().map(Folder::new);
     timings_from.iter().try_for_each(|folder| folder.require_plan().map(drop))?;
-    let known = plan.with_expected_cells(timings_from.as_ref())?;
+    let known = plan.with_expected_cells(timings_from.as_ref().map(|folder| folder as &dyn CellStates))?;
     let grouping = Grouping { max_cells: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
     let all: Vec<usize> = (0..known.cells.len()).collect();
     let groups = known.groups(&all, grouping);

@@ -54,7 +54,8 @@ pub(super) fn write(sources: ReportInputs, out: Option<PathBuf>, page: Option<&P
 /// Returns the folder report/ of the experiment. It is refused for assessments, which do not belong to the experiment.
 fn default_folder(sources: &ReportInputs) -> Result<PathBuf> {
     let Some(folder) = sources.folder.as_ref().filter(|_| sources.assessed.is_empty()) else {
-        let message = "give --out: a report with assessments is not written to an experiment's folder";
+        let message =
+            "give --out: a report with assessments or of a results table is written to no experiment's folder";
         return Err(CommandError::Usage(message.into()));
     };
     let mut out = folder.path().join("report");

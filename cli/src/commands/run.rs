@@ -10,16 +10,17 @@ use std::time::Duration;
 
 use perturb_experiment::runs::RunKind;
 use perturb_experiment::scheduler::{BackendEvent, CellEvent, EventLineWriter, JobCell, Local, WorkerJob};
-use perturb_experiment::{Cell, CellDurations, Folder, Grouping, Plan, benchmark_cells, estimates};
+use perturb_experiment::{Cell, CellDurations, DoneCells, Folder, Grouping, Plan, benchmark_cells, estimates};
 use perturb_files::interrupt::StopFlag;
 use perturb_files::require_writable;
 use perturb_learner::cell::{CellJob, run_cells};
 use perturb_learner::client::{Address, PrivateServer, Servers};
 use perturb_learner::measure::{MeasureError, measure};
+use perturb_records::ResultsTable;
 use perturb_text::count;
 
 use super::args::{Engine, RunArgs};
-use super::cells::PlanRunner;
+use super::cells::{PlanRunner, layered, without_done};
 use super::display::{is_quiet, note, say};
 use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
@@ -46,18 +47,20 @@ pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
         !page.exists() && page.parent().is_some_and(is_related)
     };
     args.html.iter().filter(|page| !is_created(page)).try_for_each(|page| require_writable(page))?;
+    let table = args.done.as_deref().map(ResultsTable::read).transpose()?;
+    let done = table.as_ref().map(DoneCells::new).transpose()?;
     if args.engine.engine == Some(Engine::Slurm) {
-        return slurm::run(args, plan, &stop);
+        return slurm::run(args, plan, done.as_ref(), &stop);
     }
     if args.cell.is_empty() {
-        return all_cells(args, plan, &folder, &stop);
+        return all_cells(args, plan, &folder, done.as_ref(), &stop);
     }
     let mut cells =
         args.cell.iter().map(|name| find_cell(args, &plan, name).cloned()).collect::<Result<Vec<Cell>>>()?;
     cells.sort_by_key(|cell| cell.index);
     // A cell may be named by index and by id.
     cells.dedup_by_key(|cell| cell.index);
-    all_cells(args, Plan { cells, candidates: Vec::new(), ..plan }, &folder, &stop)
+    all_cells(args, Plan { cells, candidates: Vec::new(), ..plan }, &folder, done.as_ref(), &stop)
 }
 
 /// Returns the cell with this index or id.
@@ -126,11 +129,18 @@ fn stop_at_end_of_input(stop: &StopFlag) -> Result<()> {
 }
 
 /// Runs all cells in worker processes.
-fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
+fn all_cells(
+    args: &RunArgs,
+    plan: Plan,
+    folder: &Folder,
+    done: Option<&DoneCells<'_>>,
+    stop: &StopFlag,
+) -> Result<ExitCode> {
     // Workers are started from this program.
     recurrent::prepare_for(&plan)?;
     let grouping = Grouping { max_cells: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
-    let unfinished = unfinished_cells(args, &plan.with_expected_cells(Some(folder))?, folder).len();
+    let expected = without_done(plan.with_expected_cells(Some(&layered(folder, done)))?, done)?;
+    let unfinished = unfinished_cells(args, &expected, folder).len();
     let (local, addresses) = servers_of_jobs(&with_tasks_of(&args.server, &plan)?, grouping.at_a_time.min(unfinished))?;
     let local: Vec<Mutex<PrivateServer>> = local.into_iter().map(Mutex::new).collect();
     let (servers, errors) = Servers::connect_to_some(&addresses)?;
@@ -154,7 +164,7 @@ fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Re
         })
     };
     let server = || local.iter().find_map(restart);
-    let mut runner = PlanRunner::begin(args, plan, folder, stop)?;
+    let mut runner = PlanRunner::begin(args, plan, folder, done, stop)?;
     while let Some(plan) = runner.next_round()? {
         let bounds = if is_quiet() { Vec::new() } else { upper_bounds(args, &servers, &plan, folder, grouping, stop)? };
         runner.run(&plan, &mut Local::new(&plan, folder, grouping, &command, &server).with_max_seconds(bounds))?;

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use perturb_experiment::scheduler::slurm::{JobCommand, Jobs, Slurm, SlurmOptions};
-use perturb_experiment::{Estimate, Folder, Grouping, Plan, benchmark_cells, estimates};
+use perturb_experiment::{DoneCells, Estimate, Folder, Grouping, Plan, benchmark_cells, estimates};
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::client::{Address, Servers};
 use perturb_learner::measure::measure;
@@ -23,7 +23,7 @@ const MEASURE_TIME: Duration = Duration::from_secs(2);
 /// Time between two requests to Slurm, whose controller serves other users, too.
 const QUEUE_INTERVAL: Duration = Duration::from_secs(15);
 
-pub(super) fn run(args: &RunArgs, plan: Plan, stop: &StopFlag) -> Result<ExitCode> {
+pub(super) fn run(args: &RunArgs, plan: Plan, done: Option<&DoneCells<'_>>, stop: &StopFlag) -> Result<ExitCode> {
     // The durations of cells are measured in this process.
     recurrent::prepare_for(&plan)?;
     let path = std::path::absolute(&args.out).map_err(system("find the absolute path of --out"))?;
@@ -45,7 +45,7 @@ pub(super) fn run(args: &RunArgs, plan: Plan, stop: &StopFlag) -> Result<ExitCod
     drop(checking);
     let grouping = Grouping { max_cells: args.group, at_a_time: options.task.jobs };
     let job_servers = ServerArgs { server: Vec::new(), workers: Some(options.task.workers), task: tasks };
-    let mut runner = PlanRunner::begin(args, plan, &folder, stop)?;
+    let mut runner = PlanRunner::begin(args, plan, &folder, done, stop)?;
     while let Some(plan) = runner.next_round()? {
         let costs = || {
             let (_private, addresses) = servers_of_jobs(&job_servers, grouping.at_a_time)?;

@@ -40,7 +40,7 @@ LOOK = """
     pictures: [...document.querySelectorAll('#profiles svg, #gains svg, #parameters svg, #thresholds svg')].filter(seen).length,
     heatmaps: [...document.querySelectorAll('#heatmaps svg')].filter(seen).length,
     without_heatmap: [...document.querySelectorAll('#heatmaps figure.missing')].filter(seen).length,
-    without_curves: document.querySelectorAll('#curves li').length,
+    without_curves: [...document.querySelectorAll('#provenance li')].filter(li => li.textContent.includes('monitor.csv')).length,
     unnamed: [...document.querySelectorAll('svg')].filter(picture => !picture.closest('[aria-label]')).length,
     dangling: [...document.querySelectorAll('nav a')].map(link => link.getAttribute('href'))
       .filter(link => !document.querySelector(link)),

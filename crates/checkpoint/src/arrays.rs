@@ -6,6 +6,9 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
 use perturb_policy::{NamedArray, PolicySpec, Weights};
 
+/// The entry of a file's metadata that holds the checkpoint's JSON document.
+const DOCUMENT: &str = "perturb";
+
 /// An array to be written: its elements are little-endian `bytes`.
 #[derive(Clone, Debug)]
 pub struct Array {
@@ -39,12 +42,17 @@ impl Array {
 /// # Errors
 /// Two arrays of one name.
 pub fn encode(arrays: &[Array]) -> Result<Vec<u8>, String> {
+    encode_with(arrays, "format", "perturb".to_owned())
+}
+
+/// A file of `arrays` with one entry of metadata. The order of several would change from run to run.
+fn encode_with(arrays: &[Array], key: &str, value: String) -> Result<Vec<u8>, String> {
     let views: Vec<(&str, TensorView<'_>)> = arrays
         .iter()
         .map(|Array { name, dtype, shape, bytes }| Ok((name.as_str(), TensorView::new(*dtype, shape.clone(), bytes)?)))
         .collect::<Result<_, safetensors::SafeTensorError>>()
         .map_err(|error| error.to_string())?;
-    let metadata = HashMap::from([("format".to_owned(), "perturb".to_owned())]);
+    let metadata = HashMap::from([(key.to_owned(), value)]);
     safetensors::serialize(views, Some(metadata)).map_err(|error| error.to_string())
 }
 
@@ -96,8 +104,23 @@ impl<'a> Arrays<'a> {
 }
 
 pub(super) fn encode_weights(weights: &Weights) -> Result<Vec<u8>, String> {
-    let arrays = weights.iter().map(|array| Array::f32(&array.name, array.shape.clone(), &array.data));
-    encode(&arrays.collect::<Vec<_>>())
+    encode(&arrays_of(weights))
+}
+
+/// A file of the weights that describes itself: its metadata hold the checkpoint's JSON document.
+pub(super) fn encode_policy(weights: &Weights, document: String) -> Result<Vec<u8>, String> {
+    encode_with(&arrays_of(weights), DOCUMENT, document)
+}
+
+/// Reads the document of a file that describes itself.
+pub(super) fn decode_document(bytes: &[u8]) -> Result<String, String> {
+    let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|error| error.to_string())?;
+    let document = metadata.metadata().as_ref().and_then(|entries| entries.get(DOCUMENT)).cloned();
+    document.ok_or_else(|| format!("its metadata have no `{DOCUMENT}`: give a file that `perturb export` wrote"))
+}
+
+fn arrays_of(weights: &Weights) -> Vec<Array> {
+    weights.iter().map(|array| Array::f32(&array.name, array.shape.clone(), &array.data)).collect()
 }
 
 pub(super) fn decode_weights(bytes: &[u8], spec: &PolicySpec) -> Result<Weights, String> {

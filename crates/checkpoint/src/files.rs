@@ -24,11 +24,17 @@ impl ArraysFile {
     /// # Errors
     /// The operating system's.
     pub fn write(directory: &Path, prefix: &str, iterations: u64, content: &[u8]) -> Result<Self> {
+        let file = Self::describe(prefix, iterations, content);
+        write_atomically(&directory.join(&file.file), content)?;
+        Ok(file)
+    }
+
+    /// Describes `content` as [`ArraysFile::write`] does, without writing it.
+    pub(super) fn describe(prefix: &str, iterations: u64, content: &[u8]) -> Self {
         let crc32c = crc32c::crc32c(content);
         // The checksum is part of the name: a file that is in use is never written over by another content.
         let file = format!("{prefix}{iterations:08}-{crc32c:08x}{ARRAYS_SUFFIX}");
-        write_atomically(&directory.join(&file), content)?;
-        Ok(Self { file, bytes: content.len() as u64, crc32c })
+        Self { file, bytes: content.len() as u64, crc32c }
     }
 
     /// Returns the file's path. The file is always in `directory`, whatever folder its name has.
@@ -57,11 +63,19 @@ impl ArraysFile {
     pub fn read(&self, directory: &Path) -> Result<Vec<u8>> {
         let path = self.path(directory);
         let content = files::read(&path)?;
-        if content.len() as u64 != self.bytes || crc32c::crc32c(&content) != self.crc32c {
-            let reason = format!("it has {} bytes, expected {} with another checksum", content.len(), self.bytes);
-            return Err(damaged(&path, reason));
-        }
+        self.require_content(&content).map_err(|reason| damaged(&path, reason))?;
         Ok(content)
+    }
+
+    /// Checks length and checksum of `content`.
+    ///
+    /// # Errors
+    /// What differs.
+    pub(super) fn require_content(&self, content: &[u8]) -> std::result::Result<(), String> {
+        if content.len() as u64 == self.bytes && crc32c::crc32c(content) == self.crc32c {
+            return Ok(());
+        }
+        Err(format!("it has {} bytes, expected {} with another checksum", content.len(), self.bytes))
     }
 }
 

@@ -4,6 +4,9 @@
 //! Writing is atomic: the arrays get new names first, then `checkpoint.json`, which names them with their sizes and
 //! checksums, is renamed into place, and only then the old arrays are deleted. Whatever moment the program or the
 //! machine dies at, the directory holds a complete checkpoint, the old one or the new one.
+//!
+//! A policy that is only to be tested may also be one file: its weights as safetensors, with the same JSON document in
+//! the file's metadata.
 #![forbid(unsafe_code)]
 
 mod arrays;
@@ -11,6 +14,7 @@ mod counters;
 mod environment;
 mod files;
 mod named;
+mod single_file;
 
 use std::path::{Path, PathBuf};
 
@@ -22,11 +26,12 @@ use perturb_settings::{Architecture, TrainConfig};
 use serde::{Deserialize, Serialize};
 
 pub use self::arrays::{Array, Arrays, encode};
-use self::arrays::{decode_weights, encode_weights};
+use self::arrays::{decode_document, decode_weights, encode_policy, encode_weights};
 pub use self::counters::Counters;
 pub use self::environment::{Changed, EnvironmentSummary, task_remedy};
 use self::files::remove_others;
 pub use self::files::{ArraysFile, damaged};
+pub use self::named::find as find_policy;
 
 /// Format of the JSON document; raised when older programs could misread it. Format 1 also stores what follows from the
 /// configuration. Formats 1 and 2 have no checksum.
@@ -179,14 +184,18 @@ impl Checkpoint {
         Ok(remove_others(directory, &[WEIGHTS_PREFIX, RESUME_PREFIX], &current)?)
     }
 
-    /// Reads the checkpoint in `path`, or in its folder `checkpoint`; or that of a cell below `results/`, or where the
-    /// variable `PERTURB_RESULTS` says, whose id is `path` or alone begins with it.
+    /// Reads the checkpoint in `path`, in its folder `checkpoint`, or in the file `path`; or that of a cell below
+    /// `results/`, or where the variable `PERTURB_RESULTS` says, whose id is `path` or alone begins with it.
     ///
     /// # Errors
     /// [`CheckpointError`], which names the file.
     pub fn load(path: &Path) -> Result<Self> {
         let named = named::find(path)?;
-        let (directory, document) = CheckpointDocument::read(named.as_deref().unwrap_or(path))?;
+        let path = named.as_deref().unwrap_or(path);
+        if single_file::is_policy(path)? {
+            return Self::load_file(path);
+        }
+        let (directory, document) = CheckpointDocument::read(path)?;
         Self::from_document(&directory, document)
     }
 
@@ -363,19 +372,24 @@ impl CheckpointDocument {
         let json = directory.join(JSON);
         let text = if has_file(&json)? { read_if_there(&json)? } else { None };
         let text = text.ok_or_else(|| CheckpointError::Missing { path: path.to_owned() })?;
-        let not_understood = |error: serde_json::Error| damaged(&json, format!("it is not understood: {error}"));
-        let mut value: serde_json::Value = serde_json::from_slice(&text).map_err(not_understood)?;
+        Ok((directory, Self::parse(&json, &text)?))
+    }
+
+    /// Reads the `text` of the file `path`.
+    fn parse(path: &Path, text: &[u8]) -> Result<Self> {
+        let not_understood = |error: serde_json::Error| damaged(path, format!("it is not understood: {error}"));
+        let mut value: serde_json::Value = serde_json::from_slice(text).map_err(not_understood)?;
         let sealed = checksum::open(&mut value);
         // Another format may have other entries.
         let format = value.get("format_version").and_then(serde_json::Value::as_u64);
         if let Some(format) = format.filter(|format| !(1..=u64::from(FORMAT_VERSION)).contains(format)) {
-            return Err(CheckpointError::Newer { path: json, format });
+            return Err(CheckpointError::Newer { path: path.to_owned(), format });
         }
         let document: Self = serde_json::from_value(value).map_err(not_understood)?;
         if sealed.is_err() || (document.format_version >= SEALED && sealed == Ok(false)) {
-            return Err(damaged(&json, format!("{}; give a copy that is whole", checksum::CHECKSUM_MISMATCH)));
+            return Err(damaged(path, format!("{}; give a copy that is whole", checksum::CHECKSUM_MISMATCH)));
         }
-        Ok((directory, document))
+        Ok(document)
     }
 }
 

@@ -1,26 +1,31 @@
-//! Policies by name, or by the folder of their cell: cells below `results/` whose trainings were kept.
+//! Policies by name, or by the folder of their cell: files in folders `policies` below `results/`, and cells there whose
+//! trainings were kept.
 
 use std::path::{Component, Path, PathBuf};
 
 use perturb_files::{has_file, list, look};
 use perturb_protocol::names;
 
+use super::single_file::{SUFFIX, is_policy};
 use super::{CheckpointError, JSON, Result};
 
 /// The folder of the policies, unless [`VARIABLE`] is set.
 const FOLDER: &str = "results";
 const VARIABLE: &str = "PERTURB_RESULTS";
+/// The folder of policy files.
+const POLICIES: &str = "policies";
 /// Folders between it and `cells`, at most.
 const DEPTH: usize = 3;
 /// Maximum difference in length between a name and a suggestion.
 const MAX_LENGTH_DIFFERENCE: usize = 3;
 
-/// Finds the checkpoint that `path` stands for, if `path` holds none itself. `path` may be the folder of a cell, also
-/// relative to `results/`, or the id of a cell, or a unique beginning of an id. Upper and lower case are equal.
+/// Finds the checkpoint that `path` stands for, if `path` holds none itself. `path` may be the folder of a cell or a
+/// policy file, also relative to `results/`, or the id of a cell, or a unique beginning of an id. Upper and lower case are
+/// equal.
 ///
 /// # Errors
 /// [`CheckpointError::Several`] with the cells whose ids begin so or, if none does, are much like it.
-pub(super) fn find(path: &Path) -> Result<Option<PathBuf>> {
+pub fn find(path: &Path) -> Result<Option<PathBuf>> {
     let folder = std::env::var_os(VARIABLE).filter(|folder| !folder.is_empty());
     let found = find_below(&folder.map_or_else(|| FOLDER.into(), PathBuf::from), path);
     if let Ok(Some(checkpoint)) = &found {
@@ -68,25 +73,33 @@ fn find_below(folder: &Path, path: &Path) -> Result<Option<PathBuf>> {
 
 /// Whether a path is one that a checkpoint is read from.
 fn holds_checkpoint(path: &Path) -> Result<bool> {
-    Ok(has_file(&path.join(JSON))? || has_file(&path.join("checkpoint").join(JSON))?)
+    Ok(is_policy(path)? || has_file(&path.join(JSON))? || has_file(&path.join("checkpoint").join(JSON))?)
 }
 
-/// A cell whose training was kept.
+/// A policy that was kept.
 struct StoredPolicy {
     id: String,
+    /// The folder of its cell, or its file.
     cell: PathBuf,
     checkpoint: PathBuf,
 }
 
-/// Adds the cells that have a checkpoint, in the order of their paths. What cannot be listed has none.
+/// Adds the policies in the order of their paths. What cannot be listed has none.
 fn collect(folder: &Path, depth: usize, found: &mut Vec<StoredPolicy>) {
     let kept = |cell: PathBuf| {
         let id = cell.file_name()?.to_str()?.to_owned();
         let checkpoint = cell.join("training/checkpoint");
         checkpoint.join(JSON).is_file().then_some(StoredPolicy { id, cell, checkpoint })
     };
+    let file = |path: PathBuf| {
+        let is_policy = path.extension().is_some_and(|ending| ending == SUFFIX) && path.is_file();
+        let id = path.file_stem()?.to_str()?.to_owned();
+        is_policy.then(|| StoredPolicy { id, cell: path.clone(), checkpoint: path })
+    };
     for path in list(folder).unwrap_or_default() {
-        if path.ends_with("cells") {
+        if path.ends_with(POLICIES) {
+            found.extend(list(&path).unwrap_or_default().into_iter().filter_map(file));
+        } else if path.ends_with("cells") {
             found.extend(list(&path).unwrap_or_default().into_iter().filter_map(kept));
         } else if depth > 0 && path.is_dir() {
             collect(&path, depth - 1, found);
@@ -125,6 +138,23 @@ mod tests {
         std::fs::write(folder.path().join("cells/Acrobot-D-2"), "").unwrap();
         assert_eq!(find_below(&folder.path().join("cells/Acrobot-D-2"), Path::new("Acro")).unwrap(), None, "a file");
         assert_eq!(find_below(&folder.path().join("nowhere"), Path::new("Hopper-D")).unwrap(), None);
+    }
+
+    #[test]
+    fn a_policy_file_is_found_by_its_name_and_path() {
+        let folder = tempfile::tempdir().unwrap();
+        let policies = folder.path().join(POLICIES);
+        std::fs::create_dir_all(&policies).unwrap();
+        for name in ["Hopper-R-1.safetensors", "Hopper-D-1.safetensors", "README.md"] {
+            std::fs::write(policies.join(name), "").unwrap();
+        }
+        let find = |name: &Path| find_below(folder.path(), name).unwrap();
+        let file = policies.join("Hopper-R-1.safetensors");
+        for name in ["Hopper-R-1", "hopper-r", "policies/Hopper-R-1.safetensors"] {
+            assert_eq!(find(Path::new(name)), Some(file.clone()), "{name}");
+        }
+        assert_eq!(find(&file), None, "it is the checkpoint itself");
+        assert_eq!(find(Path::new("README")), None);
     }
 
     #[test]

@@ -30,7 +30,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::plan::{Cell, Plan};
+use crate::plan::Plan;
 
 /// Format of `result.json`; raised when older programs could misread it.
 const FORMAT_VERSION: u32 = 1;
@@ -195,6 +195,13 @@ pub enum FolderError {
          compared: delete those of one model, and have them done again"
     )]
     Models { environment: String, cells: [String; 2], hashes: [String; 2] },
+    /// The rows of a cell in a results table.
+    #[error("the rows of cell {cell} are not understood: {reason}; export the cell's folder again")]
+    Row {
+        cell: String,
+        /// The fault.
+        reason: String,
+    },
     /// There is no experiment.
     #[error("{} holds no experiment: expected plan.toml in it; give the --out of `perturb run`", path.display())]
     NoPlan { path: PathBuf },
@@ -286,14 +293,6 @@ impl Folder {
             Some((id, place.failure_id()?))
         };
         Ok(places.filter_map(marked).collect())
-    }
-
-    /// Reads the state of `cell`.
-    ///
-    /// # Errors
-    /// [`FolderError`] if a file is there that cannot be read.
-    pub fn state(&self, cell: &Cell) -> Result<CellState> {
-        self.cell(&cell.id).state()
     }
 }
 

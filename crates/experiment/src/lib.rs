@@ -3,7 +3,7 @@
 //! - [`Plan`] expands an experiment file to cells, [`Folder`] is where they are kept, [`scheduler`] has processes or a
 //!   cluster do them.
 //! - [`runs`] finds trainings and experiments, and says how far they are.
-//! - [`Results`] reads them back and selects.
+//! - [`Results`] reads them back and selects; [`export`](export()) makes rows of a table of them.
 #![forbid(unsafe_code)]
 
 #[cfg(test)]
@@ -12,6 +12,7 @@ extern crate self as perturb_experiment; // by this name fixtures call it in eve
 mod cost;
 mod curves;
 mod eta;
+mod export;
 mod external;
 #[cfg(test)]
 mod fixture;
@@ -23,12 +24,14 @@ mod reselection;
 pub mod runs;
 pub mod scheduler;
 mod selection;
+mod states;
 mod tuning;
 mod verify;
 
 pub use cost::{Estimate, Measurement, Speed, benchmark_cells, estimates, generated_episodes, tested_episodes};
 pub use curves::{BudgetAxis, Curve, CurvePoint, EnvironmentCurves, read_curves};
 pub use eta::{CellDurations, RemainingTime, TrainingProgress};
+pub use export::{ExportError, export};
 pub use external::{add_assessed, elsewhere, judged_as_in};
 pub use folder::{
     CellFolder, CellResult, CellState, Failure, FailureId, Folder, FolderError, IntermediateEvaluation, Timing,
@@ -44,6 +47,7 @@ pub use selection::{
     MethodResults, Reported, Results, Selected, SelectedRun, TieRange, average, average_tie_range, interquartile,
     scores,
 };
+pub use states::{CellStates, DoneCells, LayeredStates, StudyResults};
 pub use tuning::{Chosen, Tuned, tuned};
 pub use verify::{VerifyError, verify};
 

@@ -15,8 +15,9 @@ use perturb_records::statistics::{Bootstrapped, Summary, interquartile_mean, mea
 use perturb_records::{ExternalEvaluation, ExternalPolicy, Metric, Scenario, TestResult, TrainedOn};
 use perturb_settings::Method;
 
-use crate::folder::{CellResult, CellState, Failure, Folder, FolderError};
+use crate::folder::{CellResult, CellState, Failure, FolderError};
 use crate::plan::{Cell, Plan, Selection};
+use crate::states::CellStates;
 use crate::tuning::{Tuned, tuned};
 
 /// The states of a plan's cells.
@@ -83,12 +84,12 @@ pub struct Selected<'a> {
 }
 
 impl<'a> Results<'a> {
-    /// Reads all cells of `plan`, see [`Plan::with_selected_cells`], in `folder`.
+    /// Reads all cells of `plan`, see [`Plan::with_selected_cells`].
     ///
     /// # Errors
-    /// [`FolderError`] if a file is there that cannot be read, or if results of an environment are of different models.
-    pub fn read(plan: &'a Plan, folder: &Folder) -> Result<Self, FolderError> {
-        let states = plan.cells.iter().map(|cell| folder.state(cell)).collect::<Result<_, _>>()?;
+    /// [`FolderError`] for a state that cannot be read, or if results of an environment are of different models.
+    pub fn read(plan: &'a Plan, states: &dyn CellStates) -> Result<Self, FolderError> {
+        let states = plan.cells.iter().map(|cell| states.state(cell)).collect::<Result<_, _>>()?;
         let results = Self { plan, states };
         results.check_models()?;
         Ok(results)

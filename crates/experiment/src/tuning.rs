@@ -12,8 +12,9 @@ use perturb_records::statistics::mean;
 use perturb_records::{TestResult, TrainedOn};
 use perturb_settings::Method;
 
-use crate::folder::{CellState, Folder, FolderError};
+use crate::folder::{CellState, FolderError};
 use crate::plan::{Cell, Plan, SELECTION_TEST};
+use crate::states::CellStates;
 
 /// Configurations from which one is selected.
 #[derive(Clone, Debug, PartialEq)]
@@ -116,29 +117,28 @@ fn kind(cell: &Cell) -> (&str, Method, TrainedOn<'_>) {
 }
 
 impl Plan {
-    /// The plan with all cells that are known by the results in `folder`: those whose configurations are selected follow
-    /// its own.
+    /// The plan with all cells that are known by `states`: those whose configurations are selected follow its own.
     ///
     /// # Errors
-    /// [`FolderError`] if a file is there that cannot be read.
-    pub fn with_selected_cells(&self, folder: &Folder) -> Result<Self, FolderError> {
-        self.with_chosen(Some(folder), false)
+    /// [`FolderError`] for a state that cannot be read.
+    pub fn with_selected_cells(&self, states: &dyn CellStates) -> Result<Self, FolderError> {
+        self.with_chosen(Some(states), false)
     }
 
     /// Returns the plan with its final number of cells. Placeholders stand for cells that are not selected yet.
     ///
     /// # Errors
-    /// [`FolderError`] if a file is there that cannot be read.
-    pub fn with_expected_cells(&self, folder: Option<&Folder>) -> Result<Self, FolderError> {
-        self.with_chosen(folder, true)
+    /// [`FolderError`] for a state that cannot be read.
+    pub fn with_expected_cells(&self, states: Option<&dyn CellStates>) -> Result<Self, FolderError> {
+        self.with_chosen(states, true)
     }
 
-    fn with_chosen(&self, folder: Option<&Folder>, stand_ins: bool) -> Result<Self, FolderError> {
+    fn with_chosen(&self, states: Option<&dyn CellStates>, stand_ins: bool) -> Result<Self, FolderError> {
         let mut plan = self.clone();
         if self.candidates.is_empty() {
             return Ok(plan);
         }
-        let state = |cell| folder.map_or(Ok(CellState::Missing), |folder| folder.state(cell));
+        let state = |cell| states.map_or(Ok(CellState::Missing), |states| states.state(cell));
         let states = self.cells.iter().map(state).collect::<Result<Vec<_>, _>>()?;
         for tuned in tuned(self, &states) {
             let known = (tuned.environment, tuned.method, tuned.trained_on);

@@ -4,6 +4,7 @@ use rstest::rstest;
 use super::*;
 use crate::fixture;
 use crate::folder::Failure;
+use crate::folder::Folder;
 use crate::plan::Selection;
 use crate::selection::Results;
 
@@ -148,7 +149,10 @@ fn selection_waits_for_all_tuning_cells() {
     );
     // Whatever is selected, so many cells it will be.
     for folder in [None, Some(&folder)] {
-        assert_eq!(plan.with_expected_cells(folder).unwrap().cells.len(), 16 + 4 * 3);
+        assert_eq!(
+            plan.with_expected_cells(folder.map(|folder| folder as &dyn CellStates)).unwrap().cells.len(),
+            16 + 4 * 3
+        );
     }
 }
 

@@ -64,7 +64,7 @@ pub fn verify(
 }
 
 /// The episodes in `path`, from which these figures of a result then follow; `None` if there are none.
-fn follows(
+pub(crate) fn follows(
     result: &CellResult,
     path: &Path,
     results: &BTreeMap<String, TestResult>,

@@ -14,5 +14,5 @@ mod report;
 pub use heatmap_policies::{PolicyHeatmap, policies_side_by_side};
 pub use report::{
     Figure, FigureData, Figures, HeatmapPicture, Picture, PictureDrawing, Report, ReportBundle, ReportError,
-    ReportInputs, curves_table, heatmap_pictures, html, old_file_name, save_heatmaps,
+    ReportInputs, StudySource, curves_table, heatmap_pictures, html, old_file_name, save_heatmaps,
 };

@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use crate::algorithm::AlgorithmState;
 use crate::logging::{EpisodeFigures, LogLengths, TimeShares};
 use crate::rollout::CollectorState;
-pub use perturb_checkpoint::{Changed, Checkpoint, CheckpointError, EnvironmentSummary, State};
+pub use perturb_checkpoint::{Changed, Checkpoint, CheckpointError, EnvironmentSummary, State, find_policy};
 
 /// The state of a training between two iterations, beside what a [`Checkpoint`] holds.
 #[derive(Clone, Debug, PartialEq)]

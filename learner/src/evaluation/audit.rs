@@ -4,13 +4,13 @@ use std::collections::{BTreeMap, VecDeque};
 
 use perturb_files::interrupt::StopFlag;
 use perturb_protocol::Version;
-use perturb_records::{EpisodeRecord, Records, RecordsMetadata};
+use perturb_records::{EpisodeRecord, Records};
 
 use super::error::TestError;
 use super::test::retry_on_disconnect;
 use super::trials::Trials;
 use crate::checkpoint::Checkpoint;
-use crate::client::{EndedEpisode, OpenOptions, Servers, Session};
+use crate::client::{OpenOptions, Servers, Session};
 
 /// The result of a replay.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -94,7 +94,8 @@ fn replay(
         for end in replay.trials.step()? {
             let Some(recorded) = running.remove(&end.slot) else { continue };
             audit.episodes += 1;
-            audit.different.extend(difference(&records.about, recorded, end));
+            let got = EpisodeRecord::new(&records.about, &recorded.set, recorded.seed, end);
+            audit.different.extend(recorded.difference(&got));
         }
         report(audit.episodes);
     }
@@ -159,24 +160,4 @@ impl<'a> Replay<'a> {
         player.begin_trial(slot, episode.seed, trial);
         Ok(player.see(slot, &observation)?)
     }
-}
-
-/// A sentence on the first difference of an episode from its record; `None` if there is none.
-fn difference(about: &RecordsMetadata, recorded: &EpisodeRecord, end: EndedEpisode) -> Option<String> {
-    let got = EpisodeRecord::new(about, &recorded.set, recorded.seed, end);
-    let what = |told: fn(&EpisodeRecord) -> String| (told(recorded), told(&got));
-    let parts = [
-        ("episode", what(|it| it.episode_index.to_string())),
-        ("requested", what(|it| format!("{:?}", it.requested))),
-        ("applied", what(|it| format!("{:?}", it.applied))),
-        ("model", what(|it| it.model_hash.clone())),
-        ("length", what(|it| it.length.to_string())),
-        ("return", what(|it| format!("{:?}", it.episode_return))),
-        ("ending", what(|it| format!("{:?}", it.ending))),
-        ("achieved", what(|it| format!("{:?}", it.achieved))),
-        ("the other it achieved", what(|it| format!("{:?}", it.also_achieved))),
-    ];
-    let (what, (was, is)) = parts.into_iter().find(|(_, (recorded, got))| recorded != got)?;
-    let EpisodeRecord { set, environment_index, episode_index, .. } = recorded;
-    Some(format!("{set}, environment {environment_index}, episode {episode_index}: {what} was {was}, is {is}"))
 }

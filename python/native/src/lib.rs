@@ -39,7 +39,7 @@ mod _native {
     #[pymodule_export]
     use super::policy::{Player, Policy};
     #[pymodule_export]
-    use super::records::{Records, metrics, published, wilson};
+    use super::records::{Records, metrics, published, read_results, wilson};
     #[pymodule_export]
     use super::session::{Session, catalogue};
     #[pymodule_export]

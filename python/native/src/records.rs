@@ -7,7 +7,7 @@ use perturb_records::outcomes::{
     Bin, Counted, Outcomes, SHARE, bins, conditional_value_at_risk, success_within, success_within_both, worst_contexts,
 };
 use perturb_records::statistics::{bootstrap, mean};
-use perturb_records::{ColumnValues, Metric, paper};
+use perturb_records::{ColumnValues, Metric, ResultsTable, paper};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -80,19 +80,7 @@ impl Records {
     /// Arrays by the names of the file's columns; where there is no number, NaN.
     fn columns<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let columns = PyDict::new(py);
-        for (name, values) in self.0.columns() {
-            match values {
-                ColumnValues::Text(texts) => columns.set_item(name, texts)?,
-                ColumnValues::Unsigned64(numbers) => columns.set_item(name, PyArray1::from_vec(py, numbers))?,
-                ColumnValues::Unsigned32(numbers) => columns.set_item(name, PyArray1::from_vec(py, numbers))?,
-                ColumnValues::Flag(flags) => columns.set_item(name, PyArray1::from_vec(py, flags))?,
-                ColumnValues::Number(numbers) => columns.set_item(name, PyArray1::from_vec(py, numbers))?,
-                ColumnValues::Optional(numbers) => {
-                    let numbers = numbers.into_iter().map(|number| number.unwrap_or(f64::NAN)).collect();
-                    columns.set_item(name, PyArray1::from_vec(py, numbers))?;
-                }
-            }
-        }
+        add_columns(&columns, self.0.columns())?;
         Ok(columns)
     }
 
@@ -180,6 +168,40 @@ impl Records {
             failure(INVALID, 0, words)
         })
     }
+}
+
+/// Adds `columns` to a dictionary: arrays, or lists of texts. Missing numbers are NaN, missing texts None.
+fn add_columns(dictionary: &Bound<'_, PyDict>, columns: Vec<(String, ColumnValues<'_>)>) -> PyResult<()> {
+    let py = dictionary.py();
+    let numbers = |name: String, numbers: Vec<f64>| dictionary.set_item(name, PyArray1::from_vec(py, numbers));
+    for (name, values) in columns {
+        match values {
+            ColumnValues::Text(texts) => dictionary.set_item(name, texts)?,
+            ColumnValues::OptionalText(texts) => dictionary.set_item(name, texts)?,
+            ColumnValues::Unsigned64(values) => dictionary.set_item(name, PyArray1::from_vec(py, values))?,
+            ColumnValues::Unsigned32(values) => dictionary.set_item(name, PyArray1::from_vec(py, values))?,
+            ColumnValues::Flag(flags) => dictionary.set_item(name, PyArray1::from_vec(py, flags))?,
+            ColumnValues::Number(values) => numbers(name, values)?,
+            ColumnValues::Optional(values) => {
+                numbers(name, values.into_iter().map(|number| number.unwrap_or(f64::NAN)).collect())?;
+            }
+            ColumnValues::OptionalUnsigned64(values) => {
+                // Exact below 2^53, which no count of episodes or steps reaches.
+                numbers(name, values.into_iter().map(|count| count.map_or(f64::NAN, |count| count as f64)).collect())?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Reads a table of `perturb export`: arrays by the names of its columns, and the text of each study's plan by its name.
+#[pyfunction]
+pub fn read_results(py: Python<'_>, path: PathBuf) -> PyResult<(Bound<'_, PyDict>, Vec<(String, String)>)> {
+    let table = py.detach(|| ResultsTable::read(&path)).map_err(|error| failure(INVALID, 0, error.to_string()))?;
+    let columns = PyDict::new(py);
+    add_columns(&columns, table.columns())?;
+    let plans = table.studies.iter().map(|(study, plan)| (study.clone(), plan.plan.clone()));
+    Ok((columns, plans.collect()))
 }
 
 /// The 95 % interval of a success rate after Wilson (1927), 0 … 1.

@@ -39,6 +39,7 @@ from .policy import Actor, Policy, load_policy
 from .registration import register_all as _register_all
 from .requests import Version
 from .results import Audit, Bin, Bin2D, Context, Result
+from .results_table import read_results
 from .tasks import register_ids as _register_tasks
 from .vector import PerturbVectorEnv
 
@@ -76,6 +77,7 @@ __all__ = [
     "environments",
     "evaluate",
     "load_policy",
+    "read_results",
     "sets",
 ]
 

@@ -216,6 +216,9 @@ class Records:
     ) -> list[tuple[tuple[float, float], tuple[float, float], int, int]]: ...
     def success_by_parameter(self, name: str, parameter: str) -> list[tuple[float, float, int, int, float, float]]: ...
 
+def read_results(path: str) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+    """A results table's columns by their names, and the plans of its studies."""
+
 def wilson(successes: int, episodes: int) -> tuple[float, float]:
     """The 95 % interval of a rate, 0 … 1."""
 

@@ -266,8 +266,9 @@ class Assessment:
 
         Args:
             path: a file to write it to, too.
-            beside: what else is on the page: other assessments, or their folders, and the folder of at most one
-                experiment (the `--out` of `perturb run`), whose rule of success then judges all.
+            beside: what else is on the page: other assessments, or their folders, and at most one experiment (the
+                `--out` of `perturb run`, or the study of a results table, `FILE.parquet/STUDY`), whose rule of success
+                then judges all.
 
         Returns the page, HTML.
 

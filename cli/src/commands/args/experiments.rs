@@ -60,6 +60,10 @@ pub struct RunArgs {
     /// each cell by itself. The number changes no result.
     #[arg(long, value_name = "N", default_value_t = Grouping::USUAL, value_parser = at_least_one::<usize>)]
     pub group: usize,
+    /// Skip the cells that are done in this table of `perturb export`, with the same settings and tests. Their results
+    /// also count when configurations are selected.
+    #[arg(long, value_name = "FILE")]
+    pub done: Option<PathBuf>,
     /// Run failed cells again.
     #[arg(long)]
     pub retry_failed: bool,
@@ -74,7 +78,7 @@ pub struct RunArgs {
     pub json: Option<PathBuf>,
     /// Run the cells that a line of standard input names. Stop when standard input is closed.
     #[arg(long, hide = true, requires = "server",
-        conflicts_with_all = ["cell", "jobs", "group", "engine", "retry_failed", "html"])]
+        conflicts_with_all = ["cell", "jobs", "group", "engine", "retry_failed", "html", "done"])]
     pub worker: bool,
     #[command(flatten)]
     pub engine: EngineArgs,
@@ -115,15 +119,40 @@ pub enum Engine {
 
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
+  perturb export runs/quick
+  perturb export runs/* --into all.parquet           # pandas, polars and DuckDB read the file
+  perturb export runs/mine --into results/results.parquet --policies")]
+pub struct ExportArgs {
+    /// The --out folders of `perturb run`. Each becomes a study of the table.
+    #[arg(required_unless_present = "csv", value_name = "DIR")]
+    pub dirs: Vec<PathBuf>,
+    /// Table to add the results to. Rows of the same cells are replaced, and all others are kept.
+    #[arg(long, value_name = "FILE", default_value = "results.parquet")]
+    pub into: PathBuf,
+    /// Name of the study in the table [default: the name of DIR].
+    #[arg(long, value_name = "NAME")]
+    pub study: Option<String>,
+    /// Also write the whole table to this file as CSV. `-` or no name prints it and nothing else.
+    #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
+    pub csv: Option<PathBuf>,
+    /// Also write the policies that DIR has to policies/ID.safetensors beside FILE, and their test episodes to
+    /// episodes/STUDY.parquet.
+    #[arg(long)]
+    pub policies: bool,
+}
+
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
   perturb report runs/quick
   perturb report runs/quick --html quick.html        # one page with everything
-  perturb report runs/quick assessed/mine --out report")]
+  perturb report runs/quick assessed/mine --out report
+  perturb report results/results.parquet/classic-ff --out classic-ff")]
 pub struct ReportArgs {
-    /// The --out folder of `perturb run`, folders that `Assessment.save` wrote in Python, or one experiment and any
-    /// number of assessments. Tables and pictures then have all agents together.
+    /// The --out folder of `perturb run`, a study of a results table (FILE.parquet/STUDY), folders that
+    /// `Assessment.save` wrote in Python, or one experiment or study and any number of assessments. Tables and pictures then have all agents together.
     #[arg(required = true, value_name = "DIR")]
     pub dirs: Vec<PathBuf>,
-    /// Folder for tables and pictures [default: report/ in the experiment's folder; required with assessments].
+    /// Folder for tables and pictures [default: report/ in the experiment's folder; required with assessments and tables].
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Rule that selects configurations [default: the plan's rule]. For a plan with selection = "clean", `paper`

@@ -15,7 +15,7 @@ use std::time::Duration;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Arg, ArgAction, Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 
-pub use experiments::{CurvesArgs, Engine, PlanArgs, ReportArgs, RunArgs};
+pub use experiments::{CurvesArgs, Engine, ExportArgs, PlanArgs, ReportArgs, RunArgs};
 use perturb_learner::client::Address;
 use perturb_protocol::names;
 pub use testing::{AuditArgs, EvaluateArgs, HeatmapArgs, RescoreArgs, SetArgs, VideoArgs};
@@ -85,6 +85,8 @@ pub enum CliCommand {
     Plan(PlanArgs),
     /// Run all trainings and tests of an experiment file, or resume them.
     Run(RunArgs),
+    /// Add the results of experiments to one table, a Parquet file.
+    Export(ExportArgs),
     /// Make tables of an experiment's results, with the paper's for comparison.
     Report(ReportArgs),
     /// Draw the training curves of an experiment.

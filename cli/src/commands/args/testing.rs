@@ -24,8 +24,8 @@ fn success_rule(text: &str) -> Result<Rule, ValueError> {
   perturb evaluate --checkpoint runs/mine --versions E --episodes 200 --json -
   perturb evaluate --checkpoint runs/mine --parameters length=0.1..2.0/20 --records long.parquet")]
 pub struct EvaluateArgs {
-    /// The --out folder of a training, its checkpoint folder, the folder of a cell, or a policy's name: the id of a
-    /// cell in results/ of the working directory, or in the folder that PERTURB_RESULTS names.
+    /// The --out folder of a training, its checkpoint folder, a policy file (.safetensors), the folder of a cell, or a
+    /// policy's name: the id of a cell in results/ of the working directory, or in the folder that PERTURB_RESULTS names.
     #[arg(long, value_name = "DIR")]
     pub checkpoint: PathBuf,
     /// Versions to test on, separated by commas [default: D,R,E; none with --parameters or --contexts].
@@ -78,10 +78,12 @@ pub struct SetArgs {
 #[command(after_help = "Examples:
   perturb audit runs/quick                           # 30 episodes of each policy, spread over all of its tests
   perturb audit long.parquet --checkpoint runs/long --all
+  perturb audit results                              # all tests of the stored policies beside a results table
   perturb audit runs/quick --ledger ledger.jsonl     # replays nothing: checks the training environments")]
 pub struct AuditArgs {
-    /// The --out folder of `perturb run`, the folder of one of its cells, the --records file of `perturb evaluate`, or
-    /// a folder that `Assessment.save` wrote in Python.
+    /// The --out folder of `perturb run`, the folder of one of its cells, the --records file of `perturb evaluate`, a
+    /// folder that `Assessment.save` wrote in Python, or a table of `perturb export --policies`, its folder, or one of
+    /// its policies. The tests of a table are replayed as a whole, and their checksums compared.
     pub dir: PathBuf,
     /// Tested checkpoint of a records file: the --out folder of its training, its checkpoint folder, the folder of its
     /// cell, or a name in results/ of the working directory or in the folder that PERTURB_RESULTS names. For an

@@ -24,6 +24,7 @@ use perturb_records::TrainedOn;
 use perturb_records::success::{Criterion, Rule};
 use perturb_settings::sets::{Contexts, TestSet, check as check_parameters};
 use perturb_settings::{Method, TrainConfig, ValueError, require};
+use sets::ReadBeside;
 
 /// Everything that an experiment file asks for.
 #[derive(Clone, Debug)]
@@ -188,7 +189,8 @@ impl Plan {
         let text = files::read_text(path)?;
         let file: File = toml::from_str(&text).map_err(|error| refused(words(&error).into()))?;
         let folder = path.parent().unwrap_or(Path::new(""));
-        let sets = sets::read(&file.sets, folder, &mut BTreeMap::new()).map_err(|error| refused(error.into()))?;
+        let sets = sets::read(&file.sets, &|name| sets::content(name, folder), &mut BTreeMap::new())
+            .map_err(|error| refused(error.into()))?;
         Ok(sets.into_values().filter(|set| set.plain().is_none()).collect())
     }
 
@@ -203,17 +205,31 @@ impl Plan {
     /// # Errors
     /// [`PlanError`], which names the table and the key.
     pub fn parse(path: &str, text: String) -> Result<Self, PlanError> {
-        Self::expand(path, text).map_err(|reason| PlanError::Refused { path: path.to_owned(), reason })
+        let folder = Path::new(path).parent().unwrap_or(Path::new(""));
+        Self::parse_with(path, text, folder, &|name| sets::content(name, folder))
     }
 
-    fn expand(path: &str, text: String) -> Result<Self, AnyError> {
+    /// Expands `text`, which `path` names in errors. Folders of tasks are relative to `folder`, and `beside` reads the
+    /// files that the plan names.
+    ///
+    /// # Errors
+    /// [`PlanError`], which names the table and the key.
+    pub(crate) fn parse_with(
+        path: &str,
+        text: String,
+        folder: &Path,
+        beside: &ReadBeside<'_>,
+    ) -> Result<Self, PlanError> {
+        Self::expand(text, folder, beside).map_err(|reason| PlanError::Refused { path: path.to_owned(), reason })
+    }
+
+    fn expand(text: String, folder: &Path, read_beside: &ReadBeside<'_>) -> Result<Self, AnyError> {
         let mut file: File = toml::from_str(&text).map_err(|error| words(&error))?;
         let revisions = file.spell()?;
         file.check()?;
         let mut beside = BTreeMap::new();
-        let folder = Path::new(path).parent().unwrap_or(Path::new(""));
         let (text, tasks) = tasks::resolve(text, &file.tasks, folder)?;
-        let sets = sets::read(&file.sets, folder, &mut beside)?;
+        let sets = sets::read(&file.sets, read_beside, &mut beside)?;
         let (cells, candidates) = expansion::expand(&file, &sets)?;
         let (selection, runs, tuning_runs) = (file.selection, file.runs, file.tuning_runs());
         let title = file.title.unwrap_or_default();

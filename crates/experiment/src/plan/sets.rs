@@ -15,10 +15,13 @@ use super::file::is_plain;
 const VERSION: &str = "version";
 const FILE: &str = "file";
 
-/// The versions and the sets of `tables`, by their names; `beside` gets the files in `folder` that these name.
+/// Reads a file by its name. The error says what was found instead.
+pub(super) type ReadBeside<'a> = dyn Fn(&str) -> Result<Vec<u8>, String> + 'a;
+
+/// The versions and the sets of `tables`, by their names; `beside` gets the files that these name.
 pub(super) fn read(
     tables: &BTreeMap<String, Table>,
-    folder: &Path,
+    read_beside: &ReadBeside<'_>,
     beside: &mut BTreeMap<String, Vec<u8>>,
 ) -> Result<BTreeMap<String, TestSet>, ValueError> {
     let mut sets = BTreeMap::from(Version::KNOWN.map(|version| (version.to_string(), version.into())));
@@ -29,7 +32,7 @@ pub(super) fn read(
         require(name.parse::<Version>().is_err(), &key, "there already", "another name than D, R, E and R+E")?;
         let expected = "values of some parameters, or left out: it is a version";
         require(table.keys().any(|key| key != VERSION), &key, "without parameters", expected)?;
-        let set = read_set(name, table, folder, beside)
+        let set = read_set(name, table, read_beside, beside)
             .map_err(|error| ValueError { what: format!("{key}: {}", error.what), ..error })?;
         sets.insert(name.clone(), set);
     }
@@ -39,7 +42,7 @@ pub(super) fn read(
 fn read_set(
     name: &str,
     table: &Table,
-    folder: &Path,
+    read_beside: &ReadBeside<'_>,
     beside: &mut BTreeMap<String, Vec<u8>>,
 ) -> Result<TestSet, ValueError> {
     let mut version = Version::D;
@@ -63,13 +66,14 @@ fn read_set(
     let Some(file) = file else { return set_of(name, version, assignments) };
     let expected = "alone: the file's header names the parameters";
     require(assignments.is_empty(), FILE, "beside parameters", expected)?;
-    let content = content(file, folder).map_err(|got| ValueError::new(FILE, got, "a CSV file beside the plan"))?;
+    let content = read_beside(file).map_err(|got| ValueError::new(FILE, got, "a CSV file beside the plan"))?;
     let set = set_of_csv(name, version, &content)?;
     beside.insert(file.clone(), content);
     Ok(set)
 }
 
-fn content(file: &str, folder: &Path) -> Result<Vec<u8>, String> {
+/// Reads the CSV file called `file` in `folder`.
+pub(super) fn content(file: &str, folder: &Path) -> Result<Vec<u8>, String> {
     if Path::new(file).components().count() != 1 || file.starts_with('.') || !file.ends_with(".csv") {
         return Err(format!("`{file}`, which is not the name of a file .csv"));
     }

@@ -1,27 +1,24 @@
 //! Recorded episodes as a table: a row an episode, a column a quantity.
 
-use super::{Ending, EpisodeRecord, Records};
+use perturb_files::AnyError;
 
-/// The values of a column, one for each episode.
-#[derive(Clone, Debug, PartialEq)]
-pub enum ColumnValues<'a> {
-    /// Names.
-    Text(Vec<&'a str>),
-    /// Seeds and indices.
-    Unsigned64(Vec<u64>),
-    /// Numbers of steps and of environments.
-    Unsigned32(Vec<u32>),
-    /// Whether something is so.
-    Flag(Vec<bool>),
-    /// Measured.
-    Number(Vec<f64>),
-    /// Numbers that some rows lack.
-    Optional(Vec<Option<f64>>),
-}
+use super::{Ending, EpisodeRecord, Records};
+use crate::parquet_file::ColumnValues;
 
 impl Ending {
-    pub(super) const NAMED: [(&str, Self); 3] =
+    const NAMED: [(&str, Self); 3] =
         [("terminated", Self::Terminated), ("truncated", Self::Truncated), ("diverged", Self::Diverged)];
+
+    /// Returns the name in files.
+    pub(crate) fn name(self) -> &'static str {
+        Self::NAMED[self as usize].0
+    }
+
+    /// Returns the ending with this name.
+    pub(crate) fn from_name(name: &str) -> Result<Self, AnyError> {
+        let known = Self::NAMED.into_iter().find(|(known, _)| *known == name);
+        known.map(|(_, ending)| ending).ok_or_else(|| format!("an ending is `{name}`").into())
+    }
 }
 
 impl Records {
@@ -52,7 +49,7 @@ impl Records {
             ("return", ColumnValues::Number(rows().map(|row| row.episode_return).collect())),
             ("length", ints(|row| row.length)),
             ("success", ColumnValues::Flag(rows().map(|row| row.success).collect())),
-            ("ending", texts(|row| Ending::NAMED[row.ending as usize].0)),
+            ("ending", texts(|row| row.ending.name())),
             ("achieved", optional(|row| row.achieved)),
         ];
         let also = about.also.iter().map(|_| ("also_achieved".to_owned(), optional(|row| row.also_achieved)));

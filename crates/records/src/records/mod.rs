@@ -3,10 +3,11 @@
 //! One Parquet file holds the tests of one policy. Every figure of a result follows from it, at any threshold of success,
 //! and each episode can be played again from its address: seed, environment index and episode index.
 
+mod checksum;
 mod columns;
 mod parquet;
+mod replay;
 
-pub use columns::ColumnValues;
 pub use parquet::{FILE, RecordsError};
 
 use perturb_protocol::{EndedEpisode, proto};

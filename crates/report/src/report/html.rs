@@ -61,7 +61,7 @@ pub fn html(report: &Report<'_>, figures: &Figures) -> String {
     let comparisons = report.comparisons_table().into_iter().collect();
     let gains = report.gains_table().into_iter().map(plain).chain(by_environment(&figures.gains)).collect();
     let sets = report.set_table().into_iter().collect();
-    let heatmap_notes = html! { p { (HEATMAPS) } (list(&figures.no_heatmaps)) };
+    let heatmap_notes = html! { p { (HEATMAPS) } };
     let sections = [
         section("metrics", "Default, Interpolation, Extrapolation", said(METRICS), metrics),
         section("iqm", "Interquartile means", html! {}, report.iqm_table().into_iter().map(plain).collect()),
@@ -77,17 +77,14 @@ pub fn html(report: &Report<'_>, figures: &Figures) -> String {
         section("marks", "Generalisation against training", html! {}, marks),
         section("settings", "What settings do", html! {}, settings),
         section("footing", "Trainings on an equal footing", said(FOOTING), tables(report.footing_tables())),
-        section("curves", "Training curves", list(&figures.no_curves), by_environment(&figures.curves)),
+        section("curves", "Training curves", html! {}, by_environment(&figures.curves)),
         section("heatmaps", "Heatmaps", heatmap_notes, by_environment(&figures.heatmaps)),
         section("cells", "Cells", html! {}, cells),
         section("elsewhere", "Trained elsewhere", html! {}, tables(elsewhere)),
     ];
-    // Curves and heatmaps say what is missing.
-    let says = !report.plan.cells.is_empty();
-    let always =
-        |section: &&Section| (says && ["curves", "heatmaps"].contains(&section.id)) || !section.subsections.is_empty();
-    let shown: Vec<&Section> = sections.iter().filter(always).collect();
-    page(report, &figures.finding, &shown).into_string()
+    let shown: Vec<&Section> = sections.iter().filter(|section| !section.subsections.is_empty()).collect();
+    let missing: Vec<String> = figures.no_curves.iter().chain(&figures.no_heatmaps).cloned().collect();
+    page(report, &figures.finding, &shown, &missing).into_string()
 }
 
 /// Tables, of each environment with its figure.
@@ -101,7 +98,8 @@ fn metrics(report: &Report<'_>, figures: &[Figure]) -> Vec<Subsection> {
     report.metrics_tables().into_iter().map(with_figure).chain(ties).collect()
 }
 
-fn page(report: &Report<'_>, finding: &[Figure], sections: &[&Section]) -> Markup {
+/// Results come first, and last how they were made and which figures are missing.
+fn page(report: &Report<'_>, finding: &[Figure], sections: &[&Section], missing: &[String]) -> Markup {
     let title = report.title();
     html! {
         (DOCTYPE)
@@ -119,20 +117,24 @@ fn page(report: &Report<'_>, finding: &[Figure], sections: &[&Section]) -> Marku
                     ol {
                         li { a href="#finding" { "Finding" } }
                         @for section in sections { (section.contents()) }
+                        li { a href="#provenance" { "Provenance" } }
                     }
                 }
                 main {
                     header {
                         h1 { (title) }
                         @for said in report.abstract_paragraphs() { p.abstract { (prose(&said)) } }
-                        (facts(report))
                     }
                     section id="finding" aria-label="Finding" {
                         @for said in report.finding_sentences() { p { (prose(&said)) } }
                         @for one in finding { div.opening { (figure(one)) } }
-                        div.notes { @for line in &report.overview { p { (prose(line)) } } }
                     }
                     @for section in sections { (section.body()) }
+                    section id="provenance" {
+                        h2 { "Provenance" }
+                        (facts(report))
+                        div.notes { @for line in &report.overview { p { (prose(line)) } } (list(missing)) }
+                    }
                 }
             }
         }

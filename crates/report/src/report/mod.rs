@@ -55,7 +55,7 @@ use perturb_experiment::{
 };
 use perturb_text::{Table, count};
 pub use pictures::{Picture, PictureDrawing};
-pub use sources::{ReportBundle, ReportError, ReportInputs};
+pub use sources::{ReportBundle, ReportError, ReportInputs, StudySource};
 
 /// The paper's budgets.
 const PAPER_EPISODES: u64 = 15_000;

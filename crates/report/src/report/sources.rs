@@ -1,12 +1,15 @@
-//! From what a report is made: an experiment's folder, assessments of agents that were trained elsewhere, or both.
+//! From what a report is made: an experiment's folder or a study of a results table, assessments of agents that were
+//! trained elsewhere, or both.
 
 use std::path::{Path, PathBuf};
 
 use perturb_experiment::{
-    EnvironmentCurves, Folder, FolderError, Plan, PlanError, Recorded, Results, Selection, VerifyError, add_assessed,
-    judged_as_in, read_curves, verify,
+    CellStates, EnvironmentCurves, Folder, FolderError, Plan, PlanError, Recorded, Results, Selection, StudyResults,
+    VerifyError, add_assessed, judged_as_in, read_curves, verify,
 };
-use perturb_records::{ExternalEvaluation, ExternalEvaluationError};
+use perturb_records::{
+    ExternalEvaluation, ExternalEvaluationError, RecordsError, ResultsTable, StudyEpisodes, TableError,
+};
 use perturb_settings::ValueError;
 
 use super::{Figures, HeatmapPicture, Report, heatmap_pictures, html};
@@ -15,12 +18,25 @@ use crate::plot::PlotError;
 /// The inputs of a report.
 #[derive(Clone, Debug, Default)]
 pub struct ReportInputs {
-    /// An experiment; `None` for assessments alone.
+    /// An experiment; `None` for a study, or for assessments alone.
     pub folder: Option<Folder>,
+    /// A study of a results table.
+    pub study: Option<StudySource>,
     /// In the place of its plan's.
     pub rule: Option<Selection>,
     /// In the order of their rows.
     pub assessed: Vec<ExternalEvaluation>,
+}
+
+/// A study of a results table.
+#[derive(Clone, Debug)]
+pub struct StudySource {
+    table: ResultsTable,
+    name: String,
+    /// The path that was given.
+    path: PathBuf,
+    /// The file of the study's recorded episodes, which need not exist.
+    episodes: PathBuf,
 }
 
 /// Why there is no report.
@@ -40,10 +56,20 @@ pub enum ReportError {
     Value(#[from] ValueError),
     #[error(transparent)]
     Verify(#[from] VerifyError),
+    #[error(transparent)]
+    Records(#[from] RecordsError),
+    #[error(transparent)]
+    Table(#[from] TableError),
+    /// A table has no such study, or several of which none was named.
+    #[error(
+        "{} has no study `{study}`: give one of them as {}/STUDY: {}",
+        table.display(), table.display(), known.join(", ")
+    )]
+    NoStudy { table: PathBuf, study: String, known: Vec<String> },
     /// A folder has neither.
     #[error(
         "{} holds neither an experiment (plan.toml) nor an assessment (assessment.json): give the --out of `perturb run`, \
-         or the folder of Assessment.save",
+         the folder of Assessment.save, or the study of a results table, FILE.parquet/STUDY",
         path.display()
     )]
     Neither { path: PathBuf },
@@ -71,12 +97,20 @@ impl ReportInputs {
         let folder = Folder::new(path);
         if ExternalEvaluation::is_in(path) {
             self.assessed.push(ExternalEvaluation::read(path)?);
-        } else if folder.require_plan().is_err() {
-            return Err(ReportError::Neither { path: path.to_owned() });
-        } else if let Some(first) = self.folder.replace(folder) {
-            return Err(ReportError::Experiments { first: first.path().to_owned(), second: path.to_owned() });
+            return Ok(());
         }
-        Ok(())
+        let first = match (&self.folder, &self.study) {
+            (Some(folder), _) => Some(folder.path().to_owned()),
+            (None, study) => study.as_ref().map(|study| study.path.clone()),
+        };
+        if let Some(study) = StudySource::find(path)? {
+            self.study = Some(study);
+        } else if folder.require_plan().is_ok() {
+            self.folder = Some(folder);
+        } else {
+            return Err(ReportError::Neither { path: path.to_owned() });
+        }
+        first.map_or(Ok(()), |first| Err(ReportError::Experiments { first, second: path.to_owned() }))
     }
 
     /// The rule by which configurations are selected, if it is another one than the plan's.
@@ -84,9 +118,13 @@ impl ReportInputs {
     /// # Errors
     /// [`ReportError`].
     pub fn another_rule(&self) -> Result<Option<Selection>, ReportError> {
-        let Some((folder, rule)) = self.folder.as_ref().zip(self.rule) else { return Ok(None) };
-        let of_plan = Plan::load(&folder.require_plan()?)?.selection;
-        Ok((rule != of_plan).then_some(rule))
+        let Some(rule) = self.rule else { return Ok(None) };
+        let plan = match (&self.folder, &self.study) {
+            (Some(folder), _) => Plan::load(&folder.require_plan()?)?,
+            (None, Some(study)) => study.plan()?,
+            (None, None) => return Ok(None),
+        };
+        Ok((rule != plan.selection).then_some(rule))
     }
 
     /// Reads everything, and gives the report to `make`.
@@ -94,16 +132,23 @@ impl ReportInputs {
     /// # Errors
     /// [`ReportError`], and those of `make`.
     pub fn read<T, E: From<ReportError>>(self, make: impl FnOnce(ReportBundle<'_>) -> Result<T, E>) -> Result<T, E> {
-        let Self { folder, rule, assessed } = self;
-        let plan = match &folder {
-            None => Plan::without_cells(),
-            Some(folder) => plan_of(folder, rule)?,
+        let Self { folder, study, rule, assessed } = self;
+        let rows = study.as_ref().map(|study| StudyResults::new(&study.table, &study.name));
+        let states = match (&folder, &rows) {
+            (Some(folder), _) => Some(folder as &dyn CellStates),
+            (None, rows) => rows.as_ref().map(|rows| rows as &dyn CellStates),
         };
+        let plan = match (&folder, &study) {
+            (Some(folder), _) => Plan::load(&folder.require_plan().map_err(ReportError::from)?),
+            (None, Some(study)) => study.plan(),
+            (None, None) => Ok(Plan::without_cells()),
+        };
+        let plan = selected_plan(plan.map_err(ReportError::from)?, states, rule)?;
         let assessed = assessed.into_iter().map(|one| judged_as_in(&plan, one)).collect::<Result<Vec<_>, _>>();
         let assessed = assessed.map_err(ReportError::from)?;
-        let results = match &folder {
+        let results = match states {
             None => Results { plan: &plan, states: Vec::new() },
-            Some(folder) => Results::read(&plan, folder).map_err(ReportError::from)?,
+            Some(states) => Results::read(&plan, states).map_err(ReportError::from)?,
         };
         let mut selections = results.select();
         let mut recorded = Recorded::new(&selections);
@@ -111,6 +156,12 @@ impl ReportInputs {
         if let Some(folder) = &folder {
             verify(&results, folder, |result, records| recorded.add(result, records)).map_err(ReportError::from)?;
             curves = read_curves(&selections, folder).map_err(ReportError::from)?;
+        } else if let Some(study) = &study {
+            let episodes =
+                StudyEpisodes::read_if_there(&study.episodes).map_err(ReportError::from)?.unwrap_or_default();
+            for result in results.done() {
+                episodes.of_cell(&result.id).into_iter().for_each(|records| recorded.add(result, records));
+            }
         }
         add_assessed(&mut selections, &assessed);
         let heatmaps = heatmap_pictures(&selections, folder.as_ref()).map_err(ReportError::from)?;
@@ -129,8 +180,35 @@ impl ReportBundle<'_> {
     }
 }
 
-fn plan_of(folder: &Folder, rule: Option<Selection>) -> Result<Plan, ReportError> {
-    let plan = Plan::load(&folder.require_plan()?)?;
+impl StudySource {
+    /// Finds the study that `path` names: FILE.parquet/STUDY, or FILE.parquet with a single study. Returns `None` if no
+    /// part of `path` is a Parquet file.
+    fn find(path: &Path) -> Result<Option<Self>, ReportError> {
+        let is_table = |path: &&Path| path.extension().is_some_and(|ending| ending == "parquet") && path.is_file();
+        let Some(file) = path.ancestors().find(is_table) else { return Ok(None) };
+        let table = ResultsTable::read(file)?;
+        let study = path.strip_prefix(file).unwrap_or(Path::new("")).display().to_string();
+        let known: Vec<String> = table.studies.keys().cloned().collect();
+        let name = match &known[..] {
+            [only] if study.is_empty() => only.clone(),
+            _ if known.contains(&study) => study,
+            _ => return Err(ReportError::NoStudy { table: file.to_owned(), study, known }),
+        };
+        let episodes = StudyEpisodes::path(file.parent().unwrap_or(Path::new("")), &name);
+        Ok(Some(Self { table, name, path: path.to_owned(), episodes }))
+    }
+
+    fn plan(&self) -> Result<Plan, PlanError> {
+        self.table.studies.get(&self.name).map_or_else(
+            || Ok(Plan::without_cells()), // the study was found in the table
+            |plan| Plan::of_study(&self.name, plan),
+        )
+    }
+}
+
+/// Returns the plan by the wanted rule, with the cells that are selected.
+fn selected_plan(plan: Plan, states: Option<&dyn CellStates>, rule: Option<Selection>) -> Result<Plan, ReportError> {
+    let Some(states) = states else { return Ok(plan) };
     let rule = rule.unwrap_or(plan.selection);
-    Ok(plan.with_rule(rule)?.with_selected_cells(folder)?)
+    Ok(plan.with_rule(rule)?.with_selected_cells(states)?)
 }

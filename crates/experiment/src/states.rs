@@ -1,0 +1,186 @@
+//! Where the states of cells are read from: an experiment's folder, a table of results, or both.
+
+use std::collections::{BTreeMap, HashMap};
+use std::path::Path;
+
+use perturb_checkpoint::Counters;
+use perturb_records::{ParameterCheck, ResultsTable, StudyPlan, TableRow, TestResult};
+
+use crate::folder::{CellResult, CellState, Failure, Folder, FolderError, IntermediateEvaluation, Training};
+use crate::plan::{Cell, Plan, PlanError};
+
+/// Separates the programs of a result in a table.
+pub(crate) const COMMIT_SEPARATOR: &str = "; ";
+
+/// A place that has the states of cells.
+pub trait CellStates {
+    /// Reads the state of `cell`.
+    ///
+    /// # Errors
+    /// [`FolderError`] for a state that cannot be read.
+    fn state(&self, cell: &Cell) -> Result<CellState, FolderError>;
+}
+
+impl CellStates for Folder {
+    fn state(&self, cell: &Cell) -> Result<CellState, FolderError> {
+        self.cell(&cell.id).state()
+    }
+}
+
+/// The results of a study in a table.
+#[derive(Clone, Debug)]
+pub struct StudyResults<'a> {
+    rows: HashMap<&'a str, Vec<&'a TableRow>>,
+}
+
+impl<'a> StudyResults<'a> {
+    /// Returns the results of `study`; none if the table does not have it.
+    pub fn new(table: &'a ResultsTable, study: &str) -> Self {
+        Self { rows: table.of_study(study) }
+    }
+
+    /// Returns the rows of a cell.
+    pub fn rows(&self, cell: &str) -> &[&'a TableRow] {
+        self.rows.get(cell).map_or(&[], Vec::as_slice)
+    }
+}
+
+impl CellStates for StudyResults<'_> {
+    fn state(&self, cell: &Cell) -> Result<CellState, FolderError> {
+        let rows = self.rows(&cell.id);
+        state_of(cell, rows).map_err(|reason| FolderError::Row { cell: cell.id.clone(), reason })
+    }
+}
+
+/// Cells that are done in a table, of whatever study. A cell counts if a study's plan has it with the same settings and
+/// the same tests.
+#[derive(Debug)]
+pub struct DoneCells<'a> {
+    studies: Vec<(Plan, StudyResults<'a>)>,
+}
+
+impl<'a> DoneCells<'a> {
+    /// Returns the finished cells of `table`.
+    ///
+    /// # Errors
+    /// [`PlanError`] for a study whose plan this program does not understand.
+    pub fn new(table: &'a ResultsTable) -> Result<Self, PlanError> {
+        let mut studies = Vec::new();
+        for (name, plan) in &table.studies {
+            studies.push((Plan::of_study(name, plan)?, StudyResults::new(table, name)));
+        }
+        Ok(Self { studies })
+    }
+}
+
+impl CellStates for DoneCells<'_> {
+    fn state(&self, cell: &Cell) -> Result<CellState, FolderError> {
+        for (plan, results) in &self.studies {
+            let is_same = |known: &Cell| known.config == cell.config && known.tests == cell.tests;
+            if plan.find(&cell.id).is_none_or(|known| !is_same(known)) {
+                continue;
+            }
+            if let done @ CellState::Done(_) = results.state(cell)? {
+                return Ok(done);
+            }
+        }
+        Ok(CellState::Missing)
+    }
+}
+
+/// The states in `first`; those of cells without any are in `then`.
+pub struct LayeredStates<'a> {
+    /// Asked first.
+    pub first: &'a dyn CellStates,
+    /// Asked for cells that are missing in the other.
+    pub then: Option<&'a dyn CellStates>,
+}
+
+impl CellStates for LayeredStates<'_> {
+    fn state(&self, cell: &Cell) -> Result<CellState, FolderError> {
+        match (self.first.state(cell)?, self.then) {
+            (CellState::Missing, Some(then)) => then.state(cell),
+            (state, _) => Ok(state),
+        }
+    }
+}
+
+impl Plan {
+    /// Reads and expands the plan of a study that a table has.
+    ///
+    /// # Errors
+    /// [`PlanError`], which names the study.
+    pub fn of_study(name: &str, study: &StudyPlan) -> Result<Self, PlanError> {
+        let beside = |file: &str| {
+            let content = study.beside.get(file).map(|content| content.clone().into_bytes());
+            content.ok_or_else(|| format!("`{file}`, which the table does not have"))
+        };
+        Self::parse_with(&format!("the study {name}"), study.plan.clone(), Path::new(""), &beside)
+    }
+
+    /// Returns the plan with its files, as a table keeps it.
+    pub fn for_table(&self) -> StudyPlan {
+        let text = |content: &Vec<u8>| String::from_utf8_lossy(content).into_owned();
+        let beside = self.beside.iter().map(|(name, content)| (name.clone(), text(content)));
+        StudyPlan { plan: self.text.clone(), beside: beside.collect() }
+    }
+}
+
+/// The state that a cell's rows say, which are in the order of their export: those of the final policy come last.
+fn state_of(cell: &Cell, rows: &[&TableRow]) -> Result<CellState, String> {
+    let Some(last) = rows.last() else { return Ok(CellState::Missing) };
+    let commits: Vec<String> = last.commit.split(COMMIT_SEPARATOR).map(str::to_owned).collect();
+    let (commit, earlier) = commits.split_last().ok_or("it names no program")?;
+    if let Some(reason) = &last.failure {
+        let (id, reason, commit) = (cell.id.clone(), reason.clone(), commit.clone());
+        return Ok(CellState::Failed(Failure { id, reason, commit, requires_restart: true }));
+    }
+    let first_of_final = rows.iter().enumerate().rposition(|(place, row)| {
+        let repeats = rows[place + 1..].iter().any(|later| later.tested_on == row.tested_on);
+        row.after_episodes != last.after_episodes || repeats
+    });
+    let (of_marks, of_final) = rows.split_at(first_of_final.map_or(0, |place| place + 1));
+    let mut marks: BTreeMap<u64, IntermediateEvaluation> = BTreeMap::new();
+    for row in of_marks {
+        let (set, result) = tested(row)?;
+        let agreement = ParameterCheck { episodes: 0, largest: None };
+        let mark = IntermediateEvaluation { counters: counters(row), results: BTreeMap::new(), agreement };
+        let mark = marks.entry(row.after_episodes.unwrap_or_default()).or_insert(mark);
+        mark.results.insert(set, result);
+    }
+    let results = of_final.iter().map(|row| tested(row)).collect::<Result<BTreeMap<_, _>, _>>()?;
+    let settings = serde_json::from_str(&last.settings).map_err(|error| format!("its settings: {error}"))?;
+    Ok(CellState::Done(Box::new(CellResult {
+        format_version: CellResult::FORMAT_VERSION,
+        id: cell.id.clone(),
+        training: Training {
+            environment: last.environment.clone(),
+            environment_revision: last.revision.and_then(|it| u32::try_from(it).ok()).ok_or("it has no revision")?,
+            model_hash: last.model_hash.clone().unwrap_or_default(),
+            version: cell.config.common.version,
+            set: cell.set.clone(),
+            method: cell.method(),
+            configuration: cell.configuration.clone(),
+            run: last.run,
+            seed: last.seed,
+            counters: counters(last),
+            settings,
+        },
+        results,
+        marks,
+        agreement: None,
+        commit: commit.clone(),
+        earlier_commits: earlier.to_vec(),
+        command: String::new(),
+    })))
+}
+
+fn tested(row: &TableRow) -> Result<(String, TestResult), String> {
+    let figures = row.tested_on.clone().zip(row.result());
+    figures.ok_or_else(|| "a row has neither a test nor a failure".into())
+}
+
+fn counters(row: &TableRow) -> Counters {
+    let (episodes, timesteps) = (row.after_episodes.unwrap_or_default(), row.timesteps.unwrap_or_default());
+    Counters { episodes, timesteps, ..Counters::default() }
+}
