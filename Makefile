@@ -92,7 +92,7 @@ missing=; \
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help deps all-deps opengl toolchain build generate recurrent build-all install install-recurrent demo all-pairs report-check serve-test test slurm-test kill-test \
+.PHONY: help deps all-deps opengl toolchain build generate recurrent build-all install install-recurrent demo all-pairs results-check report-check serve-test test slurm-test kill-test \
 	load-test bounds-test attack-test faults-test asan-test qemu-test simulation-test slurm-acceptance lint proto-lint proto-baseline bench fuzz fuzz-keep \
 	bench-peers audit cargo-deny metrics-test kubernetes-check otel-test python-test interrupts-test wheel wheel-test python-acceptance \
 	bench-python python-venv languages-test docs docs-test docker docker-base docker-test
@@ -304,6 +304,9 @@ docs-test: docs $(VENV)/installed ## run README's and the tutorials' blocks, fol
 	python3 docs/site/links.py $(DOCS)/site || failed="$$failed links"; \
 	python3 docs/site/look.py chromium $(DOCS)/site $(DOCS)/pictures || failed="$$failed look"; \
 	[ -z "$$failed" ] || { echo "docs-test failed:$$failed" >&2; exit 1; }
+
+results-check: build $(VENV)/installed ## compute the numbers of README.md, results/ and docs/findings from the results table, and run their commands
+	$(VENV)/bin/python docs/site/results_check.py $(PROGRAMS)
 
 $(PROGRAMS)/perturb-server: build ;
 

@@ -5,6 +5,8 @@ Environments, leaderboard, commands, settings, experiment files, protocol, Pytho
 Each function gives pages by their places in the site, as markdown.
 """
 
+import csv
+import io
 import json
 import re
 import subprocess
@@ -20,8 +22,8 @@ GIVEN = {"environment", "architecture"}
 # Policies of results/ that were trained with PPO on D and can be filmed, by the page about their experiment. A step of
 # MountainCar simulates a second.
 FILMED = {
-    "beyond": "results/beyond/confirm-2/cells/{}-ppo-ff-D-9bd6546b-s7/training",
-    "locomotion": "results/locomotion/cells/{}-ppo-ff-D-348d15d9-s2/training",
+    "beyond": "results/policies/{}-ppo-ff-D-9bd6546b-s7.safetensors",
+    "locomotion": "results/policies/{}-ppo-ff-D-348d15d9-s2.safetensors",
 }
 FASTER = {"MountainCar": ["--fps", "30"]}
 
@@ -127,36 +129,39 @@ def channels(entries):
 # Leaderboard.
 
 
-def leaderboard():
+def leaderboard(programs):
     """Return the trained policies of results/ by environment, with the highest mean over D, R and E first."""
-    kept = [path.parents[1] / "result.json" for path in Path("results").rglob("cells/*/training/checkpoint")]
-    results = [json.loads(path.read_text()) for path in sorted(kept) if path.exists()]
-    results = [result for result in results if set("DRE") <= set(result["results"])]
+    table = told(programs / "perturb", "export", "--into", "results/results.parquet", "--csv", "-")
+    stored = {path.stem for path in Path("results/policies").glob("*.safetensors")}
+    results = {}
+    for line in csv.DictReader(io.StringIO(table)):
+        # Rows of the final policy follow those of intermediate ones.
+        if line["cell"] in stored and line["checksum"] and line["tested_on"] in ("D", "R", "E"):
+            results.setdefault(line["cell"], {})[line["tested_on"]] = line
+    results = {cell: tests for cell, tests in sorted(results.items()) if set("DRE") <= set(tests)}
     page = (
         "# Leaderboard\n\nTrained policies that come with the repository: success in % on D, R and E, and the mean of"
         " the three, by which they stand. Their names, which say learner, network, training version and seed, are what"
         " `perturb video`, `evaluate`, `heatmap` and `perturb.load_policy` take, in a clone or with `PERTURB_RESULTS`"
         " set to its `results`:\n\n"
-        f"```sh\nperturb video --checkpoint {results[0]['id']} --version D,E --out sheet.png\n```\n\n"
+        f"```sh\nperturb video --checkpoint {next(iter(results))} --version D,E --out sheet.png\n```\n\n"
         "Each row is one seed, trained for so many episodes and tested on so many of each version: differences of few"
         " points between neighbours mean nothing. What was compared with how many seeds, and the paper's numbers, are"
         " in [results](results.md); by which rule an episode is a success stands in the files there. Policies that were"
         " trained elsewhere stand in tables of their own:"
         " [assess your own agent](tutorials/assess-your-agent.md).\n"
     )
-    for name in sorted({result["training"]["environment"] for result in results}):
-        rows = [row(result) for result in results if result["training"]["environment"] == name]
+    for name in sorted({tests["D"]["environment"] for tests in results.values()}):
+        rows = [row(cell, tests) for cell, tests in results.items() if tests["D"]["environment"] == name]
         head = ["policy", "D", "R", "E", "mean", "episodes", "tests"]
         page += f"\n## {name}\n\n" + table(head, sorted(rows, key=lambda entries: (-float(entries[4]), entries)))
     return {"leaderboard.md": page}
 
 
-def row(result):
-    training, tests = result["training"], result["results"]
-    rates = [tests[version]["success_percent"] for version in "DRE"]
-    episodes = training["counters"]["episodes"], tests["D"]["episodes"]
+def row(cell, tests):
+    rates = [100 * int(tests[version]["successes"]) / int(tests[version]["episodes"]) for version in "DRE"]
     shown = [f"{rate:.1f}" for rate in [*rates, sum(rates) / 3]]
-    return [f"`{result['id']}`", *shown, *episodes]
+    return [f"`{cell}`", *shown, tests["D"]["after_episodes"], tests["D"]["episodes"]]
 
 
 # Commands.
@@ -401,7 +406,7 @@ def python():
 def pages(programs, folder):
     return {
         **environments(programs, folder),
-        **leaderboard(),
+        **leaderboard(programs),
         **commands(programs),
         **settings(programs),
         **experiment_files(),

@@ -114,7 +114,7 @@ def main():
     for path in sys.argv[2:] or PAGES:
         print(path, flush=True)
         with tempfile.TemporaryDirectory() as folder:
-            for part in ("experiments", "proto"):  # as in a clone
+            for part in ("experiments", "proto", "results"):  # as in a clone
                 (Path(folder) / part).symlink_to(Path(part).resolve())
             page = Page(path, folder)
             try:

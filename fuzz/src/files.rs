@@ -11,7 +11,7 @@ use perturb_records::ledger::Ledgers;
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
-use crate::seeds::{POLICY, repository_path};
+use crate::seeds::{stored_policy, stored_records};
 
 /// Maximum size of an experiment file. Larger ones would only take more time.
 const MAX_PLAN_BYTES: usize = 4096;
@@ -54,11 +54,7 @@ pub fn records(data: &[u8]) {
 /// Reads the lines of a ledger, whose digests are added. If that succeeds, it checks a stored policy against the
 /// ledger.
 pub fn ledgers(data: &[u8]) {
-    static POLICY_WITH_RECORDS: LazyLock<(Checkpoint, Records)> = LazyLock::new(|| {
-        let policy = repository_path(POLICY);
-        let checkpoint = Checkpoint::load(&policy.join("training/checkpoint")).expect("a checkpoint");
-        (checkpoint, Records::read(&policy.join("episodes.parquet")).expect("recorded"))
-    });
+    static POLICY_WITH_RECORDS: LazyLock<(Checkpoint, Records)> = LazyLock::new(|| (stored_policy(), stored_records()));
     let Ok(text) = std::str::from_utf8(data) else { return };
     let mut head = "0".repeat(64);
     let mut ledger = String::new();

@@ -14,13 +14,28 @@ use perturb::proto::{
     SessionResponse, SlotGroup, Snapshot, Version,
 };
 use perturb::tasks;
+use perturb_checkpoint::Checkpoint;
 use perturb_policy::{ActionKind, PolicySpec};
+use perturb_records::{Records, StudyEpisodes};
 use prost::Message;
 
 use crate::server::{client_bytes, frame, framed, open, replies_to, steps};
 
 /// A stored policy with a recorded test.
-pub(crate) const POLICY: &str = "results/beyond/confirm-2/cells/CartPole-ppo-ff-R-9bd6546b-s7";
+const POLICY: &str = "CartPole-ppo-ff-R-9bd6546b-s7";
+
+/// Returns a stored policy.
+pub(crate) fn stored_policy() -> Checkpoint {
+    let file = repository_path("results/policies").join(format!("{POLICY}.safetensors"));
+    Checkpoint::load(&file).expect("a policy")
+}
+
+/// Returns the recorded episodes of the stored policy.
+pub(crate) fn stored_records() -> Records {
+    let path = StudyEpisodes::path(&repository_path("results"), "beyond/confirm-2");
+    let episodes = StudyEpisodes::read_if_there(&path).expect("readable").expect("a file");
+    episodes.of_cell(POLICY).expect("the policy's episodes").clone()
+}
 
 /// Returns the valid inputs of a target by its name.
 pub fn seeds(name: &str) -> Vec<Vec<u8>> {
@@ -36,9 +51,10 @@ pub fn seeds(name: &str) -> Vec<Vec<u8>> {
             b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n".to_vec(),
         ],
         "checkpoints" => {
-            let folder = repository_path(POLICY).join("training/checkpoint");
-            let document = std::fs::read(folder.join("checkpoint.json")).expect("a checkpoint");
-            let weights = std::fs::read_dir(folder).expect("its folder").flatten();
+            let folder = tempfile::tempdir().expect("a folder");
+            stored_policy().save(folder.path(), None).expect("a checkpoint");
+            let document = std::fs::read(folder.path().join("checkpoint.json")).expect("a checkpoint");
+            let weights = std::fs::read_dir(folder.path()).expect("its folder").flatten();
             let weights = weights.map(|file| file.path()).find(|path| path.extension().is_some_and(|it| it != "json"));
             let weights = std::fs::read(weights.expect("weights")).expect("weights");
             let document: serde_json::Value = serde_json::from_slice(&document).expect("JSON");
@@ -46,7 +62,12 @@ pub fn seeds(name: &str) -> Vec<Vec<u8>> {
             let length = u16::try_from(document.len()).expect("a short document");
             vec![[&length.to_le_bytes(), document.as_bytes(), &weights].concat()]
         }
-        "records" => vec![std::fs::read(repository_path(POLICY).join("episodes.parquet")).expect("recorded")],
+        "records" => {
+            let folder = tempfile::tempdir().expect("a folder");
+            let file = folder.path().join("episodes.parquet");
+            stored_records().write(&file).expect("a file");
+            vec![std::fs::read(file).expect("recorded")]
+        }
         "plans" => ["quick", "classic-ff", "classic-rc", "paper", "beyond/confirm-2", "questions/pendulum"]
             .map(|name| {
                 std::fs::read(repository_path("experiments").join(name).with_extension("toml")).expect("a file")

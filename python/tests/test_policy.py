@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +13,16 @@ import perturb
 
 from .conftest import ROOT
 
-CELLS = ROOT / "results/beyond/confirm-2/cells"
-CART_POLE = CELLS / "CartPole-ppo-ff-D-9bd6546b-s7/training"
-PENDULUM = CELLS / "Pendulum-ppo-ff-R-9bd6546b-s8/training"
+POLICIES = ROOT / "results/policies"
+CART_POLE = POLICIES / "CartPole-ppo-ff-D-9bd6546b-s7.safetensors"
+PENDULUM = POLICIES / "Pendulum-ppo-ff-R-9bd6546b-s8.safetensors"
 
 
 @pytest.fixture
 def copied(tmp_path: Path) -> Path:
     """Give a checkpoint to spoil."""
-    return Path(shutil.copytree(CART_POLE / "checkpoint", tmp_path / "checkpoint"))
+    perturb.load_policy(CART_POLE)._native.save(str(tmp_path / "checkpoint"))
+    return tmp_path / "checkpoint"
 
 
 def spoil(folder: Path, old: str, new: str) -> None:
@@ -31,15 +31,16 @@ def spoil(folder: Path, old: str, new: str) -> None:
     (folder / "checkpoint.json").write_text(document.replace(old, new, 1))
 
 
-def test_a_policy_says_what_it_is() -> None:
+def test_a_policy_says_what_it_is(tmp_path: Path) -> None:
     policy = perturb.load_policy(PENDULUM)
     assert (policy.environment, policy.version, policy.trained_on) == ("Pendulum", "R", "R")
     assert (policy.method, policy.observe, policy.seed) == ("ppo ff", "state", 8)
     assert (policy.episodes_per_trial, policy.has_memory, policy.sees_rewards) == (1, False, False)
     assert policy.observation_size == 3
-    assert f"weights-{policy.id}.safetensors" in [path.name for path in (PENDULUM / "checkpoint").iterdir()]
     assert repr(policy) == f"<perturb policy {policy.id}: ppo ff in Pendulum, trained on R>"
-    assert perturb.load_policy(str(PENDULUM / "checkpoint")).id == policy.id
+    policy._native.save(str(tmp_path))
+    assert f"weights-{policy.id}.safetensors" in [path.name for path in tmp_path.iterdir()]
+    assert perturb.load_policy(str(tmp_path)).id == policy.id
 
 
 @pytest.mark.parametrize(("path", "shape", "kind"), [(CART_POLE, (3,), np.int64), (PENDULUM, (3, 1), np.float32)])
@@ -89,9 +90,9 @@ def test_a_policy_of_results_is_loaded_by_its_name(monkeypatch: pytest.MonkeyPat
     results = Path(__file__).parents[2] / "results"
     monkeypatch.setenv("PERTURB_RESULTS", str(results))
     policy = perturb.load_policy("CartPole-ppo-ff-R-9bd6546b-s7")
-    cell = results / "beyond/confirm-2/cells/CartPole-ppo-ff-R-9bd6546b-s7/training"
+    file = results / "policies/CartPole-ppo-ff-R-9bd6546b-s7.safetensors"
     assert (policy.environment, policy.trained_on) == ("CartPole", "R")
-    assert policy.id == perturb.load_policy(cell).id
+    assert policy.id == perturb.load_policy(file).id
     with pytest.raises(perturb.PolicyError, match=r"could be any of these policies .*-s10, .*-R-\w+-s11"):
         perturb.load_policy("CartPole-ppo-ff-R")
 
@@ -101,7 +102,7 @@ def test_what_is_no_checkpoint_is_refused_with_what_is_wrong(copied: Path, tmp_p
         perturb.load_policy(tmp_path / "nothing")
     with pytest.raises(perturb.InvalidArgumentError, match="path is 7"):
         perturb.load_policy(7)  # type: ignore[arg-type]
-    spoil(copied, '"format_version": 2', '"format_version": 9')
+    spoil(copied, '"format_version": 3', '"format_version": 9')
     with pytest.raises(perturb.PolicyError, match="has format 9, and this program reads 1 to 3"):
         perturb.load_policy(copied)
 
@@ -117,5 +118,5 @@ def test_damage_is_named(copied: Path) -> None:
         perturb.load_policy(copied)
     weights.write_bytes(content)
     spoil(copied, '"observation_normaliser": {', '"observation_normaliser": null, "left": {')
-    with pytest.raises(perturb.PolicyError, match="observation_normaliser: there is none"):
+    with pytest.raises(perturb.PolicyError, match="its checksum is another"):
         perturb.load_policy(copied)

@@ -14,9 +14,9 @@ import pytest
 import perturb
 
 from .test_assess import run, same_episodes, upright
-from .test_policy import CART_POLE, CELLS
+from .test_policy import CART_POLE, POLICIES, ROOT
 
-EXPERIMENT = CELLS.parent
+EXPERIMENT = ROOT / "results/results.parquet/beyond/confirm-2"
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_the_same_policy_is_replayed_and_another_is_told(tmp_path: Path, server:
 
 
 def test_perturbs_own_policies_are_replayed_by_both(tmp_path: Path, server: str) -> None:
-    other = CELLS / "CartPole-ppo-ff-R-9bd6546b-s7/training"
+    other = POLICIES / "CartPole-ppo-ff-R-9bd6546b-s7.safetensors"
     trained = {"D": perturb.load_policy(CART_POLE), "E": upright, "R": perturb.load_policy(other)}
     assessment = perturb.evaluate(trained, "CartPole", episodes=20, server=server)
     assert assessment.audit(trained, server=server) == perturb.Audit(180, ())

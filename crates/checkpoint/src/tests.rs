@@ -41,27 +41,55 @@ fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
     Checkpoint { state, policy, weights }
 }
 
-/// The checkpoints of a shipped experiment, which the learner wrote.
+/// The policies that the repository has, which the learner wrote.
 fn shipped() -> impl Iterator<Item = PathBuf> {
-    let cells = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../results/beyond/confirm-2/cells");
-    files::list(&cells).unwrap().into_iter().map(|cell| cell.join("training"))
+    let policies = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../results/policies");
+    files::list(&policies).unwrap().into_iter()
 }
 
-/// The file of the weights has the checksum of what it was written from.
 #[test]
-fn what_the_learner_wrote_is_read_and_named_as_it_names_it() {
+fn shipped_policies_are_read_and_saved_under_their_names() {
     let mut environments = std::collections::BTreeSet::new();
     for path in shipped() {
         let policy = Checkpoint::load(&path).unwrap();
-        let names = files::list(&path.join("checkpoint")).unwrap();
-        let names: Vec<String> =
-            names.iter().map(|name| name.file_name().unwrap().to_string_lossy().into_owned()).collect();
+        let folder = tempfile::tempdir().unwrap();
+        policy.save(folder.path(), None).unwrap();
+        // The file of the weights has the checksum of what it was written from.
         let weights = format!("weights-{}.safetensors", policy.id().unwrap());
-        assert!(names.contains(&weights), "{weights} is none of {names:?}");
+        assert!(folder.path().join(&weights).is_file(), "{weights}");
+        let copy = folder.path().join("copy.safetensors");
+        Checkpoint::load(folder.path()).unwrap().save_file(&copy).unwrap();
+        assert_eq!(files::read(&copy).unwrap(), files::read(&path).unwrap(), "the same bytes");
         policy.player(3, 1, 0).unwrap();
         environments.insert(policy.state.config.common.environment);
     }
     assert!(environments.len() > 2, "{environments:?}");
+}
+
+#[test]
+fn a_policy_file_is_whole_or_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("policy.safetensors");
+    let saved = checkpoint(1, 1);
+    saved.save_file(&path).unwrap();
+    assert_eq!(Checkpoint::load(&path).unwrap(), saved);
+    let whole = files::read(&path).unwrap();
+    for at in (0..whole.len()).step_by(97) {
+        let mut other = whole.clone();
+        other[at] ^= 1;
+        fs::write(&path, other).unwrap();
+        if let Ok(loaded) = Checkpoint::load(&path) {
+            assert_eq!(loaded, saved, "byte {at}");
+        }
+    }
+    let mut other = whole.clone();
+    *other.last_mut().unwrap() ^= 1;
+    fs::write(&path, other).unwrap();
+    assert!(Checkpoint::load(&path).unwrap_err().to_string().contains("another checksum"));
+    fs::write(&path, encode_weights(&saved.weights).unwrap()).unwrap();
+    let message = Checkpoint::load(&path).unwrap_err().to_string();
+    assert!(message.contains("its metadata have no `perturb`"), "{message}");
+    assert!(Checkpoint::load_resumable(&path).unwrap_err().to_string().contains("holds no checkpoint"));
 }
 
 #[test]
@@ -97,10 +125,12 @@ fn damage_is_named() {
     let empty = tempfile::tempdir().unwrap();
     assert!(Checkpoint::load(empty.path()).unwrap_err().to_string().contains("holds no checkpoint"));
 
-    let from = shipped().next().unwrap().join("checkpoint");
+    let from = tempfile::tempdir().unwrap();
+    Checkpoint::load(&shipped().next().unwrap()).unwrap().save(from.path(), None).unwrap();
+    let from = from.path();
     let spoil = |name: &str, change: &dyn Fn(String, Vec<u8>) -> Vec<u8>| {
         let copy = tempfile::tempdir().unwrap();
-        for path in files::list(&from).unwrap() {
+        for path in files::list(from).unwrap() {
             let file = path.file_name().unwrap().to_string_lossy().into_owned();
             let content = files::read(&path).unwrap();
             let spoiled = file.starts_with(name);
@@ -122,7 +152,7 @@ fn damage_is_named() {
     };
     assert!(spoil("weights", &flip).contains("another checksum"));
     assert!(spoil("checkpoint", &|_, bytes| bytes[..bytes.len() / 2].to_vec()).contains("not understood"));
-    let later = replaced("\"format_version\": 2", "\"format_version\": 9");
+    let later = replaced("\"format_version\": 3", "\"format_version\": 9");
     assert!(spoil("checkpoint", &later).contains("has format 9, and this program reads 1 to 3"));
     // Another architecture has other weights, whatever their checksum.
     let other = replaced("\"architecture\": \"ff\"", "\"architecture\": \"rc\"");

@@ -10,9 +10,8 @@ use super::*;
 
 /// A checkpoint of a shipped experiment, with its own counters and a weight of its own.
 fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
-    let cells = Path::new(env!("CARGO_MANIFEST_DIR")).join("../results/beyond/confirm-2/cells");
-    let cell = files::list(&cells).unwrap().into_iter().next().unwrap();
-    let mut checkpoint = Checkpoint::load(&cell.join("training")).unwrap();
+    let policies = Path::new(env!("CARGO_MANIFEST_DIR")).join("../results/policies");
+    let mut checkpoint = Checkpoint::load(&policies.join("Acrobot-ppo-ff-D-9bd6546b-s10.safetensors")).unwrap();
     checkpoint.state.counters.iterations = iterations;
     checkpoint.weights[0].data[0] = seed as f32;
     checkpoint

@@ -1,0 +1,123 @@
+"""Numbers in pages about results that no result gives, and small versions of the commands that the pages print."""
+
+RATE = r"\d+e-\d"
+
+# Names, seeds, budgets, levels and settings, in any page.
+EVERYWHERE = [
+    r"\b[Ss]eeds? \d+(?:,? (?:to|and) \d+)?",
+    r"(?:seed \d \| )+",
+    r"95 % t interval",
+    r"\b(?:after|of|By) 1?\d 000(?: episodes)?(?:: D)?",
+    rf"\b(?:rates?|[Aa]t|entropy|weight|with) (?:of )?{RATE}",
+    rf"\| {RATE} \|",
+    rf"(?:the plan now has|observations:) {RATE}(?: and {RATE})?",
+    r"\d+ (?:environments|minibatches)\b",
+    r"(?:80|90) steps|(?:code's|by) (?:80|90)\b|80 or 90",
+    r"confirm-2|search-\w+",
+    r"γ of 0\.\d+(?: or 0\.\d+)?",
+]
+# A comment says where the numbers come from.
+GIVEN = {
+    "README.md": [],
+    "results/README.md": [
+        r"trials of 1, 2 and 5 episodes",
+        r"\| 2e-3 \|",
+        r"revision 0",
+        r"feed-forward policies, 15 000 episodes",
+    ],
+    "docs/findings/classic-ff.md": [
+        # The plan.
+        r"60 configurations",
+        r"All 960 cells",
+        r"960 cells",
+        r"over (?:the same )?20 pairs",
+        r"at a success of some 5 %",
+        # An earlier version of the page.
+        r"printed 71\.8 and 51\.4",
+        # Audits of cells whose policies are not stored.
+        r"30 episodes of each of 597 policies",
+        r"17 910 in all",
+        r"18 000 episodes",
+        r"The 48 selected configurations",
+        r"a rate of 7e-5",
+    ],
+    "docs/findings/acrobot-steps.md": [
+        # The plan.
+        r"40 trainings",
+        r"[DRE], [89]0 \|",
+        # The columns of 80 steps, and the curve over the threshold, are of episodes that are not stored.
+        r"from 73 to 90",
+        r"22 to 28 points on D, 20 to 21 on R and 9 to 10 on E",
+        r"and 15 steps",
+        r"end at 0 %",
+    ],
+    "docs/findings/beyond.md": [
+        # The plans.
+        r"seeds \(7 to 11\), 1 000 test episodes",
+        r"with 500 test episodes",
+        r"the last 100 episodes",
+        r"stay at 40 %",
+        r"budget of 15 000",
+    ],
+    "docs/findings/cart-pole-ties.md": [
+        # The plan.
+        r"five seeds \(2 to 6\)",
+        r"25 of them on R",
+        r"only 5 and 128 steps",
+        # The coverage of bootstrap intervals on normal data, which a test of the statistics measures.
+        r"some 84 % of the cases",
+        r"\| after 1 000 episodes: D .* after 15 000: D",
+    ],
+    "docs/findings/locomotion.md": [
+        r"1 000 episodes each",
+        r"generates 60 000 episodes",
+        # Audits of cells whose policies are not stored.
+        r"replayed 30 episodes",
+    ],
+    "docs/findings/paper-claims.md": [
+        r"stayed at 0 %",
+        r"2 000 to 20 000 steps instead of 128",
+        # Audits of cells whose policies are not stored.
+        r"replayed 4 800 test episodes of these 160",
+    ],
+    "docs/findings/pendulum-ppo.md": [
+        r"the paper's 0 % of PPO",
+        r"after 2 000 episodes: D \| after 15 000: D",
+        r"within 2 000",
+    ],
+    "docs/findings/recurrent.md": [
+        # Audits and repeated trainings of cells whose policies are not stored.
+        r"all 15 000 test episodes",
+        r"900, 510 and 1 380 episodes of 30, 17 and 46",
+        r"gave 0\.0 instead of 42\.1 % on D, 79\.0 instead of 83\.8 on R, and 93\.0 instead of 93\.3",
+        r"--measure 0",
+        r"some 8 minutes",
+    ],
+    "docs/findings/rl2-trials.md": [
+        r"Trials of 1 and 5 episodes",
+        r"rate of 2e-3",
+        # Audits of cells whose policies are not stored.
+        r"replayed 30 episodes of each of these 24",
+    ],
+}
+# Pairs of an expression and what a command becomes; the first that matches is taken. SCRATCH is an empty folder.
+SMALL = [
+    (r"^perturb audit results$", "perturb audit results/policies/CartPole-ppo-ff-R-9bd6546b-s7.safetensors"),
+    (r"^(perturb report results\S*(?: --selection paper)?) --out \S+", r"\1 --out SCRATCH/report"),
+    (r"^(perturb evaluate .*)", r"\1 --episodes 20"),
+    (r"^(perturb video .*) --episodes 3 --out (\S+)", r"\1 --episodes 1 --out SCRATCH/\2"),
+    (r"^perturb plan .* --measure 0$", r"\g<0>"),
+    # Cells that the table has are skipped, so nothing is trained.
+    (
+        r"^perturb run experiments/classic-rc.toml --out \S+(.*)",
+        r"perturb run experiments/classic-rc.toml --out SCRATCH/rc\1 --cell CartPole-a2c-ff-D-05751545-s2",
+    ),
+    (
+        r"^perturb run experiments/locomotion.toml --out \S+(.*)",
+        r"perturb run experiments/locomotion.toml --out SCRATCH/locomotion\1 --cell Hopper-ppo-ff-D-348d15d9-s2",
+    ),
+    (
+        r"^perturb run experiments/beyond/confirm-2.toml --out DIR",
+        "perturb run experiments/beyond/confirm-2.toml --out SCRATCH/confirm --done results/results.parquet",
+    ),
+]

@@ -1,0 +1,165 @@
+"""The numbers in the sentences of docs/findings; `results_pages` has those of the tables."""
+
+import json
+from collections import defaultdict
+from statistics import fmean
+
+from results_numbers import cube_root, std
+from results_words import CLEAN, FF, about, fill, fixed, spread
+
+
+def spaced(number):
+    return f"{number:,.0f}".replace(",", " ")
+
+
+def acrobot(studies):
+    updates, deviations = [], []
+    for environments, steps in ((1, 5), (1, 15), (16, 5), (16, 15)):
+        cells = studies.of("questions/acrobot", num_envs=environments, n_steps=steps, learning_rate=7e-4)
+        updates.append(about(fmean(cell.timesteps / environments / steps for cell in cells)))
+        fast = studies.of("questions/acrobot", num_envs=environments, n_steps=steps, learning_rate=7e-3)
+        deviations.append(std([cell.success("D") for cell in fast]))
+    # With one environment and five steps, most seeds fail.
+    low, high = min(deviations[1:]), max(deviations[1:])
+    return [
+        f"{updates[0]} updates of five steps and {updates[1]} of fifteen give the same success; {updates[2]} lose "
+        f"a point, and {updates[3]}, those of our default",
+        f"seeds differ by {fixed(low, 0)} to {fixed(high, 0)} points",
+    ]
+
+
+def pendulum(studies):
+    updates = {}
+    for number in (1, 8):
+        cells = studies.of("questions/pendulum", num_envs=number)
+        updates[number] = fmean(cell.timesteps / number / cell.settings["n_steps"] for cell in cells)
+    solved = studies.of("questions/pendulum", num_envs=8, bootstrap_truncation=False)
+    return [
+        f"{len(studies.of('questions/pendulum'))} trainings",
+        f"{spaced(updates[8])} updates instead of {spaced(updates[1])}",
+        f"all five seeds reach {int(min(cell.success('D') for cell in solved))} % or more",
+    ]
+
+
+def claims(studies):
+    def settings(cells):
+        return {json.dumps(cell.settings, sort_keys=True) for cell in cells}
+
+    mine = [cell for cell in studies.cells if cell.study == "questions/findings"]
+    others = [cell for cell in studies.cells if cell.study != "questions/findings"]
+    shared = len(settings(mine) & settings(others))
+    return [f"{len(mine)} trainings", f"{shared} of the {len(mine)} cells"]
+
+
+def beyond(studies, confirm, first):
+    """Return the sentences; `confirm` are the metrics of confirm-2 by seed, `first` those of the search's first row."""
+    searched = [cell for cell in studies.cells if cell.study.startswith("beyond/search-")]
+    slower = sum(cell.settings["learning_rate"] != 1e-3 for cell in searched)
+    gained = [fmean(numbers) - before for numbers, before in zip(confirm, first, strict=True)]
+    ends = []
+    for task, wanted in (("CartPole", {}), ("Pendulum", {}), ("MountainCar", {"trained_on": "D"})):
+        episodes = [cell.episodes for cell in studies.of("beyond/confirm-2", environment=task, **wanted)]
+        ends += [min(episodes), max(episodes)]
+    shown = [spaced(round(number, -1)) for number in ends[:4]] + [spaced(round(number, -2)) for number in ends[4:]]
+    return [
+        f"{len(searched)} trainings",
+        f"All but {slower} trainings have a learning rate of 1e-3",
+        fill("gained {:.1f} points in Default and lost {:.1f} and {:.1f} in", gained[0], -gained[1], -gained[2]),
+        "ended after {} to {} episodes on CartPole, {} to {} on Pendulum, {} to {} on MountainCar's D".format(*shown),
+        f"reach up to {fixed(best_on_pendulum(studies), 0)} % in Extrapolation",
+    ]
+
+
+def best_on_pendulum(studies):
+    """Return the best Extrapolation of a configuration with γ of 0.95, over its seeds."""
+    names = ("n_minibatches", "ent_coef", "num_envs", "n_steps")
+    found = defaultdict(dict)
+    for cell in studies.of("beyond/search-pendulum", gamma=0.95):
+        found[tuple(cell.settings[name] for name in names)][cell.seed, cell.trained_on] = cell
+    best = 0
+    for cells in found.values():
+        numbers = []
+        for seed in {seed for seed, _ in cells}:
+            d, r = cells[seed, "D"], cells[seed, "R"]
+            numbers.append(cube_root(d.success("R") * d.success("E") * r.success("E")))
+        best = max(best, fmean(numbers))
+    return best
+
+
+def cells_on_d(studies, algorithm, rate, weight=None, **wanted):
+    wanted = {"algorithm": algorithm, "learning_rate": rate, "trained_on": "D", **wanted}
+    return studies.of("questions/cart-pole", **wanted, **({"ent_coef": weight} if weight else {}))
+
+
+def first_of_tied(studies, algorithm, seed, order=None):
+    """Return Extrapolation with the first configurations that are best on D and on R, in an order of the grid."""
+
+    def first(version):
+        wanted = {"algorithm": algorithm, "normalize_observations": True, "trained_on": version, "seed": seed}
+        cells = studies.of("questions/cart-pole", **wanted)
+        best = max(cell.tests[version][:2] for cell in cells)
+        tied = [cell for cell in cells if cell.tests[version][:2] == best]
+        return sorted(tied, key=order)[0] if order else tied[0]
+
+    on_d, on_r = first("D"), first("R")
+    return cube_root(on_d.success("R") * on_d.success("E") * on_r.success("E"))
+
+
+def orders(studies):
+    """Return A2C's Extrapolation by the order of the grid: of rates, of weights, and which of them comes first."""
+    numbers = set()
+    for rates in (1, -1):
+        for weights in (1, -1):
+            for first in (0, 1):
+
+                def order(cell, rates=rates, weights=weights, first=first):
+                    key = (rates * cell.settings["learning_rate"], weights * cell.settings["ent_coef"])
+                    return key[first:] + key[:first]
+
+                numbers.add(round(fmean(first_of_tied(studies, "a2c", seed, order) for seed in CLEAN), 9))
+    return [fixed(number) for number in sorted(numbers)]
+
+
+def cart_pole(studies):
+    def mean(cells, version, after=None):
+        return fmean(cell.success(version, after) for cell in cells)
+
+    first = {name: [first_of_tied(studies, name, seed) for seed in CLEAN] for name in ("a2c", "ppo")}
+    paper = {name: fill("{:.1f} ± {:.1f}", *studies.paper("CartPole", FF[name], "Extrapolation")) for name in first}
+    normalised = studies.of("questions/cart-pole", algorithm="a2c", normalize_observations=True, trained_on="D")
+    on_e = [cell.success("E") for cell in normalised if cell.success("D") == 100]
+    weights = {w: cells_on_d(studies, "a2c", 7e-4, w, normalize_observations=True) for w in (1e-2, 1e-3, 1e-4, 1e-5)}
+    ppo = {rate: cells_on_d(studies, "ppo", rate, normalize_observations=True) for rate in (3e-4, 3e-3)}
+    bare = {rate: cells_on_d(studies, "ppo", rate, normalize_observations=False) for rate in (3e-4, 3e-3)}
+    kept = [*weights.values(), *ppo.values()]
+    falls = {version: [mean(cells, version, 1000) - mean(cells, version) for cells in kept] for version in "DE"}
+    plain = studies.of("questions/cart-pole", algorithm="a2c", normalize_observations=False, trained_on="D")
+    late = [fmean(mean(cells, "E") for cells in each.values()) for each in (ppo, bare)]
+    seeds = [sorted(cell.success("E") for cell in weights[weight]) for weight in (1e-4, 1e-5)]
+    failed, least, most = (
+        min(each[0] for each in seeds),
+        min(each[1] for each in seeds),
+        max(each[-1] for each in seeds),
+    )
+    shown = {weight: fixed(mean(cells, "E"), 0) for weight, cells in weights.items()}
+    *some, last = orders(studies)
+    return [
+        f"{len({cell.cell for cell in studies.cells if cell.study == 'questions/cart-pole'})} trainings",
+        f"A2C {paper['a2c']} and PPO {paper['ppo']} in Extrapolation",
+        f"the first of the tied ones has Extrapolation {spread(first['a2c'])} for A2C and "
+        f"{spread(first['ppo'])} for PPO",
+        "have 100.0 % on D",
+        f"Their success on E ranges from {fixed(min(on_e), 0)} to {fixed(max(on_e), 0)} %",
+        f"A2C's Extrapolation is {', '.join(some)} or {last}",
+        f"The paper's {paper['a2c'].split()[0]} lies among them",
+        f"success on E falls by {fixed(min(falls['E']), 0)} to {fixed(max(falls['E']), 0)} points, and on D by up to "
+        f"{fixed(max(falls['D']), 0)}",
+        f"PPO rises from {fixed(mean(bare[3e-4], 'E', 1000), 0)} to {fixed(mean(bare[3e-4], 'E'), 0)} % on E at 3e-4, "
+        f"and stays at {fixed(mean(bare[3e-3], 'E', 1000), 0)} and {fixed(mean(bare[3e-3], 'E'), 0)} at 3e-3",
+        f"after 1 000 episodes has {fixed(mean(normalised, 'E', 1000), 0)} % with and "
+        f"{fixed(mean(plain, 'E', 1000), 0)} % without it",
+        f"({fixed(late[0], 0)} % with, {fixed(late[1], 0)} % without)",
+        f"1e-4 and 1e-5 keep {shown[1e-5]} % on E (four seeds of {fixed(least, 0)} to {fixed(most, 0)} % and one "
+        f"of {fixed(failed, 0)}), 1e-3, our default, {shown[1e-3]} %, and 1e-2 {shown[1e-2]} %",
+        "seeds end at 0 % on D",
+    ]
