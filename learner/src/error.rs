@@ -22,6 +22,12 @@ pub enum Error {
         /// The attempt.
         what: &'static str,
     },
+    /// The program was asked to end, and the update would have taken long.
+    #[error("stopped by signal {signal} during an update")]
+    Stopped {
+        /// The signal.
+        signal: i32,
+    },
     /// An episode is not in a rollout.
     #[error(
         "an episode of {length} steps that ends before step {end} of environment {environment} is not in a rollout of \

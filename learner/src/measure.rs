@@ -74,14 +74,16 @@ pub fn measure(
 ) -> Result<Measurement, MeasureError> {
     let addresses: Vec<Address> = servers.addresses();
     let one = |job| {
-        let servers = Servers::connect_to_one(&addresses, job)?;
-        let scratch = Scratch::new().map_err(io("create a folder in", &std::env::temp_dir()))?;
+        let servers = Servers::connect_to_one(&addresses, job, stop)?;
+        let scratch = Scratch::new().map_err(io("create a temporary folder (TMPDIR) in", &std::env::temp_dir()))?;
         let measured = measure_one(&servers, group, scratch.path(), limit, stop);
         stop.signal().map_or(measured, |signal| Err(MeasureError::Stopped { signal }))
     };
     let one = &one;
     let speeds: Vec<Speed> = std::thread::scope(|scope| {
-        let jobs: Vec<_> = (0..jobs.max(1)).map(|job| scope.spawn(move || one(job))).collect();
+        let spawn = |job| std::thread::Builder::new().spawn_scoped(scope, move || one(job));
+        let system = |source| ClientError::System { action: "start a thread", source };
+        let jobs = (0..jobs.max(1)).map(spawn).collect::<Result<Vec<_>, _>>().map_err(system)?;
         let joined = jobs.into_iter().map(|job| job.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
         joined.collect::<Result<_, MeasureError>>()
     })?;

@@ -1,5 +1,6 @@
 //! A policy that learns.
 
+use perturb_files::interrupt::StopFlag;
 use perturb_policy::math::exp;
 use perturb_policy::random::{Purpose, stream};
 use perturb_policy::{
@@ -16,6 +17,8 @@ pub struct Policy {
     /// `[P]` of the last step.
     pub(crate) gradient: Vec<f32>,
     pub(crate) backend: Box<dyn GradientBackend>,
+    /// Raised when a long update shall be broken off.
+    pub(crate) stop: StopFlag,
 }
 
 /// Buffers in which gradients of feed-forward policies of one shape are computed.
@@ -47,7 +50,12 @@ impl Policy {
         spec.check(weights)?;
         let weights: Vec<f32> = weights.iter().flat_map(|array| array.data.iter().copied()).collect();
         let backend = gradient_backend(&spec, 1)?;
-        Ok(Policy { spec, gradient: vec![0.0; weights.len()], weights, backend })
+        Ok(Policy { spec, gradient: vec![0.0; weights.len()], weights, backend, stop: StopFlag::default() })
+    }
+
+    /// From now on breaks off updates that would take long after `stop` is raised.
+    pub fn set_stop(&mut self, stop: &StopFlag) {
+        self.stop = stop.clone();
     }
 
     /// Computes gradients of feed-forward policies with `threads` threads, at least 1. Their number changes no byte.

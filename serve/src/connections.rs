@@ -1,25 +1,31 @@
 //! Accepts connections: a limited number at a time, and none that stands still.
 
+use std::collections::VecDeque;
 use std::convert::Infallible;
-use std::sync::Arc;
+use std::net::IpAddr;
+use std::pin::Pin;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll};
 use std::time::Duration;
 
 use axum::Router;
-use axum::body::Body;
+use axum::body::{Body, Bytes, HttpBody};
 use axum::serve::Listener;
-use hyper::body::Incoming;
+use hyper::body::{Frame, Incoming, SizeHint};
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use socket2::SockRef;
 use tokio::net::TcpListener;
-use tokio::sync::Semaphore;
+use tokio::sync::{Notify, Semaphore};
 use tower_service::Service;
 
 /// Limits of all connections together, and of each one.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ConnectionLimits {
-    /// Number of open connections. A browser opens about six. Further clients wait until a connection is free.
+    /// Number of open connections. A browser opens about six. A further client takes the place of the connection that
+    /// has waited longest for a request; if all are being answered, it waits.
     max_connections: usize,
     /// Time in which a client must send the head of a request. It counts from the connection's start, or from the end
     /// of the previous response.
@@ -34,27 +40,121 @@ impl Default for ConnectionLimits {
     }
 }
 
+/// The address of a client, as an extension of its requests.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Peer(pub(crate) IpAddr);
+
+/// A connection that may be closed for the sake of another while it waits for a request.
+#[derive(Debug, Default)]
+struct OpenConnection {
+    /// Number of requests that are being answered.
+    requests: AtomicUsize,
+    closing: Notify,
+}
+
+/// The open connections, the oldest first.
+#[derive(Debug, Default)]
+struct OpenConnections(Mutex<VecDeque<Arc<OpenConnection>>>);
+
+impl OpenConnections {
+    fn add(&self) -> Arc<OpenConnection> {
+        let connection = Arc::new(OpenConnection::default());
+        self.lock().push_back(Arc::clone(&connection));
+        connection
+    }
+
+    fn remove(&self, connection: &Arc<OpenConnection>) {
+        self.lock().retain(|other| !Arc::ptr_eq(other, connection));
+    }
+
+    /// Closes the oldest connection that waits for a request, if there is one: clients that send none shut out nobody.
+    fn close_waiting(&self) {
+        let mut all = self.lock();
+        let waiting = all.iter().position(|connection| connection.requests.load(Ordering::Relaxed) == 0);
+        if let Some(connection) = waiting.and_then(|place| all.remove(place)) {
+            connection.closing.notify_one();
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, VecDeque<Arc<OpenConnection>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// A request that is being answered, until its response is whole or lost.
+struct RequestGuard(Arc<OpenConnection>);
+
+impl Drop for RequestGuard {
+    fn drop(&mut self) {
+        self.0.requests.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
 /// Answers requests with `router` on every connection of `listener`. Never returns.
 pub(crate) async fn serve(mut listener: TcpListener, router: Router, limits: ConnectionLimits) -> Infallible {
     let permits = Arc::new(Semaphore::new(limits.max_connections));
+    let all = Arc::new(OpenConnections::default());
     let mut http = http1::Builder::new();
     http.timer(TokioTimer::new()).header_read_timeout(limits.head_timeout);
     loop {
-        // The semaphore is never closed.
-        let permit = Arc::clone(&permits).acquire_owned().await;
         // axum's `accept` retries when the process has no free file descriptors.
-        let (stream, _) = Listener::accept(&mut listener).await;
+        let (stream, address) = Listener::accept(&mut listener).await;
+        let permit = match Arc::clone(&permits).try_acquire_owned() {
+            Ok(permit) => Ok(permit),
+            Err(_) => {
+                all.close_waiting();
+                Arc::clone(&permits).acquire_owned().await // the semaphore is never closed
+            }
+        };
         if let Err(error) = SockRef::from(&stream).set_tcp_user_timeout(Some(limits.write_timeout)) {
             tracing::debug!("cannot set the write timeout of a connection: {error}");
         }
-        let router = router.clone();
-        let service = service_fn(move |request: hyper::Request<Incoming>| router.clone().call(request.map(Body::new)));
+        let open = all.add();
+        let (router, own) = (router.clone(), Arc::clone(&open));
+        let service = service_fn(move |mut request: hyper::Request<Incoming>| {
+            own.requests.fetch_add(1, Ordering::Relaxed);
+            let guard = RequestGuard(Arc::clone(&own));
+            request.extensions_mut().insert(Peer(address.ip()));
+            let response = router.clone().call(request.map(Body::new));
+            async move { Ok::<_, Infallible>(response.await?.map(|body| GuardedBody { body, _guard: guard })) }
+        });
         let connection = http.serve_connection(TokioIo::new(stream), service);
+        let all = Arc::clone(&all);
         tokio::spawn(async move {
             let _permit = permit;
-            // A client that goes away or exceeds a time limit is no error of this server.
-            let _ = connection.await;
+            tokio::select! {
+                // A client that goes away or exceeds a time limit is no error of this server.
+                _ = connection => {}
+                () = open.closing.notified() => {}
+            }
+            all.remove(&open);
         });
+    }
+}
+
+/// A response body that keeps its request's guard until it was sent or dropped.
+struct GuardedBody {
+    body: Body,
+    _guard: RequestGuard,
+}
+
+impl HttpBody for GuardedBody {
+    type Data = Bytes;
+    type Error = axum::Error;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
+        Pin::new(&mut self.body).poll_frame(context)
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
     }
 }
 
@@ -132,13 +232,29 @@ mod tests {
     #[tokio::test]
     async fn further_clients_wait_for_a_free_connection() {
         let address = start().await;
-        let first = TcpStream::connect(address).await.unwrap();
+        let mut first = TcpStream::connect(address).await.unwrap();
+        first.write_all(b"GET /slow HTTP/1.1\r\nHost: a\r\n\r\n").await.unwrap();
+        sleep(LIMITS.head_timeout / 3).await; // the request arrives
         let mut second = TcpStream::connect(address).await.unwrap();
         second.write_all(REQUEST).await.unwrap();
         let mut byte = [0];
         assert!(timeout(LIMITS.head_timeout / 3, second.read(&mut byte)).await.is_err());
         drop(first);
         assert_eq!(timeout(DEADLINE, second.read(&mut byte)).await.unwrap().unwrap(), 1);
+    }
+
+    #[tokio::test]
+    async fn connections_without_a_request_shut_out_nobody() {
+        let address = start().await;
+        let mut idle = Vec::new();
+        for _ in 0..20 {
+            idle.push(TcpStream::connect(address).await.unwrap());
+        }
+        let mut client = TcpStream::connect(address).await.unwrap();
+        client.write_all(REQUEST).await.unwrap();
+        let read = timeout(LIMITS.head_timeout, client.read(&mut [0])).await;
+        assert_eq!(read.expect("at once").unwrap(), 1);
+        drop(idle);
     }
 
     #[tokio::test]

@@ -5,24 +5,27 @@ use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::Router;
 use axum::extract::{Request, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, Uri, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::sse::{Event, KeepAlive, Sse};
-use axum::response::{Html, IntoResponse, Response};
+use axum::response::{Html, IntoResponse, Redirect, Response};
 use axum::routing::get;
+use axum::{Extension, Router};
 use futures_util::{StreamExt, future};
 use perturb_protocol::Address;
 use tokio_stream::wrappers::WatchStream;
 
+use crate::connections::Peer;
 use crate::error::ViewError;
+use crate::links::WayUp;
 use crate::paths::{RelativePath, Root};
 use crate::publisher::{EventData, Publisher, Topic};
 use crate::report::ReportCache;
 use crate::server_status::ServerMonitor;
+use crate::stream_places::StreamPlaces;
 use crate::{files, pages};
-use pages::error_page;
+use pages::{MessagePage, error_page};
 
 /// Time between comments on a silent event stream. They show whether the client is still there.
 const KEEP_ALIVE_INTERVAL: Duration = Duration::from_secs(15);
@@ -37,18 +40,22 @@ const STATIC_POLICY: &str = "default-src 'none'; style-src 'unsafe-inline'; img-
 #[derive(Debug)]
 pub(crate) struct AppState {
     root: Root,
+    stream_places: StreamPlaces,
     /// Whether the server listens on the loopback address.
     is_loopback: bool,
+    /// Further names by which it is asked, of a proxy for instance.
+    hosts: Vec<String>,
     reports: Arc<ReportCache>,
     pub(crate) publisher: Arc<Publisher>,
 }
 
 impl AppState {
-    pub(crate) fn new(root: Root, address: SocketAddr, server: Option<Address>) -> Self {
+    pub(crate) fn new(root: Root, address: SocketAddr, hosts: Vec<String>, server: Option<Address>) -> Self {
         let reports = Arc::new(ReportCache::default());
         let server = server.map(|address| Arc::new(ServerMonitor::new(address)));
         let publisher = Arc::new(Publisher::new(root.clone(), Arc::clone(&reports), server));
-        Self { root, is_loopback: address.ip().is_loopback(), reports, publisher }
+        let stream_places = StreamPlaces::default();
+        Self { root, stream_places, is_loopback: address.ip().is_loopback(), hosts, reports, publisher }
     }
 }
 
@@ -73,14 +80,15 @@ pub(crate) fn router(state: Arc<AppState>) -> Router {
 /// Refuses methods that change something and requests that another site caused. Adds the security headers to each
 /// response.
 async fn guard(State(state): State<Arc<AppState>>, request: Request, next: Next) -> Response {
+    let way_up = WayUp::from_path(request.uri().path());
     let mut response = if !matches!(*request.method(), Method::GET | Method::HEAD) {
         let mut response =
             pages::message_page(StatusCode::METHOD_NOT_ALLOWED, "This server changes nothing; use GET or HEAD.");
         response.headers_mut().insert(header::ALLOW, HeaderValue::from_static("GET, HEAD"));
         response
-    } else if state.is_loopback && !is_local(request.headers(), request.uri()) {
-        let message =
-            "This server answers to localhost, 127.0.0.1 and [::1] only. Use one of these names in the address.";
+    } else if state.is_loopback && !is_known_host(request.headers(), request.uri(), &state.hosts) {
+        let message = "This server answers to localhost, 127.0.0.1 and [::1] only. Use one of these names in the \
+                       address, or start it with --host NAME.";
         pages::message_page(StatusCode::MISDIRECTED_REQUEST, message)
     } else if is_embedded_by_another_site(request.headers()) {
         let message = "A page of another site has requested this. Open it by its address or by a link.";
@@ -88,6 +96,9 @@ async fn guard(State(state): State<Arc<AppState>>, request: Request, next: Next)
     } else {
         next.run(request).await
     };
+    if let Some(MessagePage(text)) = response.extensions_mut().remove() {
+        response = (response.status(), response.headers().clone(), Html(way_up.relative_links(&text))).into_response();
+    }
     let security_headers = [
         (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
         (header::REFERRER_POLICY, "no-referrer"),
@@ -110,9 +121,9 @@ fn is_embedded_by_another_site(headers: &HeaderMap) -> bool {
     matches!(header_text("sec-fetch-site"), Some("cross-site" | "same-site")) && !is_link
 }
 
-/// Tells whether the request names this machine as localhost or by a loopback address. Another site could let its own
-/// name lead here, and its pages would then have the same origin.
-fn is_local(headers: &HeaderMap, uri: &Uri) -> bool {
+/// Tells whether the request names this machine as localhost, by a loopback address or as one of `hosts`. Another site
+/// could let its own name lead here, and its pages would then have the same origin.
+fn is_known_host(headers: &HeaderMap, uri: &Uri, hosts: &[String]) -> bool {
     let host =
         headers.get(header::HOST).and_then(|host| host.to_str().ok()).or(uri.authority().map(|host| host.as_str()));
     let Some(host) = host else { return false };
@@ -121,42 +132,57 @@ fn is_local(headers: &HeaderMap, uri: &Uri) -> bool {
         Some(_) => return false,
         None => host.split_once(':').map_or(host, |(name, _)| name),
     };
-    name.eq_ignore_ascii_case("localhost") || name.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
+    let is_named = hosts.iter().any(|host| name.eq_ignore_ascii_case(host));
+    is_named
+        || name.eq_ignore_ascii_case("localhost")
+        || name.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
 }
 
 async fn index(State(state): State<Arc<AppState>>) -> Response {
     match state.publisher.view(&Topic::Index).await {
-        Ok(view) => page(pages::index::page(&state.root, &view.update)),
+        Ok(view) => page(&pages::index::page(&state.root, &view.update), &WayUp::from_index()),
         Err(error) => error_page(&error),
     }
 }
 
 async fn run(State(state): State<Arc<AppState>>, uri: Uri) -> Response {
     let Some(relative) = relative_path(&uri, "/run/") else { return error_page(&ViewError::RunNotFound) };
+    if let Some(name) = relative.path().file_name().filter(|_| uri.path().ends_with('/')) {
+        // Relative links need one spelling of each address.
+        return Redirect::permanent(&format!("../{}", RelativePath::default().join(name).encode())).into_response();
+    }
     match state.publisher.view(&Topic::Run(relative.clone())).await {
-        Ok(view) => page(pages::run_page(&state.root, &relative, &view.update)),
+        Ok(view) => page(&pages::run_page(&state.root, &relative, &view.update), &WayUp::from_run(&relative)),
         Err(error) => error_page(&error),
     }
 }
 
-async fn index_events(State(state): State<Arc<AppState>>) -> Response {
-    events(&state, Topic::Index)
+async fn index_events(State(state): State<Arc<AppState>>, Extension(peer): Extension<Peer>) -> Response {
+    events(&state, Topic::Index, peer)
 }
 
-async fn run_events(State(state): State<Arc<AppState>>, uri: Uri) -> Response {
+async fn run_events(State(state): State<Arc<AppState>>, Extension(peer): Extension<Peer>, uri: Uri) -> Response {
     match relative_path(&uri, "/events/") {
-        Some(relative) => events(&state, Topic::Run(relative)),
+        Some(relative) => events(&state, Topic::Run(relative), peer),
         None => error_page(&ViewError::RunNotFound),
     }
 }
 
 /// Streams the events of a page.
-fn events(state: &AppState, topic: Topic) -> Response {
-    let Some(events) = state.publisher.subscribe(topic) else {
-        return pages::message_page(StatusCode::SERVICE_UNAVAILABLE, "Too many pages are open already; close some.");
+fn events(state: &AppState, topic: Topic, Peer(peer): Peer) -> Response {
+    let Some(place) = state.stream_places.take(peer) else {
+        let message = "Too many pages are open already; close some.";
+        let mut response = pages::message_page(StatusCode::SERVICE_UNAVAILABLE, message);
+        // Clients that ask again and again shall not keep connections from others.
+        response.headers_mut().insert(header::CONNECTION, HeaderValue::from_static("close"));
+        return response;
     };
-    let events = WatchStream::new(events).filter(|event: &EventData| future::ready(!event.is_empty()));
-    let events = events.map(|event| Ok::<_, Infallible>(Event::default().data(event)));
+    let events = WatchStream::new(state.publisher.subscribe(topic));
+    let events = events.filter(|event: &EventData| future::ready(!event.is_empty()));
+    let events = events.map(move |event| {
+        let _place = &place; // until the stream ends
+        Ok::<_, Infallible>(Event::default().data(event))
+    });
     Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE_INTERVAL)).into_response()
 }
 
@@ -202,8 +228,8 @@ fn relative_path(uri: &Uri, prefix: &str) -> Option<RelativePath> {
     RelativePath::decode(uri.path().strip_prefix(prefix)?)
 }
 
-fn page(text: String) -> Response {
-    Html(text).into_response()
+fn page(text: &str, way_up: &WayUp) -> Response {
+    Html(way_up.relative_links(text)).into_response()
 }
 
 #[cfg(test)]
@@ -224,10 +250,14 @@ mod tests {
     #[case("192.168.0.1", false)]
     #[case("[::1].example.org", false)]
     #[case("example.org", false)]
+    #[case("hub.example.org:443", true)]
+    #[case("HUB.example.org", true)]
+    #[case("other.hub.example.org", false)]
     #[case("", false)]
     fn names_of_this_machine(#[case] host: &str, #[case] local: bool) {
         let headers = HeaderMap::from_iter([(header::HOST, host.parse().unwrap())]);
-        assert_eq!(is_local(&headers, &Uri::from_static("/")), local);
+        let hosts = ["hub.example.org".to_owned()];
+        assert_eq!(is_known_host(&headers, &Uri::from_static("/"), &hosts), local);
     }
 
     #[rstest]
@@ -245,6 +275,6 @@ mod tests {
 
     #[test]
     fn a_request_without_a_host_is_not_local() {
-        assert!(!is_local(&HeaderMap::new(), &Uri::from_static("/")));
+        assert!(!is_known_host(&HeaderMap::new(), &Uri::from_static("/"), &[]));
     }
 }

@@ -23,6 +23,8 @@ pub(crate) struct Index {
     pub(crate) runs: Vec<Row>,
     /// Number of runs that are not listed.
     pub(crate) more_runs: usize,
+    /// Links to folders out of the served folder, which are not followed.
+    pub(crate) links_out: Vec<RelativePath>,
     /// Whether there are more folders than were searched.
     pub(crate) has_more_folders: bool,
     /// Pictures from folders that are no runs.
@@ -47,7 +49,7 @@ impl Index {
     }
 
     fn scan_within(root: &Root, known: &Runs, max_folders: usize, max_rows: usize) -> Result<Self, FileError> {
-        let found = places(root.path(), max_folders)?;
+        let found = places(root.path(), max_folders, Some(root.path()))?;
         // Hidden folders are not served.
         let rows =
             found.runs.iter().filter_map(|place| Some(Row::new(root.relative(&place.path)?, place, root, known)));
@@ -62,7 +64,8 @@ impl Index {
                 pictures.add(scan_folder(&relative, path, max_shown));
             }
         }
-        Ok(Self { runs, more_runs, has_more_folders: found.more, pictures })
+        let links_out = found.links_out.iter().filter_map(|link| root.relative(link)).collect();
+        Ok(Self { runs, more_runs, links_out, has_more_folders: found.more, pictures })
     }
 }
 

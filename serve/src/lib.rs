@@ -1,6 +1,7 @@
 //! `perturb serve`: a read-only web page that shows trainings and experiments while they run.
 //!
-//! - [`Server`] listens. `connections` limits connections, `http` routes requests and keeps other sites out.
+//! - [`Server`] listens. `connections` limits connections and `stream_places` event streams, `http` routes requests and
+//!   keeps other sites out, `links` makes links relative.
 //! - `paths` and `files` send files of the served folder.
 //! - `publisher` reads the files of open pages and sends changes as server-sent events. `cached_loader` limits how
 //!   often files are read, `runs` keeps the state of each run between two readings.
@@ -19,6 +20,7 @@ mod files;
 mod http;
 mod index;
 mod keyed_cache;
+mod links;
 mod pages;
 mod paths;
 mod pictures;
@@ -26,6 +28,7 @@ mod publisher;
 mod report;
 mod runs;
 mod server_status;
+mod stream_places;
 mod tail;
 mod training;
 
@@ -48,6 +51,8 @@ pub struct ServeOptions {
     pub folder: PathBuf,
     /// Address to listen at; port 0 takes a free port.
     pub address: SocketAddr,
+    /// Further host names by which a server on the loopback address is asked, of a proxy for instance.
+    pub hosts: Vec<String>,
     /// A server of environments whose status is shown.
     pub server: Option<perturb_protocol::Address>,
 }
@@ -70,7 +75,7 @@ impl Server {
         let failed = |source| ServeError::Address { address: options.address, source };
         let listener = TcpListener::bind(options.address).await.map_err(failed)?;
         let address = listener.local_addr().map_err(failed)?;
-        let state = Arc::new(AppState::new(root, address, options.server.clone()));
+        let state = Arc::new(AppState::new(root, address, options.hosts.clone(), options.server.clone()));
         Ok(Self { listener, address, state })
     }
 

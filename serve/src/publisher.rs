@@ -15,6 +15,7 @@ use crate::error::ViewError;
 use crate::experiment::LiveExperiment;
 use crate::index::Index;
 use crate::keyed_cache::KeyedCache;
+use crate::links::WayUp;
 use crate::pages::{self, Update};
 use crate::paths::{RelativePath, Root};
 use crate::report::ReportCache;
@@ -22,8 +23,6 @@ use crate::runs::Runs;
 use crate::server_status::{self, ServerMonitor};
 use crate::training::LiveTraining;
 
-/// Maximum number of event streams.
-pub(crate) const MAX_SUBSCRIBERS: usize = 64;
 /// Maximum number of pages whose files are read at the same time. More would take processors from trainings.
 const MAX_CONCURRENT_LOADS: usize = 4;
 /// Time after which a round of loads stops waiting. Later results are published when they arrive.
@@ -103,7 +102,11 @@ impl Publisher {
     fn load(&self, topic: &Topic) -> Result<Arc<View>, ViewError> {
         self.runs.remove_idle();
         self.loaders.remove_idle(ViewLoader::is_loading);
-        let update = self.update(topic)?;
+        let way_up = match topic {
+            Topic::Index => WayUp::from_index(),
+            Topic::Run(relative) => WayUp::from_run(relative),
+        };
+        let update = self.update(topic)?.with_relative_links(&way_up);
         let event = update.to_json().into();
         Ok(Arc::new(View { update, event }))
     }
@@ -140,17 +143,13 @@ impl Publisher {
         })
     }
 
-    /// Adds a subscriber of `topic`. Returns `None` if there are too many. The first value may be empty.
-    pub(crate) fn subscribe(&self, topic: Topic) -> Option<watch::Receiver<EventData>> {
+    /// Adds a subscriber of `topic`. The first value may be empty.
+    pub(crate) fn subscribe(&self, topic: Topic) -> watch::Receiver<EventData> {
         let mut topics = self.topics();
-        let subscribers: usize = topics.values().map(watch::Sender::receiver_count).sum();
-        if subscribers >= MAX_SUBSCRIBERS {
-            return None;
-        }
         let receiver = topics.entry(topic).or_insert_with(|| watch::channel(EventData::from("")).0).subscribe();
         drop(topics);
         self.subscribed.notify_one();
-        Some(receiver)
+        receiver
     }
 
     /// Publishes changes. Never returns.

@@ -18,7 +18,7 @@ use perturb_learner::evaluation::{Audit, audit};
 use perturb_records::{ExternalEvaluation, FILE, Records};
 
 use super::args::{AuditArgs, ServerArgs};
-use super::display::{Display, say};
+use super::display::{Display, output, say};
 use super::error::{CommandError, Result, system};
 use super::rescore::records_file;
 use super::{plan_in, reconnecting_servers, with_tasks_of};
@@ -83,7 +83,7 @@ pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
         }
     };
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let servers = reconnecting_servers(&server_args(args)?, args.wait)?;
+    let servers = reconnecting_servers(&server_args(args)?, args.wait, &stop)?;
     let max_episodes = if args.all { usize::MAX } else { args.episodes };
     let mut audits = Vec::new();
     for policy in &policies {
@@ -106,8 +106,8 @@ pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
     if !args.json.is_printed() {
         let count = if policies.len() == 1 { "1 policy".to_owned() } else { format!("{} policies", policies.len()) };
         match same {
-            Some(same) => writeln!(std::io::stdout(), "{same} of {replayed} episodes of {count} have the same bytes")?,
-            None => writeln!(std::io::stdout(), "{different} tests of {count} have other episodes")?,
+            Some(same) => writeln!(output(), "{same} of {replayed} episodes of {count} have the same bytes")?,
+            None => writeln!(output(), "{different} tests of {count} have other episodes")?,
         }
     }
     Ok(if different == 0 && finished().count() == policies.len() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
@@ -132,7 +132,7 @@ fn print(name: &str, audit: &AuditOutcome) -> std::io::Result<()> {
         Ok(audit) => &audit.different[..audit.different.len().min(MAX_SHOWN)],
         Err(error) => std::slice::from_ref(error),
     };
-    lines.iter().try_for_each(|line| writeln!(std::io::stdout(), "{name}: {line}"))
+    lines.iter().try_for_each(|line| writeln!(output(), "{name}: {line}"))
 }
 
 fn document(name: &str, audit: &AuditOutcome) -> Value {

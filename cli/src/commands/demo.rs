@@ -23,9 +23,9 @@ use perturb_settings::sets::Context;
 use perturb_text::{Table, duration, grouped};
 
 use super::args::DemoArgs;
-use super::display::{Display, note};
+use super::display::{Display, note, output};
 use super::error::{CommandError, Result, system};
-use super::{reconnecting_servers, refuse_file, signal_code, threads};
+use super::{reconnecting_servers, refuse_file, require_default_out, signal_code, threads};
 use crate::video::{VideoError, VideoFile, VideoOptions, film};
 
 /// Training episodes of the paper's results.
@@ -67,11 +67,14 @@ pub(super) fn run(args: &DemoArgs) -> Result<ExitCode> {
     let default_folder = || PathBuf::from(format!("runs/demo-{}", chrono::Utc::now().format("%Y%m%d-%H%M%S")));
     let out = args.out.clone().unwrap_or_else(default_folder);
     refuse_file(&out)?;
+    if args.out.is_none() {
+        require_default_out(&out)?;
+    }
     if !perturb_files::list(&out)?.is_empty() {
         let message = format!("{} is not empty: give another --out, or delete that folder", out.display());
         return Err(CommandError::Usage(message));
     }
-    let demo = Demo { args, servers: reconnecting_servers(&args.server, args.wait)?, stop, out };
+    let demo = Demo { args, servers: reconnecting_servers(&args.server, args.wait, &stop)?, stop, out };
     match demo.run(start) {
         Ok(()) => Ok(ExitCode::SUCCESS),
         Err(error) => {
@@ -85,7 +88,7 @@ pub(super) fn run(args: &DemoArgs) -> Result<ExitCode> {
 impl Demo<'_> {
     fn run(&self, start: Instant) -> Result<()> {
         let environment = self.servers.environment(&self.args.env)?;
-        let mut out = std::io::stdout();
+        let mut out = output();
         writeln!(
             out,
             "{}: PPO with feed-forward networks is trained on default physics (D)\n\

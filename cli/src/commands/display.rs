@@ -10,6 +10,7 @@ use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use perturb_experiment::scheduler::RunStatus;
 use perturb_experiment::{TrainingProgress, generated_episodes};
 use perturb_learner::logging::{EpisodeFigures, Progress};
+use perturb_protocol::escape_lines;
 use perturb_settings::TrainConfig;
 use perturb_text::{duration, grouped};
 
@@ -42,9 +43,33 @@ pub(super) fn note(sentence: impl std::fmt::Display) {
 }
 
 /// Prints a line on standard error, also with --quiet. Ignores errors, since a closed standard error is no reason to
-/// stop.
+/// stop. Texts of servers and names of files in it do not drive the terminal.
 pub(super) fn say(line: impl std::fmt::Display) {
-    let _ = writeln!(AboveBar, "{line}");
+    let _ = writeln!(AboveBar, "{}", escape_lines(&line.to_string()));
+}
+
+/// Returns standard output for text. Texts of servers and names of files in it do not drive the terminal.
+pub(super) fn output() -> TextOutput {
+    TextOutput(std::io::stdout())
+}
+
+/// Standard output, which escapes what a terminal would obey.
+pub(super) struct TextOutput(std::io::Stdout);
+
+impl Write for TextOutput {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0.write_all(escape_lines(&String::from_utf8_lossy(bytes)).as_bytes())?;
+        Ok(bytes.len())
+    }
+
+    /// Writes the whole text at once, because a piece may end within a character.
+    fn write_fmt(&mut self, words: std::fmt::Arguments<'_>) -> std::io::Result<()> {
+        self.write_all(words.to_string().as_bytes())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.0.flush()
+    }
 }
 
 /// Writes to standard error, above the bar on the terminal.

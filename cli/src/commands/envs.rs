@@ -2,22 +2,24 @@
 
 use std::io::Write;
 
+use perturb_files::interrupt::StopFlag;
 use perturb_learner::proto::{Channel, Distribution, Environment, action_space::Kind};
 use perturb_protocol::catalogue;
 use perturb_text::Table;
 
 use super::args::EnvsArgs;
+use super::display::output;
 use super::error::Result;
 use super::servers;
 
 pub(super) fn run(args: &EnvsArgs) -> Result<()> {
     args.json.check()?;
-    let catalogue = servers(&args.server)?.catalogue()?;
+    let catalogue = servers(&args.server, &StopFlag::default())?.catalogue()?;
     args.json.write(catalogue::to_json(&catalogue))?;
     if args.json.is_printed() {
         return Ok(());
     }
-    let mut out = std::io::stdout().lock();
+    let mut out = output();
     for environment in &catalogue.environments {
         print(&mut out, environment)?;
     }

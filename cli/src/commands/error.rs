@@ -12,6 +12,7 @@ use perturb_learner::evaluation::{AuditError, HeatmapError, TestError};
 use perturb_learner::measure::MeasureError;
 use perturb_learner::training::{RunDirectoryError, TrainError};
 use perturb_protocol::names::UnknownEnvironment;
+use perturb_protocol::spawn_failure;
 use perturb_records::{ExternalEvaluationError, RecordsError, TableError};
 use perturb_report::ReportError;
 use perturb_report::plot::PlotError;
@@ -30,7 +31,7 @@ pub(super) enum CommandError {
     Usage(String),
     #[error("{0}")]
     Failed(String),
-    #[error("cannot {action}: {source}")]
+    #[error("cannot {action}: {}", spawn_failure(source))]
     System { action: &'static str, source: std::io::Error },
     /// Standard output cannot be written.
     #[error("cannot write: {0}")]
@@ -95,14 +96,14 @@ impl CommandError {
     pub(super) fn signal(&self) -> Option<i32> {
         match self {
             Self::Heatmaps { source, .. } => source.signal(),
+            Self::Client(error) => error.signal(),
             Self::Test(error)
             | Self::Audit(AuditError::Test(error))
             | Self::Measure(MeasureError::Test(error))
             | Self::Heatmap(HeatmapError::Test(error))
             | Self::Video(VideoError::Test(error)) => error.signal(),
-            Self::Measure(MeasureError::Stopped { signal }) | Self::Train(TrainError::Stopped { signal, .. }) => {
-                Some(*signal)
-            }
+            Self::Measure(MeasureError::Stopped { signal }) => Some(*signal),
+            Self::Train(error) => error.signal(),
             _ => None,
         }
     }
@@ -216,6 +217,7 @@ fn is_wrong_file(error: &FileError) -> bool {
             | ErrorKind::NotADirectory
             | ErrorKind::ReadOnlyFilesystem
             | ErrorKind::InvalidFilename
+            | ErrorKind::InvalidInput // a pipe or a device
     )
 }
 

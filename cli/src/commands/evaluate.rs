@@ -14,7 +14,7 @@ use perturb_text::Table;
 use serde_json::{Map, Value, json};
 
 use super::args::EvaluateArgs;
-use super::display::Display;
+use super::display::{Display, output};
 use super::error::{Result, system};
 use super::{playing_servers, sets};
 
@@ -25,7 +25,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     let sets = sets::test_sets(&args.versions, &args.set)?;
     let seed = args.seed.unwrap_or(checkpoint.state.config.common.seed);
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let servers = playing_servers(&args.play)?;
+    let servers = playing_servers(&args.play, &stop)?;
     let state = &checkpoint.state;
     let config = &checkpoint.state.config;
     let common = &config.common;
@@ -72,7 +72,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     let criterion = records.about.success.as_ref();
     let success = criterion.map(|criterion| format!(", success: {criterion}")).unwrap_or_default();
     writeln!(
-        std::io::stdout(),
+        output(),
         "{} {}, trained on {} with seed {}{success}\n{}",
         common.environment,
         config.method(),

@@ -18,7 +18,7 @@ use perturb_settings::sets::Context;
 use perturb_settings::{Common, TrainConfig};
 
 use super::args::HeatmapArgs;
-use super::display::Display;
+use super::display::{Display, output};
 use super::error::{CommandError, Result, system};
 use super::{playing_servers, sets};
 
@@ -46,7 +46,7 @@ fn draw_checkpoints(args: &HeatmapArgs) -> Result<()> {
         return Err(CommandError::Usage(message));
     }
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let servers = playing_servers(&args.play)?;
+    let servers = playing_servers(&args.play, &stop)?;
     let environment = servers.environment(&name)?;
     let mut kind = HeatmapKind { parameters: axes(args, &environment)?, base: args.base_version };
     let recorded = args.records.iter().map(|path| Records::read(path)).collect::<Result<Vec<_>, _>>()?;
@@ -55,8 +55,11 @@ fn draw_checkpoints(args: &HeatmapArgs) -> Result<()> {
     }
     let fixed = sets::normalize("--parameters", fixed_parameters(args)?, &environment)?;
     let path = args.out.clone().unwrap_or_else(|| default_path(&checkpoints, &kind));
-    require_writable(&path.with_added_extension("csv"))?;
-    let mut out = std::io::stdout();
+    require_writable(&path.with_added_extension("csv")).map_err(|error| match args.out {
+        Some(_) => error.into(),
+        None => CommandError::Usage(format!("{error}; give another path with --out")),
+    })?;
+    let mut out = output();
     let mut policies = Vec::new();
     for (index, checkpoint) in checkpoints.iter().enumerate() {
         let heatmap = if let Some(records) = recorded.get(index) {

@@ -6,7 +6,7 @@ use perturb_experiment::runs::{RunSummary, no_folder, places};
 use perturb_text::{Table, grouped};
 
 use super::args::LsArgs;
-use super::display::terminal_width;
+use super::display::{note, output, terminal_width};
 use super::error::{CommandError, Result};
 
 /// Explanation of the column `success`, printed below the list.
@@ -17,12 +17,16 @@ pub(super) fn run(args: &LsArgs) -> Result<()> {
     if !args.dir.is_dir() {
         return Err(CommandError::Usage(no_folder(&args.dir)));
     }
-    let found: Vec<RunSummary> = places(&args.dir, usize::MAX)?.runs.iter().map(RunSummary::read).collect();
+    let search = places(&args.dir, usize::MAX, None)?;
+    if search.more {
+        note("there are more folders behind symbolic links than are searched; name the folder that a link leads to");
+    }
+    let found: Vec<RunSummary> = search.runs.iter().map(RunSummary::read).collect();
     args.json.write(&found)?;
     if args.json.is_printed() {
         return Ok(());
     }
-    let mut out = std::io::stdout();
+    let mut out = output();
     if found.is_empty() {
         return Ok(writeln!(out, "{} has no trainings and no experiments", args.dir.display())?);
     }

@@ -38,7 +38,7 @@ use args::{Cli, CliCommand, PlayArgs, ServerArgs, WaitArgs};
 use display::{AboveBar, note};
 use error::{CommandError, Result};
 use perturb_experiment::{Folder, Plan};
-use perturb_files::interrupt::end_on_signals;
+use perturb_files::interrupt::{StopFlag, end_on_signals};
 use perturb_learner::client::{ActorLocation, Address, PrivateServer, ServerWait, Servers};
 use tracing::Level;
 use tracing_subscriber::filter::Targets;
@@ -124,12 +124,12 @@ fn signal_code(number: i32) -> ExitCode {
 }
 
 /// Connects to the servers that were named, or starts a private one.
-fn servers(args: &ServerArgs) -> Result<Servers> {
+fn servers(args: &ServerArgs, stop: &StopFlag) -> Result<Servers> {
     check_server_args(args)?;
     let servers = if args.server.is_empty() {
-        Servers::local(args.workers, &args.task)?
+        Servers::local(args.workers, &args.task, stop)?
     } else {
-        Servers::connect(&args.server)?
+        Servers::connect_until(&args.server, stop)?
     };
     let kind = if args.server.is_empty() { "a private server" } else { "a server given by --server" };
     servers.addresses().iter().for_each(|address| tracing::debug!("connected to {address}, {kind}"));
@@ -137,20 +137,20 @@ fn servers(args: &ServerArgs) -> Result<Servers> {
 }
 
 /// Returns [`servers`] that are waited for when they are lost.
-fn reconnecting_servers(args: &ServerArgs, wait: WaitArgs) -> Result<Servers> {
-    Ok(servers(args)?.with_wait(ServerWait { limit: wait.time(), tell: |sentence| note(sentence) }))
+fn reconnecting_servers(args: &ServerArgs, wait: WaitArgs, stop: &StopFlag) -> Result<Servers> {
+    Ok(servers(args, stop)?.with_wait(ServerWait { limit: wait.time(), tell: |sentence| note(sentence) }))
 }
 
 /// Returns the servers for `jobs` simultaneous processes: the ones that were named, which all processes share, or a
 /// private one for each process. A server's single transport thread serves all its clients, so processes with short
 /// steps would wait for each other.
-fn servers_of_jobs(args: &ServerArgs, jobs: usize) -> Result<(Vec<PrivateServer>, Vec<Address>)> {
+fn servers_of_jobs(args: &ServerArgs, jobs: usize, stop: &StopFlag) -> Result<(Vec<PrivateServer>, Vec<Address>)> {
     check_server_args(args)?;
     if !args.server.is_empty() {
         return Ok((Vec::new(), args.server.clone()));
     }
     let workers = args.workers.unwrap_or_else(|| workers_of_each(jobs, cores()));
-    let start = |_| PrivateServer::start_with_tasks(Some(workers), &args.task);
+    let start = |_| PrivateServer::start_unless(Some(workers), &args.task, &|| stop.signal());
     let servers = (0..jobs.max(1)).map(start).collect::<std::result::Result<Vec<_>, _>>()?;
     let addresses = servers.iter().map(|server| server.address().clone()).collect();
     Ok((servers, addresses))
@@ -166,9 +166,9 @@ fn workers_of_each(jobs: usize, cores: usize) -> usize {
 }
 
 /// Returns the servers for a command that trains or tests.
-fn playing_servers(args: &PlayArgs) -> Result<Servers> {
+fn playing_servers(args: &PlayArgs, stop: &StopFlag) -> Result<Servers> {
     let act = if args.act == "client" { ActorLocation::Client } else { ActorLocation::Server };
-    Ok(reconnecting_servers(&args.server, args.wait)?.with_act(act))
+    Ok(reconnecting_servers(&args.server, args.wait, stop)?.with_act(act))
 }
 
 /// Returns the plan of an experiment's folder, with the cells that its tuning has selected so far.
@@ -181,10 +181,11 @@ fn check_models(servers: &Servers, plan: &Plan, folder: &Folder) -> Result<()> {
     plan.environments().into_iter().try_for_each(|name| Ok(folder.check_model(plan, &servers.environment(name)?)?))
 }
 
-/// Refuses a missing file and a folder, with a remedy. Pipes are accepted.
+/// Refuses a missing file, a folder, a pipe and a device, with a remedy.
 fn require_file(path: &Path, remedy: &str) -> Result<()> {
     let wrong = match path.metadata() {
         Ok(metadata) if metadata.is_dir() => format!("{} is a folder", path.display()),
+        Ok(metadata) if !metadata.is_file() => format!("{} is a pipe or a device, no plain file", path.display()),
         Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
             format!("there is no file {}", path.display())
         }
@@ -208,6 +209,13 @@ fn refuse_file(out: &Path) -> Result<()> {
             file.display()
         ))),
     }
+}
+
+/// Refuses a default folder for results that cannot be written, for instance that of somebody else's experiment.
+fn require_default_out(folder: &Path) -> Result<()> {
+    refuse_file(folder)?;
+    perturb_files::require_writable_folder(folder)
+        .map_err(|error| CommandError::Usage(format!("{error}; give another folder with --out")))
 }
 
 /// Reads the plan in an experiment file.
@@ -296,6 +304,7 @@ mod tests {
         std::fs::write(&file, "").unwrap();
         assert!(require_file(&file, "give one").is_ok());
         assert!(refused(&file.join("below")).starts_with("there is no file "));
+        assert_eq!(refused(Path::new("/dev/zero")), "/dev/zero is a pipe or a device, no plain file: give one");
     }
 
     #[rstest]

@@ -15,6 +15,7 @@ use perturb_text::{Table, count, counted, duration, grouped};
 use serde_json::json;
 
 use super::args::PlanArgs;
+use super::display::output;
 use super::error::{CommandError, Result, system};
 use super::{cores, load_plan, recurrent, servers_of_jobs, with_tasks_of};
 
@@ -23,7 +24,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     if args.measure > 0 && !args.json.is_printed() && args.unfinished_in.is_none() {
         recurrent::prepare_for(&plan)?;
     }
-    let mut out = std::io::stdout();
+    let mut out = output();
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     if args.json.json.is_some() && !args.cells && args.unfinished_in.is_none() {
         return Err(CommandError::Usage("--json lists cells: give --cells or --unfinished-in DIR with it".into()));
@@ -54,9 +55,9 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     let groups = known.groups(&all, grouping);
     let groups_shown = groups_line(&groups, grouping);
     let grouping = Grouping { at_a_time: grouping.at_a_time.min(groups.len()), ..grouping };
-    let (_private, addresses) = servers_of_jobs(&with_tasks_of(&args.server, &plan)?, grouping.at_a_time)?;
+    let (_private, addresses) = servers_of_jobs(&with_tasks_of(&args.server, &plan)?, grouping.at_a_time, &stop)?;
     // The run itself reports servers that do not answer.
-    let (servers, _) = Servers::connect_to_some(&addresses)?;
+    let (servers, _) = Servers::connect_to_some(&addresses, &stop)?;
     let limits = step_limits(&servers, &known)?;
     let counts = plan.counts();
     writeln!(
@@ -102,7 +103,7 @@ fn estimate(
     (servers, limits): (&Servers, &HashMap<&str, u32>),
     stop: &StopFlag,
 ) -> Result<()> {
-    let mut out = std::io::stdout();
+    let mut out = output();
     let measured_seconds = |cell: &Cell| finished.and_then(|(_, timings)| timings.seconds(cell));
     let (known, unknown): (Vec<usize>, Vec<usize>) =
         (0..plan.cells.len()).partition(|&cell| measured_seconds(&plan.cells[cell]).is_some());

@@ -10,9 +10,9 @@ use perturb_report::{ReportInputs, save_heatmaps};
 use perturb_report::{curves_table, old_file_name};
 
 use super::args::{CurvesArgs, ReportArgs};
-use super::display::{note, terminal_width};
+use super::display::{note, output, terminal_width};
 use super::error::{CommandError, Result};
-use super::{plan_in, refuse_file};
+use super::{plan_in, refuse_file, require_default_out};
 
 pub(super) fn run(args: &ReportArgs) -> Result<()> {
     let mut sources = ReportInputs { rule: args.selection, ..ReportInputs::default() };
@@ -20,7 +20,7 @@ pub(super) fn run(args: &ReportArgs) -> Result<()> {
         sources.add(dir)?;
     }
     let (text, out) = write(sources, args.out.clone(), args.html.as_deref())?;
-    write!(std::io::stdout(), "{text}")?;
+    write!(output(), "{text}")?;
     note(format_args!("\nthe tables are also in {}", out.display()));
     Ok(())
 }
@@ -29,7 +29,11 @@ pub(super) fn run(args: &ReportArgs) -> Result<()> {
 pub(super) fn write(sources: ReportInputs, out: Option<PathBuf>, page: Option<&Path>) -> Result<(String, PathBuf)> {
     let out = match out {
         Some(out) => out,
-        None => default_folder(&sources)?,
+        None => {
+            let folder = default_folder(&sources)?;
+            require_default_out(&folder)?;
+            folder
+        }
     };
     refuse_file(&out)?;
     // A page inside of the tables' folder needs no check, because that folder is created.
@@ -69,12 +73,15 @@ fn default_folder(sources: &ReportInputs) -> Result<PathBuf> {
 pub(super) fn curves(args: &CurvesArgs) -> Result<()> {
     let folder = Folder::new(&args.dir);
     let plan = plan_in(&folder)?;
-    let results = Results::read(&plan, &folder)?;
-    let all = read_curves(&results.select(), &folder)?;
     let out = args.out.clone().unwrap_or_else(|| args.dir.join("report"));
     refuse_file(&out)?;
+    if args.out.is_none() {
+        require_default_out(&out)?;
+    }
+    let results = Results::read(&plan, &folder)?;
+    let all = read_curves(&results.select(), &folder)?;
     write_atomically(&out.join("curves.csv"), &curves_table(&all).to_csv())?;
-    let mut stdout = std::io::stdout();
+    let mut stdout = output();
     for curves in &all {
         if curves.curves.is_empty() {
             note(format_args!("{}: no finished training with a monitor.csv", curves.environment));

@@ -10,6 +10,7 @@ use perturb_records::{FILE, Records, TestResult};
 use perturb_text::Table;
 
 use super::args::RescoreArgs;
+use super::display::output;
 use super::error::{CommandError, Result};
 use super::require_file;
 use super::sets::normalize_rule;
@@ -61,7 +62,7 @@ pub(super) fn run(args: &RescoreArgs) -> Result<()> {
             let [low, high] = result.success_percent_95;
             format!("{low:.1} … {high:.1}")
         });
-    writeln!(std::io::stdout(), "{}, policy {}\n{}", about.environment, about.policy, table.build().to_text())?;
+    writeln!(output(), "{}, policy {}\n{}", about.environment, about.policy, table.build().to_text())?;
     Ok(())
 }
 

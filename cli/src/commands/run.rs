@@ -98,7 +98,7 @@ fn run_worker(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<ExitCo
         }
     }
     let mut tell = |cell: &Cell, event| writer.write(&cell.id, event);
-    match Servers::connect_to_one(&args.server.server, order.turn) {
+    match Servers::connect_to_one(&args.server.server, order.turn, stop) {
         Ok(servers) => {
             for order in &orders {
                 for address in servers.addresses() {
@@ -140,10 +140,10 @@ fn all_cells(
     recurrent::prepare_for(&plan)?;
     let grouping = Grouping { max_cells: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
     let expected = without_done(plan.with_expected_cells(Some(&layered(folder, done)))?, done)?;
-    let unfinished = unfinished_cells(args, &expected, folder).len();
-    let (local, addresses) = servers_of_jobs(&with_tasks_of(&args.server, &plan)?, grouping.at_a_time.min(unfinished))?;
+    let jobs = grouping.at_a_time.min(unfinished_cells(args, &expected, folder).len());
+    let (local, addresses) = servers_of_jobs(&with_tasks_of(&args.server, &plan)?, jobs, stop)?;
     let local: Vec<Mutex<PrivateServer>> = local.into_iter().map(Mutex::new).collect();
-    let (servers, errors) = Servers::connect_to_some(&addresses)?;
+    let (servers, errors) = Servers::connect_to_some(&addresses, stop)?;
     errors.iter().for_each(|error| say(format_args!("perturb: {error}; continuing with the other servers")));
     step_limits(&servers, &plan)?;
     check_models(&servers, &plan, folder)?;
@@ -158,7 +158,7 @@ fn all_cells(
         if args.wait.time().is_zero() {
             return Some(BackendEvent::NoServer(ended));
         }
-        Some(match server.restart() {
+        Some(match server.restart(&|| stop.signal()) {
             Ok(()) => BackendEvent::Note(format!("{ended}; it was restarted")),
             Err(error) => BackendEvent::NoServer(format!("{ended}; {error}")),
         })
@@ -168,6 +168,10 @@ fn all_cells(
     while let Some(plan) = runner.next_round()? {
         let bounds = if is_quiet() { Vec::new() } else { upper_bounds(args, &servers, &plan, folder, grouping, stop)? };
         runner.run(&plan, &mut Local::new(&plan, folder, grouping, &command, &server).with_max_seconds(bounds))?;
+    }
+    if stop.signal().is_some() {
+        // No worker is left, and a server that stands still would be waited for.
+        local.iter().filter_map(|server| server.lock().ok()).for_each(|mut server| server.kill());
     }
     runner.finish()
 }

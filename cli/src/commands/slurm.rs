@@ -39,7 +39,7 @@ pub(super) fn run(args: &RunArgs, plan: Plan, done: Option<&DoneCells<'_>>, stop
     slurm.check(stop)?;
     // Environments and durations are checked here with private servers like those of a job, because the servers that
     // jobs share may be unreachable from this machine.
-    let checking = Servers::local(args.server.workers, &tasks)?;
+    let checking = Servers::local(args.server.workers, &tasks, stop)?;
     step_limits(&checking, &plan)?;
     check_models(&checking, &plan, &folder)?;
     drop(checking);
@@ -48,8 +48,8 @@ pub(super) fn run(args: &RunArgs, plan: Plan, done: Option<&DoneCells<'_>>, stop
     let mut runner = PlanRunner::begin(args, plan, &folder, done, stop)?;
     while let Some(plan) = runner.next_round()? {
         let costs = || {
-            let (_private, addresses) = servers_of_jobs(&job_servers, grouping.at_a_time)?;
-            let (servers, _) = Servers::connect_to_some(&addresses)?;
+            let (_private, addresses) = servers_of_jobs(&job_servers, grouping.at_a_time, stop)?;
+            let (servers, _) = Servers::connect_to_some(&addresses, stop)?;
             Ok(cell_seconds(&servers, &plan, grouping, stop)?)
         };
         runner.run(&plan, &mut Jobs::new(&plan, &folder, &slurm, &options, &costs, stop))?;

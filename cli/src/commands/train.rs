@@ -18,7 +18,7 @@ use toml::{Table, Value};
 use super::args::TrainArgs;
 use super::display::Display;
 use super::error::{CommandError, Result, system};
-use super::{playing_servers, recurrent, refuse_file, require_file, sets, threads};
+use super::{playing_servers, recurrent, refuse_file, require_default_out, require_file, sets, threads};
 
 pub(super) fn run(args: &TrainArgs) -> Result<ExitCode> {
     args.json.check()?;
@@ -45,7 +45,7 @@ fn begin_run(args: &TrainArgs) -> Result<ExitCode> {
     }
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let given_directory = args.out.as_deref().map(|out| RunDirectory::choose(out, args.overwrite)).transpose()?;
-    let servers = playing_servers(&args.play)?;
+    let servers = playing_servers(&args.play, &stop)?;
     let environment = servers.environment_seen(&config.common)?;
     config.common.environment = environment.name.clone();
     config.common.parameters =
@@ -65,6 +65,7 @@ fn begin_run(args: &TrainArgs) -> Result<ExitCode> {
 /// Creates a new folder for a run without --out. Runs that begin in the same second get different folders.
 fn create_default_directory(config: &TrainConfig) -> Result<PathBuf> {
     let runs = Path::new("runs");
+    require_default_out(runs)?;
     create_folder(runs)?;
     let time = chrono::Utc::now().format("%Y%m%d-%H%M%S");
     let name = format!("{}-{}-{time}", config.common.environment, config.settings.name());

@@ -7,7 +7,7 @@ use perturb_learner::checkpoint::Checkpoint;
 use perturb_text::Table;
 
 use super::args::VideoArgs;
-use super::display::{Display, note};
+use super::display::{Display, note, output};
 use super::error::{CommandError, Result, system};
 use super::{servers, sets};
 use crate::video::{Footage, Format, VideoFile, VideoOptions, film};
@@ -25,7 +25,7 @@ pub(super) fn run(args: &VideoArgs) -> Result<()> {
     let file = VideoFile::create(&args.out)?;
     let checkpoint = Checkpoint::load(&args.checkpoint)?;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let servers = servers(&args.server)?;
+    let servers = servers(&args.server, &stop)?;
     let width = args.width.unwrap_or(if is_sheet { 240 } else { 480 });
     let environment = servers.environment(&checkpoint.state.config.common.environment)?;
     let sets = args.version.iter().map(|&version| -> Result<_> {
@@ -47,7 +47,7 @@ pub(super) fn run(args: &VideoArgs) -> Result<()> {
     if let Some(sentence) = footage.thinning() {
         note(sentence);
     }
-    let mut out = std::io::stdout();
+    let mut out = output();
     let episodes: Vec<_> = footage.episodes.iter().enumerate().collect();
     let table = Table::builder("", &episodes)
         .number("episode", |(index, _)| index + 1)

@@ -1,10 +1,8 @@
 //! The file of a video. It appears when it is complete.
 
-use std::fs;
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
-use perturb_files::{io, require_writable};
+use perturb_files::{replace, require_writable, temporary_beside};
 use tempfile::NamedTempFile;
 
 use super::VideoError;
@@ -59,12 +57,7 @@ impl VideoFile {
         if format == Format::Mp4 {
             mp4::find_ffmpeg()?;
         }
-        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let temporary = tempfile::Builder::new()
-            .prefix(".perturb-video-")
-            .permissions(fs::Permissions::from_mode(0o666)) // like other files, less the umask
-            .tempfile_in(folder)
-            .map_err(io("write to", folder))?;
+        let temporary = temporary_beside(path, ".perturb-video-")?;
         Ok(Self { path: path.to_owned(), format, temporary })
     }
 
@@ -127,7 +120,7 @@ impl VideoWriter {
     pub fn finish(self) -> Result<u16, VideoError> {
         let VideoFile { path, temporary, .. } = self.file;
         let shown_every = self.encoder.finish().map_err(encoding(&path))?;
-        temporary.persist(&path).map_err(|error| io("rename a file to", &path)(error.error))?;
+        replace(temporary, &path)?;
         Ok(shown_every)
     }
 }
@@ -139,6 +132,9 @@ fn encoding(path: &Path) -> impl FnOnce(std::io::Error) -> VideoError {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+    use std::os::unix::fs::PermissionsExt;
+
     use super::*;
 
     #[test]

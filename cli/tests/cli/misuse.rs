@@ -195,7 +195,7 @@ fn each_misuse_is_refused_with_a_remedy_and_leaves_nothing() {
 #[case::train(
     "perturb train --env CartPole --episodes 1000000 --out run",
     "run/progress.csv",
-    "stopped by signal N after N of N episodes; resume with: perturb train --resume run",
+    "stopped by signal N after N of N episodes; go on with: perturb train --resume run",
     "run, run/checkpoint, run/config.toml, run/events.out.tfevents.N.perturb, run/monitor.csv, run/progress.csv"
 )]
 #[case::run(

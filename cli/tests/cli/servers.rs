@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Child;
 
 use perturb_experiment::{Folder, Plan};
+use perturb_files::interrupt::StopFlag;
 use perturb_learner::client::{Address, OpenOptions, Servers, Session};
 use perturb_protocol::Version;
 
@@ -140,7 +141,7 @@ fn sessions_rotate_over_servers_that_accept_them() {
     let servers = [server(1), server(1)];
     let both = addresses(&servers);
     for turn in 0..4 {
-        let one = Servers::connect_to_one(&both, turn).expect("a connection");
+        let one = Servers::connect_to_one(&both, turn, &StopFlag::default()).expect("a connection");
         assert_eq!(one.addresses(), [both[turn % 2].clone()]);
     }
     let (_listener, silent) = silent();
@@ -148,18 +149,23 @@ fn sessions_rotate_over_servers_that_accept_them() {
     shutting_down(|ending| {
         let ending = ending.clone();
         let three = [ending.clone(), silent.clone(), both[0].clone()];
-        let (some, troubles) = Servers::connect_to_some(&three).expect("a connection");
+        let (some, troubles) = Servers::connect_to_some(&three, &StopFlag::default()).expect("a connection");
         assert_eq!(some.addresses(), [both[0].clone()]);
         let words: Vec<String> = troubles.iter().map(ToString::to_string).collect();
         assert!(words[0].contains(&format!("{ending}: it is shutting down")), "{words:?}");
         assert!(words[1].contains(&format!("{silent}: it accepted the connection, but did not answer")), "{words:?}");
         for turn in 0..3 {
             let three = [ending.clone(), gone.clone(), both[0].clone()];
-            assert_eq!(first(&Servers::connect_to_one(&three, turn).expect("a connection")), both[0]);
+            assert_eq!(
+                first(&Servers::connect_to_one(&three, turn, &StopFlag::default()).expect("a connection")),
+                both[0]
+            );
         }
-        let error = Servers::connect_to_one(&[ending.clone(), gone.clone()], 0).expect_err("none").to_string();
+        let error = Servers::connect_to_one(&[ending.clone(), gone.clone()], 0, &StopFlag::default())
+            .expect_err("none")
+            .to_string();
         assert!(error.contains("it is shutting down; unix:/nowhere/perturb.sock: "), "{error}");
-        let error = Servers::connect_to_one(&[ending], 0).expect_err("one").to_string();
+        let error = Servers::connect_to_one(&[ending], 0, &StopFlag::default()).expect_err("one").to_string();
         assert!(error.starts_with("no server answers at unix:"), "{error}");
     });
 }
@@ -181,7 +187,8 @@ fn a_name_is_one_server_however_many_addresses_it_has() {
     // If localhost is also ::1, no server listens there.
     let name: Address = format!("localhost:{port}").parse().expect("an address");
     for turn in 0..3 {
-        let one = Servers::connect_to_one(std::slice::from_ref(&name), turn).expect("a connection");
+        let one =
+            Servers::connect_to_one(std::slice::from_ref(&name), turn, &StopFlag::default()).expect("a connection");
         Session::open(&one, &options(), &mut Vec::new()).expect("a session");
     }
     assert_eq!(Servers::connect(&[name.clone(), name]).expect("connections").addresses().len(), 2);

@@ -146,7 +146,7 @@ fn servers_of_a_run_have_the_same_model() {
     let place = Place::new();
     let server = || {
         let tasks = [place.path("arm")];
-        PrivateServer::start_with_tasks(Some(1), &tasks).unwrap_or_else(|error| panic!("{error}"))
+        PrivateServer::start_unless(Some(1), &tasks, &|| None).unwrap_or_else(|error| panic!("{error}"))
     };
     let address = |server: &PrivateServer| server.address().clone();
     let [first, second] = [server(), server()];

@@ -1,5 +1,7 @@
 //! The files of a checkpoint: written whole or not at all, read only if they are what was written.
 
+use std::fs::File;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use perturb_files::{self as files, TEMPORARY_PREFIX, write_atomically};
@@ -42,29 +44,36 @@ impl ArraysFile {
         directory.join(Path::new(&self.file).file_name().unwrap_or_default())
     }
 
-    /// Makes sure that it is there, and as long as it was written.
+    /// Makes sure that it is there, a plain file, and as long as it was written.
     ///
     /// # Errors
     /// [`CheckpointError`].
     pub(super) fn require(&self, directory: &Path) -> Result<()> {
-        let path = self.path(directory);
-        let length = std::fs::metadata(&path).map_err(files::io("read", &path))?.len();
-        if length == self.bytes {
-            Ok(())
-        } else {
-            Err(damaged(&path, format!("it has {length} bytes, expected {}", self.bytes)))
-        }
+        self.open(directory).map(drop)
     }
 
-    /// Reads the file and checks its length and checksum.
+    /// Reads the file and checks its length, before anything is read, and its checksum.
     ///
     /// # Errors
     /// [`CheckpointError`], also if it is not what was written.
     pub fn read(&self, directory: &Path) -> Result<Vec<u8>> {
         let path = self.path(directory);
-        let content = files::read(&path)?;
+        let mut content = Vec::new();
+        let mut file = self.open(directory)?.take(self.bytes.saturating_add(1)); // it may grow meanwhile
+        file.read_to_end(&mut content).map_err(files::io("read", &path))?;
         self.require_content(&content).map_err(|reason| damaged(&path, reason))?;
         Ok(content)
+    }
+
+    fn open(&self, directory: &Path) -> Result<File> {
+        let path = self.path(directory);
+        let (file, metadata) = files::open_plain(&path).map_err(files::io("read", &path))?;
+        let length = metadata.len();
+        if length == self.bytes {
+            Ok(file)
+        } else {
+            Err(damaged(&path, format!("it has {length} bytes, expected {}", self.bytes)))
+        }
     }
 
     /// Checks length and checksum of `content`.

@@ -16,6 +16,7 @@ mod files;
 mod named;
 mod single_file;
 
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use perturb_files::checksum::WithChecksum;
@@ -38,6 +39,8 @@ pub use self::named::find as find_policy;
 const FORMAT_VERSION: u32 = 3;
 /// The first with a checksum.
 const SEALED: u32 = 3;
+/// Maximum number of times that a checkpoint is read while a training replaces it again and again.
+const MAX_LOOKS: u32 = 20;
 /// The file that makes a directory a checkpoint.
 pub const JSON: &str = "checkpoint.json";
 const WEIGHTS_PREFIX: &str = "weights-";
@@ -195,8 +198,7 @@ impl Checkpoint {
         if single_file::is_policy(path)? {
             return Self::load_file(path);
         }
-        let (directory, document) = CheckpointDocument::read(path)?;
-        Self::from_document(&directory, document)
+        CheckpointDocument::read_with(path, Self::from_document)
     }
 
     /// Reads the checkpoint in `path`, or in its folder `checkpoint`, with where that is and what its training needs to go
@@ -205,11 +207,12 @@ impl Checkpoint {
     /// # Errors
     /// [`CheckpointError`], which names the file.
     pub fn load_resumable(path: &Path) -> Result<(Self, PathBuf, serde_json::Value)> {
-        let (directory, mut document) = CheckpointDocument::read(path)?;
-        let resume = document.resume.take();
-        let checkpoint = Self::from_document(&directory, document)?;
-        let resume = resume.ok_or_else(|| CheckpointError::NotResumable { path: directory.clone() })?;
-        Ok((checkpoint, directory, resume))
+        CheckpointDocument::read_with(path, |directory, mut document| {
+            let resume = document.resume.take();
+            let checkpoint = Self::from_document(directory, document)?;
+            let resume = resume.ok_or_else(|| CheckpointError::NotResumable { path: directory.to_owned() })?;
+            Ok((checkpoint, directory.to_owned(), resume))
+        })
     }
 
     /// Reads the policy that `document` in `directory` describes.
@@ -267,17 +270,11 @@ impl State {
     /// # Errors
     /// [`CheckpointError`], which names the file.
     pub fn load(path: &Path) -> Result<Self> {
-        let load = || {
-            let (directory, document) = CheckpointDocument::read(path)?;
-            let state = Self::from_document(&directory, document.rest)?;
-            document.weights.require(&directory)?;
+        CheckpointDocument::read_with(path, |directory, document| {
+            let state = Self::from_document(directory, document.rest)?;
+            document.weights.require(directory)?;
             Ok(state)
-        };
-        match load() {
-            // A training may have written the next one meanwhile, and deleted the weights of this one.
-            Err(CheckpointError::File(_)) => load(),
-            loaded => loaded,
-        }
+        })
     }
 
     /// Reads the state from the document of `checkpoint.json` in `directory`.
@@ -363,6 +360,24 @@ impl State {
 }
 
 impl CheckpointDocument {
+    /// Reads the document with [`CheckpointDocument::read`] and passes it to `take`. A training may have replaced the
+    /// checkpoint meanwhile and deleted the arrays that this document names. Then reads the new one.
+    fn read_with<T>(path: &Path, mut take: impl FnMut(&Path, Self) -> Result<T>) -> Result<T> {
+        let mut last = String::new();
+        for _ in 1..MAX_LOOKS {
+            let (directory, document) = Self::read(path)?;
+            let named = document.weights.file.clone();
+            match take(&directory, document) {
+                Err(CheckpointError::File(error)) if error.source.kind() == ErrorKind::NotFound && named != last => {
+                    last = named;
+                }
+                taken => return taken,
+            }
+        }
+        let (directory, document) = Self::read(path)?;
+        take(&directory, document)
+    }
+
     /// Reads `checkpoint.json` in `path`, or in its folder `checkpoint`; gives the folder, too.
     fn read(path: &Path) -> Result<(PathBuf, Self)> {
         let directory = match has_file(&path.join(JSON))? {

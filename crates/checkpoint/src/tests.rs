@@ -251,3 +251,51 @@ fn changed_environment_is_detected() {
     served.revision = 2;
     assert_eq!(trained.difference(&served), Some(("revision", "1".into(), "2".into())));
 }
+
+#[test]
+fn only_plain_files_of_the_right_length_are_read() {
+    let run = tempfile::tempdir().unwrap();
+    let saved = checkpoint(1, 1);
+    saved.save(run.path(), None).unwrap();
+    let find = |json: bool| {
+        let paths = files::list(run.path()).unwrap();
+        paths.into_iter().find(|path| path.ends_with(JSON) == json).unwrap()
+    };
+    let refused = || {
+        let errors = [Checkpoint::load(run.path()).unwrap_err(), State::load(run.path()).unwrap_err()];
+        errors.map(|error| error.to_string())
+    };
+    let weights = find(false);
+    fs::remove_file(&weights).unwrap();
+    for make in ["ln -s /dev/zero", "mkfifo"] {
+        let mut words = make.split(' ');
+        let mut command = std::process::Command::new(words.next().unwrap());
+        assert!(command.args(words).arg(&weights).status().unwrap().success());
+        assert!(refused().iter().all(|error| error.contains("it is a pipe or a device")), "{:?}", refused());
+        fs::remove_file(&weights).unwrap();
+    }
+    fs::File::create(&weights).unwrap().set_len(1 << 40).unwrap(); // a terabyte of nothing
+    assert!(refused().iter().all(|error| error.contains("it has 1099511627776 bytes, expected")), "{:?}", refused());
+}
+
+#[test]
+fn a_checkpoint_is_read_while_it_is_replaced_again_and_again() {
+    let run = tempfile::tempdir().unwrap();
+    let mut saved = checkpoint(1, 1);
+    saved.save(run.path(), None).unwrap();
+    let path = run.path().to_owned();
+    let is_done = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
+    let done = std::sync::Arc::clone(&is_done);
+    let writer = std::thread::spawn(move || {
+        while !done.load(std::sync::atomic::Ordering::Relaxed) {
+            saved.state.counters.iterations += 1;
+            saved.save(&path, None).unwrap();
+        }
+    });
+    for _ in 0..300 {
+        Checkpoint::load(run.path()).unwrap();
+        State::load(run.path()).unwrap();
+    }
+    is_done.store(true, std::sync::atomic::Ordering::Relaxed);
+    writer.join().unwrap();
+}

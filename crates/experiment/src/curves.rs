@@ -176,7 +176,12 @@ fn read_monitor(path: &Path) -> Result<Vec<MonitorEpisode>, FolderError> {
 
 /// Parses the three columns that the curves need.
 fn parse_monitor(content: &[u8]) -> Result<Vec<MonitorEpisode>, AnyError> {
-    let mut reader = csv::ReaderBuilder::new().comment(Some(b'#')).from_reader(content);
+    // A training that runs, or was killed, may not have written the end of its last line.
+    let whole = content.iter().rposition(|&byte| byte == b'\n').map_or(0, |end| end + 1);
+    if whole == 0 {
+        return Ok(Vec::new()); // not even its header is there
+    }
+    let mut reader = csv::ReaderBuilder::new().comment(Some(b'#')).from_reader(&content[..whole]);
     let names = reader.headers()?.clone();
     let place = |name: &str| names.iter().position(|known| known == name).ok_or_else(|| format!("no column {name}"));
     let places = [place("r")?, place("l")?, place("success")?];
@@ -184,7 +189,8 @@ fn parse_monitor(content: &[u8]) -> Result<Vec<MonitorEpisode>, AnyError> {
     while reader.read_record(&mut line)? {
         let number = |place: usize| {
             let text = line.get(place).unwrap_or_default();
-            text.parse::<f64>().map_err(|error| format!("`{text}` in line {}: {error}", episodes.len() + 1))
+            let place = || line.position().map_or(0, csv::Position::line);
+            text.parse::<f64>().map_err(|error| format!("`{text}` in line {}: {error}", place()))
         };
         let [episode_return, length, success] = places;
         let (episode_return, length, success) = (number(episode_return)?, number(length)?, number(success)?);
@@ -305,9 +311,11 @@ mod tests {
         assert!(read_monitor(&path).unwrap().is_empty());
         std::fs::write(&path, "#{\"t_start\": 1}\nr,l,t,success,terminated,mass\n-1.5,9,0.1,1,0,2\n2,8,0.1,0,1,2\n")
             .unwrap();
+        let file = std::fs::File::options().append(true).open(&path).unwrap();
+        std::io::Write::write_all(&mut &file, b"-0.5,1").unwrap(); // a line that is being written
         let expected = episodes(2, |i| [(-1.5, 9.0, 1.0), (2.0, 8.0, 0.0)][i]);
         assert_eq!(read_monitor(&path).unwrap(), expected);
-        for (damaged, reason) in [("r,l,success\n1,2,x\n", "`x` in line 1"), ("r,success\n1,1\n", "no column l")] {
+        for (damaged, reason) in [("r,l,success\n1,2,x\n", "`x` in line 2"), ("r,success\n1,1\n", "no column l")] {
             std::fs::write(&path, damaged).unwrap();
             let error = read_monitor(&path).unwrap_err().to_string();
             assert!(error.contains("monitor.csv is not understood") && error.contains(reason), "{error}");

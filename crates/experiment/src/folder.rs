@@ -41,6 +41,8 @@ const MAX_BYTES: u64 = 64 << 20;
 #[derive(Clone, Debug)]
 pub struct Folder {
     path: PathBuf,
+    /// The folder for new heatmaps, if it is another.
+    new_heatmaps: Option<PathBuf>,
 }
 
 /// The folder of a cell.
@@ -212,12 +214,22 @@ type Result<T> = std::result::Result<T, FolderError>;
 impl Folder {
     /// The folder at `path`, which need not exist.
     pub fn new(path: &Path) -> Self {
-        Self { path: path.to_owned() }
+        Self { path: path.to_owned(), new_heatmaps: None }
+    }
+
+    /// Writes new heatmaps to `path` in place of the folder `heatmaps`, which is still read.
+    pub fn with_new_heatmaps(self, path: PathBuf) -> Self {
+        Self { new_heatmaps: Some(path), ..self }
     }
 
     /// Returns the path.
     pub fn path(&self) -> &Path {
         &self.path
+    }
+
+    /// The folders of heatmaps. New ones are written to the first.
+    pub fn heatmaps(&self) -> Vec<PathBuf> {
+        self.new_heatmaps.iter().cloned().chain([self.path.join("heatmaps")]).collect()
     }
 
     /// The folder of a cell.
@@ -349,7 +361,7 @@ impl CellFolder {
     /// [`FileError`].
     pub fn try_lock(&self) -> files::Result<Option<Lock>> {
         files::create_folder(&self.path)?;
-        Lock::try_take(&self.path.join("lock"))
+        Lock::try_take(&self.path)
     }
 
     /// Makes the result appear, complete.

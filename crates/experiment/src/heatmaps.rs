@@ -10,7 +10,7 @@
 //! been replaced since, are therefore never taken for current ones. Pictures are drawn from figures when they are wanted.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use perturb_files::{self as files, delete, read_if_there, write_atomically, write_json};
 use perturb_records::{Axis, Heatmap, HeatmapKind, HeatmapOptions, TrainedOn, heatmap_table};
@@ -115,7 +115,8 @@ pub fn heatmap_kinds<'a>(
     let ids = places.iter().filter_map(|place| Some((place.selected?.cell.id.as_str(), place.environment)));
     let environments: BTreeMap<&str, &'a str> = ids.collect();
     let mut kinds: BTreeMap<&str, BTreeSet<HeatmapKind>> = BTreeMap::new();
-    for path in files::list(&folder.path().join("heatmaps"))? {
+    let lists = folder.heatmaps().iter().map(|path| files::list(path)).collect::<files::Result<Vec<_>>>()?;
+    for path in lists.into_iter().flatten() {
         if path.extension().is_none_or(|ending| ending != "json") {
             continue;
         }
@@ -141,7 +142,25 @@ impl HeatmapPlace<'_> {
     /// [`FolderError`] if a file is there that cannot be read.
     pub fn read(&self, folder: &Folder, kind: &HeatmapKind) -> Result<Result<StoredHeatmap, NoHeatmap>, FolderError> {
         let Some(Selected { cell, .. }) = self.selected else { return Ok(Err(NoHeatmap::NoResult)) };
-        let path = heatmap_path(folder, cell, kind);
+        let mut missing = NoHeatmap::NotMade;
+        for path in folder.heatmaps() {
+            match self.read_at(&path.join(heatmap_name(cell, kind)), folder, cell, kind)? {
+                Ok(stored) => return Ok(Ok(stored)),
+                Err(NoHeatmap::NotMade) => {}
+                Err(reason) => missing = reason,
+            }
+        }
+        Ok(Err(missing))
+    }
+
+    /// The heatmap at `path`, which has no extension.
+    fn read_at(
+        &self,
+        path: &Path,
+        folder: &Folder,
+        cell: &Cell,
+        kind: &HeatmapKind,
+    ) -> Result<Result<StoredHeatmap, NoHeatmap>, FolderError> {
         let record = read_if_there(&path.with_added_extension("json"))?.and_then(|text| HeatmapRecord::parse(&text));
         let Some(record) = record.filter(|record| record.cell == cell.id && record.options.kind() == *kind) else {
             return Ok(Err(NoHeatmap::NotMade));
@@ -171,9 +190,13 @@ impl std::fmt::Display for HeatmapPlace<'_> {
     }
 }
 
-/// Returns the path of a cell's heatmap without its extension.
+/// Returns the path of a cell's new heatmap without its extension.
 pub fn heatmap_path(folder: &Folder, cell: &Cell, kind: &HeatmapKind) -> PathBuf {
-    folder.path().join("heatmaps").join(format!("{}-{kind}", cell.id))
+    folder.heatmaps().swap_remove(0).join(heatmap_name(cell, kind))
+}
+
+fn heatmap_name(cell: &Cell, kind: &HeatmapKind) -> String {
+    format!("{}-{kind}", cell.id)
 }
 
 /// Keeps `heatmap` of the policy called `checkpoint` as that of `cell`.
@@ -293,6 +316,13 @@ mod tests {
         assert!(place.read(&folder, &kind).unwrap().is_ok());
         let left: Vec<_> = std::fs::read_dir(directory.path().join("heatmaps")).unwrap().collect();
         assert_eq!(left.len(), 2, "nothing temporary");
+
+        let mine = folder.clone().with_new_heatmaps(directory.path().join("mine"));
+        assert!(place.read(&mine, &kind).unwrap().is_ok(), "the experiment's own is read");
+        files::delete(&record).unwrap();
+        store_heatmap(&mine, cell, "00000001-0a".into(), options(Version::D), &heatmap()).unwrap();
+        assert!(place.read(&mine, &kind).unwrap().is_ok(), "written elsewhere");
+        assert_eq!(place.read(&folder, &kind).unwrap(), Err(NoHeatmap::NotMade));
     }
 
     #[test]

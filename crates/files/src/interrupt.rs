@@ -1,76 +1,133 @@
-//! Ctrl-C and SIGTERM as a flag that loops look at, and folders that do not outlive them.
+//! Signals as a flag that loops look at, and folders that do not outlive them.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicI32, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::task::Poll;
+use std::time::{Duration, Instant};
 
-use tokio::signal::unix::{SignalKind, signal};
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::sync::Notify;
 
 /// The folders of all [`Scratch`].
 static SCRATCH: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
+/// The signal by which the kernel warns a process that has used its processor time. It comes every second.
+const SIGXCPU: i32 = 24;
 
 /// Raised when the program is asked to end.
 #[derive(Clone, Debug, Default)]
-pub struct StopFlag(Arc<AtomicI32>);
+pub struct StopFlag(Arc<Raised>);
+
+#[derive(Debug, Default)]
+struct Raised {
+    /// The signal's number; 0 so far.
+    signal: AtomicI32,
+    since: OnceLock<Instant>,
+    notify: Notify,
+}
 
 impl StopFlag {
-    /// A flag that SIGINT and SIGTERM raise. The first one asks, the second one ends the program at once.
+    /// A flag that the signals INT, TERM, HUP, USR1, USR2 and XCPU raise. A second INT or TERM ends the program at once.
+    /// Terminals, batch systems and the kernel repeat the others. Of these, what the program was started to ignore, as
+    /// HUP under `nohup`, stays ignored.
     ///
     /// # Errors
     /// The operating system's.
     pub fn on_signals() -> std::io::Result<Self> {
         let flag = Self::default();
         let raised = flag.clone();
-        watch(move |number| {
-            if raised.0.swap(number, Ordering::SeqCst) != 0 {
+        let ignored = ignored_signals();
+        let warnings = [SignalKind::hangup(), SignalKind::user_defined1(), SignalKind::user_defined2()];
+        let warnings = warnings.into_iter().chain([SignalKind::from_raw(SIGXCPU)]);
+        let kinds: Vec<SignalKind> =
+            ENDING.into_iter().chain(warnings.filter(|kind| !contains(ignored, kind.as_raw_value()))).collect();
+        let mut was_ended = false;
+        watch(&kinds, move |number| {
+            if ENDING.iter().any(|kind| kind.as_raw_value() == number) && std::mem::replace(&mut was_ended, true) {
                 end(number);
             }
+            raised.raise(number);
         })?;
         Ok(flag)
     }
 
-    /// The number of the signal that was received; `None` so far.
+    /// The number of the first signal that was received; `None` so far.
     pub fn signal(&self) -> Option<i32> {
-        Some(self.0.load(Ordering::SeqCst)).filter(|&number| number != 0)
+        Some(self.0.signal.load(Ordering::SeqCst)).filter(|&number| number != 0)
     }
 
     /// Raises it, as signal `number` would.
     pub fn raise(&self, number: i32) {
-        self.0.store(number, Ordering::SeqCst);
+        let _ = self.0.since.set(Instant::now()); // the first one counts
+        let _ = self.0.signal.compare_exchange(0, number, Ordering::SeqCst, Ordering::SeqCst);
+        self.0.notify.notify_waiters();
+    }
+
+    /// The time since it was raised; `None` so far.
+    pub fn elapsed(&self) -> Option<Duration> {
+        self.0.since.get().map(Instant::elapsed)
+    }
+
+    /// Waits until it is raised. Returns the number of the signal.
+    pub async fn raised(&self) -> i32 {
+        loop {
+            let notified = self.0.notify.notified();
+            match self.signal() {
+                Some(number) => return number,
+                None => notified.await,
+            }
+        }
     }
 }
+
+/// The signals that ask a program to end.
+const ENDING: [SignalKind; 2] = [SignalKind::interrupt(), SignalKind::terminate()];
 
 /// Has SIGINT and SIGTERM end a program at once that has nothing to finish.
 ///
 /// # Errors
 /// The operating system's.
 pub fn end_on_signals() -> std::io::Result<()> {
-    watch(|number| {
+    watch(&ENDING, |number| {
         let _ = writeln!(std::io::stderr(), "stopped by signal {number}"); // the terminal may be gone
         end(number);
     })
 }
 
-/// Has `hear` told of every SIGINT and SIGTERM.
-fn watch(mut hear: impl FnMut(i32) + Send + 'static) -> std::io::Result<()> {
+/// Calls `hear` with the number of each signal of these `kinds`.
+fn watch(kinds: &[SignalKind], mut hear: impl FnMut(i32) + Send + 'static) -> std::io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    let (mut interrupt, mut terminate) = {
+    let mut signals = {
         let _guard = runtime.enter();
-        (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?)
+        let listen = |&kind| Ok((SignalKind::as_raw_value(&kind), signal(kind)?));
+        kinds.iter().map(listen).collect::<std::io::Result<Vec<(i32, Signal)>>>()?
     };
     std::thread::Builder::new().name("signals".into()).spawn(move || {
         runtime.block_on(async move {
             loop {
-                hear(tokio::select! {
-                    Some(()) = interrupt.recv() => SignalKind::interrupt().as_raw_value(),
-                    Some(()) = terminate.recv() => SignalKind::terminate().as_raw_value(),
-                    else => return,
+                let next = std::future::poll_fn(|context| {
+                    let came = signals
+                        .iter_mut()
+                        .find_map(|(number, signal)| signal.poll_recv(context).is_ready().then_some(*number));
+                    came.map_or(Poll::Pending, Poll::Ready)
                 });
+                hear(next.await);
             }
         });
     })?;
     Ok(())
+}
+
+/// The signals that this process was started to ignore, as a mask whose lowest bit is signal 1.
+fn ignored_signals() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).unwrap_or_default()
+}
+
+fn contains(mask: u64, signal: i32) -> bool {
+    mask >> (signal - 1) & 1 == 1
 }
 
 /// Ends the program with the status that shells give to signal `number`, and deletes what is temporary.
@@ -118,6 +175,26 @@ fn scratch() -> std::sync::MutexGuard<'static, Vec<PathBuf>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_first_signal_is_kept_and_wakes_who_waits() {
+        let flag = StopFlag::default();
+        assert_eq!((flag.signal(), flag.elapsed()), (None, None));
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let other = flag.clone();
+        let thread = std::thread::spawn(move || {
+            other.raise(15);
+            other.raise(2);
+        });
+        assert_eq!(runtime.block_on(flag.raised()), 15);
+        thread.join().unwrap();
+        assert!(flag.signal() == Some(15) && flag.elapsed().is_some());
+    }
+
+    #[test]
+    fn masks_of_signals_count_from_one() {
+        assert_eq!([1, 2, 24].map(|signal| contains(0x80_0001, signal)), [true, false, true]);
+    }
 
     #[test]
     fn a_scratch_folder_is_known_while_it_is_there() {

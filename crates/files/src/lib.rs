@@ -1,30 +1,32 @@
 //! Files: errors that name them, writing that happens wholly or not at all, locks.
 #![forbid(unsafe_code)]
 
-use std::fs::{self, File, TryLockError};
+use std::fs::{self, File};
 use std::io::{ErrorKind, Write};
-use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
+use rustix::io::Errno;
 use serde::Serialize;
+use tempfile::NamedTempFile;
 
-use perturb_system::plain::nonblocking_flag;
 use perturb_text::quoted;
+
+use self::support::{Operation, unless_unsupported};
 
 pub mod checksum;
 pub mod interrupt;
+mod lock;
 mod plain;
+mod support;
 
+pub use self::lock::{Lock, is_locked};
 pub use self::plain::{Stamp, leads_out, read_plain, read_plain_text};
 pub use perturb_system::open_plain;
 
 /// The prefix of files that a write has not finished.
 pub const TEMPORARY_PREFIX: &str = ".tmp-";
-/// Attempts to take a lock while another process only tests it.
-const MAX_LOCK_TRIES: u32 = 100;
-/// Time between two of these attempts. A test takes some microseconds.
-const LOCK_RETRY_INTERVAL: Duration = Duration::from_millis(1);
+/// Maximum size of a TOML file that is read, in bytes. The parser's memory is up to some 200 times the text.
+pub const MAX_TOML_BYTES: u64 = 256 << 10;
 
 /// A boxed error, for messages only.
 pub type AnyError = Box<dyn std::error::Error + Send + Sync>;
@@ -59,20 +61,20 @@ pub fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> F
     move |source| FileError { action, path, source }
 }
 
-/// A file's content.
+/// Reads a plain file, which must be there.
 ///
 /// # Errors
-/// The operating system's.
+/// The operating system's; a pipe or a device, and a file larger than anything that a run writes.
 pub fn read(path: &Path) -> Result<Vec<u8>> {
-    fs::read(path).map_err(io("read", path))
+    read_if_there(path)?.ok_or_else(|| io("read", path)(Errno::NOENT.into()))
 }
 
-/// A file's content as text.
+/// Reads the text of a plain TOML file.
 ///
 /// # Errors
-/// The operating system's; a file that is not UTF-8.
-pub fn read_text(path: &Path) -> Result<String> {
-    fs::read_to_string(path).map_err(io("read", path))
+/// The operating system's; a pipe or a device, a file that is not UTF-8, and more than [`MAX_TOML_BYTES`].
+pub fn read_toml(path: &Path) -> Result<String> {
+    read_plain_text(path, MAX_TOML_BYTES)
 }
 
 /// A plain file's content; `None` if it is not there.
@@ -148,16 +150,60 @@ pub fn write_atomically(path: &Path, content: &[u8]) -> Result<()> {
     if path.metadata().is_ok_and(|metadata| !metadata.is_file()) {
         return fs::write(path, content).map_err(io("write", path));
     }
-    let folder = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    create_folder(folder)?;
+    create_folder(folder_of(path))?;
+    let mut file = temporary_beside(path, TEMPORARY_PREFIX)?;
+    file.write_all(content).map_err(io("write", path))?;
+    replace(file, path)
+}
+
+/// Creates a hidden temporary file in the folder of `path`, which exists. Its name begins with `prefix`.
+///
+/// # Errors
+/// The operating system's.
+pub fn temporary_beside(path: &Path, prefix: &str) -> Result<NamedTempFile> {
     // As readable as any other file that is created here; temporary files are otherwise their owner's alone.
     let mode = <fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666);
-    let mut builder = tempfile::Builder::new();
-    let mut file =
-        builder.prefix(TEMPORARY_PREFIX).permissions(mode).tempfile_in(folder).map_err(io("write in", folder))?;
-    file.write_all(content).and_then(|()| file.as_file().sync_all()).map_err(io("write", path))?;
-    file.persist(path).map_err(|error| io("rename a file to", path)(error.error))?;
-    sync_folder(folder)
+    let folder = folder_of(path);
+    tempfile::Builder::new().prefix(prefix).permissions(mode).tempfile_in(folder).map_err(io("write in", folder))
+}
+
+/// Creates a file without a name, which is deleted when it is closed.
+///
+/// # Errors
+/// The operating system's, with the variable that chooses the folder.
+pub fn temporary_file() -> std::io::Result<File> {
+    tempfile::tempfile().map_err(|error| {
+        let folder = std::env::temp_dir();
+        let words = format!("no temporary file in {} ({error}): set TMPDIR to another folder", folder.display());
+        std::io::Error::new(error.kind(), words)
+    })
+}
+
+/// Renames a complete temporary file to `path`. Content and name are on the disk afterwards. Where the file system
+/// cannot rename, the content is copied.
+///
+/// # Errors
+/// The operating system's.
+pub fn replace(file: NamedTempFile, path: &Path) -> Result<()> {
+    sync_file(file.as_file(), path).map_err(io("write", path))?;
+    if let Err(error) = file.persist(path) {
+        let tempfile::PersistError { error, file } = error;
+        unless_unsupported(Operation::Rename, Err::<(), _>(error), path).map_err(io("rename a file to", path))?;
+        copy(&file, path).map_err(io("write", path))?;
+    }
+    sync_folder(folder_of(path))
+}
+
+/// Copies the content of a temporary file, but not its permissions.
+fn copy(file: &NamedTempFile, path: &Path) -> std::io::Result<()> {
+    let mut copy = File::create(path)?;
+    std::io::copy(&mut file.reopen()?, &mut copy)?;
+    sync_file(&copy, path)
+}
+
+/// Returns the folder of the file at `path`.
+fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// Makes sure, before there is anything to write, that [`write_atomically`] will find its folder and may write there.
@@ -166,7 +212,7 @@ pub fn write_atomically(path: &Path, content: &[u8]) -> Result<()> {
 /// [`FileError`], with what to do.
 pub fn require_writable(path: &Path) -> Result<()> {
     let refuse = |kind, words: String| Err(io("write", path)(std::io::Error::new(kind, words)));
-    let folder = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = folder_of(path);
     match path.metadata() {
         Ok(metadata) if metadata.is_dir() => {
             return refuse(ErrorKind::IsADirectory, "it is a folder; give the name of a file".into());
@@ -187,6 +233,15 @@ pub fn require_writable(path: &Path) -> Result<()> {
     tempfile::tempfile_in(folder).map(drop).map_err(io("write", path))
 }
 
+/// Makes sure that files can be written to `folder`, which is created later if it is not there.
+///
+/// # Errors
+/// [`FileError`].
+pub fn require_writable_folder(folder: &Path) -> Result<()> {
+    let existing = folder.ancestors().find(|path| path.is_dir()).unwrap_or(Path::new("."));
+    tempfile::Builder::new().prefix(TEMPORARY_PREFIX).tempfile_in(existing).map(drop).map_err(io("write in", folder))
+}
+
 /// Writes a document as JSON, in one piece.
 ///
 /// # Errors
@@ -197,63 +252,25 @@ pub fn write_json(path: &Path, document: &impl Serialize) -> Result<()> {
     write_atomically(path, &text)
 }
 
-/// Brings the names in a folder to the disk.
+/// Brings the names in a folder to the disk, where the file system can do that.
 ///
 /// # Errors
 /// The operating system's.
 pub fn sync_folder(path: &Path) -> Result<()> {
-    File::open(path).and_then(|folder| folder.sync_all()).map_err(io("sync", path))
+    let synced = match File::open(path) {
+        // A folder may be writable and not readable.
+        Err(error) if error.kind() == ErrorKind::PermissionDenied => Ok(()),
+        opened => opened.and_then(|folder| folder.sync_all()),
+    };
+    unless_unsupported(Operation::Sync, synced, path).map(drop).map_err(io("sync", path))
 }
 
-/// An advisory lock: it ends with the process that holds it, however it ends.
-#[derive(Debug)]
-pub struct Lock(File);
-
-impl Drop for Lock {
-    /// A process that is just being started has copies of all open files for a moment: closing this one does not unlock it.
-    fn drop(&mut self) {
-        let _ = self.0.unlock(); // a failure leaves it to the closing
-    }
-}
-
-impl Lock {
-    /// Takes the lock of the folder at `path`, or of a file, which is created if it is not there; `None` while somebody
-    /// else has it. Who only asks whether [somebody has it](is_locked) does not count.
-    ///
-    /// # Errors
-    /// The operating system's.
-    pub fn try_take(path: &Path) -> Result<Option<Self>> {
-        let file = if path.is_dir() {
-            File::open(path)
-        } else {
-            // NFS wants both: to read for asking who has it, to write for having it.
-            let mut options = File::options();
-            options.create(true).truncate(false).read(true).write(true).custom_flags(nonblocking_flag()).open(path)
-        };
-        let file = file.map_err(io("open", path))?;
-        for _ in 0..MAX_LOCK_TRIES {
-            match file.try_lock() {
-                Ok(()) => return Ok(Some(Self(file))),
-                Err(TryLockError::WouldBlock) => {}
-                Err(TryLockError::Error(source)) => return Err(io("lock", path)(source)),
-            }
-            // Who has it shares it with nobody; who only looks shares it with anybody.
-            match file.try_lock_shared() {
-                Ok(()) => file.unlock().map_err(io("unlock", path))?,
-                Err(TryLockError::WouldBlock) => return Ok(None),
-                Err(TryLockError::Error(source)) => return Err(io("lock", path)(source)),
-            }
-            std::thread::sleep(LOCK_RETRY_INTERVAL);
-        }
-        Ok(None)
-    }
-}
-
-/// Whether somebody has the lock of the folder or file at `path`. It is shared for a moment, which
-/// [keeps nobody from taking it](Lock::try_take).
-pub fn is_locked(path: &Path) -> bool {
-    let Ok(file) = File::options().read(true).custom_flags(nonblocking_flag()).open(path) else { return false };
-    matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock))
+/// Brings the content of `file`, which is at `path`, to the disk, where the file system can do that.
+///
+/// # Errors
+/// The operating system's.
+pub fn sync_file(file: &File, path: &Path) -> std::io::Result<()> {
+    unless_unsupported(Operation::Sync, file.sync_all(), path).map(drop)
 }
 
 /// `None` if what was asked for is not there.
@@ -267,17 +284,6 @@ fn if_there<T>(result: std::io::Result<T>) -> std::io::Result<Option<T>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn lock_ends_with_its_value_despite_inherited_files() {
-        let directory = tempfile::tempdir().unwrap();
-        let lock = Lock::try_take(directory.path()).unwrap().unwrap();
-        let copy = lock.0.try_clone().unwrap(); // as a process gets it
-        assert!(Lock::try_take(directory.path()).unwrap().is_none());
-        drop(lock);
-        assert!(Lock::try_take(directory.path()).unwrap().is_some());
-        drop(copy);
-    }
 
     #[test]
     fn a_file_that_is_written_whole_is_as_readable_as_others() {
@@ -318,6 +324,31 @@ mod tests {
     }
 
     #[test]
+    fn toml_beyond_a_limit_is_not_read() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("plan.toml");
+        fs::write(&path, vec![b'#'; MAX_TOML_BYTES as usize]).unwrap();
+        assert_eq!(read_toml(&path).unwrap().len() as u64, MAX_TOML_BYTES);
+        fs::write(&path, vec![b'#'; MAX_TOML_BYTES as usize + 1]).unwrap();
+        assert!(read_toml(&path).unwrap_err().to_string().contains("it has 262145 bytes, expected 262144 at most"));
+    }
+
+    #[test]
+    fn a_file_replaces_another_also_by_copying() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("file");
+        fs::write(&path, "the longer one before").unwrap();
+        let mut file = temporary_beside(&path, TEMPORARY_PREFIX).unwrap();
+        file.write_all(b"new").unwrap();
+        copy(&file, &path).unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"new");
+        file.write_all(b"er").unwrap();
+        replace(file, &path).unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"newer");
+        assert_eq!(list(directory.path()).unwrap(), [path], "nothing temporary");
+    }
+
+    #[test]
     fn that_the_system_cannot_tell_is_not_taken_for_nothing() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("loop");
@@ -342,31 +373,5 @@ mod tests {
     fn the_machines_faults_are_told_from_what_is_in_a_folder(#[case] code: i32, #[case] is_fault: bool) {
         let error = io("read", Path::new("file"))(std::io::Error::from_raw_os_error(code));
         assert_eq!(error.is_fault(), is_fault, "{error}");
-    }
-
-    #[test]
-    fn a_lock_is_had_while_others_look_whether_it_is_taken() {
-        let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("lock");
-        drop(Lock::try_take(&path).unwrap());
-        let looks = File::open(&path).unwrap();
-        looks.lock_shared().unwrap();
-        let begun = std::time::Instant::now();
-        assert!(Lock::try_take(&path).unwrap().is_none(), "who looks for ever");
-        assert!(begun.elapsed() >= MAX_LOCK_TRIES * LOCK_RETRY_INTERVAL, "was waited for");
-        looks.unlock().unwrap();
-        let _lock = Lock::try_take(&path).unwrap().unwrap();
-        assert!(is_locked(&path) && Lock::try_take(&path).unwrap().is_none());
-    }
-
-    #[test]
-    fn a_lock_is_held_by_one_at_a_time() {
-        let directory = tempfile::tempdir().unwrap();
-        for path in [directory.path(), &directory.path().join("lock")] {
-            let lock = Lock::try_take(path).unwrap();
-            assert!(lock.is_some() && Lock::try_take(path).unwrap().is_none());
-            drop(lock);
-            assert!(Lock::try_take(path).unwrap().is_some());
-        }
     }
 }

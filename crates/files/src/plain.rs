@@ -5,6 +5,8 @@ use std::io::{Error, ErrorKind};
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
+use rustix::io::Errno;
+
 use super::{Result, if_there, io};
 
 /// Nothing that is read whole is larger, bytes.
@@ -64,7 +66,7 @@ pub fn read_plain(path: &Path, most: u64) -> Result<Option<Vec<u8>>> {
 /// # Errors
 /// As those of [`read_plain`]; a file that is not there or not UTF-8.
 pub fn read_plain_text(path: &Path, most: u64) -> Result<String> {
-    let content = read_plain(path, most)?.ok_or_else(|| io("read", path)(ErrorKind::NotFound.into()))?;
+    let content = read_plain(path, most)?.ok_or_else(|| io("read", path)(Errno::NOENT.into()))?;
     String::from_utf8(content).map_err(|error| io("read", path)(Error::new(ErrorKind::InvalidData, error.utf8_error())))
 }
 
@@ -106,7 +108,6 @@ mod tests {
             assert!(error.to_string().contains(words) && !error.is_fault(), "{name}: {error}");
             assert!(super::super::read_if_there(&path(name)).is_err());
         }
-        assert!(!super::super::is_locked(&path("pipe")), "it is asked without waiting");
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io;
-use std::net::{IpAddr, SocketAddr};
+use std::net::{IpAddr, SocketAddr, ToSocketAddrs};
 use std::time::Duration;
 
 use hyper_util::rt::TokioIo;
@@ -21,6 +21,7 @@ use crate::address::Address;
 use crate::credentials::{Credentials, WithToken};
 use crate::encryption::{Connector, speaks_tls};
 use crate::error::{ClientError, REPLY_TIMEOUT, describe, lost, system_words, timed_out};
+use crate::escape::escape_catalogue;
 use crate::limits::SERVICE;
 use crate::proto::{self, perturb_client::PerturbClient};
 
@@ -60,6 +61,7 @@ pub type Client = PerturbClient<InterceptedService<Channel, WithToken>>;
 pub struct Connection {
     address: Address,
     client: Client,
+    health: HealthClient<Channel>,
     timeouts: Timeouts,
 }
 
@@ -165,10 +167,11 @@ impl Connection {
         };
         let channel = channel.map_err(transport)?;
         takes_sessions(address, &channel).await?;
+        let health = HealthClient::new(channel.clone());
         let client = PerturbClient::with_interceptor(channel, token)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
-        Ok(Self { address: address.clone(), client, timeouts })
+        Ok(Self { address: address.clone(), client, health, timeouts })
     }
 
     /// The address of the server.
@@ -186,6 +189,17 @@ impl Connection {
         self.client.clone()
     }
 
+    /// Whether the server answers anything within `limit`.
+    pub async fn is_alive(&self, limit: Duration) -> bool {
+        let mut health = self.health.clone();
+        match timeout(limit, health.check(HealthCheckRequest { service: SERVICE.into() })).await {
+            Err(_) => false,
+            Ok(Ok(_)) => true,
+            // Without a source it is the server's own answer, and not an error of the connection.
+            Ok(Err(status)) => std::error::Error::source(&status).is_none(),
+        }
+    }
+
     /// Requests the server's catalogue of environments.
     ///
     /// # Errors
@@ -196,7 +210,11 @@ impl Connection {
         tokio::time::timeout(self.timeouts.reply, client.list_environments(proto::ListEnvironmentsRequest {}))
             .await
             .map_err(|_| timed_out(&self.address, what, self.timeouts.reply))?
-            .map(tonic::Response::into_inner)
+            .map(|reply| {
+                let mut catalogue = reply.into_inner();
+                escape_catalogue(&mut catalogue);
+                catalogue
+            })
             .map_err(|status| match status.code() {
                 Code::Unimplemented => ClientError::NotPerturb { address: self.address.clone() },
                 _ => lost(&self.address, what, &status),
@@ -243,13 +261,24 @@ pub async fn resolve(address: &Address) -> Result<ResolvedAddresses, ClientError
         return Ok(one());
     }
     let fail = |reason| ClientError::Connect { address: address.clone(), reason };
-    let found: Vec<SocketAddr> = timeout(CONNECT_TIMEOUT, tokio::net::lookup_host((&**host, *port)))
+    let found: Vec<SocketAddr> = timeout(CONNECT_TIMEOUT, look_up(host, *port))
         .await
         .map_err(|_| fail(format!("its name was not resolved within {} s", CONNECT_TIMEOUT.as_secs())))?
-        .map_err(|error| fail(format!("its name cannot be resolved: {error}")))?
-        .collect();
+        .map_err(|error| fail(format!("its name cannot be resolved: {error}")))?;
     // A name that means a single machine says more than its number.
     Ok(if found.len() > 1 { sorted(found, tls.as_deref()) } else { one() })
+}
+
+/// Resolves a name in a thread of its own. Nobody waits for it when the resolver hangs, and no panic follows where no
+/// thread can be started, as with tokio's own.
+async fn look_up(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
+    let name = host.to_owned();
+    let (sender, found) = tokio::sync::oneshot::channel();
+    let resolve = move || {
+        let _ = sender.send((name.as_str(), port).to_socket_addrs().map(Vec::from_iter)); // nobody may wait any more
+    };
+    std::thread::Builder::new().name("resolver".into()).spawn(resolve)?;
+    found.await.unwrap_or_else(|_| Err(io::ErrorKind::Interrupted.into()))
 }
 
 fn sorted(mut found: Vec<SocketAddr>, tls: Option<&str>) -> ResolvedAddresses {

@@ -3,6 +3,7 @@
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
+use perturb_system::read_plain;
 use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer, pem::PemObject};
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
@@ -23,6 +24,11 @@ pub const INSECURE: &str = "PERTURB_INSECURE";
 /// Files in which systems keep the authorities that they trust: Debian, Red Hat, Alpine and SUSE.
 const SYSTEM_CA: [&str; 3] =
     ["/etc/ssl/certs/ca-certificates.crt", "/etc/pki/tls/certs/ca-bundle.crt", "/etc/ssl/ca-bundle.pem"];
+
+/// Maximum size of a file with certificates or a key, in bytes. A system's authorities have some 250 kB.
+const MAX_CERTIFICATES_BYTES: u64 = 16 << 20;
+/// Maximum size of a file with a token, in bytes.
+const MAX_TOKEN_FILE_BYTES: u64 = 64 << 10;
 
 /// Looks a variable up.
 type Variable<'a> = &'a dyn Fn(&str) -> Option<OsString>;
@@ -117,8 +123,12 @@ fn identity(variable: Variable<'_>) -> Result<Option<Identity>, String> {
     match (file(CERT, variable), file(KEY, variable)) {
         (None, None) => Ok(None),
         (Some(cert), Some(key)) => {
-            let wrong = |error| format!("{KEY}={}: {error}; expected a private key in PEM", key.display());
-            Ok(Some((certificates(CERT, &cert)?, PrivateKeyDer::from_pem_file(&key).map_err(wrong)?)))
+            let wrong = |reason: &dyn std::fmt::Display| {
+                format!("{KEY}={}: {reason}; expected a private key in PEM", key.display())
+            };
+            let chain = certificates(CERT, &cert)?;
+            let content = read_plain(&key, MAX_CERTIFICATES_BYTES).map_err(|error| wrong(&error))?;
+            Ok(Some((chain, PrivateKeyDer::from_pem_slice(&content).map_err(|error| wrong(&error))?)))
         }
         (Some(_), None) => Err(format!("{CERT} is set and {KEY} is not; both are expected, or none")),
         (None, Some(_)) => Err(format!("{KEY} is set and {CERT} is not; both are expected, or none")),
@@ -128,7 +138,8 @@ fn identity(variable: Variable<'_>) -> Result<Option<Identity>, String> {
 fn certificates(what: &str, path: &Path) -> Result<Vec<CertificateDer<'static>>, String> {
     let wrong =
         |reason: &dyn std::fmt::Display| format!("{what}={}: {reason}; expected certificates in PEM", path.display());
-    let all = CertificateDer::pem_file_iter(path).and_then(Iterator::collect::<Result<Vec<_>, _>>);
+    let content = read_plain(path, MAX_CERTIFICATES_BYTES).map_err(|error| wrong(&error))?;
+    let all = CertificateDer::pem_slice_iter(&content).collect::<Result<Vec<_>, _>>();
     let all = all.map_err(|error| wrong(&error))?;
     if all.is_empty() { Err(wrong(&"there is no certificate")) } else { Ok(all) }
 }
@@ -137,8 +148,8 @@ fn token(path: &Path) -> Result<BearerHeader, String> {
     let wrong = |reason: &dyn std::fmt::Display| {
         format!("{TOKEN_FILE}={}: {reason}; expected one line with a token", path.display())
     };
-    let text = std::fs::read_to_string(path).map_err(|error| wrong(&error))?;
-    let text = text.trim();
+    let content = read_plain(path, MAX_TOKEN_FILE_BYTES).map_err(|error| wrong(&error))?;
+    let text = std::str::from_utf8(&content).map_err(|error| wrong(&error))?.trim();
     if text.is_empty() || !text.bytes().all(|byte| byte.is_ascii_graphic()) {
         return Err(wrong(&"there is none"));
     }

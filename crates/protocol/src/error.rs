@@ -7,7 +7,9 @@ use std::time::Duration;
 use tonic::{Code, Status};
 
 use crate::address::Address;
+use crate::escape::escape_lines;
 use crate::names::UnknownEnvironment;
+use crate::process_limit::spawn_failure;
 
 /// Default timeout of a reply. Even a batch of thousands of environments replies much sooner.
 pub const REPLY_TIMEOUT: Duration = Duration::from_secs(60);
@@ -52,6 +54,13 @@ pub enum ClientError {
     /// A reply did not come in time.
     #[error("the server at {address} did not answer {request} within {} s", limit.as_secs_f64())]
     TimedOut { address: Address, request: &'static str, limit: Duration },
+    /// The program was asked to end while it waited for a server.
+    #[error("stopped by signal {signal} while {action}")]
+    Stopped {
+        signal: i32,
+        /// The wait, as in "connecting".
+        action: String,
+    },
     /// A reply does not follow the protocol.
     #[error("the server at {address} answered {request} with {got}, expected {expected}: are both of one version?")]
     Protocol { address: Address, request: &'static str, got: String, expected: String },
@@ -95,7 +104,7 @@ pub enum ClientError {
     )]
     Tasks { tasks: Vec<PathBuf> },
     /// The operating system refused something that a client needs.
-    #[error("cannot {action}: {source}")]
+    #[error("cannot {action}: {}", spawn_failure(source))]
     System { action: &'static str, source: std::io::Error },
 }
 
@@ -118,11 +127,17 @@ impl ClientError {
         Self::NoneConnects { reasons: errors.iter().map(Self::in_short).collect::<Vec<_>>().join("; ") }
     }
 
+    /// The signal by which the program was asked to end, if that is the error.
+    pub fn signal(&self) -> Option<i32> {
+        if let Self::Stopped { signal, .. } = self { Some(*signal) } else { None }
+    }
+
     /// Whether the request may succeed later or with another server: the request itself is not at fault.
     pub fn can_be_retried(&self) -> bool {
         match self {
             Self::Refused { code, .. } => *code == Code::ResourceExhausted, // full until other sessions end
-            Self::Snapshots { .. } | Self::NoEnvironment(_) | Self::Unsafe { .. } | Self::Tasks { .. } => false,
+            Self::Snapshots { .. } | Self::NoEnvironment(_) | Self::Unsafe { .. } => false,
+            Self::Tasks { .. } | Self::Stopped { .. } => false,
             Self::Connect { .. }
             | Self::NotPerturb { .. } // a name may resolve to another machine later
             | Self::NoneConnects { .. }
@@ -168,13 +183,13 @@ fn when(request: &str) -> String {
     if request.starts_with("to ") { format!("when it was {request}") } else { format!("during {request}") }
 }
 
-/// The reason why a call ended: the server's message, if there is one.
+/// The reason why a call ended: the server's message, if there is one, escaped.
 pub(crate) fn describe(status: &Status) -> String {
     match std::error::Error::source(status) {
         // Messages of the transport are about frames and streams, which does not help users.
         Some(cause) => system_words(cause).unwrap_or_else(|| "the connection broke off".into()),
         None if status.message().is_empty() => format!("{:?}", status.code()),
-        None => status.message().to_owned(),
+        None => escape_lines(status.message()),
     }
 }
 

@@ -4,7 +4,6 @@
 //! before (64 zeros before the first), a space, and the JSON. So a line cannot be changed, left out or added without changing
 //! all digests behind it. A single digest proves everything up to it.
 
-use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read as _};
 use std::path::{Path, PathBuf};
 
@@ -215,7 +214,7 @@ pub struct Read {
 /// [`Error`].
 pub fn read(path: &Path, mut each: impl FnMut(LedgerEntry, &str)) -> Result<Read, Error> {
     let io = |source| Error::Io { path: path.to_owned(), source };
-    let mut file = BufReader::new(File::open(path).map_err(io)?);
+    let mut file = BufReader::new(perturb_system::open_plain(path).map_err(io)?.0);
     let mut read = Read { chain: Chain::default(), bytes: 0, unfinished: 0 };
     let mut line = Vec::new();
     loop {

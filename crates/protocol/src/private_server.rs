@@ -15,6 +15,7 @@ use tempfile::TempDir;
 
 use crate::address::{Address, AddressError};
 use crate::error::ClientError;
+use crate::process_limit::spawn_failure;
 
 const PROGRAM: &str = "perturb-server";
 /// Variable with the path of the program.
@@ -27,6 +28,8 @@ const TASK_TIMEOUT: Duration = Duration::from_secs(120);
 const REFUSED_STATUS: i32 = 2;
 /// Time that a server has to end before it is killed.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(5);
+/// Interval at which a starting or ending server is looked at.
+const STOP_POLL_INTERVAL: Duration = Duration::from_millis(50);
 /// Time to wait for a server's last lines after its end.
 const STDERR_TIMEOUT: Duration = Duration::from_secs(1);
 
@@ -39,6 +42,7 @@ static STDERR_HANDLER: OnceLock<fn(String)> = OnceLock::new();
 /// The server runs in its own process group, so that Ctrl-C reaches only this process, which can then finish its work.
 #[derive(Debug)]
 pub struct PrivateServer {
+    program: PathBuf,
     process: Process,
     address: Address,
     workers: Option<usize>,
@@ -56,15 +60,20 @@ impl PrivateServer {
     /// [`ClientError::NoServerProgram`] if the program is missing, [`ClientError::Start`] if it ends or does not listen within
     /// 20 s.
     pub fn start(workers: Option<usize>) -> Result<Self, ClientError> {
-        Self::start_with_tasks(workers, &[])
+        Self::start_unless(workers, &[], &|| None)
     }
 
-    /// Starts a server like [`PrivateServer::start`] that also serves the tasks in the folders `tasks`.
+    /// Starts a server like [`PrivateServer::start`] that also serves the tasks in the folders `tasks`, unless `stopped`
+    /// gives the signal by which this process was asked to end.
     ///
     /// # Errors
-    /// Those of [`PrivateServer::start`], with two more minutes for each folder; [`ClientError::Tasks`] if the server refuses a
-    /// folder, after it wrote the reason to standard error.
-    pub fn start_with_tasks(workers: Option<usize>, tasks: &[PathBuf]) -> Result<Self, ClientError> {
+    /// Those of [`PrivateServer::start`], with two more minutes for each folder; [`ClientError::Stopped`];
+    /// [`ClientError::Tasks`] if the server refuses a folder, after it wrote the reason to standard error.
+    pub fn start_unless(
+        workers: Option<usize>,
+        tasks: &[PathBuf],
+        stopped: &dyn Fn() -> Option<i32>,
+    ) -> Result<Self, ClientError> {
         let program = find_program()?;
         let system = |action| move |source| ClientError::System { action, source };
         let directory =
@@ -83,8 +92,8 @@ impl PrivateServer {
                 ),
             })?;
 
-        let process = spawn(&program, &address, workers, tasks)?;
-        Ok(Self { process, address, workers, tasks: tasks.to_vec(), directory })
+        let process = spawn(&program, &address, workers, tasks, stopped)?;
+        Ok(Self { program, process, address, workers, tasks: tasks.to_vec(), directory })
     }
 
     /// Passes every line that servers started from now on write to standard error to `handler`. Without it they write to this
@@ -97,12 +106,12 @@ impl PrivateServer {
     /// Ends the server, if it still runs, and starts it again at the same address.
     ///
     /// # Errors
-    /// Those of [`PrivateServer::start`].
-    pub fn restart(&mut self) -> Result<(), ClientError> {
-        self.process.end();
+    /// Those of [`PrivateServer::start_unless`].
+    pub fn restart(&mut self, stopped: &dyn Fn() -> Option<i32>) -> Result<(), ClientError> {
+        self.process.kill(); // one that runs does not answer
         let again = |source| ClientError::System { action: "create the server's private directory again", source };
         own_directory(self.directory.path()).map_err(again)?;
-        self.process = spawn(&find_program()?, &self.address, self.workers, &self.tasks)?;
+        self.process = spawn(&find_program()?, &self.address, self.workers, &self.tasks, stopped)?;
         Ok(())
     }
 
@@ -111,9 +120,22 @@ impl PrivateServer {
         &self.address
     }
 
+    /// The error of a server that listens but does not take sessions, for `reason`.
+    pub fn unusable(&mut self, reason: &str) -> ClientError {
+        thread::sleep(STOP_POLL_INTERVAL); // one that ends may be a moment behind its connections
+        let ended = self.exit_status().map(|status| format!("it ended with {status}"));
+        let reason = ended.unwrap_or_else(|| format!("it listens, but does not take sessions: {reason}"));
+        ClientError::Start { program: self.program.clone(), reason }
+    }
+
     /// The process id.
     pub fn process_id(&self) -> u32 {
         self.process.child.id()
+    }
+
+    /// Ends the server at once, for instance because it does not answer.
+    pub fn kill(&mut self) {
+        self.process.kill();
     }
 
     /// The exit status; `None` while the server runs.
@@ -173,8 +195,14 @@ fn own_directory(path: &Path) -> std::io::Result<()> {
     }
 }
 
-/// Starts `program`, and waits until it listens.
-fn spawn(program: &Path, address: &Address, workers: Option<usize>, tasks: &[PathBuf]) -> Result<Process, ClientError> {
+/// Starts `program`, and waits until it listens, unless `stopped` gives a signal.
+fn spawn(
+    program: &Path,
+    address: &Address,
+    workers: Option<usize>,
+    tasks: &[PathBuf],
+    stopped: &dyn Fn() -> Option<i32>,
+) -> Result<Process, ClientError> {
     let mut command = Command::new(program);
     command.arg("--listen").arg(address.to_string()).args(["--private", "--log", "warn"]);
     if let Some(workers) = workers {
@@ -190,27 +218,44 @@ fn spawn(program: &Path, address: &Address, workers: Option<usize>, tasks: &[Pat
         .stderr(if STDERR_HANDLER.get().is_some() { Stdio::piped() } else { Stdio::inherit() })
         .process_group(0)
         .spawn()
-        .map_err(|error| fail(error.to_string()))?;
-    let stderr_done = STDERR_HANDLER.get().zip(child.stderr.take()).map(|(handler, stderr)| {
-        let (sender, done) = channel();
-        thread::spawn(move || forward_stderr(stderr, handler, &sender));
-        done
+        .map_err(|error| fail(spawn_failure(&error)))?;
+    let (sender, stderr_done) = channel();
+    let stderr = STDERR_HANDLER.get().zip(child.stderr.take());
+    let forwarded = stderr.map(|(handler, stderr)| {
+        thread::Builder::new().name("stderr".into()).spawn(move || forward_stderr(stderr, handler, &sender))
     });
+    let stderr_done = forwarded.is_some().then_some(stderr_done);
     let timeout = START_TIMEOUT + TASK_TIMEOUT * u32::try_from(tasks.len()).unwrap_or(u32::MAX);
-    let ready = wait_until_ready(&mut child, timeout);
+    let output = child.stdout.take();
     let mut process = Process { child, stderr_done };
+    let begun = forwarded.transpose().and_then(|_| output.map(read_lines).transpose());
+    let ready = match begun {
+        Ok(lines) => wait_until_ready(&mut process.child, lines, timeout, stopped),
+        Err(error) => {
+            Err(NotReady::Reason(format!("a thread for its output cannot be started: {}", spawn_failure(&error))))
+        }
+    };
     match ready {
         Ok(()) => Ok(process),
-        Err(reason) => {
-            let is_refusal = process.exit_code() == Some(REFUSED_STATUS);
+        Err(not_ready) => {
+            let is_refusal = process.exit_code() == Some(REFUSED_STATUS) && !tasks.is_empty();
             process.kill();
-            Err(if is_refusal && !tasks.is_empty() {
-                ClientError::Tasks { tasks: tasks.to_vec() }
-            } else {
-                fail(reason)
+            Err(match not_ready {
+                NotReady::Stopped(signal) => {
+                    ClientError::Stopped { signal, action: "starting a private server".into() }
+                }
+                NotReady::Reason(_) if is_refusal => ClientError::Tasks { tasks: tasks.to_vec() },
+                NotReady::Reason(reason) => fail(reason),
             })
         }
     }
+}
+
+/// Why a server is not ready.
+enum NotReady {
+    Reason(String),
+    /// This process was asked to end, by the signal of this number.
+    Stopped(i32),
 }
 
 /// Passes the lines of `stderr` to `handler` until the end, so that the server never waits for a reader. The end is signalled by
@@ -222,33 +267,44 @@ fn forward_stderr(stderr: ChildStderr, handler: &fn(String), _done: &Sender<()>)
 }
 
 /// Waits until `child` prints that it listens.
-fn wait_until_ready(child: &mut Child, timeout: Duration) -> Result<(), String> {
-    let lines = child.stdout.take().map(read_lines).ok_or("its output cannot be read")?;
+fn wait_until_ready(
+    child: &mut Child,
+    lines: Option<Receiver<String>>,
+    timeout: Duration,
+    stopped: &dyn Fn() -> Option<i32>,
+) -> Result<(), NotReady> {
+    let lines = lines.ok_or_else(|| NotReady::Reason("its output cannot be read".into()))?;
     let deadline = Instant::now() + timeout;
     loop {
-        match lines.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
+        match lines.recv_timeout(STOP_POLL_INTERVAL) {
             Ok(line) if line.starts_with("listening on ") => return Ok(()),
             Ok(_) => {}
             Err(RecvTimeoutError::Timeout) => {
-                return Err(format!("it did not listen within {} s", timeout.as_secs()));
+                if let Some(signal) = stopped() {
+                    return Err(NotReady::Stopped(signal));
+                }
+                if Instant::now() >= deadline {
+                    return Err(NotReady::Reason(format!("it did not listen within {} s", timeout.as_secs())));
+                }
             }
             Err(RecvTimeoutError::Disconnected) => {
                 let status = child.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
-                return Err(format!("it ended with {status} before it listened"));
+                return Err(NotReady::Reason(format!("it ended with {status} before it listened")));
             }
         }
     }
 }
 
 /// Reads the lines of the output until its end, so that the server never waits for a reader.
-fn read_lines(output: ChildStdout) -> Receiver<String> {
+fn read_lines(output: ChildStdout) -> std::io::Result<Receiver<String>> {
     let (sender, receiver) = channel();
-    thread::spawn(move || {
+    let read = move || {
         for line in BufReader::new(output).lines().map_while(Result::ok) {
             let _ = sender.send(line); // nobody listens once the server is ready
         }
-    });
-    receiver
+    };
+    thread::Builder::new().name("stdout".into()).spawn(read)?;
+    Ok(receiver)
 }
 
 /// Finds the server's program: `$PERTURB_SERVER`, else beside the running program, else in its parent directory (tests run in

@@ -19,6 +19,7 @@ use crate::adaptive_spin::AdaptiveSpin;
 use crate::address::Address;
 use crate::connection::Connection;
 use crate::error::{ClientError, lost, timed_out};
+use crate::escape::{escape_environment, escape_lines};
 use crate::proto::{self, SessionRequest, SessionResponse, session_request::Request, session_response::Response};
 
 /// Requests that may wait in the channel before they are sent.
@@ -142,7 +143,8 @@ impl Stream {
         let arrived = VecDeque::new();
         let spin = AdaptiveSpin::default();
         let mut stream = Self { connection, raw, arrived, unanswered: 1, unrequested: None, spin, lease: None };
-        let opened = stream.receive::<proto::Open>().await?;
+        let mut opened = stream.receive::<proto::Open>().await?;
+        opened.environment.iter_mut().for_each(escape_environment);
         stream.lease = ClientLease::from_proto(&opened);
         Ok((stream, opened))
     }
@@ -243,7 +245,7 @@ impl Stream {
         };
         match message.map(|message| message.response) {
             Some(Some(Response::Error(proto::Error { code, message }))) => {
-                let address = self.address().clone();
+                let (address, message) = (self.address().clone(), escape_lines(&message));
                 Err(ClientError::Refused { address, request: A::NAME, code: Code::from_i32(code), message })
             }
             Some(Some(response)) => A::reply(response).map_err(|other| {

@@ -10,6 +10,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use perturb_files::checksum::WithChecksum;
 use perturb_files::{self as files, FileError, checksum, read_if_there};
@@ -27,6 +28,10 @@ use crate::success::Rule;
 pub const ASSESSMENT: &str = "assessment.json";
 /// Format of `assessment.json`; raised when older programs could misread it.
 const FORMAT_VERSION: u32 = 1;
+/// Maximum number of times that a folder is read while another program replaces it.
+const MAX_LOOKS: u32 = 3;
+/// Time between two of these readings.
+const LOOK_INTERVAL: Duration = Duration::from_millis(50);
 
 /// The tests of an agent in one environment.
 #[derive(Clone, Debug, PartialEq)]
@@ -202,11 +207,24 @@ impl ExternalEvaluation {
         path.join(ASSESSMENT).is_file()
     }
 
-    /// Reads what is in the folder `path`.
+    /// Reads what is in the folder `path`. Another program may be replacing it: a folder whose files do not belong together
+    /// is looked at again.
     ///
     /// # Errors
     /// [`ExternalEvaluationError`], which names the file.
     pub fn read(path: &Path) -> Result<Self> {
+        for _ in 1..MAX_LOOKS {
+            match Self::read_once(path) {
+                Err(error) if Self::is_in(path) && !matches!(error, ExternalEvaluationError::Format { .. }) => {
+                    std::thread::sleep(LOOK_INTERVAL);
+                }
+                read => return read,
+            }
+        }
+        Self::read_once(path)
+    }
+
+    fn read_once(path: &Path) -> Result<Self> {
         let json = path.join(ASSESSMENT);
         let Some(text) = read_if_there(&json)? else {
             return Err(ExternalEvaluationError::Missing { path: path.to_owned() });

@@ -1,5 +1,7 @@
 //! Test sets: a version of an environment, or parameters of your own.
 
+mod rows;
+
 use std::collections::BTreeMap;
 use std::str::FromStr;
 
@@ -7,6 +9,7 @@ use perturb_protocol::limits::DEFAULT_MAX_ENVS;
 use perturb_protocol::{Distribution, DistributionError, Version, decimal_comma, proto};
 use serde::{Deserialize, Serialize};
 
+pub use self::rows::set_of_csv;
 use crate::value_error::{ValueError, require};
 
 /// The values that named parameters may take; the others keep their version's.
@@ -233,35 +236,6 @@ pub fn set_of(name: &str, version: Version, assignments: Vec<Assignment>) -> Res
     Ok(TestSet { name: name.into(), version, contexts })
 }
 
-/// A set called `name` of the rows of a CSV file: a header of parameters, then a row for each context.
-///
-/// # Errors
-/// [`ValueError`], which names the line.
-pub fn set_of_csv(name: &str, version: Version, text: &[u8]) -> Result<TestSet, ValueError> {
-    let mut reader = csv::Reader::from_reader(text);
-    let wrong = |error: csv::Error| {
-        ValueError::new(name, format!("not understood ({error})"), "CSV: a header of parameters, then a row a context")
-    };
-    let header = reader.headers().map_err(wrong)?.clone();
-    let mut contexts = Vec::new();
-    for (row, record) in reader.records().enumerate() {
-        let record = record.map_err(wrong)?;
-        let mut context = Context::new();
-        for (parameter, value) in header.iter().zip(&record) {
-            let number = value.trim().parse::<f64>().ok().filter(|number| number.is_finite());
-            let refuse = || {
-                ValueError::new(format!("{name}: {parameter} in line {}", row + 2), format!("`{value}`"), "a number")
-            };
-            let earlier = context.insert(parameter.trim().into(), number.ok_or_else(refuse)?);
-            require(earlier.is_none(), format!("{name}: the column {parameter}"), "there twice", "there once")?;
-        }
-        contexts.push(context);
-    }
-    let expected = format!("1 to {MAX_CONTEXTS} rows of parameters");
-    require((1..=MAX_CONTEXTS).contains(&contexts.len()), name, format!("{} rows", contexts.len()), expected)?;
-    Ok(TestSet { name: name.into(), version, contexts: Contexts::Listed(contexts) })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -330,21 +304,6 @@ mod tests {
         for text in ["7,5..8,5", "7..8,5", "0,5..1"] {
             let error = set(&[&format!("force={text}")]).unwrap_err().to_string();
             assert!(error.contains("a decimal point"), "{error}");
-        }
-    }
-
-    #[test]
-    fn rows_of_a_file_are_contexts() {
-        let set = set_of_csv("rows", Version::R, b"length,mass\n0.5, 0.1\n1,0.2\n").unwrap();
-        assert_eq!(
-            set.listed(),
-            [context(&[("length", 0.5), ("mass", 0.1)]), context(&[("length", 1.0), ("mass", 0.2)])]
-        );
-        for (text, part) in
-            [("length\n", "0 rows"), ("length\nx\n", "length in line 2"), ("a,a\n1,2\n", "twice"), ("a,b\n1\n", "CSV")]
-        {
-            let error = set_of_csv("rows", Version::R, text.as_bytes()).unwrap_err().to_string();
-            assert!(error.contains(part), "{text}: {error}");
         }
     }
 

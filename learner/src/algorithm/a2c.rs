@@ -3,6 +3,7 @@
 use perturb_policy::{CollectUntil, Losses, Objective, Optimiser, Surrogate, UpdateRule};
 use perturb_settings::A2cConfig;
 
+use super::watch::UpdateWatch;
 use super::{Algorithm, AlgorithmState, BaseAlgorithm, UpdateStats, check_rollout, explained_variance};
 use crate::error::Result;
 use crate::policy::Policy;
@@ -71,6 +72,7 @@ impl BaseAlgorithm for A2c {
         let mut estimates: Vec<Estimates> = Vec::with_capacity(rollouts.len());
         let mut losses = Losses::default();
         let mut norms = 0.0;
+        let mut watch = UpdateWatch::new(&policy.stop, rollouts.len());
         for rollout in rollouts {
             check_rollout(rollout, policy, self.config.n_steps)?;
             let estimated = n_step_returns(&rollout.trajectories()?, gamma, bootstrap_truncation);
@@ -82,6 +84,7 @@ impl BaseAlgorithm for A2c {
             losses += loss;
             drop(batch);
             estimates.push(estimated);
+            watch.step()?;
         }
         let mean = |sum: f64| sum / rollouts.len() as f64;
         Ok(UpdateStats {

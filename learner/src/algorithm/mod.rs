@@ -3,6 +3,7 @@
 mod a2c;
 mod epopt;
 mod ppo;
+mod watch;
 
 pub use a2c::{A2c, n_step_returns};
 pub use epopt::{EpisodeSelection, Epopt};

@@ -5,6 +5,7 @@ use perturb_policy::{CollectUntil, GradientBatch, Losses, Objective, Optimiser, 
 use perturb_settings::{PpoConfig, SettingError};
 use rand_chacha::ChaCha8Rng;
 
+use super::watch::UpdateWatch;
 use super::{Algorithm, AlgorithmState, BaseAlgorithm, UpdateStats, check_rollout, explained_variance};
 use crate::error::Result;
 use crate::policy::Policy;
@@ -98,6 +99,7 @@ impl BaseAlgorithm for Ppo {
         let objective = self.objective();
         let mut losses = Losses::default();
         let mut norms = 0.0;
+        let mut watch = UpdateWatch::new(&policy.stop, n_epochs * batches.len() * n_minibatches);
         for _ in 0..n_epochs {
             for (batch, sequences) in &mut batches {
                 if n_minibatches > 1 {
@@ -109,6 +111,7 @@ impl BaseAlgorithm for Ppo {
                     norms += self.optimiser.step(loss.total, gradient, weights, learning_rate)?;
                     backend.weights_changed();
                     losses += loss;
+                    watch.step()?;
                 }
             }
         }

@@ -116,7 +116,7 @@ pub fn run_cells(servers: &Servers, jobs: &[CellJob<'_>], stop: &StopFlag, tell:
     let places: Vec<usize> = (0..all.len()).filter(|&place| all[place].training.is_some()).collect();
     if let Err(failure) = train(servers, &mut all, &places, stop, tell) {
         let left: Vec<usize> = places.iter().copied().filter(|&place| all[place].trained.is_none()).collect();
-        for place in left {
+        for place in left.into_iter().take_while(|_| stop.signal().is_none()) {
             // A cell that is refused must not stop the others, nor must a server that has no room for all at once.
             let alone = if places.len() == 1 || failure.fault == Fault::Server {
                 Err(failure.clone())
@@ -344,8 +344,7 @@ mod tests {
         std::os::unix::fs::symlink(&json, &json).unwrap(); // which the system cannot follow
         let Err(error) = earlier(&training) else { panic!("what cannot be seen may be there") };
         assert!(error.to_string().starts_with("cannot look for "), "{error}");
-        let lock = std::fs::File::open(&training).unwrap();
-        lock.try_lock().unwrap();
+        let _lock = perturb_files::Lock::try_take(&training).unwrap().unwrap();
         let Err(error) = earlier(&training) else { panic!("it is locked") };
         assert!(error.to_string().contains("another process trains in"), "{error}");
     }

@@ -49,13 +49,12 @@ impl Session<'_> {
     pub fn ask_to_play(&mut self, act: proto::Act) -> Result<(), ClientError> {
         let Self { servers, parts, .. } = self;
         let [part] = parts.as_mut_slice() else { return Err(not_played_together()) };
-        let sent = servers.block_on(async {
+        servers.wait_for(async {
             part.stream.send(act).await?;
             // Lets the task that drives the connection run before the caller computes for long.
             tokio::task::yield_now().await;
             Ok(())
-        });
-        sent.map_err(|error| servers.explain(error))
+        })
     }
 
     /// Waits for the reply to [`Session::ask_to_play`].

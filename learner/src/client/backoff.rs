@@ -16,8 +16,6 @@ const MIN_PAUSE: Duration = Duration::from_millis(100);
 const MAX_PAUSE: Duration = Duration::from_secs(10);
 /// Time after which the servers that answer go on without the others.
 const PARTIAL_RECONNECT_TIMEOUT: Duration = Duration::from_secs(5);
-/// Interval at which the stop flag is read.
-const STOP_POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Reconnects with growing pauses, and counts the time that was waited without progress.
 #[derive(Debug, Default)]
@@ -52,6 +50,9 @@ impl Backoff {
     /// Also waits for a server that is full if the run had already started.
     pub fn reconnect(&mut self, servers: &Servers, error: &ClientError, stop: &StopFlag) -> Reconnect {
         let ServerWait { limit, tell } = servers.wait();
+        if let Some(signal) = stop.signal() {
+            return Reconnect::Stopped { signal };
+        }
         if !self.is_passing(error) || self.waited >= limit {
             return Reconnect::TimedOut;
         }
@@ -61,7 +62,7 @@ impl Backoff {
         servers.block_on(async {
             tokio::select! {
                 biased;
-                signal = raised(stop) => Reconnect::Stopped { signal },
+                signal = stop.raised() => Reconnect::Stopped { signal },
                 reconnect = self.retry(servers) => reconnect,
             }
         })
@@ -109,16 +110,6 @@ fn pause(attempts: u32) -> Duration {
 fn is_full(error: &ClientError) -> bool {
     let (ClientError::Refused { code, .. } | ClientError::Lost { code, .. }) = error else { return false };
     *code == tonic::Code::ResourceExhausted
-}
-
-/// Waits for the signal that asks the program to end.
-async fn raised(stop: &StopFlag) -> i32 {
-    loop {
-        match stop.signal() {
-            Some(signal) => return signal,
-            None => sleep(STOP_POLL_INTERVAL).await,
-        }
-    }
 }
 
 #[cfg(test)]

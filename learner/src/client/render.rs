@@ -62,7 +62,7 @@ impl<'a> RenderSession<'a> {
             return Err(ClientError::System { action: "open an environment", source });
         };
         let opening = ServerShard::open(connection, std::slice::from_ref(options), 0..1, AutoresetMode::Disabled, 0);
-        let (part, opened) = servers.runtime().block_on(opening).map_err(|error| servers.explain(error))?;
+        let (part, opened) = servers.wait_for(opening)?;
         let environment = opened.environment.unwrap_or_default();
         observation.resize(environment.observation.len(), 0.0);
         part.stream.decode::<proto::Open>("observations", &opened.observations, observation)?;
@@ -153,12 +153,12 @@ impl<'a> RenderSession<'a> {
 
     fn request(&mut self, request: impl TypedRequest) -> Result<(), ClientError> {
         let Self { servers, part, .. } = self;
-        servers.runtime().block_on(part.stream.send(request)).map_err(|error| servers.explain(error))
+        servers.wait_for(part.stream.send(request))
     }
 
     fn reply<A: TypedRequest>(&mut self) -> Result<A::Reply, ClientError> {
         let Self { servers, part, .. } = self;
-        servers.runtime().block_on(part.stream.receive::<A>()).map_err(|error| servers.explain(error))
+        servers.wait_for(part.stream.receive::<A>())
     }
 
     fn begun_of<A: TypedRequest>(&self, started: Vec<proto::EpisodeStart>) -> Result<BegunEpisode, ClientError> {

@@ -2,12 +2,14 @@
 
 use std::io::ErrorKind;
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tokio::runtime::{Builder, Runtime};
 use tokio::sync::oneshot;
 
+use perturb_files::interrupt::StopFlag;
 use perturb_protocol::names::EnvironmentName;
 use perturb_protocol::{
     Address, ClientError, Connection, PrivateServer, ResolvedAddresses, Timeouts, connect, connect_any, resolve,
@@ -16,6 +18,12 @@ use perturb_settings::Common;
 
 use super::options::{ActorLocation, ServerWait};
 use crate::proto;
+
+/// Time that a server has to show that it is alive after this program was asked to end. A reply of a server that answers
+/// is waited for.
+const LIFE_SIGN_TIMEOUT: Duration = Duration::from_secs(1);
+/// Time that a request is waited for before its server has to show that.
+const LIFE_SIGN_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Connections to servers, all of which serve the same environments.
 #[derive(Debug)]
@@ -28,6 +36,9 @@ pub struct Servers {
     named: Vec<Address>,
     act: ActorLocation,
     wait: ServerWait,
+    stop: StopFlag,
+    /// Set when the program was asked to end and a server did not answer: nothing is waited for any more.
+    has_given_up: AtomicBool,
 }
 
 impl Servers {
@@ -46,6 +57,11 @@ impl Servers {
         self.wait
     }
 
+    /// The flag that is raised when the program is asked to end.
+    pub(crate) fn stop(&self) -> &StopFlag {
+        &self.stop
+    }
+
     /// Whether the server is a private one of this process, which [`Servers::reconnect`] starts again.
     pub(super) fn is_private(&self) -> bool {
         self.local.is_some()
@@ -60,12 +76,22 @@ impl Servers {
     /// `tasks`, and connects to it.
     ///
     /// # Errors
-    /// Those of [`PrivateServer::start_with_tasks`] and of [`Servers::connect`].
-    pub fn local(workers: Option<usize>, tasks: &[PathBuf]) -> Result<Self, ClientError> {
-        let server = PrivateServer::start_with_tasks(workers, tasks)?;
-        let mut servers = Self::connect(std::slice::from_ref(server.address()))?;
-        servers.local = Some(Mutex::new(server));
-        Ok(servers)
+    /// Those of [`PrivateServer::start_unless`] and of [`Servers::connect`].
+    pub fn local(workers: Option<usize>, tasks: &[PathBuf], stop: &StopFlag) -> Result<Self, ClientError> {
+        let mut server = PrivateServer::start_unless(workers, tasks, &|| stop.signal())?;
+        match Self::connect_until(std::slice::from_ref(server.address()), stop) {
+            Ok(servers) => Ok(Self { local: Some(Mutex::new(server)), ..servers }),
+            Err(error @ ClientError::Stopped { .. }) => {
+                server.kill(); // it does not answer
+                Err(error)
+            }
+            // Nobody gave its address, so nobody can correct it.
+            Err(error) => Err(server.unusable(&match error {
+                ClientError::Connect { reason, .. } => reason,
+                ClientError::NotPerturb { .. } => "it is no perturb-server".into(),
+                error => error.to_string(),
+            })),
+        }
     }
 
     /// Connects to every server of `addresses`, at least one. The servers share each batch. A name that resolves to several
@@ -74,16 +100,38 @@ impl Servers {
     /// # Errors
     /// [`ClientError::Connect`] if one does not answer within some seconds, or is shutting down.
     pub fn connect(addresses: &[Address]) -> Result<Self, ClientError> {
-        let runtime = runtime()?;
-        let connections = addresses.iter().map(|address| runtime.block_on(one(address))).collect::<Result<_, _>>()?;
-        Ok(Self { named: addresses.to_vec(), ..Self::new(connections, runtime) })
+        Self::connect_until(addresses, &StopFlag::default())
     }
 
-    fn new(connections: Vec<Connection>, runtime: Runtime) -> Self {
+    /// Connects as [`Servers::connect`] does, unless `stop` is raised first. When it is raised later, a request to a server
+    /// that gives no sign of life ends within about a second.
+    ///
+    /// # Errors
+    /// Those of [`Servers::connect`], and [`ClientError::Stopped`].
+    pub fn connect_until(addresses: &[Address], stop: &StopFlag) -> Result<Self, ClientError> {
+        let runtime = runtime()?;
+        let connections = runtime.block_on(unless_stopped(stop, async {
+            let mut connections = Vec::with_capacity(addresses.len());
+            for address in addresses {
+                connections.push(one(address).await?);
+            }
+            Ok(connections)
+        }))?;
+        Ok(Self { named: addresses.to_vec(), ..Self::new(connections, runtime, stop) })
+    }
+
+    fn new(connections: Vec<Connection>, runtime: Runtime, stop: &StopFlag) -> Self {
         let named = connections.iter().map(|connection| connection.address().clone()).collect();
-        let act = ActorLocation::default();
-        let wait = ServerWait::default();
-        Self { connections: Mutex::new(connections), runtime, local: None, named, act, wait }
+        Self {
+            connections: Mutex::new(connections),
+            runtime,
+            local: None,
+            named,
+            act: ActorLocation::default(),
+            wait: ServerWait::default(),
+            stop: stop.clone(),
+            has_given_up: AtomicBool::new(false),
+        }
     }
 
     /// Connects again to the servers that answer, at least one. Returns the errors of the others. A private server is started
@@ -93,7 +141,7 @@ impl Servers {
     /// The errors of all servers, if none answers.
     pub(super) async fn reconnect(&self) -> Result<Vec<ClientError>, ClientError> {
         if let Some(local) = &self.local {
-            local.lock().unwrap_or_else(PoisonError::into_inner).restart()?;
+            local.lock().unwrap_or_else(PoisonError::into_inner).restart(&|| self.stop.signal())?;
         }
         let mut there = Vec::new();
         let mut errors = Vec::new();
@@ -115,10 +163,10 @@ impl Servers {
     ///
     /// # Errors
     /// [`ClientError::Connect`] if there is only one and it does not take sessions, [`ClientError::NoneConnects`] if none
-    /// of several does.
-    pub fn connect_to_one(addresses: &[Address], turn: usize) -> Result<Self, ClientError> {
+    /// of several does, [`ClientError::Stopped`] if `stop` is raised first.
+    pub fn connect_to_one(addresses: &[Address], turn: usize, stop: &StopFlag) -> Result<Self, ClientError> {
         let runtime = runtime()?;
-        let connection = runtime.block_on(async {
+        let connection = runtime.block_on(unless_stopped(stop, async {
             let (all, mut errors) = all_machines(addresses).await;
             match connect_any(&all.into_order(turn), Timeouts::default()).await {
                 Ok(connection) => Ok(connection),
@@ -127,8 +175,8 @@ impl Servers {
                     Err(ClientError::from_all(errors))
                 }
             }
-        })?;
-        Ok(Self::new(vec![connection], runtime))
+        }))?;
+        Ok(Self::new(vec![connection], runtime, stop))
     }
 
     /// Connects to all servers of `addresses` that take sessions, where every machine that a name resolves to counts. Returns
@@ -136,9 +184,9 @@ impl Servers {
     ///
     /// # Errors
     /// Those of [`Servers::connect_to_one`].
-    pub fn connect_to_some(addresses: &[Address]) -> Result<(Self, Vec<ClientError>), ClientError> {
+    pub fn connect_to_some(addresses: &[Address], stop: &StopFlag) -> Result<(Self, Vec<ClientError>), ClientError> {
         let runtime = runtime()?;
-        let (connections, errors) = runtime.block_on(async {
+        let (connections, errors) = runtime.block_on(unless_stopped(stop, async {
             let (all, mut errors) = all_machines(addresses).await;
             let mut connections = Vec::new();
             for address in &all.preferred {
@@ -153,12 +201,12 @@ impl Servers {
                     Err(others) => errors.extend(others),
                 }
             }
-            (connections, errors)
-        });
+            Ok((connections, errors))
+        }))?;
         if connections.is_empty() {
             return Err(ClientError::from_all(errors));
         }
-        Ok((Self::new(connections, runtime), errors))
+        Ok((Self::new(connections, runtime, stop), errors))
     }
 
     /// The addresses of the servers, one for each connection.
@@ -180,9 +228,45 @@ impl Servers {
         self.runtime.block_on(future)
     }
 
-    /// The runtime that drives the connections.
-    pub(super) fn runtime(&self) -> &Runtime {
-        &self.runtime
+    /// Waits for a request. After the program was asked to end, it waits only for servers that give signs of life.
+    ///
+    /// # Errors
+    /// Those of the request, [explained](Servers::explain); [`ClientError::Stopped`] if a server is silent then.
+    pub(crate) fn wait_for<T>(&self, request: impl Future<Output = Result<T, ClientError>>) -> Result<T, ClientError> {
+        let done = self.block_on(async {
+            tokio::select! {
+                biased;
+                done = request => done,
+                silent = self.silent_after_stop() => Err(silent),
+            }
+        });
+        done.map_err(|error| self.explain(error))
+    }
+
+    /// Waits until the program was asked to end and a server gives no sign of life.
+    async fn silent_after_stop(&self) -> ClientError {
+        let signal = self.stop.raised().await;
+        loop {
+            // Most requests are answered sooner, and servers mistrust clients that cancel many calls.
+            if !self.has_given_up() {
+                tokio::time::sleep(LIFE_SIGN_INTERVAL).await;
+            }
+            for connection in self.connections() {
+                if self.has_given_up() || !connection.is_alive(LIFE_SIGN_TIMEOUT).await {
+                    self.has_given_up.store(true, Ordering::Relaxed);
+                    if let Some(local) = &self.local {
+                        local.lock().unwrap_or_else(PoisonError::into_inner).kill();
+                    }
+                    let action = format!("waiting for the server at {}, which is silent", connection.address());
+                    return ClientError::Stopped { signal, action };
+                }
+            }
+        }
+    }
+
+    /// Whether the program was asked to end and a server was silent: nothing more is waited for then.
+    pub(super) fn has_given_up(&self) -> bool {
+        self.has_given_up.load(Ordering::Relaxed)
     }
 
     /// Runs `work`, which may take long, on this thread. Meanwhile another thread answers the servers' keepalive pings.
@@ -193,7 +277,10 @@ impl Servers {
         let runtime = &self.runtime;
         std::thread::scope(|scope| {
             // Ends when `done` is dropped, by the line below or by a panic in `work`.
-            scope.spawn(move || drop(runtime.block_on(end)));
+            let keep_alive = move || drop(runtime.block_on(end));
+            if let Err(error) = std::thread::Builder::new().name("keepalive".into()).spawn_scoped(scope, keep_alive) {
+                tracing::warn!("connections are not kept alive during an update, because no thread starts: {error}");
+            }
             let result = work();
             drop(done);
             result
@@ -211,7 +298,7 @@ impl Servers {
     }
 
     fn catalogue_of(&self, connection: &Connection) -> Result<proto::ListEnvironmentsResponse, ClientError> {
-        self.runtime.block_on(connection.catalogue()).map_err(|error| self.explain(error))
+        self.wait_for(connection.catalogue())
     }
 
     /// The entry `name` of the catalogues, in any [spelling](perturb_protocol::names). It must be the same in all of them.
@@ -299,6 +386,18 @@ async fn all_machines(addresses: &[Address]) -> (ResolvedAddresses, Vec<ClientEr
         }
     }
     (all, errors)
+}
+
+/// Waits for `connecting` until `stop` is raised.
+async fn unless_stopped<T>(
+    stop: &StopFlag,
+    connecting: impl Future<Output = Result<T, ClientError>>,
+) -> Result<T, ClientError> {
+    tokio::select! {
+        biased;
+        done = connecting => done,
+        signal = stop.raised() => Err(ClientError::Stopped { signal, action: "connecting".into() }),
+    }
 }
 
 /// Connects to the server at `address`.

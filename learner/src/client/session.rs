@@ -65,7 +65,7 @@ impl<'a> Session<'a> {
             // A Unix socket is lost only with its server.
             let lease = if matches!(connection.address(), Address::Tcp { .. }) { MAX_IN_FLIGHT } else { 0 };
             let opening = ServerShard::open(connection, options, range, AutoresetMode::SameStep, lease);
-            let (mut part, opened) = servers.runtime().block_on(opening).map_err(|error| servers.explain(error))?;
+            let (mut part, opened) = servers.wait_for(opening)?;
             if let [_, _, ..] = options {
                 part.stream.back_off_when_contended(); // groups often run beside others
             }
@@ -169,7 +169,7 @@ impl<'a> Session<'a> {
         let Some(part) = parts.iter_mut().find(|part| part.range.contains(&slot)) else { return Ok(()) };
         let mask = part.range.clone().map(|other| u8::from(other == slot)).collect();
         let request = proto::Reset { mask, ..request };
-        let done = servers.runtime().block_on(part.stream.ask(request)).map_err(|error| servers.explain(error))?;
+        let done = servers.wait_for(part.stream.ask(request))?;
         part.stream.decode::<proto::Reset>("observations", &done.observations, observation)
     }
 
@@ -208,7 +208,7 @@ impl<'a> Session<'a> {
         }
         let Self { servers, parts, observation_size: size, .. } = self;
         let mut observations = vec![0.0; slots.len() * *size];
-        let restored = servers.runtime().block_on(async {
+        servers.wait_for(async {
             for part in parts.iter_mut() {
                 for chunk in chunks(part.overlap(&slots)) {
                     let Some(mask) = part.mask(&chunk) else { continue };
@@ -220,8 +220,7 @@ impl<'a> Session<'a> {
                 }
             }
             Ok(())
-        });
-        restored.map_err(|error| servers.explain(error))?;
+        })?;
         Ok(observations)
     }
 
@@ -264,7 +263,7 @@ impl<'a> Session<'a> {
         let closing = self.parts.extract_if(.., |part| over(part)).map(|part| part.stream.close());
         let closing = futures_util::future::join_all(closing);
         // Within a runtime nothing can be waited for.
-        if Handle::try_current().is_err() {
+        if Handle::try_current().is_err() && !self.servers.has_given_up() {
             self.servers.block_on(closing);
         }
     }
@@ -277,7 +276,7 @@ impl<'a> Session<'a> {
         mut take: impl FnMut(&ServerShard, A::Reply) -> Result<(), ClientError>,
     ) -> Result<(), ClientError> {
         let Self { servers, parts, .. } = self;
-        let exchanged = servers.runtime().block_on(async {
+        servers.wait_for(async {
             for part in parts.iter_mut() {
                 let request = request(part);
                 part.asked = request.is_some();
@@ -291,8 +290,7 @@ impl<'a> Session<'a> {
                 outcome = outcome.and(taken);
             }
             outcome
-        });
-        exchanged.map_err(|error| servers.explain(error))
+        })
     }
 }
 

@@ -45,6 +45,10 @@ impl TestError {
 
     /// The signal that ended the test, if one did.
     pub fn signal(&self) -> Option<i32> {
-        if let Self::Stopped { signal } = self { Some(*signal) } else { None }
+        match self {
+            Self::Stopped { signal } => Some(*signal),
+            Self::Client(error) => error.signal(),
+            _ => None,
+        }
     }
 }

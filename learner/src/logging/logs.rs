@@ -6,7 +6,7 @@ use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use perturb_checkpoint::EnvironmentSummary;
-use perturb_files::{self as files, FileError, io, sync_folder};
+use perturb_files::{self as files, FileError, io, open_plain, sync_folder};
 use serde::{Deserialize, Serialize};
 
 use super::{Clock, Monitor, Progress, ProgressLog};
@@ -125,10 +125,11 @@ impl Logs {
 /// Opens a log for appending. It must have at least `length` bytes and, if it consists of `lines`, end a line there.
 fn open(path: &Path, length: u64, lines: bool) -> Result<File, LogError> {
     let changed = |reason| Err(LogError::Changed { path: path.to_owned(), reason });
-    let file = match OpenOptions::new().read(true).append(true).open(path) {
+    match open_plain(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => return changed("it is gone".into()),
         opened => opened.map_err(io("open", path))?,
     };
+    let file = OpenOptions::new().read(true).append(true).open(path).map_err(io("open", path))?;
     let got = file.metadata().map_err(io("look at", path))?.len();
     if got < length {
         return changed(format!("it has {got} bytes, but had {length}"));

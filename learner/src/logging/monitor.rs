@@ -108,7 +108,7 @@ impl Monitor {
     /// Flushes the file to the disk and returns its length.
     pub(super) fn sync(&mut self) -> std::io::Result<u64> {
         self.flush()?;
-        sync(&self.file)
+        sync(&self.file, "monitor.csv")
     }
 }
 

@@ -165,7 +165,7 @@ impl ProgressLog {
     /// Flushes both files to the disk. Returns the lengths of `progress.csv` and of the events.
     pub(super) fn sync(&mut self) -> std::io::Result<[u64; 2]> {
         self.csv.flush()?;
-        Ok([sync(self.csv.get_ref())?, self.events.sync()?])
+        Ok([sync(self.csv.get_ref(), "progress.csv")?, self.events.sync()?])
     }
 
     /// Adds a line and an event, and passes them to the operating system. A missing value is an empty cell.

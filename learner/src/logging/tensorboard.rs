@@ -78,7 +78,7 @@ impl EventWriter {
     /// Flushes the file to the disk and returns its length.
     pub(super) fn sync(&mut self) -> std::io::Result<u64> {
         self.file.flush()?;
-        sync(self.file.get_ref())
+        sync(self.file.get_ref(), "events.out.tfevents")
     }
 
     /// Adds scalars at `step`, `elapsed` seconds after the start, and passes them to the operating system.

@@ -93,6 +93,12 @@ pub enum TrainError {
         /// The error of the lost server.
         source: Box<TrainError>,
     },
+    /// The program was asked to end during a long update.
+    #[error("stopped by signal {signal} during an update, which was broken off")]
+    UpdateStopped {
+        /// The signal.
+        signal: i32,
+    },
     /// A training that had begun ended.
     #[error("{source}; {}", what_is_left(last.as_ref(), source))]
     Failed {
@@ -120,6 +126,16 @@ impl TrainError {
             Self::Restore { source, .. } | Self::Failed { source, .. } | Self::Stopped { source, .. } => {
                 source.of_server()
             }
+            _ => None,
+        }
+    }
+
+    /// The signal by which the program was asked to end, if that ended the training.
+    pub fn signal(&self) -> Option<i32> {
+        match self {
+            Self::Stopped { signal, .. } | Self::UpdateStopped { signal } => Some(*signal),
+            Self::Client(error) => error.signal(),
+            Self::Restore { source, .. } | Self::Failed { source, .. } => source.signal(),
             _ => None,
         }
     }

@@ -234,6 +234,7 @@ fn train_loop(
     report: &mut dyn FnMut(usize, &Progress),
     ended: &mut dyn FnMut(usize, Result<TrainOutcome>),
 ) -> Result<()> {
+    runs.iter_mut().for_each(|run| run.trainer.policy.set_stop(servers.stop()));
     let mut workspace = if let [first, _, ..] = runs.as_slice() { first.trainer.workspace()? } else { None };
     while !runs.is_empty() {
         let iteration = train_iteration(servers, collector, &mut runs, &mut workspace, stop, report);

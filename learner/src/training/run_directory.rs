@@ -118,9 +118,9 @@ impl RunDirectory {
             return Err(RunDirectoryError::IsFile { path: path.to_owned() });
         }
         let directory = Self::new(path, overwrite, false);
-        if path.exists() {
+        if Lock::is_there(path) {
             directory.lock()?;
-        }
+        } // otherwise it is locked when it is prepared: nothing may be created yet
         directory.earlier_run()?;
         Ok(directory)
     }

@@ -126,7 +126,8 @@ impl CollectRollouts for ServerSide<'_> {
         }
         while runs.iter().all(|run| run.end.is_none()) {
             let start = Instant::now();
-            let Some((mut lane, played)) = self.servers.block_on(self.playing.next()) else { break };
+            let next = self.servers.wait_for(async { Ok(self.playing.next().await) });
+            let Some((mut lane, played)) = next? else { break };
             self.waited += start.elapsed();
             let Some(run) = super::find(runs, lane.index) else { continue };
             let is_whole = lane.take(played, &mut run.trainer);

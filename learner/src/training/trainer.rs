@@ -14,6 +14,7 @@ use super::{LONG_UPDATE, LastCheckpoint, Result, RunDirectory, TrainError, Train
 use crate::algorithm::{Algorithm, UpdateStats};
 use crate::checkpoint::{Checkpoint, History, ResumeState, State};
 use crate::client::EndedEpisode;
+use crate::error::Error;
 use crate::logging::{Clock, EpisodeFigures, Logs, Progress, TimeShares};
 use crate::policy::{GradientWorkspace, Policy};
 use crate::rollout::{CollectorState, Rollout};
@@ -126,10 +127,14 @@ impl Trainer<'_> {
             self.policy.reuse_activations(player);
         }
         let remaining = self.progress_remaining();
-        let update = self.algorithm.update(&mut self.policy, &self.rollout, remaining)?;
+        let update =
+            self.algorithm.update(&mut self.policy, &self.rollout, remaining).map_err(|error| match error {
+                Error::Stopped { signal } => TrainError::UpdateStopped { signal },
+                error => error.into(),
+            })?;
         if let Some(player) = player {
             // At once, while the weights are in the processor's caches.
-            player.load(self.policy.flat_weights()).map_err(crate::error::Error::from)?;
+            player.load(self.policy.flat_weights()).map_err(Error::from)?;
         }
         let elapsed = start.elapsed();
         self.last_update = Some(elapsed);

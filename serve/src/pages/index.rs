@@ -12,6 +12,9 @@ use crate::index::{Index, MAX_FOLDERS, Row};
 use crate::paths::Root;
 use crate::server_status::ServerStatus;
 
+/// Maximum number of links out of the folder that are named.
+const MAX_SHOWN_LINKS: usize = 20;
+
 /// A polled server with its last answer, if there is one yet.
 type PolledServer<'a> = (&'a Address, Option<Result<ServerStatus, String>>);
 
@@ -58,6 +61,19 @@ fn runs(root: &Root, index: &Index) -> Markup {
         }
         @if index.more_runs > 0 {
             p { "And " (grouped(index.more_runs)) " more, which changed before these." }
+        }
+        @if !index.links_out.is_empty() {
+            p {
+                "Links that lead out of the folder are not followed: "
+                @for (place, link) in index.links_out.iter().take(MAX_SHOWN_LINKS).enumerate() {
+                    @if place > 0 { ", " }
+                    code { (link.path().display()) }
+                }
+                @if index.links_out.len() > MAX_SHOWN_LINKS {
+                    " and " (grouped(index.links_out.len() - MAX_SHOWN_LINKS)) " more"
+                }
+                "."
+            }
         }
         @if index.has_more_folders {
             p { "There are more than " (grouped(MAX_FOLDERS)) " folders; the others were not searched." }

@@ -10,16 +10,18 @@ pub(crate) mod training;
 
 use std::path::{Path, PathBuf};
 
+use axum::Extension;
 use axum::http::StatusCode;
-use axum::response::{Html, IntoResponse, Response};
+use axum::response::{IntoResponse, Response};
 use chrono::DateTime;
-use maud::{DOCTYPE, Markup, html};
+use maud::{DOCTYPE, Markup, PreEscaped, html};
 use perturb_experiment::runs::RunKind;
 use perturb_text::shortened;
 use serde_json::{Map, Value, json};
 
 use crate::cached_loader::CachedLoadError;
 use crate::error::ViewError;
+use crate::links::WayUp;
 use crate::paths::{RelativePath, Root};
 
 /// The content of a page.
@@ -51,6 +53,13 @@ pub(crate) struct ReportSource {
 }
 
 impl Update {
+    /// Makes the links of the page's parts relative.
+    pub(crate) fn with_relative_links(mut self, way_up: &WayUp) -> Self {
+        let relative = |part: &Markup| PreEscaped(way_up.relative_links(&part.0));
+        self.parts.iter_mut().for_each(|(_, part)| *part = relative(part));
+        self
+    }
+
     /// Returns the page as JSON for the script.
     pub(crate) fn to_json(&self) -> String {
         let parts: Map<String, Value> =
@@ -213,7 +222,11 @@ fn chart(name: &str, title: &str) -> Markup {
     }
 }
 
-/// Returns a page with a message in place of content.
+/// The text of a page with a message, whose links are not relative yet.
+#[derive(Clone, Debug)]
+pub(crate) struct MessagePage(pub(crate) String);
+
+/// Returns a page with a message in place of content. Its text is the extension [`MessagePage`] until links are relative.
 pub(crate) fn message_page(status: StatusCode, message: &str) -> Response {
     let page = html! {
         (DOCTYPE)
@@ -228,7 +241,7 @@ pub(crate) fn message_page(status: StatusCode, message: &str) -> Response {
             body { main { h1 { (status) } p { (message) } p { a href="/" { "All runs" } } } }
         }
     };
-    (status, Html(page.into_string())).into_response()
+    (status, Extension(MessagePage(page.into_string()))).into_response()
 }
 
 /// Time after which browsers ask again for a report that could not be built, in seconds.

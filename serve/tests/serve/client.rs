@@ -131,7 +131,12 @@ fn connect(address: SocketAddr) -> TcpStream {
 
 /// Serves `folder` until the test program ends.
 pub fn serve(folder: &Path) -> SocketAddr {
-    let options = ServeOptions { folder: folder.to_owned(), address: ([127, 0, 0, 1], 0).into(), server: None };
+    let options = ServeOptions {
+        folder: folder.to_owned(),
+        address: ([127, 0, 0, 1], 0).into(),
+        hosts: Vec::new(),
+        server: None,
+    };
     let (sender, receiver) = std::sync::mpsc::channel();
     std::thread::spawn(move || {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();

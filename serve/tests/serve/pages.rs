@@ -20,10 +20,10 @@ fn the_index_lists_runs_with_their_state_and_pictures() {
     assert_eq!(page.status, 200);
     assert!(page.head.contains("content-type: text/html"), "{}", page.head);
     for words in [
-        "href=\"/run/one\"",
+        "href=\"./run/one\"",
         "training: CartPole D a2c ff",
         "without a checkpoint",
-        "href=\"/run/study\"",
+        "href=\"./run/study\"",
         "experiment: CartPole",
         "1 of 2 cells",
         "92.0 %",
@@ -59,7 +59,7 @@ fn an_experiment_page_has_cells_rates_and_report() {
     let page = place.get("/run/study");
     assert_eq!(page.status, 200);
     for words in
-        ["1 of 2 cells done, 1 to do", "CartPole ppo ff, trained on D", "91.0", "93.0", "src=\"/report/study\""]
+        ["1 of 2 cells done, 1 to do", "CartPole ppo ff, trained on D", "91.0", "93.0", "src=\"../report/study\""]
     {
         assert!(page.body.contains(words), "{words} is not in {}", page.body);
     }
@@ -74,7 +74,7 @@ fn an_experiment_page_has_cells_rates_and_report() {
     let cell = place.path("study/cells").join(&plan.cells[0].id).join("training");
     write_training(&cell, 20);
     let page = place.get(&format!("/run/study/cells/{}/training", plan.cells[0].id));
-    assert!(page.body.contains("90.0 … 92.0") && page.body.contains("href=\"/run/study\""), "{}", page.body);
+    assert!(page.body.contains("90.0 … 92.0") && page.body.contains("href=\"../../../../run/study\""), "{}", page.body);
 }
 
 #[test]
@@ -257,10 +257,10 @@ fn pages_link_to_existing_files_only() {
     let plan = Plan::load(&place.path("study/plan.toml")).unwrap();
     let page = place.get("/run/study");
     assert!(
-        page.body.contains(&format!("{}: done", plan.cells[0].id)) && !page.body.contains("href=\"/run/study/cells")
+        page.body.contains(&format!("{}: done", plan.cells[0].id)) && !page.body.contains("href=\"../run/study/cells")
     );
     write_training(&place.path("study/cells").join(&plan.cells[0].id).join("training"), 20);
-    let address = format!("href=\"/run/study/cells/{}/training\"", plan.cells[0].id);
+    let address = format!("href=\"../run/study/cells/{}/training\"", plan.cells[0].id);
     place.until("/run/study", |page| page.body.contains(&address));
     let sent = |page: &str| {
         ["config.toml", "monitor.csv", "progress.csv"].map(|name| page.contains(&format!("/one/{name}\"")))
@@ -286,9 +286,48 @@ fn a_single_run_can_be_served() {
     let place = Place::new();
     let address = crate::client::serve(&place.path("study"));
     let study = Place { address, ..place };
-    assert!(study.get("/").body.contains("href=\"/run/\""));
+    assert!(study.get("/").body.contains("href=\"./run/\""));
     assert!(study.get("/run/").body.contains("1 of 2 cells done"));
     assert!(study.get("/report/").body.contains("1 of 2 cells are done"));
     study.events("/events/").until("an event", |event| event["parts"]["head"].is_string());
     assert_eq!(study.get("/file/plan.toml").status, 200);
+}
+
+#[test]
+fn all_links_are_relative() {
+    let place = Place::new();
+    for path in ["/", "/run/one", "/run/study", "/run/missing", "/nothing/at/all"] {
+        let page = place.get(path);
+        for attribute in ["href=\"/", "src=\"/", "data-events=\"/"] {
+            assert!(!page.body.contains(attribute), "{path}: {}", page.body);
+        }
+        let depth = path.matches('/').count() - 1;
+        let style = format!("href=\"{}assets/style.css\"", if depth == 0 { "./".into() } else { "../".repeat(depth) });
+        assert!(page.body.contains(&style), "{path}: {}", page.body);
+    }
+    let event = place.events("/events").until("the list", |event| part(event, "runs").contains("run/one"));
+    assert!(part(&event, "runs").contains("href=\"./run/one\""), "{event}");
+    let moved = place.get("/run/one/");
+    assert!(moved.status == 308 && moved.head.contains("location: ../one\r\n"), "{}", moved.head);
+}
+
+#[test]
+fn links_out_of_the_folder_are_named() {
+    let place = Place::new();
+    write_training(&place.folder.path().join("scratch/big"), 30);
+    std::os::unix::fs::symlink("../scratch/big", place.path("linked")).unwrap();
+    std::os::unix::fs::symlink("one", place.path("again")).unwrap();
+    let page = place.until("/", |page| page.body.contains("are not followed"));
+    assert!(page.body.contains("<code>linked</code>.") && !page.body.contains("run/again"), "{}", page.body);
+    assert_eq!(place.get("/run/linked").status, 404);
+}
+
+#[test]
+fn many_event_streams_leave_the_page_to_others() {
+    let place = Place::new();
+    let streams: Vec<_> = (0..500).map(|_| place.events("/events")).collect();
+    let start = std::time::Instant::now();
+    assert_eq!(place.get("/").status, 200);
+    assert!(start.elapsed() < std::time::Duration::from_secs(8), "{:?}", start.elapsed());
+    drop(streams);
 }

@@ -137,7 +137,7 @@ pub struct HeatmapArgs {
     #[arg(
         value_name = "DIR",
         required_unless_present = "checkpoint",
-        conflicts_with_all = ["checkpoint", "parameters", "records", "out"]
+        conflicts_with_all = ["checkpoint", "parameters", "records"]
     )]
     pub dir: Option<PathBuf>,
     /// Policies of one environment: for each the --out folder of its training, its checkpoint folder, the folder of a
@@ -179,8 +179,9 @@ pub struct HeatmapArgs {
     /// Random seed of the tests [default: each training's seed].
     #[arg(long, value_name = "N", value_parser = natural::<u64>)]
     pub seed: Option<u64>,
-    /// Path of the files without the extensions .csv, .svg, .png and .parquet [default: in the working directory, named
-    /// after environment, algorithm, architecture, version, seed and parameters].
+    /// With --checkpoint, path of the files without the extensions .csv, .svg, .png and .parquet [default: in the working
+    /// directory, named after environment, algorithm, architecture, version, seed and parameters]. With DIR, a folder for
+    /// pictures and new heatmaps, e.g. if DIR is somebody else's [default: DIR/report and DIR/heatmaps].
     #[arg(long, value_name = "PATH")]
     pub out: Option<PathBuf>,
     #[command(flatten)]

@@ -158,6 +158,10 @@ pub struct ServeArgs {
     /// it.
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8420", value_parser = listen_address)]
     pub address: SocketAddr,
+    /// Host names, separated by commas, by which browsers may ask for the page beside localhost, e.g. that of a proxy
+    /// which passes it on. Links are relative, so the proxy may serve the page below any path.
+    #[arg(long, value_name = "NAME", value_delimiter = ',')]
+    pub host: Vec<String>,
     /// A running perturb-server whose status the page shows: unix:/path, host:port, http://host:port or
     /// tcp://host:port, with TLS https://host:port.
     #[arg(long, value_name = "ADDRESS")]

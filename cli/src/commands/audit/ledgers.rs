@@ -5,19 +5,20 @@ use std::process::ExitCode;
 
 use serde_json::{Value, json};
 
+use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_records::Records;
 use perturb_records::ledger::{Head, Ledgers, Proof};
 
-use super::super::{args::AuditArgs, error::CommandError, error::Result, reconnecting_servers};
+use super::super::{args::AuditArgs, display::output, error::CommandError, error::Result, reconnecting_servers};
 use super::{RecordedPolicy, server_args};
 
 /// Prints what the ledgers prove about each policy.
 pub(super) fn prove(args: &AuditArgs, recorded: &[RecordedPolicy]) -> Result<ExitCode> {
     let ledgers = Ledgers::read(&args.ledger, &args.head).map_err(CommandError::Failed)?;
-    let servers = reconnecting_servers(&server_args(args)?, args.wait)?;
+    let servers = reconnecting_servers(&server_args(args)?, args.wait, &StopFlag::default())?;
     let mut proofs = Vec::new();
-    let mut out = std::io::stdout();
+    let mut out = output();
     for policy in recorded {
         let name = policy.name.as_str();
         let records = Records::read(&policy.records)?;
@@ -55,7 +56,7 @@ pub(super) fn prove(args: &AuditArgs, recorded: &[RecordedPolicy]) -> Result<Exi
 }
 
 fn print(name: &str, proof: &Proof, records: &Records) -> std::io::Result<()> {
-    let mut out = std::io::stdout();
+    let mut out = output();
     proof.against.iter().chain(&proof.refused).try_for_each(|line| writeln!(out, "{name}: {line}"))?;
     if !proof.against.is_empty() {
         return Ok(());
@@ -82,5 +83,5 @@ fn document(name: &str, Proof { tokens, sessions, against, refused }: &Proof) ->
 }
 
 fn head(Head { path, lines, digest, unfinished }: &Head) -> Value {
-    json!({ "ledger": path, "lines": lines, "head": digest, "unfinished_bytes": unfinished })
+    json!({ "ledger": path.to_string_lossy(), "lines": lines, "head": digest, "unfinished_bytes": unfinished })
 }

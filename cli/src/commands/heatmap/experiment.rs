@@ -16,9 +16,9 @@ use perturb_report::{heatmap_pictures, save_heatmaps};
 
 use super::{axes, options, test};
 use crate::commands::args::{HeatmapArgs, PlayArgs};
-use crate::commands::display::{note, say};
+use crate::commands::display::{note, output, say};
 use crate::commands::error::{CommandError, Result, system};
-use crate::commands::{plan_in, playing_servers, with_tasks_of};
+use crate::commands::{plan_in, playing_servers, refuse_file, require_default_out, with_tasks_of};
 
 /// Numbers of heatmaps.
 #[derive(Default)]
@@ -33,8 +33,19 @@ struct HeatmapCounts {
 
 /// Makes the missing heatmaps, and draws all of them.
 pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
-    let folder = Folder::new(directory);
+    let mut folder = Folder::new(directory);
     let plan = plan_in(&folder)?;
+    let report = match &args.out {
+        Some(out) => {
+            refuse_file(out)?;
+            folder = folder.with_new_heatmaps(out.join("heatmaps"));
+            out.clone()
+        }
+        None => {
+            require_default_out(directory)?;
+            directory.join("report")
+        }
+    };
     let results = Results::read(&plan, &folder)?;
     let selections = results.select();
     let places = heatmap_places(&selections);
@@ -52,7 +63,7 @@ pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
         }
         let servers = match &mut connected {
             Some(servers) => servers,
-            none => none.insert(playing_servers(&play)?),
+            none => none.insert(playing_servers(&play, &stop)?),
         };
         let environment = servers.environment(places[0].environment)?;
         if let Some(reason) = missing_parameter(args, &environment) {
@@ -74,9 +85,8 @@ pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
             counts.failed += usize::from(!make(args, &folder, place, &kind, servers, &stop)?);
         }
     }
-    let report = folder.path().join("report");
     for file in save_heatmaps(&heatmap_pictures(&selections, Some(&folder))?, &report)? {
-        writeln!(std::io::stdout(), "{}.png, .svg and .csv", report.join(file).display())?;
+        writeln!(output(), "{}.png, .svg and .csv", report.join(file).display())?;
     }
     match counts {
         HeatmapCounts { failed, total, .. } if failed > 0 => {
@@ -127,7 +137,7 @@ fn make(
     // The heatmap's own record is written last, because it marks the heatmap as complete.
     records.write(&path.with_added_extension("parquet"))?;
     store_heatmap(folder, selected.cell, id, options, &heatmap)?;
-    writeln!(std::io::stdout(), "{}.csv and .parquet", path.display())?;
+    writeln!(output(), "{}.csv and .parquet", path.display())?;
     Ok(true)
 }
 

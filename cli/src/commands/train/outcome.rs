@@ -11,7 +11,7 @@ use perturb_text::quoted;
 use serde_json::json;
 
 use super::super::args::TrainArgs;
-use super::super::display::note;
+use super::super::display::{note, output};
 use super::super::error::Result;
 use super::super::resume_hint::{resume_command, task_options, with_resume_command};
 use super::super::signal_code;
@@ -25,9 +25,13 @@ pub(super) fn finish(
 ) -> Result<ExitCode> {
     let outcome = match outcome {
         Ok(outcome) => outcome,
-        Err(TrainError::Stopped { signal, source }) => {
-            let error = with_resume_command(*source, &args.play);
-            note(format_args!("stopped by signal {signal} while waiting for a server: {error}"));
+        Err(error) if error.signal().is_some() => {
+            let signal = error.signal().unwrap_or_default();
+            // The sentence of a wait for a server has the error of the server inside.
+            let error = if let TrainError::Stopped { source, .. } = error { *source } else { error };
+            let prefix = format!("stopped by signal {signal} while waiting for a server: ");
+            let prefix = if error.signal().is_some() { "" } else { &prefix };
+            note(format_args!("{prefix}{}", with_resume_command(error, &args.play)));
             return Ok(signal_code(signal));
         }
         Err(error) => return Err(with_resume_command(error, &args.play)),
@@ -37,7 +41,7 @@ pub(super) fn finish(
     }
     if let Some(number) = outcome.signal {
         note(format_args!(
-            "stopped by signal {number} after {} of {} episodes; resume with: {}",
+            "stopped by signal {number} after {} of {} episodes; go on with: {}",
             outcome.progress.episodes,
             config.common.episodes,
             resume_command(directory.path(), &args.play)
@@ -57,8 +61,8 @@ pub(super) fn print_result(
 ) -> Result<()> {
     let TrainConfig { common, settings } = &state.config;
     args.json.write(json!({
-        "run": directory.path(),
-        "checkpoint": directory.checkpoint(),
+        "run": directory.path().to_string_lossy(),
+        "checkpoint": directory.checkpoint().to_string_lossy(),
         "environment": common.environment,
         "algorithm": settings.name(),
         "architecture": common.architecture,
@@ -78,7 +82,7 @@ pub(super) fn print_result(
     if signal.is_some() || args.json.is_printed() {
         return Ok(());
     }
-    let mut out = std::io::stdout();
+    let mut out = output();
     writeln!(out, "trained policy: {}", directory.checkpoint().display())?;
     let tasks = task_options(&args.play.server);
     let command = format!("perturb evaluate --checkpoint {}{tasks}", quoted(directory.path()));

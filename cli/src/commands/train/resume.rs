@@ -47,7 +47,7 @@ pub(super) fn resume_run(args: &TrainArgs, path: &Path) -> Result<ExitCode> {
     }
     let suffix = if args.extend.is_some() { ", the new budget" } else { "" };
     note(format_args!("{config}: resuming after {trained} of {budget} episodes{suffix}"));
-    let servers = playing_servers(&args.play)?;
+    let servers = playing_servers(&args.play, &stop)?;
     let mut display = Display::for_training(config.to_string(), &config, trained, checkpoint.state.counters.timesteps);
     let report = |progress: &Progress| display.training(progress);
     let outcome = resume(&servers, &directory, (checkpoint, state), threads(args.threads), &stop, report);

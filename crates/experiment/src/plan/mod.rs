@@ -177,7 +177,7 @@ impl Plan {
     /// # Errors
     /// [`PlanError`], which names the table and the key.
     pub fn load(path: &Path) -> Result<Self, PlanError> {
-        Self::parse(&path.display().to_string(), files::read_text(path)?)
+        Self::parse(&path.display().to_string(), files::read_toml(path)?)
     }
 
     /// The sets of the file at `path`, by their names.
@@ -186,7 +186,7 @@ impl Plan {
     /// [`PlanError`], which names the table and the key.
     pub fn own_sets(path: &Path) -> Result<Vec<TestSet>, PlanError> {
         let refused = |reason: AnyError| PlanError::Refused { path: path.display().to_string(), reason };
-        let text = files::read_text(path)?;
+        let text = files::read_toml(path)?;
         let file: File = toml::from_str(&text).map_err(|error| refused(words(&error).into()))?;
         let folder = path.parent().unwrap_or(Path::new(""));
         let sets = sets::read(&file.sets, &|name| sets::content(name, folder), &mut BTreeMap::new())

@@ -3,11 +3,11 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-use perturb_files::{AnyError, Stamp, is_locked, leads_out, list, read_plain_text};
+use perturb_files::{AnyError, Stamp, is_locked, leads_out, list, read_toml};
 use perturb_records::statistics::mean;
 use perturb_text::{grouped, shortened};
 
-use super::{MAX_TEXT_BYTES, RunSummary};
+use super::RunSummary;
 use crate::eta::CellDurations;
 use crate::folder::{CellResult, CellState, Folder, FolderError};
 use crate::plan::{Cell, Plan};
@@ -203,7 +203,7 @@ fn read_plan(folder: &Folder, within: Option<&Path>) -> Result<Plan, AnyError> {
             }
         }
     }
-    let plan = Plan::parse(&path.display().to_string(), read_plain_text(&path, MAX_TEXT_BYTES)?)?;
+    let plan = Plan::parse(&path.display().to_string(), read_toml(&path)?)?;
     if within.is_some() && plan.cells.len() > MAX_FOLLOWED_CELLS {
         let (cells, most) = (grouped(plan.cells.len()), grouped(MAX_FOLLOWED_CELLS));
         return Err(
@@ -240,7 +240,7 @@ fn status(folder: &Folder, cell: &Cell, records: RecordStamps, within: Option<&P
     let place = folder.cell(&cell.id);
     if records == [None; 2] {
         let begun = place.path().is_dir();
-        return match begun && is_locked(&place.path().join("lock")) {
+        return match begun && is_locked(place.path()) {
             true => CellStatus::InWork,
             false => CellStatus::Waiting { begun },
         };

@@ -4,17 +4,19 @@ mod experiment;
 mod progress;
 mod training;
 
+use std::collections::{HashSet, VecDeque};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 pub use self::experiment::{CellStatus, ExperimentStatus, LEADS_OUT};
 pub use self::progress::{LastProgress, last_progress};
 pub use self::training::TrainingStatus;
-use perturb_files::{self as files, AnyError};
+use perturb_files::{self as files, AnyError, leads_out};
 
-/// A run's `config.toml` or `plan.toml` is shorter, bytes.
-const MAX_TEXT_BYTES: u64 = 16 << 20;
+/// Maximum number of folders that are looked at behind symbolic links, which may lead to a whole disk.
+const MAX_FOLDERS_BEHIND_LINKS: usize = 10_000;
 
 /// A folder that holds a run.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -57,20 +59,41 @@ pub struct RunFolders {
     pub runs: Vec<RunFolder>,
     /// All other folders, the first one itself among them.
     pub others: Vec<PathBuf>,
+    /// Links to folders out of the folder that the search must stay in.
+    pub links_out: Vec<PathBuf>,
     /// Whether there are more folders than were looked at.
     pub more: bool,
 }
 
-/// Looks for runs in `folder`, in at most `most` folders. Symbolic links are not followed.
+/// Looks for runs in `folder`, in at most `most` folders. Symbolic links are followed after all folders that are no links,
+/// and each folder is looked at once. With `within`, which is absolute and without links, links that lead out of it are
+/// not followed.
 ///
 /// # Errors
 /// The operating system's, of `folder` itself; what else cannot be listed is passed over.
-pub fn places(folder: &Path, most: usize) -> files::Result<RunFolders> {
+pub fn places(folder: &Path, most: usize, within: Option<&Path>) -> files::Result<RunFolders> {
     let mut found = RunFolders::default();
+    let mut search = FolderSearch::default();
     let mut left = vec![folder.to_owned()];
     files::require_folder(folder)?;
-    while let Some(path) = left.pop() {
-        if found.runs.len() + found.others.len() == most {
+    loop {
+        let Some(path) = left.pop() else {
+            let Some(link) = search.links.pop_front() else { break };
+            let parent = link.parent().unwrap_or(folder);
+            match within.filter(|root| leads_out(root, parent, link.file_name().unwrap_or_default())) {
+                Some(_) => found.links_out.push(link),
+                None if search.followed == MAX_FOLDERS_BEHIND_LINKS => found.more = true,
+                None => {
+                    search.is_behind_link = true;
+                    left.push(link);
+                }
+            }
+            continue;
+        };
+        if !search.is_new(&path) {
+            continue;
+        }
+        if found.runs.len() + found.others.len() == most || search.followed == MAX_FOLDERS_BEHIND_LINKS {
             found.more = true;
             break;
         }
@@ -78,17 +101,48 @@ pub fn places(folder: &Path, most: usize) -> files::Result<RunFolders> {
             found.runs.push(RunFolder { path, kind });
             continue;
         }
-        let inner = files::list(&path).unwrap_or_default();
-        left.extend(inner.into_iter().rev().filter(|inner| inner.is_dir() && !inner.is_symlink()));
+        let (links, inner): (Vec<_>, Vec<_>) = files::list(&path)
+            .unwrap_or_default()
+            .into_iter()
+            .filter(|inner| inner.is_dir())
+            .partition(|inner| inner.is_symlink());
+        left.extend(inner.into_iter().rev());
+        search.links.extend(links);
         found.others.push(path);
     }
+    found.runs.sort();
+    found.others.sort();
+    found.links_out.sort();
     Ok(found)
+}
+
+/// The state of a search for runs.
+#[derive(Default)]
+struct FolderSearch {
+    /// Links to folders, which are followed last.
+    links: VecDeque<PathBuf>,
+    /// Device and inode of the folders that were looked at.
+    seen: HashSet<(u64, u64)>,
+    is_behind_link: bool,
+    /// Number of folders that were found behind links.
+    followed: usize,
+}
+
+impl FolderSearch {
+    /// Notes a folder. Returns whether it was not looked at before.
+    fn is_new(&mut self, path: &Path) -> bool {
+        let Ok(metadata) = path.metadata() else { return false };
+        let is_new = self.seen.insert((metadata.dev(), metadata.ino()));
+        self.followed += usize::from(is_new && self.is_behind_link);
+        is_new
+    }
 }
 
 /// A training or an experiment in a few figures.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RunSummary {
-    /// The path of the folder.
+    /// The path of the folder. JSON has U+FFFD where it is not UTF-8.
+    #[serde(serialize_with = "as_text")]
     pub path: PathBuf,
     /// The trained method, or the environments of an experiment.
     pub what: String,
@@ -102,6 +156,11 @@ pub struct RunSummary {
     pub success_percent: Option<f64>,
     /// "in work", "finished", "broken off", …
     pub state: &'static str,
+}
+
+/// Writes a path as text. serde refuses a path that is not UTF-8, and with it the whole document.
+fn as_text<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(&path.to_string_lossy())
 }
 
 impl RunSummary {
@@ -135,14 +194,46 @@ mod tests {
         for name in ["b/config.toml", "a/deep/plan.toml", "a/deep/cells/x/training/config.toml", "pictures/one.svg"] {
             write_atomically(&path(name), b"").unwrap();
         }
-        std::os::unix::fs::symlink(path("b"), path("link")).unwrap();
-        let found = places(directory.path(), 100).unwrap();
+        let found = places(directory.path(), 100, None).unwrap();
         let place = |name: &str, kind| RunFolder { path: path(name), kind };
         assert_eq!(found.runs, [place("a/deep", RunKind::Experiment), place("b", RunKind::Training)]);
         assert_eq!(found.others, [directory.path().to_owned(), path("a"), path("pictures")]);
-        assert!(!found.more && places(directory.path(), 3).unwrap().more);
-        assert_eq!(places(&path("b"), 9).unwrap().runs, [place("b", RunKind::Training)], "it may be a run itself");
-        assert!(places(&path("missing"), 9).unwrap_err().to_string().contains("/missing"));
+        assert!(!found.more && places(directory.path(), 3, None).unwrap().more);
+        assert_eq!(
+            places(&path("b"), 9, None).unwrap().runs,
+            [place("b", RunKind::Training)],
+            "it may be a run itself"
+        );
+        assert!(places(&path("missing"), 9, None).unwrap_err().to_string().contains("/missing"));
+    }
+
+    #[test]
+    fn links_are_followed_once_and_not_out_of_a_root() {
+        let directory = tempfile::tempdir().unwrap();
+        let root = directory.path().canonicalize().unwrap();
+        let path = |name: &str| root.join(name);
+        for name in ["runs/b/config.toml", "scratch/big/config.toml", "scratch/more/c/config.toml"] {
+            write_atomically(&path(name), b"").unwrap();
+        }
+        let links =
+            [("runs/a", "b"), ("runs/big", "../scratch/big"), ("runs/loop", "."), ("runs/more", "../scratch/more")];
+        for (name, to) in links.into_iter().chain([("runs/nowhere", "nothing")]) {
+            std::os::unix::fs::symlink(to, path(name)).unwrap();
+        }
+        let paths = |runs: Vec<RunFolder>| runs.into_iter().map(|run| run.path).collect::<Vec<_>>();
+        let found = places(&path("runs"), 100, None).unwrap();
+        assert_eq!(paths(found.runs), [path("runs/b"), path("runs/big"), path("runs/more/c")]);
+        assert!(found.links_out.is_empty() && !found.more);
+        let found = places(&path("runs"), 100, Some(&path("runs"))).unwrap();
+        assert_eq!(paths(found.runs), [path("runs/b")]);
+        assert_eq!(found.links_out, [path("runs/big"), path("runs/more")]);
+    }
+
+    #[test]
+    fn a_path_that_is_not_text_hides_no_other_run() {
+        let name = std::os::unix::ffi::OsStrExt::from_bytes(b"latin\xfc");
+        let summary = RunSummary::not_understood(Path::new::<std::ffi::OsStr>(name));
+        assert!(serde_json::to_string(&[summary]).unwrap().contains("\"path\":\"latin\u{fffd}\""));
     }
 
     #[test]

@@ -3,11 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use perturb_checkpoint::{CheckpointError, State};
-use perturb_files::{AnyError, is_locked, read_plain_text};
+use perturb_files::{AnyError, is_locked, read_toml};
 use perturb_settings::{ConfigError, TrainConfig};
 use perturb_text::shortened;
 
-use super::{LastProgress, MAX_TEXT_BYTES, RunSummary, last_progress};
+use super::{LastProgress, RunSummary, last_progress};
 
 /// Number of episodes after which the success rate may end a training.
 const RECENT: u64 = 100;
@@ -86,8 +86,9 @@ impl TrainingStatus {
 
 fn read_config(path: &Path) -> Result<TrainConfig, AnyError> {
     let origin = path.display().to_string();
-    let table = read_plain_text(path, MAX_TEXT_BYTES)?.parse().map_err(|error: toml::de::Error| {
-        ConfigError::Syntax { origin: origin.clone(), reason: error.to_string().trim().to_owned() }
+    let table = read_toml(path)?.parse().map_err(|error: toml::de::Error| ConfigError::Syntax {
+        origin: origin.clone(),
+        reason: error.to_string().trim().to_owned(),
     })?;
     Ok(TrainConfig::from_table(&origin, table)?)
 }

@@ -2,11 +2,12 @@
 
 use std::collections::HashMap;
 use std::fs::File;
-use std::io::Write;
+use std::io::{Read, Seek, SeekFrom, Write};
 use std::os::unix::fs::FileExt;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use perturb_files::open_plain;
 use serde::{Deserialize, Serialize};
 
 use super::count;
@@ -16,6 +17,8 @@ use crate::folder::FailureId;
 const INTERVAL: Duration = Duration::from_secs(1);
 /// Maximum factor by which the interval grows with the number of the worker's cells.
 const MAX_INTERVALS: u32 = 10;
+/// Number of bytes at the end of a log in which its last words are looked for.
+const MAX_LAST_WORDS_BYTES: u64 = 64 << 10;
 
 /// The only line that a worker reads. It stops when its standard input is closed, which also happens when the process
 /// that started it dies, however it dies.
@@ -170,8 +173,11 @@ pub(super) fn read_lines(file: &File, offset: &mut u64) -> std::io::Result<Vec<E
 
 /// The last line with words that was written to `log` behind its byte `start`, which may say why a process ended.
 pub(super) fn last_words(log: &Path, start: u64) -> Option<String> {
-    let text = std::fs::read(log).unwrap_or_default();
-    let text = String::from_utf8_lossy(text.get(start as usize..)?).into_owned();
+    let (mut file, metadata) = open_plain(log).ok()?;
+    let mut text = Vec::new();
+    file.seek(SeekFrom::Start(start.max(metadata.len().saturating_sub(MAX_LAST_WORDS_BYTES)))).ok()?;
+    file.take(MAX_LAST_WORDS_BYTES).read_to_end(&mut text).ok()?;
+    let text = String::from_utf8_lossy(&text);
     text.lines().rev().find(|line| !line.trim().is_empty()).map(str::to_owned)
 }
 

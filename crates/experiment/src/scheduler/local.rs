@@ -7,7 +7,8 @@ use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::Instant;
 
-use perturb_files::{FileError, create_folder, io};
+use perturb_files::{FileError, create_folder, io, temporary_file};
+use perturb_protocol::spawn_failure;
 
 use super::event::{last_words, read_lines, write_line};
 use super::{Backend, BackendEvent, CellEvent, JobCell, PendingCell, Result, WorkerJob};
@@ -73,9 +74,10 @@ impl<'a> Local<'a> {
         let program = PathBuf::from(command.get_program());
         let mut start = || {
             // A file, not a pipe: nobody has to read while the worker writes.
-            let events = tempfile::tempfile()?;
-            let child = command.stdin(Stdio::piped()).stdout(events.try_clone()?).stderr(log.try_clone()?).spawn()?;
-            Ok((child, events))
+            let events = temporary_file()?;
+            let spawned = command.stdin(Stdio::piped()).stdout(events.try_clone()?).stderr(log.try_clone()?).spawn();
+            let failed = |error: std::io::Error| std::io::Error::new(error.kind(), spawn_failure(&error));
+            Ok((spawned.map_err(failed)?, events))
         };
         let (mut child, events) = start().map_err(io("start a worker process of", &program))?;
         let order = WorkerJob { cells, turn: self.first_turn().wrapping_add(first.group + first.lost_servers) };

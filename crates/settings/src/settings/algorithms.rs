@@ -112,7 +112,7 @@ pub struct PpoConfig {
     pub learning_rate_schedule: Schedule,
     /// T: steps of each environment between two updates, at least 1 (default: `128`).
     pub n_steps: usize,
-    /// Passes over a rollout, at least 1 (default: `10`). More takes more from each sample, until clipping stops it.
+    /// Passes over a rollout, 1 … 1000 (default: `10`). More takes more from each sample, until clipping stops it.
     pub n_epochs: usize,
     /// Minibatches in a pass (default: `1`). More means more and noisier steps. T·N must be a multiple of it; with a
     /// recurrent policy, whose minibatches are of whole environments, N.
@@ -183,7 +183,7 @@ impl PpoConfig {
     pub fn validate(&self) -> Result<(), SettingError> {
         check_positive("learning_rate", self.learning_rate)?;
         check_count("n_steps", self.n_steps)?;
-        check_count("n_epochs", self.n_epochs)?;
+        check_epochs("n_epochs", self.n_epochs)?;
         check_count("n_minibatches", self.n_minibatches)?;
         check_fraction("gamma", self.gamma)?;
         check_fraction("gae_lambda", self.gae_lambda)?;
@@ -287,7 +287,7 @@ fn check(name: &'static str, value: f64, accepted: bool, expected: &'static str)
     if value.is_finite() && accepted { Ok(()) } else { Err(SettingError { name, got: value.to_string(), expected }) }
 }
 
-/// `Ok` if `value` is at least 1.
+/// `Ok` if `value` is at least 1. A rollout's size limits it from above.
 fn check_count(name: &'static str, value: usize) -> Result<(), SettingError> {
     if value > 0 { Ok(()) } else { Err(SettingError { name, got: value.to_string(), expected: "at least 1" }) }
 }
@@ -298,6 +298,14 @@ fn check_episodes(name: &'static str, value: usize) -> Result<(), SettingError> 
         return Ok(());
     }
     Err(SettingError { name, got: value.to_string(), expected: "between 1 and 1000000" })
+}
+
+/// `Ok` if `value` is a number of passes over a rollout that can be waited for.
+fn check_epochs(name: &'static str, value: usize) -> Result<(), SettingError> {
+    if (1..=1000).contains(&value) {
+        return Ok(());
+    }
+    Err(SettingError { name, got: value.to_string(), expected: "between 1 and 1000" })
 }
 
 /// `Ok` if `value` is a positive number.

@@ -138,7 +138,7 @@ impl TrainConfig {
         if let Some(path) = file {
             let shown = path.display().to_string();
             tracing::debug!("settings are read from {shown}");
-            let table = files::read_text(path)?.parse::<Table>().map_err(|error| ConfigError::Syntax {
+            let table = files::read_toml(path)?.parse::<Table>().map_err(|error| ConfigError::Syntax {
                 origin: shown.clone(),
                 reason: error.to_string().trim().to_owned(),
             })?;

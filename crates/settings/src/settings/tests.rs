@@ -364,6 +364,7 @@ fn a_wrong_type_is_refused_with_the_right_one() {
         ("episodes=0", "episodes is 0, but must be at least 1"),
         ("gamma=2", "gamma is 2, but must be between 0 and 1"),
         ("learning_rate=nan", "learning_rate is NaN"),
+        ("n_epochs=1001", "n_epochs is 1001, but must be between 1 and 1000"),
         ("n_steps", "expected key=value"),
     ] {
         let message = refusal(None, &[set]);

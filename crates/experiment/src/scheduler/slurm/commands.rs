@@ -8,6 +8,7 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use perturb_files::interrupt::StopFlag;
+use perturb_files::temporary_file;
 
 use super::error::SlurmError;
 use super::job::QueuedJob;
@@ -20,6 +21,10 @@ const LIMIT: Duration = Duration::from_secs(60);
 const TICK: Duration = Duration::from_millis(20);
 /// The format of squeue's lines.
 const FIELDS: &str = "%F|%K|%T|%r|%N|%j";
+/// Separates the fields of squeue's lines.
+const SEPARATOR: char = '|';
+/// Begins the lines that squeue prints above the jobs of each cluster where there are several, with --noheader, too.
+const CLUSTER_HEADING: &str = "CLUSTER:";
 
 /// Slurm on this machine.
 #[derive(Clone, Debug)]
@@ -52,14 +57,14 @@ impl Slurm {
     ///
     /// # Errors
     /// What squeue says, or that it says nothing.
-    pub(super) fn queue(&self, names: &[&str], stop: &StopFlag) -> Result<Vec<QueuedJob>, SlurmError> {
+    pub(super) fn queue(&self, names: &[&str], stop: &StopFlag) -> Result<QueueAnswer, SlurmError> {
         if names.is_empty() {
-            return Ok(Vec::new());
+            return Ok(QueueAnswer::default());
         }
         let names = format!("--name={}", names.join(","));
         let format = format!("--format={FIELDS}");
         let text = self.call("squeue", ["--array", "--noheader", "--states=all", &format, &names], stop)?;
-        text.lines().filter(|line| !line.trim().is_empty()).map(parse_job).collect()
+        QueueAnswer::parse(&text)
     }
 
     /// Returns the maximum number of jobs in an array.
@@ -100,7 +105,7 @@ impl Slurm {
         let program = self.directory.as_ref().map_or_else(|| PathBuf::from(name), |directory| directory.join(name));
         let failed = |source| SlurmError::System { program: name, source };
         // Files, not pipes: nobody has to read while the command runs.
-        let (mut output, mut errors) = (tempfile::tempfile().map_err(failed)?, tempfile::tempfile().map_err(failed)?);
+        let (mut output, mut errors) = (temporary_file().map_err(failed)?, temporary_file().map_err(failed)?);
         let mut command = Command::new(program);
         command.args(arguments).stdin(Stdio::null());
         command.stdout(output.try_clone().map_err(failed)?).stderr(errors.try_clone().map_err(failed)?);
@@ -165,8 +170,30 @@ fn sbatch_arguments(submission: &Submission, options: &SlurmOptions) -> Result<V
     Ok(arguments)
 }
 
+/// The answer of squeue.
+#[derive(Debug, Default)]
+pub(super) struct QueueAnswer {
+    pub(super) jobs: Vec<QueuedJob>,
+    /// Lines that are no jobs: words of a site's wrapper or plugin.
+    pub(super) foreign: Vec<String>,
+}
+
+impl QueueAnswer {
+    fn parse(text: &str) -> Result<Self, SlurmError> {
+        let mut answer = Self::default();
+        for line in text.lines().map(str::trim).filter(|line| !line.is_empty()) {
+            if line.contains(SEPARATOR) {
+                answer.jobs.push(parse_job(line)?);
+            } else if !line.starts_with(CLUSTER_HEADING) {
+                answer.foreign.push(line.to_owned());
+            }
+        }
+        Ok(answer)
+    }
+}
+
 fn parse_job(line: &str) -> Result<QueuedJob, SlurmError> {
-    let fields: Vec<&str> = line.trim().split('|').map(str::trim).collect();
+    let fields: Vec<&str> = line.trim().split(SEPARATOR).map(str::trim).collect();
     let [array, index, state, reason, node, name] = fields[..] else {
         return Err(not_understood("squeue", FIELDS, line));
     };
@@ -205,10 +232,18 @@ mod tests {
             assert_eq!(parse_job(&format!("17|3|{state}|None|n1|x")).unwrap().is_live(), live, "{state}");
         }
         assert_eq!(parse_job("1|0|CANCELLED by 0|None|n1|x").unwrap().state, "CANCELLED");
-        for line in ["17|3|RUNNING", "17|N/A|RUNNING|None|n1|x", "slurm_load_jobs error"] {
+        for line in ["17|3|RUNNING", "17|N/A|RUNNING|None|n1|x"] {
             let error = parse_job(line).unwrap_err().to_string();
             assert!(error.contains("squeue") && error.contains(line), "{error}");
         }
+    }
+
+    #[test]
+    fn lines_that_are_no_jobs_are_passed_over() {
+        let text = "Maintenance on Monday\nCLUSTER: alpha\n17|3|RUNNING|None|n1|x\n\nCLUSTER: beta\n";
+        let QueueAnswer { jobs, foreign } = QueueAnswer::parse(text).unwrap();
+        assert_eq!((jobs.len(), jobs[0].index, foreign), (1, 3, vec!["Maintenance on Monday".to_owned()]));
+        assert!(QueueAnswer::parse("CLUSTER: alpha\n").unwrap().jobs.is_empty());
     }
 
     #[test]

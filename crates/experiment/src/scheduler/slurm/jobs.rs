@@ -1,17 +1,18 @@
 //! Submitting cells as arrays, and noticing what becomes of their jobs.
 
 use std::collections::{HashMap, HashSet};
-use std::fs::File;
 use std::path::Path;
 use std::time::Instant;
 
 use perturb_files::interrupt::StopFlag;
-use perturb_files::{AnyError, Lock, create_folder, io};
+use perturb_files::{AnyError, Lock, create_folder, io, open_plain};
+
+use perturb_text::shortened;
 
 use super::super::event::{last_words, read_lines};
 use super::super::{Backend, BackendEvent, CellEvent, PendingCell, Result, RunError, count};
 use super::batch::{CellLoad, JOB_SECONDS, JobSize, batches};
-use super::commands::Slurm;
+use super::commands::{QueueAnswer, Slurm};
 use super::error::SlurmError;
 use super::job::QueuedJob;
 use super::options::SlurmOptions;
@@ -19,6 +20,9 @@ use super::script::script;
 use super::submission::{self, Submission};
 use crate::folder::Folder;
 use crate::plan::{Grouping, Plan, distinct};
+
+/// Maximum number of different foreign lines of squeue that are told.
+const MAX_FOREIGN_LINES: usize = 10;
 
 /// The jobs of a folder in Slurm's queue. Those that are there when the process ends stay there.
 pub struct Jobs<'a> {
@@ -48,6 +52,8 @@ pub struct Jobs<'a> {
     /// Locked while this process decides, from the question what is in the queue to the submission.
     deciding: Option<Lock>,
     ask_at: Option<Instant>,
+    /// Lines of squeue that were no jobs, which were told.
+    foreign: HashSet<String>,
     /// Why Slurm cannot be asked, or takes nothing.
     trouble: Option<String>,
     /// For the next call.
@@ -91,6 +97,7 @@ impl<'a> Jobs<'a> {
             suspects: HashSet::new(),
             deciding: None,
             ask_at: None,
+            foreign: HashSet::new(),
             trouble: None,
             news: Vec::new(),
         }
@@ -102,7 +109,14 @@ impl<'a> Jobs<'a> {
         let matters = |id: &String| self.places.contains_key(&**id) && !self.folder.cell(id).is_settled(false);
         submissions.retain(|submission| submission.jobs.iter().flatten().any(matters));
         let names: Vec<&str> = submissions.iter().map(|submission| submission.names.name.as_str()).collect();
-        self.queue = self.slurm.queue(&names, self.stop)?;
+        let QueueAnswer { jobs, foreign } = self.slurm.queue(&names, self.stop)?;
+        self.queue = jobs;
+        for line in foreign {
+            if self.foreign.len() < MAX_FOREIGN_LINES && self.foreign.insert(line.clone()) {
+                let line = shortened(line);
+                self.news.push(BackendEvent::Note(format!("squeue printed a line that is no job, ignored: {line}")));
+            }
+        }
         // A folder that was deleted and made again has names that were used before.
         self.queue.retain(|job| submissions.iter().any(|submission| submission.has(job)));
         self.submissions = submissions;
@@ -154,7 +168,7 @@ impl<'a> Jobs<'a> {
             return Ok(()); // it has not begun
         }
         // Opened each time, which is when a network file system looks for what is new.
-        let file = File::open(&path).map_err(io("open", &path))?;
+        let (file, _) = open_plain(&path).map_err(io("open", &path))?;
         let told = self.told.entry((submission.number, index)).or_default();
         for line in read_lines(&file, &mut told.offset).map_err(io("read", &path))? {
             let Some(&cell) = self.places.get(&*line.cell) else { continue };
@@ -353,7 +367,7 @@ impl Backend for Jobs<'_> {
             // Only one process decides at a time.
             let directory = submission::directory(self.folder);
             create_folder(&directory)?;
-            self.deciding = Lock::try_take(&directory.join("lock"))?;
+            self.deciding = Lock::try_take(&directory)?;
             match self.ask() {
                 Ok(()) => {
                     self.adopt()?;

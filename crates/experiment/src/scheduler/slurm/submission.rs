@@ -37,6 +37,9 @@ pub(super) struct SlurmNames {
     pub(super) job: Option<String>,
 }
 
+/// Maximum size of a submission's list of cells, in bytes.
+const MAX_CELLS_BYTES: u64 = 64 << 20;
+
 /// Returns the folder of all submissions.
 pub(super) fn directory(folder: &Folder) -> PathBuf {
     folder.path().join("slurm")
@@ -63,7 +66,7 @@ fn numbers(directory: &Path) -> files::Result<Vec<u32>> {
 /// The submission in `path`; `None` if it was broken off before Slurm could hear of it.
 fn read(path: &Path, number: u32) -> Result<Option<Submission>, FolderError> {
     let Some(names) = folder::read(&path.join(DOCUMENT))? else { return Ok(None) };
-    let text = files::read_text(&path.join(CELLS))?;
+    let text = files::read_plain_text(&path.join(CELLS), MAX_CELLS_BYTES)?;
     let jobs = text.lines().map(|line| line.split(',').map(str::to_owned).collect()).collect();
     Ok(Some(Submission { number, path: path.to_owned(), jobs, names }))
 }

@@ -1,0 +1,30 @@
+//! Folders whose names are no text, and links to runs.
+
+use std::ffi::OsStr;
+use std::os::unix::ffi::OsStrExt;
+
+use serde_json::Value;
+
+use crate::common::{perturb, stderr};
+
+#[test]
+fn a_run_whose_path_is_no_text_is_trained_and_listed() {
+    let folder = tempfile::tempdir().expect("a directory");
+    let runs = folder.path().join("runs");
+    for name in [OsStr::from_bytes(b"latin\xfc"), OsStr::new("new\nline")] {
+        let mut command = perturb(&["-q", "train", "--env", "CartPole", "--algorithm", "a2c", "--episodes", "6"]);
+        command.args(["--json", "-", "--out"]).arg(runs.join(name));
+        let output = command.output().expect("perturb runs");
+        assert!(output.status.success(), "{}", stderr(&output));
+        let document: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        assert_eq!(document["finished"], true);
+    }
+    std::os::unix::fs::symlink(runs.join("new\nline"), folder.path().join("link")).expect("a link");
+    let output = perturb(&["ls", "--json", "-"]).arg(folder.path()).output().expect("perturb runs");
+    let listed: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    let paths: Vec<&str> = listed.as_array().expect("a list").iter().filter_map(|run| run["path"].as_str()).collect();
+    let ends = |end: &str| paths.iter().any(|path| path.ends_with(end));
+    assert!(paths.len() == 2 && ends("/latin\u{fffd}") && ends("/new\nline"), "{paths:?}");
+    let output = perturb(&["ls"]).arg(folder.path().join("link")).output().expect("perturb runs");
+    assert!(String::from_utf8_lossy(&output.stdout).contains("CartPole"), "{}", stderr(&output));
+}

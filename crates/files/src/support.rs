@@ -1,0 +1,92 @@
+//! Operations that some file systems refuse: what is done without them, and what is then not protected.
+
+use std::io::{Error, Result};
+use std::path::Path;
+use std::sync::atomic::{AtomicU8, Ordering};
+
+use rustix::io::Errno;
+
+/// The operations whose absence this process has reported, as bits.
+static REPORTED: AtomicU8 = AtomicU8::new(0);
+
+/// An operation that a file system may not have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Operation {
+    /// An advisory lock. Lustre without `-o flock`, NFS without a lock daemon and some FUSE systems have none.
+    Lock,
+    /// Bringing a file or the names in a folder to the disk.
+    Sync,
+    /// Replacing a file by renaming another one. A file that is mounted alone cannot be replaced.
+    Rename,
+}
+
+impl Operation {
+    /// Whether `error` says that the file system does not have the operation, rather than that it failed.
+    fn is_missing(self, error: &Error) -> bool {
+        let errno = Errno::from_io_error(error);
+        let others: &[Errno] = match self {
+            Self::Lock => &[Errno::NOLCK, Errno::BADF, Errno::INVAL],
+            Self::Sync => &[Errno::INVAL, Errno::BADF],
+            Self::Rename => &[Errno::PERM, Errno::XDEV, Errno::BUSY, Errno::EXIST],
+        };
+        errno.is_some_and(|errno| errno == Errno::NOSYS || errno == Errno::OPNOTSUPP || others.contains(&errno))
+    }
+
+    /// Describes the consequence.
+    fn consequence(self) -> &'static str {
+        match self {
+            Self::Lock => {
+                "it cannot lock files: nothing protects a run from a second process that trains in the same folder; \
+                 start each run once"
+            }
+            Self::Sync => "it cannot write files through to the disk: a power failure may lose the newest checkpoint",
+            Self::Rename => {
+                "it cannot replace a file in one step: another program may read a half-written file, and a power \
+                 failure may leave one"
+            }
+        }
+    }
+}
+
+/// Returns `None` in place of the error of a file system that does not have `operation`. Reports that once.
+///
+/// # Errors
+/// Every other error.
+pub(crate) fn unless_unsupported<T>(operation: Operation, result: Result<T>, path: &Path) -> Result<Option<T>> {
+    match result {
+        Err(error) if operation.is_missing(&error) => {
+            let bit = 1 << operation as u8;
+            if REPORTED.fetch_or(bit, Ordering::Relaxed) & bit == 0 {
+                tracing::warn!("the file system of {}: {} ({error})", path.display(), operation.consequence());
+            }
+            Ok(None)
+        }
+        result => result.map(Some),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rstest::rstest;
+
+    use super::*;
+
+    #[rstest]
+    #[case::enosys(38, [true, true, true])]
+    #[case::eopnotsupp(95, [true, true, true])]
+    #[case::enolck(37, [true, false, false])]
+    #[case::ebadf(9, [true, true, false])]
+    #[case::einval(22, [true, true, false])]
+    #[case::eperm(1, [false, false, true])]
+    #[case::ebusy(16, [false, false, true])]
+    #[case::eio(5, [false, false, false])]
+    #[case::enospc(28, [false, false, false])]
+    #[case::eacces(13, [false, false, false])]
+    fn a_missing_operation_is_not_a_failed_one(#[case] code: i32, #[case] expected: [bool; 3]) {
+        let is_missing = |operation: Operation| {
+            let refused = Err::<(), _>(Error::from_raw_os_error(code));
+            unless_unsupported(operation, refused, Path::new("file")).is_ok()
+        };
+        assert_eq!([Operation::Lock, Operation::Sync, Operation::Rename].map(is_missing), expected);
+    }
+}

@@ -1,0 +1,42 @@
+//! The limit on processes and threads, in the words of an error that meets it.
+
+use std::io::{Error, ErrorKind};
+
+/// Describes the failure to start a process or a thread. Names the limit, if that is the reason.
+pub fn spawn_failure(error: &Error) -> String {
+    match error.kind() {
+        ErrorKind::WouldBlock => format!("{error}: {}", limit()),
+        _ => error.to_string(),
+    }
+}
+
+fn limit() -> String {
+    let limits = std::fs::read_to_string("/proc/self/limits").unwrap_or_default();
+    match max_processes(&limits) {
+        Some(number) => format!(
+            "this user may have {number} processes and threads (`ulimit -u`), a container perhaps fewer; end others, or \
+             have the limit raised"
+        ),
+        None => "the container or the machine may have no more processes and threads; have its limit raised".into(),
+    }
+}
+
+/// The soft limit in the text of `/proc/self/limits`; `None` without a limit.
+fn max_processes(limits: &str) -> Option<u64> {
+    limits.lines().find_map(|line| line.strip_prefix("Max processes")?.split_whitespace().next()?.parse().ok())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_limit_is_named_where_it_is_met() {
+        let text = "Limit                     Soft Limit           Hard Limit           Units\n\
+                    Max processes             4096                 63442                processes\n";
+        assert_eq!(max_processes(text), Some(4096));
+        assert_eq!(max_processes(&text.replace("4096 ", "unlimited ")), None);
+        assert!(spawn_failure(&Error::from_raw_os_error(11)).contains("processes and threads"));
+        assert_eq!(spawn_failure(&Error::from_raw_os_error(2)), "No such file or directory (os error 2)");
+    }
+}

@@ -1,0 +1,68 @@
+//! Links between pages, relative to the page that has them, so that they hold behind a proxy with any path.
+//!
+//! Pages are written with links from the root, `href="/run/a"`. Texts from files cannot look like one, because quotes in
+//! them are escaped.
+
+use crate::paths::RelativePath;
+
+/// The beginnings of attributes with links.
+const ATTRIBUTES: [&str; 3] = ["href=\"", "src=\"", "data-events=\""];
+
+/// The way from a page to the root, `./` or `../../` for instance.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct WayUp(String);
+
+impl WayUp {
+    /// From the list of all runs.
+    pub(crate) fn from_index() -> Self {
+        Self::from_path("/")
+    }
+
+    /// From the page of a run, whose address does not end with a slash.
+    pub(crate) fn from_run(relative: &RelativePath) -> Self {
+        Self("../".repeat(relative.path().iter().count().max(1)))
+    }
+
+    /// From the page at the path of an address.
+    pub(crate) fn from_path(path: &str) -> Self {
+        match path.matches('/').count() {
+            0 | 1 => Self("./".into()),
+            count => Self("../".repeat(count - 1)),
+        }
+    }
+
+    /// Makes the links of a page, or of a part of one, relative.
+    pub(crate) fn relative_links(&self, html: &str) -> String {
+        ATTRIBUTES.iter().fold(html.to_owned(), |html, attribute| {
+            html.replace(&format!("{attribute}/"), &format!("{attribute}{}", self.0))
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rstest::rstest;
+
+    use super::*;
+
+    #[rstest]
+    #[case("/", "./")]
+    #[case("/run/", "../")]
+    #[case("/run/a", "../")]
+    #[case("/run/a/b", "../../")]
+    #[case("/nothing", "./")]
+    #[case("/report/a/b/", "../../../")]
+    fn the_way_up_follows_from_the_address(#[case] path: &str, #[case] way: &str) {
+        assert_eq!(WayUp::from_path(path), WayUp(way.into()));
+        if let Some(run) = path.strip_prefix("/run/") {
+            assert_eq!(WayUp::from_run(&RelativePath::decode(run).unwrap()), WayUp(way.into()));
+        }
+    }
+
+    #[test]
+    fn links_become_relative_and_texts_stay() {
+        let html = r#"<a href="/run/a">href=&quot;/x</a><img src="/file/b.png"><body data-events="/events"><a href="https://x/">"#;
+        let expected = r#"<a href="../run/a">href=&quot;/x</a><img src="../file/b.png"><body data-events="../events"><a href="https://x/">"#;
+        assert_eq!(WayUp::from_path("/run/a").relative_links(html), expected);
+    }
+}
