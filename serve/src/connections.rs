@@ -42,7 +42,7 @@ impl Default for ConnectionLimits {
 
 /// The address of a client, as an extension of its requests.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Peer(pub(crate) IpAddr);
+pub(crate) struct ClientAddress(pub(crate) IpAddr);
 
 /// A connection that may be closed for the sake of another while it waits for a request.
 #[derive(Debug, Default)]
@@ -114,7 +114,7 @@ pub(crate) async fn serve(mut listener: TcpListener, router: Router, limits: Con
         let service = service_fn(move |mut request: hyper::Request<Incoming>| {
             own.requests.fetch_add(1, Ordering::Relaxed);
             let guard = RequestGuard(Arc::clone(&own));
-            request.extensions_mut().insert(Peer(address.ip()));
+            request.extensions_mut().insert(ClientAddress(address.ip()));
             let response = router.clone().call(request.map(Body::new));
             async move { Ok::<_, Infallible>(response.await?.map(|body| GuardedBody { body, _guard: guard })) }
         });

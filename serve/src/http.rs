@@ -16,7 +16,7 @@ use futures_util::{StreamExt, future};
 use perturb_protocol::Address;
 use tokio_stream::wrappers::WatchStream;
 
-use crate::connections::Peer;
+use crate::connections::ClientAddress;
 use crate::error::ViewError;
 use crate::links::WayUp;
 use crate::paths::{RelativePath, Root};
@@ -157,11 +157,15 @@ async fn run(State(state): State<Arc<AppState>>, uri: Uri) -> Response {
     }
 }
 
-async fn index_events(State(state): State<Arc<AppState>>, Extension(peer): Extension<Peer>) -> Response {
+async fn index_events(State(state): State<Arc<AppState>>, Extension(peer): Extension<ClientAddress>) -> Response {
     events(&state, Topic::Index, peer)
 }
 
-async fn run_events(State(state): State<Arc<AppState>>, Extension(peer): Extension<Peer>, uri: Uri) -> Response {
+async fn run_events(
+    State(state): State<Arc<AppState>>,
+    Extension(peer): Extension<ClientAddress>,
+    uri: Uri,
+) -> Response {
     match relative_path(&uri, "/events/") {
         Some(relative) => events(&state, Topic::Run(relative), peer),
         None => error_page(&ViewError::RunNotFound),
@@ -169,7 +173,7 @@ async fn run_events(State(state): State<Arc<AppState>>, Extension(peer): Extensi
 }
 
 /// Streams the events of a page.
-fn events(state: &AppState, topic: Topic, Peer(peer): Peer) -> Response {
+fn events(state: &AppState, topic: Topic, ClientAddress(peer): ClientAddress) -> Response {
     let Some(place) = state.stream_places.take(peer) else {
         let message = "Too many pages are open already; close some.";
         let mut response = pages::message_page(StatusCode::SERVICE_UNAVAILABLE, message);

@@ -31,7 +31,7 @@ const FORMAT_VERSION: u32 = 1;
 /// Maximum number of times that a folder is read while another program replaces it.
 const MAX_LOOKS: u32 = 3;
 /// Time between two of these readings.
-const LOOK_INTERVAL: Duration = Duration::from_millis(50);
+const RETRY_INTERVAL: Duration = Duration::from_millis(50);
 
 /// The tests of an agent in one environment.
 #[derive(Clone, Debug, PartialEq)]
@@ -216,7 +216,7 @@ impl ExternalEvaluation {
         for _ in 1..MAX_LOOKS {
             match Self::read_once(path) {
                 Err(error) if Self::is_in(path) && !matches!(error, ExternalEvaluationError::Format { .. }) => {
-                    std::thread::sleep(LOOK_INTERVAL);
+                    std::thread::sleep(RETRY_INTERVAL);
                 }
                 read => return read,
             }
