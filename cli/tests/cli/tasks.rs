@@ -158,7 +158,10 @@ fn servers_of_a_run_have_the_same_model() {
     let addresses = [address(&first), address(&changed)];
     let servers = connect(&addresses);
     let error = servers.environment("ReachingArm").expect_err("another model");
-    assert!(matches!(&error, ClientError::Models { hashes: [a, b], .. } if a != b && a.len() == 64), "{error}");
+    assert!(
+        matches!(&error, ClientError::Models { hashes, .. } if hashes[0] != hashes[1] && hashes[0].len() == 64),
+        "{error}"
+    );
     assert!(servers.environment("Hopper").is_ok(), "the built-in environments are the same");
     let both = addresses.map(|address| address.to_string()).join(",");
     let said = place.refused(&["train", "--env", "ReachingArm", "--server", &both]);

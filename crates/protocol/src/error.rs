@@ -72,7 +72,7 @@ pub enum ClientError {
         "the servers at {first} and {other} have different models of {environment}, with the hashes {hashes:?}: give both \
          the same files of the task, and restart them"
     )]
-    Models { first: Address, other: Address, environment: String, hashes: [String; 2] },
+    Models { first: Address, other: Address, environment: String, hashes: Box<[String; 2]> },
     /// The server has no such environment.
     #[error(transparent)]
     NoEnvironment(#[from] UnknownEnvironment),

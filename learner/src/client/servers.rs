@@ -324,7 +324,7 @@ impl Servers {
             let other = other.address().clone();
             let name = environment.name;
             if got.model_hash != environment.model_hash {
-                let hashes = [environment.model_hash, got.model_hash];
+                let hashes = Box::new([environment.model_hash, got.model_hash]);
                 return Err(ClientError::Models { first, other, environment: name, hashes });
             }
             return Err(ClientError::Disagreement { first, other, environment: name });
