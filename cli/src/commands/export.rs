@@ -11,7 +11,7 @@ use perturb_records::{MergeCounts, Records, ResultsTable, StudyEpisodes};
 use perturb_text::count;
 
 use super::args::ExportArgs;
-use super::display::note;
+use super::display::{note, output};
 use super::error::{CommandError, Result, system};
 use super::plan_in;
 
@@ -53,7 +53,7 @@ pub(super) fn run(args: &ExportArgs) -> Result<()> {
         write_atomically(path, &csv)?;
     }
     let rows = count(table.rows().len(), "row");
-    Ok(writeln!(std::io::stdout(), "{} has {rows} of {}", args.into.display(), count_studies(table.studies.len()))?)
+    Ok(writeln!(output(), "{} has {rows} of {}", args.into.display(), count_studies(table.studies.len()))?)
 }
 
 fn count_studies(studies: usize) -> String {
