@@ -87,7 +87,7 @@ class Studies:
         with PAPER.open() as file:
             self.paper_rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
 
-    def of(self, study, **wanted):
+    def finished(self, study, **wanted):
         """Return the finished cells of a study with these settings or attributes."""
 
         def fits(cell, name, value):
@@ -120,7 +120,7 @@ class Studies:
     def by_seed(self, study, environment, method, **wanted):
         """Return the three metrics of each seed of a method with one configuration for each training version."""
         algorithm, architecture, trials = method
-        cells = self.of(study, environment=environment, algorithm=algorithm, architecture=architecture, **wanted)
+        cells = self.finished(study, environment=environment, algorithm=algorithm, architecture=architecture, **wanted)
         cells = [cell for cell in cells if cell.method[2] == trials]
         found = {(cell.seed, cell.trained_on): cell for cell in cells}
         seeds = sorted({seed for seed, _ in found})
@@ -132,7 +132,7 @@ class Studies:
 
     def tied(self, study, environment, algorithm, trained_on, seed=1):
         """Return the configurations that the published rule cannot tell apart."""
-        cells = self.of(study, environment=environment, algorithm=algorithm, trained_on=trained_on, seed=seed)
+        cells = self.finished(study, environment=environment, algorithm=algorithm, trained_on=trained_on, seed=seed)
         best = max(cell.tests[trained_on][:2] for cell in cells)
         return [cell for cell in cells if cell.tests[trained_on][:2] == best]
 

@@ -53,7 +53,7 @@ def gains(studies, study, method, seeds, tasks=ENVIRONMENTS, **wanted):
     algorithm, architecture, trials = method
     strata = []
     for task in tasks:
-        cells = studies.of(study, environment=task, algorithm=algorithm, architecture=architecture, **wanted)
+        cells = studies.finished(study, environment=task, algorithm=algorithm, architecture=architecture, **wanted)
         cells = {(cell.seed, cell.trained_on): cell for cell in cells if cell.method[2] == trials}
         strata.append([cells[seed, "R"].success("E") - cells[seed, "D"].success("E") for seed in seeds])
     return strata
@@ -73,7 +73,7 @@ def readme(studies):
         ]
     _, low, high = headline(studies)["a2c"][0][2]
     tied = len(studies.tied("classic-ff", "CartPole", "a2c", "R"))
-    grid = len(studies.of("classic-ff", environment="CartPole", algorithm="a2c", trained_on="R", seed=1))
+    grid = len(studies.finished("classic-ff", environment="CartPole", algorithm="a2c", trained_on="R", seed=1))
     texts += [
         f"{tied} of {grid} A2C configurations reach 100 % on R",
         f"A2C's average Extrapolation varies from {fixed(low)} to {fixed(high)}.",
@@ -130,7 +130,7 @@ def results(studies):
         study: sum(cell.study == study and cell.cell in stored for cell in studies.cells)
         for study in ("beyond/confirm-2", "classic-ff")
     }
-    selected = len(studies.of("classic-ff", seed=2))
+    selected = len(studies.finished("classic-ff", seed=2))
     return [
         *texts,
         f"Stored are the {of['beyond/confirm-2']} of beyond/confirm-2",
@@ -155,7 +155,7 @@ def classic_ff(studies):
     texts += by_task(studies, "classic-ff", CLEAN)
     tied = {name: len(studies.tied("classic-ff", "CartPole", name, "R")) for name in ("a2c", "ppo")}
     grid = {
-        name: len(studies.of("classic-ff", environment="CartPole", algorithm=name, trained_on="R", seed=1))
+        name: len(studies.finished("classic-ff", environment="CartPole", algorithm=name, trained_on="R", seed=1))
         for name in ("a2c", "ppo")
     }
     cart_pole = {name: studies.published_rule("classic-ff", "CartPole", name)[2] for name in ("a2c", "ppo")}
@@ -199,7 +199,7 @@ def acrobot(studies):
     for rate in ("7e-4", "7e-3"):
         for environments, length in ((1, 5), (1, 15), (16, 5), (16, 15)):
             wanted = {"num_envs": environments, "n_steps": length, "learning_rate": float(rate)}
-            cells = studies.of("questions/acrobot", **wanted)
+            cells = studies.finished("questions/acrobot", **wanted)
             d, r, e = ([cell.success(version) for cell in cells] for version in "DRE")
             low, high = bootstrap_interval(d)
             updates = [cell.timesteps / environments / length for cell in cells]
@@ -233,7 +233,7 @@ def pendulum(studies):
         (8, True): "| 8 | bootstrapped (ours) |",
     }
     for (environments, bootstrap), text in label.items():
-        cells = studies.of("questions/pendulum", num_envs=environments, bootstrap_truncation=bootstrap)
+        cells = studies.finished("questions/pendulum", num_envs=environments, bootstrap_truncation=bootstrap)
         early = [cell.success("D", 2000) for cell in cells]
         end = {version: [cell.success(version) for cell in cells] for version in "DRE"}
 
@@ -267,7 +267,7 @@ def cart_pole(studies):
         }
         if weight is not None:
             wanted["ent_coef"] = weight
-        cells = studies.of("questions/cart-pole", **wanted)
+        cells = studies.finished("questions/cart-pole", **wanted)
         assert len(cells) == 5, (wanted, len(cells))
         row = []
         for after in (1000, None):
@@ -334,7 +334,7 @@ def one_seed(studies, task, method, digits=1, seed=2, trained_on=None):
     if trained_on is None:
         found = studies.by_seed("classic-rc", task, method).get(seed)
     else:
-        cells = studies.of("classic-rc", environment=task, algorithm=method[0], architecture=method[1], seed=seed)
+        cells = studies.finished("classic-rc", environment=task, algorithm=method[0], architecture=method[1], seed=seed)
         cells = [cell for cell in cells if cell.trained_on == trained_on and cell.method[2] == method[2]]
         found = [cells[0].success(version) for version in "DRE"] if cells else None
     if found is None:
@@ -432,7 +432,7 @@ def rl2(studies):
     )
     on_acrobot = [-number for number in ahead("Acrobot", "A2C FF")]
     texts.append(f"by {fixed(min(on_acrobot))} to {fixed(max(on_acrobot))} points of Extrapolation behind A2C FF")
-    on_r = studies.of("classic-rc", environment="MountainCar", algorithm="rl2-a2c", trained_on="R")
+    on_r = studies.finished("classic-rc", environment="MountainCar", algorithm="rl2-a2c", trained_on="R")
     on_r = [cell for cell in on_r if cell.method[2] == 2 and cell.seed in seeds]
     shown = [fmean([cell.success(version) for cell in on_r]) for version in "RE"]
     texts.append(fill("({:.1f} on R, {:.1f} on E)", *shown))
@@ -450,7 +450,7 @@ def locomotion(studies):
     texts = []
     table = {}
     for trained in "DRE":
-        cells = studies.of("locomotion", environment="Hopper", algorithm="ppo", trained_on=trained)
+        cells = studies.finished("locomotion", environment="Hopper", algorithm="ppo", trained_on=trained)
         cells.sort(key=lambda cell: cell.seed)
         row = []
         for tested in "DRE":
@@ -467,19 +467,19 @@ def locomotion(studies):
         f"in {fixed(fmean(table['DR']), 0)} % on R "
         f"and in {fixed(fmean(table['DE']), 0)} % on E. Trained on E it reaches {fixed(fmean(table['EE']), 0)} % on E"
     )
-    random_policy = studies.of("locomotion", environment="Hopper", algorithm="random", trained_on="D")
+    random_policy = studies.finished("locomotion", environment="Hopper", algorithm="random", trained_on="D")
     mean_return = fmean([cell.tests["D"][1] for cell in random_policy])
     texts.append(f"| random policy | 0.0 (return {fixed(mean_return, 0)}) | 0.0 | 0.0 |")
-    rates = {cell.settings["learning_rate"]: cell.tests["D"][1] for cell in studies.of("locomotion-rate")}
+    rates = {cell.settings["learning_rate"]: cell.tests["D"][1] for cell in studies.finished("locomotion-rate")}
     pairs = zip(table["RR"], table["DR"], strict=True)
     (exception,) = [fill("{:.0f} and {:.0f}", *pair) for pair in pairs if pair[0] < pair[1]]
     texts.append(f"with one exception ({exception})")
     texts.append(
         f"2e-3 gave a return of {fixed(rates[2e-3], 0)}, 7e-4 {fixed(rates[7e-4], 0)} and 2e-4 {fixed(rates[2e-4], 0)}"
     )
-    a2c = [cell.success("D") for cell in studies.of("locomotion", algorithm="a2c")]
+    a2c = [cell.success("D") for cell in studies.finished("locomotion", algorithm="a2c")]
     texts.append(fill("have {:.1f} and {:.1f} %", *a2c))
-    cheetah = studies.of("locomotion", environment="HalfCheetah", algorithm="ppo")
+    cheetah = studies.finished("locomotion", environment="HalfCheetah", algorithm="ppo")
     shown = [
         fill("{:.1f} and {:.1f} % on {}", *(cell.success(version) for cell in cheetah), version) for version in "DRE"
     ]
@@ -521,7 +521,7 @@ def beyond(studies):
         texts.append(f"| {task} | " + " | ".join(map(spread, runs)) + " |")
     groups = defaultdict(list)
     for study in ("gamma", "batch", "last", "others", "updates", "pendulum", "normalisation"):
-        for cell in studies.of(f"beyond/search-{study}"):
+        for cell in studies.finished(f"beyond/search-{study}"):
             known = cell.settings
             key = (known["num_envs"], known["n_minibatches"], known["gamma"], known["ent_coef"], known["learning_rate"])
             groups[(*key, known["normalize_observations"])].append(cell)
@@ -540,7 +540,7 @@ def beyond(studies):
     least = [least for key, (_, least, _) in rows.items() if not key[5]]
     texts.append(f"the smallest margins are {fixed(max(least))} to {fixed(min(least))}")
     added = defaultdict(list)
-    for cell in studies.of("beyond/search-regularisation"):
+    for cell in studies.finished("beyond/search-regularisation"):
         added[cell.settings.get("weight_decay", 0), cell.settings.get("observation_noise", 0)].append(cell)
     for (decay, noise), cells in added.items():
         means, least, tasks = search_row(studies, cells)

@@ -15,9 +15,9 @@ def spaced(number):
 def acrobot(studies):
     updates, deviations = [], []
     for environments, steps in ((1, 5), (1, 15), (16, 5), (16, 15)):
-        cells = studies.of("questions/acrobot", num_envs=environments, n_steps=steps, learning_rate=7e-4)
+        cells = studies.finished("questions/acrobot", num_envs=environments, n_steps=steps, learning_rate=7e-4)
         updates.append(about(fmean(cell.timesteps / environments / steps for cell in cells)))
-        fast = studies.of("questions/acrobot", num_envs=environments, n_steps=steps, learning_rate=7e-3)
+        fast = studies.finished("questions/acrobot", num_envs=environments, n_steps=steps, learning_rate=7e-3)
         deviations.append(std([cell.success("D") for cell in fast]))
     # With one environment and five steps, most seeds fail.
     low, high = min(deviations[1:]), max(deviations[1:])
@@ -31,11 +31,11 @@ def acrobot(studies):
 def pendulum(studies):
     updates = {}
     for number in (1, 8):
-        cells = studies.of("questions/pendulum", num_envs=number)
+        cells = studies.finished("questions/pendulum", num_envs=number)
         updates[number] = fmean(cell.timesteps / number / cell.settings["n_steps"] for cell in cells)
-    solved = studies.of("questions/pendulum", num_envs=8, bootstrap_truncation=False)
+    solved = studies.finished("questions/pendulum", num_envs=8, bootstrap_truncation=False)
     return [
-        f"{len(studies.of('questions/pendulum'))} trainings",
+        f"{len(studies.finished('questions/pendulum'))} trainings",
         f"{spaced(updates[8])} updates instead of {spaced(updates[1])}",
         f"all five seeds reach {int(min(cell.success('D') for cell in solved))} % or more",
     ]
@@ -58,7 +58,7 @@ def beyond(studies, confirm, first):
     gained = [fmean(numbers) - before for numbers, before in zip(confirm, first, strict=True)]
     ends = []
     for task, wanted in (("CartPole", {}), ("Pendulum", {}), ("MountainCar", {"trained_on": "D"})):
-        episodes = [cell.episodes for cell in studies.of("beyond/confirm-2", environment=task, **wanted)]
+        episodes = [cell.episodes for cell in studies.finished("beyond/confirm-2", environment=task, **wanted)]
         ends += [min(episodes), max(episodes)]
     shown = [spaced(round(number, -1)) for number in ends[:4]] + [spaced(round(number, -2)) for number in ends[4:]]
     return [
@@ -74,7 +74,7 @@ def best_on_pendulum(studies):
     """Return the best Extrapolation of a configuration with γ of 0.95, over its seeds."""
     names = ("n_minibatches", "ent_coef", "num_envs", "n_steps")
     found = defaultdict(dict)
-    for cell in studies.of("beyond/search-pendulum", gamma=0.95):
+    for cell in studies.finished("beyond/search-pendulum", gamma=0.95):
         found[tuple(cell.settings[name] for name in names)][cell.seed, cell.trained_on] = cell
     best = 0
     for cells in found.values():
@@ -88,7 +88,7 @@ def best_on_pendulum(studies):
 
 def cells_on_d(studies, algorithm, rate, weight=None, **wanted):
     wanted = {"algorithm": algorithm, "learning_rate": rate, "trained_on": "D", **wanted}
-    return studies.of("questions/cart-pole", **wanted, **({"ent_coef": weight} if weight else {}))
+    return studies.finished("questions/cart-pole", **wanted, **({"ent_coef": weight} if weight else {}))
 
 
 def first_of_tied(studies, algorithm, seed, order=None):
@@ -96,7 +96,7 @@ def first_of_tied(studies, algorithm, seed, order=None):
 
     def first(version):
         wanted = {"algorithm": algorithm, "normalize_observations": True, "trained_on": version, "seed": seed}
-        cells = studies.of("questions/cart-pole", **wanted)
+        cells = studies.finished("questions/cart-pole", **wanted)
         best = max(cell.tests[version][:2] for cell in cells)
         tied = [cell for cell in cells if cell.tests[version][:2] == best]
         return sorted(tied, key=order)[0] if order else tied[0]
@@ -126,14 +126,14 @@ def cart_pole(studies):
 
     first = {name: [first_of_tied(studies, name, seed) for seed in CLEAN] for name in ("a2c", "ppo")}
     paper = {name: fill("{:.1f} ± {:.1f}", *studies.paper("CartPole", FF[name], "Extrapolation")) for name in first}
-    normalised = studies.of("questions/cart-pole", algorithm="a2c", normalize_observations=True, trained_on="D")
+    normalised = studies.finished("questions/cart-pole", algorithm="a2c", normalize_observations=True, trained_on="D")
     on_e = [cell.success("E") for cell in normalised if cell.success("D") == 100]
     weights = {w: cells_on_d(studies, "a2c", 7e-4, w, normalize_observations=True) for w in (1e-2, 1e-3, 1e-4, 1e-5)}
     ppo = {rate: cells_on_d(studies, "ppo", rate, normalize_observations=True) for rate in (3e-4, 3e-3)}
     bare = {rate: cells_on_d(studies, "ppo", rate, normalize_observations=False) for rate in (3e-4, 3e-3)}
     kept = [*weights.values(), *ppo.values()]
     falls = {version: [mean(cells, version, 1000) - mean(cells, version) for cells in kept] for version in "DE"}
-    plain = studies.of("questions/cart-pole", algorithm="a2c", normalize_observations=False, trained_on="D")
+    plain = studies.finished("questions/cart-pole", algorithm="a2c", normalize_observations=False, trained_on="D")
     late = [fmean(mean(cells, "E") for cells in each.values()) for each in (ppo, bare)]
     seeds = [sorted(cell.success("E") for cell in weights[weight]) for weight in (1e-4, 1e-5)]
     failed, least, most = (
