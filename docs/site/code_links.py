@@ -38,7 +38,9 @@ def corrected(document, text, lines_of):
             wrong.append(f"{document}: {target}#L{number}: no line contains `{code}`; describe the present code")
             return link[0]
         if now != number:
-            wrong.append(f"{document}: {target}#L{number}: `{code}` is in line {now}; correct it with code_links.py --write")
+            wrong.append(
+                f"{document}: {target}#L{number}: `{code}` is in line {now}; correct it with code_links.py --write"
+            )
         return f"[`{code}`]({target}#L{now})"
 
     return LINK.sub(check, text), count, wrong
