@@ -1,6 +1,6 @@
 """Makes the wheel that needs nothing else: puts perturb and perturb-server, with MuJoCo, into the package's wheel.
 
-`perturb/_programs` has the programs, beside each other, so that perturb finds its server. `perturb.libs` has the
+`perturb/_programs` has the programs, beside each other, so that perturb finds its server. `perturb_rl.libs` has the
 libraries that a Linux need not have, which auditwheel finds, and beside the package's licence are theirs. auditwheel
 names the wheel by the oldest glibc that it runs with. The commands are scripts that become the programs.
 perturb-recurrent stays outside: libtorch and what it needs are 162 MB.
@@ -55,7 +55,7 @@ def add_licences(files: Path, programs: list[Path]) -> None:
     info = files / f"{files.name}.dist-info"
     libraries = re.findall(r"=> (/\S+)", run("ldd", *programs))
     found = {Path(path).name.split(".so")[0]: path for path in libraries}
-    for library in sorted((files / "perturb.libs").iterdir()):
+    for library in sorted((files / "perturb_rl.libs").iterdir()):
         origin = found[library.name.rpartition("-")[0]]
         package = run("dpkg", "--search", os.path.realpath(origin)).split(":")[0]
         copyright_file = Path("/usr/share/doc", package, "copyright")

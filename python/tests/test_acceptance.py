@@ -84,3 +84,26 @@ def test_report_has_agent_and_checkpoint_gives_same_bytes(server: str, tmp_path:
     assert (tmp_path / "other" / files[1]).read_bytes() != (tmp_path / "again" / files[1]).read_bytes()
     known = '"timesteps": 2048'
     assert known in (tmp_path / "again/assessment.json").read_text("utf-8")
+
+
+def test_a_study_of_two_conditions_takes_twenty_lines(tmp_path: Path) -> None:
+    """Its numbers are those of a script with pandas over the episodes that it writes."""
+    import pandas as pd
+
+    lines = [line for line in (EXAMPLES / "sb3_study.py").read_text().splitlines() if line]
+    assert len(lines) <= 20
+    output = run("sb3_study.py", "4096", "60", str(tmp_path / "study.csv"))
+    episodes = pd.read_csv(tmp_path / "study.csv")
+    assert len(episodes) == 6 * 3 * 60
+    by_seed = episodes.groupby(["condition", "set", "key"])["return"].mean()
+    rows = {tuple(row[:2]): row[2:] for row in (re.split(r"  +", line) for line in output.splitlines()) if len(row) > 2}
+    for tested_on in ("D", "R", "E"):
+        seeds = {name: by_seed[name, tested_on] for name in ("no DR", "DR")}
+        for condition, means in seeds.items():
+            half = 4.302653 * means.sem()  # the quantile of 2 degrees of freedom
+            interval = f"[{means.mean() - half:.1f}, {means.mean() + half:.1f}]"
+            assert rows[condition, tested_on][:3] == ["3", f"{means.mean():.1f}", interval], output
+        pairs = (seeds["DR"] - seeds["no DR"]).tolist()
+        difference = f"{sum(pairs) / 3:+.1f}"
+        assert rows["DR − no DR", tested_on][:2] == [difference, ", ".join(f"{it:+.1f}" for it in pairs)], output
+    assert "comparisons" in output.splitlines()[-3], "the verdict"

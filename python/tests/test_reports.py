@@ -178,7 +178,7 @@ def test_pictures_are_drawn_where_matplotlib_is(
 ) -> None:
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "matplotlib.pyplot", None)
-        with pytest.raises(ImportError, match=r"pip install 'perturb\[plot\]'"):
+        with pytest.raises(ImportError, match=r"pip install 'perturb-rl\[plot\]'"):
             assessment.plot_curves("length")
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("Agg")

@@ -14,6 +14,7 @@ use perturb_text::Table;
 use serde_json::{Map, Value, json};
 
 use super::args::EvaluateArgs;
+use super::by::{checked_by, table_by};
 use super::display::{Display, output};
 use super::error::{Result, system};
 use super::{playing_servers, sets};
@@ -36,6 +37,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     let code = Criterion::from_environment_code(&environment);
     let success =
         args.success.as_ref().map(|rule| sets::normalize_rule(rule, text.as_ref(), code.as_ref())).transpose()?;
+    let by = args.by.as_deref().map(|by| checked_by(by, &environment)).transpose()?;
     let options = TestOptions { episodes: args.episodes, seed, selects: args.selection_episodes, success };
     let tester = Tester::new(&servers, &checkpoint, options)?;
     let mut display: Option<(String, Display)> = None;
@@ -80,6 +82,9 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
         common.seed,
         table.build().to_text()
     )?;
+    if let Some(by) = &by {
+        writeln!(output(), "\n{}", table_by(&records, None, by)?.to_text())?;
+    }
     Ok(())
 }
 

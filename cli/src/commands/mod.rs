@@ -1,5 +1,5 @@
-//! The command line: `perturb envs | ls | serve | train | evaluate | demo | plan | run | export | report | curves |
-//! heatmap | video | audit | rescore | completions | man`.
+//! The command line: `perturb envs | ls | serve | train | evaluate | compare | demo | plan | run | export | report |
+//! curves | heatmap | video | audit | rescore | completions | man`.
 //!
 //! Results go to standard output, everything else to standard error. Exit status: 0 success; 1 failure, for `audit`
 //! also a different episode; 2 an argument or file is missing or wrong, and nothing was begun; 128 + N if signal N
@@ -7,7 +7,9 @@
 
 mod args;
 mod audit;
+mod by;
 mod cells;
+mod compare;
 mod demo;
 mod display;
 mod envs;
@@ -94,6 +96,7 @@ pub fn main() -> ExitCode {
         CliCommand::Serve(args) => serve::run(&args).map(success),
         CliCommand::Train(args) => train::run(&args),
         CliCommand::Evaluate(args) => evaluate::run(&args).map(success),
+        CliCommand::Compare(args) => compare::run(&args).map(success),
         CliCommand::Demo(args) => demo::run(&args),
         CliCommand::Plan(args) => plan::run(&args).map(success),
         CliCommand::Run(args) => run::run(&args),

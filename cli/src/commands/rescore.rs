@@ -10,6 +10,7 @@ use perturb_records::{FILE, Records, TestResult};
 use perturb_text::Table;
 
 use super::args::RescoreArgs;
+use super::by::table_by;
 use super::display::output;
 use super::error::{CommandError, Result};
 use super::require_file;
@@ -62,7 +63,13 @@ pub(super) fn run(args: &RescoreArgs) -> Result<()> {
             let [low, high] = result.success_percent_95;
             format!("{low:.1} … {high:.1}")
         });
-    writeln!(output(), "{}, policy {}\n{}", about.environment, about.policy, table.build().to_text())?;
+    let mut out = output();
+    writeln!(out, "{}, policy {}\n{}", about.environment, about.policy, table.build().to_text())?;
+    if let Some(by) = &args.by {
+        for criterion in &criteria {
+            writeln!(out, "\nsuccess: {criterion}\n{}", table_by(&records, Some(criterion), by)?.to_text())?;
+        }
+    }
     Ok(())
 }
 

@@ -4,6 +4,7 @@
 mod common;
 
 mod clocks;
+mod compare;
 mod end_to_end;
 mod experiments;
 mod guarded;

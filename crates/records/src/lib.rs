@@ -5,6 +5,7 @@
 //! - [`success`] says when an episode is one; [`outcomes`] are success over parameters and thresholds, and the worst episodes.
 //! - [`statistics`] are means, intervals and tests over runs; [`Metric`] and [`Scenario`] are the paper's.
 //! - [`Heatmap`] is a policy over two parameters; [`ExternalEvaluation`] is an agent that no experiment trained.
+//! - [`comparison`] compares conditions over their seeds and over episodes.
 //! - [`paper`] has the published numbers; [`ledger`] compares records with a server's ledger.
 #![forbid(unsafe_code)]
 
@@ -12,6 +13,7 @@
 extern crate self as perturb_records; // by this name fixtures call it in every crate
 
 mod axis;
+pub mod comparison;
 mod episodes_file;
 mod external_evaluation;
 #[cfg(test)]

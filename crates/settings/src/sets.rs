@@ -176,7 +176,8 @@ impl Values {
     }
 }
 
-/// Returns the points of `low..high/count`: `count` points from `low` to `high`, both included.
+/// Returns the points of `low..high/count`: `count` points from `low` to `high`, both included. The points between are
+/// rounded to twelve digits, so that 0.4 is 0.4 and not 0.39999999999999997.
 fn grid_points(parameter: &str, text: &str, range: &str, count: &str) -> Result<Values, ValueError> {
     let wrong = || ValueError::new(parameter, format!("`{text}`"), "a grid such as 0.1..1.0/10, of at least 1 point");
     let (low, high) = range.split_once("..").ok_or_else(wrong)?;
@@ -184,8 +185,17 @@ fn grid_points(parameter: &str, text: &str, range: &str, count: &str) -> Result<
     let (low, high) = (number(low)?, number(high)?);
     let count: usize =
         count.trim().parse().ok().filter(|count| (1..=MAX_CONTEXTS).contains(count)).ok_or_else(wrong)?;
-    let step = |index: usize| if count == 1 { 0.0 } else { index as f64 / (count - 1) as f64 };
-    finite(parameter, text, (0..count).map(|index| low + (high - low) * step(index)).collect()).map(Values::Points)
+    let point = |index: usize| match index {
+        0 => low,
+        last if last + 1 == count => high,
+        between => rounded(low + (high - low) * (between as f64 / (count - 1) as f64)),
+    };
+    finite(parameter, text, (0..count).map(point).collect()).map(Values::Points)
+}
+
+/// Rounds to twelve significant digits.
+fn rounded(number: f64) -> f64 {
+    format!("{number:.11e}").parse().unwrap_or(number)
 }
 
 fn finite(parameter: &str, text: &str, points: Vec<f64>) -> Result<Vec<f64>, ValueError> {
@@ -268,6 +278,19 @@ mod tests {
             .collect();
         assert_eq!(set.listed(), expected);
         assert_eq!(super::tests::set(&["length=0.5..1.0/1"]).unwrap().listed(), [context(&[("length", 0.5)])]);
+    }
+
+    #[test]
+    fn points_of_a_grid_are_the_numbers_that_people_mean() {
+        let points = |text: &str| match Values::parse("length", text).unwrap() {
+            Values::Points(points) => points,
+            Values::Drawn(_) => Vec::new(),
+        };
+        assert_eq!(points("0.1..1.0/10"), [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]);
+        assert_eq!(points("0.05..0.5/4"), [0.05, 0.2, 0.35, 0.5]);
+        assert_eq!(points("0..1/3"), [0.0, 0.5, 1.0]);
+        assert_eq!(points("0.1234567890123456..1/2")[0], 0.1234567890123456, "the ends are what was written");
+        assert_eq!(points("2..3/1"), [2.0]);
     }
 
     #[test]

@@ -6,7 +6,7 @@
 //! - [`arrays`], [`infos`]: replies, as arrays and dictionaries; [`episode_table`]: the episodes that these are made of.
 //! - [`policy`]: trained policies that act here, by the learner's arithmetic.
 //! - [`sets`], [`testing`], [`records`]: tests of whatever acts in Python, recorded as the program `perturb` records its own.
-//! - [`assessed`]: such tests as folders, and in reports.
+//! - [`assessed`]: such tests as folders, and in reports; [`comparison`]: such tests compared.
 //! - [`failure`]: what went wrong, for the package to say it as one of its errors.
 #![forbid(unsafe_code)]
 // The map above is for who reads this crate: all that it has is Python's, and private.
@@ -16,6 +16,7 @@ use pyo3::prelude::*;
 
 mod arrays;
 mod assessed;
+mod comparison;
 mod episode_table;
 mod failure;
 mod infos;
@@ -32,6 +33,8 @@ mod testing;
 mod _native {
     #[pymodule_export]
     use super::assessed::{Assessment, report_page};
+    #[pymodule_export]
+    use super::comparison::compare;
     #[pymodule_export]
     use super::failure::Failure;
     #[pymodule_export]

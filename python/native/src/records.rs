@@ -2,11 +2,12 @@
 
 use std::path::PathBuf;
 
-use numpy::PyArray1;
+use numpy::{PyArray1, PyReadonlyArray1};
 use perturb_records::outcomes::{
     Bin, Counted, Outcomes, SHARE, bins, conditional_value_at_risk, success_within, success_within_both, worst_contexts,
 };
 use perturb_records::statistics::{bootstrap, mean};
+use perturb_records::success::{Criterion, Rule, Side};
 use perturb_records::{ColumnValues, Metric, ResultsTable, paper};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -82,6 +83,28 @@ impl Records {
         let columns = PyDict::new(py);
         add_columns(&columns, self.0.columns())?;
         Ok(columns)
+    }
+
+    /// The same episodes, judged by a rule as it is typed.
+    fn judged_by(&self, rule: &str) -> PyResult<Self> {
+        let invalid = |error: perturb_settings::ValueError| failure(INVALID, 0, error.to_string());
+        let rule: Rule = rule.parse().map_err(invalid)?;
+        self.0.clone().judged_by(&rule).map(Self).map_err(invalid)
+    }
+
+    /// The same episodes, judged by a threshold of a quantity of which `values` `[n]` has that of each episode; NaN is no
+    /// success.
+    fn judged(
+        &self,
+        quantity: String,
+        at_least: bool,
+        threshold: f64,
+        values: PyReadonlyArray1<'_, f64>,
+    ) -> PyResult<Self> {
+        let side = if at_least { Side::AtLeast } else { Side::AtMost };
+        let criterion = Criterion { quantity, unit: "1".into(), side, threshold, most: None };
+        let judged = self.0.clone().judged_by_values(criterion, values.as_slice()?);
+        judged.map(Self).map_err(|error| failure(INVALID, 0, error.to_string()))
     }
 
     /// The sets that were tested on, in order.

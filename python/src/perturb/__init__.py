@@ -15,6 +15,9 @@ from importlib.metadata import version as _version
 
 from . import sets
 from .assessment import Assessment
+from .compared import Comparison
+from .comparison import compare
+from .comparison_results import ConditionDifference, ConditionMean
 from .env import PerturbEnv
 from .environments import Environment, Parameter, environments
 from .errors import (
@@ -35,15 +38,17 @@ from .errors import (
     UnknownNameError,
 )
 from .evaluation import evaluate
+from .examples import example_policies
 from .policy import Actor, Policy, load_policy
 from .registration import register_all as _register_all
 from .requests import Version
 from .results import Audit, Bin, Bin2D, Context, Result
 from .results_table import read_results
 from .tasks import register_ids as _register_tasks
+from .training import Training, train
 from .vector import PerturbVectorEnv
 
-__version__ = _version("perturb")
+__version__ = _version("perturb-rl")
 
 __all__ = [
     "Actor",
@@ -52,6 +57,9 @@ __all__ = [
     "Audit",
     "Bin",
     "Bin2D",
+    "Comparison",
+    "ConditionDifference",
+    "ConditionMean",
     "Context",
     "Environment",
     "InvalidArgumentError",
@@ -72,13 +80,17 @@ __all__ = [
     "ServerStartError",
     "ServerTimeoutError",
     "ServerUnavailableError",
+    "Training",
     "UnknownNameError",
     "Version",
+    "compare",
     "environments",
     "evaluate",
+    "example_policies",
     "load_policy",
     "read_results",
     "sets",
+    "train",
 ]
 
 _register_all()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import _native, plots, requests
+from . import _native, plots, requests, success_rules
 from .contents import read_folder, write_folder
 from .errors import InvalidArgumentError, UnknownNameError
 from .policy import native
@@ -20,6 +20,8 @@ from .testing import replay
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from .success_rules import SuccessRule
 
 
 class Assessment:
@@ -60,10 +62,13 @@ class Assessment:
             return _unpickled_assessment, (read_folder(folder),)
 
     def __getitem__(self, scenario: str) -> Result:
-        """The figures of a scenario, such as `DR`; of a test, such as `R`, if it is not known what was trained on."""
+        """The figures of a scenario, such as `DR` or `D on corners`, or of a test, such as `corners`."""
         for result in self.results:
             if result.scenario == scenario:
                 return result
+        tested = [result for result in self.results if result.tested_on == scenario]
+        if len(tested) == 1:
+            return tested[0]
         known = ", ".join(result.scenario for result in self.results)
         raise UnknownNameError(f"there is no scenario {scenario!r}; there are {known}")
 
@@ -139,7 +144,7 @@ class Assessment:
         tested = np.array(every["set"]) == result.tested_on
         columns = {name: np.asarray(values)[tested] for name, values in every.items()}
         parts = np.array(records.parts(result.tested_on))
-        varying = [name for name in self.parameters if len(set(columns[f"requested_{name}"].tolist())) > 1]
+        varying = self.varying_parameters(scenario)
         contexts = []
         for part in np.unique(parts):
             rows = parts == part
@@ -159,15 +164,45 @@ class Assessment:
         contexts.sort(key=lambda context: (context.success_percent, context.mean_return))
         return tuple(contexts[: requests.count(count, "count", 1)])
 
-    def plot_curves(self, parameter: str, scenarios: Sequence[str] | None = None, *, axes: Any = None) -> Any:
+    def varying_parameters(self, scenario: str) -> tuple[str, ...]:
+        """Give the names of the parameters that vary in a test.
+
+        Raises:
+            UnknownNameError: for a scenario that was not tested.
+        """
+        result, records = self._find(scenario)
+        columns = records.columns()
+        tested = np.array(columns["set"]) == result.tested_on
+        return tuple(name for name in self.parameters if len(set(columns[f"requested_{name}"][tested].tolist())) > 1)
+
+    def judged_by(self, success: SuccessRule) -> Assessment:
+        """Give the same episodes with another rule of success.
+
+        Args:
+            success: as in `evaluate`; a threshold must be of a quantity that was recorded.
+
+        Raises:
+            InvalidArgumentError: for a rule that these episodes cannot be judged by.
+        """
+        text, own = success_rules.parse(success)
+
+        def judge(records: _native.Records) -> _native.Records:
+            return records.judged_by(text) if text is not None else own.judge(records) if own is not None else records
+
+        return Assessment(self.agent, [PolicyRecords(one.known, native(judge, one.records)) for one in self._assessed])
+
+    def plot_curves(
+        self, parameter: str, scenarios: Sequence[str] | None = None, *, title: str | None = None, axes: Any = None
+    ) -> Any:
         """Draw success over a parameter, with 95 % Wilson intervals: a line for each scenario where it varies.
 
         Args:
             parameter: its name.
             scenarios: names of scenarios; by default all.
+            title: by default the environment and the rule of success.
             axes: matplotlib's axes to draw on; by default new ones.
 
-        Returns the axes. Needs matplotlib: `pip install perturb[plot]`.
+        Returns the axes. Needs matplotlib: `pip install 'perturb-rl[plot]'`.
 
         Raises:
             ImportError: if matplotlib is not installed.
@@ -175,25 +210,30 @@ class Assessment:
         """
         named = [result.scenario for result in self.results] if scenarios is None else list(scenarios)
         lines = {name: self.success_by_parameter(name, parameter) for name in named}
-        return plots.curves(lines, parameter, self.parameters, self._title(), axes)
+        return plots.curves(lines, parameter, self.parameters, title or self._title(), axes)
 
-    def plot_heatmap(self, scenario: str, x: str, y: str, *, axes: Any = None) -> Any:
+    def plot_heatmap(
+        self, scenario: str, x: str, y: str, *, title: str | None = None, cbar: bool = True, axes: Any = None
+    ) -> Any:
         """Draw success over two parameters of a test as a heatmap.
 
         Args:
             scenario: such as `DE`.
             x: the parameter along x.
             y: the parameter along y.
+            title: by default the environment, the rule of success and the scenario.
+            cbar: whether there is a colour bar.
             axes: matplotlib's axes to draw on; by default new ones.
 
-        Returns the axes. Needs matplotlib: `pip install perturb[plot]`.
+        Returns the axes. Needs matplotlib: `pip install 'perturb-rl[plot]'`.
 
         Raises:
             ImportError: if matplotlib is not installed.
             UnknownNameError, InvalidArgumentError: for an unknown scenario or parameter, or one that does not vary.
         """
         cells = self.success_by_parameters(scenario, x, y)
-        return plots.heatmap(cells, x, y, self.parameters, f"{self._title()}: {scenario}", axes)
+        title = title or f"{self._title()}: {scenario}"
+        return plots.heatmap(cells, x, y, self.parameters, title, axes, cbar)
 
     def columns(self) -> dict[str, Any]:
         """Every episode, as arrays [episodes] by name: those of `perturb evaluate --records`, after `trained_on`.

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from . import requests
+from . import requests, success_rules
 from .address import parse_address
 from .assessment import Assessment
 from .client import TIMEOUT
@@ -18,6 +19,7 @@ from .testing import Settings, play, policies
 if TYPE_CHECKING:
     from . import _native
     from .requests import Version
+    from .success_rules import SuccessRule
 
 # Names of the sets that `parameters=` and `contexts=` make.
 DRAWN, LISTED = "parameters", "contexts"
@@ -34,7 +36,7 @@ def evaluate(
     contexts: Sequence[Mapping[str, float]] | None = None,
     base: Version = "D",
     trained_on: Version | None = None,
-    success: str | None = None,
+    success: SuccessRule | None = None,
     observe: str | None = None,
     deterministic: bool | None = None,
     normalizer: Any = None,
@@ -42,6 +44,7 @@ def evaluate(
     server: str | None = None,
     task: str | os.PathLike[str] | None = None,
     timeout: float = TIMEOUT,
+    progress: bool | None = None,
 ) -> Assessment:
     """Test a policy, or policies trained on D, R and E, in episodes that no training has seen.
 
@@ -76,7 +79,8 @@ def evaluate(
         trained_on: the version that the policy was trained on, which names its scenarios. Leave it out for a loaded
             policy, which knows it.
         success: the rule of success: `text` (the environment's rule, as the paper's text has it; the default), `code`
-            (as the paper's published code has it), or a threshold such as `steps=90`.
+            (as the paper's published code has it), or a threshold such as `steps=90`, `return>=300` or `length<=90`; or
+            a function of the columns of `Assessment.columns`, arrays [episodes] by name, that returns bool [episodes].
         observe: `state` (default), or `parameters` for observations that have the parameters at their end. Leave it out
             for a loaded policy, which knows it.
         deterministic: of a stable-baselines3 model: whether it takes the mode of its actions' distribution instead of
@@ -89,6 +93,7 @@ def evaluate(
         server: `unix:/path` or `host:port`; None starts a server of this process's own.
         task: the folder of a task, which the server of this process's own then serves; see docs/tasks.md.
         timeout: how long a reply may take, s.
+        progress: whether to show on standard error how many episodes were played; by default on a terminal only.
 
     While a policy that is not perturb's acts, NumPy's global random numbers and torch's are seeded by the test;
     afterwards they are what they were. So a model that samples with torch gives the same bytes again, on the same
@@ -106,22 +111,32 @@ def evaluate(
     environment = describe(environment, find_folder(task, server), address, timeout).name
     requests.count(episodes, "episodes", 1)
     tested = policies(policy, trained_on, normalizer)
-    sets = _sets(versions, parameters, contexts, base)
+    sets = plain_sets(versions, parameters, contexts, base)
     assessed, agents = [], []
+    rule, own_rule = success_rules.parse(success)
     for trained, one, own_normalizer in tested:
-        settings = Settings(environment, sets, episodes, seed, success, observe, deterministic, server, task, timeout)
+        settings = Settings(
+            environment, sets, episodes, seed, rule, observe, deterministic, server, task, timeout, progress
+        )
         agent, recorded = play(one, settings, trained, own_normalizer, name)
+        if own_rule is not None:
+            recorded = replace(recorded, records=own_rule.judge(recorded.records))
         agents.append(agent)
         assessed.append(recorded)
     return Assessment(", ".join(dict.fromkeys(agents)), assessed)
 
 
-def _sets(
+def plain_sets(
     versions: Sequence[Any] | None,
     parameters: requests.Parameters | None,
     contexts: Sequence[Mapping[str, float]] | None,
     base: str,
 ) -> list[_native.Set]:
+    """Return the sets that the arguments of `evaluate` name.
+
+    Raises:
+        InvalidArgumentError: if there are none, or for what is no set.
+    """
     base = requests.version(base, "base")
     own = parameters is not None or contexts is not None
     named: Sequence[Any] = (() if own else ("D", "R", "E")) if versions is None else versions

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from . import _native
 from .errors import InvalidArgumentError
+from .results import Bin, Bin2D
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-
-    from .results import Bin, Bin2D
 
 
 def curves(lines: Mapping[str, Sequence[Bin]], parameter: str, units: Mapping[str, str], title: str, axes: Any) -> Any:
@@ -41,11 +41,85 @@ def curves(lines: Mapping[str, Sequence[Bin]], parameter: str, units: Mapping[st
     return axes
 
 
-def heatmap(cells: Sequence[Bin2D], x: str, y: str, units: Mapping[str, str], title: str, axes: Any) -> Any:
+def heatmap(
+    cells: Sequence[Bin2D], x: str, y: str, units: Mapping[str, str], title: str, axes: Any, cbar: bool = True
+) -> Any:
     """Success, %, in the parts of two parameters, each drawn where it lies; white without episodes."""
     axes = _axes(axes)
     if not cells:
         raise InvalidArgumentError(f"{x} or {y} does not vary in this test: there is no heatmap over them")
+    shades = _draw_cells(cells, x, y, units, axes)
+    axes.set(title=title)
+    if cbar:
+        axes.figure.colorbar(shades, ax=axes, label="success, %")
+    return axes
+
+
+def heatmaps(
+    panels: Mapping[str, Sequence[Bin2D]],
+    x: str,
+    y: str,
+    units: Mapping[str, str],
+    title: str,
+    cbar: bool,
+    axes: Any,
+) -> Any:
+    """A heatmap for each name, side by side, with the same axes and one scale of colours. Returns an array of axes."""
+    if axes is None:
+        plt = _pyplot()
+        size = (3.2 * len(panels) + 0.8, 3.6)
+        _, axes = plt.subplots(
+            1, len(panels), figsize=size, sharex=True, sharey=True, layout="constrained", squeeze=False
+        )
+    drawn = np.atleast_1d(np.asarray(axes, dtype=object)).ravel()
+    if len(drawn) != len(panels):
+        raise InvalidArgumentError(f"axes has {len(drawn)} axes; expected {len(panels)}, one for each condition")
+    shades = None
+    for place, ((name, cells), one) in enumerate(zip(panels.items(), drawn, strict=True)):
+        if not cells:
+            raise InvalidArgumentError(f"{x} or {y} does not vary in this test: there is no heatmap over them")
+        shades = _draw_cells(cells, x, y, units, one)
+        one.set_title(name)
+        if place > 0:
+            one.set_ylabel("")
+    figure = drawn[0].figure
+    figure.suptitle(title, fontsize="medium")
+    if cbar:
+        figure.colorbar(shades, ax=list(drawn), label="success, %")
+    return drawn
+
+
+def pooled(policies: Sequence[Sequence[Bin]]) -> list[Bin]:
+    """The success of several policies in the parts of a parameter: their episodes counted together."""
+    counted: dict[tuple[float, float], list[int]] = {}
+    for part in (part for parts in policies for part in parts):
+        both = counted.setdefault((part.low, part.high), [0, 0])
+        both[0] += part.successes
+        both[1] += part.episodes
+    parts = []
+    for (low, high), (successes, episodes) in sorted(counted.items()):
+        ends = _native.wilson(successes, episodes) if episodes else None
+        rate = 100 * successes / episodes if episodes else None
+        interval = None if ends is None else (100 * ends[0], 100 * ends[1])
+        parts.append(Bin(low, high, successes, episodes, rate, interval))
+    return parts
+
+
+def pooled_2d(policies: Sequence[Sequence[Bin2D]]) -> list[Bin2D]:
+    """The success of several policies in the parts of two parameters: their episodes counted together."""
+    counted: dict[tuple[tuple[float, float], tuple[float, float]], list[int]] = {}
+    for cell in (cell for cells in policies for cell in cells):
+        both = counted.setdefault((cell.x, cell.y), [0, 0])
+        both[0] += cell.successes
+        both[1] += cell.episodes
+    return [
+        Bin2D(x, y, successes, episodes, 100 * successes / episodes if episodes else None)
+        for (x, y), (successes, episodes) in counted.items()
+    ]
+
+
+def _draw_cells(cells: Sequence[Bin2D], x: str, y: str, units: Mapping[str, str], axes: Any) -> Any:
+    """Draw the parts on axes, and return the scale of colours, which is the same for all."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.patches import Rectangle
@@ -57,11 +131,10 @@ def heatmap(cells: Sequence[Bin2D], x: str, y: str, units: Mapping[str, str], ti
             (left, right), (bottom, top) = parts_x[cell.x], parts_y[cell.y]
             colour = tuple(shades.to_rgba(np.array([cell.success_percent]))[0])
             axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, color=colour, linewidth=0))
-    axes.set(title=title, xlabel=_named(x, units), ylabel=_named(y, units))
+    axes.set(xlabel=_named(x, units), ylabel=_named(y, units))
     axes.set_xlim(min(low for low, _ in parts_x.values()), max(high for _, high in parts_x.values()))
     axes.set_ylim(min(low for low, _ in parts_y.values()), max(high for _, high in parts_y.values()))
-    axes.figure.colorbar(shades, ax=axes, label="success, %")
-    return axes
+    return shades
 
 
 def _widened(parts: set[tuple[float, float]]) -> dict[tuple[float, float], tuple[float, float]]:
@@ -77,14 +150,18 @@ def _widened(parts: set[tuple[float, float]]) -> dict[tuple[float, float], tuple
 
 
 def _axes(axes: Any) -> Any:
+    return _pyplot().subplots()[1] if axes is None else axes
+
+
+def _pyplot() -> Any:
     try:
         import matplotlib.pyplot as plt
     except ImportError as error:
         raise ImportError(
-            "pictures need matplotlib, which perturb does not bring: pip install 'perturb[plot]', or pip install "
+            "pictures need matplotlib, which perturb does not bring: pip install 'perturb-rl[plot]', or pip install "
             "matplotlib; success_by_parameter() and success_by_parameters() have the numbers, to_html() has pictures"
         ) from error
-    return plt.subplots()[1] if axes is None else axes
+    return plt
 
 
 def _named(parameter: str, units: Mapping[str, str]) -> str:

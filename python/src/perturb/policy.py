@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import _native, requests
+from . import _native, exported_networks, requests
 from .contents import read_folder, write_folder
 from .errors import InvalidArgumentError, OutOfOrderError, PerturbError, PolicyError, ProtocolError
 
@@ -84,6 +84,31 @@ class Policy:
                 f"first_environment_index={first} with num_envs={count}: indices end at 2^32 - 1"
             )
         return Actor(self, count, requests.seed(seed), first)
+
+    def to_torch(self) -> Any:
+        """Give the policy as a torch module, with its normalisation: for deployment, or as a start of other trainings.
+
+        A feed-forward policy's module maps observations [N, O] to logits [N, n] of choices or means [N, A] of numbers.
+        A recurrent one's maps (observations, memory, starts) to (outputs, memory): `memory` is None at first, later
+        what was returned, and where `starts`, bool [N], is true the row is forgotten.
+
+        Raises:
+            ImportError: if torch is not installed.
+            PolicyError: for a policy of RL², which also sees rewards.
+        """
+        return exported_networks.to_torch(exported_networks.read(self._native))
+
+    def to_onnx(self, path: str | os.PathLike[str]) -> None:
+        """Write the policy as an ONNX model, with its normalisation.
+
+        Inputs are `observations`, float32 [N, O], and of a recurrent policy its memory, `h` and `c` [N, H], which is 0
+        at the start of an episode. Outputs are `outputs`, logits [N, n] or means [N, A], and `next_h` and `next_c`.
+
+        Raises:
+            ImportError: if onnx is not installed.
+            PolicyError: for a policy of RL², which also sees rewards.
+        """
+        exported_networks.to_onnx(exported_networks.read(self._native), os.fspath(path))
 
 
 def _unpickled_policy(files: dict[str, bytes]) -> Policy:

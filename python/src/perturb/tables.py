@@ -63,3 +63,15 @@ def as_html(table: list[list[str]]) -> str:
         return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
 
     return "<table>" + row(table[0], "th") + "".join(row(cells, "td") for cells in table[1:]) + "</table>"
+
+
+def as_latex(table: list[list[str]]) -> str:
+    """Return the table as LaTeX's `tabular` with the rules of booktabs."""
+    special = {"%": r"\%", "&": r"\&", "_": r"\_", "#": r"\#", "$": r"\$", "−": "$-$", ">": "$>$", "<": "$<$"}
+
+    def row(cells: list[str]) -> str:
+        return " & ".join("".join(special.get(letter, letter) for letter in cell) for cell in cells) + r" \\"
+
+    columns = "l" * 2 + "r" * (len(table[0]) - 2)
+    lines = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", row(table[0]), r"\midrule", *map(row, table[1:])]
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from . import _native, players, requests
+from . import _native, players, requests, success_rules
 from .address import parse_address
 from .catalogue import DEFAULT_PIXELS
 from .client import Client
 from .errors import InvalidArgumentError, PolicyError
 from .policy import Policy, native
+from .progress import Progress
 from .results import Audit, PolicyMetadata, PolicyRecords
 from .task_folder import describe, find_folder
 
@@ -36,6 +37,7 @@ class Settings:
     server: str | None
     task: str | os.PathLike[str] | None
     timeout: float
+    progress: bool | None = False
 
 
 def replay(
@@ -62,12 +64,14 @@ def replay(
         known, records = one.known, one.records
         acts, own_normalizer = given[one.trained_on]
         name = agent if records.policy == agent and not isinstance(acts, Policy) else None
+        # An own rule of success judged the records after they were played, and its function is not known here.
+        own = success_rules.is_own(records.rule)
         settings = Settings(
             records.environment,
             records.tests(),
             known.episodes,
             known.seed,
-            records.rule,
+            None if own else records.rule,
             known.observe,
             known.deterministic,
             server,
@@ -76,7 +80,10 @@ def replay(
         )
         _, tested = play(acts, settings, known.trained_on, own_normalizer, name, records.policy)
         episodes += len(records.columns()["seed"])
-        different += _differences(records.columns(), tested.records.columns())
+        before, after = records.columns(), tested.records.columns()
+        if own:
+            before = {name: values for name, values in before.items() if name not in ("success", "achieved")}
+        different += _differences(before, after)
     return Audit(episodes, tuple(different))
 
 
@@ -131,7 +138,11 @@ def play(
             "observe": seen,
             "timeout": settings.timeout,
         }
-        _test(tests, place, one_set, tested, client, trials)
+        shown = Progress(settings.progress)
+        trained = "" if trained_on is None else f"trained on {trained_on}, "
+        what = f"{environment}, {tested.name}: {trained}testing on {one_set[0]}"
+        _test(tests, place, one_set, tested, client, trials, partial(shown.update, what))
+        shown.finish()
     known = PolicyMetadata(trained_on, tested.timesteps, seed, settings.episodes, seen, tested.deterministic)
     return tested.agent, PolicyRecords(known, tests.records())
 
@@ -178,6 +189,7 @@ def _test(
     tested: players.PolicyUnderTest,
     settings: dict[str, Any],
     episodes_per_trial: int,
+    show: Callable[[int, int], None],
 ) -> None:
     """Play one set's episodes."""
     _, version, drawn, contexts = one_set
@@ -214,6 +226,7 @@ def _test(
                 stepped = client.session.step(native(player.act), encode)
                 observations, rewards, terminated, truncated, events = stepped
                 done, wanted = native(tests.take, events, terminated)
+                show(done, wanted)
                 native(player.observe, observations, rewards, terminated | truncated)
         native(tests.finish)
     finally:

@@ -1,5 +1,6 @@
 //! The command line's arguments.
 
+mod comparing;
 mod deprecated;
 mod experiments;
 mod testing;
@@ -15,6 +16,7 @@ use std::time::Duration;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Arg, ArgAction, Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 
+pub use comparing::CompareArgs;
 pub use experiments::{CurvesArgs, Engine, ExportArgs, PlanArgs, ReportArgs, RunArgs};
 use perturb_learner::client::Address;
 use perturb_protocol::names;
@@ -79,6 +81,8 @@ pub enum CliCommand {
     Train(Box<TrainArgs>),
     /// Test a trained policy.
     Evaluate(EvaluateArgs),
+    /// Compare conditions, such as ways of training, over their seeds and in the same test episodes.
+    Compare(CompareArgs),
     /// Train on default and on random physics, and compare both policies where they were not trained.
     Demo(DemoArgs),
     /// Print what an experiment file consists of, and what it costs.

@@ -13,7 +13,7 @@ use super::{JsonArgs, PlayArgs, ServerArgs, WaitArgs, at_least_one, natural, wit
 use crate::video::PIXELS;
 
 /// Parses a success rule. Its name may be spelled in any case.
-fn success_rule(text: &str) -> Result<Rule, ValueError> {
+pub(super) fn success_rule(text: &str) -> Result<Rule, ValueError> {
     let known = ["text", "code"];
     names::find(text.trim(), known.into_iter()).map_or(text, |index| known[index]).parse()
 }
@@ -22,7 +22,7 @@ fn success_rule(text: &str) -> Result<Rule, ValueError> {
 #[command(after_help = "Examples:
   perturb evaluate --checkpoint runs/mine
   perturb evaluate --checkpoint runs/mine --versions E --episodes 200 --json -
-  perturb evaluate --checkpoint runs/mine --parameters length=0.1..2.0/20 --records long.parquet")]
+  perturb evaluate --checkpoint runs/mine --parameters length=0.1..2.0/20 --by length --records long.parquet")]
 pub struct EvaluateArgs {
     /// The --out folder of a training, its checkpoint folder, a policy file (.safetensors), the folder of a cell, or a
     /// policy's name: the id of a cell in results/ of the working directory, or in the folder that PERTURB_RESULTS names.
@@ -53,6 +53,10 @@ pub struct EvaluateArgs {
     /// these episodes.
     #[arg(long)]
     pub selection_episodes: bool,
+    /// Also print success by the values of this parameter, or with `context` by the contexts of a grid or a list, the
+    /// lowest success rate first. Drawn parameters are told apart by tenths of their range.
+    #[arg(long, value_name = "PARAMETER|context")]
+    pub by: Option<String>,
     #[command(flatten)]
     pub json: JsonArgs,
     #[command(flatten)]
@@ -115,7 +119,8 @@ pub struct AuditArgs {
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   perturb rescore long.parquet                       # the --records of perturb evaluate
-  perturb rescore long.parquet --success text code steps=85")]
+  perturb rescore long.parquet --success text code steps=85
+  perturb rescore long.parquet --by length           # where it fails, the worst first")]
 pub struct RescoreArgs {
     /// The folder of a cell of `perturb run`, or the --records file of `perturb evaluate`.
     pub file: PathBuf,
@@ -123,6 +128,10 @@ pub struct RescoreArgs {
     /// test].
     #[arg(long, value_name = "text|code|QUANTITY=NUMBER", num_args = 1.., value_parser = success_rule)]
     pub success: Vec<Rule>,
+    /// Also print success by the values of this parameter, or with `context` by the contexts of a grid or a list, the
+    /// lowest success rate first. Drawn parameters are told apart by tenths of their range.
+    #[arg(long, value_name = "PARAMETER|context")]
+    pub by: Option<String>,
     #[command(flatten)]
     pub json: JsonArgs,
 }

@@ -11,8 +11,8 @@ mod replay;
 pub use parquet::{FILE, RecordsError};
 
 use perturb_protocol::{EndedEpisode, proto};
-use perturb_settings::ValueError;
 use perturb_settings::sets::TestSet;
+use perturb_settings::{ValueError, require};
 use serde::{Deserialize, Serialize};
 
 use crate::axis::Axis;
@@ -290,6 +290,29 @@ impl Records {
             episode.success = criterion.holds(episode.achieved);
         }
         self.about.judge_by(rule)?;
+        Ok(self)
+    }
+
+    /// Judges the episodes by a criterion of a quantity that was not recorded: `[episodes]` its values, NaN where it was not
+    /// reached. The quantity takes the place of the recorded ones.
+    ///
+    /// # Errors
+    /// [`ValueError`] for another number of values than of episodes.
+    pub fn judged_by_values(mut self, criterion: Criterion, values: &[f64]) -> Result<Self, ValueError> {
+        let expected = format!("{}, one for each episode", self.episodes.len());
+        require(
+            values.len() == self.episodes.len(),
+            "the number of values of the rule of success",
+            values.len(),
+            expected,
+        )?;
+        for (episode, &value) in self.episodes.iter_mut().zip(values) {
+            episode.achieved = Some(value).filter(|value| !value.is_nan());
+            episode.also_achieved = None;
+            episode.success = criterion.holds(episode.achieved);
+        }
+        let about = &mut self.about;
+        (about.success, about.text_success, about.code_success, about.also) = (Some(criterion), None, None, None);
         Ok(self)
     }
 

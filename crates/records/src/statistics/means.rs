@@ -1,7 +1,7 @@
 //! Figures over episodes.
 
 /// 97.5 % of a standard normal lies below.
-const Z_95: f64 = 1.959_963_984_540_054;
+pub(crate) const Z_95: f64 = 1.959_963_984_540_054;
 
 /// Returns the 95 % confidence interval of a proportion after Wilson (1927), for `successes` among `trials`, as (low,
 /// high) in 0 … 1. Unlike the textbook interval it is right near 0 and 1. Returns (0, 1) without trials.
@@ -9,13 +9,18 @@ pub fn wilson(successes: u64, trials: u64) -> (f64, f64) {
     if trials == 0 {
         return (0.0, 1.0);
     }
-    let (n, z2) = (trials as f64, Z_95 * Z_95);
-    let share = successes as f64 / n;
+    wilson_of_share(successes as f64 / trials as f64, trials as f64)
+}
+
+/// Returns [`wilson`]'s interval of a `share`, 0 … 1, of `n` trials, which need not be a whole number: correlated trials count
+/// as fewer.
+pub fn wilson_of_share(share: f64, n: f64) -> (f64, f64) {
+    let z2 = Z_95 * Z_95;
     let centre = (share + z2 / (2.0 * n)) / (1.0 + z2 / n);
     let half = Z_95 / (1.0 + z2 / n) * (share * (1.0 - share) / n + z2 / (4.0 * n * n)).sqrt();
     // At the ends the interval is exactly closed; rounding must not leave it open.
-    let low = if successes == 0 { 0.0 } else { (centre - half).max(0.0) };
-    let high = if successes == trials { 1.0 } else { (centre + half).min(1.0) };
+    let low = if share <= 0.0 { 0.0 } else { (centre - half).max(0.0) };
+    let high = if share >= 1.0 { 1.0 } else { (centre + half).min(1.0) };
     (low, high)
 }
 

@@ -12,9 +12,10 @@ mod t_interval;
 
 pub use aggregates::{interquartile_mean, optimality_gap, probability_of_improvement, profile};
 pub use bootstrap::{Bootstrapped, MIN_RUNS_FOR_INTERVAL, bootstrap, percentile_interval, resample};
-pub use means::{geometric_mean, mean, wilson};
+pub(crate) use means::Z_95;
+pub use means::{geometric_mean, mean, wilson, wilson_of_share};
 pub use paired::{holm, sign_flip_p};
-pub use t_interval::mean_with_t_interval;
+pub use t_interval::{mean_with_t_interval, t_test_p};
 
 /// Mean and deviation over runs.
 #[derive(Clone, Copy, Debug, PartialEq)]

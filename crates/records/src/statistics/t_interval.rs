@@ -19,7 +19,30 @@ pub fn mean_with_t_interval(strata: &[Vec<f64>]) -> Option<Bootstrapped> {
     Some(Bootstrapped { point, interval_95: half_width.map(|half| [point - half, point + half]), runs })
 }
 
+/// Returns the two-sided p-value of Student's t test that the mean over `strata` is 0, with the same standard error and
+/// degrees of freedom as [`mean_with_t_interval`]. One stratum of paired differences makes it the paired test; the scores of
+/// one condition and the negative scores of another make it Welch's. `None` where there is no interval. Without any
+/// deviation it is 1 if the mean is 0, else 0.
+pub fn t_test_p(strata: &[Vec<f64>]) -> Option<f64> {
+    let mean = mean_with_t_interval(strata).filter(|mean| mean.interval_95.is_some())?.point;
+    let (error, freedom) = standard_error(strata);
+    if error == 0.0 {
+        return Some(f64::from(u8::from(mean == 0.0)));
+    }
+    let beyond = |t: StudentsT| 2.0 * t.sf((mean / error).abs());
+    Some(StudentsT::new(0.0, 1.0, freedom).map_or(f64::NAN, beyond))
+}
+
 fn half_width(strata: &[Vec<f64>]) -> f64 {
+    let (error, freedom) = standard_error(strata);
+    if error == 0.0 {
+        return 0.0; // all runs of each stratum are equal
+    }
+    StudentsT::new(0.0, 1.0, freedom).map_or(f64::NAN, |t| t.inverse_cdf(0.975)) * error
+}
+
+/// Returns the standard error of the mean over `strata` and its degrees of freedom.
+fn standard_error(strata: &[Vec<f64>]) -> (f64, f64) {
     let count = strata.len() as f64;
     let (mut variance, mut by_freedom) = (0.0, 0.0);
     for runs in strata {
@@ -29,12 +52,7 @@ fn half_width(strata: &[Vec<f64>]) -> f64 {
         variance += of_mean;
         by_freedom += of_mean * of_mean / (n - 1.0);
     }
-    if variance == 0.0 {
-        return 0.0; // all runs of each stratum are equal
-    }
-    let quantile =
-        StudentsT::new(0.0, 1.0, variance * variance / by_freedom).map_or(f64::NAN, |t| t.inverse_cdf(0.975));
-    quantile * variance.sqrt()
+    (variance.sqrt(), variance * variance / by_freedom)
 }
 
 #[cfg(test)]
@@ -66,6 +84,17 @@ mod tests {
         assert_eq!(mean_with_t_interval(&[]), None);
         assert_eq!(mean_with_t_interval(&[vec![1.0], vec![]]), None);
         assert_eq!(ends(&[vec![100.0; 3]]), [100.0, 100.0]);
+    }
+
+    /// The expected values are the areas under the t distribution's tails: 1 - t / √(2 + t²) with 2 degrees of freedom, and by
+    /// Simpson's rule with Welch's 4.03.
+    #[test]
+    fn p_values_are_those_of_the_textbook_tests() {
+        let close = |got: Option<f64>, expected: f64| assert!((got.unwrap() - expected).abs() < 1e-5, "{got:?}");
+        close(t_test_p(&[vec![1.0, 2.0, 4.0]]), 0.118_083);
+        close(t_test_p(&[vec![1.0, 2.0, 4.0, 7.0], vec![0.0, 1.0, -1.0]]), 0.071_872);
+        assert_eq!(t_test_p(&[vec![1.0, 2.0]]), None);
+        assert_eq!([t_test_p(&[vec![0.0; 3]]), t_test_p(&[vec![5.0; 3]])], [Some(1.0), Some(0.0)]);
     }
 
     /// 4 000 samples of three runs, sums of 48 uniform numbers, which are nearly normal: the interval covers the mean in 95 ± 1.4 % (four

@@ -1,0 +1,47 @@
+//! Arguments of `perturb compare`.
+
+use clap::Args;
+use perturb_protocol::Version;
+use perturb_records::success::Rule;
+
+use super::testing::success_rule;
+use super::{JsonArgs, OneOf, PlayArgs, SetArgs, at_least_one, natural};
+
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  perturb compare plain=runs/d1,runs/d2,runs/d3 random=runs/r1,runs/r2,runs/r3
+  perturb compare runs/plain runs/random             # folders with a training for each seed
+  perturb compare saved/a saved/b --score return     # of Assessment.save, or --records of perturb evaluate")]
+pub struct CompareArgs {
+    /// Conditions, each with a policy for each seed: the --out folders of trainings, which are tested now; cells of an
+    /// experiment, --records files of `perturb evaluate`, or folders that `Assessment.save` wrote in Python, whose
+    /// recorded episodes are read; or a folder that has one of these for each seed. The name is by default that of the
+    /// first folder. Policies of trainings with the same seed are pairs, the others by their order.
+    #[arg(value_name = "[NAME=]PATH[,PATH]", required = true)]
+    pub conditions: Vec<String>,
+    /// What is compared: success rates, returns or lengths of episodes.
+    #[arg(long, value_name = "SCORE", default_value = "success", value_parser = OneOf::new(&["success", "return", "length"]))]
+    pub score: String,
+    /// The condition that all others are compared with [default: each is compared with each before it].
+    #[arg(long, value_name = "NAME")]
+    pub baseline: Option<String>,
+    /// Versions to test trainings on, separated by commas [default: those of the recorded tests, else D,R,E; none with
+    /// --parameters or --contexts].
+    #[arg(long, value_delimiter = ',')]
+    pub versions: Vec<Version>,
+    #[command(flatten)]
+    pub set: SetArgs,
+    /// Rule that decides about success, as in `perturb evaluate`.
+    #[arg(long, value_name = "text|code|QUANTITY=NUMBER", value_parser = success_rule)]
+    pub success: Option<Rule>,
+    /// Number of episodes of each training on each version or set.
+    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = at_least_one::<u64>)]
+    pub episodes: u64,
+    /// Random seed of the tests, the same for all trainings.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = natural::<u64>)]
+    pub seed: u64,
+    #[command(flatten)]
+    pub json: JsonArgs,
+    #[command(flatten)]
+    pub play: PlayArgs,
+}

@@ -1,0 +1,272 @@
+//! `perturb compare`.
+
+use std::collections::BTreeSet;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use perturb_files::interrupt::StopFlag;
+use perturb_learner::checkpoint::Checkpoint;
+use perturb_learner::evaluation::{TestOptions, Tester};
+use perturb_records::comparison::{ComparedCondition, ComparedScore, ConditionComparison, compare};
+use perturb_records::success::{Criterion, Rule};
+use perturb_records::{ExternalEvaluation, FILE, Records};
+use perturb_settings::sets::TestSet;
+use perturb_text::Table;
+use serde_json::json;
+
+use super::args::CompareArgs;
+use super::display::{Display, note, output};
+use super::error::{CommandError, Result, system};
+use super::{playing_servers, sets};
+
+/// Explanation of the intervals, printed below the tables.
+const INTERVALS_NOTE: &str = "\
+Intervals have 95 %. Those over seeds are t intervals, which cover the mean in 95 % also with three seeds if the means of\n\
+seeds are normally distributed; fewer than three seeds have none. Those over episodes speak of these policies in other\n\
+episodes. p is of t tests over seeds, corrected after Holm.";
+
+/// The extension of a policy in a single file.
+const POLICY_EXTENSION: &str = "safetensors";
+
+/// A policy of a condition.
+enum ComparedPolicy {
+    /// Its tests were recorded.
+    Recorded(Box<Records>),
+    /// It is tested now.
+    Trained(Box<Checkpoint>),
+}
+
+/// A condition's name, and the tests of its policies by the key that pairs them.
+type TestedPolicies = (String, Vec<(String, Records)>);
+
+/// A condition's name, and its policies by the key that pairs them.
+struct NamedPolicies {
+    name: String,
+    policies: Vec<(String, ComparedPolicy)>,
+}
+
+pub(super) fn run(args: &CompareArgs) -> Result<()> {
+    args.json.check()?;
+    let conditions = args.conditions.iter().map(|text| condition(text)).collect::<Result<Vec<_>>>()?;
+    let sets = tested_sets(args, &conditions)?;
+    let tested = test(args, conditions, &sets)?;
+    let compared: Vec<_> = tested.iter().map(by_reference).collect();
+    let names: Vec<String> = sets.iter().map(|set| set.name.clone()).collect();
+    let score = match args.score.as_str() {
+        "return" => ComparedScore::Return,
+        "length" => ComparedScore::Length,
+        _ => ComparedScore::Success,
+    };
+    let comparison = compare(&compared, &names, score, args.baseline.as_deref())?;
+    let about = &tested[0].1[0].1.about;
+    if args.json.json.is_some() {
+        let success = about.success.as_ref().map(ToString::to_string);
+        let mut document = json!(comparison);
+        document["environment"] = json!(about.environment);
+        document["success"] = json!(success);
+        args.json.write(document)?;
+    }
+    if args.json.is_printed() {
+        return Ok(());
+    }
+    let success = about.success.as_ref().map(|criterion| format!(", success: {criterion}")).unwrap_or_default();
+    let mut out = output();
+    writeln!(out, "{}{success}\n{}", about.environment, means_table(&comparison).to_text())?;
+    if !comparison.differences.is_empty() {
+        writeln!(out, "\n{}", differences_table(&comparison).to_text())?;
+    }
+    Ok(writeln!(out, "\n{}.\n\n{INTERVALS_NOTE}", comparison.verdict)?)
+}
+
+fn by_reference((name, policies): &TestedPolicies) -> ComparedCondition<'_> {
+    let policies = policies.iter().map(|(key, records)| (key.clone(), records));
+    ComparedCondition { name: name.clone(), policies: policies.collect() }
+}
+
+/// Reads a condition, written `NAME=PATH,PATH` or `PATH,PATH`.
+fn condition(text: &str) -> Result<NamedPolicies> {
+    let (name, paths) = match text.split_once('=') {
+        Some((name, paths)) if !name.is_empty() && !name.contains(['/', ',']) => (Some(name), paths),
+        _ => (None, text),
+    };
+    let paths: Vec<PathBuf> = paths.split(',').map(PathBuf::from).collect();
+    let default = || paths[0].file_stem().unwrap_or(paths[0].as_os_str()).to_string_lossy().into_owned();
+    let name = name.map_or_else(default, str::to_owned);
+    let mut policies = Vec::new();
+    for path in &paths {
+        policies.extend(policies_at(path)?);
+    }
+    let seeds: BTreeSet<String> = policies.iter().filter_map(seed).collect();
+    let are_keys = seeds.len() == policies.len();
+    let key = |place: usize, policy: &ComparedPolicy| {
+        seed(policy).filter(|_| are_keys).unwrap_or_else(|| (place + 1).to_string())
+    };
+    let policies = policies.into_iter().enumerate().map(|(place, policy)| (key(place, &policy), policy));
+    Ok(NamedPolicies { policies: policies.collect(), name })
+}
+
+/// Returns the seed of a policy's training, if it is known.
+fn seed(policy: &ComparedPolicy) -> Option<String> {
+    match policy {
+        ComparedPolicy::Trained(checkpoint) => Some(checkpoint.state.config.common.seed.to_string()),
+        ComparedPolicy::Recorded(_) => None,
+    }
+}
+
+/// Returns the policy at `path`, or if there is none those in its folders, by name.
+fn policies_at(path: &Path) -> Result<Vec<ComparedPolicy>> {
+    let error = match policy_at(path) {
+        Ok(policy) => return Ok(vec![policy]),
+        Err(error) => error,
+    };
+    let below: Vec<ComparedPolicy> = match path.is_dir() {
+        true => perturb_files::list(path)?.iter().filter_map(|below| policy_at(below).ok()).collect(),
+        false => Vec::new(),
+    };
+    if below.is_empty() { Err(error) } else { Ok(below) }
+}
+
+fn policy_at(path: &Path) -> Result<ComparedPolicy> {
+    if ExternalEvaluation::is_in(path) {
+        let evaluation = ExternalEvaluation::read(path)?;
+        let [policy] = evaluation.policies() else {
+            let count = evaluation.policies().len();
+            let message =
+                format!("{} holds tests of {count} policies; save those of each policy by themselves", path.display());
+            return Err(CommandError::Usage(message));
+        };
+        return Ok(ComparedPolicy::Recorded(Box::new(policy.records.clone())));
+    }
+    let is_policy = path.extension().is_some_and(|extension| extension == POLICY_EXTENSION);
+    if !is_policy && (path.is_file() || path.join(FILE).is_file()) {
+        let records = Records::read(&super::rescore::records_file(path))?;
+        return Ok(ComparedPolicy::Recorded(Box::new(records)));
+    }
+    Ok(ComparedPolicy::Trained(Box::new(Checkpoint::load(path)?)))
+}
+
+/// Returns the sets that are compared: those of the arguments, or the recorded ones that all recorded policies have.
+fn tested_sets(args: &CompareArgs, conditions: &[NamedPolicies]) -> Result<Vec<TestSet>> {
+    let is_given = !args.versions.is_empty() || !args.set.parameters.is_empty() || args.set.contexts.is_some();
+    let policies = conditions.iter().flat_map(|condition| &condition.policies);
+    let recorded: Vec<&Records> = policies
+        .filter_map(|(_, policy)| match policy {
+            ComparedPolicy::Recorded(records) => Some(&**records),
+            ComparedPolicy::Trained(_) => None,
+        })
+        .collect();
+    let Some(first) = recorded.first().filter(|_| !is_given) else {
+        return sets::test_sets(&args.versions, &args.set);
+    };
+    let has = |records: &Records, set: &TestSet| records.about.tests.iter().any(|test| test.set.name == set.name);
+    let common: Vec<TestSet> = first
+        .about
+        .tests
+        .iter()
+        .map(|test| test.set.clone())
+        .filter(|set| recorded.iter().all(|records| has(records, set)))
+        .collect();
+    if common.is_empty() {
+        return Err(CommandError::Usage(
+            "the recorded tests have no set in common; test all on the same versions".into(),
+        ));
+    }
+    Ok(common)
+}
+
+/// Tests the policies that were not tested, and judges all by the rule of success.
+fn test(args: &CompareArgs, conditions: Vec<NamedPolicies>, sets: &[TestSet]) -> Result<Vec<TestedPolicies>> {
+    let policies = || conditions.iter().flat_map(|condition| &condition.policies);
+    let plays = policies().any(|(_, policy)| matches!(policy, ComparedPolicy::Trained(_)));
+    if plays && policies().any(|(_, policy)| matches!(policy, ComparedPolicy::Recorded(_))) {
+        note("recorded episodes are compared with episodes that are played now: they may be different ones");
+    }
+    let servers = plays.then(|| playing_servers(&args.play)).transpose()?;
+    let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
+    let mut tested = Vec::new();
+    for NamedPolicies { name, policies } in conditions {
+        let mut records = Vec::new();
+        for (key, policy) in policies {
+            let found = match (policy, &servers) {
+                (ComparedPolicy::Trained(checkpoint), Some(servers)) => {
+                    let environment = servers.environment(&checkpoint.state.config.common.environment)?;
+                    let text = Criterion::from_environment(&environment);
+                    let code = Criterion::from_environment_code(&environment);
+                    let rule = |rule| sets::normalize_rule(rule, text.as_ref(), code.as_ref());
+                    let success = args.success.as_ref().map(rule).transpose()?;
+                    let normalize = |set: &TestSet| sets::normalize_set(set.clone(), &environment);
+                    let sets = sets.iter().map(normalize).collect::<Result<Vec<_>, _>>()?;
+                    let options = TestOptions { episodes: args.episodes, seed: args.seed, selects: false, success };
+                    let tester = Tester::new(servers, &checkpoint, options)?;
+                    let mut display: Option<(String, Display)> = None;
+                    let mut report = |set: &TestSet, episodes| {
+                        if display.as_ref().is_none_or(|(shown, _)| *shown != set.name) {
+                            let what = format!("testing {name}, seed {key}, on {}", set.name);
+                            display = Some((set.name.clone(), Display::for_episodes(what, args.episodes)));
+                        }
+                        if let Some((_, display)) = &mut display {
+                            display.episodes(episodes);
+                        }
+                    };
+                    tester.test(&sets, &stop, &mut report)?
+                }
+                (ComparedPolicy::Recorded(records), _) => judged(*records, args.success.as_ref())?,
+                (ComparedPolicy::Trained(_), None) => continue,
+            };
+            records.push((key, found));
+        }
+        tested.push((name, records));
+    }
+    Ok(tested)
+}
+
+fn judged(records: Records, rule: Option<&Rule>) -> Result<Records> {
+    let Some(rule) = rule else { return Ok(records) };
+    let about = &records.about;
+    let text = about.text_success.as_ref().or(about.success.as_ref());
+    let rule = sets::normalize_rule(rule, text, about.code_success.as_ref())?;
+    Ok(records.judged_by(&rule)?)
+}
+
+fn means_table(comparison: &ConditionComparison) -> Table {
+    let score = match comparison.score {
+        ComparedScore::Success => "success, %",
+        ComparedScore::Return => "return",
+        ComparedScore::Length => "length",
+    };
+    Table::builder("", &comparison.means)
+        .text("condition", |row| &row.condition)
+        .text("tested on", |row| &row.tested_on)
+        .number("seeds", |row| row.by_seed.len())
+        .number(score, |row| format!("{:.1}", row.mean))
+        .number("95 % over seeds", |row| interval(row.seeds_95))
+        .number("episodes", |row| row.episodes)
+        .number("95 % over episodes", |row| interval(row.episodes_95))
+        .build()
+}
+
+fn differences_table(comparison: &ConditionComparison) -> Table {
+    let unit = match comparison.score {
+        ComparedScore::Success => "points",
+        ComparedScore::Return => "difference",
+        ComparedScore::Length => "steps",
+    };
+    let number = |number: &f64| format!("{:+.1}", number + 0.0);
+    Table::builder("", &comparison.differences)
+        .text("difference", |row| format!("{} − {}", row.x, row.y))
+        .text("tested on", |row| &row.tested_on)
+        .number(unit, move |row| number(&row.difference))
+        .number("by seed", move |row| match row.paired {
+            true => row.by_seed.iter().map(number).collect::<Vec<_>>().join(", "),
+            false => "unpaired".into(),
+        })
+        .number("95 % over seeds", |row| interval(row.seeds_95))
+        .number("95 % over episodes", |row| interval(row.episodes_95))
+        .number("P(x > y)", |row| format!("{:.2}", row.improvement))
+        .number("p, Holm", |row| row.p_holm.map_or_else(String::new, |p| format!("{p:.3}")))
+        .build()
+}
+
+fn interval(ends: Option<[f64; 2]>) -> String {
+    ends.map_or_else(String::new, |[low, high]| format!("[{:.1}, {:.1}]", low + 0.0, high + 0.0))
+}

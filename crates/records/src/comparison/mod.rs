@@ -1,0 +1,314 @@
+//! Conditions compared, such as two ways of training: over their policies, which differ by their seed, and over the episodes of
+//! their tests.
+
+mod scores;
+mod verdict;
+
+use perturb_settings::{ValueError, require};
+use serde::{Deserialize, Serialize};
+
+use crate::records::Records;
+use crate::statistics::{
+    Z_95, holm, mean, mean_with_t_interval, probability_of_improvement, t_test_p, wilson_of_share,
+};
+use scores::{EpisodeScores, share_episodes};
+
+/// A condition: policies that differ by their seeds alone.
+#[derive(Clone, Debug)]
+pub struct ComparedCondition<'a> {
+    /// The name, free but distinct.
+    pub name: String,
+    /// The policies: a key that pairs those of two conditions, such as the seed of the training, and the tests.
+    pub policies: Vec<(String, &'a Records)>,
+}
+
+/// The number of each episode that is compared.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ComparedScore {
+    /// 100 for a success, else 0: means are success rates, %.
+    Success,
+    /// The undiscounted return.
+    Return,
+    /// The number of steps.
+    Length,
+}
+
+/// A condition in a test.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ConditionMean {
+    /// The condition's name.
+    pub condition: String,
+    /// The set that was tested on.
+    pub tested_on: String,
+    /// The mean score of each policy.
+    pub by_seed: Vec<f64>,
+    /// The mean over policies.
+    pub mean: f64,
+    /// The ends of the 95 % t interval over policies, which speaks of other seeds. `None` with fewer than three.
+    pub seeds_95: Option<[f64; 2]>,
+    /// Number of episodes of each policy; the smallest one if they differ.
+    pub episodes: usize,
+    /// The ends of the 95 % interval over episodes, which speaks of these policies in other episodes. It is Wilson's for success
+    /// rates, where episodes that all policies play count by their effective number, else a t interval.
+    pub episodes_95: Option<[f64; 2]>,
+}
+
+/// Two conditions in a test: the difference x − y.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ConditionDifference {
+    /// The name of the condition x.
+    pub x: String,
+    /// The name of the condition y.
+    pub y: String,
+    /// The set that was tested on.
+    pub tested_on: String,
+    /// Numbers of policies of x and y.
+    pub seeds: [usize; 2],
+    /// Whether policies of x and y with the same key are pairs.
+    pub paired: bool,
+    /// The mean difference.
+    pub difference: f64,
+    /// The difference of each pair; empty without pairs.
+    pub by_seed: Vec<f64>,
+    /// The ends of the 95 % t interval over pairs, or without pairs Welch's over policies. `None` with fewer than three policies
+    /// of either.
+    pub seeds_95: Option<[f64; 2]>,
+    /// The ends of the 95 % interval over episodes.
+    pub episodes_95: Option<[f64; 2]>,
+    /// Whether both played the same episodes, so that differences of episodes are compared.
+    pub same_episodes: bool,
+    /// The probability, 0 … 1, that a policy of x has a higher mean score than one of y.
+    pub improvement: f64,
+    /// The p-value of the t test over pairs, or without pairs of Welch's test. `None` where there is no interval.
+    pub p: Option<f64>,
+    /// The same, corrected after Holm for all differences of the comparison.
+    pub p_holm: Option<f64>,
+    /// A sentence that says no more than that.
+    pub verdict: String,
+}
+
+/// A comparison of conditions.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ConditionComparison {
+    /// The score that is compared.
+    pub score: ComparedScore,
+    /// By test, then condition.
+    pub means: Vec<ConditionMean>,
+    /// By test, then pair of conditions.
+    pub differences: Vec<ConditionDifference>,
+    /// A sentence on all differences.
+    pub verdict: String,
+}
+
+/// Compares conditions in the tests on `sets`: each with each before it, or with `baseline` alone.
+///
+/// # Errors
+/// [`ValueError`] for conditions without policies or of one name, a set that one was not tested on, or that means different
+/// parameters in two of them, policies of different environments or rules of success, and an unknown baseline.
+pub fn compare(
+    conditions: &[ComparedCondition<'_>],
+    sets: &[String],
+    score: ComparedScore,
+    baseline: Option<&str>,
+) -> Result<ConditionComparison, ValueError> {
+    check(conditions, sets, baseline)?;
+    let (mut means, mut differences) = (Vec::new(), Vec::new());
+    for set in sets {
+        let tested: Vec<TestedCondition<'_>> =
+            conditions.iter().map(|it| TestedCondition::new(it, set, score)).collect();
+        means.extend(tested.iter().map(|condition| condition.mean(set, score)));
+        let pairs: Vec<[usize; 2]> = match baseline.and_then(|name| conditions.iter().position(|it| it.name == name)) {
+            Some(y) => (0..tested.len()).filter(|x| *x != y).map(|x| [x, y]).collect(),
+            None => (0..tested.len()).flat_map(|x| (0..x).map(move |y| [x, y])).collect(),
+        };
+        differences.extend(pairs.into_iter().map(|[x, y]| difference(&tested[x], &tested[y], set)));
+    }
+    let known: Vec<f64> = differences.iter().filter_map(|it| it.p).collect();
+    let mut corrected = holm(&known).into_iter();
+    for it in &mut differences {
+        it.p_holm = it.p.and_then(|_| corrected.next());
+    }
+    let compared = known.len();
+    for it in &mut differences {
+        it.verdict = verdict::of_difference(it, score, compared);
+    }
+    let verdict = verdict::of_all(&differences, score, compared);
+    Ok(ConditionComparison { score, means, differences, verdict })
+}
+
+fn check(conditions: &[ComparedCondition<'_>], sets: &[String], baseline: Option<&str>) -> Result<(), ValueError> {
+    require(!conditions.is_empty(), "a comparison", "of nothing", "of at least one condition")?;
+    require(!sets.is_empty(), "a comparison", "without tests", "in tests that all conditions have")?;
+    let mut names = std::collections::BTreeSet::new();
+    for condition in conditions {
+        let name = &condition.name;
+        require(
+            !condition.policies.is_empty(),
+            format!("condition {name}"),
+            "without policies",
+            "of at least one policy",
+        )?;
+        require(
+            names.insert(name),
+            "the name of a condition",
+            format!("`{name}` twice"),
+            "another for each condition",
+        )?;
+    }
+    if let Some(name) = baseline {
+        let expected = conditions.iter().map(|it| it.name.as_str()).collect::<Vec<_>>().join(", ");
+        require(
+            conditions.iter().any(|it| it.name == name),
+            "the baseline",
+            format!("`{name}`"),
+            format!("one of {expected}"),
+        )?;
+    }
+    let first = conditions[0].policies[0].1;
+    for ComparedCondition { name, policies } in conditions {
+        for (_, records) in policies {
+            let (about, expected) = (&records.about, &first.about);
+            let what = |what: &str| format!("{what} of {name}");
+            let environment = |it: &crate::RecordsMetadata| format!("{} (revision {})", it.environment, it.revision);
+            let same = (&about.environment, about.revision) == (&expected.environment, expected.revision);
+            require(
+                same,
+                what("the environment"),
+                environment(about),
+                format!("{}, like the others'", environment(expected)),
+            )?;
+            let rule =
+                |it: &crate::RecordsMetadata| it.success.as_ref().map_or("the server's".into(), ToString::to_string);
+            let same = about.success == expected.success;
+            require(same, what("the rule of success"), rule(about), format!("{}, like the others'", rule(expected)))?;
+            for set in sets {
+                let test =
+                    |it: &Records| it.about.tests.iter().find(|test| test.set.name == *set).map(|it| it.set.clone());
+                let tested = about.tests.iter().map(|test| test.set.name.as_str()).collect::<Vec<_>>().join(", ");
+                let (own, others) = (test(records), test(first));
+                require(own.is_some(), what("the list of tests"), tested, format!("one with {set}, like the others'"))?;
+                require(
+                    own == others,
+                    what(&format!("the set {set}")),
+                    "of other parameters",
+                    "the same in all conditions",
+                )?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The scores of a condition in a test.
+struct TestedCondition<'a> {
+    name: &'a str,
+    keys: Vec<&'a str>,
+    policies: Vec<EpisodeScores>,
+}
+
+impl<'a> TestedCondition<'a> {
+    fn new(condition: &'a ComparedCondition<'_>, set: &str, score: ComparedScore) -> Self {
+        Self {
+            name: &condition.name,
+            keys: condition.policies.iter().map(|(key, _)| key.as_str()).collect(),
+            policies: condition.policies.iter().map(|(_, records)| EpisodeScores::new(records, set, score)).collect(),
+        }
+    }
+
+    fn by_seed(&self) -> Vec<f64> {
+        self.policies.iter().map(|policy| mean(policy.values.iter().copied())).collect()
+    }
+
+    /// Returns independent strata of scores: the mean over policies of each episode if all played the same ones, else the
+    /// scores of each policy.
+    fn strata(&self) -> Vec<Vec<f64>> {
+        if share_episodes(&self.policies) {
+            return vec![scores::mean_by_episode(&self.policies)];
+        }
+        self.policies.iter().map(|policy| policy.values.clone()).collect()
+    }
+
+    fn mean(&self, set: &str, score: ComparedScore) -> ConditionMean {
+        let by_seed = self.by_seed();
+        let strata = self.strata();
+        let mean = mean(by_seed.iter().copied());
+        ConditionMean {
+            condition: self.name.to_owned(),
+            tested_on: set.to_owned(),
+            mean,
+            seeds_95: mean_with_t_interval(std::slice::from_ref(&by_seed)).and_then(|it| it.interval_95),
+            by_seed,
+            episodes: self.policies.iter().map(|policy| policy.values.len()).min().unwrap_or(0),
+            episodes_95: match score {
+                ComparedScore::Success => Some(success_interval(mean, &strata)),
+                ComparedScore::Return | ComparedScore::Length => {
+                    mean_with_t_interval(&strata).and_then(|it| it.interval_95)
+                }
+            },
+        }
+    }
+}
+
+/// Returns Wilson's interval of a success rate, %, with the effective number of episodes: that of independent ones whose rate
+/// would vary as much.
+fn success_interval(percent: f64, strata: &[Vec<f64>]) -> [f64; 2] {
+    let share = percent / 100.0;
+    let count: usize = strata.iter().map(Vec::len).sum();
+    let variance = scores::variance_of_mean(strata) / 1e4;
+    let n = if variance > 0.0 { share * (1.0 - share) / variance } else { count as f64 };
+    let (low, high) = wilson_of_share(share, n);
+    [100.0 * low, 100.0 * high]
+}
+
+fn difference(x: &TestedCondition<'_>, y: &TestedCondition<'_>, set: &str) -> ConditionDifference {
+    let [of_x, of_y] = [x.by_seed(), y.by_seed()];
+    let pairs = pairs(&x.keys, &y.keys);
+    let by_seed: Vec<f64> = pairs.iter().flatten().map(|&[x, y]| of_x[x] - of_y[y]).collect();
+    // Without pairs: the mean of both strata is half of the difference, and so are the ends of its interval.
+    let (strata, scale) = match pairs {
+        Some(_) => (vec![by_seed.clone()], 1.0),
+        None => (vec![of_x.clone(), of_y.iter().map(|score| -score).collect()], 2.0),
+    };
+    let interval = mean_with_t_interval(&strata).and_then(|it| it.interval_95);
+    let all: Vec<EpisodeScores> = x.policies.iter().chain(&y.policies).cloned().collect();
+    let same_episodes = share_episodes(&all);
+    let difference = mean(of_x.iter().copied()) - mean(of_y.iter().copied());
+    let episodes_95 = if same_episodes {
+        let [of_x, of_y] = [&x.policies, &y.policies].map(|policies| scores::mean_by_episode(policies));
+        let by_episode: Vec<f64> = of_x.iter().zip(of_y).map(|(x, y)| x - y).collect();
+        mean_with_t_interval(&[by_episode]).and_then(|it| it.interval_95)
+    } else {
+        let half = Z_95 * (scores::variance_of_mean(&x.strata()) + scores::variance_of_mean(&y.strata())).sqrt();
+        Some([difference - half, difference + half])
+    };
+    ConditionDifference {
+        x: x.name.to_owned(),
+        y: y.name.to_owned(),
+        tested_on: set.to_owned(),
+        seeds: [of_x.len(), of_y.len()],
+        paired: !by_seed.is_empty(),
+        difference,
+        by_seed,
+        seeds_95: interval.map(|ends| ends.map(|end| scale * end)),
+        episodes_95,
+        same_episodes,
+        improvement: probability_of_improvement(&[of_x], &[of_y]),
+        p: t_test_p(&strata),
+        p_holm: None,
+        verdict: String::new(),
+    }
+}
+
+/// Returns the places in x and y of policies with the same key, in the order of x. `None` unless both have the same keys, each
+/// once.
+fn pairs(x: &[&str], y: &[&str]) -> Option<Vec<[usize; 2]>> {
+    let distinct: std::collections::BTreeSet<&&str> = x.iter().collect();
+    if x.len() != y.len() || distinct.len() != x.len() {
+        return None;
+    }
+    x.iter().enumerate().map(|(place, key)| Some([place, y.iter().position(|other| other == key)?])).collect()
+}
+
+#[cfg(test)]
+mod tests;

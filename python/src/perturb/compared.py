@@ -1,0 +1,317 @@
+"""The result of a comparison: tables, files and pictures of it."""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from . import plots
+from .errors import InvalidArgumentError, UnknownNameError
+from .tables import as_html, as_latex, text
+
+if TYPE_CHECKING:
+    from .assessment import Assessment
+    from .comparison_results import ConditionDifference, ConditionMean, Interval
+
+Table = Literal["means", "differences", "episodes"]
+
+# Heading and unit of differences by the score that is compared.
+_HEADINGS = {"success": ("success, %", "points"), "return": ("return", "difference"), "length": ("length", "steps")}
+_INTERVALS = (
+    "Intervals have 95 %. Those over seeds are t intervals and speak of other seeds: they cover the mean in 95 % also "
+    "with three seeds if the means of seeds are normally distributed, where a bootstrap would cover 73 % (84 % with "
+    "five). With fewer than three seeds there are none. Those over episodes speak of these policies in other episodes. "
+    "p is of t tests over seeds, corrected after Holm for all differences."
+)
+
+
+class Comparison:
+    """Conditions compared in the same tests. Shown as tables, in a notebook too.
+
+    Attributes:
+        environment: its name.
+        score: what is compared: `success`, `return` or `length`.
+        success: what counted as a success.
+        means: the mean of each condition in each test, by test.
+        differences: the differences of conditions in each test, by test.
+        verdict: a sentence that says what these numbers decide.
+        evaluations: the assessment of each policy, by condition and key.
+    """
+
+    def __init__(
+        self,
+        score: str,
+        means: Sequence[ConditionMean],
+        differences: Sequence[ConditionDifference],
+        verdict: str,
+        evaluations: Mapping[str, Mapping[str, Assessment]],
+    ) -> None:
+        self.score = score
+        self.means = tuple(means)
+        self.differences = tuple(differences)
+        self.verdict = verdict
+        self.evaluations = evaluations
+        first = self._assessments()[0]
+        self.environment = first.environment
+        self.success = first.success
+
+    def mean(self, condition: str, tested_on: str) -> ConditionMean:
+        """Give the mean of a condition in a test.
+
+        Raises:
+            UnknownNameError: with the conditions and tests that there are.
+        """
+        for it in self.means:
+            if (it.condition, it.tested_on) == (condition, tested_on):
+                return it
+        known = ", ".join(f"{it.condition!r} on {it.tested_on}" for it in self.means)
+        raise UnknownNameError(f"there is no {condition!r} on {tested_on}; there are {known}")
+
+    def rows(self, table: Table = "means") -> list[dict[str, Any]]:
+        """Give a table as rows by column: `means`, `differences`, or `episodes`, every episode of every policy.
+
+        Where there is no number, None.
+        """
+        if table == "means":
+            return [
+                {
+                    "condition": it.condition,
+                    "tested_on": it.tested_on,
+                    "seeds": it.seeds,
+                    "mean": it.mean,
+                    **_ends("seeds", it.seeds_interval),
+                    "episodes": it.episodes,
+                    **_ends("episodes", it.episodes_interval),
+                }
+                for it in self.means
+            ]
+        if table == "differences":
+            return [
+                {
+                    "x": it.x,
+                    "y": it.y,
+                    "tested_on": it.tested_on,
+                    "seeds_x": it.seeds[0],
+                    "seeds_y": it.seeds[1],
+                    "paired": it.paired,
+                    "difference": it.difference,
+                    **_ends("seeds", it.seeds_interval),
+                    **_ends("episodes", it.episodes_interval),
+                    "improvement": it.improvement,
+                    "p": it.p,
+                    "p_holm": it.p_holm,
+                    "verdict": it.verdict,
+                }
+                for it in self.differences
+            ]
+        if table != "episodes":
+            raise InvalidArgumentError(f"table={table!r}; expected 'means', 'differences' or 'episodes'")
+        columns = self.columns()
+        return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+    def columns(self) -> dict[str, Any]:
+        """Every episode of every policy, as arrays [episodes]: `condition`, `key`, then `Assessment.columns`."""
+        parts = [
+            {"condition": condition, "key": key, **assessment.columns()}
+            for condition, policies in self.evaluations.items()
+            for key, assessment in policies.items()
+        ]
+        columns: dict[str, Any] = {}
+        for name in parts[0]:
+            values = [
+                np.full(len(part["seed"]), part[name], dtype=object) if isinstance(part[name], str) else part[name]
+                for part in parts
+            ]
+            columns[name] = np.concatenate(values)
+        return columns
+
+    def to_pandas(self, table: Table = "means") -> Any:
+        """Give a table of `rows` as a pandas DataFrame.
+
+        Raises:
+            ImportError: if pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ImportError as error:
+            raise ImportError(
+                "to_pandas() needs pandas, which perturb does not bring: pip install pandas; rows() needs nothing"
+            ) from error
+        return pd.DataFrame(self.columns() if table == "episodes" else self.rows(table))
+
+    def to_csv(self, path: str | os.PathLike[str] | None = None, table: Table = "means") -> str:
+        """Give a table of `rows` as CSV, which is also written to `path`.
+
+        Raises:
+            OSError: if the file cannot be written.
+        """
+        rows = self.rows(table)
+        written = io.StringIO()
+        writer = csv.DictWriter(written, list(rows[0]) if rows else [], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        if path is not None:
+            Path(path).write_text(written.getvalue(), "utf-8")
+        return written.getvalue()
+
+    def to_latex(self, table: Literal["means", "differences"] = "means") -> str:
+        """Give a table as LaTeX's `tabular`, with the rules of the package booktabs."""
+        if table not in ("means", "differences"):
+            raise InvalidArgumentError(f"table={table!r}; expected 'means' or 'differences'")
+        return as_latex(self._means_table() if table == "means" else self._differences_table())
+
+    def to_html(self, path: str | os.PathLike[str] | None = None) -> str:
+        """Make a page of the verdict and the tables, in one file that needs nothing else, and write it to `path`.
+
+        Raises:
+            OSError: if the file cannot be written.
+        """
+        style = (
+            "body{font:16px/1.5 system-ui,sans-serif;max-width:60em;margin:2em auto;padding:0 1em;color:#222}"
+            "div{overflow-x:auto}table{border-collapse:collapse;margin:1em 0;white-space:nowrap}"
+            "th,td{padding:.3em .8em;border-bottom:1px solid #ddd;text-align:right}"
+            "th:first-child,td:first-child{text-align:left}"
+        )
+        title = html.escape(f"{' and '.join(self.evaluations)} in {self.environment}")
+        page = (
+            '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+            '<meta name="viewport" content="width=device-width, initial-scale=1">'
+            f"<title>{title}</title><style>{style}</style></head><body><h1>{title}</h1>{self._repr_html_()}</body></html>\n"
+        )
+        if path is not None:
+            Path(path).write_text(page, "utf-8")
+        return page
+
+    def plot(
+        self,
+        tested_on: str | None = None,
+        x: str | None = None,
+        y: str | None = None,
+        *,
+        title: str | None = None,
+        cbar: bool = True,
+        axes: Any = None,
+    ) -> Any:
+        """Draw the success of each condition over parameters, as the mean over its policies.
+
+        Over two parameters there is a heatmap for each condition, all with one scale of colours; over one there is a
+        curve for each condition.
+
+        Args:
+            tested_on: the test, by default the last one in which a parameter varies.
+            x: the parameter along x, by default the first that varies.
+            y: the parameter along y, by default the next that varies.
+            title: by default the environment, the rule of success and the test.
+            cbar: whether heatmaps have a colour bar.
+            axes: matplotlib's axes to draw on, one for each heatmap; by default new ones.
+
+        Returns the axes: an array for heatmaps. Needs matplotlib: `pip install 'perturb-rl[plot]'`.
+
+        Raises:
+            ImportError: if matplotlib is not installed.
+            UnknownNameError, InvalidArgumentError: for an unknown test or parameter, or one that does not vary.
+        """
+        first = self._assessments()[0]
+        tests = list(dict.fromkeys(it.tested_on for it in self.means))
+        if tested_on is None:
+            varying = [test for test in tests if first.varying_parameters(test)]
+            tested_on = varying[-1] if varying else tests[-1]
+        elif tested_on not in tests:
+            raise UnknownNameError(f"there is no test on {tested_on!r}; there are {', '.join(tests)}")
+        unused = [name for name in first.varying_parameters(tested_on) if name not in (x, y)]
+        x = x or (unused.pop(0) if unused else None)
+        if x is None:
+            raise InvalidArgumentError(f"no parameter varies in the test on {tested_on}: there is nothing to draw over")
+        y = y or (unused.pop(0) if unused else None)
+        title = (
+            title or f"{self.environment}, a success is {self.success or 'what the server says'}: tested on {tested_on}"
+        )
+        if y is None:
+            lines = {
+                name: plots.pooled([one.success_by_parameter(tested_on, x) for one in policies.values()])
+                for name, policies in self.evaluations.items()
+            }
+            return plots.curves(lines, x, first.parameters, title, axes)
+        panels = {
+            name: plots.pooled_2d([one.success_by_parameters(tested_on, x, y) for one in policies.values()])
+            for name, policies in self.evaluations.items()
+        }
+        return plots.heatmaps(panels, x, y, first.parameters, title, cbar, axes)
+
+    def _assessments(self) -> list[Assessment]:
+        return [one for policies in self.evaluations.values() for one in policies.values()]
+
+    def __str__(self) -> str:
+        tables = [self._means_table(), *([self._differences_table()] if self.differences else [])]
+        return "\n\n".join([self._title(), *map(text, tables), f"{self.verdict}.", _INTERVALS])
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        tables = [self._means_table(), *([self._differences_table()] if self.differences else [])]
+        shown = "".join(f"<div>{as_html(table)}</div>" for table in tables)
+        first = f"<p>{html.escape(self._title())}</p><p><b>{html.escape(self.verdict)}.</b></p>"
+        return f"{first}{shown}<p>{html.escape(_INTERVALS)}</p>"
+
+    def _title(self) -> str:
+        return f"{self.environment}, a success is {self.success or 'what the server says'}"
+
+    def _means_table(self) -> list[list[str]]:
+        heading = _HEADINGS[self.score][0]
+        head = ["condition", "tested on", "seeds", heading, "95 % over seeds", "episodes", "95 % over episodes"]
+        rows = [
+            [
+                it.condition,
+                it.tested_on,
+                str(it.seeds),
+                f"{it.mean:.1f}",
+                _shown(it.seeds_interval),
+                str(it.episodes),
+                _shown(it.episodes_interval),
+            ]
+            for it in self.means
+        ]
+        return [head, *rows]
+
+    def _differences_table(self) -> list[list[str]]:
+        unit = _HEADINGS[self.score][1]
+        head = [
+            "difference",
+            "tested on",
+            unit,
+            "by seed",
+            "95 % over seeds",
+            "95 % over episodes",
+            "P(x > y)",
+            "p, Holm",
+        ]
+        rows = [
+            [
+                f"{it.x} − {it.y}",
+                it.tested_on,
+                f"{it.difference:+.1f}",
+                ", ".join(f"{one:+.1f}" for one in it.by_seed) if it.paired else "unpaired",
+                _shown(it.seeds_interval, "+"),
+                _shown(it.episodes_interval, "+"),
+                f"{it.improvement:.2f}",
+                "" if it.p_holm is None else f"{it.p_holm:.3f}",
+            ]
+            for it in self.differences
+        ]
+        return [head, *rows]
+
+
+def _ends(of: str, interval: Interval | None) -> dict[str, float | None]:
+    low, high = interval or (None, None)
+    return {f"{of}_low_95": low, f"{of}_high_95": high}
+
+
+def _shown(interval: Interval | None, sign: str = "") -> str:
+    return "" if interval is None else f"[{interval[0]:{sign}.1f}, {interval[1]:{sign}.1f}]"

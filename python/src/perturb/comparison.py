@@ -1,0 +1,219 @@
+"""Compare conditions, such as ways of training, over their seeds and in the same episodes."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from . import _native, requests
+from .assessment import Assessment
+from .client import TIMEOUT
+from .compared import Comparison
+from .comparison_results import ConditionDifference, ConditionMean
+from .errors import InvalidArgumentError
+from .evaluation import evaluate, plain_sets
+from .policy import Policy, load_policy, native
+from .sets import Set
+
+if TYPE_CHECKING:
+    from .requests import Version
+    from .success_rules import SuccessRule
+
+# Episodes of each test and the seed of all tests, unless saved assessments have others.
+EPISODES, SEED = 1000, 1
+# The document that tells the folder of an assessment.
+_ASSESSMENT = "assessment.json"
+
+Score = Literal["success", "return", "length"]
+
+
+def compare(
+    conditions: Mapping[str, Any],
+    environment: str | None = None,
+    *,
+    versions: Sequence[Version | Set] | None = None,
+    episodes: int | None = None,
+    seed: int | None = None,
+    parameters: requests.Parameters | None = None,
+    contexts: Sequence[Mapping[str, float]] | None = None,
+    base: Version = "D",
+    score: Score = "success",
+    baseline: str | None = None,
+    success: SuccessRule | None = None,
+    observe: str | None = None,
+    deterministic: bool | None = None,
+    normalizer: Literal[False] | None = None,
+    server: str | None = None,
+    task: str | os.PathLike[str] | None = None,
+    timeout: float = TIMEOUT,
+    progress: bool | None = None,
+) -> Comparison:
+    """Compare conditions: does a change help, over seeds, and where the physics changes?
+
+        comparison = perturb.compare({"no DR": [m1, m2, m3], "DR": [m4, m5, m6]}, "Hopper", episodes=1000)
+        print(comparison.verdict)
+
+    All policies play the same episodes. Each condition has a mean with two intervals: over its policies, which speaks
+    of other seeds, and over episodes, which speaks of these policies in other episodes. Differences are of pairs of
+    policies with the same key where both conditions have the same keys, else between unpaired policies by Welch's test.
+
+    Args:
+        conditions: by free names a policy or several, which differ by their seeds: a list, whose places are the keys of
+            pairs, or a mapping by keys such as seeds. Policies of `load_policy` in a list have their seeds for keys. A
+            policy is what `evaluate` takes, an `Assessment`, or a path of a saved assessment or of a checkpoint.
+        environment: as in `evaluate`. Leave it out if all are assessments.
+        versions: as in `evaluate`; of assessments the tests that are compared, by default all that they have in common.
+        episodes: as in `evaluate`, by default those of the first assessment, else 1000.
+        seed: of all tests, by default that of the first assessment, else 1.
+        parameters: as in `evaluate`.
+        contexts: as in `evaluate`.
+        base: as in `evaluate`.
+        score: what is compared: `success` (rates in %), `return` or `length`.
+        baseline: the condition that all others are compared with. By default each is compared with each before it.
+        success: as in `evaluate`; assessments are judged anew by it.
+        observe: as in `evaluate`.
+        deterministic: as in `evaluate`.
+        normalizer: False for models whose observations were not normalised; by default the models' own.
+        server: as in `evaluate`.
+        task: as in `evaluate`.
+        timeout: as in `evaluate`.
+        progress: as in `evaluate`.
+
+    Raises:
+        InvalidArgumentError: for what cannot be compared: other environments, tests or rules of success, no policy.
+        PolicyError, UnknownNameError, ServerConnectionError, ServerTimeoutError, ServerStartError: as in `evaluate`.
+    """
+    given = _conditions(conditions)
+    saved = [one for policies in given.values() for one in policies.values() if isinstance(one, Assessment)]
+    if environment is None:
+        if not saved:
+            raise InvalidArgumentError("environment is missing; name the environment that policies are tested in")
+        environment = saved[0].environment
+    if saved and versions is None and parameters is None and contexts is None:
+        tests = _common_tests(saved)
+    else:
+        tests = plain_sets(versions, parameters, contexts, base)
+    first = saved[0]._assessed[0].known if saved else None
+    episodes = (EPISODES if first is None else first.episodes) if episodes is None else episodes
+    seed = (SEED if first is None else first.seed) if seed is None else seed
+    evaluations: dict[str, dict[str, Assessment]] = {}
+    for name, policies in given.items():
+        evaluations[name] = {}
+        for key, policy in policies.items():
+            if isinstance(policy, Assessment):
+                evaluations[name][key] = policy if success is None else policy.judged_by(success)
+                continue
+            evaluations[name][key] = evaluate(
+                policy,
+                environment,
+                versions=[
+                    Set(it[0], requests.version(it[1]), it[2], None if it[3] is None else tuple(it[3])) for it in tests
+                ],
+                episodes=episodes,
+                seed=seed,
+                success=success,
+                observe=observe,
+                deterministic=deterministic,
+                normalizer=None if isinstance(policy, Policy) else normalizer,
+                server=server,
+                task=task,
+                timeout=timeout,
+                progress=progress,
+            )
+    return _compared(evaluations, [test[0] for test in tests], score, baseline)
+
+
+def _compared(
+    evaluations: Mapping[str, Mapping[str, Assessment]], tests: Sequence[str], score: Score, baseline: str | None
+) -> Comparison:
+    plain = [
+        (name, [(key, one._assessed[0].records) for key, one in policies.items()])
+        for name, policies in evaluations.items()
+    ]
+    found: Mapping[str, Any] = json.loads(native(_native.compare, plain, list(tests), score, baseline))
+    means = tuple(
+        ConditionMean(
+            it["condition"],
+            it["tested_on"],
+            tuple(it["by_seed"]),
+            it["mean"],
+            _interval(it["seeds_95"]),
+            it["episodes"],
+            _interval(it["episodes_95"]),
+        )
+        for it in found["means"]
+    )
+    differences = tuple(
+        ConditionDifference(
+            it["x"],
+            it["y"],
+            it["tested_on"],
+            (it["seeds"][0], it["seeds"][1]),
+            it["paired"],
+            tuple(it["by_seed"]),
+            it["difference"],
+            _interval(it["seeds_95"]),
+            _interval(it["episodes_95"]),
+            it["same_episodes"],
+            it["improvement"],
+            it["p"],
+            it["p_holm"],
+            it["verdict"],
+        )
+        for it in found["differences"]
+    )
+    return Comparison(score, means, differences, found["verdict"], evaluations)
+
+
+def _interval(ends: Sequence[float] | None) -> tuple[float, float] | None:
+    return None if ends is None else (ends[0], ends[1])
+
+
+def _conditions(conditions: Any) -> dict[str, dict[str, Any]]:
+    """Return the policies of each condition by their keys, with assessments and checkpoints read."""
+    if not isinstance(conditions, Mapping) or not conditions:
+        raise InvalidArgumentError(
+            f"conditions is {conditions!r}; expected a dict of policies by names, such as "
+            "{'no DR': [m1, m2], 'DR': [m3, m4]}"
+        )
+    found: dict[str, dict[str, Any]] = {}
+    for name, policies in conditions.items():
+        if not isinstance(name, str) or not name:
+            raise InvalidArgumentError(f"conditions has the key {name!r}; expected a name")
+        if isinstance(policies, Mapping):
+            keyed = {str(key): _policy(name, policy) for key, policy in policies.items()}
+        else:
+            several = policies if isinstance(policies, list | tuple) else [policies]
+            loaded = [_policy(name, policy) for policy in several]
+            seeds = [str(policy.seed) for policy in loaded if isinstance(policy, Policy)]
+            distinct = len(seeds) == len(loaded) == len(set(seeds))
+            keyed = dict(zip(seeds if distinct else map(str, range(1, len(loaded) + 1)), loaded, strict=True))
+        if not keyed:
+            raise InvalidArgumentError(f"the condition {name!r} has no policy; expected one or several")
+        found[name] = keyed
+    return found
+
+
+def _policy(condition: str, policy: Any) -> Any:
+    if isinstance(policy, str | os.PathLike):
+        is_assessment = (Path(policy) / _ASSESSMENT).is_file()
+        policy = Assessment.load(policy) if is_assessment else load_policy(policy)
+    if isinstance(policy, Assessment) and len(policy._assessed) > 1:
+        trained = ", ".join(str(one.trained_on) for one in policy._assessed)
+        raise InvalidArgumentError(
+            f"the condition {condition!r} has an assessment of {len(policy._assessed)} policies, trained on {trained}; "
+            "expected one policy for each seed: evaluate each by itself"
+        )
+    return policy
+
+
+def _common_tests(saved: Sequence[Assessment]) -> list[_native.Set]:
+    """Return the tests that all assessments have, in the order of the first."""
+    names = [set(one._assessed[0].records.sets) for one in saved]
+    common = set.intersection(*names)
+    if not common:
+        raise InvalidArgumentError("the assessments have no test in common: evaluate all on the same versions or sets")
+    return [test for test in saved[0]._assessed[0].records.tests() if test[0] in common]

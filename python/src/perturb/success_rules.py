@@ -1,0 +1,86 @@
+"""Rules of success beyond the environment's own: thresholds of an episode's return or length, and functions."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from .errors import InvalidArgumentError
+from .policy import native
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from . import _native
+
+# A text, or a function of the columns of recorded episodes that returns bool [episodes].
+SuccessRule: TypeAlias = str | Callable[[Mapping[str, Any]], Any]
+
+_THRESHOLD = re.compile(r"\s*(return|length)\s*(>=|<=|=)\s*(\S+)\s*")
+
+
+@dataclass(frozen=True)
+class OwnRule:
+    """A rule by which recorded episodes are judged after they were played."""
+
+    quantity: str
+    at_least: bool
+    threshold: float
+    # The quantity of each episode, of the records' columns.
+    values: Callable[[Mapping[str, Any]], Any]
+
+    def judge(self, records: _native.Records) -> _native.Records:
+        """Return the same episodes, judged by this rule."""
+        columns = records.columns()
+        episodes = len(columns["seed"])
+        values: NDArray[Any] = np.asarray(self.values(columns))
+        if values.shape != (episodes,) or values.dtype.kind not in "biuf":
+            raise InvalidArgumentError(
+                f"the rule of success {self.quantity} gave {values.dtype} of the shape {values.shape}; expected bool "
+                f"of the shape ({episodes},), one for each episode of the columns"
+            )
+        judged: _native.Records = native(
+            records.judged, self.quantity, self.at_least, self.threshold, np.ascontiguousarray(values, np.float64)
+        )
+        return judged
+
+
+def parse(rule: SuccessRule | None) -> tuple[str | None, OwnRule | None]:
+    """Return what the native module judges by while it records, and what judges the records afterwards.
+
+    Raises:
+        InvalidArgumentError: for what is neither a text nor a function.
+    """
+    if rule is None:
+        return None, None
+    if callable(rule):
+        name = getattr(rule, "__name__", type(rule).__name__)
+        return None, OwnRule("rule()" if name == "<lambda>" else f"{name}()", True, 1.0, rule)
+    if not isinstance(rule, str):
+        raise InvalidArgumentError(
+            f"success is {rule!r}; expected 'text', 'code', a threshold such as 'steps=90', 'return>=300' or "
+            "'length<=90', or a function of the records' columns"
+        )
+    matched = _THRESHOLD.fullmatch(rule)
+    if matched is None:
+        return rule, None
+    quantity, sign, number = matched.groups()
+    try:
+        threshold = float(number)
+    except ValueError:
+        threshold = float("nan")
+    if not np.isfinite(threshold) or (sign == "=" and quantity != "return"):
+        raise InvalidArgumentError(
+            f"success is {rule!r}; expected a number after a sign, such as 'return>=300' or 'length<=90'"
+        )
+    return None, OwnRule(quantity, sign != "<=", threshold, lambda columns: columns[quantity])
+
+
+def is_own(rule: str | None) -> bool:
+    """Whether a recorded rule, `QUANTITY=NUMBER`, is one of this module's, and not the environment's."""
+    quantity = "" if rule is None else rule.partition("=")[0]
+    return quantity in ("return", "length") or quantity.endswith("()")

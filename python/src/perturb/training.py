@@ -1,0 +1,163 @@
+"""Train perturb's own policies from Python, by the program `perturb`."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import requests
+from .errors import InvalidArgumentError, PerturbError, ServerStartError
+from .local_server import find_program as find_server
+from .policy import Policy, load_policy
+from .progress import Progress
+
+PROGRAM = "perturb"
+# Variable that names the program.
+VARIABLE = "PERTURB_PROGRAM"
+# The program inside a wheel, if the wheel has it.
+BUNDLED = Path(__file__).with_name("_programs") / PROGRAM
+# Seconds between two looks at a training's log.
+_POLL_INTERVAL = 0.2
+# Exit status of the program for a wrong argument.
+_USAGE = 2
+
+
+@dataclass(frozen=True)
+class Training:
+    """A finished training."""
+
+    # The trained policy.
+    policy: Policy
+    # Its folder: configuration, logs, TensorBoard scalars, checkpoint. `perturb train --resume` trains on there.
+    folder: Path
+    # The columns of progress.csv, float64 [iterations] by name; NaN where there is no number.
+    progress: Mapping[str, Any]
+    # The numbers that `perturb train --json` writes.
+    result: Mapping[str, Any]
+
+
+def train(
+    environment: str,
+    *,
+    version: requests.Version = "D",
+    parameters: Mapping[str, str | float] | None = None,
+    algorithm: str = "ppo",
+    architecture: str | None = None,
+    observe: str | None = None,
+    episodes: int | None = None,
+    seed: int = 1,
+    settings: Mapping[str, Any] | None = None,
+    out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    server: str | None = None,
+    progress: bool | None = None,
+) -> Training:
+    """Train a policy with perturb's learner, as `perturb train` does, and wait for it.
+
+    Args:
+        environment: a name of docs/environments.md, such as `CartPole`.
+        version: the version that the parameters come from.
+        parameters: values that replace the version's: numbers, or texts such as `"0.3..0.4"`.
+        algorithm: `ppo`, `a2c`, `epopt-ppo`, `epopt-a2c`, `rl2-ppo` or `rl2-a2c`.
+        architecture: `ff` or `rc`; `rc` needs an installation by `make install-recurrent`.
+        observe: `state` or `parameters`.
+        episodes: of the training; by default 15 000.
+        seed: fixes all randomness: the same seed gives the same policy, byte for byte.
+        settings: other settings of docs/algorithms.md, such as `{"learning_rate": 3e-3}`.
+        out: the folder of the run, which must be new or empty; by default `runs/<environment>-<algorithm>-<time>`.
+        overwrite: whether a run that is there is deleted.
+        server: `unix:/path` or `host:port`; None starts a private server.
+        progress: whether to show the episodes so far on standard error; by default on a terminal only.
+
+    Raises:
+        InvalidArgumentError: for what the program refuses, with its words.
+        ServerStartError: if the program is not there.
+        PerturbError: if the training fails, with the program's words.
+    """
+    program = _find_program()
+    command = [program, "--quiet", "train", "--env", str(environment), "--version", requests.version(version)]
+    command += ["--algorithm", str(algorithm), "--seed", str(requests.seed(seed))]
+    for option, value in (("--architecture", architecture), ("--observe", observe), ("--episodes", episodes)):
+        command += [] if value is None else [option, str(value)]
+    command += [] if server is None else ["--server", str(server)]
+    for name, value in (settings or {}).items():
+        written = json.dumps(value) if isinstance(value, bool | str) else str(value)
+        command += ["--set", f"{name}={written}"]
+    command += ["--parameters", *(f"{name}={value}" for name, value in parameters.items())] if parameters else []
+    with tempfile.TemporaryDirectory(prefix="perturb-") as temporary:
+        document = Path(temporary) / "result.json"
+        command += ["--overwrite"] if overwrite else []
+        command += ["--out", os.fspath(out)] if out is not None else []
+        _run([*command, "--json", str(document)], Path(out) if out is not None else None, episodes, progress)
+        result: Mapping[str, Any] = json.loads(document.read_text("utf-8"))
+    folder = Path(out) if out is not None else Path(result["out"])
+    return Training(load_policy(folder), folder, _columns(folder / "progress.csv"), result)
+
+
+def _run(command: list[str], folder: Path | None, episodes: int | None, progress: bool | None) -> None:
+    """Run the program to its end, and show what its log says."""
+    # Without a server of its own the program starts the one that this package would start.
+    environment = {**os.environ, "PATH": os.pathsep.join([str(find_server().parent), os.environ.get("PATH", "")])}
+    shown = Progress(progress)
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)
+    try:
+        while True:
+            try:
+                _, words = process.communicate(timeout=_POLL_INTERVAL)
+                break
+            except subprocess.TimeoutExpired:
+                done = 0 if folder is None else _episodes_so_far(folder / "progress.csv")
+                if done and episodes:
+                    shown.update(f"training in {folder}", min(done, episodes), episodes)
+    except BaseException:  # Ctrl-C: the program writes a checkpoint and ends
+        process.send_signal(signal.SIGINT)
+        process.communicate()
+        raise
+    finally:
+        shown.finish()
+    if process.returncode != 0:
+        sentence = words.strip().removeprefix("perturb: ") or f"perturb train ended with status {process.returncode}"
+        raise (InvalidArgumentError if process.returncode == _USAGE else PerturbError)(sentence)
+
+
+def _episodes_so_far(log: Path) -> int:
+    try:
+        lines = log.read_text("utf-8").splitlines()
+        return int(dict(zip(lines[0].split(","), lines[-1].split(","), strict=True))["rollout/episodes"])
+    except (OSError, ValueError, IndexError, KeyError):  # nothing was logged so far
+        return 0
+
+
+def _columns(log: Path) -> dict[str, Any]:
+    with log.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {name: np.array([_number(row[name]) for row in rows]) for name in (rows[0] if rows else {})}
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
+
+
+def _find_program() -> str:
+    named = os.environ.get(VARIABLE)
+    found = shutil.which(named) if named else shutil.which(BUNDLED) or shutil.which(PROGRAM)
+    if found is None:
+        raise ServerStartError(
+            f"the program {PROGRAM} was not found: install a wheel that has it (`make wheel`), or build it with `make "
+            f"build` in a clone of perturb and set {VARIABLE} to target/release/{PROGRAM}"
+        )
+    return found
