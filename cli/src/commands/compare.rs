@@ -181,8 +181,8 @@ fn test(args: &CompareArgs, conditions: Vec<NamedPolicies>, sets: &[TestSet]) ->
     if plays && policies().any(|(_, policy)| matches!(policy, ComparedPolicy::Recorded(_))) {
         note("recorded episodes are compared with episodes that are played now: they may be different ones");
     }
-    let servers = plays.then(|| playing_servers(&args.play)).transpose()?;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
+    let servers = plays.then(|| playing_servers(&args.play, &stop)).transpose()?;
     let mut tested = Vec::new();
     for NamedPolicies { name, policies } in conditions {
         let mut records = Vec::new();
