@@ -160,3 +160,15 @@ def test_a_running_servers_tasks_need_no_folder(start_server: Callable[..., Serv
     local.close()
     with pytest.raises(perturb.InvalidArgumentError, match="a server that serves it"):
         perturb.PerturbEnv("Walker2dV5", server=running.address)
+
+
+def test_the_tutorials_arm_is_the_example_with_its_policies() -> None:
+    """So that the tables of both are of the same files."""
+    example = ROOT / "examples/tasks/my_arm"
+    tutorial = (ROOT / "docs/tutorials/your-robot.md").read_text()
+    for name in ("arm.xml", "task.toml"):
+        assert f"cat > my_arm/{name} <<'END'\n{(example / name).read_text()}END\n" in tutorial
+    for version in ("D", "R"):
+        policy = perturb.load_policy(example / "policies" / f"on_{version.lower()}")
+        assert policy.version == version
+        assert perturb.evaluate(policy, task=example, versions=["D"], episodes=40).results[0].success_percent > 60
