@@ -196,7 +196,7 @@ pub enum FolderError {
         "cells {cells:?} were trained in {environment} with different models, {hashes:?}, so their results cannot be \
          compared: delete those of one model, and have them done again"
     )]
-    Models { environment: String, cells: [String; 2], hashes: [String; 2] },
+    Models { environment: String, cells: Box<[String; 2]>, hashes: Box<[String; 2]> },
     /// The rows of a cell in a results table.
     #[error("the rows of cell {cell} are not understood: {reason}; export the cell's folder again")]
     Row {

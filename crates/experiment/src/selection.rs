@@ -104,8 +104,8 @@ impl<'a> Results<'a> {
             if known.training.model_hash != training.model_hash {
                 return Err(FolderError::Models {
                     environment: training.environment.clone(),
-                    cells: [known.id.clone(), result.id.clone()],
-                    hashes: [known.training.model_hash.clone(), training.model_hash.clone()],
+                    cells: Box::new([known.id.clone(), result.id.clone()]),
+                    hashes: Box::new([known.training.model_hash.clone(), training.model_hash.clone()]),
                 });
             }
         }

@@ -21,9 +21,19 @@ pub trait CellStates {
     fn state(&self, cell: &Cell) -> Result<CellState, FolderError>;
 }
 
+impl Folder {
+    /// Reads the state of `cell`.
+    ///
+    /// # Errors
+    /// [`FolderError`] if a file is there that cannot be read.
+    pub fn state(&self, cell: &Cell) -> Result<CellState, FolderError> {
+        self.cell(&cell.id).state()
+    }
+}
+
 impl CellStates for Folder {
     fn state(&self, cell: &Cell) -> Result<CellState, FolderError> {
-        self.cell(&cell.id).state()
+        Self::state(self, cell)
     }
 }
 

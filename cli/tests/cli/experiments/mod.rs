@@ -16,7 +16,7 @@ use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
 use std::process::{Child, Command, Output};
 
-use perturb_experiment::{Cell, CellResult, CellState, CellStates, Folder, Plan};
+use perturb_experiment::{Cell, CellResult, CellState, Folder, Plan};
 
 use crate::common::{is_running, kill, perturb, stderr, wait_for};
 use tempfile::TempDir;

@@ -286,7 +286,8 @@ fn agreement(results: &Results<'_>, selections: &[MethodResults<'_>]) -> Option<
         0.0 => "; they were equal".to_owned(),
         relative => format!("; the largest relative difference is {relative:.1e}, of {}", largest.parameter),
     });
-    (tested > 0).then(|| {
+    // A table of results does not say it.
+    (compared > 0).then(|| {
         let largest = largest.unwrap_or_default();
         format!("Requested and applied parameters were compared in {compared} of {tested} test episodes{largest}.")
     })
