@@ -1,7 +1,6 @@
 use std::fs;
 
 use bytes::Bytes;
-use perturb_files as files;
 use perturb_policy::NamedArray;
 use perturb_policy::random::{Purpose, stream};
 use rand::Rng;
