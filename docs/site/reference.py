@@ -131,10 +131,10 @@ def channels(entries):
 
 def leaderboard(programs):
     """Return the trained policies of results/ by environment, with the highest mean over D, R and E first."""
-    table = told(programs / "perturb", "export", "--into", "results/results.parquet", "--csv", "-")
+    printed = told(programs / "perturb", "export", "--into", "results/results.parquet", "--csv", "-")
     stored = {path.stem for path in Path("results/policies").glob("*.safetensors")}
     results = {}
-    for line in csv.DictReader(io.StringIO(table)):
+    for line in csv.DictReader(io.StringIO(printed)):
         # Rows of the final policy follow those of intermediate ones.
         if line["cell"] in stored and line["checksum"] and line["tested_on"] in ("D", "R", "E"):
             results.setdefault(line["cell"], {})[line["tested_on"]] = line
