@@ -135,6 +135,10 @@ impl RunDirectory {
             return Err(RunDirectoryError::Missing { path: path.to_owned() });
         }
         let directory = Self::new(path, false, true);
+        // Locking creates a file, and this may be any folder.
+        if !Lock::is_there(path) && !files::has_file(&directory.checkpoint().join("checkpoint.json"))? {
+            return Err(directory.nothing_to_resume()?);
+        }
         directory.lock()?;
         match ResumeState::load(&directory.checkpoint()) {
             Err(CheckpointError::Missing { .. }) => Err(directory.nothing_to_resume()?),
