@@ -13,6 +13,8 @@ import pytest
 
 import perturb
 
+from .conftest import ROOT
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -371,3 +373,13 @@ def test_a_torch_module_acts(server: str) -> None:
     with pytest.raises(perturb.PolicyError, match=r"gave the shape \(5, 3\); expected \(5, 2\)"):
         perturb.evaluate(torch.nn.Linear(4, 3), "CartPole", episodes=5, server=server)
     assert perturb.evaluate(torch.nn.Linear(3, 1), "Pendulum", episodes=5, server=server)["D"].episodes == 5
+
+
+def test_an_agent_trains_and_is_tested_on_a_tasks_folder() -> None:
+    arm = ROOT / "examples/tasks/my_arm"
+    envs = make_vec_env(task=arm, num_envs=4, version="R", seed=1)
+    model = stable_baselines3.PPO("MlpPolicy", envs, n_steps=64, seed=1, device="cpu").learn(1024)
+    envs.close()
+    tested = perturb.evaluate(model, task=arm, trained_on="R", episodes=20)
+    assert (tested.environment, tested.results[0].episodes) == ("MyArm", 20)
+    assert tested.audit(model, task=arm).different == ()
