@@ -229,9 +229,11 @@ fn edits_of_gymnasiums_models_are_recompiled_texts() {
             ("mass", "body = \"*\", field = \"mass\", by = \"scale\"", 0.8),
         ] {
             let Some(text) = recompiled(&mjcf, edit) else { continue };
+            // A mass of 0 is none.
+            let low = if edit == "mass" { 0.1 } else { 0.0 };
             let parameter = format!(
-                "[[parameter]]\nname = \"edited\"\ndescription = \"x\"\nedit = [{{ {toml} }}]\nbounds = [0.1, 5000.0]\n\
-                 random = [0.1, 1000.0]\nextreme = [[0.1, 0.1], [1000.0, 5000.0]]\n"
+                "[[parameter]]\nname = \"edited\"\ndescription = \"x\"\nedit = [{{ {toml} }}]\nbounds = [{low:?}, 5000.0]\n\
+                 random = [{low:?}, 1000.0]\nextreme = [[{low:?}, {low:?}], [1000.0, 5000.0]]\n"
             );
             let edited = super::load(folder(&[("task.toml", &format!("{task}\n{parameter}")), (model, &mjcf)]).path());
             let fresh = super::load(folder(&[("task.toml", &task), (model, &text)]).path());

@@ -160,7 +160,7 @@ fn every_term_is_its_formula() {
     }
     environment.reset_to(&[1.995, 0.6, 0.0, 0.0]);
     let end = environment.step(Action::Continuous(&[0.0]), &mut terms);
-    assert_eq!((terms[7], terms[8], end.terminated), (-0.2, -4.0, true), "at the limit, and not healthy");
+    assert_eq!((terms[8], terms[9], end.terminated), (-0.2, -4.0, true), "at the limit, and not healthy");
     assert!(spec.reward_terms.iter().all(|term| !term.description.is_empty()));
 }
 
