@@ -119,6 +119,8 @@ impl CommandError {
                 ReportError::Plan(_)
                 | ReportError::Value(_)
                 | ReportError::Neither { .. }
+                | ReportError::NoStudy { .. }
+                | ReportError::Table(TableError::Missing { .. } | TableError::Damaged { .. })
                 | ReportError::Experiments { .. },
             )
             | Self::Value(_)
@@ -128,6 +130,7 @@ impl CommandError {
             | Self::Audit(AuditError::Policy { .. })
             | Self::Folder(FolderError::NoPlan { .. } | FolderError::OtherModel { .. })
             | Self::Slurm(SlurmError::NotInstalled { .. })
+            | Self::Table(TableError::Missing { .. } | TableError::Damaged { .. })
             | Self::Video(VideoError::Extension { .. } | VideoError::NoFfmpeg { .. })
             | Self::Test(TestError::Value(_))
             | Self::Heatmap(HeatmapError::Parameter { .. } | HeatmapError::Fixed { .. }) => true,

@@ -38,7 +38,7 @@ fn a_run_is_exported_audited_and_continued_from_its_table() {
     let (status, told) = run(&[path("report"), &file.join("part"), path("--out"), &report]);
     assert!(status == Some(0) && told.contains("2 of 8 cells are done"), "{told}");
     let (status, told) = run(&[path("report"), &file.join("other"), path("--out"), &report]);
-    assert!(status == Some(1) && told.contains("has no study `other`: give one of them as"), "{told}");
+    assert!(status == Some(2) && told.contains("has no study `other`: give one of them as"), "{told}");
 
     // All tests of the stored policies give the same checksums, until a policy is another one.
     let audit = || run(&[path("audit"), &experiment.out("table")]);
