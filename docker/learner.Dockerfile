@@ -16,7 +16,7 @@ RUN [ "$RECURRENT" = 0 ] || { \
         && apt-get install --yes --no-install-recommends libopenblas0-pthread libtorch-dev \
         && rm -rf /var/lib/apt/lists/*; \
     }
-# Debug information would be nine tenths of the program; names of functions stay.
+# Debug information would be nine tenths of the program.
 ENV CARGO_PROFILE_RELEASE_DEBUG=false
 WORKDIR /perturb
 # Dependencies first, as in server.Dockerfile: libtorch's bindings take minutes.
@@ -28,7 +28,8 @@ COPY . .
 ARG PERTURB_COMMIT="unknown commit"
 RUN cargo build --package perturb-cli $([ "$RECURRENT" = 0 ] || echo --package perturb-recurrent) --release --locked \
     && mkdir /programs /libraries \
-    && cp target/release/perturb $([ "$RECURRENT" = 0 ] || echo target/release/perturb-recurrent) /programs
+    && cp target/release/perturb $([ "$RECURRENT" = 0 ] || echo target/release/perturb-recurrent) /programs \
+    && strip /programs/*
 # The shared libraries that the programs load: some 280, nearly all of them dependencies of libtorch. Debian's packages
 # would add 360 MB of files that are not loaded. The C library is left out, because the image has its own.
 RUN ldd /programs/* | awk '$3 ~ "^/" { print $3 }' | sort -u | grep -vE '/lib(c|m|dl|pthread|rt|resolv)\.so' \

@@ -10,7 +10,7 @@ FROM rust:1.95-bookworm AS build
 RUN apt-get update \
     && apt-get install --yes --no-install-recommends libmujoco-dev pkg-config \
     && rm -rf /var/lib/apt/lists/*
-# Debug information would be three quarters of the program; names of functions stay.
+# Debug information would be three quarters of the program.
 ENV CARGO_PROFILE_RELEASE_DEBUG=false
 WORKDIR /perturb
 # Dependencies first: this layer is built again only when they change. The compiled packages of the skeleton are removed,
@@ -20,7 +20,8 @@ RUN cargo build --package perturb --release --locked && rm -rf target/release/.f
 COPY . .
 # The commit, which the program reports: the repository is not in the build's context.
 ARG PERTURB_COMMIT="unknown commit"
-RUN cargo build --package perturb --release --locked
+# As `make install` does. Panics still name file and line.
+RUN cargo build --package perturb --release --locked && strip target/release/perturb-server
 
 FROM debian:bookworm-slim
 # 1: with OpenGL in software, which drawing Hopper and HalfCheetah needs.
