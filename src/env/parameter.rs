@@ -47,7 +47,7 @@ impl Parameter {
     }
 
     /// The distribution of a version; of R+E, whose trials are of one of both for all parameters, the values that it
-    /// may have.
+    /// may have. Intervals without length, as a task's folder may have on one side of R, are left out.
     pub fn distribution(&self, version: Version) -> Distribution {
         let [below, above] = self.extreme;
         let intervals: &[Interval] = match version {
@@ -56,7 +56,11 @@ impl Parameter {
             Version::E => &self.extreme,
             Version::RE => &[below, self.random, above],
         };
-        Distribution::union(intervals).expect("the table holds valid sets; a test checks each")
+        let intervals: Vec<Interval> = intervals.iter().copied().filter(|it| it.low < it.high).collect();
+        if intervals.is_empty() {
+            return Distribution::fixed(self.default);
+        }
+        Distribution::union(&intervals).expect("the table holds valid sets; a test checks each")
     }
 
     /// From the least to the greatest value that R and E have.
@@ -77,6 +81,17 @@ impl Parameter {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn intervals_without_length_are_left_out() {
+        let one_sided = Parameter::new("x", "1", "", (0.0, 9.0)).versions(1.0, (1.0, 3.0), (1.0, 5.0));
+        let above = Distribution::union(&[Interval::new(3.0, 5.0)]).unwrap();
+        assert_eq!(one_sided.distribution(Version::E), above);
+        let fixed = Parameter::new("x", "1", "", (0.0, 9.0)).versions(1.0, (1.0, 1.0), (1.0, 1.0));
+        for version in [Version::D, Version::R, Version::E, Version::RE] {
+            assert_eq!(fixed.distribution(version), Distribution::fixed(1.0), "{version:?}");
+        }
+    }
 
     #[test]
     fn a_parameter_is_observed_on_the_whole_range_of_the_versions_and_beyond_it() {
