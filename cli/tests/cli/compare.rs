@@ -44,6 +44,7 @@ fn conditions_are_compared_over_seeds_and_episodes() {
     let rates: Vec<f64> = rescored
         .lines()
         .skip_while(|line| !line.starts_with("success: "))
+        .map(str::trim_start)
         .filter(|line| line.starts_with("E ") && line.contains('…'))
         .filter_map(|line| line.split_whitespace().nth(5)?.parse().ok())
         .collect();
