@@ -17,6 +17,8 @@ const ENV_PREFIX: &str = "PERTURB_SERVER";
 const MAX_SECONDS: u64 = 86_400;
 /// Lower limit of the memory for bytes in flight. Pictures need more.
 const MIN_MEMORY: usize = 1 << 20;
+/// The maximum length of the file of settings.
+const MAX_CONFIG_BYTES: u64 = 1 << 20;
 /// The settings of `--private`. Limits protect shared servers only. The program may compute for long between two steps;
 /// its death closes the socket and the pipe anyway.
 const PRIVATE: &str = "
@@ -184,6 +186,10 @@ pub struct Arguments {
     #[arg(long, group = "instead")]
     #[serde(skip)]
     pub catalogue: bool,
+    /// Start no server, but print the contract, perturb/v1/perturb.proto, from which clients in any language are made.
+    #[arg(long, group = "instead")]
+    #[serde(skip)]
+    pub proto: bool,
     /// Start no server, but print a new token on standard output, and its entry for the file of --tokens on standard
     /// error.
     #[arg(long, value_name = "NAME", group = "instead")]
@@ -307,7 +313,8 @@ fn variables() -> Environment {
     // replaced.
     let text = std::env::vars_os().map(|(k, v)| (k.to_string_lossy().into_owned(), v.to_string_lossy().into_owned()));
     // The variable that names the file is no setting.
-    let settings = text.filter(|(name, _)| !name.eq_ignore_ascii_case("PERTURB_SERVER_CONFIG"));
+    let settings = text
+        .filter(|(name, value)| !name.eq_ignore_ascii_case("PERTURB_SERVER_CONFIG") && !is_service_link(name, value));
     Environment::with_prefix(ENV_PREFIX)
         .prefix_separator("_")
         .try_parsing(true)
@@ -315,6 +322,26 @@ fn variables() -> Environment {
         .with_list_parse_key("listen")
         .with_list_parse_key("tasks")
         .source(Some(settings.collect()))
+}
+
+/// Whether a variable is one that Kubernetes injects into every container for a Service whose name begins with
+/// `perturb-server`, such as `PERTURB_SERVER_PORT=tcp://10.96.3.7:7447` or `PERTURB_SERVER_SERVICE_HOST`.
+fn is_service_link(name: &str, value: &str) -> bool {
+    let Some(rest) = name.strip_prefix(ENV_PREFIX) else { return false };
+    let is_number = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    let is_port = |rest: &str| {
+        // NUMBER_PROTOCOL, or that with _PROTO, _PORT or _ADDR
+        let mut parts = rest.split('_');
+        parts.next().is_some_and(is_number)
+            && parts.next().is_some_and(|protocol| matches!(protocol, "TCP" | "UDP" | "SCTP"))
+            && matches!(parts.next(), None | Some("PROTO" | "PORT" | "ADDR"))
+            && parts.next().is_none()
+    };
+    rest.ends_with("_SERVICE_HOST")
+        || rest.ends_with("_SERVICE_PORT")
+        || rest.contains("_SERVICE_PORT_")
+        || (rest.ends_with("_PORT") && value.contains("://"))
+        || rest.match_indices("_PORT_").any(|(at, separator)| is_port(&rest[at + separator.len()..]))
 }
 
 /// An address to listen on.
@@ -399,6 +426,14 @@ pub enum Error {
     /// A source cannot be read, or has an unknown key or a value of a wrong type.
     #[error("the configuration cannot be read: {0}; --help lists the settings")]
     Source(#[from] config::ConfigError),
+    /// The file of settings is a pipe, a device or a folder, or too large.
+    #[error("cannot read {path}: {reason}; correct --config")]
+    File {
+        /// The file.
+        path: String,
+        /// Why not.
+        reason: String,
+    },
     /// Other machines could use the server, or read along.
     #[error(
         "{address} can be reached by other machines, and {lacks}: pass --tls-cert, --tls-key and --tokens (or \
@@ -432,6 +467,12 @@ pub enum Error {
     },
 }
 
+/// Checks that a file of settings is a plain one.
+fn require_plain_file(path: &Path) -> Result<(), Error> {
+    let refused = |error: std::io::Error| Error::File { path: path.display().to_string(), reason: error.to_string() };
+    perturb_system::read_plain(path, MAX_CONFIG_BYTES).map(drop).map_err(refused)
+}
+
 impl Config {
     /// Merges defaults, file, environment variables and flags, and validates the result.
     ///
@@ -443,6 +484,7 @@ impl Config {
             builder = builder.add_source(File::from_str(PRIVATE, FileFormat::Toml));
         } else {
             if let Some(path) = &arguments.config {
+                require_plain_file(path)?;
                 builder = builder.add_source(File::from(path.as_path()).format(FileFormat::Toml));
             }
             builder = builder.add_source(variables());
@@ -571,6 +613,36 @@ mod tests {
         std::fs::write(root.path().join("memory.max"), "8192\n").unwrap();
         assert_eq!(memory(), Some(4096));
         assert_eq!(group_memory(root.path(), ""), Some(8192), "a container sees its own group as the root");
+    }
+
+    #[test]
+    fn variables_of_kubernetes_services_are_no_settings() {
+        let address = "tcp://10.96.3.7:7447";
+        for (name, value) in [
+            ("PERTURB_SERVER_PORT", address),
+            ("PERTURB_SERVER_SERVICE_HOST", "10.96.3.7"),
+            ("PERTURB_SERVER_SERVICE_PORT", "7447"),
+            ("PERTURB_SERVER_SERVICE_PORT_GRPC", "7447"),
+            ("PERTURB_SERVER_PORT_7447_TCP", address),
+            ("PERTURB_SERVER_PORT_7447_TCP_PROTO", "tcp"),
+            ("PERTURB_SERVER_PORT_7447_UDP_PORT", "7447"),
+            ("PERTURB_SERVER_PORT_7447_TCP_ADDR", "10.96.3.7"),
+            ("PERTURB_SERVER_METRICS_SERVICE_HOST", "10.96.3.8"),
+            ("PERTURB_SERVER_METRICS_PORT", "tcp://10.96.3.8:9447"),
+            ("PERTURB_SERVER_METRICS_PORT_9447_TCP_ADDR", "10.96.3.8"),
+        ] {
+            assert!(is_service_link(name, value), "{name}");
+        }
+        for (name, value) in [
+            ("PERTURB_SERVER_PORT", "7447"),
+            ("PERTURB_SERVER_MAX_ENV", "3"),
+            ("PERTURB_SERVER_LISTEN", address),
+            ("PERTURB_SERVER_METRICS", address),
+            ("PERTURB_SERVER_PORT_7447", "7447"),
+            ("PERTURB_SERVER_PORT_7447_TCP_X", "7447"),
+        ] {
+            assert!(!is_service_link(name, value), "{name}");
+        }
     }
 
     #[test]

@@ -9,7 +9,7 @@ use perturb::{
     env::Catalogue,
     server::{
         self,
-        auth::new_token,
+        auth::{file_watcher::Reloader, new_token},
         net::{listener::Listener, probe::probe},
         security::Security,
     },
@@ -22,11 +22,14 @@ use std::{
     process::ExitCode,
 };
 use tokio::{
-    signal::unix::{SignalKind, signal},
+    signal::unix::{Signal, SignalKind, signal},
     sync::oneshot,
 };
 #[cfg(not(feature = "otel"))]
 use tracing_subscriber::{layer::SubscriberExt, util::SubscriberInitExt};
+
+/// The contract, as its file in the repository.
+const CONTRACT: &str = include_str!("../../proto/perturb/v1/perturb.proto");
 
 fn main() -> ExitCode {
     let _ = perturb_system::ignore_sigxfsz(); // without it, only a limit of file sizes ends the program
@@ -112,6 +115,8 @@ fn about(arguments: &Arguments) -> Option<Vec<u8>> {
     let (mut command, mut page) = (Arguments::command(), Vec::new());
     if let Some(shell) = arguments.completions {
         clap_complete::generate(shell, &mut command, "perturb-server", &mut page);
+    } else if arguments.proto {
+        page = CONTRACT.into();
     } else if arguments.task_schema {
         page = task_schema();
     } else if arguments.man {
@@ -255,6 +260,7 @@ fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
     let result = runtime.block_on(async {
         // This comes before the addresses are printed, because their reader may send a signal at once.
         let shutdown = shutdown(config.exit_with_stdin)?;
+        tokio::spawn(reload_on_hangup(signal(SignalKind::hangup())?, guards.reloader()));
         let mut listeners = Vec::new();
         let metrics = match &config.metrics {
             Some(address) => {
@@ -272,6 +278,9 @@ fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
         if let Some(listener) = &metrics {
             let _ = writeln!(io::stdout(), "metrics at {}{}", listener.address()?, server::metrics::endpoint::PATH);
         }
+        if let Some(target) = grpc_target(&listeners) {
+            let _ = writeln!(io::stdout(), "gRPC target {target}");
+        }
         #[cfg(feature = "mujoco")]
         tokio::spawn(watch_folders(environments.folders.clone()));
         server::run(listeners, metrics, config, &guards, environments.catalogue.clone(), shutdown).await?;
@@ -286,7 +295,29 @@ fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
 fn told(address: &ListenAddress, config: &Config) -> String {
     match address {
         ListenAddress::Tcp(tcp) if config.tls_cert.is_some() => format!("https://{tcp}"),
+        // A client may have another working folder.
+        ListenAddress::Unix(path) => {
+            ListenAddress::Unix(std::path::absolute(path).unwrap_or_else(|_| path.clone())).to_string()
+        }
         other => other.to_string(),
+    }
+}
+
+/// The first TCP address as gRPC's own tools and libraries write it, which know no `http://`. Addresses of sockets are
+/// the same for them.
+fn grpc_target(listeners: &[Listener]) -> Option<String> {
+    listeners.iter().find_map(|listener| match listener.address() {
+        Ok(ListenAddress::Tcp(tcp)) => Some(tcp.to_string()),
+        _ => None,
+    })
+}
+
+/// Reads the files of tokens and TLS again at each SIGHUP, which ends no server.
+async fn reload_on_hangup(mut hangups: Signal, reloader: Reloader) {
+    while hangups.recv().await.is_some() {
+        if !reloader.reload() {
+            tracing::info!("SIGHUP came, and there is no file of tokens or TLS to read again");
+        }
     }
 }
 
@@ -317,11 +348,14 @@ fn shutdown(exit_with_stdin: bool) -> io::Result<impl Future<Output = ()>> {
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
     let (closed, stdin) = oneshot::channel::<()>();
     if exit_with_stdin {
-        std::thread::Builder::new().name("stdin".into()).spawn(move || {
-            // Input is ignored; its end, or an error, is the signal.
-            let _ = io::copy(&mut io::stdin().lock().by_ref(), &mut io::sink());
-            drop(closed);
-        })?;
+        std::thread::Builder::new()
+            .name("stdin".into())
+            .spawn(move || {
+                // Input is ignored; its end, or an error, is the signal.
+                let _ = io::copy(&mut io::stdin().lock().by_ref(), &mut io::sink());
+                drop(closed);
+            })
+            .map_err(|error| perturb_system::explain_no_thread(&error))?;
     } else {
         std::mem::forget(closed);
     }

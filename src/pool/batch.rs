@@ -27,7 +27,7 @@ use std::{
     ops::RangeInclusive,
     sync::{Arc, Mutex, atomic::Ordering},
 };
-use tokio::time::Instant;
+use tokio::{sync::oneshot, time::Instant};
 
 /// The cost of one shard: long enough to hide the queue, short enough that sessions take turns.
 const SHARD_COST_US: RangeInclusive<f64> = 20.0..=200.0;
@@ -72,6 +72,8 @@ pub struct Batch {
     runner: Option<Box<PolicyRunner>>,
     /// The hook for the end of the batch.
     drop_hook: Option<DropHook>,
+    /// Dropped when the environments are freed, which [`Batch::close`] waits for. The last field: it is dropped last.
+    freed: Option<oneshot::Sender<()>>,
 }
 
 /// A hook that gets the draws of all environments when they are freed.
@@ -104,6 +106,7 @@ impl Batch {
             pipelined_since: None,
             runner: None,
             drop_hook: None,
+            freed: None,
         };
         batch.run().await?;
         batch.check_failures()?;
@@ -318,6 +321,16 @@ impl Batch {
         self.drop_hook = Some(hook);
     }
 
+    /// Frees the environments. Resolves when they are freed, so that there is room for others.
+    pub fn close(mut self) -> impl Future<Output = ()> + Send + use<> {
+        let (freed, is_freed) = oneshot::channel();
+        self.freed = Some(freed);
+        drop(self);
+        async move {
+            let _ = is_freed.await; // the sender's end is the answer
+        }
+    }
+
     /// Waits for a request whose future was dropped early. Call it before the next request: workers may still be
     /// running the old one and a step queued behind it. A policy that plays ends with its present step.
     pub async fn finish_abandoned(&mut self) {
@@ -425,20 +438,23 @@ impl Drop for Batch {
     fn drop(&mut self) {
         self.job.abandoned.store(true, Ordering::Relaxed);
         let is_idle = Arc::strong_count(&self.job) == 1;
-        if self.size() <= INLINE_DROP_MAX_ENVS && (is_idle || self.drop_hook.is_none()) {
+        let may_end_later = self.drop_hook.is_none() && self.freed.is_none();
+        if self.size() <= INLINE_DROP_MAX_ENVS && (is_idle || may_end_later) {
             if let Some(hook) = self.drop_hook.take() {
                 hook(draws(&self.job));
             }
             return; // freed here, so that there is room at once
         }
         // The last holder of the job frees the environments. It must be neither this thread nor a worker.
-        let mut deferred = Some((Arc::clone(&self.job), self.runner.take(), self.drop_hook.take()));
+        let mut deferred = Some((Arc::clone(&self.job), self.runner.take(), self.drop_hook.take(), self.freed.take()));
         self.workers.reaper.drop_later(Box::new(move || {
             let is_alone = deferred.as_ref().is_none_or(|(job, ..)| Arc::strong_count(job) == 1);
-            if let Some((job, _, drop_hook)) = deferred.take_if(|_| is_alone)
-                && let Some(hook) = drop_hook
-            {
-                hook(draws(&job));
+            if let Some((job, runner, drop_hook, freed)) = deferred.take_if(|_| is_alone) {
+                if let Some(hook) = drop_hook {
+                    hook(draws(&job));
+                }
+                drop((job, runner));
+                drop(freed); // after the environments
             }
             is_alone
         }));

@@ -2,6 +2,7 @@
 
 use super::sync::lock;
 use crate::priority::lower;
+use perturb_system::explain_no_thread;
 use std::{
     io,
     sync::{
@@ -42,7 +43,8 @@ impl Reaper {
             lower(REAPER_NICENESS);
             reap(&received, &counted);
         };
-        let thread = thread::Builder::new().name("free".into()).spawn(freeing)?;
+        let thread =
+            thread::Builder::new().name("free".into()).spawn(freeing).map_err(|error| explain_no_thread(&error))?;
         Ok((Self { drops: Mutex::new(Some(drops)), pending }, thread))
     }
 

@@ -12,6 +12,7 @@ use crate::{
     meters::{Histogram, Meter},
     priority::lower,
 };
+use perturb_system::explain_no_thread;
 use std::{
     collections::{BTreeMap, VecDeque},
     io,
@@ -57,7 +58,10 @@ impl Pool {
         let mut pool = Self { shared, threads: Vec::new() };
         for i in 0..workers.max(1) {
             let shared = Arc::clone(&pool.shared);
-            let thread = thread::Builder::new().name(format!("physics-{i}")).spawn(move || shared.work(i))?;
+            let thread = thread::Builder::new()
+                .name(format!("physics-{i}"))
+                .spawn(move || shared.work(i))
+                .map_err(|error| explain_no_thread(&error))?;
             pool.threads.push(thread);
         }
         pool.threads.push(freeing);

@@ -1,8 +1,8 @@
 //! Size limits of requests.
 
-/// The maximum length of a request before a session is open: enough for thousands of groups, and little enough that all
-/// sessions may come so far.
-pub const MAX_BYTES_BEFORE_OPEN: usize = 64 << 10;
+/// The maximum length of a request before a session is open: enough for thousands of groups with parameters. What is
+/// beyond 64 KiB is taken from the memory budget.
+pub const MAX_BYTES_BEFORE_OPEN: usize = 1 << 20;
 
 /// The size limits of the next request of a stream.
 #[derive(Debug, Clone, Copy)]

@@ -4,7 +4,7 @@ use super::{
     audit::ledger::Ledger,
     auth::{
         Tokens,
-        file_watcher::{self, FileWatcher},
+        file_watcher::{self, FileWatcher, Reloader},
     },
     net::tls::Tls,
 };
@@ -46,6 +46,11 @@ impl Security {
             guards.ledger = Some(Ledger::open(path).map_err(wrong)?);
         }
         Ok(guards)
+    }
+
+    /// Has the files of tokens and TLS read again at once.
+    pub fn reloader(&self) -> Reloader {
+        Reloader::new(&self.watches)
     }
 
     fn load_tokens(&mut self, path: PathBuf, catalogue: &Catalogue) -> io::Result<Tokens> {

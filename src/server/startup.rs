@@ -227,6 +227,7 @@ impl ServerParts {
             errors: self.errors.clone(),
             access: self.access.clone(),
             tokens: guards.tokens.clone(),
+            ledger: guards.ledger.clone(),
             pictures,
             lag: Histogram::default(),
         }

@@ -4,6 +4,7 @@ use crate::common::server::{Actor, Server, Session, floats, open, parameters, re
 use bytes::Bytes;
 use insta::assert_snapshot;
 use perturb::proto::{AutoresetMode, Open, Release, Reset, SlotGroup, Stepped, Version};
+use prost::Message;
 use rstest::rstest;
 use tonic::Code;
 
@@ -227,4 +228,21 @@ async fn a_release_of_all_none_or_others_is_refused(#[case] mask: &'static [u8],
     assert_eq!(code, Code::InvalidArgument);
     assert!(message.starts_with(words), "{message}");
     assert_eq!(session.step(vec![0; 12].into()).await.rewards.len(), 12);
+}
+
+#[tokio::test]
+async fn thousands_of_groups_with_parameters_fit_in_an_open() {
+    let server = Server::start(&[]);
+    let group = |seed| SlotGroup {
+        size: 1,
+        version: Version::Random.into(),
+        parameters: parameters(&[("length", &[(0.4, 0.5)]), ("mass", &[(0.1, 0.2)]), ("force", &[(9.0, 10.0)])]),
+        seed,
+        ..SlotGroup::default()
+    };
+    let request = with((0..2_000).map(group).collect());
+    let length = request.encoded_len();
+    assert!((64 << 10..1 << 20).contains(&length), "{length} bytes");
+    let (_, opened) = Session::open(server.tcp(), request).await;
+    assert_eq!(opened.observations.len(), 2_000 * 4 * 4);
 }

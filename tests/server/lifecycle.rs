@@ -1,7 +1,8 @@
 //! How the server begins and ends: configuration, addresses, health, reflection, signals, draining.
 
-use crate::common::server::{self, Actor, Server, Session, command, environment, open, until, within};
+use crate::common::server::{self, Actor, Server, Session, client, command, environment, open, until, within};
 use insta::assert_snapshot;
+use perturb::proto::{Release, session_response::Response};
 use rstest::rstest;
 use std::{
     io::Write,
@@ -550,4 +551,65 @@ async fn requests_are_counted_by_kind_and_told_at_the_end() {
         ),
         "{log}"
     );
+}
+
+#[rstest]
+#[case::small(64)]
+#[case::large(200)]
+#[tokio::test]
+async fn a_session_that_ended_in_order_has_freed_its_places(#[case] envs: u32) {
+    const OPENS: u64 = 1_000;
+    // Full with one session: each open needs all places of the one before.
+    let server = Server::start(&["--max-envs", &envs.to_string(), "--max-sessions", "1"]);
+    let mut connection = client(server.tcp()).await;
+    for seed in 0..OPENS {
+        let mut session = Session::start(&mut connection).await.expect("a place for a session is free");
+        let opened = session.answer(open("CartPole", envs, seed)).await;
+        assert!(matches!(opened, Response::Opened(_)), "open {seed}: {opened:?}");
+        session.close();
+        assert_eq!(session.end().await.code(), Code::Ok);
+    }
+}
+
+#[tokio::test]
+async fn released_environments_have_freed_their_places() {
+    let server = Server::start(&["--max-envs", "200"]);
+    let (mut first, _) = Session::open(server.tcp(), open("CartPole", 200, 1)).await;
+    let mask: Vec<u8> = (0..200).map(|slot| u8::from(slot >= 100)).collect();
+    first.ask(Release { mask: mask.into() }).await;
+    let mut connection = client(server.tcp()).await;
+    for seed in 0..100 {
+        let mut other = Session::start(&mut connection).await.unwrap();
+        let opened = other.answer(open("CartPole", 100, seed)).await;
+        assert!(matches!(opened, Response::Opened(_)), "open {seed}: {opened:?}");
+        other.close();
+        assert_eq!(other.end().await.code(), Code::Ok);
+    }
+}
+
+#[test]
+fn the_contract_is_printed_as_it_is() {
+    let printed = command().arg("--proto").output().unwrap().stdout;
+    let own = std::fs::read(concat!(env!("CARGO_MANIFEST_DIR"), "/proto/perturb/v1/perturb.proto")).unwrap();
+    assert!(printed == own);
+}
+
+#[test]
+fn variables_of_kubernetes_do_not_keep_a_server_from_starting() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut command = command();
+    command.args(["--listen", "tcp://127.0.0.1:0"]);
+    command.env("PERTURB_SERVER_PORT", "tcp://10.96.3.7:7447").env("PERTURB_SERVER_SERVICE_HOST", "10.96.3.7");
+    command.env("PERTURB_SERVER_PORT_7447_TCP_ADDR", "10.96.3.7");
+    Server::spawn(command, directory, 1);
+}
+
+#[test]
+fn printed_address_of_a_socket_is_absolute() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().canonicalize().unwrap();
+    let mut command = command();
+    command.current_dir(&path).args(["--listen", "unix:my.sock"]);
+    let server = Server::spawn(command, directory, 1);
+    assert_eq!(server.addresses[0], format!("unix:{}", path.join("my.sock").display()));
 }

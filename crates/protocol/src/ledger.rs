@@ -7,7 +7,7 @@
 use std::io::{self, BufRead, BufReader, Read as _};
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Serialize, Serializer};
 use sha2::{Digest, Sha256};
 
 use crate::region::Region;
@@ -89,7 +89,9 @@ pub struct DrawRecord {
 }
 
 /// Environments that begin to draw. The seed, an environment's index and an episode's number fix the episode.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+///
+/// Written as an array of its fields in their order. Older servers wrote an object, which is read, too.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub struct DrawStart {
     /// The seed.
     pub seed: u64,
@@ -103,8 +105,14 @@ pub struct DrawStart {
     pub episode: u64,
 }
 
-/// Environments that no longer draw from their region.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+impl Serialize for DrawStart {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        (self.seed, self.index, self.count, self.region, self.episode).serialize(serializer)
+    }
+}
+
+/// Environments that no longer draw from their region. Written as an array, as [`DrawStart`] is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub struct DrawEnd {
     /// The seed.
     pub seed: u64,
@@ -114,6 +122,12 @@ pub struct DrawEnd {
     pub count: u32,
     /// The last episode that was begun; none if the request was refused or failed, and nothing was drawn.
     pub episode: Option<u64>,
+}
+
+impl Serialize for DrawEnd {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        (self.seed, self.index, self.count, self.episode).serialize(serializer)
+    }
 }
 
 /// The chain of the lines that were written or read so far.
@@ -266,6 +280,21 @@ mod tests {
     }
 
     #[test]
+    fn draws_are_arrays_and_objects_are_read_too() {
+        let LedgerEvent::Draws(record) = event("ann") else { unreachable!() };
+        let ends = vec![DrawEnd { seed: 7, index: 3, count: 2, episode: None }];
+        let record = DrawRecord { ends, ..record };
+        let text = serde_json::to_string(&LedgerEvent::Draws(record.clone())).unwrap();
+        let (begin, end) = ("[18446744073709551615,3,2,0,0]", "[7,3,2,null]");
+        assert!(text.contains(begin) && text.contains(end), "{text}");
+        let begin_object = r#"{"seed":18446744073709551615,"index":3,"count":2,"region":0,"episode":0}"#;
+        let end_object = r#"{"seed":7,"index":3,"count":2,"episode":null}"#;
+        for text in [text.clone(), text.replace(begin, begin_object).replace(end, end_object)] {
+            assert_eq!(serde_json::from_str::<LedgerEvent>(&text).unwrap(), LedgerEvent::Draws(record.clone()));
+        }
+    }
+
+    #[test]
     fn changed_removed_and_added_lines_are_found() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("ledger");
@@ -278,7 +307,7 @@ mod tests {
         };
         for (text, line) in [
             (whole.replacen("ann", "bob", 1), 1),
-            (whole.replacen("\"seed\":1", "\"seed\":2", 1), 1),
+            (whole.replacen("[[1844", "[[2844", 1), 1),
             (format!("{}{}", lines[0], lines[2]), 2),
             (lines[1].to_owned(), 1),
             (format!("{}{}{}", lines[1], lines[0], lines[2]), 1),

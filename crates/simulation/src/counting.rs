@@ -89,6 +89,14 @@ impl SessionHandler for CountingSession {
         SessionStats { steps: self.steps, ..SessionStats::default() }
     }
 
+    /// No token has a rate.
+    fn price(&self, _request: &Self::Request) -> u64 {
+        0
+    }
+
+    /// No environments are freed.
+    async fn close(&mut self) {}
+
     async fn answer(&mut self, request: Self::Request) -> Result<CountingReply, Error> {
         match request.request {
             Some(Request::Open(open)) => self.open(&open),

@@ -1,6 +1,9 @@
 //! The audit of what a session draws from: its token's role must allow it, and the ledger has it before it happens.
 
-use super::{Error, ledger::Ledger};
+use super::{
+    Error,
+    ledger::{Ledger, line_bytes},
+};
 use crate::{
     env::{self, Distribution, Draw, EnvironmentSpec, saved_draw},
     pool::{Batch, BatchSettings, ResetEntry},
@@ -28,6 +31,9 @@ pub struct DrawAuditor {
 
 /// The ledger has at most this many refusals of a session: a client may ask for ever.
 const MAX_LOGGED_REFUSALS: u32 = 100;
+
+/// The bytes of a ledger's line that cost as much as a step.
+const LINE_BYTES_PER_STEP: usize = 16;
 
 /// Draws that are in the ledger and of which it is not known yet whether they happen.
 #[derive(Default)]
@@ -165,13 +171,24 @@ impl DrawAuditor {
         if let Some(ledger) = &self.ledger
             && self.refused.fetch_add(1, Ordering::Relaxed) < MAX_LOGGED_REFUSALS
         {
-            ledger.write_later(LedgerEvent::Refused {
-                who: self.who(spec),
-                region: region.clone(),
-                reason: reason.clone(),
-            });
+            self.write_later(
+                ledger,
+                LedgerEvent::Refused { who: self.who(spec), region: region.clone(), reason: reason.clone() },
+            );
         }
         Err(Error::NotAllowed { role: role.name().into(), environment: spec.name, region: region.to_string(), reason })
+    }
+
+    /// Charges the token for a line of this length: a rate of steps bounds how fast the ledger grows.
+    fn charge_line(&self, bytes: usize) {
+        if let Some(bearer) = &self.bearer {
+            bearer.charge(0, bytes.div_ceil(LINE_BYTES_PER_STEP) as u64);
+        }
+    }
+
+    fn write_later(&self, ledger: &Ledger, event: LedgerEvent) {
+        self.charge_line(line_bytes(&event));
+        ledger.write_later(event);
     }
 
     /// Whether nothing needs to be checked or recorded.
@@ -195,13 +212,14 @@ impl DrawAuditor {
         let Some(ledger) = &self.ledger else { return Ok(PendingDraws::default()) };
         let (regions, begins) = group_begins(spec, begins);
         let begun = PendingDraws(begins.clone());
-        ledger.write(self.event(spec, regions, begins, group_ends(ends))).await?;
+        let bytes = ledger.write(self.event(spec, regions, begins, group_ends(ends))).await?;
+        self.charge_line(bytes);
         Ok(begun)
     }
 
     fn note(&self, spec: &EnvironmentSpec, regions: Vec<Region>, begins: Vec<DrawStart>, ends: Vec<DrawEnd>) {
         if let Some(ledger) = &self.ledger {
-            ledger.write_later(self.event(spec, regions, begins, ends));
+            self.write_later(ledger, self.event(spec, regions, begins, ends));
         }
     }
 

@@ -3,19 +3,23 @@
 use super::Error;
 use crate::server::error::InvalidValue;
 use perturb_protocol::ledger::{Chain, LedgerEvent, MAX_LINE_BYTES, read};
+use perturb_system::explain_no_thread;
 use std::{
     fs::{File, OpenOptions},
     io::{self, Write},
-    os::unix::fs::OpenOptionsExt,
+    os::unix::fs::{MetadataExt, OpenOptionsExt},
     path::{Path, PathBuf},
     sync::{
         Arc,
-        atomic::{AtomicU64, Ordering},
-        mpsc::{Receiver, Sender, channel},
+        atomic::{AtomicBool, AtomicU64, Ordering},
+        mpsc::{Receiver, RecvTimeoutError, Sender, channel},
     },
-    time::SystemTime,
+    time::{Duration, SystemTime},
 };
 use tokio::sync::oneshot;
+
+/// The interval at which the file is looked at while nothing is written.
+const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A line to be written, and the sender that tells its waiter when it is on the disk.
 type WriteRequest = (LedgerEvent, Option<oneshot::Sender<Result<(), String>>>);
@@ -25,6 +29,26 @@ type WriteRequest = (LedgerEvent, Option<oneshot::Sender<Result<(), String>>>);
 pub struct Ledger {
     lines: Sender<WriteRequest>,
     sessions: Arc<AtomicU64>,
+    status: Arc<LedgerStatus>,
+}
+
+/// The state of the file, for metrics.
+#[derive(Default)]
+pub struct LedgerStatus {
+    is_lost: AtomicBool,
+    bytes: AtomicU64,
+}
+
+impl LedgerStatus {
+    /// Whether the file is what this server wrote. Otherwise nothing is drawn.
+    pub fn is_intact(&self) -> bool {
+        !self.is_lost.load(Ordering::Relaxed)
+    }
+
+    /// The bytes of whole lines.
+    pub fn bytes(&self) -> u64 {
+        self.bytes.load(Ordering::Relaxed)
+    }
 }
 
 impl Ledger {
@@ -33,6 +57,9 @@ impl Ledger {
     /// # Errors
     /// If the file is no whole ledger, another server writes it, or it cannot be written.
     pub fn open(path: &Path) -> io::Result<Self> {
+        if path.metadata().is_ok_and(|metadata| !metadata.is_file()) {
+            return Err(io::Error::other("that is no file, and a ledger is read again when the server begins"));
+        }
         let file = OpenOptions::new().read(true).append(true).create(true).mode(0o600).open(path)?;
         if !file.metadata()?.is_file() {
             return Err(io::Error::other("that is no file, and a ledger is read again when the server begins"));
@@ -49,6 +76,7 @@ impl Ledger {
             chain: existing.chain,
             pending: Vec::new(),
             is_torn: true,
+            status: Arc::default(),
         };
         let (version, commit) = (env!("CARGO_PKG_VERSION").into(), env!("PERTURB_COMMIT").into());
         let start = LedgerEvent::Began { version, commit, unfinished: existing.unfinished };
@@ -56,8 +84,17 @@ impl Ledger {
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
         File::open(folder)?.sync_all()?; // the name of a new file, too
         let (lines, received) = channel();
-        std::thread::Builder::new().name("ledger".into()).spawn(move || writer.run(&received))?;
-        Ok(Self { lines, sessions: Arc::default() })
+        let status = Arc::clone(&writer.status);
+        std::thread::Builder::new()
+            .name("ledger".into())
+            .spawn(move || writer.run(&received))
+            .map_err(|error| explain_no_thread(&error))?;
+        Ok(Self { lines, sessions: Arc::default(), status })
+    }
+
+    /// The state of the file.
+    pub fn status(&self) -> &LedgerStatus {
+        &self.status
     }
 
     /// A number for a session.
@@ -65,13 +102,13 @@ impl Ledger {
         self.sessions.fetch_add(1, Ordering::Relaxed)
     }
 
-    /// Writes a line, and waits until it is on the disk.
+    /// Writes a line, and waits until it is on the disk. Returns the [length of the line](line_bytes).
     ///
     /// # Errors
     /// [`Error::NoLedger`].
-    pub async fn write(&self, event: LedgerEvent) -> Result<(), Error> {
+    pub async fn write(&self, event: LedgerEvent) -> Result<usize, Error> {
         // What a session asks for is bounded, but numbers are longer as text.
-        let size = serde_json::to_vec(&event).map_or(usize::MAX, |json| json.len());
+        let size = line_bytes(&event);
         if size as u64 > MAX_LINE_BYTES / 2 {
             let got = format!("{size} bytes as a line of this server's ledger");
             return Err(InvalidValue::new(
@@ -84,7 +121,7 @@ impl Ledger {
         let (done, written) = oneshot::channel();
         let _ = self.lines.send((event, Some(done))); // it fails only if the thread is gone; then no answer comes
         let reason = match written.await {
-            Ok(Ok(())) => return Ok(()),
+            Ok(Ok(())) => return Ok(size),
             Ok(Err(reason)) => reason,
             Err(_) => "its thread is gone".into(),
         };
@@ -104,6 +141,14 @@ impl Ledger {
     }
 }
 
+/// Returns the length of an event's line in bytes, at most.
+pub fn line_bytes(event: &LedgerEvent) -> usize {
+    /// The digest, the number, the time and the end of the line.
+    const FRAME_BYTES: usize = 128;
+    // That it cannot be written as JSON is for the writer to tell.
+    serde_json::to_vec(event).map_or(0, |json| json.len()) + FRAME_BYTES
+}
+
 /// The state of the ledger's thread: the file, as far as it is whole.
 struct LedgerWriter {
     file: File,
@@ -114,12 +159,21 @@ struct LedgerWriter {
     is_torn: bool,
     /// Lines without a waiter that could not be written yet.
     pending: Vec<WriteRequest>,
+    status: Arc<LedgerStatus>,
 }
 
 impl LedgerWriter {
     /// Writes what comes, whatever has come meanwhile at once.
     fn run(mut self, received: &Receiver<WriteRequest>) {
-        while let Ok(first) = received.recv() {
+        loop {
+            let first = match received.recv_timeout(CHECK_INTERVAL) {
+                Ok(first) => first,
+                Err(RecvTimeoutError::Disconnected) => return,
+                Err(RecvTimeoutError::Timeout) => {
+                    let _ = self.check_file(); // it has logged what is wrong
+                    continue;
+                }
+            };
             let mut lines = std::mem::take(&mut self.pending);
             lines.push(first);
             lines.extend(received.try_iter());
@@ -141,11 +195,53 @@ impl LedgerWriter {
         }
     }
 
+    /// Compares the file at the path with what was written. Logs when that changes.
+    ///
+    /// # Errors
+    /// What was done to the file, and how to go on.
+    fn check_file(&self) -> Result<(), String> {
+        let found = self.file_is_intact();
+        match (&found, self.status.is_lost.swap(found.is_err(), Ordering::Relaxed)) {
+            (Err(reason), false) => {
+                let (lines, head) = (self.chain.lines(), self.chain.head());
+                tracing::error!(
+                    lines,
+                    head,
+                    "the ledger {}: {reason}; nothing new is drawn until then",
+                    self.path.display()
+                );
+            }
+            (Ok(()), true) => tracing::info!("the ledger {} is there again", self.path.display()),
+            _ => {}
+        }
+        found
+    }
+
+    fn file_is_intact(&self) -> Result<(), String> {
+        let own = self.file.metadata().map_err(|error| error.to_string())?;
+        match self.path.metadata() {
+            Err(error) => return Err(format!("the file is gone ({error}); move it back, or restart the server")),
+            Ok(there) if (there.dev(), there.ino()) != (own.dev(), own.ino()) => {
+                return Err("another file has taken its place; move it back, or restart the server".into());
+            }
+            Ok(_) => {}
+        }
+        if own.len() < self.bytes || (own.len() > self.bytes && !self.is_torn) {
+            let (got, expected) = (own.len(), self.bytes);
+            return Err(format!(
+                "the file has {got} bytes, but the server wrote {expected}; write back into it what another program \
+                 changed, or restart the server"
+            ));
+        }
+        Ok(())
+    }
+
     /// Writes lines and waits for the disk; all, or none.
     fn write<'a>(&mut self, events: impl IntoIterator<Item = &'a LedgerEvent>) -> Result<(), String> {
         #[expect(clippy::disallowed_methods, reason = "lines have their time; what is drawn does not depend on it")]
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
         let unix_ms = u64::try_from(now.as_millis()).unwrap_or(u64::MAX);
+        self.check_file()?;
         let mut chain = self.chain.clone();
         let lines: Result<String, _> = events.into_iter().map(|event| chain.add(event, unix_ms)).collect();
         let lines = lines.map_err(|error| error.to_string())?;
@@ -159,6 +255,7 @@ impl LedgerWriter {
             return Err(error.to_string());
         }
         self.bytes += lines.len() as u64;
+        self.status.bytes.store(self.bytes, Ordering::Relaxed);
         self.chain = chain;
         Ok(())
     }

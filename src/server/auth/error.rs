@@ -37,8 +37,8 @@ pub enum Error {
     },
     /// A token's environments have stepped too fast for too long.
     #[error(
-        "the token {name:?} may take {rate} steps a second here, and its sessions are {seconds} s ahead of that; step \
-         fewer environments at a time or in fewer sessions, or try again later"
+        "the token {name:?} may take {rate} steps a second here, other requests counted in steps, and its sessions are \
+         {seconds} s ahead of that; step fewer environments at a time or in fewer sessions, or try again later"
     )]
     TooFast {
         /// The token's name.

@@ -1,5 +1,6 @@
 //! Files that are read again when they change.
 
+use perturb_system::{explain_no_thread, read_plain};
 use std::{
     io,
     path::{Path, PathBuf},
@@ -10,24 +11,49 @@ use std::{
 /// The interval at which the files are read.
 const POLL_INTERVAL: Duration = Duration::from_millis(500);
 
-/// Watches files, on a thread of its own, until it is dropped.
-pub struct FileWatcher(#[expect(dead_code, reason = "its end is the thread's")] Sender<()>);
+/// The maximum length of a file of tokens or certificates.
+const MAX_FILE_BYTES: u64 = 1 << 20;
+
+/// Watches files, on a thread of its own, until it and its [reloaders](Reloader) are dropped.
+pub struct FileWatcher(Sender<()>);
+
+/// Has watched files read again at once.
+#[derive(Clone, Default)]
+pub struct Reloader(Vec<Sender<()>>);
+
+impl Reloader {
+    /// Has the files of these watchers read again at once.
+    pub fn new(watchers: &[FileWatcher]) -> Self {
+        Self(watchers.iter().map(|FileWatcher(look)| look.clone()).collect())
+    }
+
+    /// Has the files read again, whether or not they have changed. Returns whether there are some.
+    pub fn reload(&self) -> bool {
+        for look in &self.0 {
+            let _ = look.send(()); // a watcher that is gone needs no files
+        }
+        !self.0.is_empty()
+    }
+}
 
 /// The contents of the files, in their order, or why they cannot be read.
 pub type Contents = Result<Vec<Vec<u8>>, String>;
 
-/// Reads files.
+/// Reads plain files, without waiting for anything: a pipe is refused.
 ///
 /// # Errors
 /// A sentence that names the file.
 pub fn read(paths: &[PathBuf]) -> Contents {
-    let read = |path: &Path| std::fs::read(path).map_err(|error| format!("cannot read {}: {error}", path.display()));
+    let read = |path: &Path| {
+        read_plain(path, MAX_FILE_BYTES).map_err(|error| format!("cannot read {}: {error}", path.display()))
+    };
     paths.iter().map(|path| read(path)).collect()
 }
 
 impl FileWatcher {
     /// Calls `reload` with the contents of the files when they have changed and stay so for a moment, since a writer
-    /// may not be done. `before` is what was read at first. An error is logged, and the next change is waited for.
+    /// may not be done; at once if a [`Reloader`] asks. `before` is what was read at first. An error is logged, and the
+    /// next change is waited for.
     ///
     /// # Errors
     /// If there is no thread.
@@ -37,13 +63,18 @@ impl FileWatcher {
         before: Vec<Vec<u8>>,
         mut reload: impl FnMut(&[Vec<u8>]) -> Result<(), String> + Send + 'static,
     ) -> io::Result<Self> {
-        let (end, ended) = channel::<()>();
-        let look = move || {
+        let (look, asked) = channel::<()>();
+        let watch = move || {
             let mut taken: Contents = Ok(before);
             let mut last = taken.clone();
-            while ended.recv_timeout(POLL_INTERVAL) == Err(RecvTimeoutError::Timeout) {
+            loop {
+                let is_asked = match asked.recv_timeout(POLL_INTERVAL) {
+                    Ok(()) => true,
+                    Err(RecvTimeoutError::Timeout) => false,
+                    Err(RecvTimeoutError::Disconnected) => return,
+                };
                 let now = read(&paths);
-                if now != taken && now == last {
+                if is_asked || (now != taken && now == last) {
                     match now.as_ref().map_err(Clone::clone).and_then(|contents| reload(contents)) {
                         Ok(()) => tracing::info!("read {what} again"),
                         Err(reason) => tracing::error!("{what} changed, and those of before stay in force: {reason}"),
@@ -53,7 +84,7 @@ impl FileWatcher {
                 last = now;
             }
         };
-        std::thread::Builder::new().name("files".into()).spawn(look)?;
-        Ok(Self(end))
+        std::thread::Builder::new().name("files".into()).spawn(watch).map_err(|error| explain_no_thread(&error))?;
+        Ok(Self(look))
     }
 }

@@ -17,7 +17,7 @@ pub use token_file::{TokenFileError, new_token};
 use super::net::{managed_io::Connection, peer_limiter::Peer};
 use crate::env::Catalogue;
 use quota::{Quota, QuotaKind};
-use rate_limiter::{RateLimiter, TooFast};
+use rate_limiter::{MAX_WAIT, RateLimiter, TooFast};
 use sha2::{Digest, Sha256};
 use std::{
     sync::{
@@ -82,10 +82,10 @@ impl Token {
         &self.name
     }
 
-    /// Charges steps after they ran, because their number is unknown before.
-    pub fn charge_steps(&self, steps: u64) {
+    /// Charges steps after they ran, because their number is unknown before, and the price of other work, in steps.
+    pub fn charge(&self, steps: u64, price: u64) {
         self.quotas.steps.fetch_add(steps, Ordering::Relaxed);
-        self.quotas.rate_limiter.charge(steps);
+        self.quotas.rate_limiter.charge(steps + price);
     }
 
     /// Counts a refusal.
@@ -111,12 +111,20 @@ impl Token {
         self.quotas.rate_limiter.rate()
     }
 
-    /// Waits until its environments may step again.
+    /// Waits until its environments may step again, at most half a minute.
     ///
     /// # Errors
     /// [`Error::TooFast`], at once, if that would be too long.
     pub async fn acquire_steps(&self) -> Result<(), Error> {
-        let acquired = self.quotas.rate_limiter.acquire().await;
+        self.acquire_within(MAX_WAIT).await
+    }
+
+    /// Waits until its rate has covered what it was charged for.
+    ///
+    /// # Errors
+    /// [`Error::TooFast`], at once, if that would take longer than `max_wait`.
+    pub async fn acquire_within(&self, max_wait: Duration) -> Result<(), Error> {
+        let acquired = self.quotas.rate_limiter.acquire(max_wait).await;
         acquired.map_err(|TooFast { rate, ahead }| Error::TooFast {
             name: self.name.clone(),
             rate,

@@ -11,7 +11,7 @@ use tokio::time::{Instant, sleep};
 /// A token that was idle may catch up on the steps of this time, in seconds.
 const BURST_SECONDS: f64 = 1.0;
 /// A request that would wait longer is refused: clients give a reply a minute.
-const MAX_WAIT: Duration = Duration::from_secs(30);
+pub(super) const MAX_WAIT: Duration = Duration::from_secs(30);
 /// The minimum sleep; without it a wait that is rounded to zero would spin.
 const MIN_WAIT: Duration = Duration::from_micros(1);
 /// The interval at which a waiting request checks whether the rate has changed.
@@ -64,17 +64,17 @@ impl RateLimiter {
     /// Waits until the rate has allowed what was done when this was asked: so those who wait go one after the other.
     ///
     /// # Errors
-    /// [`TooFast`], at once, if that takes more than half a minute.
-    pub(super) async fn acquire(&self) -> Result<(), TooFast> {
+    /// [`TooFast`], at once, if that takes longer than `max_wait`.
+    pub(super) async fn acquire(&self, max_wait: Duration) -> Result<(), TooFast> {
         let mut ticket = None;
-        while let Some(wait) = self.wait(&mut ticket)? {
+        while let Some(wait) = self.wait(&mut ticket, max_wait)? {
             sleep(wait).await;
         }
         Ok(())
     }
 
-    fn wait(&self, ticket: &mut Option<f64>) -> Result<Option<Duration>, TooFast> {
-        self.lock().wait(ticket, Instant::now())
+    fn wait(&self, ticket: &mut Option<f64>, max_wait: Duration) -> Result<Option<Duration>, TooFast> {
+        self.lock().wait(ticket, max_wait, Instant::now())
     }
 
     fn lock(&self) -> MutexGuard<'_, RateState> {
@@ -100,7 +100,12 @@ impl RateState {
 
     /// Returns how long to sleep before calling again, or `None` when the caller may proceed. Pass an empty `ticket` on
     /// the first call.
-    fn wait(&mut self, ticket: &mut Option<f64>, now: Instant) -> Result<Option<Duration>, TooFast> {
+    fn wait(
+        &mut self,
+        ticket: &mut Option<f64>,
+        max_wait: Duration,
+        now: Instant,
+    ) -> Result<Option<Duration>, TooFast> {
         self.refill(now);
         let Some(rate) = self.rate else { return Ok(None) };
         let steps = *ticket.get_or_insert(self.done) - self.allowed;
@@ -109,7 +114,7 @@ impl RateState {
         }
         // A rate is at least 1.
         let ahead = Duration::from_secs_f64(steps / f64::from(rate));
-        if ahead > MAX_WAIT {
+        if ahead > max_wait {
             return Err(TooFast { rate, ahead });
         }
         let wait = ahead.clamp(MIN_WAIT, RECHECK_INTERVAL);
@@ -140,7 +145,7 @@ mod tests {
         /// How long the next turn takes, s.
         fn turn(&mut self) -> Result<f64, TooFast> {
             let (start, mut ticket) = (self.now, None);
-            while let Some(wait) = self.state.wait(&mut ticket, self.now)? {
+            while let Some(wait) = self.state.wait(&mut ticket, MAX_WAIT, self.now)? {
                 self.now += wait;
             }
             Ok((self.now - start).as_secs_f64())
@@ -180,7 +185,7 @@ mod tests {
         while let Some((at, ticket, turns)) =
             sessions.iter_mut().filter(|session| session.2 < ROUNDS).min_by_key(|session| session.0)
         {
-            match clocked.state.wait(ticket, *at).unwrap() {
+            match clocked.state.wait(ticket, MAX_WAIT, *at).unwrap() {
                 Some(wait) => *at += wait,
                 None => {
                     clocked.state.done += 100.0;
@@ -213,10 +218,10 @@ mod tests {
         clocked.set_rate(10);
         clocked.state.done += 200.0;
         let mut ticket = None;
-        let wait = clocked.state.wait(&mut ticket, clocked.now).unwrap().unwrap();
+        let wait = clocked.state.wait(&mut ticket, MAX_WAIT, clocked.now).unwrap().unwrap();
         clocked.now += wait;
         clocked.set_rate(1000);
-        let wait = clocked.state.wait(&mut ticket, clocked.now).unwrap().unwrap();
+        let wait = clocked.state.wait(&mut ticket, MAX_WAIT, clocked.now).unwrap().unwrap();
         assert!(is_about(wait.as_secs_f64(), 0.195), "{wait:?}");
     }
 
@@ -226,9 +231,9 @@ mod tests {
         clocked.set_rate(1000);
         clocked.state.done += 20_000.0;
         let mut ticket = None;
-        assert!(clocked.state.wait(&mut ticket, clocked.now).is_ok_and(|wait| wait.is_some()));
+        assert!(clocked.state.wait(&mut ticket, MAX_WAIT, clocked.now).is_ok_and(|wait| wait.is_some()));
         clocked.set_rate(100);
-        let refused = clocked.state.wait(&mut ticket, clocked.now);
+        let refused = clocked.state.wait(&mut ticket, MAX_WAIT, clocked.now);
         assert!(refused.is_err_and(|error| error.rate == 100), "some 200 s are half a minute at most for nobody");
     }
 }

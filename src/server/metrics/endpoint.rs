@@ -1,24 +1,28 @@
 //! The HTTP endpoint for scrapers: one page, small requests, few connections at a time.
 
-use super::{MetricsSources, page};
+use super::{MetricsSources, format::TextFormat, page};
 use crate::server::net::listener::Listener;
 use bytes::Bytes;
 use http_body_util::Full;
 use hyper::{
-    Method, Request, Response, StatusCode, body::Incoming, header::CONTENT_TYPE, server::conn::http1,
+    Method, Request, Response, StatusCode,
+    body::Incoming,
+    header::{ACCEPT, CONTENT_TYPE, HeaderValue},
+    server::conn::http1,
     service::service_fn,
 };
 use hyper_util::rt::{TokioIo, TokioTimer};
-use std::{convert::Infallible, io, sync::Arc, time::Duration};
+use std::{collections::VecDeque, convert::Infallible, io, sync::Arc, time::Duration};
 use tokio::{
     io::{AsyncRead, AsyncWrite},
-    sync::Semaphore,
+    task::AbortHandle,
     time::{sleep, timeout},
 };
 
 /// The path of the page.
 pub const PATH: &str = "/metrics";
-/// The maximum number of connections; others wait to be accepted.
+/// The maximum number of connections. A further one ends the oldest: a scrape takes milliseconds, so that the oldest is
+/// most likely one that does not send its request.
 const MAX_CONNECTIONS: usize = 16;
 /// The time in which a connection must send its request and take the reply.
 const CONNECTION_TIMEOUT: Duration = Duration::from_secs(5);
@@ -26,24 +30,31 @@ const CONNECTION_TIMEOUT: Duration = Duration::from_secs(5);
 const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(200);
 /// The maximum length of a request's head.
 const MAX_HEAD_BYTES: usize = 16 << 10;
-const CONTENT_TYPE_OPENMETRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
 /// Answers scrapers, for ever.
 pub async fn serve(listener: Listener, sources: Arc<MetricsSources>) {
-    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    let mut connections = VecDeque::<AbortHandle>::new();
     loop {
-        let Ok(place) = Arc::clone(&places).acquire_owned().await else { return };
         let sources = Arc::clone(&sources);
         let accepted = match &listener {
-            Listener::Tcp(listener) => listener.accept().await.map(|(stream, _)| {
-                tokio::spawn(async move { (converse(stream, sources).await, drop(place)) });
-            }),
-            Listener::Unix(listener, _) => listener.accept().await.map(|(stream, _)| {
-                tokio::spawn(async move { (converse(stream, sources).await, drop(place)) });
-            }),
+            Listener::Tcp(listener) => {
+                listener.accept().await.map(|(stream, _)| tokio::spawn(converse(stream, sources)).abort_handle())
+            }
+            Listener::Unix(listener, _) => {
+                listener.accept().await.map(|(stream, _)| tokio::spawn(converse(stream, sources)).abort_handle())
+            }
         };
-        if let Err(error) = accepted {
-            pause(&error).await;
+        match accepted {
+            Ok(connection) => {
+                connections.retain(|connection| !connection.is_finished());
+                if connections.len() >= MAX_CONNECTIONS
+                    && let Some(oldest) = connections.pop_front()
+                {
+                    oldest.abort();
+                }
+                connections.push_back(connection);
+            }
+            Err(error) => pause(&error).await,
         }
     }
 }
@@ -69,16 +80,26 @@ async fn converse(stream: impl AsyncRead + AsyncWrite + Unpin, sources: Arc<Metr
 }
 
 fn answer(request: &Request<Incoming>, sources: &Arc<MetricsSources>) -> Response<Full<Bytes>> {
-    let (status, format, text) = match (request.uri().path(), request.method()) {
-        (PATH, &Method::GET) => match page::page(sources) {
-            Ok(text) => (StatusCode::OK, CONTENT_TYPE_OPENMETRICS, text),
+    let (status, content_type, text) = match (request.uri().path(), request.method()) {
+        // The transport leaves the body of an answer to HEAD out.
+        (PATH, &Method::GET | &Method::HEAD) => match page::page(sources) {
+            Ok(text) => {
+                let format = TextFormat::negotiated(accept(request).as_deref());
+                (StatusCode::OK, format.content_type(), format.convert(text))
+            }
             Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, "text/plain", format!("{error}\n")),
         },
-        (PATH, _) => (StatusCode::METHOD_NOT_ALLOWED, "text/plain", "ask with GET\n".into()),
+        (PATH, _) => (StatusCode::METHOD_NOT_ALLOWED, "text/plain", "ask with GET or HEAD\n".into()),
         _ => (StatusCode::NOT_FOUND, "text/plain", format!("ask for {PATH}\n")),
     };
     let mut response = Response::new(Full::new(text.into()));
     *response.status_mut() = status;
-    response.headers_mut().insert(CONTENT_TYPE, hyper::header::HeaderValue::from_static(format));
+    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static(content_type));
     response
+}
+
+/// The media types that a request accepts, of all its headers; `None` if it has none.
+fn accept(request: &Request<Incoming>) -> Option<String> {
+    let values: Vec<_> = request.headers().get_all(ACCEPT).iter().filter_map(|value| value.to_str().ok()).collect();
+    (!values.is_empty()).then(|| values.join(","))
 }

@@ -1,14 +1,17 @@
 //! The server's metrics, in the text format of OpenMetrics, which Prometheus scrapes.
 //!
 //! - [`endpoint`]: the HTTP endpoint for scrapers.
+//! - [`format`]: the two text formats, and which one a scraper asks for.
 //! - [`page`]: the metrics, each with its name, labels and sentence.
 //! - [`process`]: resources of the process, as the system tells them.
 
 pub mod endpoint;
+pub mod format;
 pub mod page;
 pub mod process;
 
 use super::{
+    audit::ledger::Ledger,
     auth::Tokens,
     error::ErrorCounters,
     net::{access_log::AccessLog, peer_limiter::PeerLimiter},
@@ -45,6 +48,8 @@ pub struct MetricsSources {
     pub access: AccessLog,
     /// The tokens, if the server asks for some.
     pub tokens: Option<Tokens>,
+    /// The ledger, if the server writes one.
+    pub ledger: Option<Ledger>,
     /// The drawing times of pictures.
     pub pictures: Arc<Histogram>,
     /// The wake-up delays of the transport's thread.

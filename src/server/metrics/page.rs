@@ -2,7 +2,7 @@
 //! send.
 
 use super::{MetricsSources, process};
-use crate::meters::Histogram;
+use crate::{meters::Histogram, server::audit::ledger::Ledger};
 use prometheus_client::{
     collector::Collector,
     encoding::{DescriptorEncoder, EncodeLabelSet, MetricEncoder, NoLabelSet, text},
@@ -56,7 +56,12 @@ impl Collector for MetricsCollector {
 impl MetricsCollector {
     /// Writes what is in use, and the limits.
     fn capacity(&self, page: &mut Page<'_>) -> EncodeResult {
-        let MetricsSources { pool, sessions, leases, connections, budget, .. } = &*self.0;
+        let MetricsSources { pool, sessions, leases, connections, budget, ledger, .. } = &*self.0;
+        if let Some(status) = ledger.as_ref().map(Ledger::status) {
+            let help = "1 while the ledger's file is what this server wrote, else 0; then nothing is drawn";
+            page.gauges("perturb_ledger_intact", help, [(NO_LABELS, f64::from(status.is_intact()))])?;
+            page.gauges("perturb_ledger_bytes", "Length of the ledger", [(NO_LABELS, status.bytes() as f64)])?;
+        }
         for (name, help, value) in [
             ("perturb_sessions", "Sessions now", sessions.in_use()),
             ("perturb_sessions_limit", "The most sessions at a time", sessions.limit()),

@@ -113,11 +113,21 @@ impl<H: SessionHandler> SessionDriver<H> {
         let mut attachment = Attachment::Attached(responses);
         loop {
             attachment = match attachment {
-                Attachment::Attached(responses) => self.attached(&responses).await,
+                Attachment::Attached(responses) => match self.attached(&responses).await {
+                    Attachment::Ended => return self.close(responses).await,
+                    next => next,
+                },
                 Attachment::Detached(resuming) => self.detached(resuming).await,
                 Attachment::Ended => return,
             };
         }
+    }
+
+    /// Frees what the session holds before its client sees the stream's end: it may open another session at once.
+    async fn close(mut self, responses: ResponseSender<H::Response>) {
+        self.exchange.close().await;
+        drop(self);
+        drop(responses);
     }
 
     /// Answers a stream's requests, until it is lost or replaced, or the session ends.

@@ -10,7 +10,7 @@ use crate::server::{
     auth::{self, Bearer},
     error::{RequestError, status},
     limits::RequestLimits,
-    net::access_log::{BROKEN, GONE, SessionRecord},
+    net::access_log::{BROKEN, GONE, SessionRecord, SessionStats},
     shutdown::ShutdownPhase,
     transport::{
         message_reader::{Message, MessageReader, StreamStop},
@@ -19,11 +19,16 @@ use crate::server::{
 };
 use perturb_protocol::AdaptiveSpin;
 use std::{convert::Infallible, sync::Arc, time::Duration};
-use tokio::time::Instant;
+use tokio::time::{Instant, timeout};
 use tonic::Status;
 
 /// The ending of a stream that resumed another session. It has no line in the access log.
 pub(super) const MOVED: &str = "moved";
+
+/// The time in which a session's environments must be freed before the end of its stream is sent.
+const MAX_CLOSE_TIME: Duration = Duration::from_secs(10);
+/// The price of a request that is refused before it is decoded, in steps.
+const UNDECODED_PRICE: u64 = 1;
 
 /// A session's handler, and the requests of the stream that the session has now.
 pub(super) struct Exchange<H: SessionHandler> {
@@ -46,6 +51,10 @@ pub(super) struct Exchange<H: SessionHandler> {
     known_open: Instant,
     /// The session's steps that its token has been charged for.
     charged: u64,
+    /// The price of requests that its token has not been charged for, in steps.
+    price: u64,
+    /// The statistics of the session, once it is closed.
+    final_stats: Option<SessionStats>,
     awake: AdaptiveSpin,
     /// The ending of the session, if nothing else happens.
     pub(super) ending: &'static str,
@@ -75,6 +84,8 @@ impl<H: SessionHandler> Exchange<H> {
             was_open: false,
             known_open: start,
             charged: 0,
+            price: 0,
+            final_stats: None,
             awake: AdaptiveSpin::default(),
             ending: GONE,
             resumed: 0,
@@ -139,27 +150,32 @@ impl<H: SessionHandler> Exchange<H> {
             Message::Whole(bytes, share) => (bytes, share),
             Message::Refused(error) => return Ok(self.undecoded(error)),
         };
-        // A client that is ahead of its rate waits before anything has happened. Nothing steps before a session is
-        // open. A request that was read ahead had no rate to keep.
+        // A client that is ahead of its rate waits before anything has happened. A request that was read ahead had no
+        // rate to keep.
         let bearer = self.requests.bearer.clone();
-        let paced = bearer.as_ref().filter(|_| self.handler.is_open() && !self.came_ahead);
-        tokio::select! {
-            biased;
-            paced = wait_for_rate(paced) => match paced {
-                Ok(()) => {}
-                Err(error) => return Ok(self.undecoded(error)),
-            },
-            () = self.sessions.drain.closed() => return Err(refused(Error::Draining)),
-            error = revoked(bearer.as_ref()) => return Err(refused(error)),
+        let was_open = self.handler.is_open();
+        if let Err(error) = self.pace(bearer.as_ref().filter(|_| was_open && !self.came_ahead)).await? {
+            return Ok(self.undecoded(error));
         }
         let request = match self.sessions.decoder.decode(request, H::FIELDS, self.request_limits()).await? {
             Ok(request) => request,
             Err(error) => return Ok(self.undecoded(error)),
         };
+        let resumes = H::RESUMES.is_some_and(|resumes| resumes(&request));
         if let Admission::ResumeOnly(_, refusal) = &self.admission
-            && !H::RESUMES.is_some_and(|resumes| resumes(&request))
+            && !resumes
         {
             return Err(refused(refusal.clone()));
+        }
+        if let Some(bearer) = &bearer {
+            // A lost session is resumed whatever its token did meanwhile.
+            if !was_open
+                && !resumes
+                && let Err(error) = self.pace(Some(bearer)).await?
+            {
+                return Ok(self.undecoded(error));
+            }
+            self.price += self.handler.price(&request);
         }
         let offer = if self.reads_ahead { self.handler.pipeline(&request) } else { None };
         let limits = self.request_limits();
@@ -172,9 +188,28 @@ impl<H: SessionHandler> Exchange<H> {
         }
     }
 
+    /// Waits until the token's rate, if it has one, has covered what it was charged for.
+    async fn pace(&mut self, bearer: Option<&Bearer>) -> Result<Result<(), auth::Error>, StreamStop<H::Error>> {
+        tokio::select! {
+            biased;
+            paced = wait_for_rate(bearer) => Ok(paced),
+            () = self.sessions.drain.closed() => Err(refused(Error::Draining)),
+            error = revoked(bearer) => Err(refused(error)),
+        }
+    }
+
+    /// Frees what the handler holds.
+    pub(super) async fn close(&mut self) {
+        self.charge();
+        self.final_stats = Some(self.handler.stats());
+        if timeout(MAX_CLOSE_TIME, self.handler.close()).await.is_err() {
+            tracing::warn!("a session ends before its environments are freed");
+        }
+    }
+
     /// Accounts for an answer, and returns the reply that it is.
     pub(super) fn finish(&mut self, answer: Result<Reply<H::Response>, H::Error>) -> Reply<H::Response> {
-        self.charge_steps();
+        self.charge();
         if self.was_open || self.handler.is_open() {
             self.known_open = Instant::now();
         }
@@ -215,17 +250,18 @@ impl<H: SessionHandler> Exchange<H> {
     }
 
     /// Refuses a request that was not decoded.
-    fn undecoded<R>(&self, error: impl Into<Error>) -> Result<R, H::Error> {
+    fn undecoded<R>(&mut self, error: impl Into<Error>) -> Result<R, H::Error> {
+        self.price += UNDECODED_PRICE;
         let error = H::Error::from(error.into());
         self.counts.count_undecoded(&error);
         Err(error)
     }
 
-    /// Charges the token for the steps since the last call.
-    fn charge_steps(&mut self) {
+    /// Charges the token for the steps and requests since the last call.
+    fn charge(&mut self) {
         if let Some(bearer) = &self.requests.bearer {
-            let steps = self.handler.stats().steps;
-            bearer.charge_steps(steps.saturating_sub(self.charged));
+            let steps = self.final_stats.unwrap_or_else(|| self.handler.stats()).steps;
+            bearer.charge(steps.saturating_sub(self.charged), std::mem::take(&mut self.price));
             self.charged = steps;
         }
     }
@@ -236,12 +272,12 @@ impl<H: SessionHandler> Drop for Exchange<H> {
         if self.ending == MOVED {
             return;
         }
-        self.charge_steps();
+        self.charge();
         self.sessions.access.record(&SessionRecord {
             peer: self.requests.connection.as_ref().map(|connection| connection.peer),
             token: self.requests.bearer.as_ref().map(|bearer| bearer.name()),
             protocol: H::PROTOCOL,
-            stats: self.handler.stats(),
+            stats: self.final_stats.unwrap_or_else(|| self.handler.stats()),
             time: self.start.elapsed(),
             resumed: (self.resumed > 0).then_some(self.resumed),
             ending: self.ending,

@@ -66,6 +66,12 @@ pub trait SessionHandler: Send + 'static {
     /// The environment of the session, and its steps so far.
     fn stats(&self) -> SessionStats;
 
+    /// The price of a request beside its steps, in steps of an environment. A token's rate counts both.
+    fn price(&self, request: &Self::Request) -> u64;
+
+    /// Frees what the session holds. Resolves when there is room for another session like it.
+    fn close(&mut self) -> impl Future<Output = ()> + Send;
+
     /// Answers a request.
     ///
     /// # Errors

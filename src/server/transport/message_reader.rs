@@ -7,11 +7,7 @@ use super::{
     Error,
     budget::{Budget, MemoryReservation, PendingReservations},
 };
-use crate::server::{
-    auth::Bearer,
-    limits::{MAX_BYTES_BEFORE_OPEN, RequestLimits},
-    net::managed_io::Connection,
-};
+use crate::server::{auth::Bearer, limits::RequestLimits, net::managed_io::Connection};
 use bytes::{Buf, Bytes, BytesMut};
 use http_body::Body as _;
 use http_body_util::BodyExt;
@@ -21,8 +17,8 @@ use tonic::{Code, Status, body::Body};
 
 /// The length of a message's header: a flag and a length.
 const HEADER_BYTES: usize = 5;
-/// The bytes of a message that are not taken from the memory budget: as many as a session may send before it is open.
-const UNBUDGETED_BYTES: usize = MAX_BYTES_BEFORE_OPEN;
+/// The bytes of a message that are not taken from the memory budget: little enough that every stream may send them.
+const UNBUDGETED_BYTES: usize = 64 << 10;
 /// The minimum average rate of a message, after the time that a pause may take.
 const MIN_BYTES_PER_SECOND: usize = 64 << 10;
 /// A message of at least this length gets an allocation of its own.

@@ -31,20 +31,20 @@ fn opened(environment: &str, n: u32) -> Vec<u8> {
 }
 
 #[tokio::test]
-async fn request_over_64_kib_before_open_is_refused_unread() {
+async fn request_over_1_mib_before_open_is_refused_unread() {
     let server = Server::start(&[]);
     let neighbour = Neighbour::start(server.unix());
-    for length in [(64 << 10) + 1, 60 << 20] {
+    for length in [(1 << 20) + 1, 60 << 20] {
         let mut connection = Connection::new(server.port(), WINDOW).await;
         let mut call = connection.call(SESSION).await.unwrap();
         call.send(framed(length, &[])).await;
         let (code, message) = call.status().await.unwrap();
         assert_eq!(code, Code::OutOfRange as i32, "{message}");
-        assert!(message.contains("65536"), "the limit is told: {message}");
+        assert!(message.contains("1048576"), "the limit is told: {message}");
     }
     // A request of as many bytes is read.
     let (mut session, _) = (Session::connect(server.tcp()).await, ());
-    let padding = "x".repeat((64 << 10) - 40);
+    let padding = "x".repeat((1 << 20) - 40);
     let (code, _) = session.refused(Open { environment: padding, ..open("CartPole", 1, 1) }).await;
     assert_eq!(code, Code::NotFound);
     neighbour.was_not_held_up();

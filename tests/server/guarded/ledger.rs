@@ -1,12 +1,13 @@
 //! What is drawn is written down.
 
 use super::{
-    connect,
+    connect, logged,
     tokens::{ANN, BOB, Guarded, entry},
 };
 use crate::{
     common::server::{Server, channel, command, open, until, within},
     dm_env_rpc::client::{Agent, Settings, choice, create, double, reset_world, settings, text, uint64},
+    metrics::Page,
 };
 use perturb::proto::{
     AutoresetMode, Open, Release, Reset, Restore, Snapshot, Step, dm_env_rpc::v1::environment_client::EnvironmentClient,
@@ -16,6 +17,7 @@ use perturb_protocol::{
     Stream,
     ledger::{DrawEnd, DrawRecord, DrawStart, LedgerEntry, LedgerEvent, read},
 };
+use rstest::rstest;
 use std::path::Path;
 use tonic::Code;
 
@@ -208,6 +210,56 @@ async fn ledger_withdraws_draws_that_did_not_happen() {
     let last = draws(&path).pop().unwrap();
     assert_eq!(last.ends, [DrawEnd { seed: 5, index: 0, count: 1, episode: None }]);
     assert_eq!(last.begins, [DrawStart { seed: 6, index: 0, count: 1, region: 0, episode: 0 }]);
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Tampering {
+    Deleted,
+    Replaced,
+    Truncated,
+    Lengthened,
+}
+
+#[rstest]
+#[case::deleted(Tampering::Deleted, "the file is gone")]
+#[case::replaced(Tampering::Replaced, "another file has taken its place")]
+#[case::truncated(Tampering::Truncated, "the file has 10 bytes, but the server wrote")]
+#[case::lengthened(Tampering::Lengthened, "bytes, but the server wrote")]
+#[tokio::test]
+async fn a_ledger_that_was_tampered_with_is_noticed(#[case] tampering: Tampering, #[case] part: &str) {
+    let directory = tempfile::tempdir().unwrap();
+    let (path, aside) = (directory.path().join("ledger"), directory.path().join("aside"));
+    let metrics = directory.path().join("metrics");
+    let flags = ["--ledger", path.to_str().unwrap(), "--metrics", &format!("unix:{}", metrics.display())];
+    let server = Server::start(&flags);
+    let connection = connect(server.tcp(), &[]).await.unwrap();
+    let (mut session, _) = within(Stream::open(&connection, open("CartPole", 1, 1))).await.unwrap();
+    let whole = std::fs::read(&path).unwrap();
+    match tampering {
+        Tampering::Deleted => std::fs::rename(&path, &aside).unwrap(),
+        Tampering::Replaced => {
+            std::fs::rename(&path, &aside).unwrap();
+            std::fs::write(&path, &whole).unwrap();
+        }
+        Tampering::Truncated => std::fs::OpenOptions::new().write(true).open(&path).unwrap().set_len(10).unwrap(),
+        Tampering::Lengthened => std::fs::write(&path, [&whole[..], b"x"].concat()).unwrap(),
+    }
+    logged(&server, part).await;
+    assert_eq!(Page::scrape(&metrics).number("perturb_ledger_intact"), 0.0);
+    let refusal = within(Stream::open(&connection, open("CartPole", 1, 2))).await.unwrap_err().to_string();
+    assert!(refusal.contains("writes down what is drawn, and cannot") && refusal.contains(part), "{refusal}");
+    super::steps(&mut session, 1).await.expect("what is drawn already goes on");
+    // Put back as it was, it is gone on with.
+    match tampering {
+        Tampering::Deleted | Tampering::Replaced => std::fs::rename(&aside, &path).unwrap(),
+        Tampering::Truncated | Tampering::Lengthened => std::fs::write(&path, &whole).unwrap(),
+    }
+    logged(&server, "is there again").await;
+    let (other, _) = within(Stream::open(&connection, open("CartPole", 1, 3))).await.unwrap();
+    assert_eq!(Page::scrape(&metrics).number("perturb_ledger_intact"), 1.0);
+    assert!(Page::scrape(&metrics).number("perturb_ledger_bytes") > whole.len() as f64);
+    drop((other, session));
+    read(&path, |_, _| {}).expect("the chain is whole");
 }
 
 #[test]

@@ -11,9 +11,10 @@ use crate::{
 };
 use bytes::Bytes;
 use perturb::proto::{
-    Act, AutoresetMode, Open, Render, Resume, Step, act::Task, dm_env_rpc::v1::environment_client::EnvironmentClient,
-    session_response::Response,
+    Act, AutoresetMode, ListEnvironmentsRequest, Open, Render, Reset, Restore, Resume, Snapshot, Step, act::Task,
+    dm_env_rpc::v1::environment_client::EnvironmentClient, session_request::Request, session_response::Response,
 };
+use rstest::rstest;
 use std::time::{Duration, Instant};
 use tonic::Code;
 
@@ -91,7 +92,6 @@ async fn an_agent_of_the_other_protocol_steps_at_the_rate_too() {
 async fn client_far_ahead_is_told_and_freed_by_a_new_file() {
     let guarded = Guarded::start(&entry("ann", ANN, "max_steps_per_second = 1"));
     let mut session = session(&guarded, ANN, open("CartPole", 100, 1)).await;
-    session.step(vec![0; 400].into()).await;
     let (code, words) = session.refused(crate::common::server::step(vec![0; 400])).await;
     assert_eq!(code, Code::ResourceExhausted, "{words}");
     assert!(words.contains("\"ann\" may take 1 steps a second") && words.contains(" s ahead"), "{words}");
@@ -102,9 +102,8 @@ async fn client_far_ahead_is_told_and_freed_by_a_new_file() {
 
 #[tokio::test]
 async fn who_waits_for_a_rate_is_told_when_the_token_is_revoked() {
-    let guarded = Guarded::start(&entry("ann", ANN, "max_steps_per_second = 4"));
+    let guarded = Guarded::start(&entry("ann", ANN, "max_steps_per_second = 8"));
     let mut session = session(&guarded, ANN, open("CartPole", 100, 1)).await;
-    session.step(vec![0; 400].into()).await;
     session.send(crate::common::server::step(vec![0; 400])).await;
     std::fs::write(&guarded.file, entry("bob", BOB, "")).unwrap();
     let start = Instant::now();
@@ -150,9 +149,86 @@ async fn session_is_resumed_although_its_token_is_ahead_of_its_rate() {
     let mut lost = Session::show(&mut connection, Some(ANN)).await.unwrap();
     let opened = lost.ask(Open { lease: 1, ..open("CartPole", 40, 1) }).await;
     let step = || Step { actions: vec![0; 4 * 40].into() };
-    lost.ask(step()).await;
+    assert_eq!(lost.refused(step()).await.0, Code::ResourceExhausted, "opening costs more than half a minute");
     drop(lost);
     let mut session = Session::show(&mut connection, Some(ANN)).await.unwrap();
     assert_eq!(session.ask(Resume { lease: opened.lease, last_reply: 1 }).await.last_reply, 1);
     assert_eq!(session.refused(step()).await.0, Code::ResourceExhausted, "40 s are too long to wait");
+}
+
+/// The time that `count` requests of a token with 1 000 steps a second take, after the first ones.
+async fn paced(session: &mut Session, count: usize, request: impl Fn() -> Request) -> Duration {
+    let start = Instant::now();
+    for _ in 0..count {
+        let answer = session.answer(request()).await;
+        assert!(!matches!(answer, Response::Error(_)), "{answer:?}");
+    }
+    start.elapsed()
+}
+
+#[rstest]
+#[case::reset("reset", 100)]
+#[case::new_trial("trial", 100)]
+#[case::snapshot("snapshot", 100)]
+#[case::restore("restore", 25)]
+#[case::render("render", 50)]
+#[tokio::test]
+async fn requests_cost_as_much_of_the_rate_as_steps(#[case] kind: &str, #[case] count: usize) {
+    const ENVS: usize = 20;
+    let guarded = Guarded::start(&entry("ann", ANN, "max_steps_per_second = 1000"));
+    let same_step = Open { autoreset_mode: AutoresetMode::SameStep.into(), ..open("CartPole", ENVS as u32, 1) };
+    let mut session = session(&guarded, ANN, same_step).await;
+    let snapshots = session.snapshot(&[]).await;
+    let took = paced(&mut session, count, || match kind {
+        "reset" => Request::Reset(Reset::default()),
+        "trial" => Request::Reset(Reset { seeds: vec![7; ENVS], ..Reset::default() }),
+        "snapshot" => Request::Snapshot(Snapshot::default()),
+        "restore" => Request::Restore(Restore { snapshots: snapshots.clone(), ..Restore::default() }),
+        _ => Request::Render(Render { slot: 0, width: 200, height: 200 }),
+    })
+    .await;
+    // Each costs 20 steps at least, or 39 for a picture; one second can be made up for, and nobody waits for the last.
+    assert!(took.as_secs_f64() >= 0.9, "{kind}: {took:?}");
+}
+
+#[tokio::test]
+async fn opens_and_catalogues_cost_as_much_of_the_rate_as_steps() {
+    let guarded = Guarded::start(&entry("ann", ANN, "max_steps_per_second = 1000"));
+    let mut connection = client(guarded.server.tcp()).await;
+    let start = Instant::now();
+    for _ in 0..60 {
+        // 16 for the session, 4 for its environments, and the ledger's line.
+        let mut session = Session::show(&mut connection, Some(ANN)).await.unwrap();
+        session.ask(open("CartPole", 4, 1)).await;
+        session.close();
+        assert_eq!(session.end().await.code(), Code::Ok);
+    }
+    let opens = start.elapsed();
+    assert!(opens.as_secs_f64() > 1.1, "{opens:?}");
+    let start = Instant::now();
+    for _ in 0..100 {
+        let mut call = tonic::Request::new(ListEnvironmentsRequest {});
+        call.metadata_mut().insert("authorization", format!("Bearer {ANN}").parse().unwrap());
+        connection.list_environments(call).await.unwrap();
+    }
+    let listings = start.elapsed();
+    assert!(listings.as_secs_f64() > 0.5, "{listings:?}");
+}
+
+#[tokio::test]
+async fn a_rate_bounds_how_fast_the_ledger_grows() {
+    const RATE: u64 = 1_000;
+    let guarded = Guarded::start(&entry("ann", ANN, &format!("max_steps_per_second = {RATE}")));
+    let mut session = session(&guarded, ANN, open("CartPole", 64, 1)).await;
+    let start = Instant::now();
+    for round in 0..12 {
+        let seeds = (0..64).map(|slot| u64::MAX - 64 * round - slot).collect();
+        session.ask(Reset { seeds, ..Reset::default() }).await;
+    }
+    let seconds = start.elapsed().as_secs_f64();
+    let bytes = std::fs::metadata(guarded.directory.path().join("ledger")).unwrap().len() as f64;
+    // docs/access.md says 16 bytes a step; one second can be made up for, and the last request is not waited for.
+    let most = 16.0 * RATE as f64 * (seconds + 1.0) + 10_000.0;
+    println!("{bytes} bytes in {seconds} s, at most {most}");
+    assert!(bytes < most, "{bytes} bytes in {seconds} s");
 }

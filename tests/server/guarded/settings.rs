@@ -37,7 +37,11 @@ fn reachable_address_is_guarded_or_called_insecure(#[case] flags: &[&str], #[cas
 #[case::only_ca(&["--tls-client-ca", "x"], "tls_cert is not given")]
 #[case::no_tokens(&["--tokens", "/nowhere/tokens"], "cannot read /nowhere/tokens")]
 #[case::no_files(&["--tls-cert", "/nowhere/cert", "--tls-key", "/nowhere/key"], "cannot read /nowhere/cert")]
-#[case::no_pem(&["--tls-cert", "/dev/null", "--tls-key", "/dev/null"], "there is no certificate")]
+#[case::devices(&["--tls-cert", "/dev/null", "--tls-key", "/dev/null"], "expected a plain file")]
+#[case::endless_tokens(&["--tokens", "/dev/zero"], "cannot read /dev/zero: it is a pipe or a device")]
+#[case::folder(&["--tokens", "/"], "it is a folder, expected a file")]
+#[case::endless_ledger(&["--ledger", "/dev/zero"], "that is no file")]
+#[case::endless_config(&["--config", "/dev/zero"], "cannot read /dev/zero: it is a pipe or a device")]
 #[case::decimal(&["--socket-mode", "438"], "no mode of a socket")]
 #[case::executable(&["--socket-mode", "0700"], "expected 0600")]
 fn a_wrong_guard_is_refused(#[case] flags: &[&str], #[case] part: &str) {
@@ -55,6 +59,28 @@ fn a_wrong_file_of_tokens_is_refused_with_its_line() {
     command.args(["--listen", "tcp://127.0.0.1:0", "--tokens"]).arg(file.path());
     let words = refused(command);
     assert!(words.contains("line 3: unknown field `tokn`") && !words.contains("horse"), "{words}");
+}
+
+#[test]
+fn a_pipe_is_refused_at_the_start_and_not_waited_for() {
+    let directory = tempfile::tempdir().unwrap();
+    let pipe = directory.path().join("pipe");
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    for flag in ["--tokens", "--ledger", "--config"] {
+        let mut command = command();
+        command.args(["--listen", "tcp://127.0.0.1:0", flag]).arg(&pipe);
+        let words = refused(command);
+        assert!(words.contains("plain file") || words.contains("no file"), "{flag}: {words}");
+    }
+}
+
+#[test]
+fn a_file_without_a_certificate_is_refused() {
+    let file = tempfile::NamedTempFile::new().unwrap();
+    let mut command = command();
+    command.args(["--listen", "tcp://127.0.0.1:0", "--tls-key"]).arg(file.path()).arg("--tls-cert").arg(file.path());
+    let words = refused(command);
+    assert!(words.contains("there is no certificate"), "{words}");
 }
 
 #[test]

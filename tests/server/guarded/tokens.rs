@@ -104,6 +104,33 @@ async fn a_token_that_is_taken_out_of_the_file_is_good_no_more() {
 }
 
 #[tokio::test]
+async fn hangup_reads_files_again_and_ends_nobody() {
+    let guarded = Guarded::start(&entry("ann", ANN, ""));
+    let mut session = begin(&guarded.connect(ANN).await, 1).await.unwrap();
+    guarded.server.signal("HUP");
+    logged(&guarded.server, "read tokens again").await;
+    steps(&mut session, 1).await.expect("no session ends");
+    let unguarded = Server::start(&[]);
+    unguarded.signal("HUP");
+    logged(&unguarded, "no file of tokens or TLS to read again").await;
+    let plain = connect(unguarded.tcp(), &[]).await.unwrap();
+    begin(&plain, 1).await.unwrap();
+}
+
+#[tokio::test]
+async fn a_file_that_becomes_a_pipe_is_told_and_stops_nothing() {
+    let guarded = Guarded::start(&entry("ann", ANN, ""));
+    std::fs::remove_file(&guarded.file).unwrap();
+    assert!(std::process::Command::new("mkfifo").arg(&guarded.file).status().unwrap().success());
+    logged(&guarded.server, "it is a pipe or a device").await;
+    begin(&guarded.connect(ANN).await, 1).await.expect("the tokens of before stay in force");
+    std::fs::remove_file(&guarded.file).unwrap();
+    std::fs::write(&guarded.file, entry("bob", BOB, "")).unwrap();
+    logged(&guarded.server, "read tokens again").await;
+    begin(&guarded.connect(BOB).await, 1).await.expect("the watcher goes on");
+}
+
+#[tokio::test]
 async fn a_token_has_its_quotas() {
     let guarded = Guarded::start(&(entry("ann", ANN, "max_sessions = 2\nmax_envs = 8") + &entry("bob", BOB, "")));
     let ann = guarded.connect(ANN).await;

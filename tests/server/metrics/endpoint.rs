@@ -28,8 +28,10 @@ fn the_address_is_printed_after_those_of_sessions() {
     let lines = lines(child.stdout.take().unwrap());
     let line = || lines.recv_timeout(DEADLINE).unwrap();
     assert!(line().starts_with("listening on http://127.0.0.1:"));
-    let line = line();
-    let port = line.strip_prefix("metrics at http://").and_then(|rest| rest.strip_suffix("/metrics")).expect(&line);
+    let metrics = line();
+    let port =
+        metrics.strip_prefix("metrics at http://").and_then(|rest| rest.strip_suffix("/metrics")).expect(&metrics);
+    assert!(line().starts_with("gRPC target 127.0.0.1:"), "as gRPC's tools write it");
     let (head, body) = page::asked(page::tcp(port), "GET /metrics");
     child.kill().unwrap();
     child.wait().unwrap();
@@ -39,7 +41,7 @@ fn the_address_is_printed_after_those_of_sessions() {
 #[rstest]
 #[case("GET /", "404", "ask for /metrics")]
 #[case("GET /metrics/", "404", "ask for /metrics")]
-#[case("POST /metrics", "405", "ask with GET")]
+#[case("POST /metrics", "405", "ask with GET or HEAD")]
 fn what_is_no_page_says_where_it_is(#[case] line: &str, #[case] status: &str, #[case] words: &str) {
     let watched = Watched::start(&[]);
     let (head, body) = page::asked(page::unix(&watched.socket), line);
@@ -83,6 +85,43 @@ fn two_servers_at_one_address_are_refused_with_a_sentence(#[case] address: &str)
     let words = refused(second);
     assert!(words.contains(&format!("cannot listen at {address}: another program does")), "{words}");
     assert!(words.contains("--metrics") && !words.contains("--listen"), "{words}");
+}
+
+#[rstest]
+#[case::open_metrics("*/*", "application/openmetrics-text; version=1.0.0", true)]
+#[case::text("text/plain;version=0.0.4;q=1,*/*;q=0.1", "text/plain; version=0.0.4", false)]
+fn scraper_gets_the_format_that_it_asks_for(#[case] accept: &str, #[case] format: &str, #[case] is_open: bool) {
+    let watched = Watched::start(&[]);
+    let (head, body) = page::asked_for(page::unix(&watched.socket), "GET /metrics", &format!("Accept: {accept}\r\n"));
+    assert!(head.starts_with("HTTP/1.1 200") && head.contains(&format!("content-type: {format}")), "{head}");
+    assert_eq!(body.ends_with("# EOF\n"), is_open);
+    let counter = if is_open { "# TYPE perturb_steps counter" } else { "# TYPE perturb_steps_total counter" };
+    assert!(body.contains(counter) && body.contains("# TYPE perturb_sessions gauge\nperturb_sessions"), "{body}");
+}
+
+#[test]
+fn head_is_answered_without_a_body() {
+    let watched = Watched::start(&[]);
+    let (head, body) = page::asked(page::unix(&watched.socket), "HEAD /metrics");
+    assert!(head.starts_with("HTTP/1.1 200") && head.contains("application/openmetrics-text"), "{head}");
+    assert_eq!(body, "");
+}
+
+#[test]
+fn half_requests_keep_nobody_from_the_page() {
+    use std::io::Write;
+    let watched = Watched::start(&[]);
+    let start = Instant::now();
+    let half: Vec<_> = (0..145)
+        .map(|_| {
+            let mut stream = page::unix(&watched.socket);
+            let _ = stream.write_all(b"GET /metrics HTTP/1.1\r\nHost: "); // an older one may be closed already
+            stream
+        })
+        .collect();
+    assert!(watched.page().tells("perturb_sessions"));
+    assert!(start.elapsed() < std::time::Duration::from_secs(4), "less than one timeout: {:?}", start.elapsed());
+    drop(half);
 }
 
 #[tokio::test]

@@ -8,7 +8,7 @@ mod log;
 mod page;
 
 use crate::common::server::{Server, until};
-use page::Page;
+pub use page::Page;
 use std::path::PathBuf;
 use tempfile::TempDir;
 

@@ -19,8 +19,13 @@ pub struct Page {
 }
 
 /// What comes back for a request line: the head and the body.
-pub fn asked(mut stream: impl Read + Write, line: &str) -> (String, String) {
-    write!(stream, "{line} HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+pub fn asked(stream: impl Read + Write, line: &str) -> (String, String) {
+    asked_for(stream, line, "")
+}
+
+/// The same with further header lines.
+pub fn asked_for(mut stream: impl Read + Write, line: &str, headers: &str) -> (String, String) {
+    write!(stream, "{line} HTTP/1.1\r\nHost: localhost\r\n{headers}\r\n").unwrap();
     let mut text = String::new();
     stream.read_to_string(&mut text).unwrap();
     let (head, body) = text.split_once("\r\n\r\n").expect("a head and a body");

@@ -28,6 +28,10 @@ use crate::{
 };
 use std::sync::Arc;
 
+/// The price of a world in steps, as of an `open` of one environment.
+const WORLD_PRICE: u64 = 17;
+/// The price of the trial that a reset begins, in steps.
+const NEW_TRIAL_PRICE: u64 = 3;
 /// The maximum length of a request. A world is one environment; the rest is room for mistakes that deserve an answer.
 const MAX_REQUEST_BYTES: usize = 1 << 20;
 
@@ -177,6 +181,18 @@ impl SessionHandler for Agent {
     fn stats(&self) -> SessionStats {
         self.stats
     }
+
+    fn price(&self, request: &Self::Request) -> u64 {
+        match request.payload {
+            Some(Request::Step(_)) => 0,
+            Some(Request::CreateWorld(_)) => WORLD_PRICE,
+            Some(Request::Reset(_) | Request::ResetWorld(_)) => NEW_TRIAL_PRICE,
+            _ => 1,
+        }
+    }
+
+    /// A world is one environment, which is freed with the agent.
+    async fn close(&mut self) {}
 
     async fn answer(&mut self, request: Self::Request) -> Result<Reply<Self::Response>, Error> {
         let response = match request.payload {

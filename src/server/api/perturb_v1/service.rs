@@ -4,12 +4,19 @@ use super::session::{ServerContext, Session};
 use crate::{
     proto::{self, perturb_server::Perturb},
     server::{
+        auth::Bearer,
+        error::status,
         session::{admission::Sessions, driver::Responses, instrumented::RequestCounters},
         transport::raw_body,
     },
 };
-use std::sync::Arc;
+use std::{sync::Arc, time::Duration};
 use tonic::{Request, Response, Status, Streaming};
+
+/// The price of the catalogue in steps.
+const LISTING_PRICE: u64 = 16;
+/// The time that a call for the catalogue may wait for its token's rate: less than the timeout of such calls.
+const MAX_LISTING_WAIT: Duration = Duration::from_secs(5);
 
 /// The path of calls that are sessions.
 pub const ENDPOINT: &str = "/perturb.v1.Perturb/Session";
@@ -40,8 +47,12 @@ impl Perturb for PerturbService {
 
     async fn list_environments(
         &self,
-        _: Request<proto::ListEnvironmentsRequest>,
+        request: Request<proto::ListEnvironmentsRequest>,
     ) -> Result<Response<proto::ListEnvironmentsResponse>, Status> {
+        if let Some(bearer) = request.extensions().get::<Bearer>() {
+            bearer.acquire_within(MAX_LISTING_WAIT).await.map_err(|error| status(&error))?;
+            bearer.charge(0, LISTING_PRICE);
+        }
         Ok(Response::new(self.shared.listing.clone()))
     }
 

@@ -1,6 +1,6 @@
 //! The handler of one session: the legal order of its requests, each answered once.
 
-use super::{Error, convert, fields::SESSION_REQUEST, policy, sizes};
+use super::{Error, convert, fields::SESSION_REQUEST, policy, price::price, sizes};
 use crate::{
     env::Catalogue,
     pool::{Batch, Pool},
@@ -91,6 +91,9 @@ impl Session {
         let opened = Batch::open(&self.context.pool, settings).await;
         let (mut batch, observations, started) = opened.inspect_err(|_| self.draws.open_failed(spec, begun))?;
         self.draws.record_drop(&mut batch);
+        if let Some(bearer) = &self.bearer {
+            bearer.charge(0, envs as u64);
+        }
         let grant = match unanswered {
             0 => None,
             unanswered => self.context.leases.grant(self.bearer.clone(), unanswered as usize)?,
@@ -281,6 +284,17 @@ impl SessionHandler for Session {
             envs: batch.settings().size(),
             steps: batch.steps(),
         })
+    }
+
+    fn price(&self, request: &Self::Request) -> u64 {
+        price(request.request.as_ref(), self.batch.as_ref())
+    }
+
+    async fn close(&mut self) {
+        if let Some(batch) = self.batch.take() {
+            batch.close().await;
+        }
+        (self.env_quota, self.step_memory, self.policy_memory) = (None, None, None);
     }
 
     async fn answer(&mut self, request: Self::Request) -> Result<SessionReply, Error> {

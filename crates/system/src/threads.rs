@@ -1,0 +1,28 @@
+//! Threads that the system does not start.
+
+use std::io::Error;
+
+use rustix::process::{Resource, getrlimit};
+
+/// Explains why the system starts no further thread or process: the limit of the user, or of a container.
+pub fn explain_no_thread(error: &Error) -> Error {
+    let limit = getrlimit(Resource::Nproc).current.map_or_else(|| "unlimited".into(), |limit| limit.to_string());
+    let words = format!(
+        "the system starts no further thread or process ({error}): this user may have {limit} of them in all (`ulimit -u`, \
+         RLIMIT_NPROC), and a container as many as its pids.max; raise the limit, or end other programs"
+    );
+    Error::new(error.kind(), words)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_limit_of_threads_is_named() {
+        let error = explain_no_thread(&Error::from_raw_os_error(11));
+        let words = error.to_string();
+        assert!(words.contains("ulimit -u") && words.contains("os error 11"), "{words}");
+        assert_eq!(error.kind(), std::io::ErrorKind::WouldBlock);
+    }
+}
