@@ -19,7 +19,7 @@ pub(crate) use error::shorten;
 pub use parameter::Parameter;
 pub use perturb_protocol::{Distribution, DistributionError, Interval, Version};
 pub use seeding::{Purpose, Stream};
-pub(crate) use snapshot::MAX_SNAPSHOT_BYTES;
+pub(crate) use snapshot::{MAX_SNAPSHOT_BYTES, distributions_bytes};
 pub use snapshot::{SavedDraw, saved_draw};
 pub use spaces::{Action, ActionSpace, Channel, Quantity, RewardTerm};
 pub use success::{Achievement, Comparison, Success};

@@ -18,6 +18,9 @@ const FIRST: u32 = 1;
 /// 64 KiB, and the numbers of a state and an observation of 4096 entries, some 50 KiB.
 pub const MAX_SNAPSHOT_BYTES: usize = 128 << 10;
 
+/// The most bytes by which a snapshot's counters can grow: small numbers have short encodings.
+const MAX_COUNTERS_GROWTH_BYTES: usize = 64;
+
 /// More episodes than any environment runs: a snapshot that claims more would let the counts overflow.
 const MAX_EPISODE: u64 = 1 << 63;
 
@@ -65,6 +68,11 @@ impl Episodes {
         snapshot
     }
 
+    /// Returns an upper bound of the length of a snapshot of this environment without its distributions, in bytes.
+    pub(crate) fn max_snapshot_bytes(&self) -> usize {
+        self.snapshot().len() - distributions_bytes(&self.settings.distributions) + MAX_COUNTERS_GROWTH_BYTES
+    }
+
     /// Brings a saved environment back: what follows is what followed the snapshot, byte for byte.
     ///
     /// # Errors
@@ -105,6 +113,12 @@ impl Episodes {
         }
         Ok((saved, distributions))
     }
+}
+
+/// Returns the bytes of distributions in a snapshot, without the number of distributions.
+pub(crate) fn distributions_bytes(distributions: &[Distribution]) -> usize {
+    // A distribution has at most 64 intervals, whose number has one byte.
+    distributions.iter().map(|distribution| 1 + size_of::<(f64, f64)>() * distribution.intervals().len()).sum()
 }
 
 /// What a saved environment draws from.

@@ -18,7 +18,7 @@ use super::{
     sync::lock,
 };
 use crate::{
-    env::{Distribution, Draw, EnvironmentSpec, EpisodeStart, Episodes},
+    env::{Distribution, Draw, EnvironmentSpec, EpisodeStart, Episodes, distributions_bytes},
     meters::Tally,
     scene::Scene,
 };
@@ -360,6 +360,15 @@ impl Batch {
             return Err(Error::Defect);
         }
         Ok(lock(&self.job.shards[slot / self.shard_size]).scene(slot))
+    }
+
+    /// Returns an upper bound of the length of each environment's snapshot, in bytes. It holds until a distribution is
+    /// replaced by one of more intervals.
+    pub fn max_snapshot_bytes(&self) -> usize {
+        let own = lock(&self.job.shards[0]).max_snapshot_bytes();
+        let distributions = |group: &SlotGroup| distributions_bytes(&group.episodes.distributions);
+        let largest = self.settings.groups.iter().map(distributions).max().unwrap_or_default();
+        own + largest
     }
 
     /// Waits until no request runs, before one that is not a pipelined step, and checks that nothing has failed.

@@ -177,6 +177,11 @@ impl Shard {
         self.slots[slot - self.first_slot].scene()
     }
 
+    /// An upper bound of the length of the first environment's snapshot without its distributions, in bytes.
+    pub(super) fn max_snapshot_bytes(&self) -> usize {
+        self.slots.first().map_or(0, Episodes::max_snapshot_bytes)
+    }
+
     /// Carries out the command. Returns how many environments took a step, and how many episodes ended.
     pub(super) fn run(&mut self) -> (usize, usize) {
         self.ended.clear();

@@ -130,17 +130,32 @@ pub async fn run(
     Ok(())
 }
 
+/// The optional parts of the contract that this server knows, in alphabetical order; docs/protocol.md lists them.
+const FEATURES: &[&str] = &[
+    "act",
+    "groups",
+    "lease",
+    "observe_parameters",
+    "receipt_arrays",
+    "release",
+    "reply_bounds",
+    "reward_terms",
+    "save_player",
+];
+
 /// The catalogue of a server with these settings, as a message. Builds each environment once, so that a model that
 /// cannot be loaded is known before anything is served.
 ///
 /// # Errors
 /// [`env::Error`].
 pub fn listing(catalogue: &Catalogue, config: &Config) -> Result<proto::ListEnvironmentsResponse, env::Error> {
+    let is_served = |feature: &&str| *feature != "lease" || config.lease_seconds > 0;
     let environments = catalogue.specs().map(|spec| Ok(convert::environment(spec, (spec.make)()?.model_hash())));
     Ok(proto::ListEnvironmentsResponse {
         environments: environments.collect::<Result<_, env::Error>>()?,
         server_version: env!("CARGO_PKG_VERSION").into(),
         max_batch_size: u32::try_from(config.max_envs).unwrap_or(u32::MAX),
+        features: FEATURES.iter().copied().filter(is_served).map(Into::into).collect(),
     })
 }
 

@@ -29,6 +29,7 @@ mod pool;
 mod receipt_arrays;
 mod reference;
 mod rendering;
+mod reply_bounds;
 mod restoring;
 #[cfg(feature = "mujoco")]
 mod sharing;

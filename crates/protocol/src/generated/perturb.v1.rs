@@ -14,6 +14,10 @@ pub struct ListEnvironmentsResponse {
     /// Maximal number of environments that one session may open on this server.
     #[prost(uint32, tag = "3")]
     pub max_batch_size: u32,
+    /// Names of the optional parts of this contract that the server knows, in alphabetical order, e.g. "lease" or
+    /// "receipt_arrays"; docs/protocol.md lists them. Empty from older servers. A client ignores names that it does not know.
+    #[prost(string, repeated, tag = "4")]
+    pub features: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
 }
 /// The description of an environment.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -458,6 +462,14 @@ pub struct Opened {
     /// loss.
     #[prost(uint32, tag = "9")]
     pub lease_seconds: u32,
+    /// Upper bound of the length of a reply to `step`, `reset` or `restore`, in bytes: all N episodes may end in one step.
+    /// A client's limit on received messages should be at least this. 0 from older servers.
+    #[prost(uint64, tag = "10")]
+    pub max_step_reply_bytes: u64,
+    /// Upper bound of the length of a reply to `snapshot` of all N environments, in bytes, as long as no request replaces a
+    /// distribution by one of more intervals: each further interval adds 16 bytes. 0 from older servers.
+    #[prost(uint64, tag = "11")]
+    pub max_snapshot_reply_bytes: u64,
 }
 /// Resumes a session with a lease, as the first request of a new stream. The server need not have noticed the loss of
 /// the stream before: that one ends with ABORTED. The session is as it was; requests that the server has read completely

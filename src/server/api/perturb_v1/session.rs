@@ -100,9 +100,12 @@ impl Session {
         };
         let lease = grant.as_ref().map_or_else(Bytes::new, |grant| Bytes::copy_from_slice(&grant.name));
         let lease_seconds = grant.as_ref().map_or(0, |grant| grant.time().as_secs() as u32);
-        (self.batch, self.step_memory, self.env_quota) = (Some(batch), step_memory, env_quota);
         let started = convert::started(started);
         let acts = true;
+        let max_step_reply_bytes = environment
+            .as_ref()
+            .map_or(0, |environment| sizes::max_step_reply_bytes(batch.settings(), environment, envs) as u64);
+        let max_snapshot_reply_bytes = sizes::max_snapshot_reply_bytes(envs, batch.max_snapshot_bytes()) as u64;
         let opened = proto::Opened {
             environment,
             observations,
@@ -113,7 +116,10 @@ impl Session {
             receipt_arrays,
             lease,
             lease_seconds,
+            max_step_reply_bytes,
+            max_snapshot_reply_bytes,
         };
+        (self.batch, self.step_memory, self.env_quota) = (Some(batch), step_memory, env_quota);
         Ok(Reply { handover: grant.map(StreamHandover::Lease), ..reply(Response::Opened(opened)) })
     }
 

@@ -17,6 +17,10 @@ const EPISODE_END_BYTES: usize = 300;
 const RECEIPT_BYTES: usize = 500;
 /// The estimated length of a snapshot.
 const SNAPSHOT_BYTES: usize = 2 << 10;
+/// The most bytes of tags and lengths of all fields of a reply that are not repeated.
+const FRAMING_BYTES: usize = 256;
+/// Integers in a row of `Stepped.receipt_episodes`.
+const RECEIPT_INDICES: usize = 5;
 
 /// Entries of an action.
 fn action_width(settings: &BatchSettings) -> usize {
@@ -87,3 +91,59 @@ pub fn max_rollout_bytes(request: &RolloutRequest, batch: &Batch) -> usize {
 
 /// The approximate length at which a rollout's reply is cut.
 const MAX_ROLLOUT_BYTES: usize = 4_000_000;
+
+/// Returns the most bytes of a reply to `step`, `reset` or `restore` of `size` environments that are described so: all
+/// episodes end at once, with the largest counters.
+pub fn max_step_reply_bytes(settings: &BatchSettings, environment: &proto::Environment, size: usize) -> usize {
+    let receipt = proto::Receipt {
+        requested: vec![1.0; environment.parameters.len()],
+        applied: vec![1.0; environment.applied.len()],
+        model_hash: environment.model_hash.clone(),
+    };
+    let episode = proto::Episode {
+        environment_index: u32::MAX,
+        trial_index: u64::MAX,
+        episode_index: u64::MAX,
+        episode_in_trial: u32::MAX,
+    };
+    let slot = u32::try_from(size).unwrap_or(u32::MAX);
+    let has_messages = settings.receipts && !settings.receipt_arrays;
+    let start = proto::EpisodeStart { slot, episode: Some(episode), receipt: Some(receipt.clone()) };
+    let end = proto::EpisodeEnd {
+        slot,
+        episode: Some(episode),
+        r#return: 1.0,
+        length: u32::MAX,
+        success: true,
+        diverged: true,
+        receipt: has_messages.then_some(receipt),
+        achieved: Some(1.0),
+        code_achieved: Some(1.0),
+    };
+    let receipt_row = 8 * (RECEIPT_INDICES + environment.parameters.len() + environment.applied.len());
+    let array_row = if settings.receipts && settings.receipt_arrays { receipt_row } else { 0 };
+    let observation = 4 * settings.observation_size();
+    let start_message = if settings.receipts { entry(&start) } else { 0 };
+    let ended = entry(&end) + observation + array_row;
+    let started = if has_messages { start_message } else { array_row };
+    let events = match settings.autoreset {
+        Autoreset::SameStep => ended + started,
+        Autoreset::NextStep => ended.max(started), // an episode that begins in a step does not end in it
+        Autoreset::Disabled => ended,
+    };
+    let reward_terms = if settings.reward_terms { 4 * settings.spec.reward_terms.len() } else { 0 };
+    // Rewards and the two flags have six bytes. A reply to `reset` has messages also where steps have arrays.
+    let row = observation + (6 + reward_terms + events).max(start_message);
+    size.saturating_mul(row).saturating_add(FRAMING_BYTES)
+}
+
+/// Returns the most bytes of a reply to `snapshot` of `size` environments, each of which has at most this many.
+pub fn max_snapshot_reply_bytes(size: usize, snapshot: usize) -> usize {
+    size.saturating_mul(1 + prost::length_delimiter_len(snapshot) + snapshot).saturating_add(FRAMING_BYTES)
+}
+
+/// The bytes of a message in a list, whose tag has one byte.
+fn entry(message: &impl prost::Message) -> usize {
+    let length = message.encoded_len();
+    1 + prost::length_delimiter_len(length) + length
+}
