@@ -3,7 +3,7 @@
 use super::Failure;
 use bytes::Bytes;
 use perturb::{
-    env::{ActionSpace, EnvironmentSpec},
+    env::{ActionSpace, Distribution, EnvironmentSpec},
     proto, tasks,
 };
 use perturb_protocol::{Address, Connection, Stream as Session};
@@ -32,7 +32,18 @@ impl Client {
     }
 
     pub(crate) async fn on(connection: &Connection, name: &str, batch: usize) -> Result<Self, Failure> {
-        Self::with_spec(connection, tasks::catalogue().find(name)?, batch).await
+        Self::with_spec(connection, tasks::catalogue().find(name)?, batch, &[]).await
+    }
+
+    /// Opens an environment with these values of disturbances.
+    pub(crate) async fn open_disturbed(
+        socket: &Path,
+        name: &str,
+        batch: usize,
+        values: &[(&str, f64)],
+    ) -> Result<Self, Failure> {
+        let connection = Connection::open(&Address::Unix(socket.into())).await?;
+        Self::with_spec(&connection, tasks::catalogue().find(name)?, batch, values).await
     }
 
     /// Opens an environment that need not be built in.
@@ -42,16 +53,23 @@ impl Client {
         spec: &'static EnvironmentSpec,
         batch: usize,
     ) -> Result<Self, Failure> {
-        Self::with_spec(&Connection::open(&Address::Unix(socket.into())).await?, spec, batch).await
+        Self::with_spec(&Connection::open(&Address::Unix(socket.into())).await?, spec, batch, &[]).await
     }
 
-    async fn with_spec(connection: &Connection, spec: &'static EnvironmentSpec, batch: usize) -> Result<Self, Failure> {
+    async fn with_spec(
+        connection: &Connection,
+        spec: &'static EnvironmentSpec,
+        batch: usize,
+        values: &[(&str, f64)],
+    ) -> Result<Self, Failure> {
+        let fixed = |&(name, value): &(&str, f64)| (name.to_owned(), (&Distribution::fixed(value)).into());
         let open = proto::Open {
             environment: spec.name.into(),
             version: proto::Version::Default.into(),
             batch_size: batch as u32,
             seed: SEED,
             autoreset_mode: proto::AutoresetMode::SameStep.into(),
+            parameters: values.iter().map(fixed).collect(),
             ..Default::default()
         };
         let (session, _) = Session::open(connection, open).await?;

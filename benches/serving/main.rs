@@ -6,6 +6,7 @@
 //! - CartPole over TCP with TLS, against without ([`encrypted`]);
 //! - the round trip of one environment, and the memory of one Hopper;
 //! - CartPole, 8 environments in which the server acts with a policy, against computing the actions alone ([`acting`]);
+//! - each environment, a batch of 64, with late and noisy actions and observations, against without ([`disturbed`]);
 //! - this server against another program of it ([`compare`]);
 //! - pictures of each environment, 480 × 480 pixels, and the server's memory growth by them.
 //!
@@ -14,6 +15,7 @@
 mod acting;
 mod client;
 mod compare;
+mod disturbed;
 mod echo;
 mod encrypted;
 #[cfg(feature = "mujoco")]
@@ -78,6 +80,11 @@ fn main() -> Result<(), Failure> {
         for lstm in [None, Some(256)] {
             if wanted(acting::id(lstm)) {
                 acting::measure(lstm).await?;
+            }
+        }
+        for name in tasks::catalogue().names() {
+            if wanted(&disturbed::id(name)) {
+                disturbed::measure(name).await?;
             }
         }
         if wanted("memory/Hopper") {

@@ -1,8 +1,8 @@
 //! What an environment is: what it declares of itself, and the trait that it implements.
 
 use super::{
-    Action, ActionSpace, Channel, Distribution, Error, Parameter, Quantity, RewardTerm, Stream, Success, Version,
-    shorten,
+    Action, ActionSpace, Channel, Distribution, Draw, Error, Interval, Parameter, Quantity, RewardTerm, Stream,
+    Success, Version, shorten,
 };
 use crate::scene::Scene;
 use perturb_protocol::region::Region;
@@ -90,6 +90,26 @@ pub fn check_bounds(spec: &EnvironmentSpec, parameter: &Parameter, (low, high): 
     })
 }
 
+/// Checks that a distribution lies within the parameter's physical range, and that each of its intervals has a whole
+/// number where the parameter needs one.
+///
+/// # Errors
+/// [`Error::OutOfRange`], [`Error::NotWhole`].
+pub fn check_distribution(
+    spec: &EnvironmentSpec,
+    parameter: &Parameter,
+    distribution: &Distribution,
+) -> Result<(), Error> {
+    check_bounds(spec, parameter, distribution.range())?;
+    let is_empty = |interval: &&Interval| interval.low.ceil() > interval.high;
+    match distribution.intervals().iter().find(is_empty).filter(|_| parameter.is_integer) {
+        None => Ok(()),
+        Some(interval) => {
+            Err(Error::NotWhole { environment: spec.name, parameter: parameter.name, got: interval.to_string() })
+        }
+    }
+}
+
 /// Replaces in `base` (one distribution a parameter, in the spec's order, of one box or of several) those that
 /// `overrides` names, in every box.
 ///
@@ -108,7 +128,7 @@ pub fn resolve<'a>(
             known: spec.parameters.iter().map(|p| p.name).collect::<Vec<_>>().join(", "),
         })?;
         let parameter = &spec.parameters[position];
-        check_bounds(spec, parameter, distribution.range())?;
+        check_distribution(spec, parameter, &distribution)?;
         replaced.push((position, distribution));
     }
     for (position, distribution) in replaced {
@@ -153,6 +173,23 @@ pub trait Environment: Send {
         None
     }
 
+    /// Takes the address of the random numbers of an episode, before it begins or is loaded, and the steps that it has
+    /// taken. Environments that draw nothing after a reset ignore it.
+    fn set_address(&mut self, _draw: Draw, _steps: u32) {}
+
+    /// Writes the action that does as little as possible, `[A]`, or the number of the choice. By default it is 0 in each
+    /// entry, or the end of its range that is nearest to 0; of an odd number of choices the middle one, else the first.
+    fn neutral_action(&self, out: &mut [f32]) {
+        match self.spec().action {
+            ActionSpace::Discrete(names) => out.fill(if names.len() % 2 == 1 { (names.len() / 2) as f32 } else { 0.0 }),
+            ActionSpace::Continuous(channels) => {
+                for (entry, channel) in out.iter_mut().zip(channels) {
+                    *entry = 0.0_f64.clamp(channel.low, channel.high) as f32;
+                }
+            }
+        }
+    }
+
     /// Draws an initial state.
     fn reset(&mut self, stream: &mut Stream);
 
@@ -170,6 +207,11 @@ pub trait Environment: Send {
 
     /// Appends the complete dynamic state: all that the next step depends on besides the parameters.
     fn save(&self, out: &mut Vec<f64>);
+
+    /// Returns how many more numbers [`Environment::save`] may append with other parameters than it does now, at most.
+    fn max_saved_growth(&self) -> usize {
+        0
+    }
 
     /// Takes back what [`Environment::save`] wrote, after the same parameters were set.
     ///

@@ -1,6 +1,8 @@
 //! One environment and its episodes: trials, step limit, success, receipts, snapshots.
 
-use super::{Achievement, Action, Distribution, Environment, EnvironmentSpec, Purpose, Stream, seen::SeenParameters};
+use super::{
+    Achievement, Action, Distribution, Draw, Environment, EnvironmentSpec, Purpose, Stream, seen::SeenParameters,
+};
 use crate::scene::Scene;
 
 /// What fixes an environment's episodes.
@@ -31,17 +33,6 @@ pub struct EpisodeId {
     pub episode_index: u64,
     /// Counts the trial's episodes from 0.
     pub episode_in_trial: u32,
-}
-
-/// What an environment's random numbers follow from, beside its distributions.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Draw {
-    /// The seed.
-    pub seed: u64,
-    /// The environment's index.
-    pub environment_index: u32,
-    /// The current episode.
-    pub episode_index: u64,
 }
 
 /// What physics an episode ran with.
@@ -197,16 +188,20 @@ impl Episodes {
             let boxes = boxes(distributions.len(), n).unwrap_or(1);
             // Of a single box nothing is drawn: the numbers of its trials are those of the parameters alone.
             let chosen = if boxes > 1 { (stream.unit() * boxes as f64) as usize } else { 0 };
-            for (value, distribution) in self.values.iter_mut().zip(&distributions[chosen * n..]) {
-                *value = distribution.at(stream.unit());
+            let parameters = self.environment.spec().parameters;
+            for ((value, distribution), parameter) in
+                self.values.iter_mut().zip(&distributions[chosen * n..]).zip(parameters)
+            {
+                *value = parameter.draw(distribution, stream.unit());
             }
             self.environment.set_parameters(&self.values);
             self.see_parameters();
         }
+        let episode = self.progress.episode;
+        self.environment.set_address(Draw { seed, environment_index, episode_index: episode }, 0);
         match state {
             Some(state) => self.environment.reset_to(state),
             None => {
-                let episode = self.progress.episode;
                 let mut stream = Stream::new(seed, environment_index.into(), Purpose::InitialState, episode);
                 self.environment.reset(&mut stream);
             }

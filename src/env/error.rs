@@ -55,6 +55,27 @@ pub enum Error {
         /// Greatest accepted value.
         high: f64,
     },
+    /// A session without disturbances is asked for one.
+    #[error(
+        "{environment} was opened without disturbances, so that {name:?} cannot change; open it anew and name a \
+         disturbance, such as {name:?} at its default"
+    )]
+    NotDisturbed {
+        /// The environment.
+        environment: &'static str,
+        /// The disturbance that was asked for.
+        name: String,
+    },
+    /// A parameter of whole numbers has an interval without one.
+    #[error("parameter {parameter:?} of {environment} takes whole numbers, and {got} has none; give such as 2 or 0..4")]
+    NotWhole {
+        /// The environment.
+        environment: &'static str,
+        /// The parameter.
+        parameter: &'static str,
+        /// The interval.
+        got: String,
+    },
     /// A snapshot cannot be restored.
     #[error("the snapshot cannot be restored: {reason}; take a new one from a session of the same environment")]
     Snapshot {

@@ -1,6 +1,7 @@
 //! Environments: the trait that each implements, what they declare of themselves, and the episodes they run.
 
 mod catalogue;
+pub mod disturbance;
 mod environment;
 mod episode;
 mod error;
@@ -12,13 +13,15 @@ mod spaces;
 mod success;
 
 pub use catalogue::Catalogue;
-pub use environment::{Environment, EnvironmentSpec, MakeEnvironment, Transition, check_bounds, resolve};
-pub use episode::{Draw, EpisodeEnd, EpisodeId, EpisodeStart, Episodes, Outcome, Receipt, Settings};
+pub use environment::{
+    Environment, EnvironmentSpec, MakeEnvironment, Transition, check_bounds, check_distribution, resolve,
+};
+pub use episode::{EpisodeEnd, EpisodeId, EpisodeStart, Episodes, Outcome, Receipt, Settings};
 pub use error::Error;
 pub(crate) use error::shorten;
 pub use parameter::Parameter;
 pub use perturb_protocol::{Distribution, DistributionError, Interval, Version};
-pub use seeding::{Purpose, Stream};
+pub use seeding::{Draw, Purpose, Stream};
 pub(crate) use snapshot::{MAX_SNAPSHOT_BYTES, distributions_bytes};
 pub use snapshot::{SavedDraw, saved_draw};
 pub use spaces::{Action, ActionSpace, Channel, Quantity, RewardTerm};

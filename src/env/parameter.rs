@@ -21,6 +21,8 @@ pub struct Parameter {
     pub bounds: Interval,
     /// The quantity of [`EnvironmentSpec::applied`](super::EnvironmentSpec::applied) that reads it back, in the same unit.
     pub applied: &'static str,
+    /// Its values are whole numbers: of a distribution's intervals the whole numbers in them, each as likely.
+    pub is_integer: bool,
 }
 
 impl Parameter {
@@ -28,7 +30,17 @@ impl Parameter {
     /// [`Parameter::versions`].
     pub const fn new(name: &'static str, unit: &'static str, description: &'static str, bounds: (f64, f64)) -> Self {
         let (bounds, none) = (Interval::new(bounds.0, bounds.1), Interval::new(0.0, 0.0));
-        Self { name, unit, description, default: 0.0, random: none, extreme: [none; 2], bounds, applied: name }
+        Self {
+            name,
+            unit,
+            description,
+            default: 0.0,
+            random: none,
+            extreme: [none; 2],
+            bounds,
+            applied: name,
+            is_integer: false,
+        }
     }
 
     /// The same with the sets of its versions: the value of D, the interval of R, and the interval that E fills up around
@@ -37,6 +49,17 @@ impl Parameter {
         self.default = default;
         self.random = Interval::new(random.0, random.1);
         self.extreme = [Interval::new(around.0, random.0), Interval::new(random.1, around.1)];
+        self
+    }
+
+    /// The same with a single value in all versions: nothing is drawn unless a client says so.
+    pub const fn off(self, default: f64) -> Self {
+        self.versions(default, (default, default), (default, default))
+    }
+
+    /// The same with whole numbers as values.
+    pub const fn integer(mut self) -> Self {
+        self.is_integer = true;
         self
     }
 
@@ -61,6 +84,12 @@ impl Parameter {
             return Distribution::fixed(self.default);
         }
         Distribution::union(&intervals).expect("the table holds valid sets; a test checks each")
+    }
+
+    /// The value at the fraction `u` in [0, 1) of a distribution that was checked against the parameter.
+    pub fn draw(&self, distribution: &Distribution, u: f64) -> f64 {
+        let whole = if self.is_integer { distribution.whole_number_at(u) } else { None };
+        whole.unwrap_or_else(|| distribution.at(u))
     }
 
     /// From the least to the greatest value that R and E have.

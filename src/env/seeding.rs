@@ -16,6 +16,16 @@
 //! |---|---|---|
 //! | 0 | trial | of R+E one below ½ for R; one number u in [0, 1) for each parameter, in the catalogue's order |
 //! | 1 | episode | the initial state's numbers, in the order of the environment's document |
+//!
+//! Disturbances draw at each step. Their streams have the number of steps that the episode has taken in the last word of
+//! the counter, `[block, episode, purpose, step]`, so that a step's numbers do not depend on those of the steps before:
+//!
+//! | purpose | step | draws, in order |
+//! |---|---|---|
+//! | 2 | of the action, from 0 | one below `action_hold` to keep the last action |
+//! | 3 | of the action, from 0 | a [normal](Stream::normals) number for each entry of the action |
+//! | 4 | of the observation, 0 after a reset | a [normal](Stream::normals) number for each entry of the observation |
+//! | 5 | of the observation, 0 after a reset | for each entry of the observation one below `sensor_dropout` to lose it |
 
 /// What a stream is for: the third word of the counter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -24,6 +34,25 @@ pub enum Purpose {
     Parameters = 0,
     /// An episode's initial state.
     InitialState = 1,
+    /// The steps at which an action is held.
+    ActionHold = 2,
+    /// Noise on an action.
+    ActionNoise = 3,
+    /// Noise on an observation.
+    SensorNoise = 4,
+    /// The entries of an observation that are lost.
+    SensorDropout = 5,
+}
+
+/// The address of an episode's random numbers: they follow from it and from the distributions.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Draw {
+    /// The seed.
+    pub seed: u64,
+    /// The environment's index.
+    pub environment_index: u32,
+    /// The current episode.
+    pub episode_index: u64,
 }
 
 const MULTIPLIERS: [u64; 2] = [0xD2E7_470E_E14C_6C93, 0xCA5A_8263_9512_1157];
@@ -45,6 +74,13 @@ impl Stream {
         Self { key: [seed, environment_index], counter: [0, index, purpose as u64, 0], block: [0; 4], used: 4 }
     }
 
+    /// The stream of an episode for its step number `step`.
+    pub fn at_step(draw: &Draw, purpose: Purpose, step: u32) -> Self {
+        let mut stream = Self::new(draw.seed, draw.environment_index.into(), purpose, draw.episode_index);
+        stream.counter[3] = step.into();
+        stream
+    }
+
     /// The next 64 bits.
     pub fn next_u64(&mut self) -> u64 {
         if self.used == self.block.len() {
@@ -59,6 +95,14 @@ impl Stream {
     /// Uniform in [0, 1): the upper 53 bits over 2^53.
     pub fn unit(&mut self) -> f64 {
         (self.next_u64() >> 11) as f64 * (1.0 / (1u64 << 53) as f64)
+    }
+
+    /// Two independent standard normal numbers by Box and Muller (1958), from two uniform ones u and v: the cosine and the
+    /// sine of 2πv, each times √(-2 ln(1 - u)). The functions are libm's, whose bytes are the same on every processor.
+    pub fn normals(&mut self) -> [f64; 2] {
+        let radius = (-2.0 * libm::log(1.0 - self.unit())).sqrt();
+        let (sin, cos) = libm::sincos(std::f64::consts::TAU * self.unit());
+        [radius * cos, radius * sin]
     }
 
     /// Uniform in [low, high).

@@ -1,7 +1,7 @@
 //! Saving an environment whole, and bringing it back in another session, process or server.
 
 use super::{
-    Distribution, Draw, EnvironmentSpec, Episodes, Error, Interval, Settings, check_bounds,
+    Distribution, Draw, EnvironmentSpec, Episodes, Error, Interval, Settings, check_bounds, check_distribution,
     episode::{Progress, boxes},
     shorten,
 };
@@ -14,9 +14,10 @@ const UNSEALED: u32 = 2;
 /// Nor with [`Progress::held_longest`], which follows [`Saved`] since.
 const FIRST: u32 = 1;
 
-/// Limit of a snapshot in bytes. The largest has a distribution of 64 intervals for each of 32 parameters, of R and of E,
-/// 64 KiB, and the numbers of a state and an observation of 4096 entries, some 50 KiB.
-pub const MAX_SNAPSHOT_BYTES: usize = 128 << 10;
+/// Limit of a snapshot in bytes. The largest has a distribution of 64 intervals for each of 32 parameters and 39
+/// disturbances, of R and of E, 142 KiB, the numbers of a state and an observation of 4096 entries, some 50 KiB, and late
+/// actions and observations, 80 KiB.
+pub const MAX_SNAPSHOT_BYTES: usize = 320 << 10;
 
 /// The most bytes by which a snapshot's counters can grow: small numbers have short encodings.
 const MAX_COUNTERS_GROWTH_BYTES: usize = 64;
@@ -70,7 +71,8 @@ impl Episodes {
 
     /// Returns an upper bound of the length of a snapshot of this environment without its distributions, in bytes.
     pub(crate) fn max_snapshot_bytes(&self) -> usize {
-        self.snapshot().len() - distributions_bytes(&self.settings.distributions) + MAX_COUNTERS_GROWTH_BYTES
+        let growth = size_of::<f64>() * self.environment.max_saved_growth() + MAX_COUNTERS_GROWTH_BYTES;
+        self.snapshot().len() - distributions_bytes(&self.settings.distributions) + growth
     }
 
     /// Brings a saved environment back: what follows is what followed the snapshot, byte for byte.
@@ -79,10 +81,14 @@ impl Episodes {
     /// [`Error::Snapshot`]; nothing was changed then.
     pub fn restore(&mut self, snapshot: &[u8]) -> Result<(), Error> {
         let (saved, distributions) = self.check(snapshot)?;
-        let before = self.physics_state();
+        let (before, address) = (self.physics_state(), self.draw());
+        let Saved { seed, environment_index, progress, .. } = saved;
         self.environment.set_parameters(&saved.values);
+        self.environment
+            .set_address(Draw { seed, environment_index, episode_index: progress.episode }, progress.length);
         if let Err(error) = self.environment.load(&saved.state) {
             self.environment.set_parameters(&self.values);
+            self.environment.set_address(address, self.progress.length);
             self.environment.load(&before)?;
             return Err(error);
         }
@@ -200,13 +206,19 @@ impl Saved {
 
     fn distributions(spec: &'static EnvironmentSpec, saved: &Saved) -> Result<Vec<Distribution>, Error> {
         let bad = |error: Error| Error::Snapshot { reason: error.to_string() };
+        let refuse_value = |name, value| {
+            Err(Error::Snapshot { reason: format!("its parameter {name:?} is {value}, which is no whole number") })
+        };
         let parameters = spec.parameters.iter().zip(&saved.values).cycle();
         let each = parameters.zip(&saved.distributions);
         each.map(|((parameter, &value), pairs)| {
             let intervals: Vec<Interval> = pairs.iter().map(|&(low, high)| Interval { low, high }).collect();
             let distribution = Distribution::union(&intervals).map_err(Error::of(parameter.name)).map_err(bad)?;
-            check_bounds(spec, parameter, distribution.range()).map_err(bad)?;
+            check_distribution(spec, parameter, &distribution).map_err(bad)?;
             check_bounds(spec, parameter, (value, value)).map_err(bad)?;
+            if parameter.is_integer && value.fract() != 0.0 {
+                return refuse_value(parameter.name, value);
+            }
             Ok(distribution)
         })
         .collect()

@@ -11,12 +11,22 @@ pub struct Channel {
     pub low: f64,
     /// Greatest possible value; may be `+inf`.
     pub high: f64,
+    /// The size that a disturbance of the entry is measured by, in its unit: half of its range, or 1 without one, unless
+    /// it is declared. 0 declares an entry that is constant, which nothing disturbs.
+    pub scale: f64,
 }
 
 impl Channel {
     /// A channel of the given name, unit and range `[low, high]`.
     pub const fn new(name: &'static str, unit: &'static str, low: f64, high: f64) -> Self {
-        Self { name, unit, low, high }
+        let scale = if low.is_finite() && high.is_finite() { (high - low) / 2.0 } else { 1.0 };
+        Self { name, unit, low, high, scale }
+    }
+
+    /// The same with a declared scale.
+    pub const fn scale(mut self, scale: f64) -> Self {
+        self.scale = scale;
+        self
     }
 
     /// A channel without bounds.

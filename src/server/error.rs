@@ -152,6 +152,7 @@ impl RequestError for env::Error {
             Self::UnknownParameter { .. } => ErrorKind::UnknownParameter,
             Self::Snapshot { .. } => ErrorKind::BadSnapshot,
             Self::Model { .. } => ErrorKind::Model,
+            Self::NotDisturbed { .. } => ErrorKind::WrongOrder,
             _ => ErrorKind::BadParameter,
         }
     }

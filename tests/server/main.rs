@@ -9,6 +9,7 @@ mod catalogue;
 mod conformance;
 mod determinism;
 mod distributions;
+mod disturbances;
 mod dm_env_rpc;
 mod drawing;
 mod faults;

@@ -3,7 +3,7 @@
 use std::io::Write;
 
 use perturb_files::interrupt::StopFlag;
-use perturb_learner::proto::{Channel, Distribution, Environment, action_space::Kind};
+use perturb_learner::proto::{Channel, Distribution, Environment, Parameter, action_space::Kind};
 use perturb_protocol::catalogue;
 use perturb_text::Table;
 
@@ -50,7 +50,13 @@ fn print(out: &mut impl Write, environment: &Environment) -> std::io::Result<()>
         .number("D", |parameter| parameter.default_value)
         .text("R", |parameter| show(parameter.random.as_ref()))
         .text("E", |parameter| show(parameter.extreme.as_ref()));
-    writeln!(out, "{}\n", parameters.build().to_text())
+    writeln!(out, "{}", parameters.build().to_text())?;
+    if !environment.disturbances.is_empty() {
+        let range = |parameter: &Parameter| format!("{} {}..{}", parameter.name, parameter.low, parameter.high);
+        let ranges: Vec<String> = environment.disturbances.iter().map(range).collect();
+        writeln!(out, "  disturbances {}", ranges.join(", "))?;
+    }
+    writeln!(out)
 }
 
 /// Formats intervals as in `[0.3, 0.4] ∪ [0.8, 0.9]`.

@@ -7,7 +7,7 @@ use perturb_learner::proto::Environment;
 use perturb_protocol::{Version, names};
 use perturb_records::success::{Criterion, Rule, Threshold};
 use perturb_settings::ValueError;
-use perturb_settings::sets::{Assignment, Contexts, TestSet, set_of, set_of_csv};
+use perturb_settings::sets::{Assignment, Contexts, TestSet, known_names, set_of, set_of_csv};
 
 use super::args::SetArgs;
 use super::error::{CommandError, Result};
@@ -58,13 +58,14 @@ pub(super) fn drawn_set(version: Version, parameters: &[Assignment]) -> Result<T
 /// # Errors
 /// [`ValueError`] if there is no such parameter, with the name that was probably meant.
 pub(super) fn parameter<'a>(option: &str, written: &str, environment: &'a Environment) -> Result<&'a str, ValueError> {
-    let known = environment.parameters.iter().map(|parameter| parameter.name.as_str());
+    let all = environment.parameters.iter().chain(&environment.disturbances);
+    let known = all.map(|parameter| parameter.name.as_str());
     names::find(written, known.clone()).and_then(|index| known.clone().nth(index)).ok_or_else(|| {
-        let hint = names::did_you_mean(written, known.clone());
+        let hint = names::did_you_mean(written, known);
         ValueError {
             what: format!("{option}: a parameter of {}", environment.name),
             got: format!("`{written}`"),
-            expected: format!("one of {}{hint}", known.collect::<Vec<_>>().join(", ")),
+            expected: format!("one of {}{hint}", known_names(environment)),
         }
     })
 }

@@ -195,6 +195,41 @@ fn sets_are_tested_rescored_and_replayed() {
     assert_eq!(same, "12 of 12 episodes of 1 policy have the same bytes\n");
 }
 
+#[test]
+fn disturbed_episodes_are_recorded_and_replayed() {
+    let directory = experiment();
+    let late =
+        "[sets.late]\naction_delay = '0..2'\nsensor_noise = '0.01..0.1'\n\n[sets.grid]\nsensor_delay = '0..2/3'\n";
+    let plan = PLAN
+        .replace("versions = ['D', 'long_poles']", "versions = ['D', 'late']")
+        .replace("test_versions = ['E', 'long_poles', 'corners', 'rows']", "test_versions = ['D', 'late', 'grid']")
+        .replace("[sets.long_poles]", &format!("{late}\n[sets.long_poles]"));
+    std::fs::write(directory.path().join("plan.toml"), plan).expect("written");
+    stdout(&run(directory.path(), &[]));
+    let out = directory.path().join("out");
+    assert_eq!(stdout(&audit(&out, &["--all"])), "72 of 72 episodes of 2 policies have the same bytes\n");
+    for result in results(directory.path()) {
+        assert_eq!(
+            result.agreement.as_ref().unwrap().largest.as_ref().map(|difference| difference.relative),
+            Some(0.0)
+        );
+        let records = Records::read(&Folder::new(&out).cell(&result.id).path().join(FILE)).expect("recorded");
+        let place = |name: &str| records.about.parameters.iter().position(|parameter| parameter.name == name).unwrap();
+        let values = |set: &str, name: &str| {
+            let place = place(name);
+            records.episodes_on(set).map(|episode| episode.requested[place]).collect::<Vec<_>>()
+        };
+        assert!(values("D", "action_delay").iter().all(|delay| *delay == 0.0));
+        assert!(values("late", "action_delay").iter().all(|delay| [0.0, 1.0, 2.0].contains(delay)));
+        assert!(values("late", "sensor_noise").iter().all(|noise| (0.01..0.1).contains(noise)));
+        assert_eq!(values("grid", "sensor_delay").iter().sum::<f64>(), 12.0, "each delay in as many episodes");
+    }
+    let refused = perturb(&["train", "--env", "CartPole", "--parameters", "action_dely=2"]).output().unwrap();
+    let expected = "one of force, length, mass, or a disturbance: action_delay, action_hold, sensor_delay, sensor_noise, \
+                    sensor_dropout (did you mean `action_delay`?)";
+    assert!(stderr(&refused).contains(expected), "{}", stderr(&refused));
+}
+
 /// The text's rule counts Pendulum's last steps near upright, the code's the longest time.
 #[test]
 fn rules_with_different_quantities_test_equal_episodes() {

@@ -3,6 +3,7 @@
 use std::fmt;
 
 use perturb_policy::ActionKind;
+use perturb_protocol::disturbance::is_disturbance;
 use perturb_protocol::proto;
 use serde::{Deserialize, Serialize};
 
@@ -73,7 +74,13 @@ impl EnvironmentSummary {
         })
     }
 
-    /// The first part in which `served` is not what this says, with both values; `None` if they are equal.
+    /// The parameters that are no disturbances.
+    fn own_parameters(&self) -> Vec<&str> {
+        self.parameters.iter().map(String::as_str).filter(|name| !is_disturbance(name)).collect()
+    }
+
+    /// The first part in which `served` is not what this says, with both values; `None` if they are equal. Disturbances are
+    /// not compared: they are no part of the environment, and observations tell whether a policy sees them.
     pub fn difference(&self, served: &Self) -> Option<(&'static str, String, String)> {
         let both = |what, trained: &dyn fmt::Debug, served: &dyn fmt::Debug| {
             Some((what, format!("{trained:?}"), format!("{served:?}")))
@@ -83,7 +90,9 @@ impl EnvironmentSummary {
             (a, b) if a.model_hash != b.model_hash => both(MODEL, &a.model_hash, &b.model_hash),
             (a, b) if a.observation != b.observation => both("observations", &a.observation, &b.observation),
             (a, b) if a.action != b.action => both("actions", &a.action, &b.action),
-            (a, b) if a.parameters != b.parameters => both("parameters", &a.parameters, &b.parameters),
+            (a, b) if a.own_parameters() != b.own_parameters() => {
+                both("parameters", &a.own_parameters(), &b.own_parameters())
+            }
             (a, b) if a.step_limit != b.step_limit => both("step limit", &a.step_limit, &b.step_limit),
             _ => None,
         }

@@ -1,11 +1,13 @@
 //! The catalogue of environments, and its form in JSON for programs that do not speak the protocol.
 
+use std::borrow::Cow;
+
 use serde_json::{Value, json};
 
 use crate::limits;
 use crate::proto::{
-    Comparison, Distribution, Environment, ListEnvironmentsResponse, Parameter, ParameterObservation, Success,
-    action_space::Kind,
+    Channel, Comparison, Distribution, Environment, ListEnvironmentsResponse, Parameter, ParameterObservation,
+    Quantity, Success, action_space::Kind,
 };
 
 /// The catalogue of a server as JSON, with the [`limits`] that hold for clients too. Keys are the protocol's names; versions
@@ -32,6 +34,47 @@ pub fn to_json(catalogue: &ListEnvironmentsResponse) -> Value {
 }
 
 impl Environment {
+    /// The parameter or disturbance of that name.
+    pub fn parameter(&self, name: &str) -> Option<&Parameter> {
+        self.parameters.iter().chain(&self.disturbances).find(|parameter| parameter.name == name)
+    }
+
+    /// The environment of a session that names parameters: with the [disturbances](Self::disturbed), if one of them is
+    /// among the names.
+    pub fn with_parameters<'a>(&self, names: impl IntoIterator<Item = &'a str>) -> Cow<'_, Self> {
+        let is_own = |name: &str| self.parameters.iter().any(|parameter| parameter.name == name);
+        let is_disturbance = |name: &str| self.disturbances.iter().any(|disturbance| disturbance.name == name);
+        let names_one = names.into_iter().any(|name| !is_own(name) && is_disturbance(name));
+        if names_one { Cow::Owned(self.disturbed()) } else { Cow::Borrowed(self) }
+    }
+
+    /// The environment with its disturbances as further parameters, behind its own: that of a session which names one.
+    #[must_use]
+    pub fn disturbed(&self) -> Self {
+        let mut disturbed = self.clone();
+        for disturbance in &self.disturbances {
+            let Parameter { name, unit, low, high, default_value, .. } = disturbance;
+            if self.parameters.iter().any(|parameter| parameter.name == *name) {
+                continue;
+            }
+            disturbed.parameters.push(disturbance.clone());
+            disturbed.applied.push(Quantity { name: name.clone(), unit: unit.clone() });
+            // A disturbance has one value in all versions, from which it is observed.
+            let entry = Channel {
+                name: format!("parameter_{name}"),
+                unit: "1".into(),
+                low: low - default_value,
+                high: high - default_value,
+            };
+            disturbed.parameter_observations.push(ParameterObservation {
+                entry: Some(entry),
+                at_minus_one: *default_value,
+                at_plus_one: *default_value,
+            });
+        }
+        disturbed
+    }
+
     /// The environment of a session whose observations end with the `parameters` or not.
     #[must_use]
     pub fn observed(&self, parameters: bool) -> Self {
@@ -63,6 +106,7 @@ pub fn environment(environment: &Environment) -> Value {
         "reward_terms": environment.reward_terms,
         "success": environment.success.as_ref().map(success),
         "parameters": environment.parameters.iter().map(parameter).collect::<Vec<_>>(),
+        "disturbances": environment.disturbances.iter().map(parameter).collect::<Vec<_>>(),
         "applied": environment.applied,
         "heatmap_axes": environment.heatmap_axes,
         "model_hash": environment.model_hash,
@@ -88,6 +132,7 @@ fn parameter(parameter: &Parameter) -> Value {
         "R": intervals(parameter.random.as_ref()),
         "E": intervals(parameter.extreme.as_ref()),
         "applied": parameter.applied,
+        "integer": parameter.integer,
     })
 }
 
@@ -109,7 +154,6 @@ fn success(success: &Success) -> Value {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::proto::Channel;
 
     #[test]
     fn open_end_is_null() {

@@ -109,6 +109,26 @@ impl Distribution {
         self.0[self.0.len() - 1].high
     }
 
+    /// The whole number at the fraction `u` in [0, 1) of all whole numbers in the intervals: each is as likely if `u` is
+    /// uniform. `None` if there are none.
+    pub fn whole_number_at(&self, u: f64) -> Option<f64> {
+        // Intervals may share an end, which counts once.
+        let numbers = |place: usize| {
+            let Interval { low, high } = self.0[place];
+            let is_shared = place > 0 && self.0[place - 1].high == low && low.fract() == 0.0;
+            let first = low.ceil() + f64::from(u8::from(is_shared));
+            (first, (high.floor() - first + 1.0).max(0.0))
+        };
+        let mut rest = (u * (0..self.0.len()).map(|place| numbers(place).1).sum::<f64>()).floor();
+        for (first, count) in (0..self.0.len()).map(numbers) {
+            if rest < count {
+                return Some(first + rest);
+            }
+            rest -= count;
+        }
+        None
+    }
+
     /// Whether `value` is in one of the intervals, up to rounding.
     pub fn contains(&self, value: f64) -> bool {
         let margin = 1e-9 * value.abs();
@@ -249,6 +269,27 @@ mod tests {
             assert_eq!(Distribution::try_from(&proto::Distribution::from(&distribution)), Ok(distribution));
         }
         assert_eq!(" 1 .. 2 ".parse::<Distribution>().unwrap().range(), (1.0, 2.0));
+    }
+
+    #[test]
+    fn whole_numbers_of_all_intervals_are_as_likely() {
+        for (text, expected) in [
+            ("2", &[2.0][..]),
+            ("0..3", &[0.0, 1.0, 2.0, 3.0]),
+            ("0.5..2.5", &[1.0, 2.0]),
+            ("0..1,1..2", &[0.0, 1.0, 2.0]),
+            ("-1..0.5,3..4", &[-1.0, 0.0, 3.0, 4.0]),
+            ("2.5", &[]),
+        ] {
+            let distribution: Distribution = text.parse().unwrap();
+            let n = 120;
+            let mut counts = vec![0; expected.len()];
+            for i in 0..n {
+                let Some(drawn) = distribution.whole_number_at((f64::from(i) + 0.5) / f64::from(n)) else { continue };
+                counts[expected.iter().position(|value| *value == drawn).unwrap()] += 1;
+            }
+            assert!(counts.iter().all(|&count| count == n / counts.len() as i32), "{text}: {counts:?}");
+        }
     }
 
     #[test]

@@ -18,6 +18,7 @@ pub mod catalogue;
 mod connection;
 pub mod credentials;
 mod distribution;
+pub mod disturbance;
 mod encryption;
 mod ended;
 mod error;

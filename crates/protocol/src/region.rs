@@ -5,6 +5,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
+use crate::disturbance::{default_value, is_disturbance};
 use crate::version::Version;
 use crate::{Distribution, DistributionError, proto};
 
@@ -43,8 +44,10 @@ impl Region {
         Self(boxes)
     }
 
-    /// The region that `version` of an environment draws from, with the sets of `own` for the parameters in it.
+    /// The region that `version` of an environment draws from, with the sets of `own` for the parameters in it. With a
+    /// disturbance in `own` it has all of them.
     pub fn from_version(environment: &proto::Environment, version: Version, own: &ParameterBox) -> Self {
+        let environment = environment.with_parameters(own.keys().map(String::as_str));
         let of_part = |part: &Version| {
             let values = |parameter: &proto::Parameter| {
                 let of_version = match part {
@@ -66,21 +69,40 @@ impl Region {
         &self.0
     }
 
-    /// Whether each box of this region is inside one of the boxes of `others`.
+    /// Whether each box of this region is inside one of the boxes of `others`. A disturbance that only one of two boxes
+    /// names has its default in the other.
     pub fn is_within<'a>(&self, others: impl IntoIterator<Item = &'a Self> + Clone) -> bool {
-        let is_in = |own: &ParameterBox, other: &ParameterBox| pairs(own, other, Distribution::is_within);
+        let is_in =
+            |own: &ParameterBox, other: &ParameterBox| pairs(own, other, Distribution::is_within, default_value);
         self.0.iter().all(|own| others.clone().into_iter().flat_map(Self::boxes).any(|other| is_in(own, other)))
     }
 
-    /// Whether a part of this region is in `other`, see [`Distribution::overlaps`].
+    /// Whether a part of this region is in `other`, see [`Distribution::overlaps`]. A disturbance that only one of two boxes
+    /// names is not compared: the physics that a box without disturbances holds out stays held out with them.
     pub fn overlaps(&self, other: &Self) -> bool {
-        self.0.iter().any(|own| other.0.iter().any(|other| pairs(own, other, Distribution::overlaps)))
+        self.0.iter().any(|own| other.0.iter().any(|other| pairs(own, other, Distribution::overlaps, |_| None)))
     }
 }
 
-/// Whether `holds` is true for the sets of every parameter. False if the boxes have different parameters.
-fn pairs(one: &ParameterBox, other: &ParameterBox, holds: fn(&Distribution, &Distribution) -> bool) -> bool {
-    one.len() == other.len() && one.iter().all(|(name, own)| other.get(name).is_some_and(|others| holds(own, others)))
+/// Whether `holds` is true for the sets of every parameter. False if the boxes have different parameters that are no
+/// disturbances. A disturbance that one of the boxes lacks is passed over, unless `lacking` has a value for it.
+fn pairs(
+    one: &ParameterBox,
+    other: &ParameterBox,
+    holds: fn(&Distribution, &Distribution) -> bool,
+    lacking: fn(&str) -> Option<f64>,
+) -> bool {
+    let holds_for = |name: &String| {
+        let value = || lacking(name).map(Distribution::fixed);
+        match (one.get(name), other.get(name)) {
+            (Some(own), Some(others)) => holds(own, others),
+            (None, None) => true,
+            _ if !is_disturbance(name) => false,
+            (Some(own), None) => value().is_none_or(|others| holds(own, &others)),
+            (None, Some(others)) => value().is_none_or(|own| holds(&own, others)),
+        }
+    };
+    one.keys().chain(other.keys()).all(holds_for)
 }
 
 impl fmt::Display for Region {
@@ -145,6 +167,22 @@ mod tests {
         let e = region(Version::E, &[]);
         assert!(!mixed.is_within([&r, &e]) && !mixed.overlaps(&r) && !mixed.overlaps(&e));
         assert_eq!(mixed.to_string(), "length [0.2, 0.3], mass [0.5, 2]");
+    }
+
+    #[test]
+    fn disturbances_do_not_lead_around_a_region() {
+        use Version::{D, E, R};
+        let late = |version, delay: &str| {
+            let Region(mut boxes) = region(version, &[]);
+            boxes.iter_mut().for_each(|values| {
+                values.insert("action_delay".into(), delay.parse().unwrap());
+            });
+            Region(boxes)
+        };
+        assert!(late(E, "3").overlaps(&region(E, &[])) && region(E, &[]).overlaps(&late(E, "3")));
+        assert!(!late(R, "3").overlaps(&region(E, &[])) && !late(E, "3").overlaps(&late(E, "4")));
+        assert!(late(R, "0").is_within([&region(R, &[])]) && !late(R, "0..3").is_within([&region(R, &[])]));
+        assert!(region(D, &[]).is_within([&late(R, "0..3")]) && !region(D, &[]).is_within([&late(R, "1..3")]));
     }
 
     #[test]

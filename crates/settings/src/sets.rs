@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use std::str::FromStr;
 
 use perturb_protocol::limits::DEFAULT_MAX_ENVS;
+use perturb_protocol::proto::Interval;
 use perturb_protocol::{Distribution, DistributionError, Version, decimal_comma, proto};
 use serde::{Deserialize, Serialize};
 
@@ -71,6 +72,16 @@ impl TestSet {
         parameters
     }
 
+    /// The names of the parameters that the set replaces, some of them several times.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        let (drawn, listed) = match &self.contexts {
+            Contexts::Drawn(parameters) => (Some(parameters), None),
+            Contexts::Listed(contexts) => (None, Some(contexts)),
+        };
+        let drawn = drawn.into_iter().flat_map(BTreeMap::keys);
+        drawn.chain(listed.into_iter().flatten().flat_map(BTreeMap::keys)).map(String::as_str)
+    }
+
     /// The set's contexts; one empty one if its parameters are drawn.
     pub fn listed(&self) -> Vec<Context> {
         match &self.contexts {
@@ -100,17 +111,29 @@ impl TestSet {
 /// [`ValueError`], which names the parameter and what is accepted.
 pub fn check(set: &str, parameters: &Parameters, environment: &proto::Environment) -> Result<(), ValueError> {
     for (name, distribution) in parameters {
-        let Some(known) = environment.parameters.iter().find(|parameter| parameter.name == *name) else {
-            let names: Vec<&str> = environment.parameters.iter().map(|parameter| parameter.name.as_str()).collect();
+        let Some(known) = environment.parameter(name) else {
             let what = format!("{set}: a parameter of {}", environment.name);
-            return Err(ValueError::new(what, format!("`{name}`"), format!("one of {}", names.join(", "))));
+            return Err(ValueError::new(what, format!("`{name}`"), format!("one of {}", known_names(environment))));
         };
         let (low, high) = distribution.range();
         let what = format!("{set}: {name} of {}", environment.name);
         let expected = format!("within {} … {} {}", known.low, known.high, known.unit);
-        require(low >= known.low && high <= known.high, what, distribution, expected)?;
+        require(low >= known.low && high <= known.high, &what, distribution, expected)?;
+        let is_empty = |interval: &Interval| interval.low.ceil() > interval.high;
+        let is_whole = !known.integer || !distribution.intervals().iter().any(is_empty);
+        require(is_whole, what, distribution, "whole numbers, such as 2 or 0..4")?;
     }
     Ok(())
+}
+
+/// The names of an environment's parameters, and of its disturbances.
+pub fn known_names(environment: &proto::Environment) -> String {
+    let list = |parameters: &[proto::Parameter]| {
+        parameters.iter().map(|parameter| parameter.name.as_str()).collect::<Vec<_>>().join(", ")
+    };
+    let disturbances = list(&environment.disturbances);
+    let own = list(&environment.parameters);
+    if disturbances.is_empty() { own } else { format!("{own}, or a disturbance: {disturbances}") }
 }
 
 /// Refuses two sets of one name: results are told apart by it.

@@ -30,13 +30,16 @@ pub(super) fn tested(
     tell: &mut dyn FnMut(CellEvent),
 ) -> Result<Option<CellResult>, CellError> {
     let Tests { episodes, ref sets, ref success, ref marks, .. } = cell.tests;
+    let selection = cell.selection_test();
+    let all: Vec<TestSet> = sets.iter().cloned().chain(selection.iter().map(|(set, _)| set.clone())).collect();
     let mut test = |checkpoint: &Checkpoint, sets: &[TestSet], episodes, selects, when: &str| {
         let options = TestOptions { episodes, seed: cell.config.common.seed, selects, success: success.clone() };
         let mut testing = |set: &TestSet, episodes| {
             let set = format!("{}{when}", set.name);
             tell(CellEvent::Testing { set, episodes });
         };
-        match Tester::new(servers, checkpoint, options)?.test(sets, stop, &mut testing) {
+        let tester = Tester::new(servers, checkpoint, options)?.recording_for(&all)?;
+        match tester.test(sets, stop, &mut testing) {
             Err(TestError::Stopped { .. }) => Ok(None),
             records => records.map(Some),
         }
@@ -52,7 +55,7 @@ pub(super) fn tested(
         of_marks.insert(mark, IntermediateEvaluation { counters: kept.state.counters, results, agreement });
     }
     let Some(mut records) = test(&checkpoint, sets, episodes, false, "")? else { return Ok(None) };
-    if let Some((set, episodes)) = cell.selection_test() {
+    if let Some((set, episodes)) = selection {
         let Some(selecting) = test(&checkpoint, &[set], episodes, true, "")? else { return Ok(None) };
         records.append(selecting);
     }

@@ -338,7 +338,21 @@ impl Servers {
     /// Those of [`Servers::environment`]; [`ClientError::NoParameters`] if it sees parameters and the servers cannot
     /// tell them.
     pub fn environment_seen(&self, common: &Common) -> Result<proto::Environment, ClientError> {
+        self.environment_seen_with(common, std::iter::empty())
+    }
+
+    /// The same, with disturbances also if one of `names` is a disturbance.
+    ///
+    /// # Errors
+    /// Those of [`Servers::environment_seen`].
+    pub fn environment_seen_with<'a>(
+        &self,
+        common: &'a Common,
+        names: impl Iterator<Item = &'a str>,
+    ) -> Result<proto::Environment, ClientError> {
         let environment = self.environment(&common.environment)?;
+        let trained = common.parameters.keys().map(String::as_str);
+        let environment = environment.with_parameters(trained.chain(names));
         let sees = common.observe.sees_parameters();
         match self.connections().first() {
             Some(first) if sees && environment.parameter_observations.is_empty() => {

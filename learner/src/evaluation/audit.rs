@@ -5,9 +5,10 @@ use std::collections::{BTreeMap, VecDeque};
 use perturb_files::interrupt::StopFlag;
 use perturb_protocol::Version;
 use perturb_records::{EpisodeRecord, Records};
+use perturb_settings::sets::Parameters;
 
 use super::error::TestError;
-use super::test::retry_on_disconnect;
+use super::test::{retry_on_disconnect, with_disturbances};
 use super::trials::Trials;
 use crate::checkpoint::Checkpoint;
 use crate::client::{OpenOptions, Servers, Session};
@@ -127,10 +128,12 @@ impl<'a> Replay<'a> {
         num_envs: usize,
     ) -> Result<Self, TestError> {
         let about = &records.about;
+        let recorded = about.parameters.iter().map(|parameter| parameter.name.as_str());
+        let environment = servers.environment(&about.environment)?.with_parameters(recorded).into_owned();
         let options = OpenOptions {
             environment: about.environment.clone(),
             version: Version::D,
-            parameters: Default::default(),
+            parameters: with_disturbances(Parameters::new(), &environment),
             num_envs,
             seed: 0,
             episodes_per_trial: about.episodes_per_trial,

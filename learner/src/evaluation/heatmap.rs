@@ -1,6 +1,7 @@
 //! Tests a policy over a grid of two parameters.
 
 use perturb_files::interrupt::StopFlag;
+use perturb_protocol::disturbance::is_disturbance;
 use perturb_protocol::proto;
 use perturb_records::{Axis, Heatmap, HeatmapOptions, MAX_POINTS, Records};
 use perturb_settings::sets::{Contexts, TestSet};
@@ -99,11 +100,13 @@ pub fn heatmap_again(
 }
 
 fn axes(environment: &proto::Environment, names: &[String; 2]) -> Result<[Axis; 2], HeatmapError> {
-    let find = |name: &String| environment.parameters.iter().find(|parameter| parameter.name == *name);
+    // Disturbances have no range in R and E.
+    let ranged = environment.parameters.iter().filter(|parameter| !is_disturbance(&parameter.name));
+    let find = |name: &String| ranged.clone().find(|parameter| parameter.name == *name);
     let refuse = |name: &String| HeatmapError::Parameter {
         name: name.clone(),
         environment: environment.name.clone(),
-        parameters: environment.parameters.iter().map(|parameter| parameter.name.clone()).collect(),
+        parameters: ranged.clone().map(|parameter| parameter.name.clone()).collect(),
     };
     let [x, y] = names;
     if x == y {

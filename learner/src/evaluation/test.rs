@@ -2,12 +2,12 @@
 
 use perturb_files::interrupt::StopFlag;
 use perturb_policy::random::Purpose;
-use perturb_protocol::{Version, proto};
+use perturb_protocol::{Distribution, Version, proto};
 use perturb_records::success::Rule;
 use perturb_records::testing::{TestCollector, environment_seed};
 use perturb_records::{Records, RecordsMetadata, TestResult};
-use perturb_settings::sets::TestSet;
-use perturb_settings::{TrainConfig, sets};
+use perturb_settings::sets::{Parameters, TestSet};
+use perturb_settings::{TrainConfig, ValueError, sets};
 
 use super::error::TestError;
 use super::trials::{RemoteTrials, Trials};
@@ -40,6 +40,7 @@ pub struct Tester<'a> {
     options: TestOptions,
     about: RecordsMetadata,
     environment: proto::Environment,
+    policy: String,
 }
 
 impl<'a> Tester<'a> {
@@ -51,15 +52,45 @@ impl<'a> Tester<'a> {
         let state = &checkpoint.state;
         let environment = servers.environment_seen(&state.config.common)?;
         state.check_unchanged(&environment)?;
-        let id = checkpoint.id().map_err(TestError::Unnamed)?;
-        let mut about = RecordsMetadata::new(&environment, id, state.config.settings.episodes_per_trial());
+        let policy = checkpoint.id().map_err(TestError::Unnamed)?;
+        let about = Self::about(&environment, &policy, checkpoint, &options)?;
+        Ok(Self { servers, checkpoint, options, about, environment, policy })
+    }
+
+    fn about(
+        environment: &proto::Environment,
+        policy: &str,
+        checkpoint: &Checkpoint,
+        options: &TestOptions,
+    ) -> Result<RecordsMetadata, TestError> {
+        let episodes_per_trial = checkpoint.state.config.settings.episodes_per_trial();
+        let mut about = RecordsMetadata::new(environment, policy.to_owned(), episodes_per_trial);
         if let Some(rule) = &options.success {
             about.judge_by(rule)?;
         }
-        Ok(Self { servers, checkpoint, options, about, environment })
+        Ok(about)
     }
 
-    /// The environment, as it is served.
+    /// Records the disturbances of all episodes if one of `sets` names one: records that are to stand together have the
+    /// same columns.
+    ///
+    /// # Errors
+    /// [`TestError`] for a policy that sees parameters and was trained without disturbances.
+    pub fn recording_for(mut self, sets: &[TestSet]) -> Result<Self, TestError> {
+        let common = &self.checkpoint.state.config.common;
+        let environment = self.servers.environment_seen_with(common, sets.iter().flat_map(TestSet::names))?;
+        if environment.observation.len() != self.environment.observation.len() {
+            let expected = "without: the policy sees parameters, and was trained without those of disturbances";
+            return Err(ValueError::new("a test set", "with a disturbance", expected).into());
+        }
+        if environment.parameters.len() != self.environment.parameters.len() {
+            self.about = Self::about(&environment, &self.policy, self.checkpoint, &self.options)?;
+            self.environment = environment;
+        }
+        Ok(self)
+    }
+
+    /// The environment, as it is served and recorded.
     pub fn environment(&self) -> &proto::Environment {
         &self.environment
     }
@@ -70,13 +101,22 @@ impl<'a> Tester<'a> {
     /// # Errors
     /// [`TestError`], also if an episode did not run with the requested parameters.
     pub fn test(
-        &self,
+        self,
         sets: &[TestSet],
         stop: &StopFlag,
         report: &mut dyn FnMut(&TestSet, u64),
     ) -> Result<Records, TestError> {
         sets::distinct(sets)?;
         sets.iter().try_for_each(|set| set.check(&self.environment))?;
+        self.recording_for(sets)?.test_recorded(sets, stop, report)
+    }
+
+    fn test_recorded(
+        &self,
+        sets: &[TestSet],
+        stop: &StopFlag,
+        report: &mut dyn FnMut(&TestSet, u64),
+    ) -> Result<Records, TestError> {
         let mut records = Records::new(self.about.clone());
         for set in sets {
             let episodes_per_trial = self.about.episodes_per_trial;
@@ -106,7 +146,7 @@ impl<'a> Tester<'a> {
         let options = OpenOptions {
             environment: self.about.environment.clone(),
             version: test.set.version,
-            parameters: test.set.drawn(),
+            parameters: with_disturbances(test.set.drawn(), &self.environment),
             num_envs,
             seed: test.seed,
             episodes_per_trial: self.about.episodes_per_trial,
@@ -146,6 +186,18 @@ impl<'a> Tester<'a> {
             counting.take(trials()?);
         }
     }
+}
+
+/// Adds a disturbance at its default if `environment` has disturbances among its parameters, so that a session has them,
+/// too.
+pub(super) fn with_disturbances(mut parameters: Parameters, environment: &proto::Environment) -> Parameters {
+    let first = environment.disturbances.first();
+    let is_own = |parameter: &&proto::Parameter| environment.parameters.iter().any(|own| own.name == parameter.name);
+    if let Some(parameter) = first.filter(is_own) {
+        let default = Distribution::fixed(parameter.default_value);
+        parameters.entry(parameter.name.clone()).or_insert(default);
+    }
+    parameters
 }
 
 /// Runs `work`, and runs it again from its beginning when servers were lost and have come back. Its result must not depend on

@@ -60,6 +60,10 @@ class Description:
     success: Success | None = field(default=None, compare=False)
     # By name the least and the greatest value of each parameter of the physics that is accepted.
     parameters: Mapping[str, Range] = field(default_factory=dict, compare=False)
+    # The same of each disturbance, which a session has only if it names one.
+    disturbances: Mapping[str, Range] = field(default_factory=dict, compare=False)
+    # By name the value of each disturbance that disturbs nothing.
+    undisturbed: Mapping[str, float] = field(default_factory=dict, compare=False)
     # An episode is truncated after so many steps; None if that is not known.
     step_limit: int | None = field(default=None, compare=False)
     # SHA-256 of the model in hexadecimal digits; empty without a model.
@@ -83,9 +87,29 @@ class Description:
             parameter_observations=ranges(seen["entry"] for seen in entry.get("parameter_observations", [])),
             success=None if success is None else Success(**success),
             parameters={it["name"]: (it["low"], it["high"]) for it in entry.get("parameters", [])},
+            disturbances={it["name"]: (it["low"], it["high"]) for it in entry.get("disturbances", [])},
+            undisturbed={it["name"]: it["D"] for it in entry.get("disturbances", [])},
             step_limit=entry.get("step_limit"),
             model_hash=entry.get("model_hash", ""),
         )
+
+    def with_parameters(self, names: Iterable[str]) -> Description:
+        """The environment of a session that names these parameters: with all disturbances, if one of them is named."""
+        added = {name: ends for name, ends in self.disturbances.items() if name not in self.parameters}
+        if added.keys().isdisjoint(names):
+            return self
+        none = self.undisturbed
+        seen = tuple((low - none[name], high - none[name]) for name, (low, high) in added.items())
+        return replace(
+            self,
+            parameters={**self.parameters, **added},
+            parameter_observations=self.parameter_observations + seen,
+        )
+
+    @property
+    def is_disturbed(self) -> bool:
+        """Whether the disturbances are among the parameters."""
+        return not self.disturbances.keys().isdisjoint(self.parameters)
 
     def observing_parameters(self) -> Description:
         """The environment of a session whose observations have the parameters at their end."""

@@ -76,8 +76,6 @@ class Client:
         self._task = find_folder(task, server)
         self.description = describe(environment, self._task, self._server, self._timeout)
         observe_parameters = requests.observes_parameters(observe)
-        if observe_parameters:
-            self.description = self.description.observing_parameters()
         self.num_envs = requests.count(num_envs, "num_envs", 1)
         if server is None:
             local_server.find_program()  # so that a missing program is reported now, not at the first reset
@@ -87,6 +85,14 @@ class Client:
         self._own: list[requests.Intervals] = []
         if contexts is not None:
             self._set_contexts(requests.contexts(contexts))
+        named = {*self._parameters, *(name for own in self._own for name in own)}
+        self.description = self.description.with_parameters(named)
+        if self.description.is_disturbed:
+            # Contexts come when the session is open, which has disturbances only if its parameters name one.
+            first, value = next(iter(self.description.undisturbed.items()))
+            self._parameters = {first: [(value, value)], **self._parameters}
+        if observe_parameters:
+            self.description = self.description.observing_parameters()
         self._request: dict[str, Any] = {
             "environment": self.description.name,
             "version": requests.version(version),

@@ -229,6 +229,11 @@ def parameter_values(parameters: Parameters, description: Description) -> Interv
     """
     values = distributions(parameters)
     for name, intervals in values.items():
+        if name not in description.parameters and name in description.disturbances:
+            raise InvalidArgumentError(
+                f"{name!r} is a disturbance, and this environment was made without: give parameters={{{name!r}: "
+                f"{description.undisturbed[name]:g}}} where it is made"
+            )
         if name not in description.parameters:
             raise UnknownNameError(
                 f"{description.name} has no parameter {name!r}, only {', '.join(description.parameters)}"

@@ -113,8 +113,10 @@ def play(
 ) -> tuple[str, PolicyRecords]:
     """Test one policy, which records call as expected: what reports call the agent, and its records."""
     environment, observe = settings.environment, settings.observe
+    names = [name for _, _, drawn, contexts in settings.sets for named in (drawn, *(contexts or ())) for name in named]
     address = None if settings.server is None else parse_address(settings.server)
-    description = describe(environment, find_folder(settings.task, settings.server), address, settings.timeout)
+    described = describe(environment, find_folder(settings.task, settings.server), address, settings.timeout)
+    description = described.with_parameters(names)
     seen = observe or "state"
     if isinstance(policy, Policy):
         seen = _of_loaded(policy, environment, trained_on, observe)
@@ -138,10 +140,15 @@ def play(
             "observe": seen,
             "timeout": settings.timeout,
         }
+        # The records of all sets have the disturbances that one of them names.
+        set_name, version, drawn, contexts = one_set
+        if description.is_disturbed and not description.undisturbed.keys() & drawn.keys():
+            first, value = next(iter(description.undisturbed.items()))
+            drawn = {first: [(value, value)], **drawn}
         shown = Progress(settings.progress)
         trained = "" if trained_on is None else f"trained on {trained_on}, "
-        what = f"{environment}, {tested.name}: {trained}testing on {one_set[0]}"
-        _test(tests, place, one_set, tested, client, trials, partial(shown.update, what))
+        what = f"{environment}, {tested.name}: {trained}testing on {set_name}"
+        _test(tests, place, (set_name, version, drawn, contexts), tested, client, trials, partial(shown.update, what))
         shown.finish()
     known = PolicyMetadata(trained_on, tested.timesteps, seed, settings.episodes, seen, tested.deterministic)
     return tested.agent, PolicyRecords(known, tests.records())

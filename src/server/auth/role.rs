@@ -1,6 +1,6 @@
 //! Roles: the parameter values that a token may draw from.
 
-use crate::env::{EnvironmentSpec, Version};
+use crate::env::{EnvironmentSpec, Version, disturbance};
 use perturb_protocol::region::Region;
 use std::fmt;
 
@@ -53,6 +53,8 @@ impl Role {
     /// # Errors
     /// Why not, in half a sentence.
     pub fn check(&self, spec: &EnvironmentSpec, region: &Region) -> Result<(), String> {
+        // Versions say nothing of disturbances, so that no disturbance leads around what a role may never draw.
+        let spec = disturbance::undisturbed(spec);
         let overlaps = |set: &&DrawSet| set.region(spec).is_some_and(|never| region.overlaps(&never));
         if let Some(never) = self.never.iter().find(overlaps) {
             return Err(format!("it may never draw from {never}, which that overlaps"));

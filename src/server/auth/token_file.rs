@@ -1,7 +1,7 @@
 //! The file of tokens: what is in it, and what may be.
 
 use super::role::{DrawSet, Role};
-use crate::env::{Catalogue, Distribution, Version, resolve};
+use crate::env::{Catalogue, Distribution, Version, disturbance, resolve};
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 use std::{
@@ -151,6 +151,8 @@ fn own_set(catalogue: &Catalogue, set: SetEntry) -> Result<DrawSet, String> {
     let SetEntry { name, environment, version, parameters } = set;
     let spec = catalogue.find(&environment).map_err(|error| error.to_string())?;
     let version = version.map_or(Ok(Version::D), |version| version.parse()).map_err(|error| error.to_string())?;
+    let names = parameters.keys().map(String::as_str);
+    let spec = disturbance::with_parameters(spec, names).map_err(|error| error.to_string())?;
     let mut distributions = spec.distributions(version);
     let own = parameters.iter().map(|(name, values)| (name.as_str(), values.clone()));
     resolve(spec, &mut distributions, own).map_err(|error| error.to_string())?;

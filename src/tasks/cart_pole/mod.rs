@@ -30,9 +30,9 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
         Parameter::new("mass", "kg", "the pole's mass", (0.0001, 1000.0)).versions(0.1, (0.05, 0.5), (0.01, 1.0)),
     ],
     observation: &[
-        Channel::unbounded("cart_position", "m"),
+        Channel::unbounded("cart_position", "m").scale(POSITION_LIMIT),
         Channel::unbounded("cart_velocity", "m/s"),
-        Channel::unbounded("pole_angle", "rad"),
+        Channel::unbounded("pole_angle", "rad").scale(ANGLE_LIMIT),
         Channel::unbounded("pole_angular_velocity", "rad/s"),
     ],
     action: ActionSpace::Discrete(&["push_left", "push_right"]),

@@ -312,6 +312,15 @@ impl Environment for FolderEnvironment {
         &self.task.hash
     }
 
+    /// Writes the action whose controls are as near to 0 as they can be.
+    fn neutral_action(&self, out: &mut [f32]) {
+        for (entry, &(low, high)) in out.iter_mut().zip(&self.task.controls) {
+            let control = 0.0_f64.clamp(low, high);
+            let is_scaled = self.task.scaled && high > low;
+            *entry = if is_scaled { 2.0 * (control - low) / (high - low) - 1.0 } else { control } as f32;
+        }
+    }
+
     fn reset(&mut self, stream: &mut Stream) {
         self.clear();
         let reset = &self.task.reset;

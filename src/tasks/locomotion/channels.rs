@@ -30,17 +30,18 @@ macro_rules! names {
             joints: &[$($joint),*],
             contacts: &[$($contact),*],
             observation: &[
-                Channel::new("torso_height", "m", -CLIP, CLIP),
-                Channel::new("target_sin", "1", -1.0, 1.0),
-                Channel::new("target_cos", "1", -1.0, 1.0),
-                Channel::new("torso_velocity_x", "1", -CLIP, CLIP),
-                Channel::new("torso_velocity_y", "1", -CLIP, CLIP),
-                Channel::new("torso_velocity_z", "1", -CLIP, CLIP),
-                Channel::new("roll", "rad", -CLIP, CLIP),
-                Channel::new("pitch", "rad", -CLIP, CLIP),
+                // In the plane the angle to the target, the speed along y and the roll are constant.
+                Channel::new("torso_height", "m", -CLIP, CLIP).scale(1.0),
+                Channel::new("target_sin", "1", -1.0, 1.0).scale(0.0),
+                Channel::new("target_cos", "1", -1.0, 1.0).scale(0.0),
+                Channel::new("torso_velocity_x", "1", -CLIP, CLIP).scale(1.0),
+                Channel::new("torso_velocity_y", "1", -CLIP, CLIP).scale(0.0),
+                Channel::new("torso_velocity_z", "1", -CLIP, CLIP).scale(1.0),
+                Channel::new("roll", "rad", -CLIP, CLIP).scale(0.0),
+                Channel::new("pitch", "rad", -CLIP, CLIP).scale(1.0),
                 $(
-                    Channel::new(concat!($joint, "_position"), "1", -CLIP, CLIP),
-                    Channel::new(concat!($joint, "_speed"), "1", -CLIP, CLIP),
+                    Channel::new(concat!($joint, "_position"), "1", -CLIP, CLIP).scale(1.0),
+                    Channel::new(concat!($joint, "_speed"), "1", -CLIP, CLIP).scale(1.0),
                 )*
                 $(Channel::new(concat!($contact, "_contact"), "1", 0.0, 1.0),)*
             ],

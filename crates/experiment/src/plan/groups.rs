@@ -6,6 +6,7 @@
 
 use std::ops::Range;
 
+use perturb_protocol::disturbance::is_disturbance;
 use perturb_settings::{Architecture, CollectionMode, Observe, TrainConfig};
 
 use super::{Cell, Plan, distinct};
@@ -34,11 +35,12 @@ impl Grouping {
 }
 
 impl Cell {
-    /// Environment, architecture, what is observed, and what rollouts are like: cells that have all in common may be in
-    /// one group.
-    pub fn kind(&self) -> (&str, Architecture, Observe, CollectionMode) {
+    /// Environment, architecture, what is observed, what rollouts are like, and whether there are disturbances: cells that
+    /// have all in common may be in one group.
+    pub fn kind(&self) -> (&str, Architecture, Observe, CollectionMode, bool) {
         let TrainConfig { common, .. } = &self.config;
-        (&common.environment, common.architecture, common.observe, self.config.rollouts())
+        let is_disturbed = common.parameters.keys().any(|name| is_disturbance(name));
+        (&common.environment, common.architecture, common.observe, self.config.rollouts(), is_disturbed)
     }
 }
 
@@ -93,7 +95,7 @@ mod tests {
         assert_eq!(groups, [vec![0, 1], vec![4, 5], vec![2, 3], vec![6, 7], vec![10, 11], vec![8, 9]]);
         assert_eq!(
             plan.cells[groups[1][0]].kind(),
-            ("CartPole", Architecture::Ff, Observe::State, CollectionMode::Short)
+            ("CartPole", Architecture::Ff, Observe::State, CollectionMode::Short, false)
         );
         let left = plan.groups(&[1, 5, 8, 11], Grouping { max_cells: 36, at_a_time: 1 });
         assert_eq!(left, [vec![1, 5], vec![8], vec![11]]);

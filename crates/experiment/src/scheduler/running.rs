@@ -59,7 +59,7 @@ impl Running {
         if let Some(number) = group {
             self.places.insert(number, self.groups.len());
         }
-        let (environment, architecture, observe, _) = cell.kind();
+        let (environment, architecture, observe, ..) = cell.kind();
         let sees = observe.note().map_or_else(String::new, |sees| format!(" ({sees})"));
         self.groups.push(RunningGroup { kind: format!("{environment} {architecture}{sees}"), cells: vec![entry] });
     }

@@ -72,6 +72,13 @@ pub struct Environment {
     /// from older servers.
     #[prost(message, repeated, tag = "16")]
     pub parameter_observations: ::prost::alloc::vec::Vec<ParameterObservation>,
+    /// Disturbances: parameters of the way between a client and the physics, such as the delay of actions. They may be
+    /// named wherever parameters are. A session whose `open` names one has all of them at the end of its `parameters`, in
+    /// this order, with a quantity of the same name for each at the end of `applied`, and an entry for each at the end of
+    /// `parameter_observations`. In all versions they have their default value, which disturbs nothing. Empty from older
+    /// servers.
+    #[prost(message, repeated, tag = "17")]
+    pub disturbances: ::prost::alloc::vec::Vec<Parameter>,
 }
 /// The scaling of an observed parameter, computed in float64 and rounded to float32:
 ///    entry = 2 (value - at_minus_one) / (at_plus_one - at_minus_one) - 1
@@ -137,6 +144,10 @@ pub struct Parameter {
     /// unit: a receipt's applied value of that name equals the requested one up to rounding.
     #[prost(string, tag = "9")]
     pub applied: ::prost::alloc::string::String,
+    /// Whether its values are whole numbers. Of a distribution's intervals the whole numbers in them are then drawn, each as
+    /// likely; each interval must have one.
+    #[prost(bool, tag = "10")]
+    pub integer: bool,
 }
 /// The actions of an environment.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -353,7 +364,9 @@ pub struct Open {
     /// The version whose distributions parameters are drawn from.
     #[prost(enumeration = "Version", tag = "2")]
     pub version: i32,
-    /// Replaces the version's distribution of the named parameters; the others keep the version's.
+    /// Replaces the version's distribution of the named parameters; the others keep the version's. If one of the names, here
+    /// or in a group, is that of a disturbance, all environments of the session have the disturbances as parameters
+    /// (`Environment.disturbances`).
     #[prost(map = "string, message", tag = "3")]
     pub parameters: ::std::collections::HashMap<
         ::prost::alloc::string::String,

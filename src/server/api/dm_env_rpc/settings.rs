@@ -2,7 +2,7 @@
 
 use super::{Error, tensors};
 use crate::{
-    env::{self, Catalogue, Distribution, EnvironmentSpec, Version, resolve, shorten},
+    env::{self, Catalogue, Distribution, EnvironmentSpec, Version, disturbance, resolve, shorten},
     pool::{Autoreset, BatchSettings, SlotGroup},
     proto::dm_env_rpc::v1::Tensor,
 };
@@ -55,6 +55,9 @@ pub(super) fn create(
     })?;
     let spec = catalogue.find(tensors::text(&field(ENV_ID), id)?)?;
     let own = [ENV_ID, VERSION, SEED, ENVIRONMENT_INDEX, EPISODES_PER_TRIAL, WORLD_NAME, SHARED];
+    let is_disturbance = |name: &&String| disturbance::disturbances(spec).iter().any(|known| known.name == **name);
+    let named = settings.keys().filter(is_disturbance).map(String::as_str);
+    let spec = disturbance::with_parameters(spec, named)?;
     check_names(spec, "create_world", &own, settings)?;
     let integer = |name, default, low, high| match settings.get(name) {
         Some(tensor) => tensors::integer(&field(name), tensor, low, high),
@@ -107,6 +110,8 @@ pub(super) fn change(
     request: &'static str,
     settings: &WorldSettings,
 ) -> Result<WorldChange, Error> {
+    let disturbances = disturbance::disturbances(spec).iter().map(|disturbance| disturbance.name);
+    disturbance::check_open(spec, disturbances.filter(|name| settings.contains_key(*name)))?;
     check_names(spec, request, &[VERSION, SEED], settings)?;
     Ok(WorldChange {
         version: version(settings)?,

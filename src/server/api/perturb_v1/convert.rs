@@ -4,7 +4,7 @@ use super::Error;
 use crate::{
     env::{
         self, Achievement, ActionSpace, Catalogue, Channel, Comparison, Distribution, EnvironmentSpec, EpisodeEnd,
-        EpisodeId, EpisodeStart, Parameter, Receipt, Settings, Success, Version, resolve,
+        EpisodeId, EpisodeStart, Parameter, Receipt, Settings, Success, Version, disturbance, resolve,
     },
     pool::{Autoreset, Batch, BatchSettings, ResetEntry, SlotGroup, StepResult},
     proto,
@@ -16,7 +16,7 @@ use std::{collections::HashMap, sync::Arc};
 
 /// Checks an `open` of at most `max_envs` environments.
 pub fn open(catalogue: &Catalogue, max_envs: usize, request: proto::Open) -> Result<BatchSettings, Error> {
-    let spec = catalogue.find(&request.environment)?;
+    let spec = with_parameters(catalogue.find(&request.environment)?, &request)?;
     let autoreset = match request.autoreset_mode() {
         proto::AutoresetMode::NextStep => Autoreset::NextStep,
         proto::AutoresetMode::SameStep => Autoreset::SameStep,
@@ -45,6 +45,16 @@ pub fn open(catalogue: &Catalogue, max_envs: usize, request: proto::Open) -> Res
         numbered.map(|(i, slots)| named(i, slots)).collect::<Result<_, _>>()?
     };
     Ok(BatchSettings { spec, groups, autoreset, receipts, receipt_arrays, reward_terms, observe_parameters })
+}
+
+/// The environment that has the parameters which an `open` names: with disturbances, if it names one.
+fn with_parameters(spec: &'static EnvironmentSpec, open: &proto::Open) -> Result<&'static EnvironmentSpec, Error> {
+    let groups = open.groups.iter().map(|group| &group.parameters);
+    let mut names: Vec<&str> =
+        groups.chain([&open.parameters]).flat_map(|named| named.keys().map(String::as_str)).collect();
+    // In order, so that the same request always gets the same refusal.
+    names.sort_unstable();
+    Ok(disturbance::with_parameters(spec, names)?)
 }
 
 /// An `open` without groups as one group.
@@ -165,6 +175,9 @@ pub fn mask(field: &'static str, size: usize, mask: &[u8]) -> Result<Vec<usize>,
 /// Checks a `reset` of a batch.
 pub fn reset(batch: &Batch, request: proto::Reset) -> Result<Vec<ResetEntry>, Error> {
     let spec = batch.settings().spec;
+    let mut names: Vec<&str> = request.parameters.keys().map(String::as_str).collect();
+    names.sort_unstable();
+    disturbance::check_open(spec, names)?;
     let slots = mask("reset.mask", batch.size(), &request.mask)?;
     if !request.seeds.is_empty() && request.seeds.len() != slots.len() {
         let expected = format!("one for each of the {} selected environments, or none", slots.len());
@@ -202,7 +215,7 @@ fn states(spec: &EnvironmentSpec, bytes: &Bytes, selected: usize) -> Result<Vec<
     }
     let numbers: Vec<f64> = bytes.as_chunks::<8>().0.iter().map(|word| f64::from_le_bytes(*word)).collect();
     for (i, &x) in numbers.iter().enumerate() {
-        let Channel { name, unit, low, high } = spec.state[i % n];
+        let Channel { name, unit, low, high, .. } = spec.state[i % n];
         if !x.is_finite() || x < low || x > high {
             let got = format!("{x} {unit} for {name} in row {}", i / n);
             return Err(Error::value(FIELD, got, format!("a finite number within [{low}, {high}]")));
@@ -254,7 +267,7 @@ pub fn render(n: usize, request: proto::Render) -> Result<(usize, Size), Error> 
 }
 
 /// An environment's entry in the catalogue.
-pub fn environment(spec: &EnvironmentSpec, model_hash: &str) -> proto::Environment {
+pub fn environment(spec: &'static EnvironmentSpec, model_hash: &str) -> proto::Environment {
     let quantity = |q: &env::Quantity| proto::Quantity { name: q.name.into(), unit: q.unit.into() };
     let term = |t: &env::RewardTerm| proto::RewardTerm { name: t.name.into(), description: t.description.into() };
     proto::Environment {
@@ -262,6 +275,7 @@ pub fn environment(spec: &EnvironmentSpec, model_hash: &str) -> proto::Environme
         revision: spec.revision,
         description: spec.description.into(),
         parameters: spec.parameters.iter().map(parameter).collect(),
+        disturbances: disturbance::disturbances(spec).iter().map(parameter).collect(),
         observation: channels(spec.observation),
         action: Some(action_space(spec.action)),
         state: channels(spec.state),
@@ -310,6 +324,7 @@ fn parameter(p: &Parameter) -> proto::Parameter {
         random: Some((&p.distribution(Version::R)).into()),
         extreme: Some((&p.distribution(Version::E)).into()),
         applied: p.applied.into(),
+        integer: p.is_integer,
     }
 }
 

@@ -81,7 +81,11 @@ impl Session {
         let settings = convert::open(&self.context.catalogue, max_envs, request)?;
         let (observes_parameters, receipt_arrays) = (settings.observe_parameters, settings.receipt_arrays);
         let environment = self.context.listing.environments.iter().find(|entry| entry.name == settings.spec.name);
-        let environment = environment.map(|entry| entry.observed(observes_parameters));
+        let environment = environment.map(|entry| {
+            let is_disturbed = settings.spec.parameters.len() > entry.parameters.len();
+            let opened = if is_disturbed { entry.disturbed() } else { entry.clone() };
+            opened.observed(observes_parameters)
+        });
         let envs = settings.size();
         // More than there can be is for the pool to refuse.
         let step_memory =

@@ -1,0 +1,42 @@
+//! Cost of disturbances: the steps of a batch with a delay and noise, and without.
+
+use super::{
+    Failure, ROUNDS,
+    client::{Client, ServerProcess},
+    median,
+};
+use perturb::env::ActionSpace;
+use perturb::tasks;
+
+/// Environments of each batch.
+const BATCH: usize = 64;
+/// Simulated time of a round, roughly, in µs.
+const ROUND_US: f64 = 100_000.0;
+
+/// The figure's name.
+pub(crate) fn id(name: &str) -> String {
+    format!("disturbed/{name}/{BATCH}")
+}
+
+/// Measures an environment with late and noisy observations and late actions, noisy if they are numbers.
+pub(crate) async fn measure(name: &str) -> Result<(), Failure> {
+    let spec = tasks::catalogue().find(name)?;
+    let all = [("action_delay", 2.0), ("sensor_delay", 1.0), ("sensor_noise", 0.05), ("action_noise", 0.05)];
+    let values = if let ActionSpace::Discrete(_) = spec.action { &all[..3] } else { &all };
+    let trips = ((ROUND_US / (spec.step_cost * BATCH as f64)) as usize).clamp(20, 2000);
+    let server = ServerProcess::server(1)?;
+    let mut plain = Client::open(&server.socket, name, BATCH).await?;
+    let mut disturbed = Client::open_disturbed(&server.socket, name, BATCH, values).await?;
+    let mut ratios = Vec::new();
+    for round in 0..ROUNDS {
+        let mut seconds = [0.0; 2];
+        for turn in 0..2 {
+            let which = (round + turn) % 2; // the first is at a disadvantage
+            let client = if which == 0 { &mut plain } else { &mut disturbed };
+            seconds[which] = client.run(trips).await?;
+        }
+        ratios.push(seconds[0] / seconds[1]);
+    }
+    println!("{:<22} {:>12.3} of the steps a second without disturbances", id(name), median(&mut ratios));
+    Ok(())
+}

@@ -1,0 +1,129 @@
+//! The way of an action to the physics: late, held, noisy, scaled.
+
+use super::parameters::DisturbanceValues;
+use crate::env::{Action, ActionSpace, Draw, Error, Purpose, Stream};
+
+/// The actions of one environment that are under way. A choice is one number here.
+pub(super) struct ActionPath {
+    space: ActionSpace,
+    /// The action that acts before any other arrives, `[A]`.
+    neutral: Vec<f32>,
+    /// The actions that have not acted yet, a ring of `action_delay` times `[A]`.
+    late: Vec<f32>,
+    /// The place of the oldest of them, in numbers.
+    oldest: usize,
+    /// The last action that acted, without its noise and scale, `[A]`.
+    held: Vec<f32>,
+    /// The action that acts, `[A]`.
+    acting: Vec<f32>,
+}
+
+impl ActionPath {
+    /// The path of an environment with this neutral action, `[A]`.
+    pub(super) fn new(space: ActionSpace, neutral: Vec<f32>) -> Self {
+        let (held, acting) = (neutral.clone(), neutral.clone());
+        Self { space, neutral, late: Vec::new(), oldest: 0, held, acting }
+    }
+
+    /// Begins an episode: the neutral action acts until the first one arrives.
+    pub(super) fn begin(&mut self, values: &DisturbanceValues) {
+        self.late.clear();
+        for _ in 0..values.action_delay {
+            self.late.extend_from_slice(&self.neutral);
+        }
+        self.oldest = 0;
+        self.held.copy_from_slice(&self.neutral);
+    }
+
+    /// Takes the action of step number `step` and returns the one that acts.
+    pub(super) fn pass(
+        &mut self,
+        values: &DisturbanceValues,
+        draw: &Draw,
+        step: u32,
+        action: Action<'_>,
+    ) -> Action<'_> {
+        let choice;
+        let action = match action {
+            Action::Continuous(action) => action,
+            // Choices are few: f32 has them all.
+            Action::Discrete(number) => {
+                choice = [number as f32];
+                &choice
+            }
+        };
+        let width = self.neutral.len();
+        let is_held = values.action_hold > 0.0
+            && step > 0
+            && Stream::at_step(draw, Purpose::ActionHold, step).unit() < values.action_hold;
+        if values.action_delay == 0 {
+            if !is_held {
+                self.held.copy_from_slice(action);
+            }
+        } else {
+            let place = &mut self.late[self.oldest..][..width];
+            if !is_held {
+                self.held.copy_from_slice(place);
+            }
+            place.copy_from_slice(action);
+            self.oldest = (self.oldest + width) % self.late.len();
+        }
+        self.acting.copy_from_slice(&self.held);
+        match self.space {
+            ActionSpace::Discrete(_) => Action::Discrete(self.acting[0] as u32),
+            ActionSpace::Continuous(channels) => {
+                if values.action_noise > 0.0 {
+                    let mut stream = Stream::at_step(draw, Purpose::ActionNoise, step);
+                    for (entries, channels) in self.acting.chunks_mut(2).zip(channels.chunks(2)) {
+                        for ((entry, channel), normal) in entries.iter_mut().zip(channels).zip(stream.normals()) {
+                            let noise = values.action_noise * (channel.high - channel.low) * normal;
+                            *entry = finite(f64::from(*entry) + noise);
+                        }
+                    }
+                }
+                for ((entry, neutral), &scale) in self.acting.iter_mut().zip(&self.neutral).zip(&values.action_scales) {
+                    if scale != 1.0 {
+                        let neutral = f64::from(*neutral);
+                        *entry = finite(neutral + scale * (f64::from(*entry) - neutral));
+                    }
+                }
+                Action::Continuous(&self.acting)
+            }
+        }
+    }
+
+    /// The numbers that [`ActionPath::save`] appends.
+    pub(super) fn n_saved(&self, values: &DisturbanceValues) -> usize {
+        (1 + values.action_delay) * self.neutral.len()
+    }
+
+    /// Appends the last action and those that have not acted yet, from the oldest on.
+    pub(super) fn save(&self, out: &mut Vec<f64>) {
+        let (newer, older) = self.late.split_at(self.oldest);
+        out.extend([&self.held[..], older, newer].into_iter().flatten().map(|&number| f64::from(number)));
+    }
+
+    /// Takes back what was saved, as many numbers as [`ActionPath::n_saved`].
+    ///
+    /// # Errors
+    /// [`Error::Snapshot`] for a number that no action has; the path is undefined then.
+    pub(super) fn load(&mut self, values: &DisturbanceValues, saved: &[f64]) -> Result<(), Error> {
+        let is_legal = |&number: &f64| match self.space {
+            ActionSpace::Discrete(names) => number.fract() == 0.0 && (0.0..names.len() as f64).contains(&number),
+            ActionSpace::Continuous(_) => (number as f32).is_finite(),
+        };
+        if let Some(number) = saved.iter().find(|number| !is_legal(number)) {
+            return Err(Error::Snapshot { reason: format!("{number} is in one of its late actions") });
+        }
+        self.begin(values);
+        let (held, late) = saved.split_at(self.held.len());
+        self.held.iter_mut().zip(held).for_each(|(to, from)| *to = *from as f32);
+        self.late.iter_mut().zip(late).for_each(|(to, from)| *to = *from as f32);
+        Ok(())
+    }
+}
+
+/// The nearest f32 that is finite.
+fn finite(number: f64) -> f32 {
+    number.clamp(f32::MIN.into(), f32::MAX.into()) as f32
+}

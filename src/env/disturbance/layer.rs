@@ -1,0 +1,148 @@
+//! The layer between an episode and the physics.
+
+use super::{
+    actions::ActionPath,
+    parameters::{DisturbanceSet, DisturbanceValues},
+    sensors::SensorPath,
+};
+use crate::{
+    env::{Action, Draw, Environment, EnvironmentSpec, Error, Stream, Transition},
+    scene::Scene,
+};
+
+/// An environment whose actions and observations are disturbed. Rewards, ends, success and pictures are those of the
+/// physics, which know nothing of it.
+pub(super) struct Disturbed {
+    inner: Box<dyn Environment>,
+    spec: &'static EnvironmentSpec,
+    set: &'static DisturbanceSet,
+    /// The values of the disturbances as they were set, in order.
+    numbers: Vec<f64>,
+    values: DisturbanceValues,
+    draw: Draw,
+    /// Steps of the episode so far.
+    steps: u32,
+    actions: ActionPath,
+    sensors: SensorPath,
+}
+
+impl Disturbed {
+    /// The environment of a twin's spec, without disturbances until they are set.
+    pub(super) fn new(
+        inner: Box<dyn Environment>,
+        spec: &'static EnvironmentSpec,
+        set: &'static DisturbanceSet,
+    ) -> Self {
+        let mut neutral = vec![0.0; set.action_width];
+        inner.neutral_action(&mut neutral);
+        let mut disturbed = Self {
+            inner,
+            spec,
+            set,
+            numbers: set.parameters().map(|parameter| parameter.default).collect(),
+            values: set.defaults(),
+            draw: Draw::default(),
+            steps: 0,
+            actions: ActionPath::new(spec.action, neutral),
+            sensors: SensorPath::new(spec.observation),
+        };
+        disturbed.begin();
+        disturbed
+    }
+
+    /// Begins an episode at the state of the physics.
+    fn begin(&mut self) {
+        self.steps = 0;
+        self.actions.begin(&self.values);
+        self.sensors.begin(&self.values, &self.draw, |out| self.inner.observe(out));
+    }
+}
+
+impl Environment for Disturbed {
+    fn spec(&self) -> &'static EnvironmentSpec {
+        self.spec
+    }
+
+    fn set_parameters(&mut self, values: &[f64]) {
+        let (own, disturbances) = values.split_at(values.len() - self.numbers.len());
+        self.inner.set_parameters(own);
+        self.numbers.copy_from_slice(disturbances);
+        self.set.set(&mut self.values, disturbances);
+    }
+
+    fn applied(&self, out: &mut [f64]) {
+        let (own, disturbances) = out.split_at_mut(out.len() - self.numbers.len());
+        self.inner.applied(own);
+        self.set.read(&self.values, &self.numbers, disturbances);
+    }
+
+    fn model_hash(&self) -> &str {
+        self.inner.model_hash()
+    }
+
+    fn achieved(&self) -> Option<f64> {
+        self.inner.achieved()
+    }
+
+    fn set_address(&mut self, draw: Draw, steps: u32) {
+        (self.draw, self.steps) = (draw, steps);
+        self.inner.set_address(draw, steps);
+    }
+
+    fn neutral_action(&self, out: &mut [f32]) {
+        self.inner.neutral_action(out);
+    }
+
+    fn reset(&mut self, stream: &mut Stream) {
+        self.inner.reset(stream);
+        self.begin();
+    }
+
+    fn reset_to(&mut self, state: &[f64]) {
+        self.inner.reset_to(state);
+        self.begin();
+    }
+
+    fn observe(&self, out: &mut [f32]) {
+        out.copy_from_slice(self.sensors.seen());
+    }
+
+    fn scene(&self) -> Option<Scene> {
+        self.inner.scene()
+    }
+
+    fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
+        let action = self.actions.pass(&self.values, &self.draw, self.steps, action);
+        let transition = self.inner.step(action, reward_terms);
+        self.steps += 1;
+        self.sensors.pass(&self.values, &self.draw, self.steps, |out| self.inner.observe(out));
+        transition
+    }
+
+    /// Appends the state of the physics, then what is late. What is seen follows from it and from the address.
+    fn save(&self, out: &mut Vec<f64>) {
+        self.inner.save(out);
+        self.actions.save(out);
+        self.sensors.save(out);
+    }
+
+    fn max_saved_growth(&self) -> usize {
+        let (actions, sensors) = self.set.max_late_numbers(self.spec.observation.len());
+        let now = self.actions.n_saved(&self.values) - self.set.action_width + self.sensors.n_saved(&self.values);
+        self.inner.max_saved_growth() + (actions + sensors).saturating_sub(now)
+    }
+
+    fn load(&mut self, state: &[f64]) -> Result<(), Error> {
+        let (actions, sensors) = (self.actions.n_saved(&self.values), self.sensors.n_saved(&self.values));
+        let Some(own) = state.len().checked_sub(actions + sensors) else {
+            let reason = format!("its state has {} numbers, expected more than {}", state.len(), actions + sensors);
+            return Err(Error::Snapshot { reason });
+        };
+        let (own, late) = state.split_at(own);
+        let (late_actions, late_observations) = late.split_at(actions);
+        self.inner.load(own)?;
+        self.actions.load(&self.values, late_actions)?;
+        let address = (&self.draw, self.steps);
+        self.sensors.load(&self.values, address, late_observations, |out| self.inner.observe(out))
+    }
+}

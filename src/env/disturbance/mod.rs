@@ -1,0 +1,106 @@
+//! Disturbances: actions that arrive late, are held, noisy or weak, and observations that are late, noisy or lost.
+//! docs/disturbances.md has their laws.
+//!
+//! Every environment of a catalogue, built in or a folder, has a disturbed twin: the same environment with the
+//! disturbances as further parameters, behind its own. A session whose requests name one of them opens the twin; all other
+//! sessions are as if there were none. The twin is a layer between an episode and the physics:
+//!
+//! - `parameters` lists the disturbances of an environment.
+//! - `layer` is the twin's environment: it passes actions by `actions` to the physics, and observations by `sensors` back.
+
+mod actions;
+mod layer;
+mod parameters;
+mod sensors;
+
+use super::{Environment, EnvironmentSpec, Error, Parameter, Quantity, shorten};
+use layer::Disturbed;
+use parameters::DisturbanceSet;
+use std::sync::{Mutex, PoisonError};
+
+/// An environment and its twin. Both live as long as the process.
+#[derive(Clone, Copy)]
+struct Twin {
+    base: &'static EnvironmentSpec,
+    disturbed: &'static EnvironmentSpec,
+    disturbances: &'static [Parameter],
+}
+
+/// The twins that were made so far, at most one of each environment.
+static TWINS: Mutex<Vec<Twin>> = Mutex::new(Vec::new());
+
+/// The disturbances that an environment can have beside its own parameters.
+pub fn disturbances(spec: &'static EnvironmentSpec) -> &'static [Parameter] {
+    twin(spec).disturbances
+}
+
+/// The environment with the disturbances as further parameters.
+pub fn disturbed(spec: &'static EnvironmentSpec) -> &'static EnvironmentSpec {
+    twin(spec).disturbed
+}
+
+/// The environment without disturbances: itself, or that of which it is the twin.
+pub fn undisturbed(spec: &EnvironmentSpec) -> &EnvironmentSpec {
+    let twins = TWINS.lock().unwrap_or_else(PoisonError::into_inner);
+    twins.iter().find(|twin| std::ptr::eq(twin.disturbed, spec)).map_or(spec, |twin| twin.base)
+}
+
+/// The environment that has the parameters of these names: itself, or its twin if a name is that of a disturbance.
+///
+/// # Errors
+/// [`Error::UnknownParameter`] for a name that is neither a parameter nor a disturbance.
+pub fn with_parameters<'a>(
+    spec: &'static EnvironmentSpec,
+    names: impl IntoIterator<Item = &'a str>,
+) -> Result<&'static EnvironmentSpec, Error> {
+    let mut found = spec;
+    for name in names {
+        if spec.parameters.iter().any(|parameter| parameter.name == name) {
+            continue;
+        }
+        let disturbances = disturbances(spec);
+        if !disturbances.iter().any(|disturbance| disturbance.name == name) {
+            let list = |parameters: &[Parameter]| parameters.iter().map(|p| p.name).collect::<Vec<_>>().join(", ");
+            let known = format!("{}; and the disturbances {}", list(spec.parameters), list(disturbances));
+            return Err(Error::UnknownParameter { environment: spec.name, name: shorten(name), known });
+        }
+        found = disturbed(spec);
+    }
+    Ok(found)
+}
+
+/// Checks that an environment that is open already has the parameters of these names.
+///
+/// # Errors
+/// [`Error::UnknownParameter`], or [`Error::NotDisturbed`] for a disturbance that only its twin has.
+pub fn check_open<'a>(spec: &'static EnvironmentSpec, names: impl IntoIterator<Item = &'a str>) -> Result<(), Error> {
+    for name in names {
+        if !std::ptr::eq(with_parameters(spec, [name])?, spec) {
+            return Err(Error::NotDisturbed { environment: spec.name, name: name.into() });
+        }
+    }
+    Ok(())
+}
+
+/// Returns the twin of an environment, which is made at the first time. A twin is its own.
+fn twin(spec: &'static EnvironmentSpec) -> Twin {
+    let mut twins = TWINS.lock().unwrap_or_else(PoisonError::into_inner);
+    let is_known = |twin: &&Twin| std::ptr::eq(twin.base, spec) || std::ptr::eq(twin.disturbed, spec);
+    if let Some(twin) = twins.iter().find(is_known) {
+        return *twin;
+    }
+    let set: &'static DisturbanceSet = Box::leak(Box::new(DisturbanceSet::new(spec)));
+    let disturbances: &'static [Parameter] = Vec::leak(set.parameters().collect());
+    let quantities = disturbances.iter().map(|Parameter { name, unit, .. }| Quantity { name, unit });
+    let mut disturbed = *spec;
+    disturbed.parameters = Vec::leak(spec.parameters.iter().copied().chain(disturbances.iter().copied()).collect());
+    disturbed.applied = Vec::leak(spec.applied.iter().copied().chain(quantities).collect());
+    // The environment knows its spec, which has the closure that makes it.
+    disturbed.make = Box::leak(Box::new(move || {
+        let twin = twin(spec);
+        Ok(Box::new(Disturbed::new((spec.make)()?, twin.disturbed, set)) as Box<dyn Environment>)
+    }));
+    let twin = Twin { base: spec, disturbed: Box::leak(Box::new(disturbed)), disturbances };
+    twins.push(twin);
+    twin
+}

@@ -1,0 +1,175 @@
+//! The disturbances of an environment, as parameters, and the values that are in force.
+
+use crate::env::{ActionSpace, EnvironmentSpec, Parameter};
+
+/// The longest delay, in steps.
+const MAX_DELAY: usize = 100;
+/// Limit of the numbers of actions that are under way, so that a snapshot has room for them.
+const MAX_LATE_ACTION_NUMBERS: usize = 2048;
+/// Limit of the numbers of observations that are under way.
+const MAX_LATE_OBSERVATION_NUMBERS: usize = 8192;
+/// The most actuators that have a scale of their own.
+const MAX_SCALED_ACTUATORS: usize = 32;
+/// The largest noise, and the largest scale.
+const MAX_FACTOR: f64 = 10.0;
+/// The name of the scale of all actuators, and how those of single ones begin.
+const ACTION_SCALE: &str = "action_scale";
+
+/// What a disturbance is, so that its value finds its place.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum DisturbanceKind {
+    ActionDelay,
+    ActionHold,
+    ActionNoise,
+    ActionScale,
+    /// The scale of one actuator.
+    ActuatorScale(usize),
+    SensorDelay,
+    SensorNoise,
+    SensorDropout,
+}
+
+/// The disturbances of one environment.
+pub(super) struct DisturbanceSet {
+    entries: Vec<(DisturbanceKind, Parameter)>,
+    /// A: entries of an action, 1 where an action is a choice.
+    pub(super) action_width: usize,
+}
+
+/// The values of the disturbances that are in force.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct DisturbanceValues {
+    pub(super) action_delay: usize,
+    pub(super) action_hold: f64,
+    pub(super) action_noise: f64,
+    /// The scale of each actuator, `[A]`: that of all times its own.
+    pub(super) action_scales: Vec<f64>,
+    pub(super) sensor_delay: usize,
+    pub(super) sensor_noise: f64,
+    pub(super) sensor_dropout: f64,
+}
+
+impl DisturbanceSet {
+    /// The disturbances of an environment but those whose names it uses itself.
+    pub(super) fn new(spec: &EnvironmentSpec) -> Self {
+        let share = |name, description, most| Parameter::new(name, "1", description, (0.0, most));
+        let steps = |name, description, most: usize| share(name, description, most as f64).off(0.0).integer();
+        let (action_width, actuators) = match spec.action {
+            ActionSpace::Discrete(_) => (1, None),
+            ActionSpace::Continuous(channels) => (channels.len(), Some(channels)),
+        };
+        let most_delay = |numbers: usize, width: usize| MAX_DELAY.min(numbers / width.max(1)).max(1);
+        let mut entries = vec![
+            (
+                DisturbanceKind::ActionDelay,
+                steps(
+                    "action_delay",
+                    "steps by which actions act late",
+                    most_delay(MAX_LATE_ACTION_NUMBERS, action_width),
+                ),
+            ),
+            (
+                DisturbanceKind::ActionHold,
+                share("action_hold", "probability that the last action acts again", 1.0).off(0.0),
+            ),
+        ];
+        // A choice has no size: it cannot be noisy or weak.
+        if let Some(channels) = actuators {
+            let noise = share("action_noise", "standard deviation of actions, as a share of their range", MAX_FACTOR);
+            entries.push((DisturbanceKind::ActionNoise, noise.off(0.0)));
+            let scale = |name, description| (share(name, description, MAX_FACTOR)).off(1.0);
+            entries.push((DisturbanceKind::ActionScale, scale(ACTION_SCALE, "factor on all actions")));
+            let own = channels.iter().take(MAX_SCALED_ACTUATORS).enumerate().map(|(place, channel)| {
+                let name: &'static str = String::leak(format!("{ACTION_SCALE}_{}", channel.name));
+                let description: &'static str = String::leak(format!("factor on the action of {}", channel.name));
+                (DisturbanceKind::ActuatorScale(place), scale(name, description))
+            });
+            entries.extend(own.filter(|_| channels.len() > 1));
+        }
+        entries.extend([
+            (
+                DisturbanceKind::SensorDelay,
+                steps(
+                    "sensor_delay",
+                    "steps by which observations are late",
+                    most_delay(MAX_LATE_OBSERVATION_NUMBERS, spec.observation.len()),
+                ),
+            ),
+            (
+                DisturbanceKind::SensorNoise,
+                share("sensor_noise", "standard deviation of observations, as a share of their scales", MAX_FACTOR)
+                    .off(0.0),
+            ),
+            (
+                DisturbanceKind::SensorDropout,
+                share("sensor_dropout", "probability that an observed number is lost", 1.0).off(0.0),
+            ),
+        ]);
+        let is_free = |name: &str| {
+            spec.parameters.iter().all(|own| own.name != name) && spec.applied.iter().all(|own| own.name != name)
+        };
+        entries.retain(|(_, parameter)| is_free(parameter.name));
+        Self { entries, action_width }
+    }
+
+    /// The disturbances as parameters, in order.
+    pub(super) fn parameters(&self) -> impl Iterator<Item = Parameter> + '_ {
+        self.entries.iter().map(|(_, parameter)| *parameter)
+    }
+
+    /// Returns the most numbers of late actions, and of late observations of `observation_size` numbers.
+    pub(super) fn max_late_numbers(&self, observation_size: usize) -> (usize, usize) {
+        let longest = |wanted: DisturbanceKind| {
+            let entry = self.entries.iter().find(|(kind, _)| *kind == wanted);
+            entry.map_or(0, |(_, parameter)| parameter.bounds.high as usize)
+        };
+        let actions = longest(DisturbanceKind::ActionDelay) * self.action_width;
+        (actions, longest(DisturbanceKind::SensorDelay) * observation_size)
+    }
+
+    /// The values of no disturbance.
+    pub(super) fn defaults(&self) -> DisturbanceValues {
+        DisturbanceValues {
+            action_delay: 0,
+            action_hold: 0.0,
+            action_noise: 0.0,
+            action_scales: vec![1.0; self.action_width],
+            sensor_delay: 0,
+            sensor_noise: 0.0,
+            sensor_dropout: 0.0,
+        }
+    }
+
+    /// Takes a value for each disturbance, in order, each within its bounds.
+    pub(super) fn set(&self, values: &mut DisturbanceValues, numbers: &[f64]) {
+        values.action_scales.fill(1.0);
+        for (&(kind, _), &number) in self.entries.iter().zip(numbers) {
+            match kind {
+                DisturbanceKind::ActionDelay => values.action_delay = number as usize,
+                DisturbanceKind::ActionHold => values.action_hold = number,
+                DisturbanceKind::ActionNoise => values.action_noise = number,
+                DisturbanceKind::ActionScale => values.action_scales.iter_mut().for_each(|scale| *scale *= number),
+                DisturbanceKind::ActuatorScale(place) => values.action_scales[place] *= number,
+                DisturbanceKind::SensorDelay => values.sensor_delay = number as usize,
+                DisturbanceKind::SensorNoise => values.sensor_noise = number,
+                DisturbanceKind::SensorDropout => values.sensor_dropout = number,
+            }
+        }
+    }
+
+    /// Reads the values back from those in force, in order. The scale of all actuators and that of one are known by their
+    /// product alone, so `numbers`, what was set, tells them apart.
+    pub(super) fn read(&self, values: &DisturbanceValues, numbers: &[f64], out: &mut [f64]) {
+        for ((&(kind, _), &number), out) in self.entries.iter().zip(numbers).zip(out) {
+            *out = match kind {
+                DisturbanceKind::ActionDelay => values.action_delay as f64,
+                DisturbanceKind::ActionHold => values.action_hold,
+                DisturbanceKind::ActionNoise => values.action_noise,
+                DisturbanceKind::ActionScale | DisturbanceKind::ActuatorScale(_) => number,
+                DisturbanceKind::SensorDelay => values.sensor_delay as f64,
+                DisturbanceKind::SensorNoise => values.sensor_noise,
+                DisturbanceKind::SensorDropout => values.sensor_dropout,
+            };
+        }
+    }
+}

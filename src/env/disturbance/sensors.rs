@@ -1,0 +1,116 @@
+//! The way of an observation to the policy: late, noisy, lost.
+
+use super::parameters::DisturbanceValues;
+use crate::env::{Channel, Draw, Error, Purpose, Stream};
+
+/// The observations of one environment that are under way.
+pub(super) struct SensorPath {
+    channels: &'static [Channel],
+    /// The exact observations that have not been seen yet, with the last one that was: a ring of `sensor_delay` + 1 times
+    /// `[O]`.
+    exact: Vec<f32>,
+    /// The place of the newest of them, in numbers.
+    newest: usize,
+    /// The observation that is seen, `[O]`.
+    seen: Vec<f32>,
+}
+
+impl SensorPath {
+    /// The path of an environment with these entries of observations.
+    pub(super) fn new(channels: &'static [Channel]) -> Self {
+        Self { channels, exact: vec![0.0; channels.len()], newest: 0, seen: vec![0.0; channels.len()] }
+    }
+
+    /// Begins an episode with its first exact observation, which `observe` writes. It is seen until the next one arrives.
+    pub(super) fn begin(&mut self, values: &DisturbanceValues, draw: &Draw, observe: impl FnOnce(&mut [f32])) {
+        let width = self.channels.len();
+        self.exact.resize((values.sensor_delay + 1) * width, 0.0);
+        let (first, others) = self.exact.split_at_mut(width);
+        observe(first);
+        others.chunks_exact_mut(width.max(1)).for_each(|other| other.copy_from_slice(first));
+        self.newest = 0;
+        self.see(values, draw, 0);
+    }
+
+    /// Takes the exact observation after so many steps, which `observe` writes.
+    pub(super) fn pass(
+        &mut self,
+        values: &DisturbanceValues,
+        draw: &Draw,
+        steps: u32,
+        observe: impl FnOnce(&mut [f32]),
+    ) {
+        let width = self.channels.len();
+        self.newest = (self.newest + width) % self.exact.len().max(1);
+        observe(&mut self.exact[self.newest..][..width]);
+        self.see(values, draw, steps);
+    }
+
+    /// The observation that is seen, `[O]`.
+    pub(super) fn seen(&self) -> &[f32] {
+        &self.seen
+    }
+
+    /// Computes what is seen: the oldest observation of the ring, disturbed.
+    fn see(&mut self, values: &DisturbanceValues, draw: &Draw, steps: u32) {
+        let width = self.channels.len();
+        let oldest = (self.newest + width) % self.exact.len().max(1);
+        self.seen.copy_from_slice(&self.exact[oldest..][..width]);
+        if values.sensor_noise > 0.0 {
+            let mut stream = Stream::at_step(draw, Purpose::SensorNoise, steps);
+            for (entries, channels) in self.seen.chunks_mut(2).zip(self.channels.chunks(2)) {
+                for ((entry, channel), normal) in entries.iter_mut().zip(channels).zip(stream.normals()) {
+                    if channel.scale > 0.0 {
+                        let noisy = f64::from(*entry) + values.sensor_noise * channel.scale * normal;
+                        let (low, high) = (channel.low.max(f32::MIN.into()), channel.high.min(f32::MAX.into()));
+                        *entry = noisy.clamp(low, high) as f32;
+                    }
+                }
+            }
+        }
+        if values.sensor_dropout > 0.0 {
+            let mut stream = Stream::at_step(draw, Purpose::SensorDropout, steps);
+            for (entry, channel) in self.seen.iter_mut().zip(self.channels) {
+                let is_lost = stream.unit() < values.sensor_dropout;
+                if is_lost && channel.scale > 0.0 {
+                    *entry = 0.0_f64.clamp(channel.low, channel.high) as f32;
+                }
+            }
+        }
+    }
+
+    /// The numbers that [`SensorPath::save`] appends.
+    pub(super) fn n_saved(&self, values: &DisturbanceValues) -> usize {
+        values.sensor_delay * self.channels.len()
+    }
+
+    /// Appends the exact observations but the newest, from the oldest on.
+    pub(super) fn save(&self, out: &mut Vec<f64>) {
+        let (newer, older) = self.exact.split_at(self.newest);
+        let older = &older[self.channels.len()..];
+        out.extend(older.iter().chain(newer).map(|&number| f64::from(number)));
+    }
+
+    /// Takes back what was saved, as many numbers as [`SensorPath::n_saved`], with the newest exact observation, which
+    /// `observe` writes.
+    ///
+    /// # Errors
+    /// [`Error::Snapshot`] for a number that cannot be observed; the path is undefined then.
+    pub(super) fn load(
+        &mut self,
+        values: &DisturbanceValues,
+        (draw, steps): (&Draw, u32),
+        saved: &[f64],
+        observe: impl FnOnce(&mut [f32]),
+    ) -> Result<(), Error> {
+        if let Some(number) = saved.iter().find(|number| !(**number as f32).is_finite()) {
+            return Err(Error::Snapshot { reason: format!("{number} is in one of its late observations") });
+        }
+        self.exact.resize((values.sensor_delay + 1) * self.channels.len(), 0.0);
+        self.newest = saved.len();
+        self.exact.iter_mut().zip(saved).for_each(|(to, from)| *to = *from as f32);
+        observe(&mut self.exact[self.newest..]);
+        self.see(values, draw, steps);
+        Ok(())
+    }
+}

@@ -1,0 +1,88 @@
+//! An environment that observes the actions that act on it.
+
+use perturb::{
+    env::{
+        Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, RewardTerm, Stream,
+        Success, Transition,
+    },
+    scene::Scene,
+};
+
+/// Two motors; their last actions, the number of steps, and a constant are observed.
+pub static SPEC: EnvironmentSpec = EnvironmentSpec {
+    name: "Echo",
+    revision: 0,
+    description: "Observe what acts.",
+    make: &|| Ok(Box::new(Echo { state: [f64::NAN; 4] })),
+    parameters: &[],
+    observation: &[
+        Channel::unbounded("left", "1"),
+        Channel::unbounded("right", "1").scale(3.0),
+        Channel::unbounded("steps", "1"),
+        Channel::unbounded("constant", "1").scale(0.0),
+    ],
+    action: ActionSpace::Continuous(&[Channel::new("left", "1", -1.0, 1.0), Channel::new("right", "1", 0.5, 2.5)]),
+    state: &[],
+    reward_terms: &[RewardTerm { name: "left", description: "the left action" }],
+    applied: &[],
+    step_limit: 1_000_000,
+    control_timestep: 1.0,
+    step_cost: 0.1,
+    success: Success {
+        description: "never",
+        achievement: Achievement::FirstGoal,
+        comparison: Comparison::AtMost,
+        threshold: 0.0,
+    },
+    code_success: None,
+    heatmap_axes: None,
+};
+
+/// The constant that is observed.
+pub const CONSTANT: f32 = 7.0;
+
+struct Echo {
+    state: [f64; 4],
+}
+
+impl Environment for Echo {
+    fn spec(&self) -> &'static EnvironmentSpec {
+        &SPEC
+    }
+
+    fn set_parameters(&mut self, _: &[f64]) {}
+
+    fn applied(&self, _: &mut [f64]) {}
+
+    fn reset(&mut self, _: &mut Stream) {
+        self.state = [0.0, 0.0, 0.0, CONSTANT.into()];
+    }
+
+    fn reset_to(&mut self, _: &[f64]) {
+        self.state = [0.0, 0.0, 0.0, CONSTANT.into()];
+    }
+
+    fn observe(&self, out: &mut [f32]) {
+        out.copy_from_slice(&self.state.map(|x| x as f32));
+    }
+
+    fn scene(&self) -> Option<Scene> {
+        None
+    }
+
+    fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
+        let Action::Continuous(&[left, right]) = action else { unreachable!("two motors") };
+        self.state = [left.into(), right.into(), self.state[2] + 1.0, self.state[3]];
+        reward_terms[0] = left.into();
+        Transition { terminated: false, goal: false, diverged: false }
+    }
+
+    fn save(&self, out: &mut Vec<f64>) {
+        out.extend_from_slice(&self.state);
+    }
+
+    fn load(&mut self, state: &[f64]) -> Result<(), Error> {
+        self.state = state.try_into().map_err(|_| Error::Snapshot { reason: "four numbers".into() })?;
+        Ok(())
+    }
+}

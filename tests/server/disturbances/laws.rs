@@ -1,0 +1,207 @@
+//! The law of each disturbance, exactly, by an environment that observes what acts on it.
+
+use super::{disturbed, echo};
+use crate::common::observe;
+use perturb::env::{Action, Draw, Episodes, Purpose, Stream, Version};
+
+/// Draws for the distribution of a law.
+const DRAWS: u32 = 100_000;
+/// What the largest difference of two distribution functions, times √n, is below in 999 of 1000 samples (Kolmogorov). The
+/// samples here are always the same.
+const MAX_KOLMOGOROV: f64 = 1.95;
+/// Standard deviations within which a count of successes is in more than 9999 of 10 000 samples.
+const MAX_DEVIATIONS: f64 = 4.0;
+/// The neutral action: 0, or the end of the range that is nearest to 0.
+const NEUTRAL: [f32; 2] = [0.0, 0.5];
+const ADDRESS: (u64, u32) = (5, 9);
+
+fn echo(values: &[(&str, f64)]) -> Episodes {
+    disturbed(&echo::SPEC, Version::D, values, ADDRESS)
+}
+
+/// The action of step `t`: every one is another.
+fn action(t: u32) -> [f32; 2] {
+    [t as f32 + 1.0, -(t as f32) - 2.0]
+}
+
+/// Takes `steps` steps and returns what acted in each.
+fn acted(episodes: &mut Episodes, steps: u32, action: impl Fn(u32) -> [f32; 2]) -> Vec<[f32; 2]> {
+    let mut terms = [0.0];
+    let step = |t| {
+        episodes.step(Action::Continuous(&action(t)), &mut terms);
+        let seen = observe(episodes);
+        [seen[0], seen[1]]
+    };
+    (0..steps).map(step).collect()
+}
+
+/// The stream of a step of the first episode.
+fn stream(purpose: Purpose, step: u32) -> Stream {
+    let draw = Draw { seed: ADDRESS.0, environment_index: ADDRESS.1, episode_index: 0 };
+    Stream::at_step(&draw, purpose, step)
+}
+
+/// Checks that a sample is of the normal distribution with this mean and standard deviation.
+fn assert_normal(mut sample: Vec<f64>, mean: f64, deviation: f64) {
+    sample.sort_by(f64::total_cmp);
+    let n = sample.len() as f64;
+    let expected = |x: f64| 0.5 * libm::erfc(-(x - mean) / (deviation * std::f64::consts::SQRT_2));
+    let distance = |(i, &x): (usize, &f64)| {
+        let (below, at) = (i as f64 / n, (i + 1) as f64 / n);
+        (expected(x) - below).abs().max((at - expected(x)).abs())
+    };
+    let largest = sample.iter().enumerate().map(distance).fold(0.0, f64::max);
+    assert!(largest * n.sqrt() < MAX_KOLMOGOROV, "{}", largest * n.sqrt());
+}
+
+/// Checks that `count` of `n` events are as many as events of this probability are.
+fn assert_frequency(count: usize, n: usize, probability: f64) {
+    let (expected, deviation) = (n as f64 * probability, (n as f64 * probability * (1.0 - probability)).sqrt());
+    let deviations = (count as f64 - expected) / deviation;
+    assert!(deviations.abs() < MAX_DEVIATIONS, "{count} of {n}, {deviations} deviations from {expected}");
+}
+
+#[test]
+fn late_actions_act_after_the_delay() {
+    let acted = acted(&mut echo(&[("action_delay", 3.0)]), 20, action);
+    assert_eq!(acted[..3], [NEUTRAL; 3]);
+    assert_eq!(acted[3..], (0..17).map(action).collect::<Vec<_>>());
+}
+
+#[test]
+fn held_actions_act_again() {
+    const PROBABILITY: f64 = 0.3;
+    let acted = acted(&mut echo(&[("action_hold", PROBABILITY)]), DRAWS, action);
+    assert_eq!(acted[0], action(0), "there is no action to hold yet");
+    let is_held: Vec<bool> = (1..DRAWS).map(|t| acted[t as usize] == acted[t as usize - 1]).collect();
+    for (t, &is_held) in (1..DRAWS).zip(&is_held) {
+        assert_eq!(is_held, stream(Purpose::ActionHold, t).unit() < PROBABILITY, "step {t}");
+        assert!(is_held || acted[t as usize] == action(t), "step {t}");
+    }
+    assert_frequency(is_held.iter().filter(|is_held| **is_held).count(), is_held.len(), PROBABILITY);
+}
+
+#[test]
+fn noise_on_actions_is_normal_and_a_share_of_the_range() {
+    let acted = acted(&mut echo(&[("action_noise", 0.1)]), DRAWS, |_| [0.25, 1.0]);
+    for (t, acted) in (0..DRAWS).zip(&acted) {
+        let [left, right] = stream(Purpose::ActionNoise, t).normals();
+        assert_eq!(*acted, [(0.25 + 0.1 * 2.0 * left) as f32, (1.0 + 0.1 * 2.0 * right) as f32], "step {t}");
+    }
+    assert_normal(acted.iter().map(|acted| acted[0].into()).collect(), 0.25, 0.2);
+    assert_normal(acted.iter().map(|acted| acted[1].into()).collect(), 1.0, 0.2);
+}
+
+#[test]
+fn scales_weaken_all_motors_or_one() {
+    let acting = |values: &[(&str, f64)]| acted(&mut echo(values), 1, |_| [0.5, 2.5])[0];
+    assert_eq!(acting(&[("action_scale", 0.5)]), [0.25, 1.5], "towards the neutral action");
+    assert_eq!(acting(&[("action_scale_left", 0.5)]), [0.25, 2.5]);
+    assert_eq!(acting(&[("action_scale_right", 0.0)]), [0.5, NEUTRAL[1]]);
+    assert_eq!(acting(&[("action_scale", 0.5), ("action_scale_left", 0.5)]), [0.125, 1.5], "their product");
+}
+
+#[test]
+fn actions_pass_delay_hold_noise_and_scale_in_order() {
+    let values = [("action_delay", 2.0), ("action_hold", 0.5), ("action_noise", 0.1), ("action_scale", 0.5)];
+    let acted = acted(&mut echo(&values), 200, action);
+    let mut held = NEUTRAL;
+    for (t, acted) in (0..200).zip(acted) {
+        if t == 0 || stream(Purpose::ActionHold, t).unit() >= 0.5 {
+            held = if t < 2 { NEUTRAL } else { action(t - 2) };
+        }
+        let normals = stream(Purpose::ActionNoise, t).normals();
+        let expected: [f32; 2] = std::array::from_fn(|i| {
+            let noisy = (f64::from(held[i]) + 0.1 * 2.0 * normals[i]) as f32;
+            let neutral = f64::from(NEUTRAL[i]);
+            (neutral + 0.5 * (f64::from(noisy) - neutral)) as f32
+        });
+        assert_eq!(acted, expected, "step {t}");
+    }
+}
+
+/// Takes steps, whose number is observed, and returns what is seen at first and after each.
+fn seen(episodes: &mut Episodes, steps: u32) -> Vec<Vec<f32>> {
+    let first = observe(episodes);
+    let mut terms = [0.0];
+    let step = |t| {
+        episodes.step(Action::Continuous(&action(t)), &mut terms);
+        assert_eq!(terms[0], f64::from(action(t)[0]), "rewards are exact");
+        observe(episodes)
+    };
+    std::iter::once(first).chain((0..steps).map(step)).collect()
+}
+
+#[test]
+fn late_observations_are_seen_after_the_delay() {
+    let seen = seen(&mut echo(&[("sensor_delay", 3.0)]), 20);
+    let steps: Vec<f32> = seen.iter().map(|seen| seen[2]).collect();
+    assert_eq!(steps[..4], [0.0; 4], "the first one is seen until the next arrives");
+    assert_eq!(steps[3..], (0..18).map(|t| t as f32).collect::<Vec<_>>());
+}
+
+#[test]
+fn noise_on_observations_is_normal_and_a_share_of_the_scale() {
+    let seen = seen(&mut echo(&[("sensor_noise", 0.1)]), DRAWS);
+    let exact = |t: u32| if t == 0 { [0.0, 0.0] } else { action(t - 1).map(f64::from) };
+    let mut noise = [Vec::new(), Vec::new()];
+    for (t, seen) in (0..=DRAWS).zip(&seen) {
+        let mut stream = stream(Purpose::SensorNoise, t);
+        let ([left, right], [steps, _]) = (stream.normals(), stream.normals());
+        let expected = [exact(t)[0] + 0.1 * left, exact(t)[1] + 0.1 * 3.0 * right, f64::from(t) + 0.1 * steps];
+        assert_eq!(seen[..3], expected.map(|x| x as f32), "step {t}");
+        assert_eq!(seen[3], echo::CONSTANT, "step {t}");
+        noise[0].push(0.1 * left);
+        noise[1].push(0.1 * 3.0 * right);
+    }
+    let [left, right] = noise;
+    assert_normal(left, 0.0, 0.1);
+    assert_normal(right, 0.0, 0.3);
+}
+
+#[test]
+fn lost_observations_read_zero() {
+    const PROBABILITY: f64 = 0.2;
+    let seen = seen(&mut echo(&[("sensor_dropout", PROBABILITY)]), DRAWS);
+    let mut lost = [0; 3];
+    // Before the first step all of it is 0.
+    for (t, seen) in (1..=DRAWS).zip(&seen[1..]) {
+        let mut stream = stream(Purpose::SensorDropout, t);
+        for (entry, lost) in seen.iter().zip(&mut lost) {
+            assert_eq!(*entry == 0.0, stream.unit() < PROBABILITY, "step {t}");
+            *lost += usize::from(*entry == 0.0);
+        }
+        assert_eq!(seen[3], echo::CONSTANT, "step {t}");
+    }
+    lost.iter().for_each(|&lost| assert_frequency(lost, DRAWS as usize, PROBABILITY));
+}
+
+#[test]
+fn observations_pass_delay_noise_and_dropout_in_order() {
+    let values = [("sensor_delay", 2.0), ("sensor_noise", 0.1), ("sensor_dropout", 0.3)];
+    for (t, seen) in (0..=300).zip(seen(&mut echo(&values), 300)) {
+        let (mut noise, mut dropout) = (stream(Purpose::SensorNoise, t), stream(Purpose::SensorDropout, t));
+        let (_, [steps, _]) = (noise.normals(), noise.normals());
+        let (_, _, is_lost) = (dropout.unit(), dropout.unit(), dropout.unit() < 0.3);
+        let expected = if is_lost { 0.0 } else { f64::from(t.saturating_sub(2)) + 0.1 * steps };
+        assert_eq!(seen[2], expected as f32, "step {t}");
+    }
+}
+
+#[test]
+fn whole_numbers_are_drawn_as_likely() {
+    let mut settings = super::settings(&echo::SPEC, Version::D, &[], ADDRESS);
+    settings.distributions[0] = "0..4".parse().unwrap();
+    let spec = perturb::env::disturbance::disturbed(&echo::SPEC);
+    let mut episodes = Episodes::new((spec.make)().unwrap(), settings);
+    const EPISODES: usize = 20_000;
+    let mut counts = [0; 5];
+    for _ in 0..EPISODES {
+        let receipt = episodes.receipt();
+        assert_eq!(receipt.requested, receipt.applied);
+        assert_eq!(receipt.requested[0].fract(), 0.0);
+        counts[receipt.requested[0] as usize] += 1;
+        episodes.begin(None);
+    }
+    counts.iter().for_each(|&count| assert_frequency(count, EPISODES, 0.2));
+}

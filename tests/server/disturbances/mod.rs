@@ -1,0 +1,44 @@
+//! Disturbances: their laws, what they leave alone, and sessions with them.
+
+mod echo;
+mod environments;
+mod laws;
+mod sessions;
+
+use perturb::env::{Distribution, EnvironmentSpec, Episodes, Settings, Version, disturbance, resolve};
+
+/// Settings of a disturbed environment with these values beside those of the version.
+fn settings(
+    spec: &'static EnvironmentSpec,
+    version: Version,
+    values: &[(&str, f64)],
+    (seed, environment_index): (u64, u32),
+) -> Settings {
+    let spec = disturbance::disturbed(spec);
+    let mut distributions = spec.distributions(version);
+    resolve(spec, &mut distributions, values.iter().map(|&(name, value)| (name, Distribution::fixed(value)))).unwrap();
+    Settings { seed, environment_index, distributions, episodes_per_trial: 1 }
+}
+
+/// A disturbed environment with these values beside those of the version, at the start of its first episode.
+fn disturbed(
+    spec: &'static EnvironmentSpec,
+    version: Version,
+    values: &[(&str, f64)],
+    address: (u64, u32),
+) -> Episodes {
+    Episodes::new((disturbance::disturbed(spec).make)().unwrap(), settings(spec, version, values, address))
+}
+
+/// A value that disturbs, of each disturbance that the environment can have.
+fn all(spec: &'static EnvironmentSpec) -> Vec<(&'static str, f64)> {
+    let value = |name: &str| match name {
+        "action_delay" => 3.0,
+        "sensor_delay" => 2.0,
+        "action_scale" => 0.8,
+        name if name.starts_with("action_scale_") => 0.9,
+        "action_noise" | "sensor_noise" => 0.05,
+        _ => 0.1,
+    };
+    disturbance::disturbances(spec).iter().map(|parameter| (parameter.name, value(parameter.name))).collect()
+}
