@@ -1,4 +1,4 @@
-//! What an environment is: what it declares of itself, and the trait that it implements.
+//! The trait of environments, and the description that each gives of itself.
 
 use super::{
     Action, ActionSpace, Channel, Distribution, Draw, Error, Interval, Parameter, Quantity, RewardTerm, Stream,
@@ -11,16 +11,16 @@ use std::fmt;
 /// Makes an environment with default parameters.
 pub type MakeEnvironment = dyn Fn() -> Result<Box<dyn Environment>, Error> + Send + Sync;
 
-/// Everything that is fixed about an environment.
+/// The fixed description of an environment.
 #[derive(Clone, Copy)]
 pub struct EnvironmentSpec {
     /// The name to open it by.
     pub name: &'static str,
     /// Raised by every change of dynamics, reward or observation.
     pub revision: u32,
-    /// One sentence.
+    /// A description in one sentence.
     pub description: &'static str,
-    /// Makes one with default parameters; fails with [`Error::Model`] if its model cannot be loaded.
+    /// Makes an environment with default parameters; fails with [`Error::Model`] if its model cannot be loaded.
     pub make: &'static MakeEnvironment,
     /// The parameters that can be changed.
     pub parameters: &'static [Parameter],
@@ -30,19 +30,19 @@ pub struct EnvironmentSpec {
     pub action: ActionSpace,
     /// The entries of an exact initial state, `[S]`.
     pub state: &'static [Channel],
-    /// The reward is the sum of these, in order.
+    /// The terms of the reward, which is their sum, in order.
     pub reward_terms: &'static [RewardTerm],
-    /// What receipts read back from the physics.
+    /// The quantities that receipts read back from the physics.
     pub applied: &'static [Quantity],
-    /// An episode is truncated after this many steps.
+    /// The number of steps after which an episode is truncated.
     pub step_limit: u32,
     /// Simulated seconds in one step.
     pub control_timestep: f64,
-    /// What a step costs on one core, in µs, roughly: the pool cuts batches by it. Results never depend on it.
+    /// The approximate time of a step on one core, µs. The pool cuts batches by it; results do not depend on it.
     pub step_cost: f64,
-    /// When an episode is a success: as the paper says it.
+    /// The success rule of the paper's text.
     pub success: Success,
-    /// When it is one in the paper's published code; `None` if that is the same.
+    /// The success rule of the paper's published code; `None` if it is the same.
     pub code_success: Option<Success>,
     /// The two parameters, along x and along y, that show best where a policy works.
     pub heatmap_axes: Option<[&'static str; 2]>,
@@ -56,14 +56,14 @@ impl fmt::Debug for EnvironmentSpec {
 }
 
 impl EnvironmentSpec {
-    /// The distributions of a version, one for each parameter; of R+E those of R, then those of E:
+    /// Returns the distributions of a version, one for each parameter; for R+E those of R, then those of E, as in
     /// [`Settings::distributions`](super::Settings::distributions).
     pub fn distributions(&self, version: Version) -> Vec<Distribution> {
         let of = |&part: &Version| self.parameters.iter().map(move |parameter| parameter.distribution(part));
         version.parts().iter().flat_map(of).collect()
     }
 
-    /// The values that distributions, one for each parameter in each box, may have.
+    /// Returns the values that `distributions`, one for each parameter in each box, can give.
     pub fn region(&self, distributions: &[Distribution]) -> Region {
         let names = || self.parameters.iter().map(|parameter| parameter.name.to_owned());
         let boxes = distributions.chunks(self.parameters.len().max(1));
@@ -137,14 +137,15 @@ pub fn resolve<'a>(
     Ok(())
 }
 
-/// What one step did, besides the reward.
+/// The result of one step, besides the reward.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Transition {
-    /// The task ended the episode. The step limit is not the environment's business.
+    /// Whether the task ended the episode. Step limits are applied by [`Episodes`](super::Episodes).
     pub terminated: bool,
-    /// The goal that [`Achievement::FirstGoal`](super::Achievement::FirstGoal) and [`Achievement::LastGoals`](super::Achievement::LastGoals) count holds after this step.
+    /// Whether the goal holds after this step, which [`Achievement::FirstGoal`](super::Achievement::FirstGoal) and
+    /// [`Achievement::LastGoals`](super::Achievement::LastGoals) count.
     pub goal: bool,
-    /// The physics diverged: the state is not finite. Implies `terminated`.
+    /// Whether the physics diverged: the state is not finite. Implies `terminated`.
     pub diverged: bool,
 }
 
@@ -153,11 +154,11 @@ pub struct Transition {
 /// After construction the parameters are the defaults and the state is some valid state; callers set parameters and
 /// reset before they step. Every method is deterministic: the same calls give the same bytes.
 pub trait Environment: Send {
-    /// What is fixed about it.
+    /// Returns the environment's description.
     fn spec(&self) -> &'static EnvironmentSpec;
 
-    /// Applies parameters, in the spec's order, each within its bounds (the caller's duty), always starting from the
-    /// pristine model. The state is undefined until the next reset.
+    /// Applies parameters, in the spec's order, always starting from the unchanged model. The caller ensures that each
+    /// is within its bounds. The state is undefined until the next reset.
     fn set_parameters(&mut self, values: &[f64]);
 
     /// Reads back from the physics the values of [`EnvironmentSpec::applied`], in order.
@@ -168,7 +169,8 @@ pub trait Environment: Send {
         ""
     }
 
-    /// What the episode achieved so far, where the spec's [`Achievement`](super::Achievement) is the environment's own.
+    /// Returns the value that the episode achieved so far, if the spec's [`Achievement`](super::Achievement) is the
+    /// environment's own.
     fn achieved(&self) -> Option<f64> {
         None
     }
@@ -193,13 +195,13 @@ pub trait Environment: Send {
     /// Draws an initial state.
     fn reset(&mut self, stream: &mut Stream);
 
-    /// Starts from an exact state, `[S]`, finite (the caller's duty).
+    /// Starts from an exact state, `[S]`. The caller ensures that it is finite.
     fn reset_to(&mut self, state: &[f64]);
 
     /// Writes the current observation, `[O]`.
     fn observe(&self, out: &mut [f32]);
 
-    /// What a picture of the current state shows; none where the physics diverged and no state is left to be shown.
+    /// Returns the content of a picture of the current state; `None` after the physics diverged.
     fn scene(&self) -> Option<Scene>;
 
     /// Advances by one control step and writes the reward's terms, in the spec's order.
@@ -213,7 +215,7 @@ pub trait Environment: Send {
         0
     }
 
-    /// Takes back what [`Environment::save`] wrote, after the same parameters were set.
+    /// Loads a state that [`Environment::save`] wrote, after the same parameters were set.
     ///
     /// # Errors
     /// [`Error::Snapshot`] if the length or a value is impossible; the state is undefined then.

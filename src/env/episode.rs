@@ -1,28 +1,28 @@
-//! One environment and its episodes: trials, step limit, success, receipts, snapshots.
+//! Episodes of one environment: trials, step limit, success, receipts, snapshots.
 
 use super::{
     Achievement, Action, Distribution, Draw, Environment, EnvironmentSpec, Purpose, Stream, seen::SeenParameters,
 };
 use crate::scene::Scene;
 
-/// What fixes an environment's episodes.
+/// The settings that determine an environment's episodes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
     /// The seed.
     pub seed: u64,
     /// The environment's index: with the seed and an episode's number it fixes all randomness.
     pub environment_index: u32,
-    /// One for each parameter, in the spec's order, within the parameters' bounds: a box. Or two boxes, one after the
-    /// other: a trial is of one of them, each as likely.
+    /// A box is a distribution for each parameter, in the spec's order, within the parameters' bounds. There is one
+    /// box, or there are two, one after the other; each trial is drawn from one of them with equal probability.
     pub distributions: Vec<Distribution>,
     /// Episodes in a trial, at least 1. Parameters are drawn when a trial begins.
     pub episodes_per_trial: u32,
 }
 
-/// As many as R+E has.
-pub(super) const MOST_BOXES: usize = 2;
+/// Maximum number of boxes, which R+E has.
+pub(super) const MAX_BOXES: usize = 2;
 
-/// Names an episode.
+/// The address of an episode within its seed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct EpisodeId {
     /// The environment's index.
@@ -35,7 +35,7 @@ pub struct EpisodeId {
     pub episode_in_trial: u32,
 }
 
-/// What physics an episode ran with.
+/// The physics that an episode ran with.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Receipt {
     /// The parameters that were drawn or given, in the spec's order.
@@ -49,45 +49,45 @@ pub struct Receipt {
 /// An episode that began.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EpisodeStart {
-    /// Which one.
+    /// The episode's address.
     pub id: EpisodeId,
-    /// Its receipt, if wanted.
+    /// The episode's receipt, if requested.
     pub receipt: Option<Receipt>,
 }
 
 /// An episode that ended.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EpisodeEnd {
-    /// Which one.
+    /// The episode's address.
     pub id: EpisodeId,
-    /// Undiscounted sum of rewards.
+    /// The undiscounted sum of rewards.
     pub total_reward: f64,
-    /// Steps.
+    /// The number of steps.
     pub length: u32,
-    /// What the spec's success rule compares, if there is any.
+    /// The value that the spec's success rule compares; `None` if the episode achieved none.
     pub achieved: Option<f64>,
-    /// What the rule of the paper's published code compares, if there is any.
+    /// The value that the rule of the paper's published code compares; `None` if the episode achieved none.
     pub code_achieved: Option<f64>,
     /// Whether the spec's rule holds.
     pub success: bool,
     /// Whether the physics diverged.
     pub diverged: bool,
-    /// Its receipt, if wanted.
+    /// The episode's receipt, if requested.
     pub receipt: Option<Receipt>,
 }
 
-/// What one step did to an episode.
+/// The outcome of one step of an episode.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Outcome {
-    /// Sum of the reward's terms.
+    /// The sum of the reward's terms.
     pub reward: f64,
-    /// The task ended the episode.
+    /// Whether the task ended the episode.
     pub terminated: bool,
-    /// The step limit ended it.
+    /// Whether the step limit ended the episode.
     pub truncated: bool,
 }
 
-/// Where an environment stands in its episodes.
+/// The position of an environment in its episodes.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize, serde::Deserialize)]
 pub(super) struct Progress {
     pub(super) trial: u64,
@@ -97,9 +97,10 @@ pub(super) struct Progress {
     pub(super) total_reward: f64,
     /// The first step after which the goal held, counted from 1; 0 if none.
     pub(super) reached_at: u32,
-    /// The number of last steps after all of which the goal held.
+    /// The number of successive steps up to the last one after all of which the goal held.
     pub(super) held_for: u32,
-    /// The most successive steps after all of which the goal held. Saved apart, as the youngest of all.
+    /// The largest number of successive steps after all of which the goal held. Snapshots store it after the others,
+    /// because older snapshots lack it.
     #[serde(skip)]
     pub(super) held_longest: u32,
     pub(super) ended: bool,
@@ -110,42 +111,45 @@ pub(super) struct Progress {
 pub struct Episodes {
     pub(super) environment: Box<dyn Environment>,
     pub(super) settings: Settings,
-    /// The parameters in force.
+    /// The parameters of the current trial, `[P]`.
     pub(super) values: Vec<f64>,
     pub(super) progress: Progress,
-    /// What observations have at their end, if they do.
+    /// The parameters at the end of observations, if observations have them.
     pub(super) seen: Option<Box<SeenParameters>>,
 }
 
-/// How many boxes so many distributions are of, for `n` parameters; `None` if they cannot be. Without parameters one.
+/// Returns the number of boxes that so many distributions are for `n` parameters; `None` if they are no whole number of
+/// boxes. Without parameters there is one box.
 pub(super) fn boxes(distributions: usize, n: usize) -> Option<usize> {
-    (1..=MOST_BOXES).find(|boxes| boxes * n == distributions)
+    (1..=MAX_BOXES).find(|boxes| boxes * n == distributions)
 }
 
 impl Episodes {
     /// Takes an environment and begins its first episode.
     pub fn new(environment: Box<dyn Environment>, settings: Settings) -> Self {
         let n = environment.spec().parameters.len();
-        assert!(boxes(settings.distributions.len(), n).is_some(), "one for each parameter in each box");
+        assert!(
+            boxes(settings.distributions.len(), n).is_some(),
+            "settings.distributions has one distribution for each parameter in each box"
+        );
         let values = vec![0.0; n];
         let mut episodes = Self { environment, settings, values, progress: Progress::default(), seen: None };
         episodes.start(None);
         episodes
     }
 
-    /// The same with the parameters at the end of observations, as
-    /// [`Parameter::observed`](super::Parameter::observed) says.
+    /// Appends the parameters to observations, scaled by [`Parameter::observed`](super::Parameter::observed).
     pub fn observing_parameters(mut self) -> Self {
-        self.seen = Some(Box::new(SeenParameters::of(self.environment.as_ref())));
+        self.seen = Some(Box::new(SeenParameters::new(self.environment.as_ref())));
         self
     }
 
-    /// What is fixed about the environment.
+    /// Returns the environment's description.
     pub fn spec(&self) -> &'static EnvironmentSpec {
         self.environment.spec()
     }
 
-    /// What fixes the episodes.
+    /// Returns the settings that determine the episodes.
     pub fn settings(&self) -> &Settings {
         &self.settings
     }
@@ -186,7 +190,7 @@ impl Episodes {
             let mut stream = Stream::new(seed, environment_index.into(), Purpose::Parameters, self.progress.trial);
             let n = self.values.len();
             let boxes = boxes(distributions.len(), n).unwrap_or(1);
-            // Of a single box nothing is drawn: the numbers of its trials are those of the parameters alone.
+            // A single box takes no random number, so that versions D, R and E draw for the parameters alone.
             let chosen = if boxes > 1 { (stream.unit() * boxes as f64) as usize } else { 0 };
             let parameters = self.environment.spec().parameters;
             for ((value, distribution), parameter) in
@@ -208,7 +212,8 @@ impl Episodes {
         }
     }
 
-    /// Advances the running episode by one step. `reward_terms` is scratch of the spec's number of terms.
+    /// Advances the running episode by one step. Writes the reward's terms to `reward_terms`, which has the spec's number
+    /// of terms.
     pub fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Outcome {
         let transition = self.environment.step(action, reward_terms);
         let reward = reward_terms.iter().sum();
@@ -230,7 +235,7 @@ impl Episodes {
         Outcome { reward, terminated: transition.terminated, truncated }
     }
 
-    /// After parameters were set.
+    /// Reads the observed parameters again, after parameters were set.
     pub(super) fn see_parameters(&mut self) {
         if let Some(seen) = &mut self.seen {
             seen.read(self.environment.as_ref());
@@ -245,7 +250,7 @@ impl Episodes {
         parameters.copy_from_slice(entries);
     }
 
-    /// What a picture of the current state shows; none where the physics diverged.
+    /// Returns the content of a picture of the current state; `None` after the physics diverged.
     pub fn scene(&self) -> Option<Scene> {
         self.environment.scene()
     }
@@ -255,7 +260,7 @@ impl Episodes {
         self.progress.ended
     }
 
-    /// The current episode's name.
+    /// Returns the current episode's address.
     pub fn id(&self) -> EpisodeId {
         EpisodeId {
             environment_index: self.settings.environment_index,
@@ -265,20 +270,20 @@ impl Episodes {
         }
     }
 
-    /// Where the environment draws from, and how far it is.
+    /// Returns the address of the environment's random numbers now.
     pub fn draw(&self) -> Draw {
         let Settings { seed, environment_index, .. } = self.settings;
         Draw { seed, environment_index, episode_index: self.progress.episode }
     }
 
-    /// The physics of the current episode.
+    /// Returns the receipt of the current episode.
     pub fn receipt(&self) -> Receipt {
         let mut applied = vec![0.0; self.spec().applied.len()];
         self.environment.applied(&mut applied);
         Receipt { requested: self.values.clone(), applied, model_hash: self.environment.model_hash().into() }
     }
 
-    /// Adds what the receipt has: the requested values, then the applied ones.
+    /// Appends the values of the receipt: the requested ones, then the applied ones.
     pub fn push_receipt(&self, values: &mut Vec<f64>) {
         values.extend_from_slice(&self.values);
         let requested = values.len();
@@ -286,12 +291,12 @@ impl Episodes {
         self.environment.applied(&mut values[requested..]);
     }
 
-    /// The current episode as one that began.
+    /// Returns the current episode as one that began, with its receipt if requested.
     pub fn started(&self, receipt: bool) -> EpisodeStart {
         EpisodeStart { id: self.id(), receipt: receipt.then(|| self.receipt()) }
     }
 
-    /// The current episode as one that ended.
+    /// Returns the current episode as one that ended, with its receipt if requested.
     pub fn finished(&self, receipt: bool) -> EpisodeEnd {
         let (progress, spec) = (&self.progress, self.spec());
         let achieved = self.achieved(spec.success.achievement);

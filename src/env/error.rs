@@ -1,14 +1,14 @@
-//! What can be wrong with a request about environments.
+//! Errors of requests about environments.
 
 use super::DistributionError;
 use perturb_protocol::names::UnknownEnvironment;
 
-/// The most characters of a client's text that a refusal repeats.
-const MOST_SHOWN: usize = 100;
+/// Maximum number of characters of a client's text that an error repeats.
+const MAX_SHOWN_CHARS: usize = 100;
 
-/// A client's text, short enough to be repeated to it.
+/// Shortens a client's text to [`MAX_SHOWN_CHARS`], for errors that repeat it.
 pub(crate) fn shorten(text: &str) -> String {
-    match text.char_indices().nth(MOST_SHOWN) {
+    match text.char_indices().nth(MAX_SHOWN_CHARS) {
         Some((end, _)) => format!("{}…", &text[..end]),
         None => text.into(),
     }
@@ -26,9 +26,9 @@ pub enum Error {
     UnknownParameter {
         /// The environment.
         environment: &'static str,
-        /// What was asked for.
+        /// The name that was requested.
         name: String,
-        /// The names there are, separated by commas.
+        /// The names of the environment's parameters, separated by commas.
         known: String,
     },
     /// A distribution is not a union of intervals.
@@ -36,7 +36,7 @@ pub enum Error {
     Distribution {
         /// The parameter.
         parameter: String,
-        /// What is wrong with it.
+        /// The fault of the distribution.
         source: DistributionError,
     },
     /// A parameter leaves its physical range.
@@ -50,9 +50,9 @@ pub enum Error {
         got: f64,
         /// The parameter's unit.
         unit: &'static str,
-        /// Least accepted value.
+        /// The minimum that is accepted.
         low: f64,
-        /// Greatest accepted value.
+        /// The maximum that is accepted.
         high: f64,
     },
     /// A session without disturbances is asked for one.
@@ -79,7 +79,7 @@ pub enum Error {
     /// A snapshot cannot be restored.
     #[error("the snapshot cannot be restored: {reason}; take a new one from a session of the same environment")]
     Snapshot {
-        /// Why.
+        /// The fault of the snapshot.
         reason: String,
     },
     /// Two environments of a server would have the same name.
@@ -97,14 +97,14 @@ pub enum Error {
     Model {
         /// The environment.
         environment: &'static str,
-        /// Why.
+        /// The reason.
         reason: String,
     },
 }
 
 impl Error {
-    /// The error for a parameter's distribution.
-    pub(crate) fn of(parameter: &str) -> impl FnOnce(DistributionError) -> Self {
+    /// Returns a conversion to the error of this parameter's distribution.
+    pub(crate) fn in_distribution(parameter: &str) -> impl FnOnce(DistributionError) -> Self {
         move |source| Self::Distribution { parameter: shorten(parameter), source }
     }
 }

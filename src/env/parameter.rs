@@ -1,4 +1,4 @@
-//! The physical parameters of an environment: what can be changed, within which bounds, and the sets of its versions.
+//! The physical parameters of an environment: their bounds, and the sets of the versions.
 
 use super::{Distribution, Interval, Version};
 
@@ -9,19 +9,20 @@ pub struct Parameter {
     pub name: &'static str,
     /// SI unit, `"1"` if dimensionless.
     pub unit: &'static str,
-    /// What it is.
+    /// The meaning, in a few words.
     pub description: &'static str,
-    /// Version D.
+    /// The value in version D.
     pub default: f64,
-    /// Version R.
+    /// The interval of version R.
     pub random: Interval,
-    /// Version E.
+    /// The intervals of version E, below and above that of R.
     pub extreme: [Interval; 2],
-    /// The physical range: nothing outside is accepted.
+    /// The physical range. Values outside are refused.
     pub bounds: Interval,
-    /// The quantity of [`EnvironmentSpec::applied`](super::EnvironmentSpec::applied) that reads it back, in the same unit.
+    /// The name in [`EnvironmentSpec::applied`](super::EnvironmentSpec::applied) of the quantity that reads this parameter
+    /// back, in the same unit.
     pub applied: &'static str,
-    /// Its values are whole numbers: of a distribution's intervals the whole numbers in them, each as likely.
+    /// Whether values are whole numbers: each whole number in a distribution's intervals is equally likely.
     pub is_integer: bool,
 }
 
@@ -43,8 +44,7 @@ impl Parameter {
         }
     }
 
-    /// The same with the sets of its versions: the value of D, the interval of R, and the interval that E fills up around
-    /// it.
+    /// Sets the versions: the value of D, the interval of R, and the interval whose part outside R is E.
     pub const fn versions(mut self, default: f64, random: (f64, f64), around: (f64, f64)) -> Self {
         self.default = default;
         self.random = Interval::new(random.0, random.1);
@@ -52,25 +52,25 @@ impl Parameter {
         self
     }
 
-    /// The same with a single value in all versions: nothing is drawn unless a client says so.
+    /// Sets one value for all versions, so that nothing is drawn unless a client gives a distribution.
     pub const fn off(self, default: f64) -> Self {
         self.versions(default, (default, default), (default, default))
     }
 
-    /// The same with whole numbers as values.
+    /// Makes the values whole numbers.
     pub const fn integer(mut self) -> Self {
         self.is_integer = true;
         self
     }
 
-    /// The same, read back by another quantity.
+    /// Sets the quantity that reads the parameter back.
     pub const fn read_back_by(mut self, applied: &'static str) -> Self {
         self.applied = applied;
         self
     }
 
-    /// The distribution of a version; of R+E, whose trials are of one of both for all parameters, the values that it
-    /// may have. Intervals without length, as a task's folder may have on one side of R, are left out.
+    /// Returns the distribution of a version. For R+E, whose trials are drawn from R or from E for all parameters together,
+    /// returns the union of both. Intervals without length, as a task's folder may have on one side of R, are left out.
     pub fn distribution(&self, version: Version) -> Distribution {
         let [below, above] = self.extreme;
         let intervals: &[Interval] = match version {
@@ -92,14 +92,14 @@ impl Parameter {
         whole.unwrap_or_else(|| distribution.at(u))
     }
 
-    /// From the least to the greatest value that R and E have.
+    /// Returns the interval from the minimum to the maximum of R and E.
     pub fn whole(&self) -> Interval {
         let [below, above] = self.extreme;
         Interval::new(self.random.low.min(below.low), self.random.high.max(above.high))
     }
 
-    /// A value as it is observed: -1 … 1 within [`Parameter::whole`], and linearly beyond it. Where that is a single
-    /// value, the distance from it.
+    /// Scales a value for observations: -1 … 1 within [`Parameter::whole`], and linearly beyond it. If that interval is a
+    /// single value, returns the distance from it.
     pub fn observed(&self, value: f64) -> f32 {
         let Interval { low, high } = self.whole();
         let distance = value - low;
@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn a_parameter_is_observed_on_the_whole_range_of_the_versions_and_beyond_it() {
+    fn observed_parameter_is_linear_within_and_beyond_versions() {
         let wider_e = Parameter::new("x", "1", "", (0.0, 100.0)).versions(2.0, (1.0, 3.0), (0.5, 4.5));
         let seen = |p: &Parameter, values: &[f64]| values.iter().map(|&value| p.observed(value)).collect::<Vec<_>>();
         assert_eq!(seen(&wider_e, &[0.5, 2.5, 4.5, 0.0, 8.5]), [-1.0, 0.0, 1.0, -1.25, 3.0]);

@@ -2,8 +2,8 @@
 //!
 //! Every draw comes from Philox 4×64-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", 2011), a
 //! function of a key and a counter with no other state. The key is `[seed, environment index]`, the counter
-//! `[block, index, purpose, 0]`, with `block` counting from 1: what ran before, on which thread or server, cannot
-//! matter. The layout is that of NumPy, so a few lines of Python repeat any stream (the arrays must be of type uint64:
+//! `[block, index, purpose, 0]`, with `block` counting from 1. So numbers do not depend on what ran before, or on the
+//! thread or server. The layout is that of NumPy, so a few lines of Python repeat any stream (the arrays must be of type uint64:
 //! lists lose digits of words from 2^63 on):
 //!
 //! ```python
@@ -14,7 +14,7 @@
 //!
 //! | purpose | index | draws, in order |
 //! |---|---|---|
-//! | 0 | trial | of R+E one below ½ for R; one number u in [0, 1) for each parameter, in the catalogue's order |
+//! | 0 | trial | for R+E first a number, below ½ for R; then one number u in [0, 1) for each parameter, in the catalogue's order |
 //! | 1 | episode | the initial state's numbers, in the order of the environment's document |
 //!
 //! Disturbances draw at each step. Their streams have the number of steps that the episode has taken in the last word of
@@ -27,7 +27,7 @@
 //! | 4 | of the observation, 0 after a reset | a [normal](Stream::normals) number for each entry of the observation |
 //! | 5 | of the observation, 0 after a reset | for each entry of the observation one below `sensor_dropout` to lose it |
 
-/// What a stream is for: the third word of the counter.
+/// The purpose of a stream: the third word of the counter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Purpose {
     /// A trial's parameters.

@@ -14,7 +14,7 @@ pub(super) struct SeenParameters {
 
 impl SeenParameters {
     /// Reads the parameters that an environment has now.
-    pub(super) fn of(environment: &dyn Environment) -> Self {
+    pub(super) fn new(environment: &dyn Environment) -> Self {
         let EnvironmentSpec { parameters, applied, .. } = environment.spec();
         let place = |parameter: &'static Parameter| {
             let place = applied.iter().position(|quantity| quantity.name == parameter.applied);

@@ -1,4 +1,4 @@
-//! Saving an environment whole, and bringing it back in another session, process or server.
+//! Snapshots of environments, which can be restored in another session, process or server.
 
 use super::{
     Distribution, Draw, EnvironmentSpec, Episodes, Error, Interval, Settings, check_bounds, check_distribution,
@@ -7,11 +7,11 @@ use super::{
 };
 use serde::{Deserialize, Serialize};
 
-/// Raised by every change of the layout below.
+/// The layout of snapshots. Raised by every change of [`Saved`] or of what follows it.
 const FORMAT: u32 = 3;
-/// The layout without a checksum, which ends snapshots since: CRC-32C, little-endian, of everything before it.
+/// The last layout without a checksum. Later snapshots end with one: CRC-32C, little-endian, of everything before it.
 const UNSEALED: u32 = 2;
-/// Nor with [`Progress::held_longest`], which follows [`Saved`] since.
+/// The first layout. Later snapshots have [`Progress::held_longest`] after [`Saved`].
 const FIRST: u32 = 1;
 
 /// Limit of a snapshot in bytes. The largest has a distribution of 64 intervals for each of 32 parameters and 39
@@ -22,7 +22,7 @@ pub const MAX_SNAPSHOT_BYTES: usize = 320 << 10;
 /// The most bytes by which a snapshot's counters can grow: small numbers have short encodings.
 const MAX_COUNTERS_GROWTH_BYTES: usize = 64;
 
-/// More episodes than any environment runs: a snapshot that claims more would let the counts overflow.
+/// Maximum episode index that a snapshot may have, so that counts do not overflow.
 const MAX_EPISODE: u64 = 1 << 63;
 
 /// Everything that an environment's future depends on, besides the actions. Random streams need no state of their own:
@@ -75,7 +75,7 @@ impl Episodes {
         self.snapshot().len() - distributions_bytes(&self.settings.distributions) + growth
     }
 
-    /// Brings a saved environment back: what follows is what followed the snapshot, byte for byte.
+    /// Restores a saved environment: it continues as it did after the snapshot, byte for byte.
     ///
     /// # Errors
     /// [`Error::Snapshot`]; nothing was changed then.
@@ -127,18 +127,18 @@ pub(crate) fn distributions_bytes(distributions: &[Distribution]) -> usize {
     distributions.iter().map(|distribution| 1 + size_of::<(f64, f64)>() * distribution.intervals().len()).sum()
 }
 
-/// What a saved environment draws from.
+/// The draws of a saved environment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SavedDraw {
-    /// Where its random numbers come from.
+    /// The address of its random numbers.
     pub draw: Draw,
-    /// What parameters are drawn from: [`Settings::distributions`].
+    /// The distributions of its parameters, as in [`Settings::distributions`].
     pub distributions: Vec<Distribution>,
-    /// The parameters in force, `[P]`, which a client may have made up.
+    /// The parameters of the current trial, `[P]`. A client may have forged them.
     pub values: Vec<f64>,
 }
 
-/// What a snapshot brings back, before it does.
+/// Reads what a snapshot draws from, without restoring it.
 ///
 /// # Errors
 /// [`Error::Snapshot`].
@@ -149,11 +149,11 @@ pub fn saved_draw(spec: &'static EnvironmentSpec, snapshot: &[u8]) -> Result<Sav
 }
 
 impl Saved {
-    /// All of a snapshot but its model is checked.
+    /// Reads a snapshot and checks everything but its model's hash.
     fn read(spec: &'static EnvironmentSpec, snapshot: &[u8]) -> Result<(Self, Vec<Distribution>), Error> {
         let refuse = |reason: String| Err(Error::Snapshot { reason });
         let unreadable = || refuse(format!("its {} bytes are not a snapshot", snapshot.len()));
-        // A byte of it may claim a list, which takes more than twenty.
+        // A list's entry in a snapshot may be one byte, and takes more than twenty in memory.
         if snapshot.len() > MAX_SNAPSHOT_BYTES {
             return unreadable();
         }
@@ -165,11 +165,11 @@ impl Saved {
             {
                 rest
             }
-            (FORMAT, _) => return refuse("it is not what was taken: its checksum is another".into()),
-            (format, _) => return refuse(format!("its format is {format}, this server reads 1 to {FORMAT}")),
+            (FORMAT, _) => return refuse("its checksum does not match: it was damaged after it was taken".into()),
+            (format, _) => return refuse(format!("its format is {format}, but this server reads 1 to {FORMAT}")),
         };
         saved.progress.held_longest = match (saved.format, rest) {
-            // That run is the longest that it knows of; a longer one before it is lost.
+            // The first layout has the last run only; a longer one before it is lost.
             (FIRST, []) => saved.progress.held_for,
             (FIRST, _) => return unreadable(),
             (_, rest) => match postcard::take_from_bytes(rest) {
@@ -180,7 +180,10 @@ impl Saved {
         if (saved.environment.as_str(), saved.revision) != (spec.name, spec.revision) {
             let Saved { environment, revision, .. } = saved;
             let environment = shorten(&environment).escape_debug().to_string();
-            return refuse(format!("it is of {environment}-v{revision}, this is {}-v{}", spec.name, spec.revision));
+            return refuse(format!(
+                "it is of {environment}-v{revision}, but this session is of {}-v{}",
+                spec.name, spec.revision
+            ));
         }
         let n = spec.parameters.len();
         if boxes(saved.distributions.len(), n).is_none() || saved.values.len() != n {
@@ -213,7 +216,8 @@ impl Saved {
         let each = parameters.zip(&saved.distributions);
         each.map(|((parameter, &value), pairs)| {
             let intervals: Vec<Interval> = pairs.iter().map(|&(low, high)| Interval { low, high }).collect();
-            let distribution = Distribution::union(&intervals).map_err(Error::of(parameter.name)).map_err(bad)?;
+            let distribution =
+                Distribution::union(&intervals).map_err(Error::in_distribution(parameter.name)).map_err(bad)?;
             check_distribution(spec, parameter, &distribution).map_err(bad)?;
             check_bounds(spec, parameter, (value, value)).map_err(bad)?;
             if parameter.is_integer && value.fract() != 0.0 {

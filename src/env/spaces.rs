@@ -1,4 +1,4 @@
-//! What an environment looks like from outside: observations, actions, rewards.
+//! Observations, actions and rewards: an environment as its users see it.
 
 /// A named entry of a vector, with its unit and range.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -7,9 +7,9 @@ pub struct Channel {
     pub name: &'static str,
     /// SI unit, `"1"` if dimensionless.
     pub unit: &'static str,
-    /// Least possible value; may be `-inf`.
+    /// Minimum; may be `-inf`.
     pub low: f64,
-    /// Greatest possible value; may be `+inf`.
+    /// Maximum; may be `+inf`.
     pub high: f64,
     /// The size that a disturbance of the entry is measured by, in its unit: half of its range, or 1 without one, unless
     /// it is declared. 0 declares an entry that is constant, which nothing disturbs.
@@ -23,7 +23,7 @@ impl Channel {
         Self { name, unit, low, high, scale }
     }
 
-    /// The same with a declared scale.
+    /// Sets the scale.
     pub const fn scale(mut self, scale: f64) -> Self {
         self.scale = scale;
         self
@@ -38,13 +38,13 @@ impl Channel {
 /// The actions that an environment takes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ActionSpace {
-    /// One of `n` choices; each has a name that says what it does.
+    /// A choice out of `n`, each with a name that describes its effect.
     Discrete(&'static [&'static str]),
     /// A vector of A numbers. The environment clips them to the channels' ranges.
     Continuous(&'static [Channel]),
 }
 
-/// One environment's action.
+/// The action of one environment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Action<'a> {
     /// A choice, below the space's `n`.

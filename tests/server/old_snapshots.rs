@@ -49,7 +49,7 @@ async fn snapshot_of_another_revision_is_refused() {
     let before = session.snapshot(&[]).await;
     let old = Bytes::from_static(include_bytes!("data/snapshots/CartPole"));
     let refused = session.refused(Restore { mask: Bytes::new(), snapshots: vec![old] }).await;
-    let expected = "InvalidArgument: the snapshot cannot be restored: it is of CartPole-v0, this is CartPole-v1; take a new \
+    let expected = "InvalidArgument: the snapshot cannot be restored: it is of CartPole-v0, but this session is of CartPole-v1; take a new \
                     one from a session of the same environment\n";
     assert_eq!(refusal(refused), expected);
     assert_eq!(session.snapshot(&[]).await, before);

@@ -15,7 +15,7 @@ const MAX_FACTOR: f64 = 10.0;
 /// The name of the scale of all actuators, and how those of single ones begin.
 const ACTION_SCALE: &str = "action_scale";
 
-/// What a disturbance is, so that its value finds its place.
+/// The kind of a disturbance, by which its value is applied.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum DisturbanceKind {
     ActionDelay,

@@ -122,7 +122,8 @@ fn override_parameters(
     parameters.sort_by_key(|(name, _)| *name);
     let mut overrides = Vec::with_capacity(parameters.len());
     for (name, distribution) in parameters {
-        overrides.push((name.as_str(), Distribution::try_from(distribution).map_err(env::Error::of(name))?));
+        overrides
+            .push((name.as_str(), Distribution::try_from(distribution).map_err(env::Error::in_distribution(name))?));
     }
     Ok(resolve(spec, base, overrides)?)
 }
