@@ -31,6 +31,9 @@ type GridRow = ((f64, f64), (f64, f64), u64, u64);
 /// and its interval, and the success rate in the worst tenth of contexts, %.
 type ResultRow = (u64, f64, (f64, f64), f64, (f64, f64), f64, f64, (f64, f64), Option<f64>);
 
+/// A results table: its columns by name, and the plan of each study with its name.
+type ResultsColumns<'py> = (Bound<'py, PyDict>, Vec<(String, String)>);
+
 /// The recorded tests of a policy.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Records(pub(crate) perturb_records::Records);
@@ -219,7 +222,7 @@ fn add_columns(dictionary: &Bound<'_, PyDict>, columns: Vec<(String, ColumnValue
 
 /// Reads a table of `perturb export`: arrays by the names of its columns, and the text of each study's plan by its name.
 #[pyfunction]
-pub fn read_results(py: Python<'_>, path: PathBuf) -> PyResult<(Bound<'_, PyDict>, Vec<(String, String)>)> {
+pub fn read_results(py: Python<'_>, path: PathBuf) -> PyResult<ResultsColumns<'_>> {
     let table = py.detach(|| ResultsTable::read(&path)).map_err(|error| failure(INVALID, 0, error.to_string()))?;
     let columns = PyDict::new(py);
     add_columns(&columns, table.columns())?;
