@@ -142,7 +142,10 @@ fn damage_is_named() {
     let replaced = |from: &'static str, to: &'static str| {
         move |text: String, _| {
             assert!(text.contains(from), "{from}");
-            text.replacen(from, to, 1).into_bytes()
+            // A document with another content and the checksum of that content.
+            let mut document = serde_json::from_str(&text.replacen(from, to, 1)).unwrap();
+            checksum::open(&mut document).unwrap_err();
+            serde_json::to_vec_pretty(&WithChecksum::new(&document).unwrap()).unwrap()
         }
     };
     assert!(spoil("weights", &|_, bytes| bytes[..bytes.len() / 2].to_vec()).contains("expected"));
@@ -156,7 +159,8 @@ fn damage_is_named() {
     assert!(spoil("checkpoint", &later).contains("has format 9, and this program reads 1 to 3"));
     // Another architecture has other weights, whatever their checksum.
     let other = replaced("\"architecture\": \"ff\"", "\"architecture\": \"rc\"");
-    assert!(spoil("checkpoint", &other).contains("arrays, expected"));
+    let message = spoil("checkpoint", &other);
+    assert!(message.contains("arrays, expected"), "{message}");
     let statistics = replaced("\"observation_normaliser\": {", "\"observation_normaliser\": null, \"left\": {");
     assert!(spoil("checkpoint", &statistics).contains("observation_normaliser: there is none"));
 }

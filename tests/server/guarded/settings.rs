@@ -43,7 +43,7 @@ fn reachable_address_is_guarded_or_called_insecure(#[case] flags: &[&str], #[cas
 #[case::endless_ledger(&["--ledger", "/dev/zero"], "that is no file")]
 #[case::endless_config(&["--config", "/dev/zero"], "cannot read /dev/zero: it is a pipe or a device")]
 #[case::decimal(&["--socket-mode", "438"], "no mode of a socket")]
-#[case::executable(&["--socket-mode", "0700"], "expected 0600")]
+#[case::executable(&["--socket-mode", "0700"], "such as 0600")]
 fn a_wrong_guard_is_refused(#[case] flags: &[&str], #[case] part: &str) {
     let mut command = command();
     command.args(["--listen", "tcp://127.0.0.1:0"]).args(flags);

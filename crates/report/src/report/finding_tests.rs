@@ -205,7 +205,7 @@ fn zero_geometric_mean_is_explained(#[case] rates: [[f64; 3]; 2], #[case] said: 
 }
 
 #[test]
-fn page_begins_with_title_plan_settings_finding() {
+fn page_has_results_first_and_provenance_last() {
     let page = |plan: &Plan| with_report(plan, |report| html(report, &Figures::draw(report, &[], &[]).unwrap()));
     let of_plan = plan("'CartPole'", 4);
     let opened = page(&of_plan);
@@ -213,6 +213,9 @@ fn page_begins_with_title_plan_settings_finding() {
         "<nav",
         "<h1>Generalisation of a2c ff (paper) and ppo ff (paper) on CartPole</h1>",
         "Does it help? We asked.",
+        "aria-label=\"CartPole: Default, Interpolation and Extrapolation of each method\"><svg",
+        "<table",
+        "<h2>Provenance</h2>",
         "<dt>plan</dt><dd><a download=\"plan.toml\" href=\"data:text/plain;charset=utf-8,%23%20Does",
         "<dt>training</dt><dd>15000 episodes (as the paper) on D, R and E</dd>",
         "<dt>tests</dt><dd>1000 episodes (as the paper) each, on D, R and E</dd>",
@@ -221,9 +224,7 @@ fn page_begins_with_title_plan_settings_finding() {
         "<dt>selection</dt><dd>none: each method has one configuration in each environment</dd>",
         "<dt>success</dt><dd>as the paper's published code judges</dd>",
         "<dt>program</dt><dd>perturb 0.1.0 (0123456789ab)</dd>",
-        "aria-label=\"CartPole: Default, Interpolation and Extrapolation of each method\"><svg",
         "cells are done",
-        "<table",
     ];
     let mut rest = opened.as_str();
     for part in order {
