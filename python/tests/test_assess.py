@@ -18,7 +18,8 @@ import pytest
 import perturb
 from perturb import _native
 
-from .test_policy import CART_POLE, PENDULUM, POLICIES, ROOT
+from .conftest import ROOT
+from .test_policy import CART_POLE, PENDULUM, POLICIES
 
 # Overrides where the program perturb is looked for.
 VARIABLE = "PERTURB_PROGRAM"

@@ -1,5 +1,7 @@
 """Disturbances: parameters that an environment has if it is made with one of them."""
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import perturb
 from perturb.catalogue import CATALOGUE
 
 
-def observations(steps: int, **settings: object) -> NDArray[np.float32]:
+def observations(steps: int, **settings: Any) -> NDArray[np.float32]:
     environment = gym.make("perturb/Pendulum-v1", disable_env_checker=True, **settings)
     first, _ = environment.reset(seed=5)
     rows = [first]
@@ -37,14 +39,14 @@ def test_delays_agree_with_gymnasiums_wrapper(server: str) -> None:
     np.testing.assert_array_equal(np.stack(rows)[4:], own[4:])
 
 
-class RecordedSticky(StickyAction[np.ndarray, np.ndarray, np.ndarray]):
+class RecordedSticky(StickyAction[np.ndarray, np.ndarray]):
     """Gymnasium's wrapper with the decisions of an episode's stream, by docs/disturbances.md, instead of its own."""
 
     def __init__(self, environment: gym.Env[np.ndarray, np.ndarray], probability: float, seed: int) -> None:
         super().__init__(environment, probability)
         self._recorded = RecordedDecisions(seed)
 
-    @property
+    @property  # type: ignore[misc]
     def np_random(self) -> "RecordedDecisions":  # type: ignore[override]
         """The recorded decisions."""
         return self._recorded
@@ -69,7 +71,7 @@ class RecordedDecisions:
 
 @pytest.mark.parametrize("identifier", ["perturb/Pendulum-v1", "perturb/Acrobot-v1"])
 def test_holds_agree_with_gymnasiums_sticky_actions(server: str, identifier: str) -> None:
-    def play(environment: gym.Env[np.ndarray, np.ndarray]) -> list[NDArray[np.float32]]:
+    def play(environment: gym.Env[np.ndarray, Any]) -> list[NDArray[np.float32]]:
         rows = [environment.reset(seed=7)[0]]
         actions = np.random.default_rng(3)
         for _ in range(150):
@@ -98,7 +100,7 @@ def test_infos_and_observations_have_disturbances(server: str) -> None:
 
 
 def test_late_disturbances_are_refused_with_a_remedy(server: str) -> None:
-    environment = gym.make("perturb/Pendulum-v1", server=server).unwrapped
+    environment: Any = gym.make("perturb/Pendulum-v1", server=server).unwrapped
     with pytest.raises(perturb.InvalidArgumentError, match="where it is made"):
         environment.set_parameters({"action_delay": 1})
     environment.close()
@@ -111,7 +113,7 @@ def test_records_of_several_sets_have_the_same_columns(server: str) -> None:
     tested = perturb.evaluate(
         still, "Pendulum", versions=["D", "R"], parameters={"sensor_noise": (0, 0.1)}, episodes=4, server=server
     )
-    columns = tested.policies[0].records.columns()
+    columns = tested.columns()
     assert set(columns["set"]) == {"D", "R", "parameters"}
     noise = np.asarray(columns["requested_sensor_noise"])
     drawn = np.asarray(columns["set"]) == "parameters"

@@ -93,7 +93,7 @@ def test_a_policy_of_results_is_loaded_by_its_name(monkeypatch: pytest.MonkeyPat
     file = results / "policies/CartPole-ppo-ff-R-9bd6546b-s7.safetensors"
     assert (policy.environment, policy.trained_on) == ("CartPole", "R")
     assert policy.id == perturb.load_policy(file).id
-    with pytest.raises(perturb.PolicyError, match=r"could be any of these policies .*-s10, .*-R-\w+-s11"):
+    with pytest.raises(perturb.PolicyError, match=r"could be any of these policies .*-s10\.safetensors, .*-R-\w+-s11"):
         perturb.load_policy("CartPole-ppo-ff-R")
 
 

@@ -13,8 +13,9 @@ import pytest
 
 import perturb
 
+from .conftest import ROOT
 from .test_assess import run, same_episodes, upright
-from .test_policy import CART_POLE, POLICIES, ROOT
+from .test_policy import CART_POLE, POLICIES
 
 EXPERIMENT = ROOT / "results/results.parquet/beyond/confirm-2"
 

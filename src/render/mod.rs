@@ -100,7 +100,7 @@ impl Renderer {
     }
 
     /// Draws a picture, `[height, width, 3]`: red, green, blue, the uppermost row first. Pictures are drawn one at a
-    /// time, in the fair order of [`Turns`]. The same scene and size give the same bytes.
+    /// time, in the fair order of `Turns`. The same scene and size give the same bytes.
     ///
     /// # Errors
     /// [`Error`].

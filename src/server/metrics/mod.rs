@@ -1,7 +1,7 @@
 //! The server's metrics, in the text format of OpenMetrics, which Prometheus scrapes.
 //!
 //! - [`endpoint`]: the HTTP endpoint for scrapers.
-//! - [`format`]: the two text formats, and which one a scraper asks for.
+//! - [`mod@format`]: the two text formats, and which one a scraper asks for.
 //! - [`page`]: the metrics, each with its name, labels and sentence.
 //! - [`process`]: resources of the process, as the system tells them.
 
