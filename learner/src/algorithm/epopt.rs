@@ -30,13 +30,13 @@ pub struct EpisodeSelection {
     pub kept_steps: u64,
     /// Mean return of all L episodes.
     pub mean_return: f64,
-    /// Conditional value at risk: the mean return of the ⌈εL⌉ worst episodes, of the configured ε also while the
-    /// iteration's is 1.
+    /// Conditional value at risk: the mean return of the ⌈εL⌉ worst episodes. Here ε is the configured share, even while
+    /// the iteration's ε is still 1.
     pub cvar: f64,
 }
 
 impl Epopt {
-    /// Checks the settings; `base` is fresh.
+    /// Checks the settings. `base` must not have made an update yet.
     pub fn new(config: EpoptConfig, base: Box<dyn BaseAlgorithm>) -> Result<Self> {
         config.validate()?;
         Ok(Epopt { config, base, iterations: 0 })

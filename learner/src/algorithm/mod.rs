@@ -37,9 +37,9 @@ pub trait Algorithm: Send {
 
 /// An algorithm that EPOpt can wrap: it can learn from several rollouts at once.
 pub trait BaseAlgorithm: Algorithm {
-    /// Improves `policy` by `rollouts`, at least one, with as many passes over each as over one alone: A2C takes a step on
-    /// each, PPO makes `n_epochs` passes over all. All advantages are estimated before the first step. Figures are means over
-    /// all steps.
+    /// Improves `policy` by one or more `rollouts`, with as many passes over each as if it were the only one: A2C takes a
+    /// step on each, PPO makes `n_epochs` passes over all. All advantages are estimated before the first step. Figures are
+    /// means over all steps.
     ///
     /// # Errors
     /// Those of [`Algorithm::update`].

@@ -11,13 +11,13 @@ use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{Estimates, Rollout, Trajectories};
 
-/// Proximal policy optimisation with a clipped ratio, Schulman et al. (2017), arXiv:1707.06347: `n_epochs` passes over a
-/// rollout's T·N samples, each in `n_minibatches` random parts with one gradient step (of samples or, for a recurrent
-/// policy, of environments),
+/// Proximal policy optimisation with a clipped ratio, Schulman et al. (2017), arXiv:1707.06347. An update makes `n_epochs`
+/// passes over a rollout's T·N samples. Each pass cuts them at random into `n_minibatches` parts and takes one gradient
+/// step on each; for a recurrent policy a part consists of whole environments. The loss is
 ///
 /// loss = clipped surrogate - ent_coef · mean entropy + vf_coef · clipped value loss + kl_coef · mean KL(π_old ‖ π),
 ///
-/// with [`gae`]'s advantages and returns, computed once from the rollout's values, and the acting policy π_old.
+/// with [`gae`]'s advantages and returns, computed once from the rollout's values. π_old is the policy that acted.
 pub struct Ppo {
     config: PpoConfig,
     optimiser: Optimiser,

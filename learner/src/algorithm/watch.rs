@@ -6,8 +6,8 @@ use perturb_files::interrupt::StopFlag;
 
 use crate::error::{Error, Result};
 
-/// An update that would take longer after the program was asked to end is broken off. Its run continues from its last
-/// checkpoint, to the same bytes.
+/// Longest time that the rest of an update may take after the program was asked to end. A longer update is broken off, and
+/// its run can be resumed from its last checkpoint, to the same bytes.
 const MAX_REMAINING: Duration = Duration::from_secs(5);
 
 /// Counts the gradient steps of an update.

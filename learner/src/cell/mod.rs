@@ -188,7 +188,8 @@ fn train(
 }
 
 impl<'a> RunningCell<'a> {
-    /// Locks the cell. The error is the end of a cell that is not to be run.
+    /// Locks the cell. The error is the cell's last event, if it is not to be run: it is done, failed earlier, or is locked
+    /// by another process.
     fn lock(job: &'a CellJob<'a>, tell: &mut dyn FnMut(&Cell, CellEvent)) -> Result<Self, CellEvent> {
         let CellJob { folder, retry, .. } = job;
         let Some(lock) = folder.try_lock().map_err(failed)? else { return Err(CellEvent::Busy) };
@@ -208,8 +209,9 @@ impl<'a> RunningCell<'a> {
         Ok(work)
     }
 
-    /// Recovers a training that was interrupted. A finished training is taken as it is. Another is resumed from its last
-    /// checkpoint, to the same bytes as without the break. A training without a usable checkpoint begins again.
+    /// Recovers a training that was interrupted. The policy of a finished training is only tested. An unfinished training
+    /// is resumed from its last checkpoint, to the same bytes as without the break. A training without a usable checkpoint
+    /// begins again.
     fn recover(&mut self, tell: &mut dyn FnMut(&Cell, CellEvent)) -> Result<(), RunDirectoryError> {
         let Cell { config, tests, .. } = self.job.cell;
         let path = self.job.folder.training();
@@ -239,11 +241,11 @@ impl<'a> RunningCell<'a> {
 
     /// Recovers the training after an attempt that may have left a checkpoint.
     fn recover_after_failure(&mut self, tell: &mut dyn FnMut(&Cell, CellEvent)) -> Result<(), CellFailure> {
-        self.training = None; // its directory is locked by it
+        self.training = None; // it holds the directory's lock, which `recover` needs
         self.recover(tell).map_err(|error| CellError::from(TrainError::from(error)).into())
     }
 
-    /// Tests the policy, whose training took `seconds`, and writes the result. Returns the end of the cell.
+    /// Tests the policy, whose training took `seconds`, and writes the result. Returns the cell's last event.
     ///
     /// # Errors
     /// [`FolderError`]: the folder cannot be read or written. Other failures are recorded in the folder.
@@ -296,7 +298,7 @@ impl From<CellError> for CellFailure {
     }
 }
 
-/// The end of a cell whose folder cannot be read or written.
+/// The last event of a cell whose folder cannot be read or written.
 fn failed(error: impl Into<FolderError>) -> CellEvent {
     let error = error.into();
     let reason = error.to_string();
@@ -309,7 +311,7 @@ fn failed(error: impl Into<FolderError>) -> CellEvent {
 /// The last checkpoint of a training that was interrupted; `None` if nothing can be resumed.
 ///
 /// # Errors
-/// Any other failure to read it, e.g. a lock: the training may still be resumed later, and is left as it is.
+/// A failure that may pass, e.g. a lock of another process. The training may be resumed later, so nothing is changed.
 fn earlier(directory: &Path) -> Result<Option<(RunDirectory, Checkpoint, ResumeState)>, RunDirectoryError> {
     match RunDirectory::resume(directory) {
         Ok(earlier) => Ok(Some(earlier)),
@@ -341,7 +343,7 @@ mod tests {
         let Err(error) = earlier(&training) else { panic!("a newer program goes on with it") };
         assert!(error.to_string().contains("has format 99"), "{error}");
         std::fs::remove_file(&json).unwrap();
-        std::os::unix::fs::symlink(&json, &json).unwrap(); // which the system cannot follow
+        std::os::unix::fs::symlink(&json, &json).unwrap(); // a link to itself cannot be followed
         let Err(error) = earlier(&training) else { panic!("what cannot be seen may be there") };
         assert!(error.to_string().starts_with("cannot look for "), "{error}");
         let _lock = perturb_files::Lock::try_take(&training).unwrap().unwrap();

@@ -29,7 +29,7 @@ pub struct ResumeState {
     pub history: History,
 }
 
-/// Figures of a run that are not those of its last iteration.
+/// Figures of the whole run so far, which the last iteration alone does not have.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct History {
@@ -56,7 +56,7 @@ struct ResumeDocument {
 }
 
 impl ResumeState {
-    /// Replaces the checkpoint in `directory` by `checkpoint` with this, see [`Checkpoint::save`].
+    /// Saves `checkpoint` together with this state. Replaces the checkpoint in `directory`, see [`Checkpoint::save`].
     ///
     /// # Errors
     /// [`CheckpointError::File`]; the earlier checkpoint, if any, is then still there.
@@ -108,7 +108,7 @@ impl ResumeState {
 }
 
 impl ResumeDocument {
-    /// Puts the arrays in.
+    /// Adds the arrays, read from `content`, the bytes of the file of arrays.
     fn complete(mut self, content: &[u8]) -> std::result::Result<ResumeState, String> {
         let arrays = Arrays::decode(content)?;
         for array in &mut self.algorithm.optimiser {

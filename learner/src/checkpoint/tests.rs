@@ -99,7 +99,7 @@ fn only_the_current_arrays_are_kept() {
     assert_eq!(Checkpoint::load(directory.path()).unwrap(), checkpoint(2, 2));
 }
 
-/// Every state of the directory that a crash during a save can leave.
+/// Goes through every state of the directory that a crash during a save can leave.
 #[test]
 fn a_crash_at_any_moment_leaves_a_whole_checkpoint() {
     let old = (checkpoint(1, 1), resume_state(1));
@@ -117,7 +117,7 @@ fn a_crash_at_any_moment_leaves_a_whole_checkpoint() {
             fs::write(directory.path().join(name), content).unwrap();
         }
         let loaded = ResumeState::load(directory.path()).unwrap();
-        // A later save finds its way out of any of them.
+        // A later save succeeds from each of these states.
         new.1.save(&new.0, directory.path()).unwrap();
         assert_eq!(names(directory.path()), after_names);
         loaded

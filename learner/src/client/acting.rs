@@ -104,7 +104,7 @@ impl ServerShard {
         self.stream.mismatch::<proto::Act>(got, "arrays as the protocol describes them".into())
     }
 
-    /// Names the episodes that ended in a reply.
+    /// Converts the episodes that ended in a reply, with their slots counted over the whole batch.
     fn played(&self, mut acted: proto::Acted) -> Result<RolloutReply, ClientError> {
         let mut ended = Vec::with_capacity(acted.ended.len());
         for proto::EndedAt { step, end, terminated, .. } in std::mem::take(&mut acted.ended) {
@@ -139,7 +139,7 @@ pub fn policy(spec: &PolicySpec, player: &Player) -> proto::Policy {
     }
 }
 
-/// The policy of a test for one of several servers, which has `n_envs` environments.
+/// The policy of a test as one of several servers gets it, for its own `n_envs` environments.
 pub fn for_server(policy: &proto::Policy, n_envs: usize) -> proto::Policy {
     let mut policy = policy.clone();
     if let Some(rewards) = &mut policy.rewards {
@@ -148,7 +148,8 @@ pub fn for_server(policy: &proto::Policy, n_envs: usize) -> proto::Policy {
     policy
 }
 
-/// Reads a player that a server saved. `observation_size` is the session's O; statistics may leave the last entries alone.
+/// Reads a player that a server saved. `observation_size` is the session's O; statistics of fewer entries leave the last
+/// ones as they are.
 /// The error names the field that is wrong.
 fn saved_player(saved: &proto::PlayerSaved, observation_size: usize) -> Result<(PlayerState, Normalisers), String> {
     let (Some(actions), Some(state)) = (&saved.actions, &saved.state) else {

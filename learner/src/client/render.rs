@@ -15,7 +15,7 @@ use crate::proto::{self, AutoresetMode};
 pub struct BegunEpisode {
     /// Counts the environment's episodes from 0.
     pub episode_index: u64,
-    /// Counts its trials from 0.
+    /// Counts the environment's trials from 0.
     pub trial_index: u64,
     /// Counts the trial's episodes from 0.
     pub episode_in_trial: u32,
@@ -76,7 +76,7 @@ impl<'a> RenderSession<'a> {
         &self.environment
     }
 
-    /// Asks for a step with an action as the protocol wants it, i32 or f32 `[A]`.
+    /// Asks for a step with an action, encoded for the protocol: i32, or f32 `[A]`.
     ///
     /// # Errors
     /// The failures of a connection, as of all requests.
@@ -93,7 +93,7 @@ impl<'a> RenderSession<'a> {
         self.request(proto::Reset::default())
     }
 
-    /// Asks for a picture of `width` × `height` pixels of the state after the requests before.
+    /// Asks for a picture of `width` × `height` pixels of the state after all earlier requests.
     ///
     /// # Errors
     /// The failures of a connection.
@@ -102,8 +102,8 @@ impl<'a> RenderSession<'a> {
         self.request(proto::Render { slot: 0, width, height })
     }
 
-    /// Takes the answer to [`Self::request_step`]. Replaces what is in `reply`, whose N is 1; `observations` is the last
-    /// one of an episode that ended.
+    /// Takes the answer to [`Self::request_step`] and replaces the content of `reply`, whose N is 1. After the end of an
+    /// episode, `observations` is the episode's last one.
     ///
     /// # Errors
     /// [`ClientError::Refused`] if the action is wrong, and the failures of a connection.
@@ -132,7 +132,8 @@ impl<'a> RenderSession<'a> {
         let (width, height) = self.size;
         let rendered = match self.reply::<proto::Render>() {
             Ok(rendered) => rendered,
-            // Sizes are checked before they are sent. A server that refuses the request does not know it.
+            // Sizes were checked before they were sent, so a server that refuses the request does not know this kind of
+            // request.
             Err(ClientError::Refused { address, request, code, message }) if code == Code::InvalidArgument => {
                 let message = format!("{message}; is the server older than this program?");
                 return Err(ClientError::Refused { address, request, code, message });

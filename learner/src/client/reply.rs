@@ -14,7 +14,7 @@ pub struct StepReply {
     pub rewards: Vec<f32>,
     /// `[N]` whether the task ended the episode.
     pub terminated: Vec<bool>,
-    /// `[N]` whether the step limit ended it.
+    /// `[N]` whether the step limit ended the episode.
     pub truncated: Vec<bool>,
     /// `[K, O]` last observations of the episodes that ended, in the order of `ended`.
     pub final_observations: Vec<f32>,
@@ -37,7 +37,7 @@ pub struct StepSlice<'a> {
     pub truncated: &'a [bool],
     /// `[k, O]`
     pub final_observations: &'a [f32],
-    /// `[k]`, whose slots are counted over the whole batch.
+    /// `[k]` the episodes that ended, with slots counted over the whole batch.
     pub ended: &'a [EndedEpisode],
 }
 
@@ -47,7 +47,7 @@ impl StepReply {
         self.slice(0..self.rewards.len())
     }
 
-    /// The part of the slots of `range`.
+    /// The part of the reply for the slots of `range`.
     pub fn slice(&self, range: Range<usize>) -> StepSlice<'_> {
         let size = self.observations.len() / self.rewards.len().max(1);
         let place = |slot| self.ended.partition_point(|end| end.slot < slot);

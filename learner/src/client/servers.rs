@@ -19,10 +19,10 @@ use perturb_settings::Common;
 use super::options::{ActorLocation, ServerWait};
 use crate::proto;
 
-/// Time that a server has to show that it is alive after this program was asked to end. A reply of a server that answers
-/// is waited for.
+/// Time in which a server must show that it is alive after this program was asked to end. As long as a server is alive, its
+/// reply is waited for.
 const LIFE_SIGN_TIMEOUT: Duration = Duration::from_secs(1);
-/// Time that a request is waited for before its server has to show that.
+/// Time for which a reply is waited for before its server must show that it is alive.
 const LIFE_SIGN_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Connections to servers, all of which serve the same environments.
@@ -85,7 +85,7 @@ impl Servers {
                 server.kill(); // it does not answer
                 Err(error)
             }
-            // Nobody gave its address, so nobody can correct it.
+            // The user gave no address, so an error that names the address would not help.
             Err(error) => Err(server.unusable(&match error {
                 ClientError::Connect { reason, .. } => reason,
                 ClientError::NotPerturb { .. } => "it is no perturb-server".into(),
@@ -158,8 +158,9 @@ impl Servers {
         Ok(errors)
     }
 
-    /// Connects to one server of `addresses`, where every machine that a name resolves to counts: to number `turn`, modulo
-    /// their number, or to the next one that takes sessions. Callers with successive turns are spread evenly.
+    /// Connects to one server of `addresses`. Every machine that a name resolves to counts as a server. Tries number
+    /// `turn`, modulo the number of servers, first, then the next ones until one takes sessions. Callers with successive
+    /// turns are spread evenly.
     ///
     /// # Errors
     /// [`ClientError::Connect`] if there is only one and it does not take sessions, [`ClientError::NoneConnects`] if none
@@ -179,8 +180,8 @@ impl Servers {
         Ok(Self::new(vec![connection], runtime, stop))
     }
 
-    /// Connects to all servers of `addresses` that take sessions, where every machine that a name resolves to counts. Returns
-    /// the errors of the others.
+    /// Connects to all servers of `addresses` that take sessions. Every machine that a name resolves to counts as a server.
+    /// Returns the errors of the others.
     ///
     /// # Errors
     /// Those of [`Servers::connect_to_one`].
@@ -231,7 +232,8 @@ impl Servers {
     /// Waits for a request. After the program was asked to end, it waits only for servers that give signs of life.
     ///
     /// # Errors
-    /// Those of the request, [explained](Servers::explain); [`ClientError::Stopped`] if a server is silent then.
+    /// Those of the request, [explained](Servers::explain); [`ClientError::Stopped`] if a server then gives no sign of
+    /// life.
     pub(crate) fn wait_for<T>(&self, request: impl Future<Output = Result<T, ClientError>>) -> Result<T, ClientError> {
         let done = self.block_on(async {
             tokio::select! {
@@ -332,7 +334,8 @@ impl Servers {
         Ok(environment)
     }
 
-    /// The environment as a training's policy sees it.
+    /// The environment as a training's policy sees it: with the parameters in its observations, if the policy sees
+    /// parameters.
     ///
     /// # Errors
     /// Those of [`Servers::environment`]; [`ClientError::NoParameters`] if it sees parameters and the servers cannot
@@ -341,7 +344,8 @@ impl Servers {
         self.environment_seen_with(common, std::iter::empty())
     }
 
-    /// The same, with disturbances also if one of `names` is a disturbance.
+    /// The environment as [`Servers::environment_seen`] gives it. It has its disturbances, too, if one of `names` is a
+    /// disturbance.
     ///
     /// # Errors
     /// Those of [`Servers::environment_seen`].

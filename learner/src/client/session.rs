@@ -200,8 +200,8 @@ impl<'a> Session<'a> {
     /// snapshots.
     ///
     /// # Errors
-    /// [`ClientError::Snapshots`] if their number is another, [`ClientError::Refused`] if one is of something else, and the
-    /// failures of a connection. After the latter two some environments may have been restored.
+    /// [`ClientError::Snapshots`] if there are not n snapshots, [`ClientError::Refused`] if one is of something else, and
+    /// the failures of a connection. After the latter two some environments may have been restored.
     pub fn restore(&mut self, slots: Range<usize>, snapshots: &[Bytes]) -> Result<Vec<f32>, ClientError> {
         if snapshots.len() != slots.len() {
             return Err(ClientError::Snapshots { got: snapshots.len(), expected: slots.len() });
@@ -262,7 +262,7 @@ impl<'a> Session<'a> {
     fn close(&mut self, over: impl Fn(&ServerShard) -> bool) {
         let closing = self.parts.extract_if(.., |part| over(part)).map(|part| part.stream.close());
         let closing = futures_util::future::join_all(closing);
-        // Within a runtime nothing can be waited for.
+        // A thread that runs a runtime cannot block until a request is answered.
         if Handle::try_current().is_err() && !self.servers.has_given_up() {
             self.servers.block_on(closing);
         }

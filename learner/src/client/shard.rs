@@ -54,7 +54,7 @@ impl ServerShard {
         (!own.is_empty()).then(|| self.range.clone().map(|slot| u8::from(own.contains(&slot))).collect())
     }
 
-    /// Puts one server's reply in its place in the batch's.
+    /// Copies this server's reply to the places of its slots in the batch's `reply`.
     pub(super) fn store(&self, stepped: proto::Stepped, size: usize, reply: &mut StepReply) -> Result<(), ClientError> {
         let Range { start, end } = self.range;
         check_step(&stepped, self.range.len(), size).map_err(|it| self.mismatch(it.got, it.expected))?;

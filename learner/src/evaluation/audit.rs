@@ -102,8 +102,9 @@ fn replay(
     }
 }
 
-/// At most `max_episodes` of `episodes`: one of each of as many equal parts, at the next place in each part, so that first
-/// and later episodes of environments are among them.
+/// Chooses at most `max_episodes` of `episodes`. Cuts them into as many equal parts and takes one episode from each: the
+/// first of the first part, the second of the second, and so on. So both early and late episodes of environments are
+/// chosen.
 fn spread(episodes: &[EpisodeRecord], max_episodes: usize) -> impl Iterator<Item = &EpisodeRecord> {
     let count = max_episodes.min(episodes.len());
     (0..count).map(move |i| {

@@ -17,7 +17,7 @@ use crate::client::{Backoff, EndedEpisode, OpenOptions, Reconnect, Servers, Sess
 /// Options of a test.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TestOptions {
-    /// Episodes on each set, at least 1. A set of contexts has at least one in each context.
+    /// Episodes on each set, at least 1. On a set of contexts at least one episode is played in each context.
     pub episodes: u64,
     /// Fixes all randomness.
     pub seed: u64,
@@ -71,8 +71,8 @@ impl<'a> Tester<'a> {
         Ok(about)
     }
 
-    /// Records the disturbances of all episodes if one of `sets` names one: records that are to stand together have the
-    /// same columns.
+    /// Records the disturbances of all episodes if one of `sets` names a disturbance. So all records that stand together
+    /// have the same columns.
     ///
     /// # Errors
     /// [`TestError`] for a policy that sees parameters and was trained without disturbances.
@@ -188,8 +188,8 @@ impl<'a> Tester<'a> {
     }
 }
 
-/// Adds a disturbance at its default if `environment` has disturbances among its parameters, so that a session has them,
-/// too.
+/// Gives the first disturbance its default value if disturbances are among the `environment`'s parameters and `parameters`
+/// gives it none. A session has disturbances only if its parameters name one.
 pub(super) fn with_disturbances(mut parameters: Parameters, environment: &proto::Environment) -> Parameters {
     let first = environment.disturbances.first();
     let is_own = |parameter: &&proto::Parameter| environment.parameters.iter().any(|own| own.name == parameter.name);
@@ -200,8 +200,8 @@ pub(super) fn with_disturbances(mut parameters: Parameters, environment: &proto:
     parameters
 }
 
-/// Runs `work`, and runs it again from its beginning when servers were lost and have come back. Its result must not depend on
-/// this.
+/// Runs `work`. If servers were lost and have come back, runs it again from its beginning. The result of `work` must not
+/// depend on the number of attempts.
 pub(super) fn retry_on_disconnect<T>(
     servers: &Servers,
     stop: &StopFlag,

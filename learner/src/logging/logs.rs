@@ -74,7 +74,8 @@ impl Logs {
     /// Continues the files in `directory` at these `lengths`. Later lines are deleted.
     ///
     /// # Errors
-    /// [`LogError::Changed`] if one is shorter, or does not end a line there; then none was changed. [`LogError::File`].
+    /// [`LogError::Changed`] if a file is shorter than its length, or does not end a line there; no file was changed then.
+    /// [`LogError::File`].
     pub fn resume(
         directory: &Path,
         lengths: &LogLengths,
@@ -102,7 +103,8 @@ impl Logs {
         self.monitor.write(episode).map_err(io("write", &self.directory.join(MONITOR)))
     }
 
-    /// Adds a line to `progress.csv`, and an event. All episodes that ended before are in `monitor.csv` then.
+    /// Adds a line to `progress.csv` and an event. First passes all earlier episodes of `monitor.csv` to the operating
+    /// system.
     ///
     /// # Errors
     /// [`FileError`].

@@ -91,11 +91,13 @@ impl Progress {
         TimeShares { acting: percent(acting), waiting: percent(waiting), updating: percent(updating) }
     }
 
-    /// The columns with their values, `None` where there is nothing to say. They have stable-baselines3's names;
-    /// `time/acting`, `time/waiting` and `time/updating` are ours: seconds since the start spent on choosing actions, on
-    /// waiting for servers and on updates; and `epopt/…`: EPOpt's generated episodes so far, and of the last iteration the
-    /// share ε that was aimed at, the episodes kept, the mean return of all and that of the worst (conditional value at
-    /// risk).
+    /// The columns with their values, `None` where there is no value. They have stable-baselines3's names, except:
+    ///
+    /// - `time/acting`, `time/waiting` and `time/updating`: seconds since the start spent on choosing actions, on waiting
+    ///   for servers, and on updates;
+    /// - `epopt/episodes_generated`: episodes that EPOpt has generated so far;
+    /// - the other `epopt/…`: the last iteration's intended share ε, number of episodes kept, mean return of all episodes,
+    ///   and mean return of the worst (conditional value at risk).
     fn columns(&self) -> [(&'static str, Option<f64>); 29] {
         let Self { shares, recent, update, .. } = self;
         let selection = update.selection;
@@ -133,7 +135,7 @@ impl Progress {
     }
 }
 
-/// Writes both forms.
+/// Writes the scalars of an iteration to `progress.csv` and to the TensorBoard events.
 #[derive(Debug)]
 pub struct ProgressLog {
     csv: csv::Writer<File>,

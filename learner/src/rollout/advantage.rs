@@ -27,7 +27,7 @@ pub struct Trajectories<'a> {
     pub values: &'a [f32],
     /// `[T, N]` whether the task ended the episode in step t.
     pub terminated: &'a [bool],
-    /// `[T, N]` whether the time limit did.
+    /// `[T, N]` whether the time limit ended the episode in step t.
     pub truncated: &'a [bool],
     /// `[T, N]` V(final observation) where truncated; ignored elsewhere.
     pub truncation_values: &'a [f32],

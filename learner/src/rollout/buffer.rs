@@ -317,7 +317,7 @@ impl Rollout {
         self.lengths.as_deref()
     }
 
-    /// Places t·N + n of the samples, in order; None if every place is one.
+    /// Indices t·N + n of the samples, in order; None if every step is a sample.
     pub fn samples(&self) -> Option<Vec<u32>> {
         let lengths = self.lengths.as_ref()?;
         let places = (0..self.len).flat_map(|t| (0..self.n_envs).map(move |n| (t, n)));

@@ -34,7 +34,7 @@ impl CollectError {
 /// Fills a rollout with the steps of a player: T steps of each of N environments, where episodes and a recurrent policy's
 /// memory continue from one rollout to the next; or complete episodes.
 ///
-/// [`Collector::begin`], then [`Collector::act`] and [`Collector::take`] in turn until [`Collector::is_done`], then
+/// Call [`Collector::begin`], then [`Collector::act`] and [`Collector::take`] by turns until [`Collector::is_done`], then
 /// [`Collector::finish`].
 #[derive(Debug)]
 pub struct Collector {

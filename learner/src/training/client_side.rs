@@ -1,7 +1,7 @@
 //! Rollouts of runs whose actions are chosen in this process, in lockstep over one session.
 //!
-//! Each run has its own weights, randomness, logs and checkpoint, and its own slots of the session. So its bytes are those
-//! that it has alone.
+//! Each run has its own weights, randomness, logs and checkpoint, and its own slots of the session. So it gives the same
+//! bytes as a run that is trained alone.
 
 use std::ops::Range;
 use std::time::{Duration, Instant};

@@ -41,7 +41,8 @@ use crate::policy::GradientWorkspace;
 
 type Result<T> = std::result::Result<T, TrainError>;
 
-/// During longer updates connections are kept alive. Servers wait for seconds at least.
+/// Expected duration of an update above which connections are kept alive meanwhile. Servers drop a silent connection only
+/// after some seconds.
 const LONG_UPDATE: Duration = Duration::from_millis(100);
 
 /// Trains as `config` says and writes logs and checkpoints to `directory`. Updates use `threads` threads, whose number
@@ -252,7 +253,7 @@ fn train_loop(
         }
         if !runs.is_empty() {
             released.into_iter().try_for_each(|index| collector.release(index))?;
-        } // otherwise everything is closed as a whole
+        } // the last run's session is closed as a whole
     }
     Ok(())
 }
@@ -278,7 +279,7 @@ fn train_iteration(
         }
         Ok::<(), TrainError>(())
     })?;
-    updated.sort_by_key(|(index, _)| *index); // whatever the order of updates
+    updated.sort_by_key(|(index, _)| *index); // reports come in the order of runs, in whatever order these were updated
     for (index, progress) in updated {
         let Some(run) = find(runs, index) else { continue };
         report(index, &progress);

@@ -16,7 +16,8 @@ pub struct RunDirectory {
     overwrite: bool,
     /// Taken as soon as the directory exists.
     lock: OnceCell<Lock>,
-    /// Whether the files in it belong to the run of this value.
+    /// Whether the files in the directory are of this run. Files of an earlier run are there until
+    /// [`RunDirectory::prepare`].
     is_own: Cell<bool>,
 }
 

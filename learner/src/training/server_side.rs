@@ -1,7 +1,7 @@
 //! Rollouts that servers play: each run has a session of its own, and this process gets whole rollouts.
 //!
 //! While one run is updated, the rollouts of the others are played. No run waits for another, and runs share nothing but
-//! this thread and the gradient workspace. So the bytes of a run are those that it has alone.
+//! this thread and the gradient workspace. So each run gives the same bytes as if it were trained alone.
 
 use std::pin::Pin;
 use std::time::{Duration, Instant};

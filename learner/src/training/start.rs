@@ -55,7 +55,7 @@ pub(super) fn start_or_resume<'a>(
             resume((checkpoint, &state), directory, &environment, threads, restore)?
         }
     };
-    // The others were kept when they came.
+    // Policies for earlier marks were kept when these were passed.
     let episodes = trainer.checkpoint.state.counters.episodes;
     trainer.marks = marks.iter().copied().filter(|mark| *mark > episodes).collect();
     Ok((trainer, player))

@@ -84,9 +84,9 @@ impl Trainer<'_> {
         (&mut self.rollout, &mut self.tally)
     }
 
-    /// Duration of the last update, or [`LONG_UPDATE`] before the first. The next update takes about as long, with EPOpt up
-    /// to some ten times, which is still less than servers wait for. To keep connections alive takes a thread, which would
-    /// cost more than the shortest updates.
+    /// Duration of the last update, or [`LONG_UPDATE`] before the first. The next update takes about as long. With EPOpt it
+    /// takes up to some ten times as long, which is still less than servers wait. Keeping connections alive takes a thread,
+    /// which would cost more than the shortest updates.
     pub(super) fn last_update(&self) -> Duration {
         self.last_update.unwrap_or(LONG_UPDATE)
     }
@@ -200,7 +200,7 @@ impl Trainer<'_> {
         }
         let due = |saved: Counters| progress.episodes / checkpoint_interval > saved.episodes / checkpoint_interval;
         let save = finished || self.saved.is_none_or(due) || signal.is_some();
-        let passed = |mark: &u64| finished || *mark <= progress.episodes; // one that stops early stays as it is
+        let passed = |mark: &u64| finished || *mark <= progress.episodes; // after its end a policy no longer changes
         let passed = self.marks.partition_point(passed);
         let marks = self.marks.drain(..passed).collect();
         Ok(IterationOutcome { progress, save, marks, ends: finished || signal.is_some(), signal, logged })
@@ -262,7 +262,7 @@ impl Trainer<'_> {
         Ok(TrainOutcome { checkpoint: self.checkpoint.clone(), progress: iteration.progress, signal: iteration.signal })
     }
 
-    /// Adds to an `error` that ended the run which checkpoint is left.
+    /// Wraps an `error` that ended the run, and adds the last checkpoint that is left, if any.
     pub(super) fn failed(&self, error: TrainError) -> TrainError {
         let run = || self.directory.path().to_owned();
         let last = self.saved.map(|Counters { episodes, .. }| LastCheckpoint { episodes, run: run() });

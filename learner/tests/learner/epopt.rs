@@ -36,9 +36,9 @@ fn noise(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
     (0..count).map(|_| normal(rng) as f32).collect()
 }
 
-/// Fills `rollout` with episodes of noise. Those of environment n have `lengths[n]` steps and the returns `returns[n]`, one
-/// after the other; an environment that has no more goes on unseen until the last has ended. The task ends about half of
-/// them, the time limit the others.
+/// Fills `rollout` with episodes of noise. Those of environment n follow one another and have `lengths[n]` steps and the
+/// returns `returns[n]`. An environment that has played all its episodes is stepped on, in no episode, until the others
+/// have ended. The task ends about half of the episodes, the time limit the others.
 fn play(policy: &Policy, lengths: &[Vec<usize>], returns: &[Vec<f64>], mut rollout: Rollout) -> Rollout {
     let action = policy.spec().action;
     let n_envs = lengths.len();
@@ -78,7 +78,7 @@ fn play(policy: &Policy, lengths: &[Vec<usize>], returns: &[Vec<f64>], mut rollo
             actor.forget(n);
         }
     }
-    rollout.finish(&vec![9.0; n_envs]).expect("values that fit"); // nothing may ask for them
+    rollout.finish(&vec![9.0; n_envs]).expect("values that fit"); // no estimate may use them
     rollout
 }
 
@@ -171,7 +171,7 @@ fn epopt_can_rank_by_normalised_rewards() {
     let rollout = play(&policy, &lengths, &returns, of_episodes(&spec, 4));
     let learned = rollout.normalized_returns();
     let rewards = rollout.trajectories().expect("a finished rollout").rewards;
-    let last = rollout.episodes()[7]; // of environment 1, its second
+    let last = rollout.episodes()[7]; // the second one of environment 1
     let sum: f64 = (9..11).map(|t| f64::from(rewards[4 * t + 1])).sum();
     assert_eq!((last.environment, last.length, learned[7]), (1, 2, sum));
     let mut ranked: Vec<usize> = (0..8).collect();
@@ -222,7 +222,7 @@ fn each_kept_episode_can_have_an_update_of_its_own() {
 
             let figures: [fn(&UpdateStats) -> f64; 4] =
                 [|it| it.entropy_loss, |it| it.value_loss, |it| it.loss, |it| it.grad_norm];
-            // PPO's are of other weights in the other order; the entropy hardly is.
+            // PPO's figures belong to other weights in the other order of steps; only the entropy hardly changes.
             let (count, share) = [(4, 1e-9), (1, 0.1)][which];
             for figure in &figures[..count] {
                 let mean = steps.iter().map(figure).sum::<f64>() / 4.0;
@@ -298,8 +298,8 @@ fn epsilon_falls_after_full_iterations_also_when_resumed() {
     }
 }
 
-/// A rollout whose every number says where it comes from: place p = t·N + n holds the observation (p, -p), and numbers that
-/// are functions of p.
+/// A rollout in which every number shows its origin: the sample with index p = t·N + n has the observation (p, -p), and its
+/// other numbers are functions of p.
 fn coded(lengths: &[Vec<usize>]) -> Rollout {
     let n_envs = lengths.len();
     let mut rollout = Rollout::of_episodes(n_envs, 2, 1);
@@ -334,7 +334,7 @@ fn coded(lengths: &[Vec<usize>]) -> Rollout {
     rollout
 }
 
-/// The numbers of place `p` of a rollout of [`coded`], or of one selected from it.
+/// The numbers and the flags of sample `p` of a rollout of [`coded`], or of a rollout selected from it.
 fn at(rollout: &Rollout, p: usize) -> (Vec<f32>, [bool; 2]) {
     let trajectories = rollout.trajectories().expect("a finished rollout");
     let numbers = [
@@ -349,7 +349,7 @@ fn at(rollout: &Rollout, p: usize) -> (Vec<f32>, [bool; 2]) {
     (numbers.to_vec(), [trajectories.terminated[p], trajectories.truncated[p]])
 }
 
-/// Episodes of up to six environments, and some of them.
+/// A rollout with episodes of up to six environments, and some of these episodes.
 fn some_episodes() -> impl Strategy<Value = (Rollout, Vec<EpisodeSlice>)> {
     let lengths = prop::collection::vec(prop::collection::vec(1usize..12, 1..6), 1..7);
     (lengths, prop::collection::vec(any::<bool>(), 36)).prop_map(|(lengths, choice)| {
@@ -365,7 +365,7 @@ fn some_episodes() -> impl Strategy<Value = (Rollout, Vec<EpisodeSlice>)> {
     })
 }
 
-/// An episode of a rollout as one that is alone.
+/// The estimates for an episode of a rollout, as if the rollout held nothing else.
 fn alone(rollout: &Rollout, episode: &EpisodeSlice, estimate: &dyn Fn(&Trajectories<'_>) -> Estimates) -> Estimates {
     let whole = rollout.trajectories().expect("finished");
     let places = || (0..episode.length).map(|t| (episode.start + t) * rollout.n_envs() + episode.environment);
@@ -392,7 +392,7 @@ proptest! {
         prop_assert_eq!(packed.n_steps(), chosen.iter().map(|e| e.length).max().expect("one"));
         prop_assert_eq!(packed.memory(), vec![0.0; 2 * columns]);
 
-        // Where each step of the chosen episodes came from, and whether it is a first one.
+        // For each step of the chosen episodes: its index in the rollout, and whether it begins an episode.
         let mut expected = BTreeMap::new();
         for episode in &chosen {
             for step in 0..episode.length {
@@ -424,7 +424,7 @@ proptest! {
         }
     }
 
-    /// Equal bytes, since the sums are the same in the same order.
+    /// The bytes are equal, since the sums are the same in the same order.
     #[test]
     fn advantages_of_chosen_episodes_are_those_of_each_alone(
         (rollout, chosen) in some_episodes(), bootstrap in any::<bool>()
@@ -476,7 +476,7 @@ fn episodes_that_a_rollout_does_not_hold_are_refused() {
     assert!(matches!(result, Err(Error::RolloutLength { .. })), "{result:?}");
 }
 
-/// The mean over the samples of a packed `rollout` of a loss in which every output of the policy counts, with its gradient.
+/// A loss in which every output of the policy counts: its mean over the samples of a packed `rollout`, and its gradient.
 fn loss_of(policy: &TorchPolicy, rollout: &Rollout) -> (f64, Vec<f32>) {
     let sequences =
         Sequences::new(policy.spec(), rollout.n_steps(), rollout.observations(), rollout.starts(), rollout.memory())
@@ -493,7 +493,7 @@ fn loss_of(policy: &TorchPolicy, rollout: &Rollout) -> (f64, Vec<f32>) {
     (loss.double_value(&[]), gradient)
 }
 
-/// Thirty steps.
+/// Lengths of episodes by environment, thirty steps in all.
 fn unequal() -> Vec<Vec<usize>> {
     vec![vec![6, 2], vec![9], vec![1, 3, 5], vec![4]]
 }
@@ -572,10 +572,10 @@ fn padding_does_not_count_in_updates() {
 }
 
 const CARTPOLES: usize = 4;
-/// Not divisible by their number: 3, 3, 2 and 2.
+/// Number of episodes. It is not divisible by the number of environments, which play 3, 3, 2 and 2.
 const COUNT: usize = 10;
 
-/// A recurrent policy that pushes to either side as often, whatever it sees.
+/// A recurrent policy that pushes to either side with equal probability, whatever it observes.
 fn blind(input_size: usize) -> Policy {
     perturb_torch::register();
     let spec = PolicySpec {
@@ -589,7 +589,7 @@ fn blind(input_size: usize) -> Policy {
     Policy::from_weights(spec, &weights).expect("a policy")
 }
 
-/// Two rollouts of complete episodes with those that ended, and the statistics after them.
+/// Two rollouts of complete episodes, with the episodes that ended, and the statistics after them.
 fn collect(servers: &[PrivateServer], normalised: bool) -> (Vec<(Rollout, Vec<EndedEpisode>)>, Normalisers) {
     let servers = connect(servers);
     let mut observations = Vec::new();
@@ -634,7 +634,8 @@ fn collected_episodes_are_fixed_beforehand() {
             let first = own[0].episode_index;
             assert!(own.iter().zip(first..).all(|(episode, index)| episode.episode_index == index), "its first ones");
             assert!(iteration > 0 || first == 1, "what was opened is broken off");
-            // One after the other from the rollout's first step on, with an end after the last step and nowhere else.
+            // Episodes follow one another from the rollout's first step on. Each has an end at its last step and nowhere
+            // else.
             let mut t = 0;
             for span in rollout.episodes().iter().filter(|span| span.environment == slot) {
                 assert_eq!(span.start, t);
@@ -661,7 +662,7 @@ fn unseen_steps_are_no_part_of_the_statistics() {
     let server = [server()];
     let (raw, _) = collect(&server, false);
     let (normalised, normalisers) = collect(&server, true);
-    let mut rows = Vec::new(); // those that the session opens with, then all that was acted on
+    let mut rows = Vec::new(); // first the session's first observations, later all that were acted on
     Session::open(&connect(&server), &options("CartPole", CARTPOLES, 1), &mut rows).expect("a session");
     let size = rows.len() / CARTPOLES;
     let mut seen = 0;
@@ -708,8 +709,8 @@ fn complete_episodes_are_the_same_on_one_server_and_on_two() {
 const SAFE: f32 = 0.0;
 const ENVS: usize = 16;
 
-/// Episodes of one step with two arms. The safe one pays 0, the risky one 1, but -2.5 in a fifth of the drawn environments,
-/// so that it is better by 0.3 in the mean.
+/// Episodes of one step with two arms. The safe one pays 0. The risky one pays 1, but -2.5 in a fifth of the drawn
+/// environments, so its mean is higher by 0.3.
 fn pull(policy: &Policy, rng: &mut ChaCha8Rng, episodes: usize) -> Rollout {
     let mut rollout = Rollout::of_episodes(ENVS, 1, 1);
     let mut actor = Actor::new(policy.spec(), ENVS);
@@ -753,7 +754,8 @@ fn ppo(policy: &Policy) -> Box<dyn BaseAlgorithm> {
     Box::new(Ppo::new(config, policy, 5).expect("valid settings"))
 }
 
-/// A tenth of the episodes of a policy that takes either arm is catastrophic. The worst fifth holds these and safe ones.
+/// A policy that takes both arms with probability ½ has a catastrophe in a tenth of its episodes. The worst fifth of the
+/// episodes consists of these and of safe ones.
 #[rstest]
 #[case::a2c(a2c, 1500)]
 #[case::ppo(ppo, 100)]
@@ -772,7 +774,7 @@ fn epopt_avoids_catastrophes_that_its_base_accepts(
     }
     let last = pull(&policy, &mut rng, 1024);
     let safe = last.actions().iter().filter(|&&action| action == SAFE).count() as f64 / 1024.0;
-    // Both are nearly sure in the end; at first it is ½.
+    // Each base prefers one arm almost surely in the end; at first the share is ½.
     let expected = if epsilon < 1.0 { 0.9..=1.0 } else { 0.0..=0.1 };
     assert!(expected.contains(&safe), "{safe}");
 }

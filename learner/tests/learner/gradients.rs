@@ -38,8 +38,8 @@ fn weights_survive_a_round_trip() {
     assert_eq!(Policy::from_weights(spec, &weights).expect("a policy").weights(), weights);
 }
 
-/// Acting and learning compute the same function by other means: sums in another order, and a tanh that is off by up to
-/// 3e-7. Over two layers of 64 that grows to about 1e-6 of values and logits of order 1 to 10.
+/// Acting and learning compute the same function in different ways: they add in another order, and acting's tanh is off by
+/// up to 3e-7. Over two layers of 64 that grows to about 1e-6 for values and logits of order 1 to 10.
 const TOLERANCE: f32 = 1e-5;
 
 #[test]
@@ -74,7 +74,7 @@ fn the_actor_agrees_with_libtorch() {
     }
 }
 
-/// Samples of a policy that acted a little while ago.
+/// Samples of a policy whose weights differ a little from those to be updated, as after some gradient steps.
 struct Data {
     observations: Vec<f32>,
     actions: Vec<f32>,
@@ -87,7 +87,7 @@ struct Data {
 }
 
 impl Data {
-    /// `n` samples of a policy that differs by some hundredths from the one of `weights`.
+    /// `n` samples of a policy whose weights differ from `weights` by some hundredths.
     fn new(spec: &PolicySpec, weights: &[f32], n: usize) -> Self {
         let old: Vec<f32> = weights.iter().zip(numbers(weights.len(), 0.02, 3)).map(|(w, x)| w + x).collect();
         let observations = numbers(n * spec.observation_size, 1.0, 5);
@@ -202,7 +202,7 @@ fn gradients_agree_with_libtorch(
     let spec = spec(action, hidden);
     let policy = moved(&spec);
     let data = Data::new(&spec, policy.flat_weights(), n);
-    // Not all of them, and in another order.
+    // Some of the samples, in another order.
     let indices: Vec<u32> = (0..n as u32).rev().filter(|i| n < 10 || i % 7 != 0).collect();
     let mut network = Differentiator::new(&spec, 2).expect("threads");
     network.load(policy.flat_weights()).expect("weights that fit");

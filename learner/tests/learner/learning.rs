@@ -62,7 +62,7 @@ impl Identity {
     }
 }
 
-/// A policy, the task, and what a training loop has.
+/// A policy and a task, with the state of a training loop.
 struct Training {
     policy: Policy,
     actor: Actor,
@@ -83,7 +83,7 @@ impl Training {
         }
     }
 
-    /// Fills the rollout; gives the mean reward.
+    /// Fills the rollout. Returns the mean reward.
     fn collect(&mut self) -> f64 {
         self.actor.load(&self.policy.weights()).expect("weights that fit");
         self.rollout.clear();
@@ -111,7 +111,7 @@ impl Training {
         sum / (self.rollout.n_steps() * N_ENVS) as f64
     }
 
-    /// Collects and updates `updates` times; gives the mean reward of the last rollout.
+    /// Collects and updates `updates` times. Returns the mean reward of the last rollout.
     fn train(&mut self, algorithm: &mut dyn Algorithm, updates: usize) -> f64 {
         for update in 0..updates {
             self.collect();
@@ -168,7 +168,7 @@ fn ppo_begins_with_ratio_1_and_clips_nothing(
 ) {
     let mut training = Training::new(action, 32);
     training.collect();
-    // A learning rate that moves no weight by a rounding, so that each of four minibatches is a first one.
+    // The learning rate is so small that no weight changes. So each of four minibatches is like a first one.
     let config = PpoConfig {
         n_steps: 32,
         n_epochs: 1,
@@ -180,12 +180,13 @@ fn ppo_begins_with_ratio_1_and_clips_nothing(
     let mut first = Ppo::new(config.clone(), &training.policy, 1).expect("valid settings");
     let stats = first.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
     assert_eq!(stats.clip_fraction, Some(0.0));
-    // The actor's log-probabilities are off by 1e-6 at most, the divergence by half the square of that; but its
-    // f32 terms are rounded to 2⁻²⁴ each.
+    // The actor's log-probabilities are off by 1e-6 at most, and the divergence by half the square of that. But its f32
+    // terms are rounded to 2⁻²⁴ each.
     assert!(stats.approx_kl.expect("PPO's").abs() < 2e-7, "{stats:?}");
-    // The policy diverges from itself by nothing; a minibatch's outputs may differ from all's by a rounding.
+    // The divergence of a policy from itself is 0. The outputs of a minibatch may differ from those of the whole batch by
+    // rounding.
     assert!(stats.kl_divergence.expect("a penalty").abs() < 2e-7, "{stats:?}");
-    // With ratio 1, the surrogate is minus the mean of the normalised advantages, 0 but for the ratios' error.
+    // With ratio 1, the surrogate is minus the mean of the normalised advantages, which is 0 up to the error of the ratios.
     assert!(stats.policy_gradient_loss.abs() < 1e-5, "{stats:?}");
     // The rollout's own values lie inside any clipping interval.
     let mut unclipped =
@@ -212,7 +213,7 @@ fn the_loss_is_the_weighted_sum_of_its_parts() {
             ent_coef,
             vf_coef,
             n_epochs: 3,
-            learning_rate: 1e-2, // so far that the divergence matters
+            learning_rate: 1e-2, // large enough for the divergence to matter
             ..PpoConfig::default()
         };
         let penalised = |n_minibatches| PpoConfig { kl_coef, n_minibatches, ..ppo.clone() };
@@ -343,7 +344,7 @@ fn the_learning_rate_falls_linearly_or_stays() {
         assert_eq!(stats.learning_rate, expected);
         assert!(algorithm.update(&mut training.policy, &training.rollout, 1.5).is_err());
     }
-    // A2C's last learning rate is 0, and then nothing moves.
+    // A2C's last learning rate is 0, so the last update moves no weight.
     let mut algorithm = a2c(&training);
     let before = training.policy.weights();
     algorithm.update(&mut training.policy, &training.rollout, 0.0).expect("an update");

@@ -30,7 +30,7 @@ fn trained(settings: &str) -> (TempDir, Vec<Progress>) {
 
 const N_STEPS: usize = 6;
 const N_ENVS: usize = 3;
-/// With it, of numbers like 1.5 a half is exact.
+/// Half of a number like 1.5 has no rounding error.
 const GAMMA: f64 = 0.5;
 
 /// The way in which the task reports its time limit.
@@ -42,7 +42,8 @@ enum Limit {
     Termination { bonus: f32 },
 }
 
-/// Noise in which the time limit ends an episode in the middle and one in the last step. Final observations are worth 1.5.
+/// Noise in two of whose episodes the time limit is reached: one ends in the middle of the rollout, one in its last step.
+/// The value of every final observation is 1.5.
 fn rollout(spec: &PolicySpec, limit: Limit) -> Rollout {
     let mut rng = stream(7, Purpose::Actions);
     let mut numbers = |count: usize| (0..count).map(|_| normal(&mut rng) as f32).collect::<Vec<f32>>();
@@ -103,8 +104,8 @@ fn updates_bootstrap_truncation_if_set(
     assert_ne!(weights(true, Limit::Truncation), weights(false, Limit::Truncation));
 }
 
-/// The reference counts only what it learns from: steps, or episodes if each has an update, since it pads these to the step
-/// limit.
+/// Counts what EPOpt learns from, as the reference does: steps; or, if each episode has an update, episodes, because the
+/// reference then pads each episode to the step limit.
 #[rstest]
 fn epopts_linear_learning_rate_falls_by_the_kept_episodes(#[values(true, false)] update_per_episode: bool) {
     let settings = "preset = 'paper'\nalgorithm = 'epopt-a2c'\nepisodes = 9\nepisodes_per_iteration = 4\nepsilon = 0.4\n\
@@ -124,7 +125,7 @@ fn epopts_linear_learning_rate_falls_by_the_kept_episodes(#[values(true, false)]
     assert!(progress.len() > 2 && episodes < 4 * progress.len() as u64, "some are not kept: {progress:?}");
 }
 
-/// A rollout of one environment is an eighth of one of eight.
+/// The preset "paper" has one environment and logs every tenth rollout, "perturb" has eight and logs every rollout.
 #[rstest]
 #[case("perturb", 8, 1)]
 #[case("paper", 1, 10)]
@@ -148,7 +149,8 @@ fn ppos_log_has_a_line_for_so_many_rollouts_and_for_the_last(
     assert_eq!(logged, (1..=last).filter(due).collect::<Vec<_>>());
 }
 
-/// The reference tests those that it saved last, up to a hundred updates before.
+/// Tests see the last weights, whatever `checkpoint_interval` is. In contrast, the reference tests the weights that it
+/// saved last, which can be a hundred updates old.
 #[test]
 fn tested_policy_has_the_last_weights() {
     let checkpoint = |checkpoint_interval: u64| {

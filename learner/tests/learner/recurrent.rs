@@ -22,7 +22,7 @@ fn spec(action: ActionKind, hidden: &[usize], width: usize) -> PolicySpec {
     PolicySpec { observation_size: O, action, hidden: hidden.to_vec(), lstm: Some(width) }
 }
 
-/// Weights that differ from the initial ones everywhere: every number, biases and log_std too, moves by about 0.1.
+/// Weights that differ from the initial ones everywhere: every number, also of biases and log_std, moves by about 0.1.
 fn moved(spec: &PolicySpec) -> Weights {
     let mut rng = stream(9, Purpose::Weights);
     let mut weights = Policy::new(spec.clone(), 1).expect("a policy").weights();
@@ -30,12 +30,12 @@ fn moved(spec: &PolicySpec) -> Weights {
     weights
 }
 
-/// A window of acting on noise, with memories from before it and episodes that start in it.
+/// Some steps of a policy that acts on noise. It remembers earlier steps, and episodes start in between.
 struct Window {
     n_envs: usize,
     observations: Vec<f32>,
     starts: Vec<bool>,
-    /// Before the first step.
+    /// The memory before the first step.
     memory: Vec<f32>,
     acts: Vec<ActorOutput>,
 }
@@ -57,7 +57,8 @@ impl Window {
                     n_envs,
                 };
             }
-            // About every sixth step starts an episode; in the first step too, and in none of some steps.
+            // About every sixth step of an environment starts an episode: 30 % of the odd steps and no even one. The
+            // window's first step is odd.
             for n in 0..n_envs {
                 let start = t % 2 == 1 && uniform(&mut rng) < 0.3;
                 if start {
@@ -83,8 +84,8 @@ impl Window {
     }
 }
 
-/// Acting and learning compute the same function by other means: sums in another order, and a tanh that is off by up to
-/// 3e-7. Over layers of at most 256 that grows to about 1e-6 of values and logits of order 1.
+/// Acting and learning compute the same function in different ways: they add in another order, and acting's tanh is off by
+/// up to 3e-7. Over layers of at most 256 that grows to about 1e-6 for values and logits of order 1.
 const TOLERANCE: f32 = 1e-5;
 
 fn torch(spec: &PolicySpec, weights: &Weights) -> TorchPolicy {
@@ -232,10 +233,11 @@ const N_ENVS: usize = 16;
 /// Steps of an episode of [`Recall`].
 const LENGTH: usize = 4;
 
-/// A task for a memory: the first observation of an episode is (±1, 0), the next are (0, 0), the last is (0, 1). Reward 1
-/// for telling the first one's sign in the last step, else 0; without memory ½ is the best.
+/// A task that needs a memory: the first observation of an episode is (±1, 0), the next are (0, 0), the last is (0, 1). In
+/// the last step the action must name the sign of the first observation, for a reward of 1, else 0. Without memory the best
+/// mean reward is ½.
 ///
-/// The environments' episodes start one after the other, so that windows begin in the middle of some.
+/// Neighbouring environments start their episodes one step apart, so that windows begin in the middle of some episodes.
 struct Recall {
     rng: ChaCha8Rng,
     cues: [usize; N_ENVS],
@@ -261,7 +263,7 @@ impl Recall {
     }
 }
 
-/// A policy, the task, and what a training loop has.
+/// A policy and a task, with the state of a training loop.
 struct Training {
     policy: Policy,
     actor: Actor,
@@ -289,7 +291,7 @@ impl Training {
         }
     }
 
-    /// Fills the rollout; gives the share of episodes in which the sign was told.
+    /// Fills the rollout. Returns the share of episodes whose action named the sign.
     fn collect(&mut self) -> f64 {
         self.actor.load(&self.policy.weights()).expect("weights that fit");
         self.rollout.begin(self.actor.memory());
@@ -326,7 +328,7 @@ impl Training {
         told / episodes
     }
 
-    /// Collects and updates `updates` times; gives the mean share of four more rollouts.
+    /// Collects and updates `updates` times. Returns the mean share of right signs in four more rollouts.
     fn train(&mut self, algorithm: &mut dyn Algorithm, updates: usize) -> f64 {
         for _ in 0..updates {
             self.collect();
@@ -348,8 +350,8 @@ fn ppo(training: &Training, n_minibatches: usize) -> Ppo {
     Ppo::new(config, &training.policy, 5).expect("valid settings")
 }
 
-/// The share of signs told in the end. Chance is ½; four standard deviations of the 128 episodes of A2C's four rollouts
-/// are 0.18.
+/// Checks the final share of right signs. Chance gives ½. Four standard deviations of a mean over 128 episodes, those of
+/// A2C's last four rollouts, are 0.18.
 fn assert_recalls(lstm: Option<usize>, share: f64) {
     let expected = if lstm.is_some() { 0.95..=1.0 } else { 0.0..=0.68 };
     assert!(expected.contains(&share), "{share}");
@@ -391,11 +393,12 @@ fn ppo_begins_with_ratio_1_and_clips_nothing(#[values(1, 4)] n_minibatches: usiz
     let mut first = Ppo::new(config.clone(), &training.policy, 1).expect("valid settings");
     let stats = first.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
     assert_eq!(stats.clip_fraction, Some(0.0));
-    // The divergence is half the square of the log-probabilities' errors of 1e-6; its f32 terms are rounded to 2⁻²⁴.
+    // The divergence is half the square of the log-probabilities' errors of 1e-6, and its f32 terms are rounded to 2⁻²⁴.
     assert!(stats.approx_kl.expect("PPO's").abs() < 2e-7, "{stats:?}");
-    // The policy diverges from itself by nothing; a minibatch's outputs may differ from all's by a rounding.
+    // The divergence of a policy from itself is 0. The outputs of a minibatch may differ from those of the whole batch by
+    // rounding.
     assert!(stats.kl_divergence.expect("a penalty").abs() < 2e-7, "{stats:?}");
-    // With ratio 1, the surrogate is minus the mean of the normalised advantages, 0 but for the ratios' error.
+    // With ratio 1, the surrogate is minus the mean of the normalised advantages, which is 0 up to the error of the ratios.
     assert!(stats.policy_gradient_loss.abs() < 1e-5, "{stats:?}");
     let config = PpoConfig { n_epochs: 10, learning_rate: 1e-2, ..config };
     let mut later = Ppo::new(config, &training.policy, 1).expect("valid settings");

@@ -43,7 +43,7 @@ fn as_bits(flag: bool) -> f32 {
     f32::from(u8::from(flag))
 }
 
-/// The previous step in an input: the last action and reward, and that no episode has ended.
+/// The numbers that an input has beside the observation: last action, last reward, and 0, because no episode has ended.
 fn beside(action: ActionKind, taken: f32, reward: f32) -> Vec<f32> {
     let mut beside: Vec<f32> = match action {
         ActionKind::Discrete { n } => (0..n).map(|j| as_bits(taken == j as f32)).collect(),
@@ -144,7 +144,8 @@ fn trial_of_one_episode_equals_longer_inputs() {
     }
 }
 
-/// Rollouts of one step each, which show the memory before every step, and what ended when.
+/// Rollouts of one step each, whose `memory` is thus the one before every step, and the episodes that ended, with their
+/// steps.
 struct Steps {
     rollouts: Vec<Rollout>,
     ended: Vec<(usize, EndedEpisode)>,
@@ -250,7 +251,7 @@ fn advantages_run_across_the_episodes_of_a_trial() {
             let place = (end - 1) * N_ENVS + n;
             let next = place + N_ENVS;
             if end == rollout.n_steps() {
-                continue; // what follows is in the next rollout
+                continue; // the next value is in the next rollout
             }
             let value = f64::from(values[place]);
             let reward = 1.0; // CartPole pays 1 a step
@@ -270,14 +271,15 @@ fn advantages_run_across_the_episodes_of_a_trial() {
     assert!(inner >= N_ENVS && outer >= N_ENVS, "{inner} {outer}");
 }
 
-/// A checkpoint of RL² on CartPole, whose policy is four cells:
+/// A checkpoint of RL² on CartPole. Its policy has four cells:
 ///
-/// - how often an episode has ended of which it remembers a step, n: h = tanh n;
-/// - which way the pole leans and falls;
-/// - the last reward, r: h = tanh tanh r;
-/// - whether there was a step before.
+/// - the first counts the episodes n whose end follows a remembered step: h = tanh n;
+/// - the second tells to which side the pole leans and falls;
+/// - the third holds the last reward r: h = tanh tanh r;
+/// - the fourth tells whether there was an earlier step.
 ///
-/// It balances the pole if n = 1 and r = 0.1, which is 1 normalised, and else pushes to one side until the pole falls.
+/// The policy balances the pole if n = 1 and r = 0.1, which is a reward of 1 normalised. Otherwise it pushes to one side
+/// until the pole falls.
 fn balancing_in_the_second_episode(servers: &Servers) -> Checkpoint {
     let settings = "environment = 'CartPole'\nalgorithm = 'rl2-a2c'\nepisodes = 1\nnum_envs = 2";
     let config = TrainConfig::from_table("the test", settings.parse().expect("TOML")).expect("a configuration");
@@ -329,12 +331,12 @@ fn tests_count_the_last_episode_of_each_trial() {
     let two = connect(&both);
     let checkpoint = balancing_in_the_second_episode(&one);
     let figures_of = |servers: &Servers, checkpoint: &Checkpoint, seed| {
-        // More than 100, so that environments meet more than one trial.
+        // More than 100 trials, so that environments play more than one trial each.
         test(servers, checkpoint, Version::D, 250, seed, &StopFlag::default(), |_| {}).expect("a test")
     };
     let figures = |servers: &Servers, checkpoint: &Checkpoint| figures_of(servers, checkpoint, 1);
     let result = figures(&one, &checkpoint);
-    // First episodes fall within a dozen steps, second ones stand for nearly 200.
+    // A trial's first episode ends within a dozen steps, its second lasts for nearly 200.
     assert!(result.mean_length > 150.0, "{result:?}");
     assert_eq!(result.episodes, 250);
     assert_eq!(figures(&two, &checkpoint), result);
@@ -342,7 +344,7 @@ fn tests_count_the_last_episode_of_each_trial() {
     let raw = &mut checkpoint.clone();
     raw.state.reward_normaliser = None;
     assert!(figures(&one, raw).mean_length < 15.0, "the reward is no longer what the policy knows");
-    // Falls come sooner or later by how an episode starts.
+    // How soon a pole falls depends on the start of the episode, and so on the seed.
     assert_eq!(figures(&two, raw), figures(&one, raw));
     assert_ne!(figures_of(&one, raw, 2), figures(&one, raw));
     let single = &mut checkpoint.clone();
@@ -351,12 +353,11 @@ fn tests_count_the_last_episode_of_each_trial() {
 }
 
 const ARMS: usize = 16;
-/// Pulls in an episode, and in a trial of two.
+/// Steps of an episode, each with a choice of one arm.
 const EPISODE: usize = 3;
 const TRIAL: usize = 2 * EPISODE;
 
-/// Two arms, of which one pays 1 and the other nothing; which it is, is drawn for every trial, and the observation does not
-/// say it.
+/// Two arms: one pays 1, the other nothing. The paying arm is drawn for every trial, and the observation does not show it.
 struct Bandits {
     policy: Policy,
     actor: Actor,
@@ -385,7 +386,7 @@ impl Bandits {
         }
     }
 
-    /// Fills the rollout with whole trials; gives the share of pulls in their last episodes that paid.
+    /// Fills the rollout with whole trials. Returns the share of steps that paid in the trials' last episodes.
     fn collect(&mut self) -> f64 {
         self.actor.load(&self.policy.weights()).expect("weights that fit");
         self.rollout.begin(self.actor.memory());
@@ -428,7 +429,7 @@ impl Bandits {
         paid / pulls
     }
 
-    /// Learns; gives the share over some 400 trials more.
+    /// Updates the policy `updates` times. Returns the share of steps that paid in some 400 further trials.
     fn train(&mut self, algorithm: &mut dyn Algorithm, updates: usize) -> f64 {
         for _ in 0..updates {
             self.collect();
@@ -444,7 +445,7 @@ fn bandits_a2c(policy: &Policy) -> A2c {
     A2c::new(config, policy).expect("valid settings")
 }
 
-// The best share is 1: the first pull tells which arm pays. Without what came of it ½ is the best.
+// The best share is 1: the first step shows which arm pays. A policy that does not see its reward reaches ½ at best.
 
 #[test]
 fn a2c_adapts_within_a_trial() {
@@ -469,6 +470,7 @@ fn without_rl2_it_does_not_adapt() {
     let mut bandits = Bandits::new(false, 1);
     let mut a2c = bandits_a2c(&bandits.policy);
     let share = bandits.train(&mut a2c, 1500);
-    // If all pulls of a trial are the same arm, 400 shares of 0 or 1: four standard deviations of their mean.
+    // Four standard deviations of a mean of 400 numbers that are 0 or 1, for the case that all choices of a trial are the
+    // same arm.
     assert!((share - 0.5).abs() < 0.1, "{share}");
 }

@@ -14,7 +14,7 @@ use rstest::rstest;
 
 use crate::common::{connect, server};
 
-/// Algorithms of all kinds, with batches of different sizes, versions and parameters, and long rollouts and short ones.
+/// Trainings with all algorithms: batches of different sizes, versions and parameters, long rollouts and short ones.
 const TRAININGS: [&str; 11] = [
     "algorithm = 'a2c'\nnum_envs = 1\nn_steps = 5\nseed = 3",
     "algorithm = 'ppo'\nversion = 'R'\nnum_envs = 3\nn_steps = 16\nn_minibatches = 2\nn_epochs = 2\nseed = 3",
@@ -27,16 +27,16 @@ const TRAININGS: [&str; 11] = [
      full_iterations = 1\nseed = 4",
     "preset = 'paper'\nalgorithm = 'epopt-ppo'\narchitecture = 'rc'\nepisodes_per_iteration = 3\nepsilon = 0.5
      full_iterations = 1\nn_epochs = 2\nseed = 4",
-    // What sees noise acts at the learner.
+    // Trainings with observation noise choose their actions at the learner.
     "algorithm = 'ppo'\nversion = 'R'\nnum_envs = 3\nn_steps = 64\nn_epochs = 2\nobservation_noise = 0.5
      weight_decay = 0.1\nseed = 8",
     "algorithm = 'epopt-a2c'\nversion = 'E'\nnum_envs = 2\nepisodes_per_iteration = 3\nepsilon = 0.5
      full_iterations = 1\nobservation_noise = 0.5\nweight_decay = 0.1\nseed = 4",
-    // A rollout that comes in pieces, if others wait for the server too.
+    // If other runs wait for the server too, this rollout comes in several replies.
     "algorithm = 'ppo'\nversion = 'R'\nnum_envs = 65\nn_steps = 64\nn_minibatches = 2\nn_epochs = 1\nseed = 7",
 ];
 
-/// Tasks, with what their policies see.
+/// Environments and budgets; the policies of the last one also see parameters.
 const CART_POLE: &str = "environment = 'CartPole'\nepisodes = 12";
 const PENDULUM: &str = "environment = 'Pendulum'\nepisodes = 5";
 const SEEN_PENDULUM: &str = "environment = 'Pendulum'\nepisodes = 5\nobserve = 'parameters'";
@@ -46,7 +46,7 @@ fn config(task: &str, training: &str) -> TrainConfig {
     TrainConfig::from_table("the test", text.parse().expect("TOML")).expect("a configuration")
 }
 
-/// All that decides what a training does next, and what it has done.
+/// The whole state of a run: everything that its next step depends on, and everything that it has done.
 fn kept(directory: &Path) -> String {
     let (checkpoint, resume) = ResumeState::load(directory).expect("a checkpoint");
     let state = checkpoint.state;
@@ -63,7 +63,8 @@ fn kept(directory: &Path) -> String {
     )
 }
 
-/// Trains in folders of these numbers, from where these are, until all end or one has had so many iterations.
+/// Trains the runs with these `numbers`, each in its folder, from their last checkpoints. Stops when all have ended, or
+/// when one has had `most_iterations` iterations.
 fn together(servers: &Servers, base: &Path, task: &str, numbers: &[usize], most_iterations: u64) {
     let directories: Vec<(RunDirectory, Start)> = numbers
         .iter()
@@ -138,7 +139,8 @@ fn training_bytes_do_not_depend_on_the_group(#[values(CART_POLE, PENDULUM, SEEN_
     assert!(all(base.path(), 10) == expected, "resumed in other groups");
 }
 
-/// The reference fills each kept episode up to the step limit, and counts all steps.
+/// With an update per episode, counts every kept episode with the maximal number of steps, as the reference does, which
+/// pads episodes to the step limit.
 #[rstest]
 fn learning_rate_falls_by_episodes_with_update_per_episode(#[values(true, false)] update_per_episode: bool) {
     let private = [server()];

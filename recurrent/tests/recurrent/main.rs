@@ -16,7 +16,7 @@ fn train(program: &Path, architecture: &str, out: &Path) -> Command {
     let mut command = Command::new(program);
     let options = ["--env", "CartPole", "--algorithm", "a2c", "--episodes", "20", "--architecture", architecture];
     command.arg("train").args(options).arg("--out").arg(out);
-    // A copy of the program has no server beside it.
+    // The program's copy has no server beside it, so it gets the server's path.
     command.env("PERTURB_SERVER", Path::new(RECURRENT).with_file_name("perturb-server"));
     command
 }
@@ -55,7 +55,8 @@ fn missing_perturb_recurrent_is_reported_with_a_remedy() {
     assert_eq!(said, expected);
     assert!(!out.exists());
 
-    // With it, by either name, to the same weights; and again without it, what was trained is tested and gone on with.
+    // `perturb` trains with `perturb-recurrent` beside it, and either program gives the same weights. Without
+    // `perturb-recurrent` a trained policy can still be tested.
     fs::copy(RECURRENT, folder.path().join("perturb-recurrent")).expect("copied");
     let (out, other) = (folder.path().join("one"), folder.path().join("other"));
     for (program, out) in [("perturb", &out), ("perturb-recurrent", &other)] {
@@ -92,7 +93,7 @@ fn programs_of_two_builds_are_refused() {
     let said = stderr(&output);
     assert!(said.contains("perturb is 0.0.1 (other), but perturb-recurrent is "), "{said}");
     assert!(said.contains("install both from one clone with `make install-recurrent`"), "{said}");
-    // Without a recurrent policy it does not matter.
+    // The builds need not agree for other tasks than training a recurrent policy.
     let output = run(Command::new(perturb()).arg("--version").env("PERTURB_STARTED_BY", "0.0.1 (other)"));
     assert!(output.status.success());
 }
