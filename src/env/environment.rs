@@ -11,6 +11,17 @@ use std::fmt;
 /// Makes an environment with default parameters.
 pub type MakeEnvironment = dyn Fn() -> Result<Box<dyn Environment>, Error> + Send + Sync;
 
+/// The pushes that an environment can take.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PushSpec {
+    /// The description of the parameter that is their size, as in "impulse of a push on the torso".
+    pub description: &'static str,
+    /// The unit of their size.
+    pub unit: &'static str,
+    /// The axes along which they act, ascending: 0 to 2 for x, y and z. An analytic task has one, its coordinate.
+    pub axes: &'static [usize],
+}
+
 /// The fixed description of an environment.
 #[derive(Clone, Copy)]
 pub struct EnvironmentSpec {
@@ -40,6 +51,8 @@ pub struct EnvironmentSpec {
     pub control_timestep: f64,
     /// The approximate time of a step on one core, µs. The pool cuts batches by it; results do not depend on it.
     pub step_cost: f64,
+    /// How it can be pushed; `None` if it cannot.
+    pub push: Option<PushSpec>,
     /// The success rule of the paper's text.
     pub success: Success,
     /// The success rule of the paper's published code; `None` if it is the same.
@@ -191,6 +204,9 @@ pub trait Environment: Send {
             }
         }
     }
+
+    /// Pushes the physics during the next step, by an impulse along x, y and z in the unit of [`EnvironmentSpec::push`].
+    fn push(&mut self, _impulse: [f64; 3]) {}
 
     /// Draws an initial state.
     fn reset(&mut self, stream: &mut Stream);

@@ -14,7 +14,7 @@ mod success;
 
 pub use catalogue::Catalogue;
 pub use environment::{
-    Environment, EnvironmentSpec, MakeEnvironment, Transition, check_bounds, check_distribution, resolve,
+    Environment, EnvironmentSpec, MakeEnvironment, PushSpec, Transition, check_bounds, check_distribution, resolve,
 };
 pub use episode::{EpisodeEnd, EpisodeId, EpisodeStart, Episodes, Outcome, Receipt, Settings};
 pub use error::Error;

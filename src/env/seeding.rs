@@ -26,6 +26,7 @@
 //! | 3 | of the action, from 0 | a [normal](Stream::normals) number for each entry of the action |
 //! | 4 | of the observation, 0 after a reset | a [normal](Stream::normals) number for each entry of the observation |
 //! | 5 | of the observation, 0 after a reset | for each entry of the observation one below `sensor_dropout` to lose it |
+//! | 6 | of the action, from 0 | one below 1 / `push_interval` to push, then those of the [direction](Stream::direction) |
 
 /// The purpose of a stream: the third word of the counter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -42,6 +43,8 @@ pub enum Purpose {
     SensorNoise = 4,
     /// The entries of an observation that are lost.
     SensorDropout = 5,
+    /// The steps with a push, and the directions of pushes.
+    Push = 6,
 }
 
 /// The address of an episode's random numbers: they follow from it and from the distributions.
@@ -103,6 +106,19 @@ impl Stream {
         let radius = (-2.0 * libm::log(1.0 - self.unit())).sqrt();
         let (sin, cos) = libm::sincos(std::f64::consts::TAU * self.unit());
         [radius * cos, radius * sin]
+    }
+
+    /// A random direction along `n` axes: ±1 for one; uniform on the circle for two, by its angle; uniform on the sphere for
+    /// three, by its last coordinate and its angle about that axis. The other entries are 0.
+    pub fn direction(&mut self, n: usize) -> [f64; 3] {
+        let last = match n {
+            1 => return [if self.unit() < 0.5 { -1.0 } else { 1.0 }, 0.0, 0.0],
+            2 => 0.0,
+            _ => 2.0 * self.unit() - 1.0,
+        };
+        let (sin, cos) = libm::sincos(std::f64::consts::TAU * self.unit());
+        let radius = (1.0 - last * last).sqrt();
+        [radius * cos, radius * sin, last]
     }
 
     /// Uniform in [low, high).

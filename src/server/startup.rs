@@ -133,6 +133,7 @@ pub async fn run(
 /// The optional parts of the contract that this server knows, in alphabetical order; docs/protocol.md lists them.
 const FEATURES: &[&str] = &[
     "act",
+    "disturbances",
     "groups",
     "lease",
     "observe_parameters",

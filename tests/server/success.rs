@@ -30,6 +30,7 @@ const fn scripted_spec(achievement: Achievement, comparison: Comparison, thresho
         control_timestep: 1.0,
         step_cost: 0.1,
         success: Success { description: "", achievement, comparison, threshold },
+        push: None,
         code_success: None,
         heatmap_axes: None,
     }

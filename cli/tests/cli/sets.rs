@@ -225,7 +225,7 @@ fn disturbed_episodes_are_recorded_and_replayed() {
         assert_eq!(values("grid", "sensor_delay").iter().sum::<f64>(), 12.0, "each delay in as many episodes");
     }
     let refused = perturb(&["train", "--env", "CartPole", "--parameters", "action_dely=2"]).output().unwrap();
-    let expected = "one of force, length, mass, or a disturbance: action_delay, action_hold, sensor_delay, sensor_noise, \
+    let expected = "one of force, length, mass, or a disturbance: action_delay, action_hold, push, push_interval, sensor_delay, sensor_noise, \
                     sensor_dropout (did you mean `action_delay`?)";
     assert!(stderr(&refused).contains(expected), "{}", stderr(&refused));
 }

@@ -385,6 +385,13 @@ impl Simulation {
         self.array_mut(start, length)
     }
 
+    /// Sets the force on the centre of mass of a body in N, in the world's frame, until it is set again. It is no part of
+    /// the [state](Self::state).
+    pub fn set_force(&mut self, body: usize, force: [f64; 3]) {
+        let (start, length) = (self.raw().xfrc_applied, 6 * self.model.n_body());
+        self.array_mut(start, length)[6 * body..][..3].copy_from_slice(&force);
+    }
+
     // ---- what step1 computed
 
     /// An array that MuJoCo computed.

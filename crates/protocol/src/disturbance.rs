@@ -1,10 +1,15 @@
 //! The names of disturbances: parameters that every environment can have beside its own, with the same meaning in all.
 
 /// Disturbances with 0 as their default.
-const NAMES: [&str; 6] =
-    ["action_delay", "action_hold", "action_noise", "sensor_delay", "sensor_noise", "sensor_dropout"];
+const NAMES: [&str; 7] =
+    ["action_delay", "action_hold", "action_noise", "push", "sensor_delay", "sensor_noise", "sensor_dropout"];
 /// The scale of all actuators, whose default is 1. With `_` and an actuator's name it is that of one.
 const ACTION_SCALE: &str = "action_scale";
+
+/// The mean number of steps between pushes, which there are none of as long as their size is 0.
+const PUSH_INTERVAL: &str = "push_interval";
+/// The default of the mean interval of pushes, in steps.
+pub const DEFAULT_PUSH_INTERVAL: f64 = 100.0;
 
 /// Whether a parameter of this name is a disturbance.
 pub fn is_disturbance(name: &str) -> bool {
@@ -14,5 +19,8 @@ pub fn is_disturbance(name: &str) -> bool {
 /// The value of a disturbance that disturbs nothing; `None` for other parameters.
 pub fn default_value(name: &str) -> Option<f64> {
     let is_scale = name.strip_prefix(ACTION_SCALE).is_some_and(|rest| rest.is_empty() || rest.starts_with('_'));
+    if name == PUSH_INTERVAL {
+        return Some(DEFAULT_PUSH_INTERVAL);
+    }
     if is_scale { Some(1.0) } else { NAMES.contains(&name).then_some(0.0) }
 }

@@ -6,7 +6,7 @@ use super::{
     sensors::SensorPath,
 };
 use crate::{
-    env::{Action, Draw, Environment, EnvironmentSpec, Error, Stream, Transition},
+    env::{Action, Draw, Environment, EnvironmentSpec, Error, Purpose, Stream, Transition},
     scene::Scene,
 };
 
@@ -113,6 +113,12 @@ impl Environment for Disturbed {
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
         let action = self.actions.pass(&self.values, &self.draw, self.steps, action);
+        if self.values.push > 0.0
+            && let Some(push) = self.spec.push
+            && let Some(impulse) = impulse(&self.values, &self.draw, self.steps, push.axes)
+        {
+            self.inner.push(impulse);
+        }
         let transition = self.inner.step(action, reward_terms);
         self.steps += 1;
         self.sensors.pass(&self.values, &self.draw, self.steps, |out| self.inner.observe(out));
@@ -145,4 +151,17 @@ impl Environment for Disturbed {
         let address = (&self.draw, self.steps);
         self.sensors.load(&self.values, address, late_observations, |out| self.inner.observe(out))
     }
+}
+
+/// The impulse along x, y and z of this step's push, if there is one.
+fn impulse(values: &DisturbanceValues, draw: &Draw, step: u32, axes: &[usize]) -> Option<[f64; 3]> {
+    let mut stream = Stream::at_step(draw, Purpose::Push, step);
+    if stream.unit() * values.push_interval >= 1.0 {
+        return None;
+    }
+    let mut impulse = [0.0; 3];
+    for (&axis, part) in axes.iter().zip(stream.direction(axes.len())) {
+        impulse[axis] = values.push * part;
+    }
+    Some(impulse)
 }

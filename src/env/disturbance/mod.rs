@@ -16,7 +16,7 @@ mod sensors;
 use super::{Environment, EnvironmentSpec, Error, Parameter, Quantity, shorten};
 use layer::Disturbed;
 use parameters::DisturbanceSet;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, OnceLock, PoisonError};
 
 /// An environment and its twin. Both live as long as the process.
 #[derive(Clone, Copy)]
@@ -32,6 +32,22 @@ static TWINS: Mutex<Vec<Twin>> = Mutex::new(Vec::new());
 /// The disturbances that an environment can have beside its own parameters.
 pub fn disturbances(spec: &'static EnvironmentSpec) -> &'static [Parameter] {
     twin(spec).disturbances
+}
+
+/// The disturbances that an environment could have, as parameters: all but those whose names it uses itself.
+pub fn possible(spec: &EnvironmentSpec) -> Vec<Parameter> {
+    DisturbanceSet::new(spec).parameters().collect()
+}
+
+/// The environment whose sessions all have the disturbances as further parameters, as a catalogue has it: with the sets of
+/// `declared` in versions R and E. It has no disturbances beside its parameters, and is its own twin.
+pub fn declare(spec: &'static EnvironmentSpec, declared: &[Parameter]) -> &'static EnvironmentSpec {
+    let mut set = DisturbanceSet::new(spec);
+    set.declare(declared);
+    let disturbed = with_set(spec, set);
+    let twin = Twin { base: disturbed, disturbed, disturbances: &[] };
+    TWINS.lock().unwrap_or_else(PoisonError::into_inner).push(twin);
+    disturbed
 }
 
 /// The environment with the disturbances as further parameters.
@@ -89,18 +105,25 @@ fn twin(spec: &'static EnvironmentSpec) -> Twin {
     if let Some(twin) = twins.iter().find(is_known) {
         return *twin;
     }
-    let set: &'static DisturbanceSet = Box::leak(Box::new(DisturbanceSet::new(spec)));
+    let set = DisturbanceSet::new(spec);
     let disturbances: &'static [Parameter] = Vec::leak(set.parameters().collect());
-    let quantities = disturbances.iter().map(|Parameter { name, unit, .. }| Quantity { name, unit });
-    let mut disturbed = *spec;
-    disturbed.parameters = Vec::leak(spec.parameters.iter().copied().chain(disturbances.iter().copied()).collect());
-    disturbed.applied = Vec::leak(spec.applied.iter().copied().chain(quantities).collect());
-    // The environment knows its spec, which has the closure that makes it.
-    disturbed.make = Box::leak(Box::new(move || {
-        let twin = twin(spec);
-        Ok(Box::new(Disturbed::new((spec.make)()?, twin.disturbed, set)) as Box<dyn Environment>)
-    }));
-    let twin = Twin { base: spec, disturbed: Box::leak(Box::new(disturbed)), disturbances };
+    let twin = Twin { base: spec, disturbed: with_set(spec, set), disturbances };
     twins.push(twin);
     twin
+}
+
+/// The environment with these disturbances behind its own parameters.
+fn with_set(spec: &'static EnvironmentSpec, set: DisturbanceSet) -> &'static EnvironmentSpec {
+    let set: &'static DisturbanceSet = Box::leak(Box::new(set));
+    let quantities = set.parameters().map(|Parameter { name, unit, .. }| Quantity { name, unit });
+    let mut disturbed = *spec;
+    disturbed.parameters = Vec::leak(spec.parameters.iter().copied().chain(set.parameters()).collect());
+    disturbed.applied = Vec::leak(spec.applied.iter().copied().chain(quantities).collect());
+    // An environment knows its spec, which has the closure that makes it.
+    let address: &'static OnceLock<&'static EnvironmentSpec> = Box::leak(Box::default());
+    disturbed.make = Box::leak(Box::new(move || {
+        let disturbed = address.get().expect("nobody has the closure before the address is set");
+        Ok(Box::new(Disturbed::new((spec.make)()?, disturbed, set)) as Box<dyn Environment>)
+    }));
+    address.get_or_init(|| Box::leak(Box::new(disturbed)))
 }

@@ -1,6 +1,7 @@
 //! The disturbances of an environment, as parameters, and the values that are in force.
 
 use crate::env::{ActionSpace, EnvironmentSpec, Parameter};
+use perturb_protocol::disturbance::DEFAULT_PUSH_INTERVAL;
 
 /// The longest delay, in steps.
 const MAX_DELAY: usize = 100;
@@ -12,6 +13,10 @@ const MAX_LATE_OBSERVATION_NUMBERS: usize = 8192;
 const MAX_SCALED_ACTUATORS: usize = 32;
 /// The largest noise, and the largest scale.
 const MAX_FACTOR: f64 = 10.0;
+/// The largest impulse of a push, in its unit.
+const MAX_PUSH: f64 = 1000.0;
+/// The longest mean interval of pushes, in steps.
+const MAX_PUSH_INTERVAL: f64 = 1e6;
 /// The name of the scale of all actuators, and how those of single ones begin.
 const ACTION_SCALE: &str = "action_scale";
 
@@ -24,6 +29,8 @@ pub(super) enum DisturbanceKind {
     ActionScale,
     /// The scale of one actuator.
     ActuatorScale(usize),
+    Push,
+    PushInterval,
     SensorDelay,
     SensorNoise,
     SensorDropout,
@@ -44,6 +51,10 @@ pub(super) struct DisturbanceValues {
     pub(super) action_noise: f64,
     /// The scale of each actuator, `[A]`: that of all times its own.
     pub(super) action_scales: Vec<f64>,
+    /// The size of pushes.
+    pub(super) push: f64,
+    /// The mean number of steps between pushes: a step has one with the probability of its reciprocal.
+    pub(super) push_interval: f64,
     pub(super) sensor_delay: usize,
     pub(super) sensor_noise: f64,
     pub(super) sensor_dropout: f64,
@@ -86,6 +97,15 @@ impl DisturbanceSet {
             });
             entries.extend(own.filter(|_| channels.len() > 1));
         }
+        if let Some(push) = spec.push {
+            let size = Parameter::new("push", push.unit, push.description, (0.0, MAX_PUSH)).off(0.0);
+            let bounds = (1.0, MAX_PUSH_INTERVAL);
+            let interval = Parameter::new("push_interval", "1", "mean number of steps between pushes", bounds);
+            entries.extend([
+                (DisturbanceKind::Push, size),
+                (DisturbanceKind::PushInterval, interval.off(DEFAULT_PUSH_INTERVAL)),
+            ]);
+        }
         entries.extend([
             (
                 DisturbanceKind::SensorDelay,
@@ -112,6 +132,15 @@ impl DisturbanceSet {
         Self { entries, action_width }
     }
 
+    /// Replaces disturbances by parameters of the same name, which have other sets of values.
+    pub(super) fn declare(&mut self, declared: &[Parameter]) {
+        for (_, parameter) in &mut self.entries {
+            if let Some(own) = declared.iter().find(|own| own.name == parameter.name) {
+                *parameter = *own;
+            }
+        }
+    }
+
     /// The disturbances as parameters, in order.
     pub(super) fn parameters(&self) -> impl Iterator<Item = Parameter> + '_ {
         self.entries.iter().map(|(_, parameter)| *parameter)
@@ -134,6 +163,8 @@ impl DisturbanceSet {
             action_hold: 0.0,
             action_noise: 0.0,
             action_scales: vec![1.0; self.action_width],
+            push: 0.0,
+            push_interval: DEFAULT_PUSH_INTERVAL,
             sensor_delay: 0,
             sensor_noise: 0.0,
             sensor_dropout: 0.0,
@@ -150,6 +181,8 @@ impl DisturbanceSet {
                 DisturbanceKind::ActionNoise => values.action_noise = number,
                 DisturbanceKind::ActionScale => values.action_scales.iter_mut().for_each(|scale| *scale *= number),
                 DisturbanceKind::ActuatorScale(place) => values.action_scales[place] *= number,
+                DisturbanceKind::Push => values.push = number,
+                DisturbanceKind::PushInterval => values.push_interval = number,
                 DisturbanceKind::SensorDelay => values.sensor_delay = number as usize,
                 DisturbanceKind::SensorNoise => values.sensor_noise = number,
                 DisturbanceKind::SensorDropout => values.sensor_dropout = number,
@@ -166,6 +199,8 @@ impl DisturbanceSet {
                 DisturbanceKind::ActionHold => values.action_hold,
                 DisturbanceKind::ActionNoise => values.action_noise,
                 DisturbanceKind::ActionScale | DisturbanceKind::ActuatorScale(_) => number,
+                DisturbanceKind::Push => values.push,
+                DisturbanceKind::PushInterval => values.push_interval,
                 DisturbanceKind::SensorDelay => values.sensor_delay as f64,
                 DisturbanceKind::SensorNoise => values.sensor_noise,
                 DisturbanceKind::SensorDropout => values.sensor_dropout,

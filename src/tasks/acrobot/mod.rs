@@ -9,7 +9,7 @@ use super::analytic;
 use crate::{
     env::{
         Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, Parameter,
-        Quantity, RewardTerm, Stream, Success, Transition,
+        PushSpec, Quantity, RewardTerm, Stream, Success, Transition,
     },
     scene::Scene,
 };
@@ -54,6 +54,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     step_limit: 500,
     control_timestep: DT,
     step_cost: 0.3,
+    push: Some(PushSpec { description: "impulse of a push on the first joint", unit: "N m s", axes: &[0] }),
     success: Success {
         description: "the height was reached within 80 steps",
         achievement: Achievement::FirstGoal,
@@ -85,17 +86,20 @@ pub struct Acrobot {
     link_moi: f64,
     /// Angle of link 1 from hanging, angle of link 2 relative to link 1, and their velocities.
     state: [f64; 4],
+    /// The impulse on the first joint in the next step, N m s.
+    push: f64,
 }
 
 impl Acrobot {
     /// Makes an Acrobot with default parameters, hanging.
     pub fn new() -> Self {
         let [link_length, link_mass, link_moi] = [0, 1, 2].map(|i: usize| SPEC.parameters[i].default);
-        Self { link_length, link_mass, link_moi, state: [0.0; 4] }
+        Self { link_length, link_mass, link_moi, state: [0.0; 4], push: 0.0 }
     }
 
-    /// Time derivative of the state under `torque` (Sutton and Barto, "book" version).
-    fn derivative(&self, [theta1, theta2, dtheta1, dtheta2]: [f64; 4], torque: f64) -> [f64; 4] {
+    /// Time derivative of the state under a torque on the second joint (Sutton and Barto, "book" version) and the torque of
+    /// a push on the first.
+    fn derivative(&self, [theta1, theta2, dtheta1, dtheta2]: [f64; 4], torque: f64, push: f64) -> [f64; 4] {
         let (m1, m2) = (self.link_mass, self.link_mass);
         let (lc1, lc2) = (CENTRE_OF_MASS, CENTRE_OF_MASS);
         let (i1, i2) = (self.link_moi, self.link_moi);
@@ -107,19 +111,20 @@ impl Acrobot {
         let phi2 = m2 * lc2 * g * libm::cos(theta1 + theta2 - PI / 2.0);
         let phi1 = -m2 * l1 * lc2 * dtheta2 * dtheta2 * sin2 - 2.0 * m2 * l1 * lc2 * dtheta2 * dtheta1 * sin2
             + (m1 * lc1 + m2 * l1) * g * libm::cos(theta1 - PI / 2.0)
-            + phi2;
+            + phi2
+            - push;
         let ddtheta2 = (torque + d2 / d1 * phi1 - m2 * l1 * lc2 * dtheta1 * dtheta1 * sin2 - phi2)
             / (m2 * lc2 * lc2 + i2 - d2 * d2 / d1);
         let ddtheta1 = -(d2 * ddtheta2 + phi1) / d1;
         [dtheta1, dtheta2, ddtheta1, ddtheta2]
     }
 
-    fn runge_kutta(&self, state: [f64; 4], torque: f64) -> [f64; 4] {
+    fn runge_kutta(&self, state: [f64; 4], torque: f64, push: f64) -> [f64; 4] {
         let along = |k: [f64; 4], h: f64| std::array::from_fn(|i| state[i] + h * k[i]);
-        let k1 = self.derivative(state, torque);
-        let k2 = self.derivative(along(k1, DT / 2.0), torque);
-        let k3 = self.derivative(along(k2, DT / 2.0), torque);
-        let k4 = self.derivative(along(k3, DT), torque);
+        let k1 = self.derivative(state, torque, push);
+        let k2 = self.derivative(along(k1, DT / 2.0), torque, push);
+        let k3 = self.derivative(along(k2, DT / 2.0), torque, push);
+        let k4 = self.derivative(along(k3, DT), torque, push);
         std::array::from_fn(|i| state[i] + DT / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]))
     }
 }
@@ -158,6 +163,10 @@ impl Environment for Acrobot {
         out.copy_from_slice(&[self.link_length, self.link_mass, self.link_moi]);
     }
 
+    fn push(&mut self, [impulse, ..]: [f64; 3]) {
+        self.push = impulse;
+    }
+
     fn reset(&mut self, stream: &mut Stream) {
         self.state = analytic::draw(stream, -RESET_RANGE, RESET_RANGE);
     }
@@ -180,7 +189,8 @@ impl Environment for Acrobot {
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
         let torque = f64::from(analytic::choice(action)) - 1.0;
-        let [theta1, theta2, dtheta1, dtheta2] = self.runge_kutta(self.state, torque);
+        let push = std::mem::take(&mut self.push) / DT;
+        let [theta1, theta2, dtheta1, dtheta2] = self.runge_kutta(self.state, torque, push);
         let next = [
             wrap(theta1),
             wrap(theta2),

@@ -8,7 +8,7 @@ use super::analytic;
 use crate::{
     env::{
         Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, Parameter,
-        Quantity, RewardTerm, Stream, Success, Transition,
+        PushSpec, Quantity, RewardTerm, Stream, Success, Transition,
     },
     scene::Scene,
 };
@@ -53,6 +53,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     step_limit: 200,
     control_timestep: TAU,
     step_cost: 0.04,
+    push: Some(PushSpec { description: "impulse of a push on the cart", unit: "N s", axes: &[0] }),
     success: Success {
         description: "the episode lasted at least 195 steps",
         achievement: Achievement::Length,
@@ -89,6 +90,8 @@ pub struct CartPole {
     inverse_total_mass: f64,
     /// Position, velocity, angle, angular velocity.
     state: [f64; 4],
+    /// The impulse on the cart in the next step, N s.
+    push: f64,
 }
 
 impl CartPole {
@@ -101,6 +104,7 @@ impl CartPole {
             pole_mass_length: 0.0,
             inverse_total_mass: 0.0,
             state: [0.0; 4],
+            push: 0.0,
         };
         cart_pole.set_parameters(&[0, 1, 2].map(|i: usize| SPEC.parameters[i].default));
         cart_pole
@@ -130,6 +134,10 @@ impl Environment for CartPole {
         out.copy_from_slice(&values);
     }
 
+    fn push(&mut self, [impulse, ..]: [f64; 3]) {
+        self.push = impulse;
+    }
+
     fn reset(&mut self, stream: &mut Stream) {
         self.state = analytic::draw(stream, -RESET_RANGE, RESET_RANGE);
     }
@@ -149,7 +157,10 @@ impl Environment for CartPole {
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
         let [x, x_dot, theta, theta_dot] = self.state;
-        let force = if analytic::choice(action) == 1 { self.force } else { -self.force };
+        let mut force = if analytic::choice(action) == 1 { self.force } else { -self.force };
+        if self.push != 0.0 {
+            force += std::mem::take(&mut self.push) / TAU;
+        }
         let (sin, cos) = libm::sincos(theta);
         let (pole_mass_length, inverse) = (self.pole_mass_length, self.inverse_total_mass);
         let temp = (force + pole_mass_length * (theta_dot * theta_dot) * sin) * inverse;

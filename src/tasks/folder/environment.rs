@@ -10,7 +10,7 @@ use super::{
     template::{self, ModelEdit, Template},
 };
 use crate::{
-    env::{Action, Environment, EnvironmentSpec, Error, Stream, Transition},
+    env::{Action, Environment, EnvironmentSpec, Error, Parameter, Stream, Transition},
     scene::{Look, PosedModel, Scene},
 };
 use perturb_mujoco::{Error as SimulationError, Simulation};
@@ -50,6 +50,10 @@ pub(super) struct Task {
     pub(super) scaled: bool,
     pub(super) parameters: Vec<EditedParameter>,
     pub(super) applied: Vec<AppliedQuantity>,
+    /// The body that is pushed; none if no body moves.
+    pub(super) pushed_body: Option<usize>,
+    /// The disturbances with sets of R and E, which the catalogue has among the parameters.
+    pub(super) disturbances: Vec<Parameter>,
     pub(super) needs: Needs,
     /// Whether the model's text scales its masses to a total, which edited masses are not.
     pub(super) has_total_mass: bool,
@@ -102,6 +106,8 @@ pub(super) struct FolderEnvironment {
     action: Box<[f32]>,
     observation: Box<[f32]>,
     achieved: f64,
+    /// The force on the pushed body in the next step, N.
+    push: Option<[f64; 3]>,
     /// Until the next reset.
     diverged: bool,
 }
@@ -123,6 +129,7 @@ impl FolderEnvironment {
             action: vec![0.0; task.controls.len()].into(),
             observation: vec![0.0; task.spec.observation.len()].into(),
             achieved: 0.0,
+            push: None,
             diverged: false,
         };
         environment.start();
@@ -321,6 +328,10 @@ impl Environment for FolderEnvironment {
         }
     }
 
+    fn push(&mut self, impulse: [f64; 3]) {
+        self.push = Some(impulse.map(|impulse| impulse / self.task.spec.control_timestep));
+    }
+
     fn reset(&mut self, stream: &mut Stream) {
         self.clear();
         let reset = &self.task.reset;
@@ -353,9 +364,13 @@ impl Environment for FolderEnvironment {
             return self.fail(reward_terms);
         }
         let edit = Arc::clone(&self.edit);
+        let push = self.push.take().zip(self.task.pushed_body);
         let stepped = template::with(&self.task.template, |shared| {
-            let at = shared.at(&edit, &self.state)?;
-            self.advance(at, action, reward_terms)
+            let (simulation, numbers) = shared.at(&edit, &self.state)?;
+            push.into_iter().for_each(|(force, body)| simulation.set_force(body, force));
+            let stepped = self.advance((&mut *simulation, numbers), action, reward_terms);
+            push.into_iter().for_each(|(_, body)| simulation.set_force(body, [0.0; 3]));
+            stepped
         });
         match stepped {
             Ok(Some(transition)) => transition,

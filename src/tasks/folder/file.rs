@@ -2,6 +2,7 @@
 
 use super::{
     checks,
+    declared::{self, Push},
     elements::{Elements, actuator_name},
     environment::{Needs, Poses, Task},
     error::{Error, Result, escaped},
@@ -45,6 +46,8 @@ pub(super) const KEYS: &[&str] = &[
     "applied",
     "heatmap",
     "parameter",
+    "push",
+    "disturbances",
 ];
 const ACTIONS: &[&str] = &["scaled", "range"];
 /// The format that this server reads.
@@ -192,6 +195,8 @@ fn assemble(top: &Table<'_>, about: Header, (mjcf, model, main): (Mjcf, Model, &
     let Mjcf { picture, statistic, .. } = mjcf;
     let mut template = Template::new(model, &statistic).map_err(|error| Error::file(main, error))?;
     template.prepare(&parameters);
+    let push = top.get("push").map(|value| value.table()).transpose()?;
+    let push = Push::new(push.as_ref(), &template.model, &elements)?;
     let needs = Needs::new(&observation, &reward, &healthy, &goal);
     let quantities =
         parameters.iter().map(|edited| Quantity { name: edited.parameter.name, unit: edited.parameter.unit });
@@ -209,10 +214,12 @@ fn assemble(top: &Table<'_>, about: Header, (mjcf, model, main): (Mjcf, Model, &
         step_limit: about.step_limit,
         control_timestep: template.model.timestep() * f64::from(about.frame_skip),
         step_cost: step_cost(&template.model, about.frame_skip),
+        push: push.map(|push| push.spec),
         success: goal.rule,
         code_success: None,
         heatmap_axes,
     };
+    let disturbances = declared::read(top, &spec)?;
     let look = Look {
         name: about.name,
         mjcf: leaked(&picture.xml),
@@ -237,6 +244,8 @@ fn assemble(top: &Table<'_>, about: Header, (mjcf, model, main): (Mjcf, Model, &
         scaled,
         parameters,
         applied,
+        pushed_body: push.map(|push| push.body),
+        disturbances,
         needs,
         has_total_mass: mjcf.has_total_mass,
     })

@@ -7,20 +7,21 @@ use super::{
     files::Files,
     mjcf,
 };
-use crate::env::{self, EnvironmentSpec};
+use crate::env::{self, EnvironmentSpec, disturbance};
 use std::{fmt, path::Path, sync::OnceLock};
 
 /// A loaded folder. It lives as long as the process: environments, catalogues and sessions refer to it.
 #[derive(Clone, Copy)]
 pub struct Folder {
     pub(super) task: &'static Task,
+    spec: &'static EnvironmentSpec,
     pub(super) files: &'static Files,
 }
 
 impl Folder {
-    /// The environment.
+    /// The environment; with disturbances among its parameters, if the task declares sets for one.
     pub fn spec(&self) -> &'static EnvironmentSpec {
-        &self.task.spec
+        self.spec
     }
 
     /// Whether the files on the disk are still those that were loaded.
@@ -58,7 +59,9 @@ pub fn load(folder: &Path) -> Result<Folder, Error> {
     }));
     let task: &'static Task = task;
     let _ = address.set(task); // it is set once
-    Ok(Folder { task, files })
+    let declared = &task.disturbances;
+    let spec = if declared.is_empty() { &task.spec } else { disturbance::declare(&task.spec, declared) };
+    Ok(Folder { task, spec, files })
 }
 
 /// Reads the model `main` of a folder and what it includes, without MuJoCo: for tests of what strangers may write.

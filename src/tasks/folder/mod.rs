@@ -11,6 +11,7 @@
 
 mod checks;
 pub mod child;
+mod declared;
 mod effect;
 mod elements;
 mod environment;

@@ -212,7 +212,7 @@ fn default(table: &Table<'_>, model: &Model, edits: &[Edit]) -> Result<f64> {
 }
 
 /// The sets of R and E, which must fit each other.
-fn sets(table: &Table<'_>, bounds: (f64, f64), default: f64) -> Result<(Interval, [Interval; 2])> {
+pub(super) fn sets(table: &Table<'_>, bounds: (f64, f64), default: f64) -> Result<(Interval, [Interval; 2])> {
     let within = |value: &Value<'_>, name: &str, (low, high): (f64, f64)| {
         if bounds.0 <= low && high <= bounds.1 {
             return Ok(());

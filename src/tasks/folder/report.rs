@@ -87,11 +87,13 @@ fn describe(out: &mut String, task: &Task, files: &Files, unseen: &[&str], trial
     if spec.parameters.is_empty() {
         writeln!(out, "  parameters    none: versions D, R and E are the same")?;
     }
-    for parameter in spec.parameters {
+    let parameters = spec.parameters.iter().map(|parameter| ("parameter", parameter));
+    let disturbances = task.disturbances.iter().map(|disturbance| ("disturbance", disturbance));
+    for (kind, parameter) in parameters.chain(disturbances) {
         let [below, above] = parameter.extreme;
         writeln!(
             out,
-            "  parameter     {} ({}): D {}, R [{}, {}], E [{}, {}] and [{}, {}], within [{}, {}]: {}",
+            "  {kind:<13} {} ({}): D {}, R [{}, {}], E [{}, {}] and [{}, {}], within [{}, {}]: {}",
             parameter.name,
             parameter.unit,
             parameter.default,

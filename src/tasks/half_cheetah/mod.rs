@@ -2,7 +2,7 @@
 
 use super::locomotion::{
     Posture, Robot, SCENERY, Walker,
-    channels::{APPLIED, CONTROL_TIMESTEP, DENSITY, FRICTION, Names, REWARD_TERMS, SUCCESS, names, power},
+    channels::{APPLIED, CONTROL_TIMESTEP, DENSITY, FRICTION, Names, PUSH, REWARD_TERMS, SUCCESS, names, power},
     colours::*,
 };
 use crate::{
@@ -41,6 +41,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     step_limit: 1000,
     control_timestep: CONTROL_TIMESTEP,
     step_cost: 29.0,
+    push: PUSH,
     success: SUCCESS,
     code_success: None,
     heatmap_axes: Some(["density", "friction"]),

@@ -1,6 +1,6 @@
 //! Channels, reward terms and quantities that the specifications of Hopper and HalfCheetah share.
 
-use crate::env::{Achievement, Channel, Comparison, Parameter, Quantity, RewardTerm, Success};
+use crate::env::{Achievement, Channel, Comparison, Parameter, PushSpec, Quantity, RewardTerm, Success};
 
 /// Limit of the numbers of an observation, which are clipped to ± this.
 pub const CLIP: f64 = 5.0;
@@ -94,6 +94,10 @@ pub const APPLIED: &[Quantity] = &[
     Quantity { name: "control_factor", unit: "1" },
     Quantity { name: "density", unit: "kg/m³" },
 ];
+
+/// The pushes of both robots.
+pub const PUSH: Option<PushSpec> =
+    Some(PushSpec { description: "impulse of a push on the torso along x", unit: "N s", axes: &[0] });
 
 /// The success rule of both robots.
 pub const SUCCESS: Success = Success {

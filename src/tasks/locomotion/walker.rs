@@ -68,6 +68,8 @@ pub struct Walker {
     x: f64,
     /// The torso's greatest x in the episode, m.
     greatest_x: f64,
+    /// The force on the torso in the next step, N.
+    push: Option<[f64; 3]>,
     /// Whether the physics diverged; until the next reset.
     diverged: bool,
 }
@@ -89,6 +91,7 @@ impl Walker {
             initial_height: 0.0,
             x: 0.0,
             greatest_x: 0.0,
+            push: None,
             diverged: false,
         };
         walker.clear();
@@ -299,6 +302,10 @@ impl Environment for Walker {
         &self.pristine.hash
     }
 
+    fn push(&mut self, impulse: [f64; 3]) {
+        self.push = Some(impulse.map(|impulse| impulse / CONTROL_TIMESTEP));
+    }
+
     fn reset(&mut self, stream: &mut Stream) {
         self.clear();
         let joints = &self.pristine.joints;
@@ -332,9 +339,14 @@ impl Environment for Walker {
         if self.diverged {
             return self.fail(reward_terms);
         }
+        let push = self.push.take();
+        let torso = self.pristine.torso;
         let stepped = shared::with(self.pristine, |shared| {
             let simulation = shared.at(&self.edit, self.state())?;
-            self.advance(simulation, action, reward_terms)
+            push.into_iter().for_each(|force| simulation.set_force(torso, force));
+            let stepped = self.advance(simulation, action, reward_terms);
+            push.into_iter().for_each(|_| simulation.set_force(torso, [0.0; 3]));
+            stepped
         });
         match stepped {
             Ok(Some(transition)) => transition,

@@ -8,7 +8,7 @@ use super::analytic;
 use crate::{
     env::{
         Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, Parameter,
-        Quantity, RewardTerm, Stream, Success, Transition,
+        PushSpec, Quantity, RewardTerm, Stream, Success, Transition,
     },
     scene::Scene,
 };
@@ -44,6 +44,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     step_limit: 200,
     control_timestep: 1.0,
     step_cost: 0.04,
+    push: Some(PushSpec { description: "change of velocity by a push on the car", unit: "1", axes: &[0] }),
     success: Success {
         description: "the goal was reached within 110 steps",
         achievement: Achievement::FirstGoal,
@@ -68,13 +69,15 @@ pub struct MountainCar {
     gravity: f64,
     /// Position, velocity.
     state: [f64; 2],
+    /// The change of velocity by a push in the next step.
+    push: f64,
 }
 
 impl MountainCar {
     /// Makes a MountainCar with default parameters, at the valley's bottom.
     pub fn new() -> Self {
         let [force, gravity] = [0, 1].map(|i: usize| SPEC.parameters[i].default);
-        Self { force, gravity, state: [-0.5, 0.0] }
+        Self { force, gravity, state: [-0.5, 0.0], push: 0.0 }
     }
 }
 
@@ -97,6 +100,10 @@ impl Environment for MountainCar {
         out.copy_from_slice(&[self.force, self.gravity]);
     }
 
+    fn push(&mut self, [impulse, ..]: [f64; 3]) {
+        self.push = impulse;
+    }
+
     fn reset(&mut self, stream: &mut Stream) {
         self.state = [stream.uniform(-0.6, -0.4), 0.0];
     }
@@ -116,8 +123,11 @@ impl Environment for MountainCar {
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
         let [mut position, mut velocity] = self.state;
-        let push = f64::from(analytic::choice(action)) - 1.0;
-        velocity += push * self.force + libm::cos(3.0 * position) * -self.gravity;
+        let engine = f64::from(analytic::choice(action)) - 1.0;
+        velocity += engine * self.force + libm::cos(3.0 * position) * -self.gravity;
+        if self.push != 0.0 {
+            velocity += std::mem::take(&mut self.push);
+        }
         velocity = velocity.clamp(-MAX_SPEED, MAX_SPEED);
         position = (position + velocity).clamp(MIN_POSITION, MAX_POSITION);
         if position == MIN_POSITION && velocity < 0.0 {

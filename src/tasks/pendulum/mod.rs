@@ -9,7 +9,7 @@ use super::analytic;
 use crate::{
     env::{
         Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, Parameter,
-        Quantity, RewardTerm, Stream, Success, Transition,
+        PushSpec, Quantity, RewardTerm, Stream, Success, Transition,
     },
     scene::Scene,
 };
@@ -44,6 +44,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     step_limit: STEP_LIMIT,
     control_timestep: DT,
     step_cost: 0.05,
+    push: Some(PushSpec { description: "impulse of a push on the joint", unit: "N m s", axes: &[0] }),
     success: Success {
         description: "the angle was within π/3 of vertical after each of the last 100 steps",
         achievement: Achievement::LastGoals,
@@ -78,13 +79,15 @@ pub struct Pendulum {
     state: [f64; 2],
     /// The torque of the last step, if a step led to this state. Only pictures show it.
     torque: Option<f64>,
+    /// The impulse on the joint in the next step, N m s.
+    push: f64,
 }
 
 impl Pendulum {
     /// Makes a Pendulum with default parameters, upright.
     pub fn new() -> Self {
         let [length, mass] = [0, 1].map(|i: usize| SPEC.parameters[i].default);
-        Self { length, mass, state: [0.0; 2], torque: None }
+        Self { length, mass, state: [0.0; 2], torque: None, push: 0.0 }
     }
 
     /// Advances by one step under a torque in N m, clipped to ±2, in full precision: actions arrive as f32, but the
@@ -97,7 +100,8 @@ impl Pendulum {
         let angle = normalise(theta);
         reward_terms.copy_from_slice(&[-(angle * angle), -(0.1 * (velocity * velocity)), -(0.001 * (u * u))]);
 
-        let acceleration = 3.0 * GRAVITY / (2.0 * l) * libm::sin(theta) + 3.0 / (m * (l * l)) * u;
+        let torque = if self.push == 0.0 { u } else { u + std::mem::take(&mut self.push) / DT };
+        let acceleration = 3.0 * GRAVITY / (2.0 * l) * libm::sin(theta) + 3.0 / (m * (l * l)) * torque;
         let velocity = (velocity + acceleration * DT).clamp(-MAX_SPEED, MAX_SPEED);
         let diverged = analytic::advance(&mut self.state, [theta + velocity * DT, velocity]);
         Transition { terminated: diverged, goal: normalise(self.state[0]).abs() < UPRIGHT, diverged }
@@ -126,6 +130,10 @@ impl Environment for Pendulum {
 
     fn applied(&self, out: &mut [f64]) {
         out.copy_from_slice(&[self.length, self.mass]);
+    }
+
+    fn push(&mut self, [impulse, ..]: [f64; 3]) {
+        self.push = impulse;
     }
 
     fn reset(&mut self, stream: &mut Stream) {

@@ -2,8 +2,8 @@
 
 use perturb::{
     env::{
-        Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, RewardTerm, Stream,
-        Success, Transition,
+        Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, PushSpec,
+        RewardTerm, Stream, Success, Transition,
     },
     scene::Scene,
 };
@@ -13,13 +13,15 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "Echo",
     revision: 0,
     description: "Observe what acts.",
-    make: &|| Ok(Box::new(Echo { state: [f64::NAN; 4] })),
+    make: &|| Ok(Box::new(Echo { state: [f64::NAN; 6], is_pushed: false })),
     parameters: &[],
     observation: &[
         Channel::unbounded("left", "1"),
         Channel::unbounded("right", "1").scale(3.0),
         Channel::unbounded("steps", "1"),
         Channel::unbounded("constant", "1").scale(0.0),
+        Channel::unbounded("push_x", "N s").scale(0.0),
+        Channel::unbounded("push_z", "N s").scale(0.0),
     ],
     action: ActionSpace::Continuous(&[Channel::new("left", "1", -1.0, 1.0), Channel::new("right", "1", 0.5, 2.5)]),
     state: &[],
@@ -34,6 +36,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
         comparison: Comparison::AtMost,
         threshold: 0.0,
     },
+    push: Some(PushSpec { description: "a push", unit: "N s", axes: &[0, 2] }),
     code_success: None,
     heatmap_axes: None,
 };
@@ -42,7 +45,10 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
 pub const CONSTANT: f32 = 7.0;
 
 struct Echo {
-    state: [f64; 4],
+    /// The motors, the number of steps, the constant, and the push of the last step.
+    state: [f64; 6],
+    /// Whether the next step is pushed.
+    is_pushed: bool,
 }
 
 impl Environment for Echo {
@@ -54,12 +60,18 @@ impl Environment for Echo {
 
     fn applied(&self, _: &mut [f64]) {}
 
+    fn push(&mut self, [x, y, z]: [f64; 3]) {
+        assert_eq!(y, 0.0, "it has no axis y");
+        (self.state[4], self.state[5]) = (x, z);
+        self.is_pushed = true;
+    }
+
     fn reset(&mut self, _: &mut Stream) {
-        self.state = [0.0, 0.0, 0.0, CONSTANT.into()];
+        self.state = [0.0, 0.0, 0.0, CONSTANT.into(), 0.0, 0.0];
     }
 
     fn reset_to(&mut self, _: &[f64]) {
-        self.state = [0.0, 0.0, 0.0, CONSTANT.into()];
+        self.state = [0.0, 0.0, 0.0, CONSTANT.into(), 0.0, 0.0];
     }
 
     fn observe(&self, out: &mut [f32]) {
@@ -72,7 +84,8 @@ impl Environment for Echo {
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
         let Action::Continuous(&[left, right]) = action else { unreachable!("two motors") };
-        self.state = [left.into(), right.into(), self.state[2] + 1.0, self.state[3]];
+        let push = if std::mem::take(&mut self.is_pushed) { [self.state[4], self.state[5]] } else { [0.0; 2] };
+        self.state = [left.into(), right.into(), self.state[2] + 1.0, self.state[3], push[0], push[1]];
         reward_terms[0] = left.into();
         Transition { terminated: false, goal: false, diverged: false }
     }
@@ -82,7 +95,7 @@ impl Environment for Echo {
     }
 
     fn load(&mut self, state: &[f64]) -> Result<(), Error> {
-        self.state = state.try_into().map_err(|_| Error::Snapshot { reason: "four numbers".into() })?;
+        self.state = state.try_into().map_err(|_| Error::Snapshot { reason: "six numbers".into() })?;
         Ok(())
     }
 }

@@ -34,7 +34,8 @@ fn catalogue_has_no_disturbances_among_parameters() {
             ActionSpace::Continuous(_) => &["action_delay", "action_hold", "action_noise", "action_scale"],
         };
         assert_eq!(&names[..of_actions.len()], of_actions, "{}", spec.name);
-        assert_eq!(names[names.len() - 3..], ["sensor_delay", "sensor_noise", "sensor_dropout"], "{}", spec.name);
+        let others = ["push", "push_interval", "sensor_delay", "sensor_noise", "sensor_dropout"];
+        assert_eq!(names[names.len() - others.len()..], others, "{}", spec.name);
     }
 }
 
@@ -193,7 +194,7 @@ fn names_that_are_neither_are_refused_with_those_that_are() {
     assert_eq!(
         refused,
         "CartPole has no parameter \"action_dely\"; it has force, length, mass; and the disturbances action_delay, \
-         action_hold, sensor_delay, sensor_noise, sensor_dropout"
+         action_hold, push, push_interval, sensor_delay, sensor_noise, sensor_dropout"
     );
     assert!(std::ptr::eq(disturbance::with_parameters(spec, ["length", "mass"]).unwrap(), spec));
     let mut base = settings(spec, Version::D, &[], (0, 0)).distributions;

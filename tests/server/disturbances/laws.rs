@@ -42,10 +42,19 @@ fn stream(purpose: Purpose, step: u32) -> Stream {
 }
 
 /// Checks that a sample is of the normal distribution with this mean and standard deviation.
-fn assert_normal(mut sample: Vec<f64>, mean: f64, deviation: f64) {
+fn assert_normal(sample: Vec<f64>, mean: f64, deviation: f64) {
+    assert_distributed(sample, |x| 0.5 * libm::erfc(-(x - mean) / (deviation * std::f64::consts::SQRT_2)));
+}
+
+/// Checks that a sample is of the uniform distribution on [0, 1].
+fn assert_uniform(sample: Vec<f64>) {
+    assert_distributed(sample, |x| x.clamp(0.0, 1.0));
+}
+
+/// Checks that a sample is of the distribution with this function.
+fn assert_distributed(mut sample: Vec<f64>, expected: impl Fn(f64) -> f64) {
     sample.sort_by(f64::total_cmp);
     let n = sample.len() as f64;
-    let expected = |x: f64| 0.5 * libm::erfc(-(x - mean) / (deviation * std::f64::consts::SQRT_2));
     let distance = |(i, &x): (usize, &f64)| {
         let (below, at) = (i as f64 / n, (i + 1) as f64 / n);
         (expected(x) - below).abs().max((at - expected(x)).abs())
@@ -204,4 +213,59 @@ fn whole_numbers_are_drawn_as_likely() {
         episodes.begin(None);
     }
     counts.iter().for_each(|&count| assert_frequency(count, EPISODES, 0.2));
+}
+
+/// Takes steps and returns the push of each, along x and z.
+fn pushed(episodes: &mut Episodes, steps: u32) -> Vec<[f64; 2]> {
+    seen(episodes, steps)[1..].iter().map(|seen| [seen[4].into(), seen[5].into()]).collect()
+}
+
+#[test]
+fn pushes_come_at_random_in_random_directions() {
+    const SIZE: f64 = 3.0;
+    const INTERVAL: f64 = 4.0;
+    let pushed = pushed(&mut echo(&[("push", SIZE), ("push_interval", INTERVAL)]), DRAWS);
+    let mut angles = Vec::new();
+    for (t, push) in (0..DRAWS).zip(&pushed) {
+        let mut stream = stream(Purpose::Push, t);
+        if stream.unit() < 1.0 / INTERVAL {
+            let turn = stream.unit();
+            let (sin, cos) = libm::sincos(std::f64::consts::TAU * turn);
+            assert_eq!(push.map(|part| part as f32), [(SIZE * cos) as f32, (SIZE * sin) as f32], "step {t}");
+            angles.push(turn);
+        } else {
+            assert_eq!(*push, [0.0; 2], "step {t}");
+        }
+    }
+    assert_frequency(angles.len(), DRAWS as usize, 1.0 / INTERVAL);
+    assert_uniform(angles);
+    // A push changes whether the next step has one no more than any other step's.
+    let both = pushed.windows(2).filter(|pair| pair.iter().all(|push| *push != [0.0; 2])).count();
+    assert_frequency(both, pushed.len() - 1, 1.0 / (INTERVAL * INTERVAL));
+}
+
+#[test]
+fn pushes_of_no_size_are_none_and_the_shortest_interval_is_one() {
+    assert!(pushed(&mut echo(&[("push_interval", 1.0)]), 100).iter().all(|push| *push == [0.0; 2]));
+    let every = pushed(&mut echo(&[("push", 2.0), ("push_interval", 1.0)]), 100);
+    assert!(every.iter().all(|[x, z]| (x.hypot(*z) - 2.0).abs() < 1e-6), "f32 rounds by 1e-7");
+}
+
+#[test]
+fn directions_are_uniform_on_a_line_a_circle_and_a_sphere() {
+    let directions = |n| {
+        let direction = move |t| stream(Purpose::Push, t).direction(n);
+        (0..DRAWS).map(direction).inspect(|[x, y, z]| assert!((x * x + y * y + z * z - 1.0).abs() < 1e-12))
+    };
+    let right = directions(1).filter(|direction| *direction == [1.0, 0.0, 0.0]).count();
+    assert!(directions(1).all(|[x, y, z]| x.abs() == 1.0 && (y, z) == (0.0, 0.0)));
+    assert_frequency(right, DRAWS as usize, 0.5);
+    let turn = |x: f64, y: f64| y.atan2(x) / std::f64::consts::TAU + 0.5;
+    assert!(directions(2).all(|direction| direction[2] == 0.0));
+    assert_uniform(directions(2).map(|[x, y, _]| turn(x, y)).collect());
+    // On a sphere each coordinate is uniform (Archimedes).
+    assert_uniform(directions(3).map(|[x, y, _]| turn(x, y)).collect());
+    for axis in 0..3 {
+        assert_uniform(directions(3).map(|direction| (direction[axis] + 1.0) / 2.0).collect());
+    }
 }

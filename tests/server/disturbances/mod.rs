@@ -3,6 +3,7 @@
 mod echo;
 mod environments;
 mod laws;
+mod pushes;
 mod sessions;
 
 use perturb::env::{Distribution, EnvironmentSpec, Episodes, Settings, Version, disturbance, resolve};
@@ -36,6 +37,7 @@ fn all(spec: &'static EnvironmentSpec) -> Vec<(&'static str, f64)> {
         "action_delay" => 3.0,
         "sensor_delay" => 2.0,
         "action_scale" => 0.8,
+        "push_interval" => 10.0,
         name if name.starts_with("action_scale_") => 0.9,
         "action_noise" | "sensor_noise" => 0.05,
         _ => 0.1,

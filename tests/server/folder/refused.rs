@@ -41,6 +41,13 @@ const WRONG: &[(&str, Spoil)] = &[
     ("random beyond bounds", |f| replace(f, "task.toml", "bounds = [0.1, 5.0]", "bounds = [0.5, 5.0]")),
     ("extreme apart from random", |f| replace(f, "task.toml", "[[0.2, 0.4], [0.6, 1.0]]", "[[0.2, 0.3], [0.6, 1.0]]")),
     ("default outside of random", |f| replace(f, "task.toml", "random = [0.4, 0.6]\nextreme = [[0.2, 0.4]", "random = [0.55, 0.6]\nextreme = [[0.2, 0.55]")),
+    ("unknown disturbance", |f| replace(f, "task.toml", "reset =", "disturbances = { action_dely = { random = [0, 2], extreme = [[0, 0], [2, 3]] } }\nreset =")),
+    ("disturbance of no whole number", |f| replace(f, "task.toml", "reset =", "disturbances = { action_delay = { random = [0, 1.2], extreme = [[0, 0], [1.2, 1.8]] } }\nreset =")),
+    ("disturbance beyond bounds", |f| replace(f, "task.toml", "reset =", "disturbances = { action_hold = { random = [0, 0.5], extreme = [[0, 0], [0.5, 2.0]] } }\nreset =")),
+    ("disturbance in every R", |f| replace(f, "task.toml", "reset =", "disturbances = { action_delay = { random = [1, 2], extreme = [[0, 1], [2, 3]] } }\nreset =")),
+    ("push on nothing", |f| replace(f, "task.toml", "reset =", "push = { body = \"pol\" }\nreset =")),
+    ("push on the world", |f| replace(f, "task.toml", "reset =", "push = { body = \"world\" }\nreset =")),
+    ("push along an axis twice", |f| replace(f, "task.toml", "reset =", "push = { axes = [\"x\", \"x\"] }\nreset =")),
     ("negative mass", |f| replace(f, "task.toml", "bounds = [0.1, 5.0]", "bounds = [-0.1, 5.0]")),
     ("unknown field", |f| replace(f, "task.toml", "field = \"mass\"", "field = \"weight\"")),
     ("different targets", |f| replace(f, "task.toml", "body = \"pole\"", "body = [\"pole\", \"cart\"]")),
@@ -136,6 +143,8 @@ fn the_schema_has_the_keys_of_the_parser() {
         ("/$defs/edit/properties", "by = \"set\"", "zzz = \"set\""),
         ("/$defs/picture/properties", "reset =", "picture = { zzz = 1 }\nreset ="),
         ("/$defs/actions/properties", "reset =", "actions = { zzz = 1 }\nreset ="),
+        ("/$defs/push/properties", "reset =", "push = { zzz = 1 }\nreset ="),
+        ("/$defs/sets/properties", "reset =", "disturbances = { action_delay = { zzz = 1 } }\nreset ="),
         ("/$defs/applied/properties", "reset =", "applied = [{ zzz = 1 }]\nreset ="),
     ] {
         assert_eq!(told(old, new), keys(pointer), "{pointer}");

@@ -105,3 +105,51 @@ async fn sessions_keep_what_was_loaded_when_files_change() {
     server::until("the server notices", async || server.log().contains("the files of this task changed")).await;
     assert_eq!(run().await, before, "until it is restarted");
 }
+
+#[tokio::test]
+async fn declared_disturbances_are_parameters_of_every_session() {
+    const DECLARED: &str = r#"
+[disturbances]
+action_delay = { random = [0, 2.5], extreme = [[0, 0], [2.5, 5]] }
+sensor_noise = { random = [0.0, 0.05], extreme = [[0.0, 0.0], [0.05, 0.1]] }
+"#;
+    let task = folder(&[("task.toml", &format!("{TASK}{DECLARED}")), ("cart.xml", CART)]);
+    let path = task.path().to_str().unwrap();
+    let server = Server::start(&["--task", path]);
+    let environment = server::environment(server.tcp(), "CartAndPole").await;
+    let names: Vec<&str> = environment.parameters.iter().map(|parameter| parameter.name.as_str()).collect();
+    let expected = [
+        "pole_mass",
+        "action_delay",
+        "action_hold",
+        "action_noise",
+        "action_scale",
+        "push",
+        "push_interval",
+        "sensor_delay",
+        "sensor_noise",
+        "sensor_dropout",
+    ];
+    assert_eq!(names, expected);
+    assert!(environment.disturbances.is_empty(), "nothing is left beside the parameters");
+    let drawn = async |version: Version| {
+        let open = Open { version: version.into(), ..open("CartAndPole", 64, 1) };
+        let (_, opened) = Session::open(server.tcp(), open).await;
+        assert_eq!(opened.environment.as_ref(), Some(&environment));
+        let receipts = opened.started.iter().map(|start| start.receipt.clone().unwrap());
+        receipts.map(|receipt| (receipt.requested[1], receipt.requested[8])).collect::<Vec<_>>()
+    };
+    assert!(drawn(Version::Default).await.iter().all(|&drawn| drawn == (0.0, 0.0)));
+    let is_in =
+        |(delay, noise): (f64, f64), delays: &[f64], low, high| delays.contains(&delay) && (low..high).contains(&noise);
+    assert!(drawn(Version::Random).await.iter().all(|&drawn| is_in(drawn, &[0.0, 1.0, 2.0], 0.0, 0.05)));
+    assert!(drawn(Version::Extreme).await.iter().all(|&drawn| is_in(drawn, &[3.0, 4.0, 5.0], 0.05, 0.1)));
+    let seen = Open { observe_parameters: true, version: Version::Default.into(), ..open("CartAndPole", 1, 1) };
+    let (_, opened) = Session::open(server.tcp(), seen).await;
+    let observation = floats(&opened.observations);
+    assert_eq!(observation[observation.len() - 9], -1.0, "a delay of 0 is the least of R and E");
+    let checked = server::command().args(["--check", "--task", path]).output().unwrap();
+    let printed = String::from_utf8(checked.stdout).unwrap();
+    let line = "  disturbance   action_delay (1): D 0, R [0, 2.5], E [0, 0] and [2.5, 5], within [0, 100]: ";
+    assert!(printed.contains(line), "{printed}");
+}

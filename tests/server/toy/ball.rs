@@ -32,6 +32,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
         comparison: Comparison::AtLeast,
         threshold: 0.3,
     },
+    push: None,
     code_success: None,
     heatmap_axes: Some(["mass", "drag"]),
 };

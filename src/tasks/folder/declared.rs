@@ -1,0 +1,78 @@
+//! The disturbances of a task: what is pushed, and the sets of R and E that it declares.
+
+use super::{
+    elements::Elements,
+    error::{Result, escaped},
+    parameter::sets,
+    rules::leaked,
+    table::Table,
+};
+use crate::env::{EnvironmentSpec, Parameter, PushSpec, Version, check_distribution, disturbance};
+use perturb_mujoco::{Index, Kind, Model};
+
+const SETS: &[&str] = &["random", "extreme"];
+const PUSH: &[&str] = &["body", "axes"];
+const AXES: [&str; 3] = ["x", "y", "z"];
+
+/// The pushes of a task.
+#[derive(Clone, Copy)]
+pub(super) struct Push {
+    /// The number of the body that is pushed.
+    pub(super) body: usize,
+    pub(super) spec: PushSpec,
+}
+
+impl Push {
+    /// Reads the table `push`. By default the first body that can move is pushed, along x and y. `None` if no body can.
+    pub(super) fn new(table: Option<&Table<'_>>, model: &Model, elements: &Elements) -> Result<Option<Self>> {
+        // The number of the body that a body is fixed to; 0 for the world.
+        let fixed_to = model.index_array(Index::BodyWeld);
+        let mut body = (1..model.n_body()).find(|&body| fixed_to[body] != 0);
+        let mut axes: &'static [usize] = &[0, 1];
+        if let Some(table) = table {
+            table.only(PUSH)?;
+            if let Some(value) = table.get("body") {
+                let found = elements.find(Kind::Body, &value)?;
+                if fixed_to[found] == 0 {
+                    return Err(value.error("this body cannot move; name one with a joint"));
+                }
+                body = Some(found);
+            }
+            if let Some(value) = table.get("axes") {
+                let named = value.texts()?;
+                let found: Vec<usize> = (0..AXES.len()).filter(|&axis| named.contains(&AXES[axis])).collect();
+                if found.len() != named.len() {
+                    return Err(value.error("expected one or more of \"x\", \"y\" and \"z\", each once"));
+                }
+                axes = Vec::leak(found);
+            }
+        }
+        Ok(body.map(|body| {
+            let along: Vec<&str> = axes.iter().map(|&axis| AXES[axis]).collect();
+            let (name, along) = (elements.name(Kind::Body, body), along.join(" and "));
+            let description = leaked(&format!("impulse of a push on {name} along {along}"));
+            Self { body, spec: PushSpec { description, unit: "N s", axes } }
+        }))
+    }
+}
+
+/// Reads the table `disturbances`, whose keys are names of disturbances.
+pub(super) fn read(top: &Table<'_>, spec: &EnvironmentSpec) -> Result<Vec<Parameter>> {
+    let Some(value) = top.get("disturbances") else { return Ok(Vec::new()) };
+    let table = value.table()?;
+    let possible = disturbance::possible(spec);
+    table.only(&possible.iter().map(|parameter| parameter.name).collect::<Vec<_>>())?;
+    let mut declared = Vec::new();
+    for parameter in possible {
+        let Some(value) = table.get(parameter.name) else { continue };
+        let table = value.table()?.at(format!("disturbance {}", escaped(parameter.name)));
+        table.only(SETS)?;
+        let (random, extreme) = sets(&table, (parameter.bounds.low, parameter.bounds.high), parameter.default)?;
+        let own = Parameter { random, extreme, ..parameter };
+        for version in [Version::R, Version::E] {
+            check_distribution(spec, &own, &own.distribution(version)).map_err(|error| table.error(error))?;
+        }
+        declared.push(own);
+    }
+    Ok(declared)
+}
