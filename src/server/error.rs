@@ -1,6 +1,6 @@
 //! The classes of errors that clients get: the gRPC code of each, its word in metrics and logs, and its counter. Each
-//! layer has an error enum of its own, which says the class of each variant by [`RequestError`]. Only this table has
-//! the codes.
+//! layer has its own error enum, which maps each variant to a class by [`RequestError`]. Only this module maps classes
+//! to codes.
 
 use crate::{env, pool, render};
 use std::{
@@ -13,7 +13,7 @@ use std::{
 };
 use tonic::{Code, Status};
 
-/// An error of a request, a call or a stream, which its client gets.
+/// An error that is returned to the client of a request, a call or a stream.
 pub trait RequestError: Error {
     /// The error's class.
     fn kind(&self) -> ErrorKind;
@@ -28,11 +28,11 @@ pub fn status(error: &impl RequestError) -> Status {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("{field} is {got}; expected {expected}")]
 pub struct InvalidValue {
-    /// The field, by its path in the protocol; of dm_env_rpc the setting, action or property.
+    /// The path of the field in the protocol; in dm_env_rpc the setting, action or property.
     pub field: Cow<'static, str>,
     /// The value that came.
     pub got: String,
-    /// The values that are right, and what to do.
+    /// The values that are accepted, and what to do.
     pub expected: String,
 }
 
@@ -59,7 +59,7 @@ impl ErrorCounters {
         self.0[kind as usize].fetch_add(1, Ordering::Relaxed);
     }
 
-    /// The count of each class. Classes that never happened have a 0, so that a rate shows their first event.
+    /// The count of each class. Classes without an event are listed with 0, so that a rate shows their first event.
     pub fn counts(&self) -> impl Iterator<Item = (ErrorKind, u64)> {
         ErrorKind::ALL.iter().zip(&*self.0).map(|(kind, count)| (*kind, count.load(Ordering::Relaxed)))
     }
@@ -67,13 +67,13 @@ impl ErrorCounters {
 
 macro_rules! error_kinds {
     ($($kind:ident = $code:ident, $reason:literal;)*) => {
-        /// The class of an error: nothing that a client sent is in it.
+        /// The class of an error. It holds no data of a client.
         #[derive(Debug, Clone, Copy, PartialEq, Eq)]
         #[allow(missing_docs, reason = "each has its word in metrics and logs")]
         pub enum ErrorKind { $($kind,)* }
 
         impl ErrorKind {
-            /// All that there are, in the order of their numbers.
+            /// All classes, in the order of their numbers.
             const ALL: &[Self] = &[$(Self::$kind,)*];
 
             /// The gRPC code.
@@ -117,7 +117,8 @@ error_kinds! {
     NoToken = Unauthenticated, "no_token";
     WrongToken = Unauthenticated, "wrong_token";
     RevokedToken = Unauthenticated, "revoked_token";
-    // More than the token may ever have, which is not to be tried again, and more than is left.
+    // The first is for a request beyond the whole quota, which a retry cannot help; the second for one beyond what
+    // is left of it.
     MoreThanTokenQuota = InvalidArgument, "token_quota";
     TokenQuota = ResourceExhausted, "token_quota";
     TokenRate = ResourceExhausted, "token_rate";

@@ -1,11 +1,11 @@
-//! Names that nobody guesses.
+//! Random names that cannot be guessed.
 
 use super::error::{ErrorKind, RequestError};
 
 /// 128 random bits.
 pub type Id = [u8; 16];
 
-/// There can be no name that nobody guesses.
+/// The operating system gives no random bits, so a name could be guessed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("the system gives no random numbers; ask for no lease, or name a world by the setting world_name")]
 pub struct NoRandomness;
@@ -16,7 +16,7 @@ impl RequestError for NoRandomness {
     }
 }
 
-/// 128 bits of the system's, which no seed has anything to do with.
+/// Returns 128 random bits of the operating system. They do not depend on any seed.
 ///
 /// # Errors
 /// [`NoRandomness`].

@@ -1,7 +1,7 @@
 //! Size limits of requests.
 
-/// The maximum length of a request before a session is open: enough for thousands of groups with parameters. What is
-/// beyond 64 KiB is taken from the memory budget.
+/// The maximum length of a request before a session is open: enough for thousands of groups with parameters. Bytes
+/// beyond the first 64 KiB count against the memory budget.
 pub const MAX_BYTES_BEFORE_OPEN: usize = 1 << 20;
 
 /// The size limits of the next request of a stream.
@@ -11,6 +11,6 @@ pub struct RequestLimits {
     pub bytes: usize,
     /// The most entries of fields that have one for each environment.
     pub entries: usize,
-    /// The bytes of a message for which the budget was asked already.
+    /// The bytes of a message that are already reserved in the memory budget.
     pub covered: usize,
 }

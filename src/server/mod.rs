@@ -1,11 +1,11 @@
-//! The server: gRPC in, gRPC out. Each module uses those below it alone:
+//! The server, from gRPC requests to gRPC replies. Each module uses only those below it:
 //!
 //! - `startup`: startup and shutdown; [`security`]: the files of tokens, TLS and the ledger.
 //! - [`metrics`]: the page that Prometheus scrapes.
 //! - [`api`]: the protocols, with all validation.
 //! - [`session`]: the transport of a session, and leases.
 //! - [`transport`]: messages off the wire and onto it, and the memory for both.
-//! - [`audit`]: the checks of what a session samples, by its token's role, and the ledger of it.
+//! - [`audit`]: the check of a session's draws against its token's role, and the ledger of draws.
 //! - [`auth`]: tokens, their quotas and roles.
 //! - [`net`]: connections, their limits and encryption.
 //! - [`shutdown`]: the phases of a shutdown; [`error`]: the classes of errors, with their gRPC codes; [`limits`], [`id`].

@@ -14,7 +14,7 @@ use crate::{
 };
 use std::{io, path::PathBuf};
 
-/// The tokens, TLS and the ledger of a server; by default there is none of them.
+/// The tokens, TLS and the ledger of a server; by default a server has none of them.
 #[derive(Default)]
 pub struct Security {
     /// The tokens that callers must show.
@@ -23,16 +23,16 @@ pub struct Security {
     pub tls: Option<Tls>,
     /// The ledger of all draws.
     pub ledger: Option<Ledger>,
-    /// The threads that read the files again when they change.
+    /// The watchers, whose threads read the files again when they change.
     watches: Vec<FileWatcher>,
 }
 
 impl Security {
-    /// Loads the files that the configuration of a server of these environments names, and loads them again when they
-    /// change.
+    /// Loads the files that the configuration names, and loads them again when they change. The file of tokens may name
+    /// the environments of `catalogue`.
     ///
     /// # Errors
-    /// If a file is wrong: it is named, with what was expected.
+    /// If a file is wrong. The message names the file and what was expected.
     pub fn load(config: &Config, catalogue: &Catalogue) -> io::Result<Self> {
         let mut guards = Self::default();
         if let Some(path) = &config.tokens {

@@ -13,7 +13,7 @@ pub enum ShutdownPhase {
     Closed,
 }
 
-/// A view of the shutdown. Those made by [`Drain::enter`] count as running sessions.
+/// A view of the shutdown. A view that was made by [`Drain::enter`] counts as a running session.
 #[derive(Clone)]
 pub struct Drain {
     phase: watch::Receiver<ShutdownPhase>,
@@ -48,7 +48,7 @@ impl Controller {
 }
 
 impl Drain {
-    /// A view for a session, which counts as running as long as it holds it.
+    /// Returns a view for a session, which counts as running as long as it holds the view.
     pub fn enter(&self) -> Self {
         Self { _session: Some(self.sessions.subscribe()), ..self.clone() }
     }

@@ -50,15 +50,14 @@ use tower::{Layer, ServiceBuilder};
 
 /// The flow-control window of a stream: the actions of ten thousand robots.
 const STREAM_WINDOW_BYTES: u32 = 1 << 20;
-/// The flow-control window of a connection. A session whose requests pile up does not stall the others: there is room
-/// for
-/// 16 of them.
+/// The flow-control window of a connection, bytes. It has room for 16 sessions whose requests pile up, before they
+/// stall the others.
 const CONNECTION_WINDOW_BYTES: u32 = 16 * STREAM_WINDOW_BYTES;
-/// The streams of a connection beside its sessions: health, the catalogue, reflection.
+/// The maximum number of streams of a connection besides its sessions: health, the catalogue, reflection.
 const MAX_OTHER_STREAMS: usize = 16;
 /// The timeout of calls that are not streams.
 const UNARY_TIMEOUT: Duration = Duration::from_secs(10);
-/// The maximum length of a request outside the streams of sessions: it is a name or nothing.
+/// The maximum length of a request outside the streams of sessions. Such a request is a name or empty.
 const MAX_UNARY_BYTES: usize = 1 << 10;
 /// The time in which connections must close at the end of a shutdown.
 const CONNECTION_CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
@@ -73,7 +72,7 @@ pub enum Error {
     /// An environment cannot be built.
     #[error(transparent)]
     Environment(#[from] env::Error),
-    /// The operating system refused something.
+    /// An operation of the operating system failed.
     #[error(transparent)]
     Io(#[from] io::Error),
     /// A connection could not be served.
@@ -250,7 +249,7 @@ impl ServerParts {
     }
 }
 
-/// All services, with what stands before each.
+/// All services, each with its layers.
 fn router<H: Health>(
     config: &Config,
     state: &ServerParts,
@@ -361,7 +360,7 @@ async fn shut_down(
     }
 }
 
-/// Tells the health of the services of both protocols.
+/// Sets the reported health of the services of both protocols.
 async fn set_health(health: &HealthReporter, status: ServingStatus) {
     for service in SERVICES {
         health.set_service_status(service, status).await;

@@ -29,18 +29,18 @@ pub struct DrawAuditor {
     refused: Arc<AtomicU32>,
 }
 
-/// The ledger has at most this many refusals of a session: a client may ask for ever.
+/// The maximum number of refusals of one session in the ledger. A client can repeat a refused request without end.
 const MAX_LOGGED_REFUSALS: u32 = 100;
 
-/// The bytes of a ledger's line that cost as much as a step.
+/// The number of bytes of a ledger's line that are charged as one step.
 const LINE_BYTES_PER_STEP: usize = 16;
 
-/// Draws that are in the ledger and of which it is not known yet whether they happen.
+/// Draws that are in the ledger before they happen. They are withdrawn if they do not.
 #[derive(Default)]
 pub struct PendingDraws(Vec<DrawStart>);
 
 impl PendingDraws {
-    /// Nothing of it was drawn.
+    /// Returns the ends of these draws, none of which happened.
     fn withdraw(self) -> Vec<DrawEnd> {
         self.0
             .into_iter()
@@ -122,7 +122,7 @@ impl DrawAuditor {
             let are_drawn =
                 |of_box: &[Distribution]| of_box.iter().zip(&saved.values).all(|(set, value)| set.contains(*value));
             if !boxes.clone().any(are_drawn) {
-                // A client wrote them into the snapshot: they hold until the trial ends.
+                // A client may have forged the snapshot's parameters. They hold until the trial ends.
                 starts.push((saved.draw, saved.values.iter().copied().map(Distribution::fixed).collect()));
             }
             starts.push((saved.draw, saved.distributions));
@@ -137,7 +137,8 @@ impl DrawAuditor {
         self.note(spec, Vec::new(), Vec::new(), begun.withdraw());
     }
 
-    /// Withdraws the draws of environments that could not be restored. Those of these slots continue as before.
+    /// Withdraws the draws of environments that could not be restored. The environments in these slots continue as
+    /// before.
     pub fn restore_failed(&self, batch: &Batch, slots: &[usize], begun: PendingDraws) {
         let spec = batch.settings().spec;
         let previous: Vec<_> = slots.iter().map(|slot| (batch.draw(*slot), batch.distributions(*slot))).collect();
@@ -163,7 +164,7 @@ impl DrawAuditor {
         }
     }
 
-    /// Checks that the token may draw from there, and records a refusal.
+    /// Checks that the token may draw from these distributions, and records a refusal.
     pub fn check(&self, spec: &EnvironmentSpec, distributions: &[Distribution]) -> Result<(), Error> {
         let Some(role) = self.bearer.as_ref().and_then(|bearer| bearer.role()) else { return Ok(()) };
         let region = spec.region(distributions);
@@ -179,7 +180,7 @@ impl DrawAuditor {
         Err(Error::NotAllowed { role: role.name().into(), environment: spec.name, region: region.to_string(), reason })
     }
 
-    /// Charges the token for a line of this length: a rate of steps bounds how fast the ledger grows.
+    /// Charges the token for a line of this length in steps, so that its step rate also limits the ledger's growth.
     fn charge_line(&self, bytes: usize) {
         if let Some(bearer) = &self.bearer {
             bearer.charge(0, bytes.div_ceil(LINE_BYTES_PER_STEP) as u64);
@@ -196,7 +197,8 @@ impl DrawAuditor {
         self.ledger.is_none() && self.bearer.as_ref().is_none_or(|bearer| bearer.role().is_none())
     }
 
-    /// Checks the draws that begin, each for a number of environments, and records them with those that end.
+    /// Checks the draws that begin, and records them with the draws that end. Each of `begins` has the number of
+    /// environments that draw alike.
     async fn begin<'a>(
         &self,
         spec: &EnvironmentSpec,
@@ -243,7 +245,7 @@ impl DrawAuditor {
     }
 }
 
-/// Groups the environments that begin, neighbours with equal draws as one, and returns the regions that they draw from.
+/// Groups neighbouring environments that begin equal draws. Returns the regions that they draw from, and the groups.
 fn group_begins<'a>(
     spec: &EnvironmentSpec,
     begins: impl Iterator<Item = (NextDraw<'a>, usize)>,
@@ -269,7 +271,7 @@ fn group_begins<'a>(
     (regions, group_begins)
 }
 
-/// Groups the environments that end likewise.
+/// Groups neighbouring environments whose draws end alike.
 fn group_ends(draws: impl IntoIterator<Item = Draw>) -> Vec<DrawEnd> {
     let mut group_ends: Vec<DrawEnd> = Vec::new();
     for Draw { seed, environment_index: index, episode_index } in draws {

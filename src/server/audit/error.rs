@@ -9,10 +9,10 @@ use crate::{
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A snapshot does not say what it draws from.
+    /// The distributions of a snapshot cannot be read.
     #[error(transparent)]
     Environment(#[from] env::Error),
-    /// The ledger takes no line of that length.
+    /// The request needs a longer line than the ledger accepts.
     #[error(transparent)]
     Value(#[from] InvalidValue),
     /// The token's role does not allow it.

@@ -1,4 +1,4 @@
-//! Writes the ledger: what every token drew, before it draws it. See [`perturb_protocol::ledger`].
+//! Writes the ledger, which records every draw of a token before it happens. See [`perturb_protocol::ledger`].
 
 use super::Error;
 use crate::server::error::InvalidValue;
@@ -21,7 +21,7 @@ use tokio::sync::oneshot;
 /// The interval at which the file is looked at while nothing is written.
 const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
-/// A line to be written, and the sender that tells its waiter when it is on the disk.
+/// A line to be written, and the sender that tells the caller when the line is on the disk.
 type WriteRequest = (LedgerEvent, Option<oneshot::Sender<Result<(), String>>>);
 
 /// A server's ledger. A thread of its own writes it.
@@ -40,22 +40,22 @@ pub struct LedgerStatus {
 }
 
 impl LedgerStatus {
-    /// Whether the file is what this server wrote. Otherwise nothing is drawn.
+    /// Whether the file still has what this server wrote. If not, requests that draw are refused.
     pub fn is_intact(&self) -> bool {
         !self.is_lost.load(Ordering::Relaxed)
     }
 
-    /// The bytes of whole lines.
+    /// The length of the file's complete lines, bytes.
     pub fn bytes(&self) -> u64 {
         self.bytes.load(Ordering::Relaxed)
     }
 }
 
 impl Ledger {
-    /// Goes on with a ledger, whose chain is checked, or begins one.
+    /// Continues the ledger at `path` after a check of its chain, or begins a new one.
     ///
     /// # Errors
-    /// If the file is no whole ledger, another server writes it, or it cannot be written.
+    /// If the file is not a valid ledger, another server writes it, or it cannot be written.
     pub fn open(path: &Path) -> io::Result<Self> {
         if path.metadata().is_ok_and(|metadata| !metadata.is_file()) {
             return Err(io::Error::other("that is no file, and a ledger is read again when the server begins"));
@@ -102,12 +102,13 @@ impl Ledger {
         self.sessions.fetch_add(1, Ordering::Relaxed)
     }
 
-    /// Writes a line, and waits until it is on the disk. Returns the [length of the line](line_bytes).
+    /// Writes a line, and waits until it is on the disk. Returns an upper bound of the [line's length](line_bytes) in
+    /// bytes.
     ///
     /// # Errors
-    /// [`Error::NoLedger`].
+    /// [`Error::NoLedger`] if the file cannot be written, [`Error::Value`] if the line would be too long.
     pub async fn write(&self, event: LedgerEvent) -> Result<usize, Error> {
-        // What a session asks for is bounded, but numbers are longer as text.
+        // Requests are bounded in bytes, but their numbers are longer as text.
         let size = line_bytes(&event);
         if size as u64 > MAX_LINE_BYTES / 2 {
             let got = format!("{size} bytes as a line of this server's ledger");
@@ -128,12 +129,12 @@ impl Ledger {
         Err(Error::NoLedger { reason })
     }
 
-    /// Has a line written, sooner or later.
+    /// Queues a line without waiting for it. A line that cannot be written now is tried again with the next one.
     pub fn write_later(&self, event: LedgerEvent) {
         let _ = self.lines.send((event, None));
     }
 
-    /// Writes that the server ends, after all lines before.
+    /// Writes the line that the server ends, after all queued lines.
     pub async fn close(&self) {
         if let Err(error) = self.write(LedgerEvent::Ended).await {
             tracing::error!("{error}");
@@ -141,29 +142,29 @@ impl Ledger {
     }
 }
 
-/// Returns the length of an event's line in bytes, at most.
+/// Returns an upper bound of the length of an event's line, bytes.
 pub fn line_bytes(event: &LedgerEvent) -> usize {
     /// The digest, the number, the time and the end of the line.
     const FRAME_BYTES: usize = 128;
-    // That it cannot be written as JSON is for the writer to tell.
+    // The writer reports an event that cannot be written as JSON.
     serde_json::to_vec(event).map_or(0, |json| json.len()) + FRAME_BYTES
 }
 
-/// The state of the ledger's thread: the file, as far as it is whole.
+/// The state of the ledger's thread. `bytes` and `chain` cover the complete lines of the file.
 struct LedgerWriter {
     file: File,
     path: PathBuf,
     bytes: u64,
     chain: Chain,
-    /// Whether there may be more in the file.
+    /// Whether the file may have a part of a line after the first `bytes`, left by a failed write.
     is_torn: bool,
-    /// Lines without a waiter that could not be written yet.
+    /// Lines that nobody waits for and that could not be written yet.
     pending: Vec<WriteRequest>,
     status: Arc<LedgerStatus>,
 }
 
 impl LedgerWriter {
-    /// Writes what comes, whatever has come meanwhile at once.
+    /// Writes lines as they come. All lines that are queued by then go to the disk together.
     fn run(mut self, received: &Receiver<WriteRequest>) {
         loop {
             let first = match received.recv_timeout(CHECK_INTERVAL) {
@@ -195,10 +196,10 @@ impl LedgerWriter {
         }
     }
 
-    /// Compares the file at the path with what was written. Logs when that changes.
+    /// Checks that the file at the path is still the one that was written. Logs when it is lost, and when it is back.
     ///
     /// # Errors
-    /// What was done to the file, and how to go on.
+    /// If the file was moved, replaced or changed: a text that says which, and how to continue.
     fn check_file(&self) -> Result<(), String> {
         let found = self.file_is_intact();
         match (&found, self.status.is_lost.swap(found.is_err(), Ordering::Relaxed)) {
@@ -236,7 +237,7 @@ impl LedgerWriter {
         Ok(())
     }
 
-    /// Writes lines and waits for the disk; all, or none.
+    /// Writes all lines, or none on an error, and waits for the disk.
     fn write<'a>(&mut self, events: impl IntoIterator<Item = &'a LedgerEvent>) -> Result<(), String> {
         #[expect(clippy::disallowed_methods, reason = "lines have their time; what is drawn does not depend on it")]
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
@@ -250,7 +251,7 @@ impl LedgerWriter {
             self.is_torn = false;
         }
         if let Err(error) = self.file.write_all(lines.as_bytes()).and_then(|()| self.file.sync_data()) {
-            // A part of them is not a line.
+            // A failed write may leave a part of a line, which is cut off.
             self.is_torn = self.file.set_len(self.bytes).is_err();
             return Err(error.to_string());
         }

@@ -1,8 +1,8 @@
-//! Why a token is not good, or not good for that.
+//! Why a token is refused, or does not allow a request.
 
 use crate::server::error::{ErrorKind, RequestError};
 
-/// An error of a token's holder.
+/// An error that concerns the caller's token.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -12,16 +12,16 @@ pub enum Error {
          PERTURB_TOKEN_FILE, or send it as the metadata `authorization: Bearer TOKEN`"
     )]
     NoToken,
-    /// A call with a token that is none here.
+    /// A call with a token that this server does not know.
     #[error("this server does not know the token that came; ask who runs it for one that is good")]
     WrongToken,
-    /// The session's token was taken out of the file of tokens.
+    /// The session's token was removed from the file of tokens, or got another role.
     #[error("the token {name:?} was revoked, or has another role now; ask who runs this server")]
     RevokedToken {
         /// The token's name.
         name: String,
     },
-    /// A token has all that it may have.
+    /// The request would exceed a quota of the token.
     #[error(
         "the token {name:?} may have {limit} {what} here, and {wanted} more would be too many; ask for less, or close"
     )]

@@ -51,9 +51,9 @@ pub fn read(paths: &[PathBuf]) -> Contents {
 }
 
 impl FileWatcher {
-    /// Calls `reload` with the contents of the files when they have changed and stay so for a moment, since a writer
-    /// may not be done; at once if a [`Reloader`] asks. `before` is what was read at first. An error is logged, and the
-    /// next change is waited for.
+    /// Calls `reload` with the contents of the files after a change. It waits until two readings agree, since a writer
+    /// may not be done, but not if a [`Reloader`] asks. `before` is the contents at the start. An error is logged, and
+    /// the files are watched further.
     ///
     /// # Errors
     /// If there is no thread.

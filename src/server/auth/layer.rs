@@ -18,7 +18,7 @@ use tonic::{
 };
 use tower::Layer;
 
-/// A service that answers calls with a good token, or all calls if the server has no tokens.
+/// A service that answers only calls with a valid token, or all calls if the server has no tokens.
 #[derive(Clone)]
 pub struct AuthService<S> {
     service: S,

@@ -106,23 +106,23 @@ impl Token {
         }
     }
 
-    /// The most steps a second that its environments may take together; none: as many as there can be.
+    /// The maximum number of steps per second of all the token's environments together; `None` for no limit.
     pub fn rate(&self) -> Option<u32> {
         self.quotas.rate_limiter.rate()
     }
 
-    /// Waits until its environments may step again, at most half a minute.
+    /// Waits until the token's environments may step again, at most 30 s.
     ///
     /// # Errors
-    /// [`Error::TooFast`], at once, if that would be too long.
+    /// [`Error::TooFast`], without waiting, if it would take longer.
     pub async fn acquire_steps(&self) -> Result<(), Error> {
         self.acquire_within(MAX_WAIT).await
     }
 
-    /// Waits until its rate has covered what it was charged for.
+    /// Waits until the token's rate has covered all steps that it was charged for.
     ///
     /// # Errors
-    /// [`Error::TooFast`], at once, if that would take longer than `max_wait`.
+    /// [`Error::TooFast`], without waiting, if it would take longer than `max_wait`.
     pub async fn acquire_within(&self, max_wait: Duration) -> Result<(), Error> {
         let acquired = self.quotas.rate_limiter.acquire(max_wait).await;
         acquired.map_err(|TooFast { rate, ahead }| Error::TooFast {
@@ -137,12 +137,12 @@ impl Token {
         self.role.as_deref()
     }
 
-    /// Whether it is in the file no more, or with another role.
+    /// Whether the token is no longer in the file, or has another role there.
     fn is_revoked(&self) -> bool {
         self.revoked.load(Ordering::Acquire)
     }
 
-    /// Waits until it is in the file no more, or with another role, and gives the refusal of what comes then.
+    /// Waits until the token is revoked. Returns the error for later requests.
     pub async fn revoked(&self) -> Error {
         loop {
             let notified = self.revoked_notify.notified();
@@ -186,11 +186,11 @@ impl Token {
     }
 }
 
-/// The tokens that are good now.
+/// The tokens that are valid now.
 #[derive(Clone, Default)]
 pub struct Tokens {
     good: Arc<RwLock<Vec<Bearer>>>,
-    /// The environments that sets are of.
+    /// The environments that the sets of the file may name.
     catalogue: Arc<Catalogue>,
 }
 
@@ -210,17 +210,17 @@ impl Tokens {
         self.good.read().unwrap_or_else(PoisonError::into_inner).iter().map(|token| token.usage()).collect()
     }
 
-    /// Takes the file's new text: tokens that stay, with the same role, keep what they have, others are revoked.
+    /// Applies the file's new text. Tokens that stay with the same role keep their sessions; others are revoked.
     ///
     /// # Errors
-    /// [`TokenFileError`]; then all stays as it is.
+    /// [`TokenFileError`]; the tokens are unchanged then.
     pub fn reload(&self, text: &str) -> Result<(), TokenFileError> {
         let listed = listed(&self.catalogue, text)?;
         let mut tokens = self.good.write().unwrap_or_else(PoisonError::into_inner);
         let mut renewed = Vec::with_capacity(listed.len());
         for ParsedToken { digest, entry, role } in listed {
             let TokenEntry { name, max_sessions, max_envs, max_steps_per_second, max_bytes, .. } = entry;
-            // Another token of the same name has what was taken with the one before, too.
+            // A new token of the same name shares the quotas of the previous one, which may still be in use.
             let before = tokens.iter().find(|token| token.name == name);
             let quotas = before.map_or_else(Default::default, |token| Arc::clone(&token.quotas));
             quotas.sessions.set_limit(max_sessions);
@@ -245,7 +245,7 @@ impl Tokens {
         Ok(())
     }
 
-    /// The token that a call shows. All are compared, each in constant time.
+    /// The token whose digest matches that of the `shown` text. All are compared, each in constant time.
     fn find(&self, shown: &[u8]) -> Option<Bearer> {
         let digest: [u8; 32] = Sha256::digest(shown).into();
         let tokens = self.good.read().unwrap_or_else(PoisonError::into_inner);

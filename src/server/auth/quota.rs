@@ -61,7 +61,7 @@ pub struct QuotaGuard {
 }
 
 impl QuotaGuard {
-    /// Nothing of it yet.
+    /// An empty part of a token's quota of this kind.
     pub(super) fn empty(token: Bearer, kind: QuotaKind) -> Self {
         Self { token, count: 0, kind }
     }
@@ -69,7 +69,7 @@ impl QuotaGuard {
     /// Takes `count` more.
     ///
     /// # Errors
-    /// [`Error::QuotaExceeded`]; then it is as before.
+    /// [`Error::QuotaExceeded`]; the count is unchanged then.
     pub fn grow(&mut self, count: usize) -> Result<(), Error> {
         self.kind.quota(&self.token).take(count).map_err(|limit| Error::QuotaExceeded {
             name: self.token.name.clone(),
@@ -81,7 +81,7 @@ impl QuotaGuard {
         Ok(())
     }
 
-    /// Changes the count, which may then be more than the quota.
+    /// Sets the count, even if it then exceeds the quota.
     pub fn set(&mut self, count: usize) {
         let taken = &self.kind.quota(&self.token).taken;
         taken.fetch_add(count, Ordering::Relaxed);

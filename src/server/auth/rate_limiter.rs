@@ -1,6 +1,6 @@
 //! The rate limit for the steps of a token's environments. Steps are charged after they ran. A client that is ahead of
-//! the rate waits with its next request, while nothing is held but the request itself. Steps that were not used can be
-//! made up for within a second.
+//! the rate waits before its next request is handled, and only the request is kept in memory meanwhile. An idle client
+//! may catch up on the steps of one second.
 
 use std::{
     sync::{Mutex, MutexGuard, PoisonError},
@@ -10,7 +10,7 @@ use tokio::time::{Instant, sleep};
 
 /// A token that was idle may catch up on the steps of this time, in seconds.
 const BURST_SECONDS: f64 = 1.0;
-/// A request that would wait longer is refused: clients give a reply a minute.
+/// A request that would wait longer is refused. Clients wait a minute for a reply.
 pub(super) const MAX_WAIT: Duration = Duration::from_secs(30);
 /// The minimum sleep; without it a wait that is rounded to zero would spin.
 const MIN_WAIT: Duration = Duration::from_micros(1);
@@ -27,7 +27,7 @@ struct RateState {
     rate: Option<u32>,
     /// Steps so far.
     done: f64,
-    /// The steps that the rate has allowed by `at`, at most [`BURST_SECONDS`] more than were done.
+    /// The steps that the rate has allowed until `at`, at most those of [`BURST_SECONDS`] more than were done.
     allowed: f64,
     at: Option<Instant>,
     waited: Duration,
@@ -61,10 +61,11 @@ impl RateLimiter {
         self.lock().done += steps as f64;
     }
 
-    /// Waits until the rate has allowed what was done when this was asked: so those who wait go one after the other.
+    /// Waits until the rate has allowed all steps that were charged before this call. Later calls wait for the steps of
+    /// earlier ones, so callers proceed one after the other.
     ///
     /// # Errors
-    /// [`TooFast`], at once, if that takes longer than `max_wait`.
+    /// [`TooFast`], without waiting, if it would take longer than `max_wait`.
     pub(super) async fn acquire(&self, max_wait: Duration) -> Result<(), TooFast> {
         let mut ticket = None;
         while let Some(wait) = self.wait(&mut ticket, max_wait)? {
@@ -88,7 +89,7 @@ impl RateState {
         self.rate = rate;
     }
 
-    /// Allows what the time since the last call allows.
+    /// Adds the steps that the rate allows for the time since the last call.
     fn refill(&mut self, now: Instant) {
         let elapsed = self.at.map_or(Duration::ZERO, |at| now.saturating_duration_since(at)).as_secs_f64();
         self.allowed = match self.rate.map(f64::from) {
@@ -112,7 +113,7 @@ impl RateState {
         if steps <= 0.0 {
             return Ok(None);
         }
-        // A rate is at least 1.
+        // A rate is at least 1, so this does not divide by 0.
         let ahead = Duration::from_secs_f64(steps / f64::from(rate));
         if ahead > max_wait {
             return Err(TooFast { rate, ahead });

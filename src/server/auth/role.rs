@@ -4,27 +4,27 @@ use crate::env::{EnvironmentSpec, Version, disturbance};
 use perturb_protocol::region::Region;
 use std::fmt;
 
-/// The parameter values that the sessions of some tokens may draw from.
+/// The parameter values that the sessions of the tokens with this role may draw from.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Role {
     pub(super) name: String,
-    /// Nothing that is not within these; none: anything.
+    /// A draw must lie within the union of these sets; `None` allows any draw.
     pub(super) draws: Option<Vec<DrawSet>>,
-    /// Nothing that overlaps one of these.
+    /// A draw must not overlap any of these sets.
     pub(super) never: Vec<DrawSet>,
 }
 
 /// Parameter values with a name.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum DrawSet {
-    /// A version of every environment.
+    /// The parameter values of this version, in whichever environment.
     Version(Version),
-    /// A set of the file's own.
+    /// A set that the file of tokens defines for one environment.
     Own { name: String, environment: &'static str, region: Region },
 }
 
 impl DrawSet {
-    /// The values of an environment, if it has some of that one.
+    /// The parameter values for an environment, if the set has some for it.
     fn region(&self, spec: &EnvironmentSpec) -> Option<Region> {
         match self {
             Self::Version(version) => Some(spec.region(&spec.distributions(*version))),
@@ -48,12 +48,13 @@ impl Role {
         &self.name
     }
 
-    /// Whether it may draw from that.
+    /// Checks that the role allows draws from a region of an environment.
     ///
     /// # Errors
-    /// Why not, in half a sentence.
+    /// If it does not: the reason, as a part of a sentence.
     pub fn check(&self, spec: &EnvironmentSpec, region: &Region) -> Result<(), String> {
-        // Versions say nothing of disturbances, so that no disturbance leads around what a role may never draw.
+        // Versions are defined without disturbances. So a session with disturbances is compared with the same sets, and
+        // cannot bypass what a role may never draw.
         let spec = disturbance::undisturbed(spec);
         let overlaps = |set: &&DrawSet| set.region(spec).is_some_and(|never| region.overlaps(&never));
         if let Some(never) = self.never.iter().find(overlaps) {

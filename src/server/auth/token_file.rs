@@ -1,4 +1,4 @@
-//! The file of tokens: what is in it, and what may be.
+//! The file of tokens: its format, and the checks of its entries.
 
 use super::role::{DrawSet, Role};
 use crate::env::{Catalogue, Distribution, Version, disturbance, resolve};
@@ -19,7 +19,7 @@ const EXPECTED_ENTRY: &str = "[[token]] with name = \"…\", sha256 = \"64 hexad
                      max_steps_per_second = N, max_bytes = N and role = \"…\"; [[role]] with name, draws = [\"D\", \"R\", …] and \
                      never = […]; [[set]] with name, environment, version and parameters";
 
-/// Why a file of tokens is refused. Nothing of a token is in it.
+/// Why a file of tokens is refused. The message never repeats a part of a token.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}: {what}; expected {EXPECTED_ENTRY}")]
 pub struct TokenFileError {
@@ -78,11 +78,11 @@ pub(super) struct ParsedToken {
     pub(super) role: Option<Arc<Role>>,
 }
 
-/// The tokens of a file, whose sets are of these environments.
+/// Parses a file of tokens. Its sets may name the environments of `catalogue`.
 pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToken>, TokenFileError> {
     let line = |byte: usize| 1 + text.bytes().take(byte).filter(|byte| *byte == b'\n').count();
     let TokenFile { token: entries, role: roles, set: sets } = toml::from_str(text).map_err(|error| {
-        // A parser's words may quote a token, but for those that are about keys.
+        // A parser's message may quote a token, except for messages about keys.
         let words = error.message();
         let about_keys = ["unknown field", "missing field", "duplicate key"].iter().any(|kind| words.starts_with(kind));
         let what = if about_keys { words.lines().next().unwrap_or_default() } else { "this cannot be read" };
@@ -111,7 +111,7 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
             draws.map(find).transpose().and_then(|draws| Ok((draws, find(never)?)));
         let (draws, never) = sets.map_err(|what| TokenFileError { line, what })?;
         if draws.is_none() && !never.is_empty() {
-            // A hair beside the set would do.
+            // A draw just beside the forbidden set would be allowed, so `never` alone forbids nothing.
             return Err(TokenFileError {
                 line,
                 what: format!("the role {name:?} has never without draws: say what it may draw from"),
@@ -146,7 +146,7 @@ fn found<T: Clone>(what: &str, name: &str, known: &BTreeMap<String, T>) -> Resul
     known.get(name).cloned().ok_or_else(|| format!("there is no {what} {name:?}; there are {}", names()))
 }
 
-/// A set of the file's own.
+/// Resolves a set that the file defines.
 fn own_set(catalogue: &Catalogue, set: SetEntry) -> Result<DrawSet, String> {
     let SetEntry { name, environment, version, parameters } = set;
     let spec = catalogue.find(&environment).map_err(|error| error.to_string())?;

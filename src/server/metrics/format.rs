@@ -1,17 +1,17 @@
-//! The two text formats of metrics: OpenMetrics 1.0, and Prometheus' own of before, 0.0.4.
+//! The two text formats of metrics: OpenMetrics 1.0, and Prometheus' older format 0.0.4.
 
 /// A text format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TextFormat {
     /// OpenMetrics 1.0.
     OpenMetrics,
-    /// Prometheus' text format 0.0.4, for scrapers that know no other.
+    /// Prometheus' text format 0.0.4, for scrapers that do not know OpenMetrics.
     Prometheus,
 }
 
 impl TextFormat {
-    /// The format that the value of an `Accept` header asks for. OpenMetrics unless plain text is preferred, or both are
-    /// refused: what asks for neither is likelier to read the older one.
+    /// The format that the value of an `Accept` header asks for: OpenMetrics, unless plain text is preferred or neither
+    /// is accepted. A scraper that accepts neither more likely reads the older one.
     pub fn negotiated(accept: Option<&str>) -> Self {
         let Some(accept) = accept else { return Self::OpenMetrics };
         let open_metrics = quality(accept, "application", "openmetrics-text");
@@ -27,7 +27,7 @@ impl TextFormat {
         }
     }
 
-    /// A page of OpenMetrics in this format.
+    /// Converts a page of OpenMetrics to this format.
     pub fn convert(self, page: String) -> String {
         match self {
             Self::OpenMetrics => page,

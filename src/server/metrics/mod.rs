@@ -30,7 +30,7 @@ pub type RequestCounts = (&'static str, Arc<RequestCounters>);
 
 /// The counters of the other layers, which the page reads.
 pub struct MetricsSources {
-    /// Environments, and what happens in them.
+    /// The pool, with the counters of environments.
     pub pool: Arc<Pool>,
     /// The limiter of sessions.
     pub sessions: PeerLimiter,
@@ -46,7 +46,7 @@ pub struct MetricsSources {
     pub errors: ErrorCounters,
     /// The counts of ended sessions.
     pub access: AccessLog,
-    /// The tokens, if the server asks for some.
+    /// The tokens, if the server requires one.
     pub tokens: Option<Tokens>,
     /// The ledger, if the server writes one.
     pub ledger: Option<Ledger>,
@@ -57,7 +57,7 @@ pub struct MetricsSources {
 }
 
 impl MetricsSources {
-    /// Watches how late the thread wakes that runs this, for ever.
+    /// Measures, for ever, how late the thread that runs this wakes up.
     pub async fn watch_lag(&self) {
         loop {
             let due = Instant::now() + LAG_CHECK_INTERVAL;

@@ -1,5 +1,5 @@
-//! The metrics. Labels have names of this program, of its environments and of the file of tokens: nothing that clients
-//! send.
+//! The metrics. Labels have names of this program, of its environments and of the file of tokens, but no text that a
+//! client sent.
 
 use super::{MetricsSources, process};
 use crate::{meters::Histogram, server::audit::ledger::Ledger};
@@ -20,10 +20,10 @@ type MetricLabels<'a, const N: usize> = [(&'static str, &'a str); N];
 /// The labels of a metric without labels.
 const NO_LABELS: MetricLabels<'static, 0> = [];
 
-/// The page of these numbers, as they are now.
+/// Renders the page with the present values.
 ///
 /// # Errors
-/// A defect: memory takes all text.
+/// Only by a defect, since writing to memory cannot fail.
 pub fn page(sources: &Arc<MetricsSources>) -> Result<String, fmt::Error> {
     let mut registry = Registry::default();
     registry.register_collector(Box::new(MetricsCollector(Arc::clone(sources))));
@@ -149,7 +149,7 @@ fn resources(page: &mut Page<'_>) -> EncodeResult {
     Ok(())
 }
 
-/// A code as gRPC's documents write it.
+/// The name of a code in the spelling of gRPC's documents.
 fn written(code: Code) -> String {
     let mut text = String::new();
     for letter in format!("{code:?}").chars() {
@@ -174,7 +174,7 @@ impl Page<'_> {
         self.series(name, help, MetricType::Gauge, each, |mut encoder, value| encoder.encode_gauge(&value))
     }
 
-    /// Names end with `_total`, which is not given.
+    /// Writes counters. The encoder adds `_total` to `name`.
     fn counters<S: EncodeLabelSet>(
         &mut self,
         name: &str,

@@ -18,14 +18,14 @@ pub struct Resources {
     pub threads: i64,
     /// File descriptors in use.
     pub descriptors: usize,
-    /// The most there may be; none: as many as there are.
+    /// The maximum number of file descriptors; `None` for no limit.
     pub max_descriptors: Option<u64>,
 }
 
-/// Reads them.
+/// Reads the resources of this process.
 ///
 /// # Errors
-/// Where `/proc` is not there or does not tell.
+/// If `/proc` is missing, or has not the expected format.
 pub fn resources() -> io::Result<Resources> {
     let stat = fs::read_to_string("/proc/self/stat")?;
     let system = fs::read_to_string("/proc/stat")?;

@@ -23,14 +23,14 @@ pub const BROKEN: &str = "broken";
 /// The ending of a session whose lease is over. All other endings are the reasons of errors.
 pub const LEASE_OVER: &str = "lease_over";
 
-/// The environment of a session, and how far it came.
+/// The environment of a session, and its steps.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct SessionStats {
     /// The environment that the session was opened with.
     pub environment: Option<&'static str>,
     /// The number of environments that it was opened with.
     pub envs: usize,
-    /// Steps of an environment.
+    /// The number of steps, summed over its environments.
     pub steps: u64,
 }
 
@@ -52,20 +52,20 @@ pub struct SessionRecord<'a> {
     pub ending: &'static str,
 }
 
-/// The log, and how many sessions ended how.
+/// The log, and the number of ended sessions by ending.
 #[derive(Clone, Default)]
 pub struct AccessLog(Arc<Mutex<LogState>>);
 
 #[derive(Default)]
 struct LogState {
-    /// By protocol and ending.
+    /// The number of ended sessions by protocol and ending.
     endings: BTreeMap<(&'static str, &'static str), u64>,
     /// The window's beginning, and the number of sessions that ended in it.
     window: Option<(Instant, u64)>,
 }
 
 impl AccessLog {
-    /// Has [`endings`](Self::endings) tell of sessions of this protocol before the first one ends.
+    /// Makes [`endings`](Self::endings) list this protocol, with counts of 0, before its first session ends.
     pub fn register_protocol(&self, protocol: &'static str) {
         let mut state = self.lock();
         for ending in [GONE, CLOSED, BROKEN, LEASE_OVER] {
@@ -105,7 +105,7 @@ impl AccessLog {
         *state.endings.entry((protocol, ending)).or_default() += 1;
         let now = Instant::now();
         let (since, wanted) = state.window.get_or_insert((now, 0));
-        // A window that leaves lines out ends when the log says how many.
+        // A window that has left out lines ends with the line that tells their number.
         if *wanted <= MAX_LINES_PER_WINDOW && since.elapsed() >= WINDOW {
             (*since, *wanted) = (now, 0);
         }

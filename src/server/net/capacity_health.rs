@@ -7,7 +7,7 @@ use tonic_health::{ServingStatus, server::HealthReporter};
 /// The name for which health says NOT_SERVING while all sessions or all environments are taken, and in a drain.
 pub const NEW_SESSIONS: &str = "perturb.v1.Perturb.NewSessions";
 
-/// Keeps the health of [`NEW_SESSIONS`], for ever.
+/// Updates the health of [`NEW_SESSIONS`], for ever.
 pub async fn report_capacity(health: &HealthReporter, sessions: &PeerLimiter, pool: &Pool) {
     let mut reported = None;
     loop {

@@ -39,7 +39,7 @@ pub enum Listener {
 pub struct AcceptLimits {
     /// The limiter of connections.
     pub limiter: PeerLimiter,
-    /// The time in which a client must begin.
+    /// The time in which a client must finish its handshake or send its preface.
     pub handshake: Duration,
 }
 
@@ -74,7 +74,7 @@ impl AcceptLimits {
     }
 }
 
-/// Connections as they come, without Nagle's delay: a step is one small message each way.
+/// Accepts connections. Nagle's delay is switched off, because a step is one small message each way.
 pub fn tcp_connections(
     listener: TcpListener,
     limits: AcceptLimits,
@@ -83,7 +83,7 @@ pub fn tcp_connections(
         let connection = loop {
             match listener.accept().await {
                 Ok((connection, address)) => {
-                    // It fails for connections that are gone already.
+                    // It fails only for connections that are already closed.
                     let _ = connection.set_nodelay(true);
                     if let Some(connection) = limits.admit(connection, Peer::at(address.ip())) {
                         break connection;
@@ -96,7 +96,8 @@ pub fn tcp_connections(
     })
 }
 
-/// Connections whose clients have finished the handshake, in the order in which they finish: none waits for another.
+/// Accepts connections and returns them after their TLS handshakes, in the order in which these finish. A slow
+/// handshake does not delay the others.
 pub fn tls_connections(
     listener: TcpListener,
     limits: AcceptLimits,
@@ -122,7 +123,7 @@ pub fn tls_connections(
     })
 }
 
-/// Connections as they come. The socket's file is removed when the stream is dropped.
+/// Accepts connections. The socket's file is removed when the stream is dropped.
 pub fn unix_connections(
     listener: UnixListener,
     file: SocketFile,
@@ -144,7 +145,7 @@ pub fn unix_connections(
     })
 }
 
-/// Why an address cannot be had, and what to do about the flag that gives it.
+/// Returns why an address cannot be bound, and how to change the flag that names it.
 fn explain(address: &ListenAddress, flag: &str, error: &io::Error) -> String {
     let text = address.written();
     match (address, error.kind()) {
@@ -165,7 +166,8 @@ fn explain(address: &ListenAddress, flag: &str, error: &io::Error) -> String {
     }
 }
 
-/// Out of file descriptors, most likely: trying again at once would keep the thread from those it serves.
+/// Logs that the system refuses connections, and waits. The process most likely has no file descriptors left, and
+/// retrying at once would keep the thread from its open connections.
 async fn pause(error: &io::Error) {
     tracing::warn!(%error, "cannot accept a connection");
     tokio::time::sleep(ACCEPT_RETRY_DELAY).await;
@@ -186,7 +188,7 @@ fn identity(path: &Path) -> Option<(u64, u64)> {
 impl Drop for SocketFile {
     fn drop(&mut self) {
         if identity(&self.path) == self.identity {
-            // Gone already is as good.
+            // The file may already be gone, which is no error.
             let _ = std::fs::remove_file(&self.path);
         }
     }
@@ -213,7 +215,7 @@ impl Listener {
             ListenAddress::Unix(path) => {
                 let is_socket = std::fs::symlink_metadata(path).is_ok_and(|m| m.file_type().is_socket());
                 let refused = |e: io::Error| e.kind() == ErrorKind::ConnectionRefused;
-                // Without waiting: a server that accepts nobody is one all the same.
+                // The connection is not awaited further: a server that does not accept still holds the address.
                 if is_socket && UnixStream::connect(path).await.is_err_and(refused) {
                     std::fs::remove_file(path).map_err(explain)?;
                 }
@@ -226,7 +228,7 @@ impl Listener {
         }
     }
 
-    /// The address that was bound, with the port that was found.
+    /// The address that was bound, with the port that the system chose.
     ///
     /// # Errors
     /// If the operating system does not tell the port.

@@ -1,4 +1,4 @@
-//! A connection's bytes: the time that it has to begin, and how it is ended.
+//! The I/O of a connection, with a timeout for its first bytes and a switch that ends it.
 
 use super::peer_limiter::{Peer, PeerPermit};
 use futures_util::task::AtomicWaker;
@@ -37,7 +37,7 @@ struct KillSwitch {
 }
 
 impl Connection {
-    /// Ends it, with all its calls.
+    /// Ends the connection and all its calls.
     pub fn close(&self) {
         self.kill_switch.requested.store(true, Ordering::Release);
         self.kill_switch.waker.wake();
@@ -48,13 +48,13 @@ impl Connection {
 pub struct ManagedIo<S> {
     stream: S,
     connection: Connection,
-    /// The bytes of the preface that have not come, and until when they may.
+    /// The number of bytes of the preface that have not arrived, and the deadline for them.
     preface: Option<(usize, Pin<Box<Sleep>>)>,
     _permit: PeerPermit,
 }
 
 impl<S> ManagedIo<S> {
-    /// Gives the client so long to begin.
+    /// Wraps a connection whose client must send its preface within `limit`.
     pub fn new(stream: S, peer: Peer, permit: PeerPermit, limit: Duration) -> Self {
         let preface = Some((PREFACE_BYTES, Box::pin(sleep(limit))));
         Self { stream, connection: Connection { peer, kill_switch: Arc::default() }, preface, _permit: permit }
@@ -68,7 +68,7 @@ impl<S> ManagedIo<S> {
 }
 
 impl<S> Drop for ManagedIo<S> {
-    /// Nobody needs to be woken any more; the waker would keep the connection's memory as long as a call knows of it.
+    /// Drops the waker, which would keep the connection's memory as long as a call holds a [`Connection`].
     fn drop(&mut self) {
         self.connection.kill_switch.waker.take();
     }

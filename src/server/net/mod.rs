@@ -1,4 +1,4 @@
-//! Connections: who they are from, how they begin and end, and what is logged of their sessions.
+//! Connections: their peers, limits and encryption, and the access log of their sessions.
 
 pub mod access_log;
 pub mod capacity_health;

@@ -1,4 +1,4 @@
-//! Peers, and limits on what each may have at a time.
+//! Peers, and the limits of concurrent connections or sessions of each.
 
 use std::{
     collections::BTreeMap,
@@ -11,9 +11,9 @@ use tokio::sync::Notify;
 /// The other end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Peer {
-    /// A machine, or a network of them that one may have for itself.
+    /// A machine, or a network that one machine may have for itself.
     Machine(IpAddr),
-    /// A user of this machine, by a Unix socket; none where the system does not tell.
+    /// A user of this machine, by a Unix socket; `None` if the system does not tell the user.
     User(Option<u32>),
 }
 
@@ -38,7 +38,7 @@ impl fmt::Display for Peer {
     }
 }
 
-/// A concurrency limiter, with a limit in all and one for each peer.
+/// A concurrency limiter, with a total limit and a limit for each peer.
 #[derive(Clone)]
 pub struct PeerLimiter(Arc<PermitCounts>);
 
@@ -55,7 +55,7 @@ struct PermitCounts {
 pub enum LimitReached {
     /// All permits are in use.
     All(usize),
-    /// The peer has as many as it may.
+    /// The peer has this many permits, as many as it may have.
     Peer(usize),
 }
 
@@ -66,7 +66,7 @@ pub struct PeerPermit {
 }
 
 impl PeerLimiter {
-    /// A limiter with a limit in all, and one for each peer.
+    /// Makes a limiter with a total limit, and a limit for each peer.
     pub fn new(max_total: usize, max_per_peer: usize) -> Self {
         Self(Arc::new(PermitCounts { max_total, max_per_peer, in_use: Mutex::default(), changed: Notify::new() }))
     }
@@ -98,7 +98,7 @@ impl PeerLimiter {
         self.lock().0
     }
 
-    /// The limit in all.
+    /// The total limit.
     pub fn limit(&self) -> usize {
         self.0.max_total
     }

@@ -1,4 +1,4 @@
-//! Asking a running server for its health, as container engines do by starting the server's own program.
+//! Asks a running server for its health. Container engines start the server's program for this purpose.
 
 use crate::config::ListenAddress;
 use perturb_protocol::{Address, AddressError, ClientError, Connection, Timeouts, credentials::Credentials};
@@ -22,7 +22,7 @@ pub enum Error {
     /// The working directory, which a socket's path begins with, is gone.
     #[error("a relative path of a socket: {0}")]
     Directory(#[from] io::Error),
-    /// Nobody answers, or not as a server that takes sessions does.
+    /// No answer came, or the server does not take sessions.
     #[error("no server answers at {address}: {reason}")]
     NoAnswer {
         /// The address.
@@ -32,8 +32,8 @@ pub enum Error {
     },
 }
 
-/// Asks the server that listens at `listen` whether it takes sessions. One that listens everywhere is asked through the
-/// loopback interface; one with TLS must show this certificate, whatever names are in it.
+/// Asks the server that listens at `listen` whether it takes sessions. A server that listens on all interfaces is asked
+/// through the loopback interface. A server with TLS must show `certificate`, whatever names are in it.
 ///
 /// # Errors
 /// [`Error`], after at most 3 s.

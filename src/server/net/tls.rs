@@ -1,4 +1,4 @@
-//! TLS 1.3: the server's certificate, and whose certificates clients must show.
+//! TLS 1.3: the server's certificate, and the authorities that must have signed clients' certificates.
 
 use crate::config::TlsFiles;
 use std::{
@@ -21,7 +21,7 @@ use tokio_rustls::{
     server::TlsStream,
 };
 
-/// The settings of connections with what is in the files.
+/// Builds the settings of connections from the contents of the files.
 fn configured(files: &TlsFiles, contents: &[Vec<u8>]) -> Result<ServerConfig, String> {
     let [cert, key, rest @ ..] = contents else { return Err("a certificate and a key are expected".into()) };
     let chain = certificates(&files.cert, cert)?;
@@ -62,7 +62,7 @@ fn certificates(path: &std::path::Path, pem: &[u8]) -> Result<Vec<CertificateDer
     Ok(all)
 }
 
-/// The TLS settings of the connections to come.
+/// The TLS settings of new connections, which can be reloaded.
 #[derive(Clone)]
 pub struct Tls {
     files: Arc<TlsFiles>,
@@ -70,19 +70,19 @@ pub struct Tls {
 }
 
 impl Tls {
-    /// With what is in the files.
+    /// Makes the settings from the contents of the files.
     ///
     /// # Errors
-    /// What is wrong with which of them.
+    /// If a file is wrong: a text that names it and the fault.
     pub fn new(files: TlsFiles, contents: &[Vec<u8>]) -> Result<Self, String> {
         let config = Arc::new(configured(&files, contents)?);
         Ok(Self { files: Arc::new(files), config: Arc::new(RwLock::new(config)) })
     }
 
-    /// Takes what is in the files now, for the connections to come.
+    /// Applies the new contents of the files to new connections.
     ///
     /// # Errors
-    /// What is wrong with which of them; then all stays as it is.
+    /// If a file is wrong: a text that names it and the fault. The settings are unchanged then.
     pub fn reload(&self, contents: &[Vec<u8>]) -> Result<(), String> {
         let config = Arc::new(configured(&self.files, contents)?);
         *self.config.write().unwrap_or_else(PoisonError::into_inner) = config;
@@ -93,7 +93,7 @@ impl Tls {
     /// connection that is closed while there is something to read is reset, and the alert may be lost.
     ///
     /// # Errors
-    /// If they do not agree.
+    /// If the handshake fails.
     pub async fn accept(&self, connection: TcpStream) -> io::Result<TlsStream<TcpStream>> {
         let config = Arc::clone(&self.config.read().unwrap_or_else(PoisonError::into_inner));
         match TlsAcceptor::from(config).accept(connection).into_fallible().await {

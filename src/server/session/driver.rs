@@ -1,6 +1,6 @@
 //! The task that runs a session. Streams attach to it and detach from it. Without a lease the session ends with its
-//! stream. With one it outlives the stream for a while: what was asked for is done whether or not anybody waits for it,
-//! and the last replies are stored, to be sent again.
+//! stream. With a lease it outlives the stream for a while: requests are carried out even if no stream waits for the
+//! reply, and the last replies are stored, to be sent again.
 
 use super::{
     Error,
@@ -35,10 +35,10 @@ use tokio::{
 };
 use tonic::Status;
 
-/// The most bytes of a session's stored replies, unless the last one alone has more: a client that has not received
-/// that much is better off with a snapshot.
+/// The maximum length of a session's stored replies, bytes. The last reply is stored even if it is longer. A client
+/// that has missed more than this should continue from a snapshot.
 const MAX_STORED_BYTES: usize = 4 << 20;
-/// A stored reply's bytes beside those that are sent.
+/// The memory of a stored reply beside its encoded length, bytes.
 const REPLY_OVERHEAD_BYTES: usize = 512;
 
 /// Responses as they come, or the status that ends the stream.
@@ -90,9 +90,9 @@ struct ActiveLease<R> {
 
 struct StoredReply<R> {
     response: R,
-    /// The memory for it. A reply without is dropped when it is sent.
+    /// The reservation while the reply is stored. Without one the reply is dropped when it is sent.
     memory: Option<MemoryReservation>,
-    /// The memory that the handler took for it, until it is sent for the first time.
+    /// The reservation of the handler, which is released when the reply is first sent.
     outgoing: Option<MemoryReservation>,
 }
 
@@ -100,7 +100,7 @@ struct StoredReply<R> {
 enum Attachment<R> {
     /// The session has the stream that takes these responses.
     Attached(ResponseSender<R>),
-    /// The session has none. One may be about to come.
+    /// The session has no stream, but a stream that was accepted may be about to attach.
     Detached(Option<Resuming<R>>),
     /// The session has ended.
     Ended,
@@ -123,7 +123,8 @@ impl<H: SessionHandler> SessionDriver<H> {
         }
     }
 
-    /// Frees what the session holds before its client sees the stream's end: it may open another session at once.
+    /// Frees the session's resources before its client sees the stream's end, so that the client can open another
+    /// session at once.
     async fn close(mut self, responses: ResponseSender<H::Response>) {
         self.exchange.close().await;
         drop(self);
@@ -166,7 +167,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         }
     }
 
-    /// Answers a request. Without a lease it is given up when its stream is lost.
+    /// Answers a request. Without a lease the request is abandoned when its stream is lost.
     async fn respond(
         &mut self,
         message: Message,
@@ -195,7 +196,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         }
     }
 
-    /// Sends the reply of a session without a lease, which may get one by it.
+    /// Sends the reply of a session that had no lease so far. The reply may grant one.
     async fn deliver(
         &mut self,
         reply: Reply<H::Response>,
@@ -204,7 +205,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         let Reply { response, memory, handover } = reply;
         let resumed = match handover {
             Some(StreamHandover::Lease(grant)) => {
-                // A request that was read ahead would be lost with its stream, and come again.
+                // Clients with a lease send unanswered requests again after a lost stream, so none may be read ahead.
                 self.exchange.reads_ahead = false;
                 self.lease = Some(ActiveLease { stored: ReplayBuffer::new(grant.max_unanswered), grant, sent: 0 });
                 None
@@ -291,7 +292,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         self.lease.as_mut().and_then(|lease| lease.accept_resume(ask))
     }
 
-    /// Ends the stream, because another resumes the session.
+    /// Ends the present stream, because another stream resumes the session.
     fn supersede(
         &mut self,
         responses: &ResponseSender<H::Response>,
@@ -309,7 +310,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         Attachment::Detached(resuming)
     }
 
-    /// Ends a stream that cannot go on. The session of a lease ends only if the server wants it.
+    /// Ends a stream that cannot continue. A session with a lease ends only if the server ends it.
     fn stopped(
         &mut self,
         responses: &ResponseSender<H::Response>,
@@ -364,7 +365,8 @@ impl<R: Clone> ActiveLease<R> {
         Some(OutgoingResponse { response, memory })
     }
 
-    /// Answers a stream that asks for the session. Returns where it will come, if it may.
+    /// Answers a stream that asks to resume the session. Returns the channel by which the stream will arrive, or `None`
+    /// if it was refused.
     fn accept_resume(&mut self, ResumeRequest { last_reply, answer }: ResumeRequest<R>) -> Option<Resuming<R>> {
         if let Err(error) = self.stored.check(last_reply) {
             let _ = answer.send(Err(error)); // a stream that is gone does not hear it
@@ -377,7 +379,7 @@ impl<R: Clone> ActiveLease<R> {
     }
 }
 
-/// Ends a stream with this status, as soon as it takes it.
+/// Ends a stream with this status, as soon as its channel has room.
 fn end_stream<R: Send + 'static>(responses: &ResponseSender<R>, status: Status) {
     if let Err(TrySendError::Full(status)) = responses.try_send(Err(status)) {
         let responses = responses.clone();
@@ -385,7 +387,7 @@ fn end_stream<R: Send + 'static>(responses: &ResponseSender<R>, status: Status) 
     }
 }
 
-/// Waits for a stream that asks for the session; for ever without a lease.
+/// Waits for a stream that asks to resume the session. Never resolves without a lease.
 async fn resume_request<R>(lease: &mut Option<ActiveLease<R>>) -> ResumeRequest<R> {
     if let Some(lease) = lease
         && let Some(ask) = lease.grant.resume_requests.recv().await
@@ -395,7 +397,7 @@ async fn resume_request<R>(lease: &mut Option<ActiveLease<R>>) -> ResumeRequest<
     std::future::pending().await
 }
 
-/// Waits for a stream that is about to come, or for ever.
+/// Waits for the stream that was accepted. Never resolves if there is none.
 async fn arrival<R>(resuming: &mut Option<Resuming<R>>) -> Result<ResumingStream<R>, oneshot::error::RecvError> {
     match resuming {
         Some(resuming) => resuming.await,

@@ -12,7 +12,7 @@ use crate::server::{
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The token is not good any more, has all that it may have, or steps too fast.
+    /// The token was revoked, is at its quota, or steps too fast.
     #[error(transparent)]
     Auth(#[from] auth::Error),
     /// A message is refused.
@@ -21,19 +21,19 @@ pub enum Error {
     /// A session cannot be resumed, or another stream has resumed it.
     #[error(transparent)]
     Lease(#[from] lease::Error),
-    /// A lease would have no name.
+    /// The system has no random bits for the name of a lease.
     #[error(transparent)]
     NoRandomness(#[from] NoRandomness),
     /// The server is full of sessions.
     #[error("all of this server's {limit} sessions are in use; close one, or try again later")]
     SessionsFull {
-        /// The most there may be.
+        /// The maximum number of sessions.
         limit: usize,
     },
-    /// A peer has all the sessions that it may have.
+    /// A peer has as many sessions as it may have.
     #[error("all of the {limit} sessions that one machine or user may have here are in use; close one")]
     PeerFull {
-        /// The most there may be.
+        /// The maximum number of sessions of a peer.
         limit: usize,
     },
     /// The session sent nothing for too long.

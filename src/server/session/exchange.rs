@@ -22,7 +22,7 @@ use std::{convert::Infallible, sync::Arc, time::Duration};
 use tokio::time::{Instant, timeout};
 use tonic::Status;
 
-/// The ending of a stream that resumed another session. It has no line in the access log.
+/// The ending of the temporary session whose stream went over to a resumed one. It has no line in the access log.
 pub(super) const MOVED: &str = "moved";
 
 /// The time in which a session's environments must be freed before the end of its stream is sent.
@@ -33,7 +33,7 @@ const UNDECODED_PRICE: u64 = 1;
 /// A session's handler, and the requests of the stream that the session has now.
 pub(super) struct Exchange<H: SessionHandler> {
     pub(super) requests: MessageReader,
-    /// The request that came while the one before it was being answered.
+    /// The request that was read ahead, while the previous one was being answered.
     ahead: Option<Result<Option<Message>, StreamStop>>,
     /// Whether the present request was read ahead. Its step may have begun then.
     came_ahead: bool,
@@ -41,7 +41,7 @@ pub(super) struct Exchange<H: SessionHandler> {
     pub(super) reads_ahead: bool,
     handler: H,
     counts: Arc<RequestCounters>,
-    /// The session counts as running as long as it holds this.
+    /// The server's sessions. The session counts as running as long as it holds this view.
     pub(super) sessions: Sessions,
     start: Instant,
     /// Whether the session was open when it began to wait for the present request.
@@ -56,7 +56,7 @@ pub(super) struct Exchange<H: SessionHandler> {
     /// The statistics of the session, once it is closed.
     final_stats: Option<SessionStats>,
     awake: AdaptiveSpin,
-    /// The ending of the session, if nothing else happens.
+    /// The ending that the access log will have, unless it changes before the session ends.
     pub(super) ending: &'static str,
     /// The number of streams that resumed the session.
     pub(super) resumed: u32,
@@ -93,8 +93,8 @@ impl<H: SessionHandler> Exchange<H> {
         }
     }
 
-    /// Returns the next request, or `None` at the client's end. If the future is dropped, the next call continues where
-    /// it was: nothing is lost.
+    /// Returns the next request, or `None` after the client has closed the stream. If the future is dropped, no data is
+    /// lost: the next call continues.
     pub(super) async fn request(&mut self) -> Result<Option<Message>, StreamStop<H::Error>> {
         let SessionLimits { handshake, idle, .. } = self.sessions.limits;
         let limits = self.request_limits();
@@ -114,7 +114,7 @@ impl<H: SessionHandler> Exchange<H> {
             let seconds = limit.map_or(0, |limit| limit.as_secs());
             Err(refused(Error::Idle { seconds }))
         };
-        // A request that is there already does not help.
+        // The timeout applies even if a request has already arrived.
         if limit.is_some_and(|limit| passed > limit) {
             return late();
         }
@@ -145,13 +145,13 @@ impl<H: SessionHandler> Exchange<H> {
         if self.sessions.phase() != ShutdownPhase::Running && !self.handler.is_open() {
             return Err(refused(Error::Draining));
         }
-        // The request's bytes count until it is answered.
+        // The request's reservation is held until it is answered.
         let (request, _share) = match message {
             Message::Whole(bytes, share) => (bytes, share),
             Message::Refused(error) => return Ok(self.undecoded(error)),
         };
-        // A client that is ahead of its rate waits before anything has happened. A request that was read ahead had no
-        // rate to keep.
+        // A client that is ahead of its rate waits before its request is decoded. A request is read ahead only if its
+        // token has no rate, so it does not wait.
         let bearer = self.requests.bearer.clone();
         let was_open = self.handler.is_open();
         if let Err(error) = self.pace(bearer.as_ref().filter(|_| was_open && !self.came_ahead)).await? {
@@ -168,7 +168,7 @@ impl<H: SessionHandler> Exchange<H> {
             return Err(refused(refusal.clone()));
         }
         if let Some(bearer) = &bearer {
-            // A lost session is resumed whatever its token did meanwhile.
+            // A request that resumes a session does not wait for the token's rate.
             if !was_open
                 && !resumes
                 && let Err(error) = self.pace(Some(bearer)).await?
@@ -198,7 +198,7 @@ impl<H: SessionHandler> Exchange<H> {
         }
     }
 
-    /// Frees what the handler holds.
+    /// Frees the resources of the handler.
     pub(super) async fn close(&mut self) {
         self.charge();
         self.final_stats = Some(self.handler.stats());
@@ -207,7 +207,7 @@ impl<H: SessionHandler> Exchange<H> {
         }
     }
 
-    /// Accounts for an answer, and returns the reply that it is.
+    /// Counts and charges an answer, and turns an error into its in-band reply.
     pub(super) fn finish(&mut self, answer: Result<Reply<H::Response>, H::Error>) -> Reply<H::Response> {
         self.charge();
         if self.was_open || self.handler.is_open() {
@@ -219,7 +219,7 @@ impl<H: SessionHandler> Exchange<H> {
         })
     }
 
-    /// Notes why the session ends. Returns the status that its stream ends with, if its client still listens.
+    /// Records why the session ends. Returns the status of its stream's end, or `None` if the client is gone.
     pub(super) fn end(&mut self, stop: StreamStop<H::Error>) -> Option<Status> {
         match stop {
             StreamStop::Refused(error) => {
@@ -234,7 +234,7 @@ impl<H: SessionHandler> Exchange<H> {
         }
     }
 
-    /// Notes that the server ends the session with this error.
+    /// Records that the server ends the session with this error.
     pub(super) fn end_by(&mut self, error: &impl RequestError) {
         self.count(error);
         self.ending = error.kind().reason();
@@ -285,7 +285,8 @@ impl<H: SessionHandler> Drop for Exchange<H> {
     }
 }
 
-/// Reads the request that comes while another is answered, and offers it to the pool.
+/// Reads the next request while another is answered, and offers it to the pool. Never resolves, so that a `select!`
+/// always waits for the answer.
 async fn read_ahead<H: SessionHandler>(
     requests: &mut MessageReader,
     ahead: &mut Option<Result<Option<Message>, StreamStop>>,
@@ -309,7 +310,7 @@ pub(super) fn refused<E: From<Error>>(error: impl Into<Error>) -> StreamStop<E> 
     StreamStop::Refused(error.into().into())
 }
 
-/// Resolves when the token is revoked, if there is one.
+/// Resolves when the token is revoked. Never resolves without a token.
 pub(super) async fn revoked(bearer: Option<&Bearer>) -> auth::Error {
     match bearer {
         Some(bearer) => bearer.revoked().await,
@@ -317,7 +318,7 @@ pub(super) async fn revoked(bearer: Option<&Bearer>) -> auth::Error {
     }
 }
 
-/// Resolves when the token, if there is one, lets its environments step.
+/// Resolves when the token's rate allows another step, at once without a token.
 async fn wait_for_rate(bearer: Option<&Bearer>) -> Result<(), auth::Error> {
     match bearer {
         Some(bearer) => bearer.acquire_steps().await,
@@ -325,7 +326,7 @@ async fn wait_for_rate(bearer: Option<&Bearer>) -> Result<(), auth::Error> {
     }
 }
 
-/// Resolves after that long, or never.
+/// Resolves after `limit`. Never resolves without one.
 async fn sleep(limit: Option<Duration>) {
     match limit {
         Some(limit) => tokio::time::sleep(limit).await,

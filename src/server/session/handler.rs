@@ -1,4 +1,4 @@
-//! Handlers answer the requests of a session, whatever its protocol and its transport: a request in, a reply out.
+//! The trait of handlers, which answer the requests of a session. It is the same for both protocols.
 
 use super::{
     Error,
@@ -24,20 +24,20 @@ pub enum StreamHandover<R> {
 pub struct Reply<R> {
     /// The response.
     pub response: R,
-    /// The memory that the response takes until it is sent, if it is not part of what the session holds anyway.
+    /// The reservation for the response until it is sent; `None` if the session's own reservation covers it.
     pub memory: Option<MemoryReservation>,
     /// The effect of the response on its stream, if it has one.
     pub handover: Option<StreamHandover<R>>,
 }
 
 impl<R> Reply<R> {
-    /// A reply that changes nothing but the session.
+    /// A reply without a reservation and without an effect on its stream.
     pub fn new(response: R) -> Self {
         Self { response, memory: None, handover: None }
     }
 }
 
-/// The state of one session, in one protocol. Dropping it frees what it holds.
+/// The state of one session, in one protocol. Dropping it frees its resources.
 pub trait SessionHandler: Send + 'static {
     /// A message of the client.
     type Request: prost::Message + Default + 'static;
@@ -60,7 +60,7 @@ pub trait SessionHandler: Send + 'static {
     /// The size limits of the next request.
     fn request_limits(&self) -> RequestLimits;
 
-    /// Whether the session holds something that a shutdown should wait for.
+    /// Whether a shutdown should wait for the session.
     fn is_open(&self) -> bool;
 
     /// The environment of the session, and its steps so far.
@@ -69,20 +69,20 @@ pub trait SessionHandler: Send + 'static {
     /// The price of a request beside its steps, in steps of an environment. A token's rate counts both.
     fn price(&self, request: &Self::Request) -> u64;
 
-    /// Frees what the session holds. Resolves when there is room for another session like it.
+    /// Frees the session's resources. Resolves when they are free, so that another session like it has room.
     fn close(&mut self) -> impl Future<Output = ()> + Send;
 
     /// Answers a request.
     ///
     /// # Errors
-    /// Why the request is refused; the session stays open.
+    /// If the request is refused. The session stays open.
     fn answer(
         &mut self,
         request: Self::Request,
     ) -> impl Future<Output = Result<Reply<Self::Response>, Self::Error>> + Send;
 
     /// Returns a function that offers the next request to the pool while `request` runs, or `None` if the next request
-    /// must wait. The caller must answer a request that it offered next.
+    /// must wait. If the caller offers a request, it must answer that request next.
     fn pipeline(&self, request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<Self>>;
 
     /// The response to a request that is refused.

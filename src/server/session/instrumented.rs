@@ -24,12 +24,12 @@ pub struct RequestCount {
 pub struct RequestCounters(Vec<(&'static str, RequestCount)>);
 
 impl RequestCounters {
-    /// Counters of a handler's kinds, all of them 0.
+    /// Makes counters, all 0, for the kinds of requests that the handler `H` answers.
     pub fn new<H: SessionHandler>() -> Arc<Self> {
         Arc::new(Self(H::KINDS.iter().map(|kind| (*kind, RequestCount::default())).collect()))
     }
 
-    /// Every kind with its count.
+    /// Returns every kind of request with its counts.
     pub fn iter(&self) -> impl Iterator<Item = &(&'static str, RequestCount)> {
         self.0.iter()
     }
@@ -47,7 +47,7 @@ impl RequestCounters {
         reply
     }
 
-    /// Counts a request that was refused before a handler had it.
+    /// Counts a request that was refused before it reached the handler.
     pub(super) fn count_undecoded(&self, error: &impl RequestError) {
         self.count("unknown", Some(error));
     }

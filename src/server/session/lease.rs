@@ -2,7 +2,7 @@
 //!
 //! - This module: the leases of a server, and how a new stream asks for one.
 //! - [`replay_buffer`](super::replay_buffer): replies that may not have been received.
-//! - Beside it, the driver runs such a session and waits for its streams.
+//! - The `driver` module runs sessions with and without a lease, and waits for their streams.
 
 use crate::server::{
     auth::Bearer,
@@ -21,7 +21,7 @@ use subtle::ConstantTimeEq;
 use tokio::sync::{mpsc, oneshot};
 use tonic::Status;
 
-/// The maximum number of stored replies, and so of unanswered requests, of a session with a lease.
+/// The maximum number of stored replies of a session with a lease. It also limits the unanswered requests.
 pub const MAX_STORED_REPLIES: u32 = 64;
 
 /// Why a session cannot be resumed.
@@ -34,7 +34,7 @@ pub enum Error {
     /// The session belongs to another token.
     #[error("the session was opened with another token; show the one that it was opened with, or open another session")]
     OtherToken,
-    /// A number beyond the last reply.
+    /// The client names a reply that was never sent.
     #[error(
         "last_reply is {got}, but {last} is the last that there is; opened is 0, and each response after it one more"
     )]
@@ -44,7 +44,7 @@ pub enum Error {
         /// The last one.
         last: u64,
     },
-    /// Replies after this one are not kept.
+    /// Some replies after `got` are no longer stored.
     #[error(
         "last_reply is {got}, but replies up to {first} are kept no more: open.lease said that so many requests would not \
          wait, or there was no memory for them; open another session"
@@ -52,7 +52,7 @@ pub enum Error {
     Forgotten {
         /// The number that came.
         got: u64,
-        /// The least that can be gone on from.
+        /// The smallest `last_reply` from which the session can be resumed.
         first: u64,
     },
     /// Another stream has resumed the session.
@@ -76,14 +76,14 @@ impl RequestError for Error {
 pub struct OutgoingResponse<R> {
     /// The response.
     pub response: R,
-    /// The memory that it takes until it is sent.
+    /// The reservation for the response until it is sent.
     pub memory: Option<MemoryReservation>,
 }
 
 /// Sends responses to a stream, or the status that ends it.
 pub type ResponseSender<R> = mpsc::Sender<Result<OutgoingResponse<R>, Status>>;
 
-/// The leases of a server, of sessions with these responses.
+/// The leases of a server's sessions of one protocol, whose responses are `R`.
 pub struct Leases<R>(Arc<LeaseRegistry<R>>);
 
 impl<R> Clone for Leases<R> {
@@ -98,7 +98,7 @@ struct LeaseRegistry<R> {
     leases: Mutex<Vec<LeaseEntry<R>>>,
 }
 
-/// A lease that is held.
+/// A lease that a session holds.
 struct LeaseEntry<R> {
     name: Id,
     bearer: Option<Bearer>,
@@ -170,9 +170,9 @@ pub struct ResumeRequest<R> {
 
 /// The positive answer to a stream that resumes a session.
 pub struct ResumeAccepted<R> {
-    /// The number of the last reply that there is.
+    /// The number of the session's last reply.
     pub last_reply: u64,
-    /// The sender that takes the stream to the session.
+    /// The sender by which the stream goes to the session.
     pub stream: oneshot::Sender<ResumingStream<R>>,
 }
 
@@ -210,7 +210,7 @@ impl<R> Leases<R> {
             return Ok(None);
         }
         let name = random()?;
-        // One at a time is answered.
+        // The session answers one of them at a time.
         let (sender, resume_requests) = mpsc::channel(1);
         self.lock().push(LeaseEntry { name, bearer, resume_requests: sender });
         self.0.counters.0.held.fetch_add(1, Ordering::Relaxed);
@@ -235,12 +235,12 @@ impl<R> Leases<R> {
 
     fn find(&self, name: &[u8], bearer: Option<&Bearer>) -> Result<mpsc::Sender<ResumeRequest<R>>, Error> {
         let leases = self.lock();
-        // All of them are looked at, each in a time that does not depend on the name.
+        // Every lease is compared, each in constant time, so that the time does not reveal a name.
         let found = leases
             .iter()
             .fold(None, |found, lease| if lease.name[..].ct_eq(name).into() { Some(lease) } else { found });
         let LeaseEntry { bearer: own, resume_requests, .. } = found.ok_or(Error::Unknown)?;
-        // A name that has another token now has lost its sessions.
+        // The names are enough: a revoked token loses its sessions, so a new token of the same name finds none.
         if own.as_ref().map(|own| own.name()) != bearer.map(|bearer| bearer.name()) {
             return Err(Error::OtherToken);
         }

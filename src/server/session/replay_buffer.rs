@@ -1,9 +1,9 @@
-//! The last replies of a session, by number, until its client is known to have received them.
+//! The last replies of a session, which are stored by number until its client must have received them.
 
 use super::lease::Error;
 use std::collections::VecDeque;
 
-/// The replies 1, 2, 3, …, of which the last few are stored.
+/// The last few replies of a session. Replies are numbered 1, 2, 3, …
 pub struct ReplayBuffer<R> {
     last: u64,
     max_unanswered: usize,
@@ -39,7 +39,7 @@ impl<R> ReplayBuffer<R> {
         self.replies.iter()
     }
 
-    /// The stored replies, to be changed.
+    /// Mutable access to the stored replies.
     pub fn replies_mut(&mut self) -> impl Iterator<Item = &mut R> {
         self.replies.iter_mut()
     }
@@ -94,8 +94,8 @@ mod tests {
     }
 
     proptest! {
-        /// A client that keeps its word about how many requests wait finds all that it has not received, and the server
-        /// never holds more.
+        /// A client with at most `max_unanswered` unanswered requests finds all replies that it has not received. The
+        /// server never stores more.
         #[test]
         fn nothing_that_was_not_received_is_let_go_and_no_more_is_held(
             max_unanswered in 1_usize..8,

@@ -37,12 +37,12 @@ impl Budget {
         self.state.used.load(Ordering::Relaxed)
     }
 
-    /// The most there may be.
+    /// The limit of bytes in flight.
     pub fn limit(&self) -> usize {
         self.state.limit
     }
 
-    /// An empty reservation, to be grown.
+    /// Returns an empty reservation, which can grow.
     pub fn empty(&self) -> MemoryReservation {
         MemoryReservation {
             state: Arc::clone(&self.state),
@@ -66,7 +66,7 @@ impl Budget {
 pub struct MemoryReservation {
     state: Arc<BudgetCounter>,
     bytes: usize,
-    /// The token's quota for these bytes.
+    /// The same bytes as a part of the token's quota, if there is a token.
     held: Option<QuotaGuard>,
 }
 
@@ -79,7 +79,7 @@ impl MemoryReservation {
     /// Reserves more bytes.
     ///
     /// # Errors
-    /// [`Error::MemoryFull`], [`Error::Auth`]; then it is as before.
+    /// [`Error::MemoryFull`], [`Error::Auth`]; the reservation is unchanged then.
     pub fn grow(&mut self, bytes: usize) -> Result<(), Error> {
         if bytes == 0 {
             return Ok(());
@@ -101,7 +101,7 @@ impl MemoryReservation {
         }
     }
 
-    /// Changes the size to what was made in the end, which may be more than was expected.
+    /// Sets the reservation to the final length, even if it exceeds the budget.
     pub fn resize(&mut self, bytes: usize) {
         if let Some(held) = &mut self.held {
             held.set(bytes);
@@ -128,8 +128,8 @@ impl PendingReservations {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).push(share);
     }
 
-    /// Attaches the reservations, and what `hold` makes, to the bytes of a reply. They are held until the last of the
-    /// bytes is written or dropped. Without reservations the bytes are returned as they are.
+    /// Attaches the queued reservations, and the value that `hold` returns, to the bytes of a reply. They are held
+    /// until the last of the bytes is written or dropped. Without reservations the bytes are returned unchanged.
     pub fn attach<H: Send + 'static>(&self, bytes: Bytes, hold: impl FnOnce() -> H) -> Bytes {
         let shares = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
         if shares.is_empty() { bytes } else { Bytes::from_owner(ReservedBytes { bytes, _held: (shares, hold()) }) }

@@ -9,10 +9,10 @@ use crate::server::{
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The token has as many bytes in flight as it may have.
+    /// The token's quota of bytes in flight is used up.
     #[error(transparent)]
     Auth(#[from] auth::Error),
-    /// A field has too many entries, or one that is not of the encoding.
+    /// A field has too many entries, or an entry that cannot be decoded.
     #[error(transparent)]
     Value(#[from] InvalidValue),
     /// The budget of bytes in flight is used up.
@@ -23,28 +23,28 @@ pub enum Error {
     MemoryFull {
         /// The bytes that were requested.
         wanted: usize,
-        /// In use.
+        /// The bytes that are in use.
         used: usize,
-        /// The most there may be.
+        /// The limit of the budget, bytes.
         limit: usize,
     },
-    /// A message began and does not end.
+    /// The rest of a message did not arrive in time.
     #[error(
         "a message began, and nothing more of it came for {seconds} s, or less than {rate} bytes a second in all; send \
          messages whole"
     )]
     Unfinished {
-        /// The longest pause.
+        /// The maximum pause within a message, s.
         seconds: u64,
-        /// The least bytes a second.
+        /// The minimum average rate of a message, bytes per second.
         rate: usize,
     },
-    /// A message is larger than its stream may send now.
+    /// A message is longer than the limit that applies to its stream at this moment.
     #[error("a message of {got} bytes came; at most {limit} are read here now")]
     TooLarge {
         /// The length in bytes.
         got: usize,
-        /// The most there may be.
+        /// The maximum length in bytes.
         limit: usize,
     },
 }

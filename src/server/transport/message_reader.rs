@@ -1,7 +1,9 @@
-//! Messages off the wire: gRPC's frames, each bounded by what its stream may send now, before anything of it is kept.
+//! Reads gRPC's frames. The length of each message is checked against its stream's present limit before any of its
+//! bytes are stored.
 //!
-//! tonic has one limit for all messages of a service, and decodes them on the transport's thread. So the streams of
-//! both protocols keep their bodies from it ([`raw_body`](super::raw_body)) and read them here.
+//! tonic has one limit for all messages of a service, and decodes them on the transport's thread. So
+//! [`raw_body`](super::raw_body) withholds the request bodies of both protocols' streams from tonic, and they are read
+//! here.
 
 use super::{
     Error,
@@ -17,9 +19,10 @@ use tonic::{Code, Status, body::Body};
 
 /// The length of a message's header: a flag and a length.
 const HEADER_BYTES: usize = 5;
-/// The bytes of a message that are not taken from the memory budget: little enough that every stream may send them.
+/// The first bytes of a message, so many that they do not count against the memory budget. Every stream may send them.
 const UNBUDGETED_BYTES: usize = 64 << 10;
-/// The minimum average rate of a message, after the time that a pause may take.
+/// The minimum average rate of a message, bytes per second. A message may take [`StreamLimits::limit`] longer than at
+/// this rate.
 const MIN_BYTES_PER_SECOND: usize = 64 << 10;
 /// A message of at least this length gets an allocation of its own.
 const OWN_BUFFER_MIN_BYTES: usize = 1 << 20;
@@ -35,10 +38,10 @@ pub struct StreamLimits {
     pub handshake: Duration,
 }
 
-/// The messages of a request's body, as they come.
+/// Reads the messages of a request's body.
 pub struct MessageReader {
     body: Body,
-    /// Bytes that came and were not returned yet.
+    /// The bytes that have arrived and were not returned yet.
     buffer: BytesMut,
     message: Option<PartialMessage>,
     /// The deadline of the partly read message.
@@ -48,7 +51,7 @@ pub struct MessageReader {
     transit: StreamLimits,
     /// The connection of the stream.
     pub connection: Option<Connection>,
-    /// The token that came with them.
+    /// The token of the call.
     pub bearer: Option<Bearer>,
     /// The reservations of the stream's replies.
     pub outbox: PendingReservations,
@@ -58,7 +61,7 @@ pub struct MessageReader {
 enum PartialMessage {
     /// The length of the message.
     Wanted(usize),
-    /// The budget has no room for it. The bytes of it that have not come yet, this many, are thrown away.
+    /// The budget has no room for the message. Has the number of its bytes that are yet to arrive and to be discarded.
     Refused(usize, Error),
 }
 
@@ -66,22 +69,22 @@ enum PartialMessage {
 pub enum Message {
     /// The bytes of the message, with their reservation.
     Whole(Bytes, MemoryReservation),
-    /// The budget has no room for it.
+    /// The budget has no room for the message, which was discarded.
     Refused(Error),
 }
 
-/// Why a stream ends before its client's end.
+/// Why a stream ends before its client has closed it.
 pub enum StreamStop<E = Error> {
-    /// The server wants no more of it.
+    /// The server refuses further requests, with this error.
     Refused(E),
     /// The bytes cannot be decoded, the connection broke, or the server has a defect.
     Broken(Status),
-    /// The client wants no more of it, or something in between, or nothing comes from there any more.
+    /// The client or a proxy has reset the stream, or its connection has gone silent.
     Cancelled,
 }
 
 impl<E> StreamStop<E> {
-    /// Changes the error.
+    /// Converts the error.
     pub fn map<F>(self, error: impl FnOnce(E) -> F) -> StreamStop<F> {
         match self {
             Self::Refused(refused) => StreamStop::Refused(error(refused)),
@@ -131,10 +134,11 @@ impl MessageReader {
         std::mem::replace(self, left)
     }
 
-    /// The next message; none at the client's end. To be called again if its future was dropped: nothing is lost.
+    /// Returns the next message, or `None` after the client has closed the stream. If the future is dropped, no data is
+    /// lost: the next call continues.
     ///
     /// # Errors
-    /// What ends the stream: the message is too large, or never ends, or what came is not gRPC.
+    /// If the stream must end: the message is too long or stays incomplete, or the bytes are not gRPC.
     pub async fn next(&mut self, limits: RequestLimits) -> Result<Option<Message>, StreamStop> {
         loop {
             if self.message.is_none() && self.buffer.len() >= HEADER_BYTES {
@@ -150,7 +154,7 @@ impl MessageReader {
                     }
                 }
                 Some(Err(status)) if status.code() == Code::Cancelled => return Err(StreamStop::Cancelled),
-                // The body of a connection that said nothing for too long ends as if its client had ended it.
+                // The body of a connection that was silent for too long ends without an error before the stream's end.
                 None if !self.body.is_end_stream() => return Err(StreamStop::Cancelled),
                 Some(Err(status)) => return Err(status.into()),
                 None if self.buffer.is_empty() && self.message.is_none() => return Ok(None),
@@ -196,7 +200,7 @@ impl MessageReader {
                 let bytes = if *length < OWN_BUFFER_MIN_BYTES {
                     self.buffer.split_to(*length).freeze()
                 } else {
-                    // Its memory goes with it; a part would keep the whole.
+                    // The message takes the whole buffer with it. A slice of the buffer would keep all of its memory.
                     let rest = BytesMut::from(&self.buffer[*length..]);
                     let mut whole = std::mem::replace(&mut self.buffer, rest);
                     whole.truncate(*length);
@@ -217,7 +221,7 @@ impl MessageReader {
         }
     }
 
-    /// Appends bytes that came, and reserves memory for them.
+    /// Appends bytes that have arrived, and reserves memory for them.
     fn push_data(&mut self, data: &[u8], limits: RequestLimits) {
         if let Some(PartialMessage::Wanted(length)) = self.message {
             let free = limits.covered.max(UNBUDGETED_BYTES);
@@ -225,12 +229,12 @@ impl MessageReader {
             let (before, after) = (beyond(self.buffer.len()), beyond(self.buffer.len() + data.len()));
             if let Err(refusal) = self.share.grow(after - before) {
                 self.share = self.transit.budget.empty();
-                // What has come of it goes with its memory.
+                // The bytes that have arrived are dropped with their reservation.
                 let come = std::mem::take(&mut self.buffer).len();
                 self.message = Some(PartialMessage::Refused(length - come, refusal));
             }
             if self.buffer.capacity() - self.buffer.len() < data.len() {
-                // By doubling, and not all that was announced: a client that announces much need not send it.
+                // The buffer doubles, whatever length is announced: a client may announce more than it sends.
                 let rest = length.saturating_sub(self.buffer.len());
                 self.buffer.reserve(rest.min(self.buffer.len()).max(data.len()));
             }

@@ -1,5 +1,5 @@
-//! Requests from their bytes. The encoding lets two bytes stand for an entry of a hundred, so entries are counted
-//! before anything is made of them, and what has many fields is decoded by other threads than the transport's.
+//! Decodes requests. An entry of two encoded bytes may take a hundred bytes in memory, so entries are counted before a
+//! request is decoded. Requests with many fields are decoded on other threads than the transport's.
 
 use self::FieldKind::{Fields, Numbers};
 use crate::{
@@ -36,9 +36,9 @@ pub struct Field {
 
 /// The type of a field's entries.
 pub enum FieldKind {
-    /// Messages.
+    /// Messages, whose own fields with these numbers are counted, too.
     Fields(&'static [Field]),
-    /// Numbers, which may stand in a row.
+    /// Numbers, which may be packed.
     Numbers,
     /// Anything else.
     Opaque,
@@ -50,7 +50,7 @@ pub enum Cardinality {
     One,
     /// At most [`MAX_REPEATED`].
     Many,
-    /// At most as many as there are environments, and no fewer than [`MAX_REPEATED`].
+    /// At most the number of environments, or [`MAX_REPEATED`] if that is larger.
     Environments,
 }
 
@@ -69,7 +69,7 @@ pub const fn field(number: u64, name: &'static str, most: Cardinality, inside: F
     Field { number, name, most, inside }
 }
 
-/// Decodes requests, the large ones elsewhere.
+/// Decodes requests, large ones on other threads.
 #[derive(Clone)]
 pub struct Decoder(Arc<Semaphore>);
 
@@ -79,7 +79,7 @@ impl Default for Decoder {
     }
 }
 
-/// The request of these bytes, if it is a good one and decoded at once.
+/// Decodes a request on the calling thread. Returns `None` if it is malformed, refused or too large for that.
 pub fn decoded_at_once<T: Message + Default>(
     bytes: Bytes,
     fields: &'static [Field],
@@ -90,10 +90,10 @@ pub fn decoded_at_once<T: Message + Default>(
 }
 
 impl Decoder {
-    /// The request of these bytes, or why it is refused.
+    /// Decodes a request, or returns why it is refused.
     ///
     /// # Errors
-    /// If they are none: a status that ends the stream.
+    /// A status that ends the stream, if the bytes are not a request.
     pub async fn decode<T: Message + Default + 'static>(
         &self,
         bytes: Bytes,
@@ -125,13 +125,13 @@ fn decoded<T: Message + Default>(bytes: Bytes) -> Result<T, Status> {
 /// Why the count of a message stopped.
 #[derive(Debug, PartialEq)]
 enum PrecheckError {
-    /// The message has more fields than should be counted here.
+    /// The message has more fields than the caller allowed to count.
     Work,
     Refused(InvalidValue),
 }
 
-/// Counts a message's fields and entries, at most `work` of them. What is not well-formed ends the count, as it ends
-/// the decoding.
+/// Counts a message's fields and entries, at most `work` of them. The count ends at malformed bytes, which the decoder
+/// then refuses.
 fn check(message: &[u8], fields: &[Field], limits: RequestLimits, mut work: usize) -> Result<(), PrecheckError> {
     count(message, fields, limits, &mut work).map(|_| ())
 }

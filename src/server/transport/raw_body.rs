@@ -1,4 +1,4 @@
-//! The bodies of streams, kept from tonic: it would decode their messages itself.
+//! Withholds the request bodies of streams from tonic, which would decode their messages itself.
 
 use super::{
     budget::PendingReservations,
@@ -21,7 +21,7 @@ use tonic::{
 };
 use tower::Layer;
 
-/// A service one of whose methods, that at `path`, has the body of its requests kept from tonic.
+/// A service that withholds the request bodies of the method at `path` from tonic.
 #[derive(Clone)]
 pub struct RawBodyService<S> {
     service: S,
@@ -29,7 +29,7 @@ pub struct RawBodyService<S> {
     transit: StreamLimits,
 }
 
-/// Puts [`RawBodyService`] around a service.
+/// Wraps a service in [`RawBodyService`].
 #[derive(Clone)]
 pub struct RawBodyLayer {
     path: &'static str,
@@ -37,7 +37,7 @@ pub struct RawBodyLayer {
 }
 
 impl RawBodyLayer {
-    /// Keeps the bodies of calls of this path.
+    /// Withholds the request bodies of calls of this path.
     pub fn new(path: &'static str, transit: StreamLimits) -> Self {
         Self { path, transit }
     }
@@ -52,7 +52,7 @@ impl<S> Layer<S> for RawBodyLayer {
 }
 
 impl<S> RawBodyService<S> {
-    /// Keeps the bodies of calls of this path.
+    /// Withholds the request bodies of calls of this path.
     pub fn new(service: S, path: &'static str, transit: StreamLimits) -> Self {
         Self { service, path, transit }
     }
@@ -79,7 +79,7 @@ where
         let outbox = PendingReservations::default();
         let connection = request.extensions().get::<Connection>().cloned();
         let is_stream = request.uri().path() == self.path;
-        // What is no stream is one small reply.
+        // Other calls have one small reply, which needs no timeout.
         let timeouts = is_stream.then_some(ReadTimeouts { first: self.transit.handshake, rest: self.transit.limit });
         if is_stream {
             let bearer = request.extensions_mut().remove::<Bearer>();
@@ -95,14 +95,14 @@ where
     }
 }
 
-/// A request's frames, as an extension of the request, which must be one that could be cloned.
+/// Carries the raw body as a request extension. Extensions must be `Clone`, hence the shared cell.
 #[derive(Clone)]
 struct RawBody(Arc<Mutex<Option<MessageReader>>>);
 
-/// The messages of a request whose body was kept.
+/// Takes the reader of a request whose body was withheld from tonic.
 ///
 /// # Errors
-/// Where it was not: a defect.
+/// If the body was not withheld, which is a defect.
 pub fn messages<T>(request: &mut tonic::Request<T>) -> Result<MessageReader, Status> {
     let kept = request.extensions_mut().remove::<RawBody>();
     let reader = kept.and_then(|kept| kept.0.lock().unwrap_or_else(PoisonError::into_inner).take());

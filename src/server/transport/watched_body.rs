@@ -1,5 +1,5 @@
-//! Replies on their way to the wire: their shares of the budget go with their bytes, and a client that does not read
-//! loses its connection.
+//! Response bodies. The memory reservation of a reply is held until its bytes are sent, and the connection of a client
+//! that does not read is closed.
 
 use super::budget::PendingReservations;
 use crate::server::net::managed_io::Connection;
@@ -47,8 +47,8 @@ struct ProgressState {
     /// Number of unread replies that hold reservations.
     unread: usize,
     unread_since: Instant,
-    /// The time since which a reply waits for the flow control of the client. The session is not asked for more
-    /// meanwhile, so none of its own limits would end it.
+    /// The time since which a reply waits for the flow control of the client. The session gets no further requests
+    /// meanwhile, so its own timeouts do not end it.
     held_since: Option<Instant>,
     /// No reply has been taken yet.
     is_first: bool,
@@ -83,7 +83,7 @@ impl ReadProgress {
         }
     }
 
-    /// Notes that the transport asks for a reply: the one before is on its way.
+    /// Records that the transport asks for a reply, so that the previous one is no longer held.
     fn on_poll(&self) {
         let mut state = self.state();
         if state.held_since.take().is_some() {
@@ -91,7 +91,7 @@ impl ReadProgress {
         }
     }
 
-    /// Notes that the transport has a reply.
+    /// Records that the transport has received a reply.
     fn on_frame(&self) {
         self.state().held_since = Some(Instant::now());
     }
