@@ -28,14 +28,16 @@ use crate::{
 };
 use std::sync::Arc;
 
-/// The price of a world in steps, as of an `open` of one environment.
+/// The price of a world in steps, the same as of an `open` of one environment in `perturb.v1`.
 const WORLD_PRICE: u64 = 17;
 /// The price of the trial that a reset begins, in steps.
 const NEW_TRIAL_PRICE: u64 = 3;
-/// The maximum length of a request. A world is one environment; the rest is room for mistakes that deserve an answer.
+/// The maximum length of a request. A world is one environment and needs far less. The rest is room for wrong requests,
+/// which should get an error in-band.
 const MAX_REQUEST_BYTES: usize = 1 << 20;
 
-/// A client's stream. When it is dropped, it leaves its world. The worlds that it made go unless an agent is in them.
+/// A client's stream. When it is dropped, its agent leaves the joined world, and the worlds that it made are freed
+/// unless they have an agent.
 pub(super) struct Agent {
     worlds: Arc<Worlds>,
     caller: Caller,
@@ -68,7 +70,7 @@ impl Agent {
         }
         settings::check_none("join_world", &request.settings)?;
         let (world, runner) = self.worlds.join(&self.caller, &request.world_name)?;
-        // Before anything is awaited: if the client goes now, the world is left and not lost.
+        // This comes before the first await. If the client disconnects there, dropping the agent returns the world.
         let joined = self.joined.insert(JoinedWorld { world, runner });
         self.stats = SessionStats { environment: Some(joined.world.spec().name), envs: 1, ..self.stats };
         joined.runner.finish_abandoned().await;
@@ -173,7 +175,7 @@ impl SessionHandler for Agent {
         }
     }
 
-    /// Whether it keeps a world alive.
+    /// Whether the stream keeps a world alive.
     fn is_open(&self) -> bool {
         self.joined.is_some() || self.worlds.are_made_by(&self.caller)
     }
@@ -191,7 +193,7 @@ impl SessionHandler for Agent {
         }
     }
 
-    /// A world is one environment, which is freed with the agent.
+    /// Nothing is freed here: a world is one environment, which is freed with the agent.
     async fn close(&mut self) {}
 
     async fn answer(&mut self, request: Self::Request) -> Result<Reply<Self::Response>, Error> {
@@ -217,7 +219,7 @@ impl SessionHandler for Agent {
         response.map(|payload| Reply::new(rpc::EnvironmentResponse { payload: Some(payload) }))
     }
 
-    /// A world is stepped by the thread that asks.
+    /// Steps of a world run on the calling thread, so none is pipelined.
     fn pipeline(&self, _request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<>> {
         None::<fn(Self::Request)>
     }

@@ -11,26 +11,26 @@ use crate::{
 };
 use std::borrow::Cow;
 
-/// Why a request was refused. It changed nothing.
+/// A refused request, which changed nothing.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The stream's transport refuses it.
+    /// The session layer refuses the request.
     #[error(transparent)]
     Session(#[from] session::Error),
-    /// The token may not draw from there, or the ledger cannot be written.
+    /// The token's role does not allow the draw, or the ledger cannot be written.
     #[error(transparent)]
     Audit(#[from] audit::Error),
-    /// The environments refuse it.
+    /// An environment or a parameter is unknown or not valid.
     #[error(transparent)]
     Environment(#[from] env::Error),
-    /// The pool refuses it.
+    /// The pool is full or has failed.
     #[error(transparent)]
     Pool(#[from] pool::Error),
     /// A setting, an action or a property has a value that it cannot have.
     #[error(transparent)]
     Value(#[from] InvalidValue),
-    /// A world would have no name.
+    /// The system has no random bits for a world's name.
     #[error(transparent)]
     NoRandomness(#[from] NoRandomness),
     /// Nothing has this name.
@@ -43,7 +43,7 @@ pub enum Error {
         /// The names that are known.
         known: String,
     },
-    /// A request of agents on a stream that is none.
+    /// A request that needs a joined world came from a stream that has joined none.
     #[error("{request} came from a stream that has joined no world; send join_world first")]
     NotJoined {
         /// The request.
@@ -52,10 +52,10 @@ pub enum Error {
     /// A second `join_world`.
     #[error("join_world came from a stream that has joined {world:?}; leave that world first, or use another stream")]
     AlreadyJoined {
-        /// The world that it has joined.
+        /// The world that the stream has joined.
         world: String,
     },
-    /// A world has an agent and must not.
+    /// The request needs a world without an agent, but the world has one.
     #[error("world {world:?} has an agent; {request} can be done when the agent has left it")]
     Occupied {
         /// The world.
@@ -63,7 +63,7 @@ pub enum Error {
         /// The request.
         request: &'static str,
     },
-    /// A world of others.
+    /// The world belongs to another stream and is not shared.
     #[error(
         "{request} came from a stream that has neither made world {world:?} nor is its agent; join it first, or have it \
          made with the setting shared"
@@ -93,7 +93,7 @@ pub enum Error {
     UnknownExtension {
         /// The type of the message.
         name: String,
-        /// The one that there is.
+        /// The extension that this server has.
         known: &'static str,
     },
 }
@@ -132,7 +132,7 @@ impl From<auth::Error> for Error {
     }
 }
 
-/// The error in-band: the stream lives on.
+/// The error as an in-band response, after which the stream stays open.
 impl From<Error> for proto::google::rpc::Status {
     fn from(error: Error) -> Self {
         Self { code: error.kind().code() as i32, message: error.to_string(), details: Vec::new() }

@@ -5,10 +5,10 @@
 //! - `worlds`: all worlds of the server, by name; how long each lives.
 //! - `world`: what requests of any stream may change about a world.
 //! - `runner`: a world's episodes, on the pool.
-//! - `settings`: settings to the domain, through the checks that `perturb.v1` has.
+//! - `settings`: conversion of settings to the domain, with the checks of `perturb.v1`.
 //! - `specs`: actions and observations, their uids, names and bounds.
-//! - `tensors`: what a tensor must be.
-//! - `properties`: values by name.
+//! - `tensors`: checks of a tensor's type, shape and bounds.
+//! - `properties`: values that clients read and write by name.
 
 mod agent;
 mod error;

@@ -1,5 +1,5 @@
-//! Properties: values beside actions and observations, by name. They are those of the episode that was begun last; what
-//! is written takes effect when the next begins.
+//! Properties: named values besides actions and observations. A read returns the value of the episode that began last.
+//! A write takes effect when the next episode begins.
 
 use super::{
     Error,
@@ -35,9 +35,9 @@ const SEED: &str = "seed";
 struct Property {
     key: String,
     description: String,
-    /// The value; `None` if the property only holds others.
+    /// The value; `None` if the property only groups others.
     value: Option<Tensor>,
-    /// The way to write the property, if it can be written.
+    /// The range of values that can be written, if it is limited.
     range: Option<(f64, f64)>,
     is_writable: bool,
 }
@@ -45,7 +45,7 @@ struct Property {
 /// Answers an extension's message.
 ///
 /// # Errors
-/// If it is of another extension or cannot be decoded, or for what the request is refused for.
+/// If the message belongs to another extension or cannot be decoded, or if the request is refused.
 pub(super) fn answer(catalogue: &Catalogue, joined: Option<&JoinedWorld>, request: &Any) -> Result<Any, Error> {
     let name = request.type_url.rsplit('/').next().unwrap_or_default();
     if name != REQUEST {
@@ -87,7 +87,7 @@ fn properties(catalogue: &Catalogue, joined: Option<&JoinedWorld>) -> Vec<Proper
             tensors::tensor(Payload::Strings(StringArray { array: names }), &[n]),
         ),
     ];
-    // A world's batch is opened with receipts, so that there is always an episode's start.
+    // Worlds are opened with receipts, so every joined world has the start of an episode.
     if let Some((joined, start)) = joined.and_then(|joined| Some((joined, joined.runner.start()?))) {
         all.extend(of_world(joined, start.id, start.receipt.as_ref()));
     }
@@ -136,7 +136,7 @@ fn find<'a>(properties: &'a [Property], key: &str) -> Result<&'a Property, Error
     })
 }
 
-/// The properties that a key holds, or those at the root.
+/// The properties that `key` groups, or those at the root if it is empty.
 fn list<'a>(properties: &'a [Property], key: &'a str) -> Result<impl Iterator<Item = &'a Property>, Error> {
     if !key.is_empty() {
         let property = find(properties, key)?;
@@ -148,7 +148,7 @@ fn list<'a>(properties: &'a [Property], key: &'a str) -> Result<impl Iterator<It
 }
 
 fn write(joined: Option<&JoinedWorld>, property: &Property, request: &WritePropertyRequest) -> Result<(), Error> {
-    // Only a joined world's can be written.
+    // Only properties of a joined world can be written.
     let (Some(joined), true) = (joined, property.is_writable) else {
         return Err(property.forbidden("written"));
     };
@@ -182,7 +182,7 @@ impl Property {
         Self { is_writable: true, ..self }
     }
 
-    /// The key of what holds it; empty at the root.
+    /// The key of the property that groups this one; empty at the root.
     fn parent(&self) -> &str {
         self.key.rsplit_once('.').map_or("", |(parent, _)| parent)
     }

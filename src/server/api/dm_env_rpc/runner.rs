@@ -10,7 +10,7 @@ use crate::{
 use bytes::Bytes;
 use std::sync::Arc;
 
-/// An environment and where its episode stands.
+/// The environment of a world, with the state of its episode.
 pub(super) struct Runner {
     batch: Batch,
     draws: DrawAuditor,
@@ -39,7 +39,7 @@ pub(super) struct WorldStep {
     pub(super) state: State,
     /// f32 `[O]`, little-endian.
     pub(super) observation: Bytes,
-    /// 0 where an episode begins.
+    /// The reward; 0 at the first observation of an episode.
     pub(super) reward: f32,
     /// The step limit ended the episode.
     pub(super) truncated: bool,
@@ -52,7 +52,7 @@ pub(super) struct WorldStep {
 /// Changes that take effect with the next episode.
 #[derive(Clone)]
 pub(super) struct Changes {
-    /// The version in force.
+    /// The version of the next episode.
     pub(super) version: Version,
     /// A new seed.
     pub(super) seed: Option<u64>,
@@ -84,7 +84,7 @@ impl Runner {
         &self.batch.settings().groups[0].episodes
     }
 
-    /// The checks and records of what the world draws from.
+    /// The auditor of the world's draws.
     pub(super) fn draws(&self) -> &DrawAuditor {
         &self.draws
     }
@@ -94,17 +94,17 @@ impl Runner {
         self.batch.settings().spec
     }
 
-    /// The episode that was begun last, with its receipt.
+    /// The episode that began last, with its receipt.
     pub(super) fn start(&self) -> Option<&EpisodeStart> {
         self.start.as_ref()
     }
 
-    /// The seed of that episode.
+    /// The seed of the episode that began last.
     pub(super) fn seed(&self) -> u64 {
         self.seed
     }
 
-    /// The version of that episode.
+    /// The version of the episode that began last.
     pub(super) fn version(&self) -> Version {
         self.version
     }
@@ -114,19 +114,19 @@ impl Runner {
         self.phase == EpisodePhase::Running
     }
 
-    /// Interrupts a running episode: the next step begins another.
+    /// Interrupts a running episode, so that the next step begins another.
     pub(super) fn stop(&mut self) {
         if self.is_running() {
             self.phase = EpisodePhase::Over;
         }
     }
 
-    /// Waits for a step whose agent went away meanwhile.
+    /// Waits for a step whose stream ended before the step did.
     pub(super) async fn finish_abandoned(&mut self) {
         self.batch.finish_abandoned().await;
     }
 
-    /// Begins an episode: the next, or that of a world that is new. With changes a new trial begins, as in
+    /// Begins the next episode, or returns the first one of a new world. With changes a new trial begins, as in
     /// `perturb.v1`.
     ///
     /// # Errors
@@ -175,7 +175,8 @@ impl Runner {
     }
 }
 
-/// An end by the task comes before one from outside: the state that it leaves has no value, as in Gymnasium.
+/// The state that an agent sees. If the task ends an episode in the step that interrupts it, the episode counts as
+/// terminated: its last state has no value, as in Gymnasium.
 fn state(terminated: bool, interrupted: bool) -> State {
     match (terminated, interrupted) {
         (true, _) => State::Terminated,
@@ -184,7 +185,7 @@ fn state(terminated: bool, interrupted: bool) -> State {
     }
 }
 
-/// The only environment's.
+/// The start of the only environment's episode, if one began.
 fn only(started: Vec<(u32, EpisodeStart)>) -> Option<EpisodeStart> {
     started.into_iter().next().map(|(_, start)| start)
 }

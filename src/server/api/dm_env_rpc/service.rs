@@ -26,7 +26,7 @@ pub struct DmEnvRpcService {
 }
 
 impl DmEnvRpcService {
-    /// A service over a pool, without worlds, whose draws the ledger has.
+    /// Makes a service without worlds. It records draws in the ledger, if there is one.
     pub fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>, sessions: Sessions, ledger: Option<Ledger>) -> Self {
         Self {
             worlds: Arc::new(Worlds::new(pool, catalogue, ledger)),

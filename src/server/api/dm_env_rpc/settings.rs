@@ -1,4 +1,4 @@
-//! Settings to the domain. Names and types are checked here, values by the domain.
+//! Converts settings to the domain. Names and types are checked here, and values in the domain.
 
 use super::{Error, tensors};
 use crate::{
@@ -25,23 +25,23 @@ type WorldSettings = BTreeMap<String, Tensor>;
 pub(super) struct Ownership {
     /// The name that was asked for.
     pub(super) name: Option<String>,
-    /// Whether every stream may reset and destroy it.
+    /// Whether every stream with the same token may reset and destroy the world.
     pub(super) shared: bool,
 }
 
-/// Changes by a reset or a written property, from the next episode on.
+/// Changes that a reset or a written property makes from the next episode on.
 #[derive(Default)]
 pub(super) struct WorldChange {
-    /// All parameters get this version's distributions, then those named below theirs.
+    /// The new version, which sets the distributions of all parameters before `parameters` overrides some.
     pub(super) version: Option<Version>,
-    /// Restarts the counts of episodes and trials.
+    /// The new seed, which restarts the counts of episodes and trials at 0.
     pub(super) seed: Option<u64>,
-    /// New distributions by parameters' names.
+    /// New distributions, each with the name of its parameter.
     pub(super) parameters: Vec<(&'static str, Distribution)>,
 }
 
-/// Checks the settings of `create_world`. Returns the version, and whose the world is to be, beside what the batch
-/// needs to know.
+/// Checks the settings of `create_world`. Returns the version, the ownership of the world, and the settings of its
+/// batch.
 ///
 /// # Errors
 /// For settings that are missing, unknown, of a wrong type or out of range.
@@ -74,7 +74,7 @@ pub(super) fn create(
         distributions,
         episodes_per_trial: small(EPISODES_PER_TRIAL, 1, 1)?,
     };
-    // An agent's step after the end begins the next episode by a reset.
+    // The runner itself resets the environment at an agent's first step after an end.
     let autoreset = Autoreset::Disabled;
     let batch = BatchSettings {
         spec,
@@ -104,7 +104,8 @@ fn ownership(settings: &WorldSettings) -> Result<Ownership, Error> {
 /// Checks the settings of a reset.
 ///
 /// # Errors
-/// For settings that are unknown, of a wrong type or not finite. Bounds of parameters are checked by who applies it.
+/// For settings that are unknown, of a wrong type or not finite. The bounds of parameters are checked when the change
+/// is applied.
 pub(super) fn change(
     spec: &'static EnvironmentSpec,
     request: &'static str,
@@ -123,7 +124,7 @@ pub(super) fn change(
 /// Checks that there are no settings.
 ///
 /// # Errors
-/// If there are.
+/// If there is one.
 pub(super) fn check_none(request: &'static str, settings: &WorldSettings) -> Result<(), Error> {
     match settings.keys().next() {
         Some(name) => Err(unknown(name, format!("{request} takes no settings; give them to create_world or reset"))),
@@ -131,10 +132,10 @@ pub(super) fn check_none(request: &'static str, settings: &WorldSettings) -> Res
     }
 }
 
-/// A version by its letter.
+/// The version with this letter.
 ///
 /// # Errors
-/// If it is another letter.
+/// If no version has this letter.
 pub(super) fn parse_version(field: String, letter: &str) -> Result<Version, Error> {
     let found = letter.parse().ok().filter(|version| Version::ALL.contains(version));
     found.ok_or_else(|| Error::value(field, format!("{:?}", shorten(letter)), "\"D\", \"R\" or \"E\""))

@@ -11,10 +11,10 @@ use crate::{
 };
 use std::collections::BTreeMap;
 
-/// The only action.
+/// The uid of the only action.
 const ACTION: u64 = 1;
 
-/// The observations, from 1: 0 is none's uid.
+/// The uids of the observations, from 1: no observation has uid 0.
 const OBSERVATION: u64 = 1;
 const REWARD: u64 = 2;
 const TRUNCATED: u64 = 3;
@@ -23,7 +23,7 @@ const DIVERGED: u64 = 5;
 
 /// The actions and observations of an environment.
 ///
-/// There is no `discount`: clients make it of the state, as they should, and must not get one with a first step.
+/// There is no `discount`, because clients derive it from the state and must not get one with a first step.
 pub(super) fn action_observation_specs(spec: &EnvironmentSpec) -> ActionObservationSpecs {
     let scalar = |name: &str, dtype: DataType| TensorSpec {
         name: name.into(),
@@ -72,7 +72,7 @@ pub(super) fn check_requested(uids: &[u64]) -> Result<(), Error> {
 /// Checks a step's actions. Returns them as the pool takes them: i32, or f32 `[A]`, little-endian.
 ///
 /// # Errors
-/// If there is an unknown one, or none, or one that is not as its spec says.
+/// If the action is missing, does not fit its spec, or comes with an unknown one.
 pub(super) fn actions(spec: &EnvironmentSpec, actions: &BTreeMap<u64, Tensor>) -> Result<Vec<u8>, Error> {
     if let Some(uid) = actions.keys().find(|uid| **uid != ACTION) {
         return Err(unknown("action", *uid, format!("the only action is {ACTION}")));
@@ -106,12 +106,13 @@ pub(super) fn response(outcome: &WorldStep, requested: &[u64]) -> StepResponse {
         REWARD => floats(vec![outcome.reward], &[]),
         TRUNCATED => bool(outcome.truncated),
         SUCCESS => bool(outcome.success),
-        // The caller has checked that there are no others.
+        // The caller has checked that no other uids come.
         _ => bool(outcome.diverged),
     };
     StepResponse {
         state: outcome.state.into(),
-        // Each once, however often it is asked for: a reply must not be many times as large as its request.
+        // An observation is sent only once, however often it is requested, so that a small request cannot have a large
+        // reply.
         observations: (OBSERVATION..=DIVERGED)
             .filter(|uid| requested.contains(uid))
             .map(|uid| (uid, observation(uid)))
@@ -119,7 +120,7 @@ pub(super) fn response(outcome: &WorldStep, requested: &[u64]) -> StepResponse {
     }
 }
 
-/// The last of the choices.
+/// The number of the last choice.
 fn last(names: &[&str]) -> i32 {
     names.len() as i32 - 1
 }
@@ -128,7 +129,7 @@ fn length(channels: &[Channel]) -> Vec<i32> {
     vec![channels.len() as i32]
 }
 
-/// Least and greatest values, if every channel has some: one pair for all if they are alike, else one for each.
+/// The minima and maxima, if every channel has finite ones: one pair if all are equal, otherwise one for each channel.
 fn bounds(channels: &[Channel]) -> (Option<Value>, Option<Value>) {
     if !channels.iter().all(|c| c.low.is_finite() && c.high.is_finite()) {
         return (None, None);

@@ -81,8 +81,9 @@ pub(super) fn floats(field: &str, tensor: &Tensor, shape: &[usize], bounds: &[(f
     }
 }
 
-/// The elements, if they have this shape; there are as many bounds. A single element stands for all. One dimension may
-/// be negative: then it is what the number of elements makes of it, and a single element stands for itself.
+/// Returns the elements of a tensor of exactly this shape, whose product is the number of `bounds`. A single element
+/// is repeated for all. If a dimension is negative, it is inferred from the number of elements, and nothing is
+/// repeated.
 fn elements<T: Copy + PartialOrd + Display>(
     field: &str,
     tensor: &Tensor,
@@ -102,7 +103,7 @@ fn elements<T: Copy + PartialOrd + Display>(
         many if many.len() == bounds.len() => many.to_vec(),
         _ => return Err(refuse()),
     };
-    // NaN is within no bounds.
+    // NaN is outside of every interval.
     match all.iter().zip(bounds).position(|(x, (low, high))| !(low..=high).contains(&x)) {
         Some(i) => {
             let (got, (low, high)) = (format!("{} in element {i}", all[i]), bounds[i]);
@@ -154,7 +155,7 @@ pub(super) fn dtype_and_count(tensor: &Tensor) -> Option<(DataType, usize)> {
 
 /// A tensor of this shape, which is empty for a scalar.
 pub(super) fn tensor(payload: Payload, shape: &[usize]) -> Tensor {
-    // Shapes are those of specs, a few dozen elements.
+    // The shapes come from specs, which have at most a few dozen elements.
     let shape = shape.iter().map(|&length| i32::try_from(length).unwrap_or(i32::MAX)).collect();
     Tensor { payload: Some(payload), shape }
 }

@@ -1,4 +1,5 @@
-//! The state of a world that requests of any stream may change. The physics follows when the next episode begins.
+//! The state of a world that requests of several streams may change. Changes reach the physics when the next episode
+//! begins.
 
 use super::{
     Error,
@@ -24,10 +25,10 @@ struct PendingChanges {
     version: Version,
     /// The distribution of each parameter.
     distributions: Vec<Distribution>,
-    /// Whether they are other than the running episode's.
+    /// Whether the distributions differ from those of the running episode.
     new_distributions: bool,
     seed: Option<u64>,
-    /// Another stream has reset the world: the running episode ends with its next step.
+    /// Whether another stream has reset the world, so that the running episode ends with its next step.
     interruption: bool,
 }
 
@@ -38,7 +39,7 @@ pub(super) struct JoinedWorld {
 }
 
 impl World {
-    /// The world of an environment that has just been made.
+    /// Makes the world of a new environment.
     pub(super) fn new(name: String, runner: &Runner) -> Self {
         let wanted = PendingChanges {
             version: runner.version(),
@@ -60,10 +61,10 @@ impl World {
         self.spec
     }
 
-    /// Notes a change for the next episode.
+    /// Stores a change for the next episode.
     ///
     /// # Errors
-    /// If a parameter is out of its bounds, or the token may not draw from there; nothing is noted then.
+    /// If a parameter is out of its bounds, or the token's role does not allow the draw. Nothing is changed then.
     pub(super) fn change(&self, change: WorldChange) -> Result<(), Error> {
         let mut wanted = self.lock();
         let version = change.version.unwrap_or(wanted.version);
@@ -93,19 +94,19 @@ impl World {
         }
     }
 
-    /// Takes back the changes of an episode that could not begin, but for what was changed since.
+    /// Stores the changes of an episode that could not begin again. Changes that came since take precedence.
     pub(super) fn keep(&self, changes: Changes) {
         let mut wanted = self.lock();
         wanted.seed = wanted.seed.or(changes.seed);
         wanted.new_distributions |= changes.distributions.is_some();
     }
 
-    /// Has the running episode end with its next step.
+    /// Marks the running episode to end with its next step.
     pub(super) fn interrupt(&self) {
         self.lock().interruption = true;
     }
 
-    /// Whether the running episode is to end with the step that is now.
+    /// Returns whether the running episode must end with the present step, and clears the mark.
     pub(super) fn take_interruption(&self) -> bool {
         std::mem::take(&mut self.lock().interruption)
     }

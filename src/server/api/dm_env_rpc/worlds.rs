@@ -1,5 +1,5 @@
-//! All worlds of the server, by name. A world lives as long as the stream that made it, or an agent that is in it. A
-//! client that knows the name may join, with the token that the world was made with. Names cannot be guessed, unless a
+//! All worlds of the server, by name. A world lives as long as the stream that made it is open, or an agent has joined
+//! it. A client that knows the name and shows the token of the world's maker may join. Names are random, unless a
 //! client chose them.
 
 use super::{Error, runner::Runner, settings::Ownership, world::World};
@@ -20,7 +20,7 @@ use std::{
 /// The number of a stream.
 type StreamId = u64;
 
-/// A stream.
+/// The stream that a request came from.
 pub(super) struct Caller {
     stream: StreamId,
     bearer: Option<Bearer>,
@@ -30,7 +30,7 @@ impl Caller {
     /// Takes environments out of the quota of the stream's token.
     ///
     /// # Errors
-    /// If it has as many as it may have.
+    /// If the quota is exceeded.
     pub(super) fn envs(&self, count: usize) -> Result<Option<QuotaGuard>, Error> {
         Ok(self.bearer.as_ref().map(|bearer| bearer.envs(count)).transpose()?)
     }
@@ -41,7 +41,7 @@ impl Caller {
     }
 }
 
-/// A world's name, with that of the token which it was made with: others do not see it, and may use the name too.
+/// A world's name with the name of its maker's token, so that each token has names of its own.
 type Key = (Option<String>, String);
 
 /// The registry that all streams share.
@@ -60,11 +60,11 @@ struct Registry {
 
 struct WorldEntry {
     world: Arc<World>,
-    /// The stream that made it, until it ends.
+    /// The stream that made the world, as long as it is open.
     maker: Option<StreamId>,
-    /// The stream whose agent is in it.
+    /// The stream whose agent has joined the world.
     agent: Option<StreamId>,
-    /// Whether every stream may reset and destroy it.
+    /// Whether every stream with the same token may reset and destroy the world.
     shared: bool,
     /// The episodes; `None` while an agent has them.
     runner: Option<Runner>,
@@ -78,7 +78,7 @@ impl Worlds {
         Self { pool, catalogue, ledger, registry: Mutex::default() }
     }
 
-    /// The checks and records of what a new world of a stream draws from.
+    /// Makes the auditor of the draws of a stream's new world.
     pub(super) fn draws(&self, maker: &Caller) -> DrawAuditor {
         DrawAuditor::new(maker.bearer.clone(), self.ledger.clone())
     }
@@ -88,7 +88,7 @@ impl Worlds {
         &self.pool
     }
 
-    /// The environments that there may be worlds of.
+    /// The environments that a world can have.
     pub(super) fn catalogue(&self) -> &Catalogue {
         &self.catalogue
     }
@@ -100,7 +100,7 @@ impl Worlds {
         Caller { stream: registry.streams, bearer }
     }
 
-    /// Whether there is no world of the name that is asked for.
+    /// Checks that the requested name, if any, is free.
     ///
     /// # Errors
     /// [`Error::Taken`].
@@ -111,10 +111,10 @@ impl Worlds {
         }
     }
 
-    /// Takes a world that a stream has made, and what it holds of its token's. Returns its name.
+    /// Adds a world that a stream has made, with the part of its token's quota that it holds. Returns its name.
     ///
     /// # Errors
-    /// [`Error::Taken`] if another has the name that was asked for, [`Error::NoRandomness`].
+    /// [`Error::Taken`] if another world has the requested name, [`Error::NoRandomness`].
     pub(super) fn add(
         &self,
         maker: &Caller,
@@ -143,7 +143,7 @@ impl Worlds {
         Ok(name)
     }
 
-    /// The world of that name, for a stream that wants to change it.
+    /// Returns the world of that name, if the stream may change it.
     ///
     /// # Errors
     /// [`Error::Unknown`], [`Error::NotYours`].
@@ -151,7 +151,7 @@ impl Worlds {
         Ok(Arc::clone(&self.lock().find_owned(caller, name, request)?.world))
     }
 
-    /// Gives a world to a stream's agent.
+    /// Hands a world's runner to a stream's agent.
     ///
     /// # Errors
     /// [`Error::Unknown`], [`Error::Occupied`].
@@ -164,7 +164,7 @@ impl Worlds {
         Ok((Arc::clone(&entry.world), runner))
     }
 
-    /// Takes a world back from its agent.
+    /// Takes the runner of a world back from the agent that leaves it.
     pub(super) fn leave(&self, agent: &Caller, world: &World, runner: Runner) {
         let mut registry = self.lock();
         if let Some(entry) = registry.worlds.get_mut(&agent.key(world.name())) {
@@ -186,12 +186,12 @@ impl Worlds {
         Ok(())
     }
 
-    /// Whether there are worlds that this stream has made.
+    /// Whether a world of this stream exists.
     pub(super) fn are_made_by(&self, caller: &Caller) -> bool {
         self.lock().worlds.values().any(|entry| entry.maker == Some(caller.stream))
     }
 
-    /// A stream is gone, and with it those of its worlds that have no agent.
+    /// Frees the worlds of a stream that has ended, unless they have an agent.
     pub(super) fn stream_ended(&self, caller: &Caller) {
         let mut registry = self.lock();
         for entry in registry.worlds.values_mut().filter(|entry| entry.maker == Some(caller.stream)) {
@@ -206,14 +206,14 @@ impl Worlds {
 }
 
 impl Registry {
-    /// The world of that name, if the stream has made it, is its agent's, or may do as if.
+    /// The world of that name, if the stream made it or has joined it, or if it is shared.
     fn find_owned(&mut self, caller: &Caller, name: &str, request: &'static str) -> Result<&WorldEntry, Error> {
         let entry = self.find(caller, name)?;
         let is_its = entry.shared || [entry.maker, entry.agent].contains(&Some(caller.stream));
         if is_its { Ok(entry) } else { Err(Error::NotYours { world: name.into(), request }) }
     }
 
-    /// The world of that name, if there is one for streams with this token.
+    /// The world of that name among those of the stream's token.
     fn find(&mut self, caller: &Caller, name: &str) -> Result<&mut WorldEntry, Error> {
         self.worlds.get_mut(&caller.key(name)).ok_or_else(|| unknown(name))
     }
@@ -224,7 +224,7 @@ impl Registry {
     }
 }
 
-/// A name that nobody guesses.
+/// Makes a name that cannot be guessed.
 fn random_name(environment: &str) -> Result<String, Error> {
     Ok(format!("{environment}-{:032x}", u128::from_ne_bytes(id::random()?)))
 }

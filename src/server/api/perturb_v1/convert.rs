@@ -31,7 +31,7 @@ pub fn open(catalogue: &Catalogue, max_envs: usize, request: proto::Open) -> Res
         vec![group(spec, "open", "open.batch_size", single(request))?]
     } else {
         check_no_single(&request)?;
-        // Before anything is made of them: each has one environment at least.
+        // This is checked before groups are converted. Each has at least one environment.
         if request.groups.len() > max_envs {
             let got = format!("{} groups", request.groups.len());
             return Err(Error::value(
@@ -47,12 +47,13 @@ pub fn open(catalogue: &Catalogue, max_envs: usize, request: proto::Open) -> Res
     Ok(BatchSettings { spec, groups, autoreset, receipts, receipt_arrays, reward_terms, observe_parameters })
 }
 
-/// The environment that has the parameters which an `open` names: with disturbances, if it names one.
+/// Returns the environment that an `open` asks for. It has the disturbances as further parameters if the `open` names
+/// one of them.
 fn with_parameters(spec: &'static EnvironmentSpec, open: &proto::Open) -> Result<&'static EnvironmentSpec, Error> {
     let groups = open.groups.iter().map(|group| &group.parameters);
     let mut names: Vec<&str> =
         groups.chain([&open.parameters]).flat_map(|named| named.keys().map(String::as_str)).collect();
-    // In order, so that the same request always gets the same refusal.
+    // Names are sorted, so that the same request always gets the same error.
     names.sort_unstable();
     Ok(disturbance::with_parameters(spec, names)?)
 }
@@ -80,7 +81,7 @@ fn check_no_single(request: &proto::Open) -> Result<(), Error> {
     }
 }
 
-/// Checks a group, whose fields are those of `path`.
+/// Checks a group. Errors name its fields after `path`.
 fn group(
     spec: &'static EnvironmentSpec,
     path: &str,
@@ -117,7 +118,7 @@ fn override_parameters(
     base: &mut [Distribution],
     parameters: &HashMap<String, proto::Distribution>,
 ) -> Result<(), Error> {
-    // In order of names, so that the same request always gets the same refusal.
+    // Names are sorted, so that the same request always gets the same error.
     let mut parameters: Vec<_> = parameters.iter().collect();
     parameters.sort_by_key(|(name, _)| *name);
     let mut overrides = Vec::with_capacity(parameters.len());
@@ -185,7 +186,7 @@ pub fn reset(batch: &Batch, request: proto::Reset) -> Result<Vec<ResetEntry>, Er
         return Err(Error::value("reset.seeds", format!("{} seeds", request.seeds.len()), expected));
     }
     let mut states = states(spec, &request.states, slots.len())?.into_iter();
-    // Neighbours mostly share their distributions, which are then overridden once.
+    // Neighbouring environments mostly share their distributions, which are then overridden only once.
     let mut edited: (Vec<Distribution>, Arc<[Distribution]>) = (Vec::new(), Arc::new([]));
     let mut entries = Vec::with_capacity(slots.len());
     for (i, slot) in slots.into_iter().enumerate() {
@@ -355,7 +356,7 @@ fn action_space(space: ActionSpace) -> proto::ActionSpace {
     proto::ActionSpace { kind: Some(kind) }
 }
 
-/// A step's outcome.
+/// The response to a step.
 pub fn stepped(stepped: StepResult) -> proto::Stepped {
     proto::Stepped {
         observations: stepped.observations,

@@ -12,23 +12,23 @@ use crate::{
 };
 use std::borrow::Cow;
 
-/// Why a request was refused. It changed nothing, but for an act that failed on its way.
+/// A refused request. It changed nothing, except an `act` that failed between its steps.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The session's transport refuses it.
+    /// The session layer refuses the request.
     #[error(transparent)]
     Session(#[from] session::Error),
-    /// The token may not draw from there, or the ledger cannot be written.
+    /// The token's role does not allow the draw, or the ledger cannot be written.
     #[error(transparent)]
     Audit(#[from] audit::Error),
-    /// The environments refuse it.
+    /// An environment, a parameter or a snapshot is unknown or not valid.
     #[error(transparent)]
     Environment(#[from] env::Error),
-    /// The pool refuses it.
+    /// The pool is full, or refuses or fails the request.
     #[error(transparent)]
     Pool(#[from] pool::Error),
-    /// There is no picture.
+    /// The picture cannot be drawn.
     #[error(transparent)]
     Render(#[from] render::Error),
     /// A field has a value that it cannot have.
@@ -49,7 +49,7 @@ pub enum Error {
     /// A second `open`.
     #[error("open came on a session that is open already; use reset, or start another session")]
     AlreadyOpen,
-    /// A request that cannot come now.
+    /// A request that is not allowed in the session's present state.
     #[error("{request} came {when}; {advice}")]
     Order {
         /// The request.
@@ -109,7 +109,7 @@ impl From<NoRandomness> for Error {
     }
 }
 
-/// The error in-band: the session lives on.
+/// The error as an in-band response, after which the session stays open.
 impl From<Error> for proto::Error {
     fn from(error: Error) -> Self {
         Self { code: error.kind().code() as i32, message: error.to_string() }

@@ -1,4 +1,4 @@
-//! The fields of requests whose entries are counted before anything is made of them.
+//! The fields of requests whose entries are counted before the request is decoded.
 
 use crate::server::transport::precheck::{
     Cardinality, Field,

@@ -2,9 +2,10 @@
 //!
 //! - [`service`]: one short method for each call.
 //! - [`session`]: the legal order of a session's requests.
-//! - [`convert`]: the protocol to the domain and back, with all validation; [`policy`]: that of policies.
-//! - `price`: what requests cost a token's rate.
-//! - [`sizes`]: how many bytes requests and replies have.
+//! - [`convert`]: conversion between the protocol and the domain, with all validation; [`policy`]: the same for
+//!   policies.
+//! - `price`: the price of requests, in steps of a token's rate.
+//! - [`sizes`]: upper bounds of the lengths of requests and replies.
 
 pub mod convert;
 mod error;

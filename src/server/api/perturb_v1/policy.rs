@@ -17,12 +17,12 @@ const MAX_HIDDEN_LAYERS: usize = 8;
 const MAX_LAYER_WIDTH: u32 = 1024;
 /// The maximum number of activations of a policy, in all environments together.
 const MAX_ACTIVATIONS: usize = 1 << 25;
-/// A reply is cut when its steps cost about this time, so that a client is never left without an answer for long.
+/// The maximum cost of the steps of one reply, µs, so that no client waits long for an answer.
 const MAX_REPLY_COST_US: f64 = 1e6;
-/// The estimated number of weights that a policy computes with in a microsecond.
+/// The estimated number of a policy's weights that are evaluated per microsecond.
 const WEIGHTS_PER_US: f64 = 5000.0;
 
-/// Numbers of each kind in a batch.
+/// The sizes of a batch.
 #[derive(Clone, Copy)]
 struct Sizes {
     /// N.
@@ -90,7 +90,7 @@ pub fn rollout_request(batch: &Batch, rate: Option<u32>, request: proto::Act) ->
         return Err(Error::value("act.policy", got, "fewer, so that a step takes less than about a second"));
     }
     let affordable = (MAX_REPLY_COST_US / ((settings.spec.step_cost + computed) * n_envs as f64)).max(1.0) as usize;
-    // Of a second, so that none waits long for the next.
+    // A reply has at most the steps that the rate allows in a second, so that no client waits long for the next one.
     let allowed = rate.map_or(usize::MAX, |rate| (rate as usize / n_envs.max(1)).max(1));
     let affordable = affordable.min(allowed);
     let max_steps = if most_steps == 0 { affordable } else { affordable.min(most_steps as usize) };
@@ -138,7 +138,7 @@ fn policy(policy: proto::Policy, given: &Bytes, sizes: Sizes, episodes_per_trial
     Ok(Policy { spec, inputs, normalisers, role, state, weights, episodes_per_trial })
 }
 
-/// The shape of a policy whose inputs have `input_size` numbers.
+/// Checks the shape of a policy whose input has `input_size` numbers.
 fn spec(policy: &proto::Policy, input_size: usize, sizes: Sizes) -> Result<PolicySpec, Error> {
     const FIELD: &str = "act.policy.hidden";
     if policy.hidden.len() > MAX_HIDDEN_LAYERS {
@@ -180,7 +180,7 @@ fn read<'a, M, T: TryFrom<&'a M, Error = DecodeError>>(
     given.as_ref().map(T::try_from).transpose().map_err(in_message(field))
 }
 
-/// Names the message that a field is of.
+/// Returns a conversion of decoding errors, which names the message.
 fn in_message(message: &'static str) -> impl Fn(DecodeError) -> Error {
     move |wrong| {
         let DecodeError { field, got, expected } = wrong.within(message);
@@ -207,7 +207,7 @@ fn state(
     player_state(given, actions).map_err(in_message("act.policy.state"))
 }
 
-/// Whether there are bytes for exactly `count` numbers.
+/// Checks that there are bytes for exactly `count` numbers.
 fn check_length(field: &'static str, bytes: &Bytes, count: usize, shape: &str) -> Result<(), Error> {
     let expected = || format!("{} bytes: {shape}, {count} numbers", 4 * count);
     let got = || format!("{} bytes", bytes.len());
@@ -238,7 +238,7 @@ fn ended_at(EndedAt { step, slot, end, terminated, truncated }: EndedAt) -> prot
     proto::EndedAt { step: step as u32, end: Some(convert::ended((slot, end))), terminated, truncated }
 }
 
-/// The state of the policy that plays, without its weights.
+/// The state of the playing policy, without its weights.
 pub fn player_saved(batch: &Batch) -> Result<proto::PlayerSaved, Error> {
     let order = |when: &'static str, advice| Err(Error::Order { request: "save_player", when: when.into(), advice });
     let Some(runner) = batch.policy_runner() else {

@@ -2,13 +2,13 @@
 
 use crate::{pool::Batch, proto::session_request::Request};
 
-/// The price of `open` beside that of its environments: a session with its buffers and log line.
+/// The price of `open` without that of its environments. It covers the session's buffers and log line.
 const OPEN_PRICE: u64 = 16;
-/// The price of each environment that is restored.
+/// The price of each restored environment.
 const RESTORED_PRICE: u64 = 4;
-/// The pixels of a picture that cost as much as a step.
+/// The number of pixels of a picture that are charged as one step.
 const PIXELS_PER_STEP: u64 = 1024;
-/// The price of a request beside what it does.
+/// The fixed price of each request other than `open`, `step` and `act`.
 const REQUEST_PRICE: u64 = 1;
 
 /// The price of a request beside the steps that it takes. Nothing is added for `step` and `act`. The environments of an
@@ -35,7 +35,7 @@ pub fn price(request: Option<&Request>, batch: Option<&Batch>) -> u64 {
     }
 }
 
-/// The side of a picture of which none is given, pixels.
+/// The default side of a picture, pixels.
 const DEFAULT_SIDE: u64 = 480;
 /// The largest side of a picture, pixels.
 const MAX_SIDE: u64 = 2048;

@@ -15,7 +15,7 @@ use tonic::{Request, Response, Status, Streaming};
 
 /// The price of the catalogue in steps.
 const LISTING_PRICE: u64 = 16;
-/// The time that a call for the catalogue may wait for its token's rate: less than the timeout of such calls.
+/// The maximum time that a call for the catalogue waits for its token's rate. It is below the timeout of such calls.
 const MAX_LISTING_WAIT: Duration = Duration::from_secs(5);
 
 /// The path of calls that are sessions.
@@ -30,7 +30,7 @@ pub struct PerturbService {
 }
 
 impl PerturbService {
-    /// A service of sessions that share this.
+    /// Makes a service whose sessions share `shared`.
     pub fn new(shared: ServerContext, sessions: Sessions) -> Self {
         Self { shared: Arc::new(shared), sessions, counts: RequestCounters::new::<Session>() }
     }

@@ -24,7 +24,7 @@ use crate::{
 use bytes::Bytes;
 use std::sync::Arc;
 
-/// The length of a step's request beside its actions.
+/// An upper bound of the length of a step's request without its actions, bytes.
 const STEP_OVERHEAD_BYTES: usize = 32;
 
 /// The parts of a server that all its sessions share.
@@ -59,7 +59,7 @@ pub struct Session {
 }
 
 impl Session {
-    /// A session that is not open yet, whose replies' bytes are taken from the budget.
+    /// Makes a session that is not open yet. Its replies are reserved in `budget`.
     pub fn new(context: Arc<ServerContext>, bearer: Option<Bearer>, budget: Budget) -> Self {
         let draws = DrawAuditor::new(bearer.clone(), context.ledger.clone());
         Self { context, batch: None, bearer, env_quota: None, draws, budget, step_memory: None, policy_memory: None }
@@ -87,7 +87,7 @@ impl Session {
             opened.observed(observes_parameters)
         });
         let envs = settings.size();
-        // More than there can be is for the pool to refuse.
+        // A batch above the pool's limit gets no reservation, because the pool refuses it with the better message.
         let step_memory =
             (envs <= max_envs).then(|| self.budget.reserve(sizes::session(&settings, envs))).transpose()?;
         let env_quota = self.bearer.as_ref().map(|bearer| bearer.envs(envs)).transpose()?;
@@ -323,7 +323,7 @@ impl SessionHandler for Session {
         }
     }
 
-    /// Steps follow steps, unless a token has to wait between them.
+    /// A step may be pipelined behind another step, if the token has no rate.
     fn pipeline(&self, request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<>> {
         let batch = self.batch.as_ref().filter(|_| matches!(request.request, Some(Request::Step(_))))?;
         let has_no_rate = self.bearer.as_ref().is_none_or(|bearer| bearer.rate().is_none());

@@ -7,22 +7,23 @@ use crate::{
     render::Size,
 };
 
-/// Room in a request beside its bytes for each environment: parameters, and mistakes that deserve an answer.
+/// The length of a request beyond its bytes for each environment. It has room for parameters, and for wrong requests,
+/// which should get an error in-band.
 const REQUEST_OVERHEAD_BYTES: usize = 1 << 20;
 /// The maximum length of a number in the encoding, tag included.
 const MAX_VARINT_FIELD_BYTES: usize = 11;
-/// The estimated memory of an episode's end, as it is computed and as it is sent.
+/// The estimated memory of an episode's end in the domain and in the encoded reply together, bytes.
 const EPISODE_END_BYTES: usize = 300;
 /// The estimated memory of a receipt.
 const RECEIPT_BYTES: usize = 500;
 /// The estimated length of a snapshot.
 const SNAPSHOT_BYTES: usize = 2 << 10;
-/// The most bytes of tags and lengths of all fields of a reply that are not repeated.
+/// An upper bound of the tags and lengths of all fields of a reply that are not repeated, bytes.
 const FRAMING_BYTES: usize = 256;
-/// Integers in a row of `Stepped.receipt_episodes`.
+/// The number of integers in a row of `Stepped.receipt_episodes`.
 const RECEIPT_INDICES: usize = 5;
 
-/// Entries of an action.
+/// The number of entries of an action.
 fn action_width(settings: &BatchSettings) -> usize {
     match settings.spec.action {
         ActionSpace::Discrete(_) => 1,
@@ -30,8 +31,8 @@ fn action_width(settings: &BatchSettings) -> usize {
     }
 }
 
-/// The most bytes of a request that a batch can need. Weights are as many as a policy has, which any session may send
-/// that the server can act for.
+/// An upper bound of the length of a valid request to a batch, bytes. In [`Autoreset::SameStep`] there is no bound,
+/// because such a session may send a policy with any number of weights.
 pub fn max_request_bytes(batch: &Batch) -> usize {
     let settings = batch.settings();
     if settings.autoreset == Autoreset::SameStep {
@@ -42,13 +43,13 @@ pub fn max_request_bytes(batch: &Batch) -> usize {
     REQUEST_OVERHEAD_BYTES.saturating_add(batch.size().saturating_mul(reset.max(restore)))
 }
 
-/// A step's request.
+/// The length of a step's request, bytes.
 pub fn step_request(settings: &BatchSettings, envs: usize) -> usize {
     envs.saturating_mul(4 * action_width(settings))
 }
 
-/// The memory that a session holds as long as it is open, so that no step is refused because of other sessions: the
-/// requests of a step and of the next one, and three replies, one being computed, one that waits and one being sent.
+/// The memory that an open session reserves, bytes, so that no step is refused because of other sessions. It has room
+/// for the requests of two steps, and for three replies: one being computed, one waiting and one being sent.
 pub fn session(settings: &BatchSettings, envs: usize) -> usize {
     let numbers = 2 * settings.observation_size() + 1 + settings.spec.reward_terms.len();
     let ends = if settings.receipts { 2 * RECEIPT_BYTES } else { EPISODE_END_BYTES };
@@ -61,17 +62,17 @@ pub fn snapshots(envs: usize) -> usize {
     envs.saturating_mul(SNAPSHOT_BYTES)
 }
 
-/// Snapshots that were taken.
+/// The memory of snapshots, bytes.
 pub fn snapshot_bytes(snapshots: &[bytes::Bytes]) -> usize {
     snapshots.iter().map(|snapshot| snapshot.len() + size_of::<bytes::Bytes>()).sum()
 }
 
-/// A picture.
+/// The memory of a picture, bytes.
 pub fn picture(size: Size) -> usize {
     3 * usize::from(size.width) * usize::from(size.height)
 }
 
-/// The memory of a policy that plays: its weights as they came and as they are used, and its activations in each
+/// The memory of a playing policy, bytes: its weights as received and as loaded, and its activations in each
 /// environment.
 pub fn policy(request: &proto::Act, envs: usize) -> usize {
     let widths = request.policy.as_ref().map_or(0, |policy| {
@@ -80,10 +81,10 @@ pub fn policy(request: &proto::Act, envs: usize) -> usize {
     (2 * request.weights.len()).saturating_add(envs.saturating_mul(widths).saturating_mul(16))
 }
 
-/// The most of a turn's reply.
+/// An upper bound of the reply to an `act`, bytes.
 pub fn max_rollout_bytes(request: &RolloutRequest, batch: &Batch) -> usize {
     let settings = batch.settings();
-    // Flags, values and the like beside observations and two times the action: as sampled, and as an input.
+    // The action counts twice, as sampled and as an input of the policy. The 10 are flags, values and the like.
     let numbers = settings.observation_size() + 2 * action_width(settings) + 10;
     let step = batch.size().saturating_mul(4 * numbers + RECEIPT_BYTES);
     step.saturating_mul(request.max_steps).min(MAX_ROLLOUT_BYTES.saturating_add(step))
@@ -92,8 +93,8 @@ pub fn max_rollout_bytes(request: &RolloutRequest, batch: &Batch) -> usize {
 /// The approximate length at which a rollout's reply is cut.
 const MAX_ROLLOUT_BYTES: usize = 4_000_000;
 
-/// Returns the most bytes of a reply to `step`, `reset` or `restore` of `size` environments that are described so: all
-/// episodes end at once, with the largest counters.
+/// Returns an upper bound of a reply to `step`, `reset` or `restore` of `size` environments, bytes. It is reached when
+/// all episodes end at once with the largest counters. `environment` is the entry of the catalogue.
 pub fn max_step_reply_bytes(settings: &BatchSettings, environment: &proto::Environment, size: usize) -> usize {
     let receipt = proto::Receipt {
         requested: vec![1.0; environment.parameters.len()],
@@ -132,17 +133,18 @@ pub fn max_step_reply_bytes(settings: &BatchSettings, environment: &proto::Envir
         Autoreset::Disabled => ended,
     };
     let reward_terms = if settings.reward_terms { 4 * settings.spec.reward_terms.len() } else { 0 };
-    // Rewards and the two flags have six bytes. A reply to `reset` has messages also where steps have arrays.
+    // The reward and two flags of a step have six bytes. A reply to `reset` has messages even if steps have arrays.
     let row = observation + (6 + reward_terms + events).max(start_message);
     size.saturating_mul(row).saturating_add(FRAMING_BYTES)
 }
 
-/// Returns the most bytes of a reply to `snapshot` of `size` environments, each of which has at most this many.
+/// Returns an upper bound of a reply to `snapshot` of `size` environments, bytes, if each snapshot has at most
+/// `snapshot` bytes.
 pub fn max_snapshot_reply_bytes(size: usize, snapshot: usize) -> usize {
     size.saturating_mul(1 + prost::length_delimiter_len(snapshot) + snapshot).saturating_add(FRAMING_BYTES)
 }
 
-/// The bytes of a message in a list, whose tag has one byte.
+/// The length of a message as an entry of a repeated field, bytes. The field's tag has one byte.
 fn entry(message: &impl prost::Message) -> usize {
     let length = message.encoded_len();
     1 + prost::length_delimiter_len(length) + length
