@@ -29,17 +29,17 @@ use std::{
 };
 use tokio::{sync::oneshot, time::Instant};
 
-/// The cost of one shard: long enough to hide the queue, short enough that sessions take turns.
+/// The cost of a step of one shard, µs: large compared with the overhead of the queue, but small enough that sessions
+/// take turns.
 const SHARD_COST_US: RangeInclusive<f64> = 20.0..=200.0;
-/// The number of shards of each worker, if they are long enough, so that workers end together.
+/// The number of shards for each worker, so that workers finish together. There are fewer if these would be too cheap.
 const SHARDS_PER_WORKER: f64 = 32.0;
-/// The minimum cost of a worker's share for more than one worker to be used.
+/// The minimum cost of one worker's share, µs, at which a batch is split among the workers.
 const MIN_WORKER_SHARE_US: f64 = 10.0;
-/// Batches of at most this many environments are freed on the transport's thread, since that takes less time than it
-/// notices.
+/// Batches of at most this many environments are freed on the transport's thread, because this takes only a moment.
 const INLINE_DROP_MAX_ENVS: usize = 64;
 
-/// The reset of one environment: a new episode, or with a seed or distributions a new trial.
+/// The reset of one environment. It begins a new episode, and with a seed or distributions also a new trial.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ResetEntry {
     /// The slot in the batch.
@@ -52,7 +52,7 @@ pub struct ResetEntry {
     pub state: Option<Vec<f64>>,
 }
 
-/// A batch of environments. Dropping it frees them at once, or as soon as the shards under way have finished.
+/// A batch of environments. Dropping the batch frees them at once, or as soon as the running shards have finished.
 pub struct Batch {
     settings: BatchSettings,
     /// N.
@@ -64,15 +64,15 @@ pub struct Batch {
     buffer: BytesMut,
     /// The number of requests that were handed to the workers.
     n_requests: u64,
-    /// Whether a request was handed to the workers and its end not been waited for.
+    /// Whether a request was handed to the workers and its end has not been awaited.
     under_way: bool,
-    /// The time at which the next request began, if that is a pipelined step.
+    /// The start time of the next request, if it is a pipelined step.
     pipelined_since: Option<Instant>,
-    /// The policy that plays, until somebody else changes the environments.
+    /// The playing policy, until a request other than `act` changes the environments.
     runner: Option<Box<PolicyRunner>>,
-    /// The hook for the end of the batch.
+    /// The hook that runs when the environments are freed.
     drop_hook: Option<DropHook>,
-    /// Dropped when the environments are freed, which [`Batch::close`] waits for. The last field: it is dropped last.
+    /// Dropped when the environments are freed, which [`Batch::close`] waits for. As the last field it is dropped last.
     freed: Option<oneshot::Sender<()>>,
 }
 
@@ -157,7 +157,7 @@ impl Batch {
         let number = self.next_request();
         let ended = self.workers.wait(&self.job, number).await;
         self.under_way = false;
-        // The worker has gathered what came of it if another step followed at once.
+        // If a pipelined step followed at once, the worker has already gathered the result.
         let (pipelined_since, end) = {
             let mut pipelined = lock(&self.job.pipelined);
             (pipelined.take_result(), pipelined.ended_at())
@@ -184,20 +184,20 @@ impl Batch {
         self.job.tally.meter.times(self.size).observe(end.saturating_duration_since(start));
     }
 
-    /// Returns the queue for the step after the next one, or `None` if a step must know the result of the one before,
-    /// or if the session's own thread may take it.
+    /// Returns the queue for a pipelined step. Returns `None` if the client must see the result of a step before the
+    /// next one, or if steps may run on the session's own thread.
     pub fn step_queue(&self) -> Option<StepQueue> {
         let (job, spec, size) = (Arc::clone(&self.job), self.settings.spec, self.size);
         let follows = self.settings.autoreset != Autoreset::Disabled && job.needs_workers();
         follows.then_some(StepQueue { job, spec, size })
     }
 
-    /// Has a policy play. Without a new policy the previous one continues, without a new task it continues its own. The
-    /// caller has checked that there is a policy, that the previous task is done if another begins, that the mode is
-    /// [`Autoreset::SameStep`], and that policy and weights fit.
+    /// Runs a rollout of a policy. Without a new policy the previous one continues, and without a new task the previous
+    /// task. The caller has checked that there is a policy, that the previous task is done if another begins, that the
+    /// mode is [`Autoreset::SameStep`], and that policy and weights fit.
     ///
     /// # Errors
-    /// [`Error::Policy`] if numbers are not finite, [`Error::Defect`]; after both another policy must be given.
+    /// [`Error::Policy`] if numbers are not finite, [`Error::Defect`]. After either the next call needs a new policy.
     pub async fn act(&mut self, turn: RolloutRequest) -> Result<Rollout, Error> {
         self.ready().await?;
         let task = Box::new(RolloutTask::new(turn, self.runner.take()));
@@ -209,13 +209,13 @@ impl Batch {
         Ok(played)
     }
 
-    /// The policy that plays.
+    /// The playing policy, if there is one.
     pub fn policy_runner(&self) -> Option<&PolicyRunner> {
         self.runner.as_deref()
     }
 
-    /// Frees environments, in order of slots; at least one stays. The others are numbered anew and keep everything
-    /// else.
+    /// Frees the environments in these slots, which are in order. At least one environment stays. The others move to
+    /// the slots from 0 on and are unchanged otherwise.
     ///
     /// # Errors
     /// [`Error::Defect`].
@@ -332,9 +332,9 @@ impl Batch {
     }
 
     /// Waits for a request whose future was dropped early. Call it before the next request: workers may still be
-    /// running the old one and a step queued behind it. A policy that plays ends with its present step.
+    /// running the old one and a step queued behind it. A rollout ends with its present step.
     pub async fn finish_abandoned(&mut self) {
-        // Whether any of it failed the next request will tell.
+        // The next request reports a failure of the abandoned one.
         if self.under_way {
             self.job.is_halted.store(true, Ordering::Relaxed);
             lock(&self.job.pipelined).stop();
@@ -350,8 +350,8 @@ impl Batch {
         }
     }
 
-    /// Returns the scene of a slot, or `None` where its physics diverged. Little is read, between two requests, so no
-    /// worker is asked.
+    /// Returns the scene of a slot, or `None` if its physics diverged. It is read on the calling thread, because no
+    /// request runs and little is read.
     ///
     /// # Errors
     /// [`Error::Defect`].
@@ -371,7 +371,7 @@ impl Batch {
         own + largest
     }
 
-    /// Waits until no request runs, before one that is not a pipelined step, and checks that nothing has failed.
+    /// Prepares for a request other than a pipelined step: waits until none runs, and checks that none has failed.
     async fn ready(&mut self) -> Result<(), Error> {
         self.finish_abandoned().await;
         self.job.result()
@@ -384,7 +384,7 @@ impl Batch {
         result
     }
 
-    /// Counts a request that is handed to the workers now.
+    /// Counts a request that is handed to the workers now. Returns its number.
     fn next_request(&mut self) -> u64 {
         self.under_way = true;
         self.n_requests += 1;
@@ -454,7 +454,7 @@ impl Drop for Batch {
             }
             return; // freed here, so that there is room at once
         }
-        // The last holder of the job frees the environments. It must be neither this thread nor a worker.
+        // The last owner of the job frees the environments. It must be neither this thread nor a worker.
         let mut deferred = Some((Arc::clone(&self.job), self.runner.take(), self.drop_hook.take(), self.freed.take()));
         self.workers.reaper.drop_later(Box::new(move || {
             let is_alone = deferred.as_ref().is_none_or(|(job, ..)| Arc::strong_count(job) == 1);
@@ -496,7 +496,7 @@ fn cut(groups: &[SlotGroup], size: usize) -> Vec<Vec<SlotGroup>> {
             let taken = deferred.size.min(free_slots);
             part.push(SlotGroup { size: taken, ..deferred.clone() });
             deferred.size -= taken;
-            // The index of an empty rest is never used, and may be one too many.
+            // Once nothing is left of the group, this index is never used and may overflow.
             deferred.episodes.environment_index = deferred.episodes.environment_index.wrapping_add(taken as u32);
             free_slots -= taken;
             if free_slots == 0 {

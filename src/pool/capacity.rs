@@ -62,7 +62,7 @@ pub(super) struct Permit {
 }
 
 impl Permit {
-    /// Gives back environments of the permit, not more than it has.
+    /// Returns environments of the permit to the budget, at most as many as it has.
     pub(super) fn release(&self, count: usize) {
         self.count.fetch_sub(count, Ordering::Relaxed);
         self.capacity.release(count);

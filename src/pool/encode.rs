@@ -1,4 +1,4 @@
-//! Arrays as they are on the wire: little-endian, without gaps.
+//! Encodes arrays for the wire: little-endian, without gaps.
 
 use bytes::BytesMut;
 

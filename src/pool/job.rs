@@ -1,4 +1,4 @@
-//! A batch's shards, and the request of it that is under way.
+//! The shards of a batch, and the state of its running request.
 
 use super::{
     Error, capacity::Permit, pipelined_step::PipelinedStep, rollout::task::RolloutTask, shard::Shard, sync::lock,
@@ -16,12 +16,12 @@ use tokio::sync::Notify;
 
 /// Batches cheaper than this run on the session's thread, since a hand-over to a worker costs more.
 pub(super) const INLINE_MAX_US: f64 = 20.0;
-/// This limit applies instead while no other session has stepped meanwhile. A hand-over costs more than a second worker
-/// saves, and no other session waits.
+/// This limit applies instead if no other session has stepped since this one did. No other session waits then, and up
+/// to this cost a second worker saves less than a hand-over costs.
 pub(super) const INLINE_MAX_US_UNCONTENDED: f64 = 80.0;
-/// The session polls for the end of a job that is at most this expensive before it sleeps.
+/// The maximum cost of a job for whose end the session polls before it sleeps, µs.
 const POLL_MAX_US: f64 = 50.0;
-/// The number of polls, which take about twice that time.
+/// The number of polls, which take about twice [`POLL_MAX_US`].
 const POLLS_BEFORE_WAIT: usize = 50;
 
 /// The continuation of a job at a step's end.
@@ -33,28 +33,28 @@ pub(super) enum Continuation {
     Request,
 }
 
-/// A batch's shards and the state of its current request. A batch has at most one request under way, and one that
-/// follows.
+/// The shards of a batch and the state of its running request. At most one request runs, and one pipelined step waits
+/// behind it.
 pub(super) struct Job {
     pub(super) shards: Vec<Mutex<Shard>>,
-    /// For each worker the range of shards that it takes first, and the next of them. A worker that meets the same
-    /// environments again finds them in its core's cache. A worker that is done helps the others.
+    /// For each worker the range of shards that it takes first, and the next shard of the range. A worker that gets the
+    /// same environments at each step finds them in its core's cache. A worker whose range is done helps the others.
     ranges: Vec<(Range<usize>, AtomicUsize)>,
     /// The number of parts that have not finished.
     remaining: AtomicUsize,
-    /// The rollout of the policy that plays, if one plays.
+    /// The running rollout of a policy, if there is one.
     rollout: Mutex<Option<Box<RolloutTask>>>,
-    /// The pipelined step that may follow a step, while no policy plays.
+    /// The pipelined step that may follow a step. It is used only without a rollout.
     pub(super) pipelined: Mutex<PipelinedStep>,
     /// Whether the next part is the beginning of the rollout and not a shard.
     begins_rollout: AtomicBool,
-    /// The number of requests that have ended, of those that were handed to the workers.
+    /// The number of requests that were handed to the workers and have ended.
     pub(super) ended: AtomicU64,
     /// Notified whenever a request has ended.
     pub(super) done: Notify,
-    /// Whether the session is gone, so that shards that have not run need not.
+    /// Whether the session is gone, so that shards that have not run are skipped.
     pub(super) abandoned: AtomicBool,
-    /// Whether nobody waits for the rollout any more, so that it ends with its present step.
+    /// Whether the rollout must end with its present step, because nobody waits for it any more.
     pub(super) is_halted: AtomicBool,
     failed: AtomicBool,
     /// The cost of a step of all environments, µs.
@@ -100,7 +100,7 @@ impl Job {
         self.cost > INLINE_MAX_US_UNCONTENDED
     }
 
-    /// Whether a worker panicked on it, now or earlier.
+    /// Whether a worker has panicked while it ran the job.
     pub(super) fn failed(&self) -> bool {
         self.failed.load(Ordering::Relaxed)
     }
@@ -109,7 +109,7 @@ impl Job {
         if self.failed() { Err(Error::Defect) } else { Ok(()) }
     }
 
-    /// Makes every shard ready to be taken.
+    /// Makes every shard available to the workers.
     pub(super) fn prepare(&self) {
         for (range, next) in &self.ranges {
             next.store(range.start, Ordering::Relaxed);
@@ -117,8 +117,8 @@ impl Job {
         self.remaining.store(self.shards.len(), Ordering::Relaxed);
     }
 
-    /// Claims a shard that nobody has taken, first of the worker's own. The caller has a part from the queue, so there
-    /// is one.
+    /// Claims a shard that no worker has taken, if possible of the worker's own range. The caller has taken a part from
+    /// the queue, so a shard is left.
     fn claim(&self, worker: usize) -> usize {
         loop {
             for i in 0..self.ranges.len() {
@@ -131,7 +131,7 @@ impl Job {
         }
     }
 
-    /// Makes the beginning of a rollout ready to be taken.
+    /// Makes the beginning of a rollout available to the workers.
     pub(super) fn prepare_rollout(&self, rollout: Box<RolloutTask>) {
         *lock(&self.rollout) = Some(rollout);
         self.is_halted.store(false, Ordering::Relaxed);
@@ -139,14 +139,14 @@ impl Job {
         self.remaining.store(1, Ordering::Relaxed);
     }
 
-    /// Takes the rollout, when it has ended or will never be run.
+    /// Takes the rollout after it has ended, or if it will never run.
     pub(super) fn take_rollout(&self) -> Option<Box<RolloutTask>> {
         lock(&self.rollout).take()
     }
 
-    /// Runs a part that the caller has from the queue. Returns whether it was the last.
+    /// Runs a part of the job that the caller has taken from the queue. Returns whether it was the last part.
     pub(super) fn run_part(&self, worker: usize) -> bool {
-        // The beginning of a round is its job's only part.
+        // The beginning of a rollout is the job's only part.
         if self.begins_rollout.swap(false, Ordering::Relaxed) {
             self.remaining.store(0, Ordering::Release);
             return true;
@@ -160,7 +160,7 @@ impl Job {
         self.done.notify_one();
     }
 
-    /// Returns whether a step follows, and which. No step follows if the pool is `closing`.
+    /// Decides at a step's end whether another step follows. None follows if the pool is `closing`.
     pub(super) fn after_step(&self, closing: bool) -> Continuation {
         if self.failed() || self.abandoned.load(Ordering::Relaxed) {
             lock(&self.pipelined).stop();
@@ -179,7 +179,7 @@ impl Job {
         self.catch_panic(Continuation::Step, || rollout.after_step(&self.shards, is_halted))
     }
 
-    /// Returns `next` if it is wanted, and marks the job as failed if the question panics.
+    /// Returns `next` if `is_wanted` returns true. Marks the job as failed if it panics.
     fn catch_panic(&self, next: Continuation, is_wanted: impl FnOnce() -> bool) -> Continuation {
         match catch_unwind(AssertUnwindSafe(is_wanted)) {
             Ok(true) => next,
@@ -204,7 +204,7 @@ impl Job {
                 }
             }
         }
-        // Release: who sees 0 sees what every shard wrote.
+        // Release, so that the worker that reads 0 sees what every shard wrote.
         self.remaining.fetch_sub(1, Ordering::AcqRel) == 1
     }
 }

@@ -6,11 +6,11 @@
 //! wakes the session, which gathers the outputs into one reply. Which worker ran which shard cannot be seen from
 //! outside.
 //!
-//! A step that was asked for before the one under way had ended begins at once when that ends: the last shard's worker
-//! gathers the outputs, and puts the batch back, before the session is woken.
+//! A pipelined step is requested while another one runs. It begins as soon as that step ends: the last shard's worker
+//! gathers the outputs and puts the batch back into the queue before the session is woken.
 //!
-//! Where a policy plays, the last shard's worker gathers them itself, computes the next actions and puts the batch back
-//! into the queue; only the end of such a rollout wakes the session.
+//! During a rollout of a policy the last shard's worker gathers the outputs, computes the next actions and puts the
+//! batch back into the queue. Only the end of the rollout wakes the session.
 
 mod batch;
 mod capacity;
@@ -43,7 +43,7 @@ use crate::env;
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The environments refuse it. Nothing was changed.
+    /// An environment or a snapshot is not valid. Nothing was changed.
     #[error(transparent)]
     Environment(#[from] env::Error),
     /// The pool has no room. Nothing was changed.
@@ -55,7 +55,7 @@ pub enum Error {
         requested: usize,
         /// Environments in use.
         used: usize,
-        /// The most there may be.
+        /// The maximum number of environments.
         limit: usize,
     },
     /// Autoreset is disabled and some environments have ended. Nothing was changed.
@@ -63,7 +63,7 @@ pub enum Error {
         "the episodes of slots {slots} have ended and autoreset is disabled; reset these slots before the next step"
     )]
     Ended {
-        /// The first few, separated by commas.
+        /// The first few of these slots, separated by commas.
         slots: String,
     },
     /// An input or an output of a policy is not finite.

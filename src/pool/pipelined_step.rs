@@ -1,5 +1,5 @@
-//! A pipelined step is requested while another is under way. It begins as soon as that ends, while the session, which
-//! has to answer the first, is still being woken.
+//! A pipelined step is requested while another one runs. It begins as soon as that step ends, while the session is
+//! still being woken to answer the first request.
 
 use super::{
     shard::{Shard, set_actions},
@@ -12,30 +12,30 @@ use tokio::time::Instant;
 /// The pipelined step of a job.
 #[derive(Default)]
 pub(super) struct PipelinedStep {
-    /// A step is under way, and its worker will look here at its end.
+    /// Whether a step runs whose last worker will check for a pipelined one.
     is_under_way: bool,
     /// The next step's actions.
     actions: Option<Bytes>,
     /// Result and completion time of the step before the running one, until the session collects it.
     result: Option<(StepResult, Instant)>,
-    /// The time at which the last step ended that no other followed.
+    /// The end time of the last step that no pipelined step followed.
     ended: Option<Instant>,
     buffer: BytesMut,
     reward_terms: bool,
 }
 
 impl PipelinedStep {
-    /// No pipelined step, of a job whose steps report the reward's terms or not.
+    /// Makes the state without a pipelined step. `reward_terms` says whether steps report the reward's terms.
     pub(super) fn new(reward_terms: bool) -> Self {
         Self { reward_terms, ..Self::default() }
     }
 
-    /// Notes that a step begins.
+    /// Records that a step begins.
     pub(super) fn begin(&mut self) {
         self.is_under_way = true;
     }
 
-    /// At the end of a step: if another is queued, keeps the result and gives the shards their next actions. Returns
+    /// Ends a step. If another one is queued, stores the result and gives the shards their next actions. Returns
     /// whether one was queued.
     pub(super) fn after_step(&mut self, shards: &[Mutex<Shard>]) -> bool {
         let Some(actions) = self.actions.take() else {
@@ -53,17 +53,17 @@ impl PipelinedStep {
         (self.is_under_way, self.actions) = (false, None);
     }
 
-    /// Takes result and completion time of the last step, if another has begun since.
+    /// Takes the result and the end time of the last step, if a pipelined step has followed it.
     pub(super) fn take_result(&mut self) -> Option<(StepResult, Instant)> {
         self.result.take()
     }
 
-    /// The time at which the last step ended, if no other followed.
+    /// The end time of the last step that no pipelined step followed.
     pub(super) fn ended_at(&self) -> Option<Instant> {
         self.ended
     }
 
-    /// Keeps the actions of the step that is to follow, if one can.
+    /// Queues a step with these actions, if a step runs and its result is not stored yet.
     pub(super) fn offer(&mut self, actions: Bytes) {
         if self.is_under_way && self.result.is_none() {
             self.actions = Some(actions);

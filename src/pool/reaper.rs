@@ -1,4 +1,4 @@
-//! Frees what sessions leave behind, on a thread of its own.
+//! A thread that frees the environments of closed sessions.
 
 use super::sync::lock;
 use crate::priority::lower;
@@ -14,16 +14,16 @@ use std::{
     time::Duration,
 };
 
-/// The niceness of the thread: nobody waits for it.
+/// The niceness of the thread. It is low in priority because no request waits for it.
 const REAPER_NICENESS: i32 = 3;
 
-/// Frees what a session leaves behind, and returns whether it could. It runs on the reaper's thread, since thousands of
-/// environments take longer than the transport may be kept.
+/// Frees a closed session's batch, and returns whether it could. It runs on the reaper's thread, because freeing
+/// thousands of environments would block the transport's thread for too long.
 pub(super) type DeferredDrop = Box<dyn FnMut() -> bool + Send>;
-/// The interval at which a batch that was still in use is tried again.
+/// The interval at which freeing is retried for a batch that was still in use.
 const REAP_INTERVAL: Duration = Duration::from_millis(1);
 
-/// The way to the thread that frees, until it is closed.
+/// The handle of the thread, until it is closed.
 pub(super) struct Reaper {
     drops: Mutex<Option<mpsc::Sender<DeferredDrop>>>,
     /// The number of batches that are not freed yet.
@@ -48,7 +48,7 @@ impl Reaper {
         Ok((Self { drops: Mutex::new(Some(drops)), pending }, thread))
     }
 
-    /// Frees what a session leaves behind, elsewhere.
+    /// Hands a batch to the thread, which frees it.
     pub(super) fn drop_later(&self, deferred: DeferredDrop) {
         if let Some(drops) = &*lock(&self.drops) {
             self.pending.fetch_add(1, Ordering::AcqRel);
@@ -56,7 +56,7 @@ impl Reaper {
         }
     }
 
-    /// Waits until everything that sessions have left behind so far is freed.
+    /// Waits until all batches that were handed over so far are freed.
     pub(super) async fn idle(&self) {
         while self.pending.load(Ordering::Acquire) > 0 {
             tokio::time::sleep(REAP_INTERVAL).await;
@@ -69,7 +69,7 @@ impl Reaper {
     }
 }
 
-/// Frees what comes, as soon as it can be freed, until the pool ends.
+/// Frees each batch that comes, as soon as it is not in use, until the pool ends.
 fn reap(received: &mpsc::Receiver<DeferredDrop>, pending: &AtomicUsize) {
     let mut left: Vec<DeferredDrop> = Vec::new();
     loop {

@@ -1,4 +1,4 @@
-//! Receipts as arrays: what a large batch sends of its episodes without a message for each.
+//! Receipts as arrays, so that a large batch needs no message for each episode.
 
 use crate::env::Episodes;
 
@@ -7,7 +7,7 @@ use crate::env::Episodes;
 pub(super) struct ReceiptColumns {
     /// `[m, 5]`: slot of the batch, indices of environment, trial and episode, and the episode's number in its trial.
     pub(super) episodes: Vec<u64>,
-    /// `[m, P + Q]`: what was requested, then what was applied.
+    /// `[m, P + Q]`: the requested values, then the applied ones.
     pub(super) values: Vec<f64>,
 }
 

@@ -24,11 +24,11 @@ use std::{
 };
 use tokio::time::Instant;
 
-/// The number of times that an idle worker yields its core before it sleeps. To wake a worker takes longer than a step
+/// The number of times that an idle worker yields its core before it sleeps. Waking a worker takes longer than a step
 /// of many small environments.
 const YIELDS_BEFORE_SLEEP: usize = 100;
 
-/// The niceness of the workers: the transport, which has little to do at a time, comes before them.
+/// The niceness of the workers. The transport's thread, which only works in short bursts, goes before them.
 const WORKER_NICENESS: i32 = 1;
 
 /// Worker threads that step batches, and the count of environments they may hold.
@@ -78,12 +78,12 @@ impl Pool {
         self.shared.capacity.used()
     }
 
-    /// The most environments there may be.
+    /// The maximum number of environments.
     pub fn limit(&self) -> usize {
         self.shared.capacity.limit()
     }
 
-    /// Waits until the number of environments in use has changed since this was last waited for, by one caller.
+    /// Waits until the number of environments in use has changed since the last call. Only one caller may wait.
     pub async fn changed(&self) {
         self.shared.capacity.changed().await;
     }
@@ -93,12 +93,12 @@ impl Pool {
         Arc::clone(lock(&self.shared.meters).entry(environment).or_default())
     }
 
-    /// The counters of all environments that have some, by name.
+    /// The counters of all environments for which [`Pool::meter`] was called, by name.
     pub fn meters(&self) -> BTreeMap<&'static str, Arc<Meter>> {
         lock(&self.shared.meters).clone()
     }
 
-    /// The times that batches waited for a worker to take a part.
+    /// The times that batches spent in the queue before a worker took a part.
     pub fn waits(&self) -> &Histogram {
         &self.shared.waits
     }
@@ -134,9 +134,9 @@ pub(super) struct StepScheduler {
     /// The number of jobs in the queue, readable without its lock.
     waiting: AtomicUsize,
     ready: Condvar,
-    /// Whether the pool ends, so that rollouts end with their present step.
+    /// Whether the pool is closing, so that rollouts end with their present step.
     closing: AtomicBool,
-    /// The job that stepped last; only to be compared.
+    /// The job that stepped last. The pointer is only compared.
     last_stepped: AtomicPtr<Job>,
     meters: Mutex<BTreeMap<&'static str, Arc<Meter>>>,
     waits: Histogram,
@@ -152,7 +152,7 @@ struct JobQueue {
 }
 
 impl StepScheduler {
-    /// Steps the environments of every shard on this thread, if that is cheap. Returns whether it did.
+    /// Runs a step of all shards on this thread if the job is cheap. Returns whether it did.
     pub(super) fn step_inline(&self, job: &Job) -> bool {
         let tiny = if self.mark_last_stepped(job) { INLINE_MAX_US_UNCONTENDED } else { INLINE_MAX_US };
         if job.cost > tiny {
@@ -163,13 +163,13 @@ impl StepScheduler {
         true
     }
 
-    /// Has the workers step the environments of every shard. Another step may follow.
+    /// Queues a step of all shards for the workers. A pipelined step may follow.
     pub(super) fn begin_step(&self, job: &Arc<Job>) {
         lock(&job.pipelined).begin();
         self.begin(job);
     }
 
-    /// Runs every shard of the job on the workers and waits for the last: the job's `number`th request.
+    /// Runs the job's request `number` on the workers: queues all shards and waits for the last one.
     pub(super) async fn run(&self, job: &Arc<Job>, number: u64) -> Result<(), Error> {
         self.begin(job);
         self.wait(job, number).await
@@ -181,7 +181,7 @@ impl StepScheduler {
         self.push(job, shards, shards); // its lock publishes the job's counters
     }
 
-    /// Runs a rollout on the workers, its beginning and its steps, and returns it at its end.
+    /// Runs a rollout on the workers. Returns it when it has ended.
     pub(super) async fn run_rollout(
         &self,
         job: &Arc<Job>,
@@ -195,16 +195,16 @@ impl StepScheduler {
         job.take_rollout().ok_or(Error::Defect)
     }
 
-    /// Notes that a job steps. Returns whether it was also the last one that did.
+    /// Records that a job steps. Returns whether the previous step was this job's, too.
     fn mark_last_stepped(&self, job: &Job) -> bool {
         let job = std::ptr::from_ref(job).cast_mut();
         self.last_stepped.swap(job, Ordering::Relaxed) == job
     }
 
-    /// Waits until a job's first `number` requests that workers were asked for have ended.
+    /// Waits until the first `number` requests of a job that were handed to the workers have ended.
     pub(super) async fn wait(&self, job: &Arc<Job>, number: u64) -> Result<(), Error> {
         let has_ended = || job.ended.load(Ordering::Acquire) >= number;
-        // A job that is nearly done is worth more polls than a sleep: being woken costs more than many steps.
+        // A job of low cost is polled before the session sleeps, because waking costs more than many steps.
         for _ in 0..job.polls {
             if has_ended() {
                 break;
@@ -226,7 +226,7 @@ impl StepScheduler {
         self.waiting.store(queue.jobs.len(), Ordering::Release);
         let sleeping = queue.sleeping;
         drop(queue);
-        // A wake-up is a system call, also when nobody sleeps.
+        // A notification is a system call even if no worker sleeps.
         match sleeping.min(helpers) {
             0 => {}
             1 => self.ready.notify_one(),
@@ -234,8 +234,8 @@ impl StepScheduler {
         }
     }
 
-    /// The job at the queue's head, one part of which is now the caller's. If parts remain the job goes to the tail,
-    /// where others find it.
+    /// Takes one part of the job at the queue's head. If parts remain, the job goes to the tail for other workers.
+    /// Returns `None` when the queue is closed.
     fn pop(&self) -> Option<Arc<Job>> {
         for _ in 0..YIELDS_BEFORE_SLEEP {
             if self.waiting.load(Ordering::Acquire) > 0 {
@@ -272,8 +272,8 @@ impl StepScheduler {
         }
     }
 
-    /// At the end of a job's last part: notifies its session, and begins another step if a rollout or a pipelined step
-    /// wants one.
+    /// Called at the end of a job's last part. Begins another step if a rollout or a pipelined step wants one, and
+    /// notifies the session if a request has ended.
     fn after_step(&self, job: &Arc<Job>) {
         loop {
             let next = job.after_step(self.closing.load(Ordering::Relaxed));
@@ -282,8 +282,8 @@ impl StepScheduler {
             }
             job.prepare();
             let shards = job.shards.len();
-            // Others have their turn first. One part is this worker's, which is awake, if nobody waits: through the
-            // queue an idle worker would snatch a job that is in this one's cache.
+            // Jobs in the queue have their turn first. If none waits and the job has one part, this worker runs it at
+            // once: through the queue an idle worker could take a job that is in this worker's cache.
             let is_own = shards == 1 && self.waiting.load(Ordering::Acquire) == 0;
             if !is_own {
                 self.push(job, shards, shards - 1);

@@ -13,7 +13,7 @@ pub struct BatchSettings {
     pub autoreset: Autoreset,
     /// Whether episodes carry receipts.
     pub receipts: bool,
-    /// Whether those of steps are arrays.
+    /// Whether the receipts in replies to steps are arrays.
     pub receipt_arrays: bool,
     /// Whether steps report the reward's terms.
     pub reward_terms: bool,
@@ -26,7 +26,8 @@ pub struct BatchSettings {
 pub struct SlotGroup {
     /// The number of slots, at least 1.
     pub size: usize,
-    /// Fixes all randomness; `environment_index` is that of the group's first slot, and its last slot's fits a u32.
+    /// The settings of the group's episodes, which fix all randomness. `environment_index` is the index of the first
+    /// slot, and the index of the last slot fits a u32.
     pub episodes: Settings,
 }
 
@@ -53,10 +54,10 @@ impl BatchSettings {
 /// The autoreset mode of an environment whose episode has ended (Gymnasium's three modes).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Autoreset {
-    /// The next step ignores its action and resets.
+    /// The next step ignores its action and resets the environment.
     NextStep,
-    /// The last step itself resets.
+    /// The step that ends the episode also resets the environment.
     SameStep,
-    /// Nothing: the client resets.
+    /// The environment is reset only by the client.
     Disabled,
 }

@@ -19,10 +19,10 @@ pub(super) enum Command {
     Open,
     Step,
     Reset(Vec<SlotReset>),
-    /// Begins the next episode everywhere.
+    /// Begins the next episode in every environment.
     ResetAll,
     Snapshot(Vec<usize>),
-    /// Restores all, keeping what was there for [`Command::RollBack`].
+    /// Restores these snapshots. The previous states are kept for [`Command::RollBack`].
     Restore(Vec<(usize, Bytes)>),
     /// Undoes the last restore.
     RollBack,
@@ -37,7 +37,7 @@ pub(super) struct SlotReset {
 }
 
 impl SlotReset {
-    /// The next episode.
+    /// A reset that begins the next episode of the current trial.
     pub(super) fn next_episode(slot: usize) -> Self {
         Self { slot, seed: None, distributions: None, state: None }
     }
@@ -89,14 +89,14 @@ pub(super) struct Shard {
 }
 
 impl Shard {
-    /// A shard of slots from `first_slot` on, whose environments are yet to be made by [`Command::Open`].
+    /// Makes a shard of the slots from `first_slot` on. [`Command::Open`] makes its environments later.
     pub(super) fn new(settings: &BatchSettings, groups: Vec<SlotGroup>, first_slot: usize) -> Self {
         let size = groups.iter().map(|group| group.size).sum();
         Self { groups, command: Command::Open, ..Self::with_environments(settings, Vec::new(), (first_slot, size)) }
     }
 
-    /// A shard of `size` slots from `first_slot` on with these environments; its outputs are unknown yet but for the
-    /// observations.
+    /// Makes a shard of `size` slots from `first_slot` on with these environments. Of its outputs only the observations
+    /// are valid.
     pub(super) fn with_environments(
         settings: &BatchSettings,
         slots: Vec<Episodes>,
@@ -141,7 +141,7 @@ impl Shard {
         shard
     }
 
-    /// Gives its environments away.
+    /// Takes the environments out of the shard.
     pub(super) fn take_slots(&mut self) -> Vec<Episodes> {
         std::mem::take(&mut self.slots)
     }
@@ -228,7 +228,7 @@ impl Shard {
         }
     }
 
-    /// Returns how many environments took a step, and did not begin an episode instead.
+    /// Advances every environment. Returns how many took a step instead of beginning an episode.
     fn step(&mut self) -> usize {
         let (n_terms, mut steps) = (self.terms.len(), 0);
         for slot in 0..self.size {
@@ -341,7 +341,8 @@ pub(super) fn set_actions(shards: &[Mutex<Shard>], actions: &[u8]) {
     for shard in shards {
         let mut shard = lock(shard);
         let Shard { choices, vectors, .. } = &mut *shard;
-        // One of the two is empty. The words come second in each pair, so that none is lost where a shard's part ends.
+        // One of the two is empty. `words` is second in each `zip`: if it were first, `zip` would take and lose a word of
+        // the next shard.
         choices.iter_mut().zip(&mut words).for_each(|(to, from)| *to = u32::from_le_bytes(*from));
         vectors.iter_mut().zip(&mut words).for_each(|(to, from)| *to = f32::from_le_bytes(*from));
     }

@@ -5,7 +5,7 @@ use crate::env::EnvironmentSpec;
 use bytes::Bytes;
 use std::sync::Arc;
 
-/// A handle to queue the step that follows the one under way.
+/// A handle by which a step can be queued behind the running one.
 pub struct StepQueue {
     pub(super) job: Arc<Job>,
     /// The environment of the batch.
@@ -15,10 +15,10 @@ pub struct StepQueue {
 }
 
 impl StepQueue {
-    /// Queues a step with these actions, which were checked, behind the step under way, if there is one. The batch's
-    /// next request must then be that step.
+    /// Queues a step with these checked actions behind the running step, if there is one. The batch's next request must
+    /// then be that step.
     pub fn enqueue(&self, actions: Bytes) {
-        // Who holds it now is at the step's end.
+        // If the lock is taken, a worker is already ending the step, and it is too late to queue another.
         if let Ok(mut pipelined) = self.job.pipelined.try_lock() {
             pipelined.offer(actions);
         }

@@ -29,21 +29,21 @@ pub struct StepResult {
     pub ended: Vec<(u32, EpisodeEnd)>,
     /// Slot and episode; only with receipts.
     pub started: Vec<(u32, EpisodeStart)>,
-    /// u64 `[M, 5]`, of what ended, then of what began; only with receipts as arrays: slot, indices of environment,
-    /// trial and episode, number in the trial.
+    /// u64 `[M, 5]`, only with receipts as arrays: slot, indices of environment, trial and episode, number in the
+    /// trial. The rows of the episodes that ended come before those of the episodes that began.
     pub receipt_episodes: Bytes,
     /// f64 `[M, P + Q]`: requested and applied values.
     pub receipt_values: Bytes,
 }
 
-/// Shards and the buffer that arrays are cut off.
+/// The shards whose outputs are gathered, and the buffer from which the gathered arrays are split off.
 pub(super) struct ShardOutputs<'a> {
     pub(super) shards: &'a [Mutex<Shard>],
     pub(super) buffer: &'a mut BytesMut,
 }
 
 impl ShardOutputs<'_> {
-    /// Takes what the last step left in the shards, the reward's terms if they are wanted.
+    /// Gathers the outputs of the last step from the shards. The reward's terms are left out unless `reward_terms`.
     pub(super) fn step_result(mut self, reward_terms: bool) -> StepResult {
         StepResult {
             observations: self.observations(),
@@ -59,7 +59,7 @@ impl ShardOutputs<'_> {
         }
     }
 
-    /// The present ones of all environments, f32 `[N, O]`.
+    /// Gathers the present observations of all environments, f32 `[N, O]`.
     pub(super) fn observations(&mut self) -> Bytes {
         self.f32(|shard| &shard.observations)
     }

@@ -19,13 +19,13 @@ use std::sync::Mutex;
 pub struct Policy {
     /// The shape of the networks.
     pub spec: PolicySpec,
-    /// The inputs, at their start.
+    /// The inputs of the networks, in their initial state.
     pub inputs: Inputs,
     /// The normalisers of observations and rewards.
     pub normalisers: Normalisers,
     /// The random streams of the actions.
     pub role: PolicyRole,
-    /// The state that it continues from, in training. Without one a trial begins in every environment.
+    /// The saved state from which a training continues. Without one a trial begins in every environment.
     pub state: Option<PlayerState>,
     /// All weights in a row, `[P]`, finite.
     pub weights: Vec<f32>,
@@ -37,27 +37,27 @@ pub struct Policy {
 #[derive(Debug, Clone)]
 #[allow(clippy::large_enum_variant)] // a policy has one
 pub enum PolicyRole {
-    /// A single stream; statistics are updated.
+    /// All actions are drawn from one stream, and statistics are updated.
     Training(ChaCha8Rng),
-    /// A stream of each trial; statistics are frozen.
+    /// The actions of each trial are drawn from a stream of its own, and statistics are frozen.
     Testing {
-        /// With the environment's index and the trial's it fixes the stream.
+        /// The seed. With the indices of the environment and the trial it determines the stream.
         seed: u64,
     },
 }
 
-/// A policy at play, between two steps.
+/// A playing policy, in its state between two steps.
 pub struct PolicyRunner {
     player: Player,
     pub(in crate::pool) task: RemainingRollout,
-    /// In a test.
+    /// The seed of [`PolicyRole::Testing`]; `None` in training.
     seed: Option<u64>,
     /// The outputs of the last step.
     pub(in crate::pool) step: StepBuffers,
     spec: PolicySpec,
 }
 
-/// The outputs of a step of all environments; buffers are used again.
+/// The outputs of a step of all environments. The buffers are reused at each step.
 #[derive(Default)]
 pub(in crate::pool) struct StepBuffers {
     observations: Vec<f32>,
@@ -66,12 +66,12 @@ pub(in crate::pool) struct StepBuffers {
     pub(in crate::pool) truncated: Vec<bool>,
     final_observations: Vec<f32>,
     ended: Vec<SlotEnd>,
-    /// The ends of those episodes, with their slots.
+    /// The ends of the episodes that ended in the step, with their slots.
     pub(in crate::pool) ends: Vec<(u32, EpisodeEnd)>,
 }
 
 impl PolicyRunner {
-    /// Has the policy begin in the environments of `shards`, at the start of a trial or from its saved state.
+    /// Begins with a policy in the environments of `shards`, at the start of a trial or from its saved state.
     pub(in crate::pool) fn begin(policy: Policy, shards: &[Mutex<Shard>]) -> Result<Self, Error> {
         let Policy { spec, inputs, normalisers, role, state, weights, episodes_per_trial } = policy;
         let trials: Vec<(u32, u64)> =
@@ -109,18 +109,18 @@ impl PolicyRunner {
         &self.task
     }
 
-    /// Takes over weights `[P]`.
+    /// Loads new weights `[P]`.
     pub(in crate::pool) fn load(&mut self, weights: &[f32]) -> Result<(), Error> {
         Ok(self.player.load(weights)?)
     }
 
-    /// Begins a task; whether all environments are to be reset before.
+    /// Begins a task. Returns whether all environments must be reset first.
     pub(in crate::pool) fn begin_task(&mut self, task: CollectUntil) -> bool {
         self.task = task.begin(self.player.n_envs());
         matches!(task, CollectUntil::Episodes(_))
     }
 
-    /// Begins the task's episodes in environments that were reset.
+    /// Begins the task's episodes in environments that have just been reset.
     pub(in crate::pool) fn begin_episodes(&mut self, shards: &[Mutex<Shard>]) -> Result<(), Error> {
         let Self { player, task, seed, step, .. } = self;
         step.gather_observations(shards);
@@ -135,14 +135,14 @@ impl PolicyRunner {
         Ok(())
     }
 
-    /// Chooses actions and gives them to the shards; returns them as they are on the wire.
+    /// Chooses actions and gives them to the shards. Returns them in the encoding of the wire.
     pub(in crate::pool) fn act(&mut self, shards: &[Mutex<Shard>]) -> Result<&[u8], Error> {
         let actions = self.player.act()?;
         set_actions(shards, actions);
         Ok(actions)
     }
 
-    /// Takes the outcome of the actions from the shards.
+    /// Gathers the outcome of the actions from the shards.
     pub(in crate::pool) fn observe(&mut self, shards: &[Mutex<Shard>]) -> Result<(), Error> {
         let Self { player, task, step, .. } = self;
         step.gather(shards);

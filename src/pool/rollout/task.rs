@@ -1,8 +1,7 @@
-//! A rollout: the steps of one reply, which a policy plays without a session in between.
+//! A rollout: the steps of one reply to `act`, which a policy plays without involving the session.
 //!
-//! The worker that ends a step's last shard has the rollout take the outcome, choose the next actions and give them to
-//! the shards. Then the job goes to the queue's tail, like that of any other step. The session is woken at the
-//! rollout's end.
+//! The worker that runs a step's last shard gathers the outcome, chooses the next actions and gives them to the shards.
+//! Then the job goes to the queue's tail, like that of any other step. The session is woken at the rollout's end.
 
 use super::policy_runner::{Policy, PolicyRunner};
 use crate::{
@@ -22,7 +21,7 @@ use std::sync::Mutex;
 const MAX_REPLY_BYTES: usize = 4_000_000;
 /// The estimated length of an episode's end without its receipt.
 const EPISODE_END_BYTES: usize = 100;
-/// The steps that buffers are made for at first where the number of steps is not known.
+/// The initial capacity of buffers, in steps, if the number of steps is not known.
 const INITIAL_CAPACITY_STEPS: usize = 256;
 
 /// The parameters of one rollout.
@@ -36,7 +35,7 @@ pub struct RolloutRequest {
     pub task: Option<CollectUntil>,
     /// The maximum number of steps, at least 1.
     pub max_steps: usize,
-    /// Records nothing but the episodes that ended.
+    /// Whether only the episodes that ended are recorded.
     pub only_ended: bool,
 }
 
@@ -63,9 +62,9 @@ pub struct Rollout {
     pub truncated: BytesMut,
     /// f32 `[T, N]`
     pub truncation_values: BytesMut,
-    /// The episodes that ended and count, in order of steps and slots.
+    /// The episodes that ended and count for the task, in order of steps and slots.
     pub ended: Vec<EndedAt>,
-    /// Whether nothing is left of the task.
+    /// Whether the task is done.
     pub finished: bool,
     /// f32 `[N]`: V of the present observations, when finished.
     pub last_values: BytesMut,
@@ -92,11 +91,11 @@ pub struct EndedAt {
 
 /// The event that a rollout waits for.
 enum RolloutPhase {
-    /// The first worker that takes it.
+    /// The rollout has not begun: it waits for a worker.
     Begin,
-    /// All environments to be reset.
+    /// All environments are being reset.
     Reset,
-    /// A step.
+    /// All environments are taking a step.
     Step,
 }
 
@@ -110,18 +109,18 @@ pub(in crate::pool) struct RolloutTask {
 }
 
 impl RolloutTask {
-    /// A rollout of the previous policy, if the request has no new one.
+    /// Makes a rollout. `runner` is the previous policy, which plays if the request has no new one.
     pub(in crate::pool) fn new(request: RolloutRequest, runner: Option<Box<PolicyRunner>>) -> Self {
         Self { request, runner, phase: RolloutPhase::Begin, rollout: Rollout::default(), error: None }
     }
 
-    /// Returns the rollout, with the policy unless it failed.
+    /// Returns the policy and the rollout, or the error with which the rollout failed.
     pub(in crate::pool) fn finish(self) -> Result<(Option<Box<PolicyRunner>>, Rollout), Error> {
         self.error.map_or(Ok((self.runner, self.rollout)), Err)
     }
 
-    /// Takes what the shards did last and tells them what to do next. Returns false at the rollout's end, which comes
-    /// in any case when it is `halted`.
+    /// Records the outcome of the shards' last command and gives them the next one. Returns false at the rollout's end,
+    /// which comes at once if it is `halted`.
     pub(in crate::pool) fn after_step(&mut self, shards: &[Mutex<Shard>], halted: bool) -> bool {
         match self.advance(shards) {
             Ok(goes_on) => goes_on && !halted,
@@ -180,7 +179,7 @@ impl RolloutTask {
 }
 
 impl Rollout {
-    /// Allocates the arrays, and records the memory of the policy where a task `begins`.
+    /// Allocates the arrays, and records the policy's memory if a task `begins`.
     fn begin(&mut self, runner: &PolicyRunner, begins: bool, request: &RolloutRequest) {
         if request.only_ended {
             return;
@@ -231,7 +230,7 @@ impl Rollout {
         push_f32(&mut self.truncation_values, step.truncation_values);
     }
 
-    /// The estimated length in bytes, with another step.
+    /// The estimated length after one more step, bytes.
     fn size(&self) -> usize {
         let arrays = [&self.observations, &self.actions, &self.log_probs, &self.values, &self.rewards];
         let others = [&self.truncation_values, &self.starts, &self.terminated, &self.truncated];
