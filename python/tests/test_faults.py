@@ -320,7 +320,7 @@ def test_proxy_variables_do_not_reach_loopback_and_sockets(
 
 
 def private() -> local_server.LocalServer | None:
-    return local_server._shared.get(None)
+    return local_server._shared.get((local_server.LocalServer, None))
 
 
 def test_private_server_ends_with_last_environment() -> None:
@@ -430,7 +430,7 @@ env.reset(seed=1)
 if {fork}:
     if os.fork() == 0:
         time.sleep(60)
-print(local_server._shared[None].process.pid, flush=True)
+print(local_server._shared[local_server.LocalServer, None].process.pid, flush=True)
 sys.stdin.readline() if {wait} else None
 """
 

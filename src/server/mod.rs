@@ -1,5 +1,6 @@
 //! The server, from gRPC requests to gRPC replies. Each module uses only those below it:
 //!
+//! - [`embedded`]: a server inside of a client's process, without a transport.
 //! - `startup`: startup and shutdown; [`security`]: the files of tokens, TLS and the ledger.
 //! - [`metrics`]: the page that Prometheus scrapes.
 //! - [`api`]: the protocols, with all validation.
@@ -13,6 +14,7 @@
 pub mod api;
 pub mod audit;
 pub mod auth;
+pub mod embedded;
 pub mod error;
 pub mod id;
 pub mod limits;

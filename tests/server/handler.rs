@@ -1,56 +1,77 @@
-//! The handler of a session without gRPC: a request in, a reply out.
+//! The embedded server: the handler of a session without gRPC, a request in, a reply out.
 
-use crate::common::server::{Server, Session, open, step};
+use crate::{
+    acting::game::PLAIN,
+    common::server::{Server, Session, open, step},
+};
+use bytes::Bytes;
 use perturb::{
-    config::Config,
-    pool::Pool,
-    proto::{Render, Reset, SessionRequest, SessionResponse, Snapshot, session_request::Request},
-    render::Renderer,
+    proto::{
+        Open, Render, Reset, Restore, SavePlayer, SessionRequest, Snapshot, act, session_request::Request,
+        session_response::Response,
+    },
     server::{
-        self,
-        api::perturb_v1::session::{ServerContext, Session as Handler},
-        session::{
-            handler::SessionHandler,
-            lease::{LeaseCounters, Leases},
-        },
-        transport::budget::Budget,
+        embedded::{EmbeddedServer, EmbeddedSession},
+        limits::MAX_BYTES_BEFORE_OPEN,
     },
     tasks,
 };
-use std::{sync::Arc, time::Duration};
 
-fn handler() -> Handler {
-    let catalogue = tasks::catalogue();
-    let listing = server::listing(&catalogue, &Config::default()).unwrap();
-    let shared = ServerContext {
-        pool: Arc::new(Pool::new(2, 100).unwrap()),
-        catalogue: Arc::new(catalogue),
-        listing,
-        renderer: Renderer::new(),
-        ledger: None,
-        leases: Leases::new(Duration::ZERO, LeaseCounters::default()),
-    };
-    Handler::new(Arc::new(shared), None, Budget::new(1 << 30))
+async fn answer(session: &mut EmbeddedSession, request: impl Into<Request>) -> Response {
+    let request = SessionRequest { request: Some(request.into()) };
+    session.answer(request).await.unwrap().response.unwrap()
 }
 
 #[tokio::test]
-async fn handler_without_grpc_gives_the_responses_of_a_server() {
+async fn embedded_server_gives_the_responses_of_a_server() {
     let server = Server::start(&[]);
     let mut session = Session::connect(server.unix()).await;
-    let mut handler = handler();
-    let requests: [Request; 7] = [
+    let mut own = EmbeddedServer::start(tasks::catalogue()).unwrap().session();
+    let requests: [Request; 8] = [
         step(vec![0; 4]), // before open, which is refused
         open("CartPole", 8, 7).into(),
         step(vec![0; 32]),
         Render { slot: 3, width: 32, height: 32 }.into(),
         Snapshot { mask: vec![1, 0, 0, 0, 0, 0, 0, 1].into() }.into(),
         Reset { seeds: vec![5; 8], ..Reset::default() }.into(),
-        step(vec![0; 3]), // of a wrong length
+        Reset { seeds: vec![5; 2000], ..Reset::default() }.into(), // more than are counted
+        step(vec![0; 3]),                                          // of a wrong length
     ];
     for request in requests {
-        let reply = handler.answer(SessionRequest { request: Some(request.clone()) }).await;
-        let own = reply.map_or_else(Handler::error_response, |reply| reply.response);
-        let served = SessionResponse { response: Some(session.answer(request).await) };
-        assert_eq!(own, served);
+        assert_eq!(answer(&mut own, request.clone()).await, session.answer(request).await);
     }
+}
+
+#[tokio::test]
+async fn embedded_server_plays_policies_and_restores_as_a_server() {
+    let server = Server::start(&[]);
+    let (mut session, environment) = PLAIN.session(&server).await;
+    let mut own = EmbeddedServer::start(tasks::catalogue()).unwrap().session();
+    answer(&mut own, PLAIN.open()).await;
+    let saved = match answer(&mut own, Snapshot::default()).await {
+        Response::Snapshot(saved) => saved.snapshots,
+        other => panic!("{other:?}"),
+    };
+    let requests: [Request; 5] = [
+        PLAIN.act(&environment, act::Task::Steps(40)).into(),
+        SavePlayer {}.into(),
+        Restore { snapshots: saved, ..Restore::default() }.into(),
+        Restore { snapshots: vec![Bytes::from_static(b"none"); PLAIN.n], ..Restore::default() }.into(),
+        step(vec![0; 4 * PLAIN.n]),
+    ];
+    for request in requests {
+        assert_eq!(answer(&mut own, request.clone()).await, session.answer(request).await);
+    }
+}
+
+#[tokio::test]
+async fn request_that_is_too_large_ends_an_embedded_session() {
+    let server = Server::start(&[]);
+    let mut session = Session::connect(server.unix()).await;
+    let embedded = EmbeddedServer::start(tasks::catalogue()).unwrap();
+    let long = Open { environment: "a".repeat(MAX_BYTES_BEFORE_OPEN), ..Open::default() };
+    session.send(long.clone()).await;
+    let ended = embedded.session().answer(SessionRequest { request: Some(long.into()) }).await.unwrap_err();
+    let expected = session.end().await;
+    assert_eq!((ended.code(), ended.message()), (expected.code(), expected.message()));
 }

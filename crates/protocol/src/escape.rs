@@ -22,7 +22,7 @@ pub(crate) fn escape_catalogue(catalogue: &mut ListEnvironmentsResponse) {
 }
 
 /// Escapes all texts of an environment's description.
-pub(crate) fn escape_environment(environment: &mut Environment) {
+pub fn escape_environment(environment: &mut Environment) {
     let Environment {
         name,
         description,

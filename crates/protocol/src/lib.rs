@@ -40,7 +40,7 @@ pub use connection::{Connection, ResolvedAddresses, Timeouts, connect, connect_a
 pub use distribution::{Distribution, DistributionError, Interval, decimal_comma};
 pub use ended::EndedEpisode;
 pub use error::{ClientError, REPLY_TIMEOUT};
-pub use escape::escape_lines;
+pub use escape::{escape_environment, escape_lines};
 pub use private_server::PrivateServer;
 pub use process_limit::spawn_failure;
 pub use reply::{Malformed, check_observations, check_step};

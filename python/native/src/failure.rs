@@ -32,6 +32,23 @@ pub const UNUSABLE: &str = "unusable";
 /// A policy that cannot be loaded, does not fit, or cannot act.
 pub const POLICY: &str = "policy";
 
+/// Why a request has no reply.
+pub enum RequestFailure {
+    /// The server's sentence; the session lives on.
+    Refused(PyErr),
+    /// The session has ended.
+    Ended(PyErr),
+}
+
+impl RequestFailure {
+    /// The failure for Python.
+    pub fn into_error(self) -> PyErr {
+        match self {
+            Self::Refused(error) | Self::Ended(error) => error,
+        }
+    }
+}
+
 /// gRPC's code of a server that is not trusted, or does not trust.
 const UNAUTHENTICATED: i32 = 16;
 

@@ -1,6 +1,7 @@
 //! The Python package's native module, `perturb._native`: sessions of the protocol, as Python objects and NumPy arrays.
 //!
 //! - [`session`]: a session that waits for its replies without Python's lock, hears of signals, and survives forks.
+//! - [`embedded`]: the server in this process, and its side of a session.
 //! - [`session_runtime`]: the connection under it, which is driven by the thread that waits.
 //! - [`requests`]: requests, made of what Python gives.
 //! - [`arrays`], [`infos`]: replies, as arrays and dictionaries; [`episode_table`]: the episodes that these are made of.
@@ -17,6 +18,7 @@ use pyo3::prelude::*;
 mod arrays;
 mod assessed;
 mod comparison;
+mod embedded;
 mod episode_table;
 mod failure;
 mod infos;
@@ -35,6 +37,8 @@ mod _native {
     use super::assessed::{Assessment, report_page};
     #[pymodule_export]
     use super::comparison::compare;
+    #[pymodule_export]
+    use super::embedded::NativeServer;
     #[pymodule_export]
     use super::failure::Failure;
     #[pymodule_export]

@@ -23,8 +23,8 @@ const POLL_YIELDS: usize = 4;
 /// Further sessions share them, because each runtime takes four file descriptors.
 const MAX_RUNTIMES: usize = 16;
 
-/// Something to wait for, which owns what it needs.
-pub type Pending<T> = Pin<Box<dyn Future<Output = T> + Send>>;
+/// Something to wait for.
+pub type Pending<'a, T> = Pin<&'a mut (dyn Future<Output = T> + Send + 'a)>;
 
 /// Why a wait ended without what it was for.
 pub enum WaitError {
@@ -124,7 +124,7 @@ impl SessionRuntime {
     pub fn wait<T: Send>(
         &self,
         py: Python<'_>,
-        mut pending: Pending<T>,
+        mut pending: Pending<'_, T>,
         deadline: Option<Instant>,
         closing: &Arc<CloseSignal>,
     ) -> Result<T, WaitError> {
@@ -153,6 +153,14 @@ impl SessionRuntime {
                 return Err(WaitError::TimedOut);
             }
         }
+    }
+
+    /// Does on this thread, without Python's lock, what can be done at once and may begin tasks of the runtime.
+    pub fn now<T: Send>(&self, py: Python<'_>, work: impl FnOnce() -> T + Send) -> T {
+        py.detach(|| {
+            let _context = self.reactor.runtime.as_ref().map(Runtime::enter);
+            work()
+        })
     }
 
     /// Lets the connection write what it has, and answer the server's questions whether this side lives. Not for who

@@ -35,6 +35,12 @@ Stepped: TypeAlias = tuple[
     NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_], Events | None
 ]
 
+class NativeServer:
+    """A server of this process. Sessions end with it."""
+
+    def __init__(self) -> None: ...
+    def close(self) -> None: ...
+
 class Session:
     """A stream to a server, which owns a batch of environments."""
 
@@ -48,7 +54,7 @@ class Session:
     def last_ended(self) -> NDArray[np.bool_]: ...
     def __init__(
         self,
-        address: str,
+        server: str | NativeServer,
         timeout: float,
         keepalive: tuple[float, float],
         num_envs: int,

@@ -13,7 +13,7 @@ from .errors import InvalidArgumentError
 
 @dataclass(frozen=True)
 class Address:
-    """Address of a server: `unix:/path`, `host:port`, or with TLS `https://host:port`."""
+    """Address of a server: `unix:/path`, `host:port`, with TLS `https://host:port`, or `embedded`."""
 
     target: str
 
@@ -21,19 +21,25 @@ class Address:
         return self.target
 
 
+# The server that runs in this process.
+EMBEDDED = Address("embedded")
+
+
 def parse_address(text: str) -> Address:
-    """Understand `unix:/path`, `host:port` (`http://` or `tcp://` before it), `https://host:port`, as the learner does.
+    """Understand `unix:/path`, `host:port` (`http://` or `tcp://` before it), `https://host:port`, and `embedded`.
 
     Raises:
         InvalidArgumentError: with what is wrong with it.
     """
 
     def refuse(reason: str) -> InvalidArgumentError:
-        forms = "write unix:/path, host:port, http://host:port or tcp://host:port, with TLS https://host:port"
+        forms = "write unix:/path, [http:// or tcp://]host:port, with TLS https://host:port, or embedded"
         return InvalidArgumentError(f"server={text!r} is not a server's address: {reason}; {forms}")
 
     if not isinstance(text, str):
         raise refuse("it is no text")
+    if text == EMBEDDED.target:
+        return EMBEDDED
     if text.startswith("unix:"):
         path = text.removeprefix("unix:")
         if path.startswith("//"):

@@ -1,8 +1,8 @@
-"""A perturb-server of this process's own, on a private Unix socket.
+"""A perturb-server of this process's own, on a private Unix socket, and how environments share it.
 
 All environments that were made without `server=` share it, those of each `task=` another one. It starts with the first
 and ends with the last. It also ends with this process, however that ends, for this process holds the other end of the
-server's standard input.
+server's standard input. Environments with `server="embedded"` share embedded servers in the same way.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import time
 import weakref
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, Any, Protocol, TypeVar
 
 from .address import Address, parse_address
 from .catalogue import MAX_SOCKET_PATH_BYTES
@@ -145,6 +145,24 @@ class LocalServer:
             raise ServerStartError(f"the private server {program} did not start: {reason}")
 
 
+class OwnServer(Protocol):
+    """A server of this process's own, which environments share."""
+
+    task: TaskFolder | None
+    users: int
+
+    def __init__(self, task: TaskFolder | None = None) -> None: ...
+
+    def end(self) -> None:
+        """End the server. Its sessions should be closed."""
+
+    def exit_status(self) -> int | None:
+        """Tell how it ended; None while it runs."""
+
+
+Server = TypeVar("Server", bound=OwnServer)
+
+
 def _spawn(program: Path, address: Address, task: TaskFolder | None) -> subprocess.Popen[bytes]:
     folder = [] if task is None else ["--task", task.path]
     return subprocess.Popen(
@@ -180,34 +198,35 @@ def _end(process: subprocess.Popen[bytes], directory: str, owner: int) -> None:
 # Every server whose pipe this process holds.
 _running: weakref.WeakSet[LocalServer] = weakref.WeakSet()
 _lock = threading.Lock()
-# The servers that run, by their task's folder; None for the server without one.
-_shared: dict[TaskFolder | None, LocalServer] = {}
+# The servers that run, by their kind and their task's folder; None for the server without one.
+_shared: dict[tuple[type[OwnServer], TaskFolder | None], Any] = {}
 
 
-def acquire(task: TaskFolder | None = None) -> LocalServer:
-    """Share this process's server for a task, or for none; start it if it does not run.
+def acquire(kind: type[Server], task: TaskFolder | None = None) -> Server:
+    """Share this process's server of a kind for a task, or for none; start it if it does not run.
 
     Raises:
         ServerStartError: if there is no program, or it does not start.
     """
     with _lock:
-        server = _shared.get(task)
+        server: Server | None = _shared.get((kind, task))
         if server is None or server.exit_status() is not None:
-            server = LocalServer(task)
-            _shared[task] = server
+            server = kind(task)
+            _shared[kind, task] = server
         server.users += 1
         return server
 
 
-def release(server: LocalServer) -> None:
+def release(server: OwnServer) -> None:
     """Give a share back; the last ends the server."""
     with _lock:
-        if server is not _shared.get(server.task):
+        key = type(server), server.task
+        if server is not _shared.get(key):
             return  # it died and was replaced
         server.users -= 1
         if server.users > 0:
             return
-        del _shared[server.task]
+        del _shared[key]
     server.end()
 
 

@@ -17,7 +17,9 @@ import time
 import weakref
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from . import _native, local_server
+from . import _native, embedded_server, local_server
+from .address import EMBEDDED
+from .embedded_server import EmbeddedServer
 from .errors import (
     InvalidArgumentError,
     OutOfOrderError,
@@ -29,6 +31,7 @@ from .errors import (
     ServerTimeoutError,
     refusal,
 )
+from .local_server import LocalServer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -56,7 +59,9 @@ DEADLINE_EXCEEDED, RESOURCE_EXHAUSTED, OUT_OF_RANGE, UNIMPLEMENTED, UNAUTHENTICA
 
 
 class Session:
-    """The stream. `server` is an address, or None for this process's own server, which serves `task`, too.
+    """The stream. `server` is an address, or None for this process's own server.
+
+    That server, or the embedded one, serves `task`, too.
 
     A session that is lost (the server died, a reply took too long, the wait for it was interrupted) stays lost.
     """
@@ -72,17 +77,19 @@ class Session:
         task: TaskFolder | None = None,
     ) -> None:
         _close_unclosed()
-        self._local: local_server.LocalServer | None = None
+        self._local: LocalServer | EmbeddedServer | None = None
         if server is None:
-            self._local = local_server.acquire(task)
+            self._local = local_server.acquire(LocalServer, task)
             server = self._local.address
+        elif server == EMBEDDED:
+            self._local = local_server.acquire(EmbeddedServer, task)
         self.address: Address = server
         self._owner = os.getpid()
         self._limit = timeout
         self._lost: str | None = None
         self._opened = False
         self._native = _native.Session(
-            str(server),
+            self._local.native if isinstance(self._local, EmbeddedServer) else str(server),
             timeout,
             (KEEPALIVE_INTERVAL, KEEPALIVE_LIMIT),
             num_envs,
@@ -134,7 +141,8 @@ class Session:
 
     def open(self, **request: Any) -> _native.Opened:
         """Create the environments and begin their first episodes."""
-        opened = self._call("open", self._native.open, **request)
+        with self._loading():
+            opened = self._call("open", self._native.open, **request)
         self._opened = True
         return opened
 
@@ -175,7 +183,11 @@ class Session:
 
     def render(self, slot: int, width: int, height: int) -> NDArray[np.uint8]:
         """Draw an environment: [height, width, 3]."""
-        return self._call("render", self._native.render, slot, width, height)
+        with self._loading():
+            return self._call("render", self._native.render, slot, width, height)
+
+    def _loading(self) -> contextlib.AbstractContextManager[object]:
+        return embedded_server.loading if self.address == EMBEDDED else contextlib.nullcontext()
 
     def poll_io(self) -> None:
         """Answer the server's keepalive pings; the keepalive thread calls it."""
@@ -232,33 +244,36 @@ class Session:
 
     def _explain(self, kind: str, what: str, code: int, words: str) -> PerturbError:
         """Say what ended the stream and what to do."""
-        lost = f"lost the server at {self.address} during {kind}"
+        where = "the embedded server" if self.address == EMBEDDED else f"the server at {self.address}"
+        lost = f"lost {where} during {kind}"
         if what == "timed out":
             return ServerTimeoutError(
-                f"the server at {self.address} did not answer {kind} within {self._limit:g} s; "
+                f"{where} did not answer {kind} within {self._limit:g} s; "
                 "look at its log, or give slow environments more time with timeout="
             )
         if what == "mismatch":
-            return ProtocolError(f"the server at {self.address} answered {kind} with {words}: are both of one version?")
+            return ProtocolError(f"{where} answered {kind} with {words}: are both of one version?")
         if code == RESOURCE_EXHAUSTED:
-            return ServerFullError(f"the server at {self.address} refused {kind}: {words}")
+            return ServerFullError(f"{where} refused {kind}: {words}")
         if code == OUT_OF_RANGE:
             return InvalidArgumentError(
-                f"the server at {self.address} refused {kind}, which is too large for it: {words}; "
+                f"{where} refused {kind}, which is too large for it: {words}; "
                 "start it with a larger --max-message-bytes, or use fewer environments"
             )
         if code == UNAUTHENTICATED and what == "unreachable":  # certificates, or the files that variables name
-            return ServerConnectionError(f"no safe connection to the server at {self.address}: {words}")
+            return ServerConnectionError(f"no safe connection to {where}: {words}")
         if code == UNAUTHENTICATED:
-            return ServerConnectionError(f"the server at {self.address} does not let this process in: {words}")
+            return ServerConnectionError(f"{where} does not let this process in: {words}")
         if code == UNIMPLEMENTED:
             return ProtocolError(f"what answers at {self.address} is no perturb-server: {words}")
-        if self._local is not None:
+        if isinstance(self._local, LocalServer):
             with contextlib.suppress(subprocess.TimeoutExpired):
                 status = self._local.process.wait(1)
                 return ServerConnectionError(
                     f"{lost}: this process's perturb-server ended with status {status}; reset() starts another"
                 )
+        if self.address == EMBEDDED:
+            return ServerConnectionError(f"{lost}: {words}; reset() begins anew")
         if not self._opened:
             return ServerConnectionError(
                 f"no server answers at {self.address}: {words}; "
@@ -285,7 +300,7 @@ def _listen(address: Address) -> str:
 
 
 # Resources of a session that have to be closed: the stream, the private server, and the process that opened it.
-_Resources: TypeAlias = "tuple[_native.Session, local_server.LocalServer | None, int]"
+_Resources: TypeAlias = "tuple[_native.Session, LocalServer | EmbeddedServer | None, int]"
 # Resources of sessions that nobody closed. The next session that is opened or closed closes them, or the thread does.
 _unclosed: collections.deque[_Resources] = collections.deque()
 
@@ -296,7 +311,7 @@ def _close_unclosed() -> None:
             _close(*_unclosed.popleft())
 
 
-def _close(native: _native.Session, local: local_server.LocalServer | None, owner: int) -> None:
+def _close(native: _native.Session, local: LocalServer | EmbeddedServer | None, owner: int) -> None:
     if os.getpid() != owner:
         return  # what a forked process inherited is the parent's
     native.close()

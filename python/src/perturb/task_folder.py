@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import _native, catalogue, local_server
+from .address import EMBEDDED
 from .catalogue import Description
 from .errors import InvalidArgumentError, ServerStartError
 from .local_server import TaskFolder
@@ -36,7 +37,7 @@ def find_folder(task: str | os.PathLike[str] | None, server: object = None) -> T
         return None
     if not isinstance(task, str | os.PathLike):
         raise InvalidArgumentError(f"task={task!r}; expected the path of a folder with a task.toml")
-    if server is not None:
+    if server is not None and str(server) != EMBEDDED.target:
         raise InvalidArgumentError(
             f"task={os.fspath(task)!r} is for a server of this process's own, and server={str(server)!r} is another's: "
             "leave server= out, or start that server with `perturb-server --task DIR` and leave task= out"
@@ -109,7 +110,7 @@ def describe(
     try:
         return catalogue.find(environment)
     except InvalidArgumentError:
-        if server is None or not isinstance(environment, str):
+        if server is None or server == EMBEDDED or not isinstance(environment, str):
             raise
         served = _served(server, timeout)
         for description in served:

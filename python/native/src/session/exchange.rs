@@ -1,13 +1,16 @@
 //! Exchange of requests and replies by one thread of the process that opened the stream.
 
+use std::pin::pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use perturb_protocol::{ClientError, Connection, Stream, TypedRequest};
+use perturb_protocol::TypedRequest;
 use pyo3::prelude::*;
 
 use super::Session;
-use crate::failure::{self, TIMED_OUT, UNUSABLE, failure};
+use super::transport::Transport;
+use crate::embedded::poll_once;
+use crate::failure::{RequestFailure, TIMED_OUT, UNUSABLE, failure};
 use crate::infos::InfoKeys;
 use crate::session_runtime::{SessionRuntime, WaitError};
 
@@ -20,10 +23,9 @@ pub(super) enum SessionState {
     Ended,
 }
 
-/// An open session. The stream is dropped before the runtime that drives it.
+/// An open session. The transport is dropped before the runtime that drives it.
 pub(super) struct OpenSession {
-    pub(super) stream: Stream,
-    pub(super) connection: Connection,
+    pub(super) transport: Transport,
     pub(super) runtime: SessionRuntime,
     pub(super) labels: Arc<InfoKeys>,
     /// Steps that were sent and not received.
@@ -117,46 +119,42 @@ impl Session {
     fn exchange<A>(
         &self,
         py: Python<'_>,
-        open: Box<OpenSession>,
+        mut open: Box<OpenSession>,
         request: Option<A>,
     ) -> PyResult<(Arc<InfoKeys>, A::Reply)>
     where
         A: TypedRequest + Send + 'static,
         A::Reply: Send,
     {
-        let OpenSession { mut stream, connection, runtime, labels, under_way } = *open;
-        let pending = Box::pin(async move {
-            let reply = match request {
-                Some(request) => stream.ask(request).await,
-                None => stream.receive::<A>().await,
-            };
-            (stream, reply)
-        });
-        let (stream, reply) = match runtime.wait(py, pending, self.deadline(), &self.closing) {
-            Ok(come) => come,
-            Err(broken) => {
-                // The reply to come would be taken for that to the next request.
-                drop(connection);
-                py.detach(|| runtime.poll_io());
-                self.end();
-                return Err(explain(broken));
+        let OpenSession { transport, runtime, labels, .. } = &mut *open;
+        let (labels, is_embedded) = (Arc::clone(labels), transport.is_embedded());
+        let come = {
+            let mut pending = pin!(transport.exchange(request));
+            // An embedded server is mostly done at once.
+            let come = if is_embedded { runtime.now(py, || poll_once(pending.as_mut())) } else { None };
+            match come {
+                Some(come) => Ok(come),
+                None => runtime.wait(py, pending, self.deadline(), &self.closing),
             }
         };
-        match reply {
-            Ok(reply) => {
-                self.put_back(
-                    py,
-                    Box::new(OpenSession { stream, connection, runtime, labels: Arc::clone(&labels), under_way }),
-                );
+        match come {
+            Ok(Ok(reply)) => {
+                self.put_back(py, open);
                 Ok((labels, reply))
             }
-            Err(error @ ClientError::Refused { .. }) => {
-                self.put_back(py, Box::new(OpenSession { stream, connection, runtime, labels, under_way }));
-                Err(failure::from_client(&error))
+            Ok(Err(RequestFailure::Refused(error))) => {
+                self.put_back(py, open);
+                Err(error)
             }
-            Err(error) => {
+            Ok(Err(RequestFailure::Ended(error))) => {
                 self.end();
-                Err(failure::from_client(&error))
+                Err(error)
+            }
+            Err(broken) => {
+                // The reply to come would be taken for that to the next request.
+                open.close(py);
+                self.end();
+                Err(explain(broken))
             }
         }
     }
@@ -175,9 +173,14 @@ impl Drop for Session {
 impl OpenSession {
     /// Tells the server, so that it frees the environments even where another process has the socket, too.
     pub(super) fn close(self, py: Python<'_>) {
-        let Self { stream, connection, runtime, .. } = self;
-        drop((stream, connection));
-        py.detach(|| runtime.poll_io());
+        let Self { transport, runtime, .. } = self;
+        let is_embedded = transport.is_embedded();
+        py.detach(|| {
+            drop(transport);
+            if !is_embedded {
+                runtime.poll_io();
+            }
+        });
     }
 }
 

@@ -1,12 +1,15 @@
 //! A session as Python has it. Whatever it raises is a [`Failure`](crate::failure::Failure), or what a signal's handler
 //! raised.
 //!
-//! - [`exchange`]: who has the stream, requests and replies.
+//! - [`exchange`]: who has the session, requests and replies.
+//! - [`transport`]: the gRPC stream, or the embedded server.
 //! - [`opened`]: what opening it gave.
 
 mod exchange;
 mod opened;
+mod transport;
 
+use std::pin::pin;
 use std::str::FromStr;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -14,18 +17,21 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use numpy::{PyArray1, PyArray2, PyArray3};
 use perturb_protocol::proto;
-use perturb_protocol::{Address, ClientError, Stream, Timeouts, check_observations, check_step, connect};
+use perturb_protocol::{Address, ClientError, Timeouts, check_observations, check_step, connect};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use crate::arrays;
-use crate::failure::{self, INVALID, MALFORMED, UNREACHABLE, UNUSABLE, failure, malformed};
+use crate::embedded::poll_once;
+use crate::failure::{self, INVALID, MALFORMED, RequestFailure, UNREACHABLE, UNUSABLE, failure, malformed};
 use crate::infos::{Events, InfoKeys};
 use crate::requests::{self, Actions, IntervalsByName};
 use crate::session_runtime::{CloseSignal, SessionRuntime};
 use exchange::{OpenSession, OpeningGuard, SessionState, duration, explain, unpoisoned};
+use transport::SessionServer;
 
 pub use opened::Opened;
+pub use transport::NamedServer;
 
 /// Maximum number of steps under way, whose replies are kept until they are received.
 const MAX_STEPS_UNDER_WAY: usize = 64;
@@ -38,11 +44,10 @@ type StepArrays<'py> = (
     Option<Events>,
 );
 
-/// A stream to a server, which owns a batch of environments.
+/// A session of a server, which owns a batch of environments.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Session {
-    address: Address,
-    patience: Timeouts,
+    server: SessionServer,
     /// Limit for a reply; `None` for no limit.
     timeout: Mutex<Option<Duration>>,
     actions: Actions,
@@ -67,12 +72,12 @@ struct LastStep {
 
 #[pymethods]
 impl Session {
-    /// Times are in seconds, and may be infinite. `action_size` is None for choices; of a `single` environment actions
+    /// The server is an address, or the embedded server. Times are in seconds, and may be infinite. `action_size` is None for choices; of a `single` environment actions
     /// have no first axis.
     #[new]
-    #[pyo3(signature = (address, timeout, keepalive, num_envs, observation_size, action_size, single))]
+    #[pyo3(signature = (server, timeout, keepalive, num_envs, observation_size, action_size, single))]
     fn new(
-        address: &str,
+        server: NamedServer<'_>,
         timeout: f64,
         keepalive: (f64, f64),
         num_envs: usize,
@@ -80,16 +85,14 @@ impl Session {
         action_size: Option<usize>,
         single: bool,
     ) -> PyResult<Self> {
-        let address = Address::from_str(address).map_err(|error| failure(INVALID, 0, error.to_string()))?;
         let forever = |seconds| duration(seconds).unwrap_or(Duration::MAX);
-        let patience = Timeouts {
+        let timeouts = Timeouts {
             reply: Duration::MAX, // waits have a limit of their own, which can be changed
             keepalive_interval: forever(keepalive.0),
             keepalive_limit: forever(keepalive.1),
         };
         Ok(Self {
-            address,
-            patience,
+            server: SessionServer::new(&server, timeouts)?,
             timeout: Mutex::new(duration(timeout)),
             actions: Actions { num_envs, size: action_size, single },
             observation_size,
@@ -182,15 +185,9 @@ impl Session {
         }
         let unopened = OpeningGuard(self);
         let runtime = SessionRuntime::new().map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
-        let (address, patience) = (self.address.clone(), self.patience);
-        let opening = Box::pin(async move {
-            let connection = connect(&address, patience).await?;
-            let (stream, opened) = Stream::open(&connection, request).await?;
-            Ok((connection, stream, opened))
-        });
-        let come: Result<_, ClientError> =
-            runtime.wait(py, opening, self.deadline(), &self.closing).map_err(explain)?;
-        let (connection, stream, opened) = come.map_err(|error| failure::from_client(&error))?;
+        let opening = pin!(self.server.clone().open(request));
+        let come = runtime.wait(py, opening, self.deadline(), &self.closing).map_err(explain)?;
+        let (transport, opened) = come.map_err(RequestFailure::into_error)?;
         // An older server leaves parameters out of observations, which the package reports better.
         if opened.observes_parameters == observe_parameters {
             check_observations(&opened.observations, n, self.observation_size).map_err(|error| malformed(&error))?;
@@ -200,7 +197,7 @@ impl Session {
         let events = Events::begun(&labels, opened.started)?;
         *unpoisoned(&self.last) = LastStep { observations: opened.observations.clone(), ..LastStep::default() };
         std::mem::forget(unopened);
-        self.put_back(py, Box::new(OpenSession { stream, connection, runtime, labels, under_way: 0 }));
+        self.put_back(py, Box::new(OpenSession { transport, runtime, labels, under_way: 0 }));
         Ok(Opened {
             environment: perturb_protocol::catalogue::environment(&served).to_string(),
             observes_parameters: opened.observes_parameters,
@@ -228,21 +225,27 @@ impl Session {
     fn send(&self, py: Python<'_>, actions: &Bound<'_, PyAny>, encode: &Bound<'_, PyAny>) -> PyResult<()> {
         let request = proto::Step { actions: self.actions.encode(actions, encode)? };
         let mut open = self.take(MAX_STEPS_UNDER_WAY - 1)?;
-        let OpenSession { mut stream, connection, runtime, labels, under_way } = *open;
-        let sending = Box::pin(async move {
-            let sent = stream.send_ahead(request).await;
-            (stream, sent)
-        });
-        match runtime.wait(py, sending, self.deadline(), &self.closing) {
-            Ok((stream, Ok(()))) => {
-                py.detach(|| runtime.poll_io());
-                open = Box::new(OpenSession { stream, connection, runtime, labels, under_way: under_way + 1 });
+        let OpenSession { transport, runtime, under_way, .. } = &mut *open;
+        let is_embedded = transport.is_embedded();
+        let sent = {
+            let mut sending = pin!(transport.send(request));
+            match is_embedded.then(|| runtime.now(py, || poll_once(sending.as_mut()))).flatten() {
+                Some(sent) => Ok(sent),
+                None => runtime.wait(py, sending, self.deadline(), &self.closing),
+            }
+        };
+        match sent {
+            Ok(Ok(())) => {
+                *under_way += 1;
+                if !is_embedded {
+                    py.detach(|| runtime.poll_io());
+                }
                 self.put_back(py, open);
                 Ok(())
             }
-            Ok((_, Err(error))) => {
+            Ok(Err(failed)) => {
                 self.end();
-                Err(failure::from_client(&error))
+                Err(failed.into_error())
             }
             Err(broken) => {
                 self.end();
@@ -332,7 +335,9 @@ impl Session {
         }
         // Locked and unlocked without Python's lock: who has that one may wait for this one.
         py.detach(|| {
-            if let Ok(SessionState::Idle(open)) = self.state.try_lock().as_deref() {
+            if let Ok(SessionState::Idle(open)) = self.state.try_lock().as_deref()
+                && !open.transport.is_embedded()
+            {
                 open.runtime.poll_io();
             }
         });
@@ -404,7 +409,7 @@ impl Session {
 pub fn catalogue(py: Python<'_>, address: &str, timeout: f64) -> PyResult<String> {
     let address = Address::from_str(address).map_err(|error| failure(INVALID, 0, error.to_string()))?;
     let runtime = SessionRuntime::new().map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
-    let asking = Box::pin(async move { connect(&address, Timeouts::default()).await?.catalogue().await });
+    let asking = pin!(async move { connect(&address, Timeouts::default()).await?.catalogue().await });
     let deadline = duration(timeout).and_then(|timeout| Instant::now().checked_add(timeout));
     let come: Result<_, ClientError> = runtime.wait(py, asking, deadline, &Arc::default()).map_err(explain)?;
     Ok(perturb_protocol::catalogue::to_json(&come.map_err(|error| failure::from_client(&error))?).to_string())

@@ -1,0 +1,177 @@
+//! The embedded server: the same pool and the same handler of sessions as in `perturb-server`, in this process.
+
+use std::collections::VecDeque;
+use std::future::Future;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::task::{Context, Poll, Waker};
+
+use perturb::server::embedded as server;
+use perturb::tasks;
+use perturb_protocol::proto::{self, SessionRequest, SessionResponse, session_response::Response};
+use perturb_protocol::{TypedRequest, escape_lines};
+use pyo3::prelude::*;
+use tonic::Status;
+
+use crate::failure::{LOST, MISMATCH, REFUSED, RequestFailure, UNREACHABLE, failure};
+
+/// A server of this process. Sessions end with it.
+#[pyclass(frozen, module = "perturb._native")]
+pub struct NativeServer {
+    /// None after its end.
+    server: Mutex<Option<Arc<server::EmbeddedServer>>>,
+    /// The process that made it.
+    owner: u32,
+}
+
+#[pymethods]
+impl NativeServer {
+    /// Starts the server's threads.
+    #[new]
+    fn new(py: Python<'_>) -> PyResult<Self> {
+        let started = py.detach(|| server::EmbeddedServer::start(tasks::catalogue()));
+        let server = started.map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
+        Ok(Self { server: Mutex::new(Some(Arc::new(server))), owner: std::process::id() })
+    }
+
+    /// Ends the threads. Sessions should be closed.
+    fn close(&self, py: Python<'_>) {
+        if std::process::id() == self.owner {
+            let server = self.server.lock().unwrap_or_else(PoisonError::into_inner).take();
+            py.detach(|| drop(server));
+        }
+    }
+}
+
+impl NativeServer {
+    /// A way to the server that does not keep it alive.
+    pub fn handle(&self) -> Weak<server::EmbeddedServer> {
+        self.server.lock().unwrap_or_else(PoisonError::into_inner).as_ref().map(Arc::downgrade).unwrap_or_default()
+    }
+}
+
+impl Drop for NativeServer {
+    fn drop(&mut self) {
+        if std::process::id() != self.owner {
+            // A forked process has none of the threads that would be waited for.
+            std::mem::forget(self.server.get_mut().unwrap_or_else(PoisonError::into_inner).take());
+        }
+    }
+}
+
+/// The answer to a request: a response, or the status that ends the session.
+type Answer = Result<SessionResponse, Status>;
+/// A request under way, which owns the session meanwhile.
+type StepUnderWay = Pin<Box<dyn Future<Output = (server::EmbeddedSession, Answer)> + Send>>;
+
+/// A session of the embedded server. Steps may be sent ahead; replies are taken in the order of their requests.
+pub struct EmbeddedStream {
+    /// None while a step that was sent ahead is under way.
+    session: Option<server::EmbeddedSession>,
+    running: Option<StepUnderWay>,
+    /// Takes the step after the running one, unless that has come.
+    offer: Option<Box<dyn FnOnce(SessionRequest) + Send>>,
+    /// Steps that wait for the running one.
+    waiting: VecDeque<SessionRequest>,
+    /// Answers that nobody has taken.
+    answers: VecDeque<Answer>,
+}
+
+impl EmbeddedStream {
+    /// Begins a session.
+    ///
+    /// # Errors
+    /// If the server was closed.
+    pub fn new(server: &Weak<server::EmbeddedServer>) -> PyResult<Self> {
+        let server = server.upgrade().ok_or_else(|| failure(UNREACHABLE, 0, "the embedded server was closed"))?;
+        let session = Some(server.session());
+        Ok(Self { session, running: None, offer: None, waiting: VecDeque::new(), answers: VecDeque::new() })
+    }
+
+    /// Makes a request and takes its reply. No step may be under way.
+    ///
+    /// # Errors
+    /// [`RequestFailure`].
+    pub async fn ask<A: TypedRequest>(&mut self, request: A) -> Result<A::Reply, RequestFailure> {
+        let session = self.session.as_mut().ok_or_else(defect)?;
+        reply::<A>(session.answer(SessionRequest { request: Some(request.into()) }).await)
+    }
+
+    /// Begins a step, or has it wait for those before it. Needs the context of a runtime.
+    pub fn send(&mut self, step: proto::Step) {
+        let request = SessionRequest { request: Some(step.into()) };
+        self.waiting.push_back(request);
+        self.offer_next();
+        self.advance();
+    }
+
+    /// Waits for the oldest step.
+    ///
+    /// # Errors
+    /// [`RequestFailure`].
+    pub async fn receive<A: TypedRequest>(&mut self) -> Result<A::Reply, RequestFailure> {
+        if let Some(answer) = self.answers.pop_front() {
+            return reply::<A>(answer);
+        }
+        let (session, answer) = self.running.as_mut().ok_or_else(defect)?.await;
+        (self.session, self.running, self.offer) = (Some(session), None, None);
+        self.advance();
+        reply::<A>(answer)
+    }
+
+    /// Begins steps that wait, as long as each is done at once.
+    fn advance(&mut self) {
+        while self.running.is_none() {
+            let Some(request) = self.waiting.pop_front() else { return };
+            let Some(mut session) = self.session.take() else { return };
+            self.offer = session.pipeline(&request).map(|offer| Box::new(offer) as Box<_>);
+            let mut running: StepUnderWay = Box::pin(async move {
+                let answer = session.answer(request).await;
+                (session, answer)
+            });
+            match poll_once(running.as_mut()) {
+                Some((session, answer)) => {
+                    (self.session, self.offer) = (Some(session), None);
+                    self.answers.push_back(answer);
+                }
+                None => {
+                    self.running = Some(running);
+                    self.offer_next();
+                }
+            }
+        }
+    }
+
+    /// Offers the next step to the pool, so that it begins when the running one ends.
+    fn offer_next(&mut self) {
+        if let Some(next) = self.waiting.front()
+            && let Some(offer) = self.offer.take()
+        {
+            offer(next.clone()); // the bytes of its actions are shared
+        }
+    }
+}
+
+fn reply<A: TypedRequest>(answer: Answer) -> Result<A::Reply, RequestFailure> {
+    match answer.map(|answer| answer.response) {
+        Ok(Some(Response::Error(proto::Error { code, message }))) => {
+            Err(RequestFailure::Refused(failure(REFUSED, code, escape_lines(&message))))
+        }
+        Ok(Some(response)) => A::reply(response).map_err(|other| RequestFailure::Ended(failure(MISMATCH, 0, other))),
+        Ok(None) => Err(RequestFailure::Ended(failure(MISMATCH, 0, "an empty reply"))),
+        Err(status) => Err(RequestFailure::Ended(failure(LOST, status.code() as i32, escape_lines(status.message())))),
+    }
+}
+
+/// The failure of a stream that is used in a wrong order.
+fn defect() -> RequestFailure {
+    RequestFailure::Ended(failure(MISMATCH, 0, "no session: a defect of the native module"))
+}
+
+/// Polls a future once. A result that is there at once costs no more.
+pub fn poll_once<T>(future: Pin<&mut (dyn Future<Output = T> + Send + '_)>) -> Option<T> {
+    match future.poll(&mut Context::from_waker(Waker::noop())) {
+        Poll::Ready(come) => Some(come),
+        Poll::Pending => None,
+    }
+}

@@ -1,0 +1,104 @@
+//! The two ways of a session to its server: a gRPC stream, or the embedded server.
+
+use std::str::FromStr;
+use std::sync::Weak;
+
+use perturb::server::embedded;
+use perturb_protocol::{Address, ClientError, Connection, Stream, Timeouts, TypedRequest, connect, proto};
+use pyo3::prelude::*;
+
+use crate::embedded::{EmbeddedStream, NativeServer};
+use crate::failure::{self, INVALID, RequestFailure, failure};
+
+/// A server, as Python names it.
+#[derive(FromPyObject)]
+pub enum NamedServer<'py> {
+    /// The address of a server.
+    Address(String),
+    /// The embedded server.
+    Embedded(PyRef<'py, NativeServer>),
+}
+
+/// The server of a session.
+#[derive(Clone)]
+pub(super) enum SessionServer {
+    Address(Address, Timeouts),
+    /// The session does not keep it alive until it is open.
+    Embedded(Weak<embedded::EmbeddedServer>),
+}
+
+impl SessionServer {
+    /// Understands what Python gave.
+    pub(super) fn new(named: &NamedServer<'_>, timeouts: Timeouts) -> PyResult<Self> {
+        match named {
+            NamedServer::Address(address) => {
+                let address = Address::from_str(address).map_err(|error| failure(INVALID, 0, error.to_string()))?;
+                Ok(Self::Address(address, timeouts))
+            }
+            NamedServer::Embedded(server) => Ok(Self::Embedded(server.handle())),
+        }
+    }
+
+    /// Opens a session.
+    pub(super) async fn open(self, request: proto::Open) -> Result<(Transport, proto::Opened), RequestFailure> {
+        match self {
+            Self::Address(address, timeouts) => {
+                let connection = connect(&address, timeouts).await.map_err(failed)?;
+                let (stream, opened) = Stream::open(&connection, request).await.map_err(failed)?;
+                Ok((Transport::Stream { stream, connection }, opened))
+            }
+            Self::Embedded(server) => {
+                let mut stream = EmbeddedStream::new(&server).map_err(RequestFailure::Ended)?;
+                let mut opened = stream.ask(request).await?;
+                opened.environment.iter_mut().for_each(perturb_protocol::escape_environment);
+                Ok((Transport::Embedded(stream), opened))
+            }
+        }
+    }
+}
+
+/// The way of an open session's requests and replies. A stream is dropped before its connection.
+pub(super) enum Transport {
+    Stream {
+        stream: Stream,
+        #[expect(dead_code, reason = "held")]
+        connection: Connection,
+    },
+    Embedded(EmbeddedStream),
+}
+
+impl Transport {
+    /// Whether nothing has to be written to or read from a connection.
+    pub(super) fn is_embedded(&self) -> bool {
+        matches!(self, Self::Embedded(_))
+    }
+
+    /// Sends a request, or none if it was sent before, and takes the reply.
+    pub(super) async fn exchange<A: TypedRequest>(&mut self, request: Option<A>) -> Result<A::Reply, RequestFailure> {
+        match (self, request) {
+            (Self::Stream { stream, .. }, Some(request)) => stream.ask(request).await.map_err(failed),
+            (Self::Stream { stream, .. }, None) => stream.receive::<A>().await.map_err(failed),
+            (Self::Embedded(stream), Some(request)) => stream.ask(request).await,
+            (Self::Embedded(stream), None) => stream.receive::<A>().await,
+        }
+    }
+
+    /// Sends a step whose reply is taken later.
+    pub(super) async fn send(&mut self, step: proto::Step) -> Result<(), RequestFailure> {
+        match self {
+            Self::Stream { stream, .. } => stream.send_ahead(step).await.map_err(failed),
+            Self::Embedded(stream) => {
+                stream.send(step);
+                Ok(())
+            }
+        }
+    }
+}
+
+fn failed(error: ClientError) -> RequestFailure {
+    let failure = failure::from_client(&error);
+    match error {
+        ClientError::Refused { .. } => RequestFailure::Refused(failure),
+        _ => RequestFailure::Ended(failure),
+    }
+}

@@ -1,0 +1,44 @@
+"""The embedded server: what perturb-server does, in this process, without a connection."""
+
+from __future__ import annotations
+
+import os
+import threading
+from typing import TYPE_CHECKING
+
+from . import _native
+from .address import EMBEDDED
+from .errors import ServerStartError
+
+if TYPE_CHECKING:
+    from .local_server import TaskFolder
+
+# Held while models are loaded or drawn, and by forks. A process that was forked in the middle of it would inherit locks
+# that nobody opens.
+loading = threading.RLock()
+
+
+class EmbeddedServer:
+    """A running server of this process, which ends its threads when it is ended."""
+
+    address = EMBEDDED
+
+    def __init__(self, task: TaskFolder | None = None) -> None:
+        self.task = task
+        self.users = 0
+        try:
+            with loading:
+                self.native = _native.NativeServer()
+        except _native.Failure as error:
+            raise ServerStartError(f"the embedded server did not start: {error.args[2]}") from None
+
+    def end(self) -> None:
+        """End the server's threads. Its sessions should be closed."""
+        self.native.close()
+
+    def exit_status(self) -> int | None:
+        """Return None: it runs as long as this process does."""
+        return None
+
+
+os.register_at_fork(before=loading.acquire, after_in_parent=loading.release, after_in_child=loading.release)
