@@ -147,7 +147,8 @@ impl Kernel for RecurrentStep<'_> {
     }
 }
 
-/// Replaces c' by c and what is in `h` by h; `sums` are i, f, g and o, and serve as room.
+/// Replaces the old cell states in `c` by the new ones, and `h` by the new outputs. `sums` holds i, f, g and o before their
+/// nonlinearities, and is overwritten.
 #[inline(always)]
 fn cell(sums: &mut [f32], h: &mut [f32], c: &mut [f32]) {
     let width = c.len();

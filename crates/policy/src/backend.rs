@@ -10,11 +10,11 @@ use crate::recurrent::{RecurrentDifferentiator, recurrent_differentiator};
 use crate::samples::SequenceSamples;
 use crate::spec::PolicySpec;
 
-/// The backend of a policy of shape `spec`. A feed-forward policy's computes with `threads` threads, at least 1, whose number
-/// changes no byte. A recurrent policy's ignores `threads`.
+/// The backend of a policy of shape `spec`. For a feed-forward policy it computes with `threads` threads, at least 1, whose
+/// number changes no byte. For a recurrent policy it ignores `threads`.
 ///
 /// # Errors
-/// Threads that cannot be started; a recurrent policy in a process where nothing is registered to differentiate it.
+/// Threads that cannot be started; a recurrent policy in a process without a registered library for recurrent policies.
 pub fn gradient_backend(spec: &PolicySpec, threads: usize) -> Result<Box<dyn GradientBackend>> {
     Ok(match spec.lstm {
         None => Box::new(Differentiator::new(spec, threads)?),

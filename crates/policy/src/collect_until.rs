@@ -28,9 +28,9 @@ pub enum RemainingRollout {
 pub struct EpisodeQuotas {
     /// `[N]`
     left: Vec<usize>,
-    /// `[N]` where the next step counts.
+    /// `[N]` whether the next step counts.
     active: Vec<bool>,
-    /// `[N]` where the last step counted.
+    /// `[N]` whether the last step counted.
     stepped: Vec<bool>,
 }
 
@@ -70,13 +70,13 @@ impl RemainingRollout {
         }
     }
 
-    /// `[N]` where the last step counted; `None` means everywhere.
+    /// `[N]` whether the last step counted; `None` if it counted everywhere.
     pub fn stepped(&self) -> Option<&[bool]> {
         if let Self::Episodes(quotas) = self { Some(&quotas.stepped) } else { None }
     }
 
-    /// `[N]` where the next step will count; `None` means everywhere. The observation after an environment's last episode
-    /// belongs to an episode that is not collected.
+    /// `[N]` whether the next step will count; `None` if it will count everywhere. The observation after an environment's
+    /// last episode belongs to an episode that is not collected.
     pub fn active(&self) -> Option<&[bool]> {
         if let Self::Episodes(quotas) = self { Some(&quotas.active) } else { None }
     }

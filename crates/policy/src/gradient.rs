@@ -1,4 +1,4 @@
-//! The interface to what computes a policy's gradient.
+//! The interface of gradient backends.
 
 use crate::act::Actor;
 use crate::error::Result;
@@ -45,13 +45,13 @@ pub trait GradientBackend {
 }
 
 /// A rollout as M sequences, each of which the policy must see whole. A recurrent policy needs the steps of an environment
-/// in order: M = N. A feed-forward one takes every sample by itself: M = T·N, or those of them that are samples.
+/// in order: M = N. A feed-forward policy takes every sample by itself: M is the number of samples, T·N without padding.
 pub enum GradientBatch<'a> {
     /// A batch of a feed-forward policy.
     FeedForward {
         /// The rollout.
         samples: Samples<'a>,
-        /// The places of the samples in it.
+        /// The indices of the samples in the rollout.
         indices: Vec<u32>,
         /// The distributions of the policy that acted, if they were remembered.
         acting: Option<ActingOutputs>,

@@ -1,5 +1,5 @@
-//! Functions that give the same bytes on every processor: the C library's choose their instructions by it, and round
-//! differently.
+//! Functions that give the same bytes on every processor. The C library's choose their instructions by the processor, and
+//! round differently.
 
 /// eˣ.
 pub fn exp(x: f32) -> f32 {

@@ -143,8 +143,9 @@ impl ObservationNormaliser {
         ObservationNormaliser { moments, left_alone: 0 }
     }
 
-    /// Adds `left_alone` elements at the end of observations, which are not normalised: observed parameters are scaled
-    /// already. They may be the same throughout a training, and statistics of it would stretch them without bound.
+    /// Adds `left_alone` elements at the end of observations, which are not normalised. Observed parameters are such
+    /// elements, since they are scaled already. They may also be constant throughout a training, and a division by their
+    /// deviation would then stretch later differences without bound.
     #[must_use]
     pub fn leaving_alone(self, left_alone: usize) -> Self {
         ObservationNormaliser { left_alone, ..self }

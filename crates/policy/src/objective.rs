@@ -10,8 +10,8 @@ use crate::spec::ActionKind;
 pub enum Surrogate {
     /// The policy gradient's: -1/B Σ_b advantage_b log π(a_b | s_b). Mnih et al. (2016), arXiv:1602.01783.
     PolicyGradient,
-    /// PPO's clipped one, Schulman et al. (2017), arXiv:1707.06347, equation 7, negated: with the ratio
-    /// ρ_b = π(a_b | s_b)/π_old(a_b | s_b),
+    /// PPO's clipped surrogate, Schulman et al. (2017), arXiv:1707.06347, equation 7, negated. With the ratio
+    /// ρ_b = π(a_b | s_b)/π_old(a_b | s_b) it is
     ///
     /// 1/B Σ_b max(-advantage_b ρ_b, -advantage_b clip(ρ_b, 1 - range, 1 + range)).
     Clipped {
@@ -25,8 +25,9 @@ pub enum Surrogate {
 pub struct Objective {
     /// The policy's part.
     pub surrogate: Surrogate,
-    /// Whether advantages are brought to mean 0 and standard deviation 1 before: (advantage_b - mean)/(standard deviation +
-    /// 10⁻⁸), the population's as in the reference (stable-baselines3: the sample's). A single advantage becomes 0.
+    /// Whether advantages are first normalised to mean 0 and standard deviation 1:
+    /// (advantage_b - mean)/(standard deviation + 10⁻⁸). The deviation is the population's, as in the reference;
+    /// stable-baselines3 takes the sample's. A single advantage becomes 0.
     pub normalize_advantages: bool,
     /// Weight of the entropy, per nat.
     pub ent_coef: f64,

@@ -6,7 +6,7 @@ use crate::error::{Error, Result, check_length};
 use crate::kernel::{Kernel, run};
 use crate::weights::{NamedArray, check_arrays};
 
-/// Numbers that are summed side by side; the order of a sum is fixed by it.
+/// Number of partial sums that are computed side by side. It fixes the order of a sum.
 const SUMS: usize = 8;
 
 /// The rule that turns a gradient into a step.
@@ -18,13 +18,13 @@ pub enum UpdateRule {
     Adam(Adam),
 }
 
-/// RMSProp (Hinton, 2012, lecture 6e) as TensorFlow's and so the reference's: for i = 0 … P-1,
+/// RMSProp (Hinton, 2012, lecture 6e) in TensorFlow's form, which the reference uses: for i = 0 … P-1,
 ///
 /// s_i ← α s_i + (1 - α) g_i²,
 /// w_i ← w_i - η g_i/√(s_i + ε),
 ///
-/// where s starts at 1 and ε is inside the root. libtorch's starts s at 0 and adds ε outside, which makes the first
-/// steps ten times as long: A2C is known to be less stable with it.
+/// where s starts at 1 and ε is inside the root. libtorch starts s at 0 and adds ε outside, which makes the first steps ten
+/// times as long: A2C is known to be less stable with it.
 #[derive(Clone, Debug)]
 pub struct RmsProp {
     alpha: f32,
@@ -39,8 +39,8 @@ pub struct RmsProp {
 /// v_i ← β₂ v_i + (1 - β₂) g_i²,
 /// w_i ← w_i - η/(1 - β₁ᵗ) m_i/(√(v_i/(1 - β₂ᵗ)) + ε).
 ///
-/// As libtorch's. TensorFlow's, the reference's, adds ε to √v_i before the correction instead, so that its ε is larger
-/// by up to √1000 in the first steps; with ε = 1e-5 this matters only to weights whose gradient is that small.
+/// This is libtorch's form. TensorFlow, which the reference uses, adds ε to √v_i before the correction. So its ε is larger
+/// by up to √1000 in the first steps. With ε = 1e-5 this matters only to weights whose gradient is that small.
 #[derive(Clone, Debug)]
 pub struct Adam {
     epsilon: f32,
@@ -52,13 +52,13 @@ const BETA_1: f64 = 0.9;
 const BETA_2: f64 = 0.999;
 
 impl UpdateRule {
-    /// RMSProp with decay α and ε for `n_weights`.
+    /// RMSProp with decay α and ε for `n_weights` weights.
     pub fn rms_prop(alpha: f64, epsilon: f64, n_weights: usize) -> Self {
         let mean_square = vec![1.0; n_weights];
         UpdateRule::RmsProp(RmsProp { alpha: alpha as f32, epsilon: epsilon as f32, mean_square })
     }
 
-    /// Adam with ε for `n_weights`.
+    /// Adam with ε for `n_weights` weights.
     pub fn adam(epsilon: f64, n_weights: usize) -> Self {
         let mean = vec![0.0; n_weights];
         let mean_square = vec![0.0; n_weights];
@@ -160,12 +160,12 @@ impl Kernel for AdamStep<'_> {
     }
 }
 
-/// Takes gradient steps: clipping by global norm, then the optimiser, and beside it the decay of all weights,
+/// Takes gradient steps: clips the gradient by its global norm, applies the update rule, and lets all weights decay,
 ///
-/// w_i ← (1 - η λ) w_i - the optimiser's step,
+/// w_i ← (1 - η λ) w_i - the rule's step,
 ///
-/// Loshchilov and Hutter (2019), arXiv:1711.05101, as libtorch's AdamW: what the optimiser divides gradients by does not
-/// divide the decay (the decay is decoupled).
+/// Loshchilov and Hutter (2019), arXiv:1711.05101, as libtorch's AdamW. The decay is decoupled: the update rule scales
+/// gradients, but not the decay.
 #[derive(Clone, Debug)]
 pub struct Optimiser {
     optimiser: UpdateRule,

@@ -22,7 +22,7 @@ impl Layer {
         Layer { inputs, outputs, matrix: Matrix::new(inputs, outputs), biases: vec![[0.0; LANES]; lanes(outputs)] }
     }
 
-    /// Loads the weights [outputs, their number] of the inputs from `first` on.
+    /// Loads `weights` [outputs, n] of n inputs, those from `first` on.
     pub(crate) fn load_inputs(&mut self, first: usize, weights: &[f32]) {
         self.matrix.load(first, weights, self.outputs);
     }

@@ -19,7 +19,7 @@ use crate::spec::PolicySpec;
 /// of ends in between are left out, and the discounted returns that rewards are divided by run on.
 ///
 /// Final observations are normalised with statistics that include the observations after them. Noise is added only to the
-/// observations that actions are chosen on: neither to final observations nor to statistics.
+/// observations from which actions are chosen: neither to final observations nor to statistics.
 #[derive(Clone, Debug)]
 pub struct Player {
     actor: Actor,
@@ -30,7 +30,7 @@ pub struct Player {
     episodes_per_trial: u32,
     /// Standard deviation of the noise that is added to normalised observations in training.
     noise: f64,
-    /// `[N, O]` normalised observations that the next actions are chosen on.
+    /// `[N, O]` normalised observations from which the next actions are chosen.
     observations: Vec<f32>,
     /// `[N]` whether those are the first of a trial.
     starts: Vec<bool>,
@@ -64,7 +64,7 @@ pub struct TrialStreams {
 /// The state of a training's player, without weights and normalisers, that decides what it does next.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PlayerState {
-    /// `[N, O]` normalised observations that the next actions are chosen on.
+    /// `[N, O]` normalised observations from which the next actions are chosen.
     pub observations: Vec<f32>,
     /// `[N]` whether those are the first of a trial.
     pub starts: Vec<bool>,
@@ -96,7 +96,7 @@ pub struct StepOutcome<'a> {
     pub rewards: &'a [f32],
     /// `[N]` whether the task ended the episode.
     pub terminated: &'a [bool],
-    /// `[N]` whether the step limit ended it.
+    /// `[N]` whether the step limit ended the episode.
     pub truncated: &'a [bool],
     /// `[K, O]` last observations of the episodes that ended, in the order of `ended`.
     pub final_observations: &'a [f32],
@@ -107,7 +107,7 @@ pub struct StepOutcome<'a> {
 /// A step of N environments, as a rollout stores it; or T steps, with arrays `[T, N, …]`.
 #[derive(Clone, Copy, Debug)]
 pub struct RolloutStep<'a> {
-    /// `[N, I]` inputs that the actions were chosen on, normalised.
+    /// `[N, I]` normalised inputs from which the actions were chosen.
     pub observations: &'a [f32],
     /// `[N]` whether the policy's memory was emptied before the step.
     pub starts: &'a [bool],
@@ -121,7 +121,7 @@ pub struct RolloutStep<'a> {
     pub rewards: &'a [f32],
     /// `[N]` whether the task ended the episode, or the trial.
     pub terminated: &'a [bool],
-    /// `[N]` whether the time limit ended it.
+    /// `[N]` whether the time limit ended the episode, or the trial.
     pub truncated: &'a [bool],
     /// `[N]` V(final observation) where truncated; ignored elsewhere.
     pub truncation_values: &'a [f32],
@@ -327,8 +327,8 @@ impl Player {
         &self.bytes
     }
 
-    /// Takes the results of the last actions. `remaining`, which must have been advanced already, says which environments'
-    /// rewards and next observations are added to statistics.
+    /// Takes the results of the last actions. `remaining` must have been advanced already. It selects the environments
+    /// whose rewards and next observations are added to statistics.
     ///
     /// # Errors
     /// Other lengths; numbers that are not finite.

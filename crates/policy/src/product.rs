@@ -30,7 +30,7 @@ impl Matrix {
         Matrix { inputs, data: vec![[0.0; LANES]; lanes(outputs) * inputs] }
     }
 
-    /// Loads the weights of the inputs from `first` on: `matrix` [outputs, their number].
+    /// Loads the weights `matrix` [outputs, n] of n inputs, those from `first` on.
     pub(crate) fn load(&mut self, first: usize, matrix: &[f32], outputs: usize) {
         let inputs = matrix.len() / outputs;
         for (block, lanes) in matrix.chunks(LANES * inputs).zip(self.data.chunks_exact_mut(self.inputs)) {
@@ -64,7 +64,7 @@ pub(crate) struct Factor<'a> {
 }
 
 impl<'a> Factor<'a> {
-    /// The rows of `matrix` [inputs, `outputs`], without a copy.
+    /// Uses the rows of `matrix` [inputs, `outputs`], without a copy.
     #[inline(always)]
     pub(crate) fn rows(matrix: &'a [f32], outputs: usize) -> Self {
         Factor { numbers: matrix, inputs: matrix.len() / outputs, outputs, per_column: LANES, per_input: outputs }
@@ -120,7 +120,8 @@ impl<'a> Factor<'a> {
         }
     }
 
-    /// A lane of outputs of `rows`, eight and at last four to seven of them at once. `WHOLE`: the lane is.
+    /// Computes a lane of outputs for `rows`: eight rows at once, and the last four to seven together. `WHOLE` says that
+    /// the lane has [`LANES`] outputs.
     #[inline(always)]
     fn columns<S: Simd, const WHOLE: bool>(
         self,
@@ -145,8 +146,8 @@ impl<'a> Factor<'a> {
         }
     }
 
-    /// From the first input's numbers of a lane of outputs to the last one's. All whole lanes are as long as each other: so an
-    /// index that was checked for one need not be checked for the next.
+    /// The numbers of a lane of outputs, from the first input's to the last input's. All whole lanes are equally long, so
+    /// an index that was checked for one lane need not be checked for the next.
     #[inline(always)]
     fn column<const WHOLE: bool>(self, column: usize) -> &'a [f32] {
         let last = if WHOLE { LANES } else { self.outputs % LANES };
@@ -346,7 +347,7 @@ fn outer_here<S: Simd, const ADD: bool>(
     }
 }
 
-/// `R` outputs from `first` on, a lane of inputs. `WHOLE`: that lane is.
+/// Computes `R` outputs from `first` on for a lane of inputs. `WHOLE` says that the lane has [`LANES`] inputs.
 #[inline(always)]
 fn outers<S: Simd, const R: usize, const ADD: bool, const WHOLE: bool>(
     simd: S,
@@ -420,10 +421,10 @@ mod tests {
     const INPUTS: usize = 69;
     const OUTPUTS: usize = 85;
 
-    /// Products of `n` rows and back, and sums over the rows.
+    /// Products with a matrix and with its transpose for `n` rows, and sums over the rows.
     struct Products<'a> {
         matrix: &'a Matrix,
-        /// `[OUTPUTS, INPUTS]`, the same.
+        /// `[OUTPUTS, INPUTS]` the numbers of `matrix`.
         flat: &'a [f32],
         from: &'a Rows,
         n: usize,
@@ -481,7 +482,7 @@ mod tests {
         all.concat().iter().map(|x| x.to_bits()).collect()
     }
 
-    /// The result by the definitions, one number after the other.
+    /// The same result by the definitions, one number at a time.
     fn naive(n: usize) -> Vec<u32> {
         let matrix = numbers(INPUTS * OUTPUTS, 1);
         let rows = numbers(n * INPUTS, 2);

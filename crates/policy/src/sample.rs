@@ -37,7 +37,7 @@ pub(crate) fn sample_categorical(logits: &[f32], rng: &mut ChaCha8Rng) -> (usize
 }
 
 /// Draws an action `[A]` from the Gaussian of `means` `[A]` and `log_std` `[A]` into `action`; two uniform numbers an
-/// element. Gives the log-density.
+/// element. Returns the log-density.
 pub(crate) fn sample_gaussian(means: &[f32], log_std: &[f32], rng: &mut ChaCha8Rng, action: &mut [f32]) -> f32 {
     let mut log_prob = -0.5 * LOG_TAU * means.len() as f32;
     for ((action, mean), log_std) in action.iter_mut().zip(means).zip(log_std) {
@@ -48,8 +48,8 @@ pub(crate) fn sample_gaussian(means: &[f32], log_std: &[f32], rng: &mut ChaCha8R
     log_prob
 }
 
-/// Draws an action `[A]` uniformly from the box with `middles` `[A]` and the logarithms of half its widths, `log_half` `[A]`,
-/// into `action`; one uniform number an element. Gives the log-density.
+/// Draws an action `[A]` uniformly from the box with `middles` `[A]` and the logarithms of half its widths, `log_half`
+/// `[A]`, into `action`; one uniform number an element. Returns the log-density.
 pub(crate) fn sample_uniform(middles: &[f32], log_half: &[f32], rng: &mut ChaCha8Rng, action: &mut [f32]) -> f32 {
     let mut log_prob = 0.0;
     for ((action, middle), log_half) in action.iter_mut().zip(middles).zip(log_half) {

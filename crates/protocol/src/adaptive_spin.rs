@@ -36,8 +36,8 @@ impl AdaptiveSpin {
         self.backs_off = true;
     }
 
-    /// Waits for `event`. While it spins, the thread's other tasks run, and it yields the core to other threads again and again,
-    /// but after these tasks, one of which may send the request.
+    /// Waits for `event`. While it spins, it yields again and again: first to the thread's other tasks, one of which may
+    /// send the request, then the core to other threads.
     pub async fn until<F: Future>(&mut self, event: F) -> F::Output {
         let begun = Instant::now();
         let mut event = pin!(event);

@@ -19,7 +19,8 @@ pub enum Address {
         host: Box<str>,
         /// The port, at least 1.
         port: u16,
-        /// With TLS the name that the server's certificate must have: the host, or that from which it was resolved.
+        /// With TLS, the name for which the server's certificate must be: the host, or the name from which the host's
+        /// address was resolved.
         tls: Option<Box<str>>,
     },
 }
@@ -46,7 +47,7 @@ impl FromStr for Address {
 }
 
 impl Address {
-    /// The text of this address with TLS.
+    /// The text of this address with `https://` in place of `http://`.
     pub(crate) fn with_tls(&self) -> String {
         let text = self.to_string();
         text.strip_prefix("http://").map_or_else(|| text.clone(), |rest| format!("https://{rest}"))

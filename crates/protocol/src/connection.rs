@@ -195,7 +195,7 @@ impl Connection {
         match timeout(limit, health.check(HealthCheckRequest { service: SERVICE.into() })).await {
             Err(_) => false,
             Ok(Ok(_)) => true,
-            // Without a source it is the server's own answer, and not an error of the connection.
+            // An error without a source is the server's own answer. An error of the connection has a source.
             Ok(Err(status)) => std::error::Error::source(&status).is_none(),
         }
     }
@@ -265,17 +265,17 @@ pub async fn resolve(address: &Address) -> Result<ResolvedAddresses, ClientError
         .await
         .map_err(|_| fail(format!("its name was not resolved within {} s", CONNECT_TIMEOUT.as_secs())))?
         .map_err(|error| fail(format!("its name cannot be resolved: {error}")))?;
-    // A name that means a single machine says more than its number.
+    // The name is kept if it means a single machine: it tells users more than a number.
     Ok(if found.len() > 1 { sorted(found, tls.as_deref()) } else { one() })
 }
 
-/// Resolves a name in a thread of its own. Nobody waits for it when the resolver hangs, and no panic follows where no
-/// thread can be started, as with tokio's own.
+/// Resolves a name in a thread of its own: a resolver that hangs then blocks nothing else. If no thread can be started this
+/// is an error, where tokio's own resolver would panic.
 async fn look_up(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
     let name = host.to_owned();
     let (sender, found) = tokio::sync::oneshot::channel();
     let resolve = move || {
-        let _ = sender.send((name.as_str(), port).to_socket_addrs().map(Vec::from_iter)); // nobody may wait any more
+        let _ = sender.send((name.as_str(), port).to_socket_addrs().map(Vec::from_iter)); // the caller's time may be over
     };
     std::thread::Builder::new().name("resolver".into()).spawn(resolve)?;
     found.await.unwrap_or_else(|_| Err(io::ErrorKind::Interrupted.into()))

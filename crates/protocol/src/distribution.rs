@@ -135,7 +135,7 @@ impl Distribution {
         self.0.iter().any(|interval| interval.low - margin <= value && value <= interval.high + margin)
     }
 
-    /// Whether all values of this are values of `other`, too, whose intervals may touch.
+    /// Whether all values of this are also values of `other`. Two intervals of `other` that touch count as one interval.
     pub fn is_within(&self, other: &Self) -> bool {
         let mut wider: Vec<Interval> = Vec::with_capacity(other.0.len());
         for &interval in &other.0 {
@@ -147,8 +147,9 @@ impl Distribution {
         self.0.iter().all(|own| wider.iter().any(|other| other.low <= own.low && own.high <= other.high))
     }
 
-    /// Whether some values of this are values of `other`, too. A common end of two intervals does not count, since it is never
-    /// drawn: R and E, which touch, do not overlap. A fixed value overlaps an interval whose end it is.
+    /// Whether some values of this are also values of `other`. A common end of two intervals does not count, since the
+    /// probability of drawing it is 0: R and E, which touch, do not overlap. A fixed value overlaps an interval whose end
+    /// it is.
     pub fn overlaps(&self, other: &Self) -> bool {
         let meet = |one: &Interval, other: &Interval| {
             let low = one.low.max(other.low);

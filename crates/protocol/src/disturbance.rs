@@ -3,10 +3,10 @@
 /// Disturbances with 0 as their default.
 const NAMES: [&str; 7] =
     ["action_delay", "action_hold", "action_noise", "push", "sensor_delay", "sensor_noise", "sensor_dropout"];
-/// The scale of all actuators, whose default is 1. With `_` and an actuator's name it is that of one.
+/// The scale of all actuators, whose default is 1. With `_` and an actuator's name behind it: the scale of that actuator.
 const ACTION_SCALE: &str = "action_scale";
 
-/// The mean number of steps between pushes, which there are none of as long as their size is 0.
+/// The mean number of steps between pushes. There are no pushes as long as their size is 0.
 const PUSH_INTERVAL: &str = "push_interval";
 /// The default of the mean interval of pushes, in steps.
 pub const DEFAULT_PUSH_INTERVAL: f64 = 100.0;

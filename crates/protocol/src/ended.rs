@@ -7,7 +7,8 @@ use crate::proto;
 pub struct EndedEpisode {
     /// The slot in the session's batch, 0 … N-1.
     pub slot: usize,
-    /// The environment's index: its place among those that were opened with it, unless that was given or restored.
+    /// The environment's index: its place among the environments that were opened together, unless the client gave it or
+    /// restored it.
     pub environment_index: u32,
     /// Counts the environment's episodes from 0.
     pub episode_index: u64,

@@ -31,7 +31,7 @@ pub enum ClientError {
     /// The server is not trusted, or does not trust this client.
     #[error("no safe connection to the server at {address}: {reason}")]
     Unsafe { address: Address, reason: String },
-    /// No one of several servers takes sessions.
+    /// Several servers were tried, and no server takes sessions.
     #[error(
         "no server answers ({reasons}); start one of them with `perturb-server --listen ADDRESS`, or correct --server"
     )]
@@ -193,7 +193,7 @@ pub(crate) fn describe(status: &Status) -> String {
     }
 }
 
-/// The operating system's error of a connection, in words; `None` if there is none.
+/// Describes the operating system's error of a connection, e.g. "nobody listens there". `None` if there is no such error.
 pub(crate) fn system_words(error: &(dyn std::error::Error + 'static)) -> Option<String> {
     let mut chain = std::iter::successors(Some(error), |error| error.source());
     let system = chain.find_map(|error| error.downcast_ref::<std::io::Error>())?;

@@ -16,12 +16,12 @@ fn letters(name: &str) -> impl Iterator<Item = char> {
     name.chars().filter(|c| !matches!(c, '-' | '_')).map(|c| c.to_ascii_lowercase())
 }
 
-/// The place of the name that `written` stands for: the one that is written so, or else the first that is spelled so.
+/// The place of the name that `written` stands for: an exact match, or else the first name of which it is a spelling.
 pub fn find<'a>(written: &str, known: impl Iterator<Item = &'a str> + Clone) -> Option<usize> {
     known.clone().position(|name| name == written).or_else(|| known.clone().position(|name| is_spelled(written, name)))
 }
 
-/// The name that `written` is most like, if it is much like one.
+/// The name that is most similar to `written`; `None` if none is similar enough.
 pub fn closest<'a>(written: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     let written: String = letters(written).collect();
     let alike = |name: &str| strsim::jaro_winkler(&written, &letters(name).collect::<String>());

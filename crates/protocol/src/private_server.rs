@@ -28,7 +28,7 @@ const TASK_TIMEOUT: Duration = Duration::from_secs(120);
 const REFUSED_STATUS: i32 = 2;
 /// Time that a server has to end before it is killed.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(5);
-/// Interval at which a starting or ending server is looked at.
+/// Interval between two checks of a server that is starting or ending.
 const STOP_POLL_INTERVAL: Duration = Duration::from_millis(50);
 /// Time to wait for a server's last lines after its end.
 const STDERR_TIMEOUT: Duration = Duration::from_secs(1);
@@ -108,7 +108,7 @@ impl PrivateServer {
     /// # Errors
     /// Those of [`PrivateServer::start_unless`].
     pub fn restart(&mut self, stopped: &dyn Fn() -> Option<i32>) -> Result<(), ClientError> {
-        self.process.kill(); // one that runs does not answer
+        self.process.kill(); // a server that still runs does not answer
         let again = |source| ClientError::System { action: "create the server's private directory again", source };
         own_directory(self.directory.path()).map_err(again)?;
         self.process = spawn(&find_program()?, &self.address, self.workers, &self.tasks, stopped)?;
@@ -122,7 +122,7 @@ impl PrivateServer {
 
     /// The error of a server that listens but does not take sessions, for `reason`.
     pub fn unusable(&mut self, reason: &str) -> ClientError {
-        thread::sleep(STOP_POLL_INTERVAL); // one that ends may be a moment behind its connections
+        thread::sleep(STOP_POLL_INTERVAL); // a server that ends closes its connections a moment earlier
         let ended = self.exit_status().map(|status| format!("it ended with {status}"));
         let reason = ended.unwrap_or_else(|| format!("it listens, but does not take sessions: {reason}"));
         ClientError::Start { program: self.program.clone(), reason }
@@ -153,7 +153,7 @@ impl Drop for PrivateServer {
 #[derive(Debug)]
 struct Process {
     child: Child,
-    /// Disconnects when all lines of standard error were handled; `None` without a handler.
+    /// Disconnects after all lines of standard error were handled; `None` without a handler.
     stderr_done: Option<Receiver<()>>,
 }
 
@@ -177,7 +177,7 @@ impl Process {
         // An error means that it has ended.
         let _ = self.child.kill();
         let _ = self.child.wait();
-        // A process that inherited the standard error may live on.
+        // A process that inherited the standard error may live on, so the wait is limited.
         self.stderr_done.take().map(|done| done.recv_timeout(STDERR_TIMEOUT));
     }
 }

@@ -1,4 +1,4 @@
-//! The limit on processes and threads, in the words of an error that meets it.
+//! Explains that a process or a thread could not be started because of a limit.
 
 use std::io::{Error, ErrorKind};
 

@@ -44,8 +44,8 @@ impl Region {
         Self(boxes)
     }
 
-    /// The region that `version` of an environment draws from, with the sets of `own` for the parameters in it. With a
-    /// disturbance in `own` it has all of them.
+    /// The region that `version` of an environment draws from. A parameter in `own` has its set of values from there. If
+    /// `own` names a disturbance, the region has all disturbances.
     pub fn from_version(environment: &proto::Environment, version: Version, own: &ParameterBox) -> Self {
         let environment = environment.with_parameters(own.keys().map(String::as_str));
         let of_part = |part: &Version| {
@@ -77,15 +77,15 @@ impl Region {
         self.0.iter().all(|own| others.clone().into_iter().flat_map(Self::boxes).any(|other| is_in(own, other)))
     }
 
-    /// Whether a part of this region is in `other`, see [`Distribution::overlaps`]. A disturbance that only one of two boxes
-    /// names is not compared: the physics that a box without disturbances holds out stays held out with them.
+    /// Whether a part of this region is in `other`, see [`Distribution::overlaps`]. A disturbance that only one of two
+    /// boxes names is not compared. So a region that was held out without disturbances is also held out with any.
     pub fn overlaps(&self, other: &Self) -> bool {
         self.0.iter().any(|own| other.0.iter().any(|other| pairs(own, other, Distribution::overlaps, |_| None)))
     }
 }
 
-/// Whether `holds` is true for the sets of every parameter. False if the boxes have different parameters that are no
-/// disturbances. A disturbance that one of the boxes lacks is passed over, unless `lacking` has a value for it.
+/// Whether `holds` is true for the sets of every parameter. False if only one box has a parameter that is no disturbance. A
+/// disturbance that one of the boxes lacks has there the value that `lacking` returns; with `None` it is ignored.
 fn pairs(
     one: &ParameterBox,
     other: &ParameterBox,

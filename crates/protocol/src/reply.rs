@@ -1,4 +1,5 @@
-//! Checks of what a server replies to a step, shared by all clients: nothing that breaks the protocol is learned from.
+//! Checks a server's reply to a step, for all clients. A reply that breaks the protocol is an error, so that no policy
+//! learns from it.
 
 use crate::proto;
 

@@ -178,8 +178,8 @@ impl Stream {
         self.raw.requests.send(message).await.map_err(ended)
     }
 
-    /// Sends one of many requests whose replies are taken later. A server whose replies are not read reads no requests either.
-    /// So replies that come while this request has to wait are stored. With a lease this is [`Stream::send`].
+    /// Sends one of many requests whose replies are taken later. A server stops reading requests while its replies are not
+    /// read. So replies that come while this request has to wait are stored. With a lease this is [`Stream::send`].
     ///
     /// # Errors
     /// [`ClientError::Lost`].
@@ -205,7 +205,7 @@ impl Stream {
         }
     }
 
-    /// Counts a request. Looks first for a reply that nobody requested, which a later request would take for its own.
+    /// Counts a request. Before, looks for a reply that nobody requested: a later request would take it for its own.
     async fn note_request(&mut self) {
         if self.unanswered == 0 && self.unrequested.is_none() {
             let replies = &mut self.raw.replies;
@@ -223,7 +223,7 @@ impl Stream {
         let Self { raw: RawStream { requests, mut replies }, lease, .. } = self;
         drop(requests);
         if lease.is_some() {
-            // However it ends.
+            // The session's end is not checked: the lease ends anyway.
             let _ =
                 tokio::time::timeout(CLOSE_TIMEOUT, async { while let Ok(Some(_)) = replies.message().await {} }).await;
         }
@@ -343,7 +343,7 @@ mod tests {
 
     use crate::proto::DESCRIPTORS;
 
-    /// The contract says so, and clients in other languages rely on it.
+    /// Other clients rely on this rule of the protocol.
     #[test]
     fn reply_has_the_number_of_its_request() {
         let files = FileDescriptorSet::decode(DESCRIPTORS).unwrap().file;

@@ -22,7 +22,7 @@ pub(crate) struct TensorBatch {
     advantages: Tensor,
     /// `[L, M]`.
     returns: Tensor,
-    /// The acting policy's distributions, `[L, M]` of them, where they count.
+    /// `[L, M]` the acting policy's action distributions; `None` if no KL divergence is computed.
     acting: Option<Distributions>,
 }
 

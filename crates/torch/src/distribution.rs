@@ -115,7 +115,7 @@ mod tests {
             ("divergence_gaussian", gaussian("means", "log_std"), gaussian("other_means", "other_log_std")),
         ] {
             assert_close(&own.divergence_to(&other), &fixture(case, "divergence"), TOLERANCE);
-            // Of Gaussians σ² · σ⁻² is 1 but for two roundings of 2⁻²⁴ in each of three elements.
+            // For Gaussians σ² · σ⁻² is 1 up to two roundings of 2⁻²⁴ in each of three elements.
             assert_close(&own.divergence_to(&own), &[0.0; 11], 5e-7);
         }
     }

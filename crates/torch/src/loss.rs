@@ -9,7 +9,7 @@ use crate::error::Result;
 /// Added to the standard deviation that advantages are divided by.
 const EPSILON: f64 = 1e-8;
 
-/// The inputs of a loss beside the policy's evaluation of the samples.
+/// The inputs of a loss that do not come from the policy that is being trained.
 #[derive(Debug)]
 pub struct LossTargets {
     /// Log-probabilities under the acting policy.
@@ -24,7 +24,7 @@ pub struct LossTargets {
     pub acting: Option<Distributions>,
 }
 
-/// The total of `objective`, with the gradient in what `evaluated` was computed from, and the losses.
+/// Returns the total of `objective`, from which gradients flow back through `evaluated`, and the losses.
 pub fn evaluate(objective: &Objective, evaluated: &Evaluated, targets: &LossTargets) -> Result<(Tensor, Losses)> {
     let Objective { ent_coef, vf_coef, kl_coef, .. } = *objective;
     let normalised = objective.normalize_advantages.then(|| normalise(&targets.advantages));

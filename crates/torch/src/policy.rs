@@ -97,13 +97,13 @@ impl TorchPolicy {
         Evaluated { log_probs, entropy, values, distributions, tape }
     }
 
-    /// The action distributions over `sequences`, `[L, M]` of them, padding included; without gradient.
+    /// `[L, M]` the action distributions at all steps of `sequences`, padding included, without gradient.
     pub(crate) fn distributions(&self, sequences: &Sequences) -> Distributions {
         tch::no_grad(|| {
             let (outputs, _, _) = self.forward(sequences);
             let outputs = outputs.view((sequences.n_steps(), sequences.count(), self.spec.action.outputs() as i64));
             let Distributions { outputs, log_std } = self.distributions_of(outputs);
-            // A copy, for the weights will change.
+            // The deviations are copied, since the weights will change.
             Distributions { outputs, log_std: log_std.map(|log_std| log_std.detach().copy()) }
         })
     }

@@ -6,12 +6,12 @@ use crate::error::Result;
 use perturb_policy::PolicySpec;
 use perturb_policy::check_length;
 
-/// M sequences of L steps, on libtorch. Flattened to B = L·M samples, sample l·M + m is step l of sequence m. Where
-/// sequences are of different lengths, what fills them up is no sample, and B is less.
+/// M sequences of L steps, on libtorch. Flattened to B = L·M samples, sample l·M + m is step l of sequence m. Shorter
+/// sequences are padded; padding is no sample, so B is then less.
 ///
-/// A sequence is what a policy must see whole. A recurrent one needs the steps of an environment in order: M = N, L = T. A
-/// feed-forward one takes every step by itself: M = T·N, L = 1. So the samples' order is that of the rollout with both,
-/// and minibatches of sequences are right for both.
+/// A sequence is what a policy must see whole. A recurrent policy needs the steps of an environment in order: M = N, L = T.
+/// A feed-forward policy takes every step by itself: M = T·N, L = 1. In both cases the samples have the rollout's order,
+/// and a minibatch is a set of sequences.
 #[derive(Debug)]
 pub struct Sequences {
     /// `[L, M, O]`.

@@ -10,7 +10,7 @@ fn spec(action: ActionKind, hidden: &[usize]) -> PolicySpec {
     PolicySpec { observation_size: 17, action, hidden: hidden.to_vec(), lstm: None }
 }
 
-/// Weights that differ from the initial ones everywhere: every number, biases and log_std too, moves by about 0.1.
+/// Weights that differ from the initial ones everywhere: every number, also of biases and log_std, moves by about 0.1.
 fn moved(spec: &PolicySpec) -> Weights {
     let mut rng = stream(9, Purpose::Weights);
     let mut weights = initial_weights(spec, &mut stream(1, Purpose::Weights));

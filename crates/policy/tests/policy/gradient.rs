@@ -1,4 +1,4 @@
-//! Gradients: what must hold whatever computes them.
+//! Gradients: the properties that must hold for every backend.
 
 use std::f64::consts::TAU;
 
@@ -65,7 +65,8 @@ fn the_number_of_threads_changes_no_byte(
     }
 }
 
-/// In N environments for T steps: few, as many as are kept, more; values come between.
+/// Acts in N environments for T steps: fewer observations than the cache holds, as many, and more. Values are computed in
+/// between.
 #[rstest]
 fn cached_activations_give_the_same_gradient(
     #[values(ActionKind::Discrete { n: 2 }, ActionKind::Continuous { size: 3 })] action: ActionKind,
@@ -150,14 +151,14 @@ fn networks_of_an_actor_give_the_same_gradient(
     assert!(expected.iter().filter(|&&g| g != 0.0).count() > expected.len() / 2);
     assert_eq!(gradient(&mut taken), expected);
 
-    // The actor has what the other one had, and says so in place of acting.
+    // The actor now has the other networks, and refuses to act.
     let mut acts = ActorOutput::new(action, 1);
     let refused = actor.act(&numbers(O, 3), &mut stream(1, Purpose::Actions), &mut acts);
     assert_eq!(refused, Err(Error::NoWeights));
     assert_eq!(actor.values(&numbers(O, 3), &mut Vec::new()), Err(Error::NoWeights));
     assert_eq!(actor.values_in(&numbers(O, 3), &[0], &mut Vec::new()), Err(Error::NoWeights));
 
-    // Once it has weights, it acts as a new one does, and can give them, too.
+    // With new weights it acts as a new actor does, and its networks can be taken again.
     let others: Vec<f32> = numbers(spec.n_weights(), 7).iter().map(|x| 0.2 * x).collect();
     let acts = |actor: &mut Actor| {
         let mut acts = ActorOutput::new(action, 1);
@@ -289,7 +290,7 @@ fn total(spec: &PolicySpec, weights: &[f64], samples: &Samples<'_>, objective: &
 
 #[rstest]
 fn gradients_are_finite_differences(
-    // The second has more outputs than are computed side by side.
+    // The second kind of action has more outputs than the kernel computes side by side.
     #[values(ActionKind::Discrete { n: 3 }, ActionKind::Discrete { n: 19 }, ActionKind::Continuous { size: 2 })]
     action: ActionKind,
     #[values(&[], &[7], &[5, 18])] hidden: &[usize],

@@ -19,7 +19,7 @@ fn player(episodes_per_trial: u32, with_outcomes: bool, normalisers: Normalisers
     player
 }
 
-/// Step `t` of episodes of two steps each, observed as 3.
+/// Plays step `t` of episodes with two steps each, whose observations are all 3.
 fn step(player: &mut Player, t: u64, episodes_per_trial: u32, reward: f32) {
     player.act().expect("an action");
     let episode = t / 2;
@@ -37,7 +37,8 @@ fn step(player: &mut Player, t: u64, episodes_per_trial: u32, reward: f32) {
     player.observe(&outcome, None).expect("numbers that fit");
 }
 
-/// Each step pays 1. After five of them EPOpt's next iteration begins.
+/// Checks the discounted return after each of five steps with reward 1, and after the reset that begins EPOpt's next
+/// iteration.
 #[rstest]
 #[case::an_episode(1, false, [1.0, 0.0, 1.0, 0.0, 1.0, 0.0])]
 #[case::a_trial(2, false, [1.0, 1.5, 1.75, 0.0, 1.0, 0.0])]
@@ -62,7 +63,7 @@ fn the_return_that_rewards_are_divided_by_runs_over(
     assert_eq!(returns, expected);
 }
 
-/// The environment always shows 3, with mean 1 and deviation 2: the policy sees N(1, 0.25²).
+/// The environment always shows 3. With mean 1 and deviation 2 the policy sees N(1, 0.25²).
 #[test]
 fn only_training_sees_noise() {
     let played = |noise: f64, role: Role| {
@@ -88,7 +89,7 @@ fn only_training_sees_noise() {
     assert!(played(0.25, Role::testing(1, 0, 1)).0.iter().all(|x| (x - 1.0).abs() < 1e-4));
 }
 
-/// Two environments with two numbers each, all of which are 3, and whose first episodes the step limit ends at once.
+/// Plays two environments whose two observed numbers are always 3. The step limit ends both first episodes at once.
 #[test]
 fn final_observations_have_no_noise() {
     let played = |noise: f64| {
@@ -121,7 +122,7 @@ fn final_observations_have_no_noise() {
     assert!(values == value_of_clean && values[0] != 0.0, "{values:?}");
 }
 
-/// Neither what follows the noise nor the noise that follows depends on where a training was interrupted.
+/// A saved state fixes all later noise and everything that follows from it.
 #[test]
 fn noise_continues_from_a_saved_state() {
     let none = || Normalisers::default();
@@ -137,7 +138,8 @@ fn noise_continues_from_a_saved_state() {
     }
 }
 
-/// The reference gives a policy of RL² raw rewards in tests.
+/// Statistics stay as they are, and rewards are normalised. In contrast, the reference gives a policy of RL² raw rewards in
+/// tests.
 #[test]
 fn tests_leave_statistics_unchanged() {
     // Means of 1 and variances of 4 and 100.
