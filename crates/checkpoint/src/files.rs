@@ -44,7 +44,7 @@ impl ArraysFile {
         directory.join(Path::new(&self.file).file_name().unwrap_or_default())
     }
 
-    /// Makes sure that it is there, a plain file, and as long as it was written.
+    /// Makes sure that the file is there, is a plain file, and has the length that was written.
     ///
     /// # Errors
     /// [`CheckpointError`].

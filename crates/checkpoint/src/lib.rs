@@ -37,7 +37,7 @@ pub use self::named::find as find_policy;
 /// Format of the JSON document; raised when older programs could misread it. Format 1 also stores what follows from the
 /// configuration. Formats 1 and 2 have no checksum.
 const FORMAT_VERSION: u32 = 3;
-/// The first with a checksum.
+/// The first format with a checksum.
 const SEALED: u32 = 3;
 /// Maximum number of times that a checkpoint is read while a training replaces it again and again.
 const MAX_LOOKS: u32 = 20;
@@ -91,7 +91,7 @@ pub struct Resume {
 struct CheckpointDocument {
     format_version: u32,
     weights: ArraysFile,
-    /// Not looked into for testing.
+    /// The state of the training. Tests do not read it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     resume: Option<serde_json::Value>,
     #[serde(flatten)]
@@ -133,7 +133,7 @@ pub enum CheckpointError {
         /// The fault.
         reason: String,
     },
-    /// Another program wrote it, which may go on with it.
+    /// The file has an unknown format, probably that of a newer program, which can read it.
     #[error(
         "{} has format {format}, and this program reads 1 to {FORMAT_VERSION}: use the version of perturb that wrote it, or \
          a copy that is whole",
@@ -187,8 +187,9 @@ impl Checkpoint {
         Ok(remove_others(directory, &[WEIGHTS_PREFIX, RESUME_PREFIX], &current)?)
     }
 
-    /// Reads the checkpoint in `path`, in its folder `checkpoint`, or in the file `path`; or that of a cell below
-    /// `results/`, or where the variable `PERTURB_RESULTS` says, whose id is `path` or alone begins with it.
+    /// Reads the checkpoint in `path`, in its folder `checkpoint`, or in the file `path`. If there is none, reads the
+    /// checkpoint of the cell whose id is `path`, or the only one that begins with `path`, below `results/` or the folder
+    /// in the variable `PERTURB_RESULTS`.
     ///
     /// # Errors
     /// [`CheckpointError`], which names the file.
@@ -201,8 +202,8 @@ impl Checkpoint {
         CheckpointDocument::read_with(path, Self::from_document)
     }
 
-    /// Reads the checkpoint in `path`, or in its folder `checkpoint`, with where that is and what its training needs to go
-    /// on.
+    /// Reads the checkpoint in `path`, or in its folder `checkpoint`. Returns also the folder in which it was found, and
+    /// the document of its training's state.
     ///
     /// # Errors
     /// [`CheckpointError`], which names the file.
@@ -264,8 +265,8 @@ impl Checkpoint {
 }
 
 impl State {
-    /// Reads that of the checkpoint in `path`, or in its folder `checkpoint`. Of the weights it is only looked whether they
-    /// are there.
+    /// Reads the state of the checkpoint in `path`, or in its folder `checkpoint`. Does not read the weights, but checks
+    /// that they are there.
     ///
     /// # Errors
     /// [`CheckpointError`], which names the file.
@@ -378,7 +379,7 @@ impl CheckpointDocument {
         take(&directory, document)
     }
 
-    /// Reads `checkpoint.json` in `path`, or in its folder `checkpoint`; gives the folder, too.
+    /// Reads `checkpoint.json` in `path`, or in its folder `checkpoint`. Returns also the folder in which it was found.
     fn read(path: &Path) -> Result<(PathBuf, Self)> {
         let directory = match has_file(&path.join(JSON))? {
             true => path.to_owned(),

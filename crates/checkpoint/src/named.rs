@@ -1,5 +1,5 @@
-//! Policies by name, or by the folder of their cell: files in folders `policies` below `results/`, and cells there whose
-//! trainings were kept.
+//! Finds policies by name, or by the folder of their cell: files in folders `policies` below `results/`, and cells below
+//! `results/` whose trainings were kept.
 
 use std::path::{Component, Path, PathBuf};
 
@@ -14,7 +14,7 @@ const FOLDER: &str = "results";
 const VARIABLE: &str = "PERTURB_RESULTS";
 /// The folder of policy files.
 const POLICIES: &str = "policies";
-/// Folders between it and `cells`, at most.
+/// Maximal number of folders between the folder of the policies and `cells`.
 const DEPTH: usize = 3;
 /// Maximum difference in length between a name and a suggestion.
 const MAX_LENGTH_DIFFERENCE: usize = 3;
@@ -24,7 +24,8 @@ const MAX_LENGTH_DIFFERENCE: usize = 3;
 /// equal.
 ///
 /// # Errors
-/// [`CheckpointError::Several`] with the cells whose ids begin so or, if none does, are much like it.
+/// [`CheckpointError::Several`] with the cells whose ids begin with the name or, if there is none, with the cells whose ids
+/// are similar.
 pub fn find(path: &Path) -> Result<Option<PathBuf>> {
     let folder = std::env::var_os(VARIABLE).filter(|folder| !folder.is_empty());
     let found = find_below(&folder.map_or_else(|| FOLDER.into(), PathBuf::from), path);
@@ -60,7 +61,8 @@ fn find_below(folder: &Path, path: &Path) -> Result<Option<PathBuf>> {
     let mut meant = of(&begins);
     if meant.is_empty() {
         let nearest = names::closest(name, all.iter().map(|kept| kept.id.as_str()));
-        // The beginnings of all are alike: a folder that is not there, `hopper_run`, is no slip in an id.
+        // Ids have similar beginnings, so that a missing folder such as `hopper_run` resembles one. A misspelled id has
+        // about the length of the id.
         meant = of(&|id| nearest == Some(id) && id.len().abs_diff(name.len()) <= MAX_LENGTH_DIFFERENCE);
     }
     if meant.is_empty() {
@@ -76,7 +78,7 @@ fn holds_checkpoint(path: &Path) -> Result<bool> {
     Ok(is_policy(path)? || has_file(&path.join(JSON))? || has_file(&path.join("checkpoint").join(JSON))?)
 }
 
-/// A policy that was kept.
+/// A policy that was found.
 struct StoredPolicy {
     id: String,
     /// The folder of its cell, or its file.
@@ -84,7 +86,7 @@ struct StoredPolicy {
     checkpoint: PathBuf,
 }
 
-/// Adds the policies in the order of their paths. What cannot be listed has none.
+/// Adds the policies in the order of their paths. Skips folders that cannot be listed.
 fn collect(folder: &Path, depth: usize, found: &mut Vec<StoredPolicy>) {
     let kept = |cell: PathBuf| {
         let id = cell.file_name()?.to_str()?.to_owned();

@@ -54,7 +54,7 @@ fn shipped_policies_are_read_and_saved_under_their_names() {
         let policy = Checkpoint::load(&path).unwrap();
         let folder = tempfile::tempdir().unwrap();
         policy.save(folder.path(), None).unwrap();
-        // The file of the weights has the checksum of what it was written from.
+        // The name of the weights' file holds the checksum of the weights.
         let weights = format!("weights-{}.safetensors", policy.id().unwrap());
         assert!(folder.path().join(&weights).is_file(), "{weights}");
         let copy = folder.path().join("copy.safetensors");
@@ -165,7 +165,7 @@ fn damage_is_named() {
     assert!(spoil("checkpoint", &statistics).contains("observation_normaliser: there is none"));
 }
 
-/// Of the statistics, for instance, which no other file has.
+/// The JSON holds the statistics, for instance, which are in no other file.
 #[test]
 fn no_byte_of_the_json_changes_a_checkpoint_unnoticed() {
     let directory = tempfile::tempdir().unwrap();
@@ -179,14 +179,14 @@ fn no_byte_of_the_json_changes_a_checkpoint_unnoticed() {
         other[at] ^= 1;
         fs::write(&path, other).unwrap();
         match Checkpoint::load(directory.path()) {
-            // A space, or a last digit that rounds to the same number.
+            // The changes are a space, and a last digit that rounds to the same number.
             Ok(loaded) => assert!(loaded == saved, "byte {at}, {:?}", text[at] as char),
             Err(_) => refused += 1,
         }
     }
     assert!(refused > text.len() / 2, "{refused} of {}", text.len());
 
-    // Nor can the checksum be left out, or the format be called an earlier one beside it.
+    // A missing checksum is refused, too, and so is an earlier format beside a checksum.
     let mut document: serde_json::Value = serde_json::from_slice(&text).unwrap();
     document["format_version"] = 2.into();
     fs::write(&path, document.to_string()).unwrap();

@@ -1,8 +1,8 @@
-//! Checksums of what is written and read back, so that a changed byte is an error and never another result.
+//! Checksums of files. With them a changed byte is an error, and never leads to another result.
 //!
-//! A JSON document holds that of everything else in it as `crc32c`: CRC-32C of the document as compact JSON with sorted
-//! names, so that spaces and order do not matter. In another file stands `perturb.crc32c=` with eight hexadecimal digits,
-//! CRC-32C of what is before and behind it. Files of earlier programs have neither, and are read as they are.
+//! A JSON document has the entry `crc32c`: CRC-32C of the rest of the document as compact JSON with sorted names, so that
+//! spaces and order do not matter. Any other file holds `perturb.crc32c=` with eight hexadecimal digits: CRC-32C of the
+//! bytes before and behind it. Files of earlier programs have neither, and are read without a check.
 
 use serde::Serialize;
 use serde_json::Value;
@@ -57,10 +57,10 @@ pub fn insert(file: &mut Vec<u8>, place: usize) {
     file.splice(place..place, [MARK, digits.as_bytes()].concat());
 }
 
-/// Whether `file` is what was written, if it says so.
+/// Checks the checksum in `file`. A file without one is accepted.
 ///
 /// # Errors
-/// [`CHECKSUM_MISMATCH`] if it is not.
+/// [`CHECKSUM_MISMATCH`] if the content was changed.
 pub fn check(file: &[u8]) -> Result<(), &'static str> {
     let Some(place) = file.windows(MARK.len()).rposition(|piece| piece == MARK) else { return Ok(()) };
     let (before, rest) = (&file[..place], &file[place + MARK.len()..]);

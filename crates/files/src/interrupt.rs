@@ -52,24 +52,24 @@ impl StopFlag {
         Ok(flag)
     }
 
-    /// The number of the first signal that was received; `None` so far.
+    /// The number of the first signal that was received; `None` if none was received yet.
     pub fn signal(&self) -> Option<i32> {
         Some(self.0.signal.load(Ordering::SeqCst)).filter(|&number| number != 0)
     }
 
-    /// Raises it, as signal `number` would.
+    /// Raises the flag, as signal `number` would.
     pub fn raise(&self, number: i32) {
         let _ = self.0.since.set(Instant::now()); // the first one counts
         let _ = self.0.signal.compare_exchange(0, number, Ordering::SeqCst, Ordering::SeqCst);
         self.0.notify.notify_waiters();
     }
 
-    /// The time since it was raised; `None` so far.
+    /// The time since the flag was raised; `None` if it was not raised yet.
     pub fn elapsed(&self) -> Option<Duration> {
         self.0.since.get().map(Instant::elapsed)
     }
 
-    /// Waits until it is raised. Returns the number of the signal.
+    /// Waits until the flag is raised. Returns the number of the signal.
     pub async fn raised(&self) -> i32 {
         loop {
             let notified = self.0.notify.notified();
@@ -84,7 +84,7 @@ impl StopFlag {
 /// The signals that ask a program to end.
 const ENDING: [SignalKind; 2] = [SignalKind::interrupt(), SignalKind::terminate()];
 
-/// Has SIGINT and SIGTERM end a program at once that has nothing to finish.
+/// Lets SIGINT and SIGTERM end the program at once. For programs that have nothing to finish.
 ///
 /// # Errors
 /// The operating system's.
@@ -143,7 +143,7 @@ fn end(number: i32) -> ! {
 pub struct Scratch(PathBuf);
 
 impl Scratch {
-    /// A new one.
+    /// Creates a new temporary folder.
     ///
     /// # Errors
     /// The operating system's.

@@ -37,14 +37,14 @@ pub type AnyError = Box<dyn std::error::Error + Send + Sync>;
 pub struct FileError {
     /// The action, e.g. "read".
     pub action: &'static str,
-    /// On what.
+    /// The path to which the action was applied.
     pub path: PathBuf,
     /// The operating system's answer.
     pub source: std::io::Error,
 }
 
 impl FileError {
-    /// Whether the machine is at fault, a full disk or a lost mount for instance, and not what is or is not in a folder.
+    /// Whether the machine is at fault, e.g. by a full disk or a lost mount, and not the content of a folder.
     pub fn is_fault(&self) -> bool {
         use ErrorKind::{AlreadyExists, InvalidData, InvalidInput, IsADirectory, NotADirectory, NotFound};
         let kind = self.source.kind();
@@ -141,8 +141,8 @@ pub fn delete(path: &Path) -> Result<()> {
     if_there(deleted).map(drop).map_err(io("delete", path))
 }
 
-/// Writes a file in one piece: it appears complete, and on the disk, or not at all. Folders are created. What is there
-/// and is no plain file, a pipe for instance, is written to.
+/// Writes a file in one piece: it appears complete, and on the disk, or not at all. Creates missing folders. An existing
+/// file that is no plain file, e.g. a pipe, is written to and not replaced.
 ///
 /// # Errors
 /// The operating system's; an earlier file is then still there.
@@ -273,7 +273,7 @@ pub fn sync_file(file: &File, path: &Path) -> std::io::Result<()> {
     unless_unsupported(Operation::Sync, file.sync_all(), path).map(drop)
 }
 
-/// `None` if what was asked for is not there.
+/// Turns the error "not found" into `None`.
 fn if_there<T>(result: std::io::Result<T>) -> std::io::Result<Option<T>> {
     match result {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),

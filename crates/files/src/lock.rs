@@ -22,22 +22,23 @@ const LOCK_RETRY_INTERVAL: Duration = Duration::from_millis(1);
 pub struct Lock(File);
 
 impl Drop for Lock {
-    /// A process that is just being started has copies of all open files for a moment: closing this one does not unlock it.
+    /// Unlocks before the file is closed. A process that is just being started has copies of all open files for a moment,
+    /// so closing alone would not unlock.
     fn drop(&mut self) {
-        let _ = self.0.unlock(); // a failure leaves it to the closing
+        let _ = self.0.unlock(); // after a failure the closing unlocks
     }
 }
 
 impl Lock {
-    /// Takes the lock of `folder`, its file `lock`, which is created if it is not there; `None` while somebody else has it.
-    /// Who only asks whether [somebody has it](is_locked) does not count. On a file system without locks everybody gets
-    /// it, and a warning says so once.
+    /// Takes the lock of `folder`: its file `lock`, which is created if it is missing. Returns `None` while another process
+    /// has the lock. A process that only [tests the lock](is_locked) does not have it. On a file system without locks every
+    /// process gets the lock, and a warning says so once.
     ///
     /// # Errors
     /// The operating system's.
     pub fn try_take(folder: &Path) -> Result<Option<Self>> {
         let path = folder.join(LOCK_FILE);
-        // NFS wants both: to read for asking who has it, to write for having it.
+        // NFS needs both permissions: reading for a shared lock, writing for an exclusive one.
         let mut options = File::options();
         options.create(true).truncate(false).read(true).write(true).custom_flags(nonblocking_flag());
         let file = options.open(&path).map_err(io("open", &path))?;
@@ -46,7 +47,7 @@ impl Lock {
             if exclusive != Some(false) {
                 return Ok(Some(Self(file)));
             }
-            // Who has it shares it with nobody; who only looks shares it with anybody.
+            // A taken lock is exclusive, a test of it is shared. If a shared lock is possible, another process only tests.
             match supported(file.try_lock_shared(), &path).map_err(io("lock", &path))? {
                 Some(true) => file.unlock().map_err(io("unlock", &path))?,
                 _ => return Ok(None),
@@ -62,8 +63,7 @@ impl Lock {
     }
 }
 
-/// Whether somebody has the lock of `folder`. It is shared for a moment, which [keeps nobody from taking
-/// it](Lock::try_take).
+/// Whether a process has the lock of `folder`. Takes a shared lock for a moment, for which [`Lock::try_take`] waits.
 pub fn is_locked(folder: &Path) -> bool {
     let file = File::options().read(true).custom_flags(nonblocking_flag()).open(folder.join(LOCK_FILE));
     file.is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
@@ -95,7 +95,7 @@ mod tests {
     fn lock_ends_with_its_value_despite_inherited_files() {
         let directory = tempfile::tempdir().unwrap();
         let lock = Lock::try_take(directory.path()).unwrap().unwrap();
-        let copy = lock.0.try_clone().unwrap(); // as a process gets it
+        let copy = lock.0.try_clone().unwrap(); // a process that is being started gets such a copy
         assert!(Lock::try_take(directory.path()).unwrap().is_none());
         drop(lock);
         assert!(Lock::try_take(directory.path()).unwrap().is_some());

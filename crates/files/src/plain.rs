@@ -1,4 +1,4 @@
-//! Files that anybody may have put where they are: opened without waiting, read to a limit, and told from what they were.
+//! Plain files in folders to which others may write: opens them without waiting, limits their size, and recognises changes.
 
 use std::fs::Metadata;
 use std::io::{Error, ErrorKind};
@@ -9,10 +9,10 @@ use rustix::io::Errno;
 
 use super::{Result, if_there, io};
 
-/// Nothing that is read whole is larger, bytes.
+/// Maximal size of a file that is read whole, in bytes.
 pub(super) const MAX_BYTES: u64 = 1 << 30;
 
-/// Tells what is at a path from what was there, without reading it: another one when its content is.
+/// Identifies the content of a file without reading it: the stamp changes when the content does.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub struct Stamp {
     inode: u64,
@@ -31,7 +31,7 @@ impl Stamp {
         Self { inode: file.ino(), length: file.len(), changed: (file.mtime(), file.mtime_nsec()) }
     }
 
-    /// In letters that stand for themselves in addresses.
+    /// The stamp as text that needs no escaping in URLs.
     pub fn tag(&self) -> String {
         let Self { inode, length, changed: (seconds, nanoseconds) } = self;
         format!("{inode:x}-{length:x}-{seconds:x}-{nanoseconds:x}")
@@ -70,8 +70,8 @@ pub fn read_plain_text(path: &Path, most: u64) -> Result<String> {
     String::from_utf8(content).map_err(|error| io("read", path)(Error::new(ErrorKind::InvalidData, error.utf8_error())))
 }
 
-/// Whether `name` in `folder`, which is in `root` and has no symbolic links, is or goes through a link that leads out of
-/// `root`, or to what is hidden there.
+/// Whether `name` in `folder` is, or goes through, a symbolic link to a place outside `root` or to a hidden place in it.
+/// `folder` is in `root` and has no symbolic links.
 pub fn leads_out(root: &Path, folder: &Path, name: impl AsRef<Path>) -> bool {
     let mut path = folder.to_owned();
     name.as_ref().components().any(|component| {
@@ -82,7 +82,7 @@ pub fn leads_out(root: &Path, folder: &Path, name: impl AsRef<Path>) -> bool {
 
 fn is_elsewhere(root: &Path, path: &Path) -> bool {
     let real = match path.canonicalize() {
-        Err(error) => return error.kind() != ErrorKind::NotFound, // a link to nothing is as good as none
+        Err(error) => return error.kind() != ErrorKind::NotFound, // a link to nothing leads nowhere
         Ok(real) => real,
     };
     let hidden = |name: &std::ffi::OsStr| name.as_encoded_bytes().starts_with(b".");

@@ -40,7 +40,7 @@ pub struct ExternalEvaluation {
     pub name: String,
     /// The agent's name in reports, e.g. "PPO".
     pub agent: String,
-    /// At least one, all of one environment, each trained on something else.
+    /// The policies: at least one, all of one environment, each with another training distribution.
     policies: Vec<ExternalPolicy>,
 }
 
@@ -58,17 +58,17 @@ pub struct ExternalPolicy {
 /// Metadata of a policy that is not in its records.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PolicyMetadata {
-    /// The distribution of parameters in training; `None` if it is not known or none of the versions.
+    /// The distribution of parameters in training; `None` if it is unknown or is none of the versions.
     pub trained_on: Option<Version>,
     /// Steps of its training, of all environments together; `None` if not known.
     pub timesteps: Option<u64>,
-    /// From which the seeds of the tests follow.
+    /// The seed from which the seeds of the tests follow.
     pub seed: u64,
-    /// Episodes of each test, as they were asked for.
+    /// Number of episodes that was requested for each test.
     pub episodes: u64,
     /// The observation of the policy.
     pub observe: Observe,
-    /// Whether it took the mode of its actions' distribution. `None` if that was its own business.
+    /// Whether the policy took the mode of its actions' distribution. `None` if the evaluation did not decide this.
     pub deterministic: Option<bool>,
 }
 
@@ -100,7 +100,7 @@ pub enum ExternalEvaluationError {
     /// Records are missing or damaged.
     #[error(transparent)]
     Records(#[from] RecordsError),
-    /// There is none.
+    /// There is no assessment.
     #[error("{} holds no assessment: {ASSESSMENT} is not there; give the folder of Assessment.save", path.display())]
     Missing { path: PathBuf },
     /// The document is damaged, or was written by an incompatible program.
@@ -119,7 +119,7 @@ pub enum ExternalEvaluationError {
         /// The violated condition.
         got: String,
     },
-    /// Something is there.
+    /// The folder for the assessment is not empty.
     #[error("{} is not empty; {instead}", path.display())]
     NotEmpty {
         path: PathBuf,
@@ -190,7 +190,7 @@ impl ExternalEvaluation {
         &self.policies
     }
 
-    /// The row of reports that it belongs to.
+    /// The row of reports to which the evaluation belongs.
     pub fn method(&self) -> Method {
         Method {
             algorithm: self.agent.clone(),
@@ -207,8 +207,8 @@ impl ExternalEvaluation {
         path.join(ASSESSMENT).is_file()
     }
 
-    /// Reads what is in the folder `path`. Another program may be replacing it: a folder whose files do not belong together
-    /// is looked at again.
+    /// Reads the assessment in the folder `path`. Another program may be replacing it, so a folder whose files do not fit
+    /// together is read again.
     ///
     /// # Errors
     /// [`ExternalEvaluationError`], which names the file.
@@ -242,7 +242,7 @@ impl ExternalEvaluation {
         let document: EvaluationDocument = serde_json::from_value(value).map_err(damaged)?;
         let mut policies = Vec::new();
         for PolicyEntry { file, known } in document.policies {
-            // A file's name is that of one beside this, whatever is said of its folder.
+            // Only the file's name counts: the file is always in this folder.
             let file = Path::new(&file).file_name().unwrap_or_default();
             let policy = ExternalPolicy::new(known, Records::read(&path.join(file))?);
             if file != policy.file_name().as_str() {
@@ -256,12 +256,12 @@ impl ExternalEvaluation {
         Self::new(name, document.agent, policies)
     }
 
-    /// Writes it into the folder `path`, which must be new or empty unless it holds an assessment that may be overwritten.
-    /// Of that one the records go, and nothing else that is in the folder.
+    /// Writes the assessment into the folder `path`, which must be new or empty unless it holds an assessment that may be
+    /// overwritten. Deletes the records of an overwritten assessment, and nothing else in the folder.
     ///
     /// # Errors
-    /// [`ExternalEvaluationError`]. Nothing is deleted before all is written: what was overwritten in part has the former
-    /// `assessment.json`, and in a new folder there is none.
+    /// [`ExternalEvaluationError`]. Nothing is deleted before everything is written: after a failure a former
+    /// `assessment.json` is still there, and a new folder has none.
     pub fn write(&self, path: &Path, overwrite: bool) -> Result<()> {
         let (json, is_one) = (path.join(ASSESSMENT), Self::is_in(path));
         let replaced = overwrite && is_one;
@@ -305,11 +305,11 @@ impl ExternalEvaluation {
     }
 }
 
-/// The records that the document `json` names, files beside it; none if it is not there or cannot be understood.
+/// The files of records that the document `json` names; none if the document is missing or cannot be understood.
 fn records_named_in(json: &Path) -> Result<BTreeSet<String>> {
     let text = read_if_there(json)?.unwrap_or_default();
     let mut value = serde_json::from_slice(&text).unwrap_or_default();
-    // What was changed names its files all the same.
+    // A document with a wrong checksum still names its files.
     let _ = checksum::open(&mut value);
     let entries =
         serde_json::from_value(value).map_or_else(|_| Vec::new(), |document: EvaluationDocument| document.policies);

@@ -31,7 +31,7 @@ fn an_assessment_is_there_until_another_one_is_written() {
     let directory = tempfile::tempdir().unwrap();
     let former = fixture::assessed("PPO", "CartPole", &[Some(D), Some(R)], [200; 3]);
     former.write(directory.path(), false).unwrap();
-    fs::create_dir(directory.path().join("episodes-E.parquet")).unwrap(); // so that this one cannot be written
+    fs::create_dir(directory.path().join("episodes-E.parquet")).unwrap(); // a folder, so that this file cannot be written
     fixture::assessed("PPO", "CartPole", &[Some(E)], [100; 3]).write(directory.path(), true).unwrap_err();
     assert_eq!(ExternalEvaluation::read(directory.path()).unwrap().policies(), former.policies());
 }

@@ -9,7 +9,7 @@ use perturb_records::{
 };
 use perturb_settings::Observe;
 
-/// The `index`th episode of a test on `set`, which had one requested parameter, and achieved so many steps.
+/// The `index`th episode of a test on `set`, with one requested parameter and `steps` as the achieved value.
 pub fn episode(set: &str, index: u32, requested: f64, steps: u32, success: bool) -> EpisodeRecord {
     EpisodeRecord {
         set: set.into(),
@@ -28,7 +28,7 @@ pub fn episode(set: &str, index: u32, requested: f64, steps: u32, success: bool)
     }
 }
 
-/// A policy of Pendulum's mean return and success rate, %, by mass and length.
+/// A policy's heatmap on Pendulum. `figures` gives the mean return and the success rate, %, by mass and length.
 pub fn heatmap(grid: usize, figures: impl Fn(f64, f64) -> (f64, f64)) -> Heatmap {
     let axis = |name: &str, unit: &str| Axis {
         name: name.into(),
@@ -50,8 +50,8 @@ pub fn heatmap(grid: usize, figures: impl Fn(f64, f64) -> (f64, f64)) -> Heatmap
     Heatmap { environment, base: Version::D, fixed: Default::default(), grid, episodes: 20, points, axes }
 }
 
-/// An agent in `environment` that took so many steps in each of the ten episodes of its tests on D, R and E, where 195 are a
-/// success; a policy for each of what was `trained_on`.
+/// An agent in `environment` with a policy for each of `trained_on`. In each of the ten episodes of its tests on D, R and E
+/// it took `steps`; 195 steps are a success.
 pub fn assessed(agent: &str, environment: &str, trained_on: &[Option<Version>], steps: [u32; 3]) -> ExternalEvaluation {
     let criterion = |threshold| Criterion {
         quantity: "steps".into(),

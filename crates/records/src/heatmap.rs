@@ -11,7 +11,7 @@ use crate::axis::Axis;
 use crate::records::{EpisodeRecord, Records};
 use crate::statistics::mean;
 
-/// The most points along an axis: all environments run together.
+/// Maximal number of points along an axis: the environments of all points run together.
 pub const MAX_POINTS: usize = 100;
 
 /// Options of a heatmap.
@@ -50,7 +50,7 @@ impl HeatmapOptions {
 /// The parameters and the base of a heatmap. Heatmaps of one kind can be compared.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct HeatmapKind {
-    /// Along x and along y.
+    /// The names of the parameters along x and along y.
     pub parameters: [String; 2],
     /// The distribution of the other parameters.
     pub base: Version,
@@ -59,9 +59,9 @@ pub struct HeatmapKind {
 /// A policy's figures over two parameters, or the means of several policies'.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Heatmap {
-    /// By its name in the catalogue.
+    /// The environment's name in the catalogue.
     pub environment: String,
-    /// x and y.
+    /// The axes x and y.
     pub axes: [Axis; 2],
     /// The distribution of the other parameters, see [`HeatmapOptions::base`].
     pub base: Version,
@@ -82,7 +82,7 @@ pub struct HeatmapPoint {
     pub x: f64,
     /// The value of the parameter along y.
     pub y: f64,
-    /// Undiscounted.
+    /// The mean undiscounted return.
     pub mean_return: f64,
     /// The success rate of the point's episodes, %.
     pub success_percent: f64,
@@ -108,7 +108,7 @@ impl Heatmap {
     /// The name of the test set in a heatmap's records.
     pub const SET: &str = "heatmap";
 
-    /// The axes of a heatmap's set: the two parameters that vary, the faster one along x. `None` of another set.
+    /// The axes of a heatmap's set: the two parameters that vary, the faster one along x. `None` for another set.
     pub(crate) fn axes_of(set: &TestSet, environment: &proto::Environment) -> Option<[Axis; 2]> {
         let contexts = set.listed();
         let [first, second, ..] = contexts.as_slice() else { return None };
@@ -153,8 +153,8 @@ impl Heatmap {
         records.about.tests.iter().find(|test| test.set.name == Self::SET).map(|test| test.set.version)
     }
 
-    /// From the recorded episodes of a test over `axes`, whose contexts are the points, by y, then x; `None` if they are
-    /// those of something else.
+    /// Computes the heatmap of a recorded test over `axes`, whose contexts are the points, by y, then x. `None` if the
+    /// episodes are those of another test.
     pub fn from_records(records: &Records, axes: [Axis; 2]) -> Option<Self> {
         let test = records.about.tests.iter().find(|test| test.set.name == Self::SET)?;
         let contexts = test.set.listed();
@@ -190,7 +190,7 @@ impl Heatmap {
         heatmap.is_whole().then_some(heatmap)
     }
 
-    /// The means of several policies' figures at each point; `None` of nothing, or of figures over other points.
+    /// The means of several policies' figures at each point; `None` without heatmaps, or if their points differ.
     pub fn mean(heatmaps: &[Self]) -> Option<Self> {
         let first = heatmaps.first()?;
         let about = |of: &Self| Self { points: Vec::new(), ..of.clone() };
@@ -207,7 +207,8 @@ impl Heatmap {
         Some(Self { points: first.points.iter().enumerate().map(point).collect(), ..about(first) })
     }
 
-    /// With the points of [`heatmap_table`] as CSV; `None` if they are others than its axes and grid have.
+    /// Replaces the points by those in `csv`, written by [`heatmap_table`]; `None` if they do not fit the axes and the
+    /// grid.
     pub fn with_points(self, csv: &[u8]) -> Option<Self> {
         let mut reader = csv::Reader::from_reader(csv);
         let rows: Result<Vec<[f64; 4]>, _> = reader.deserialize().collect();
@@ -217,13 +218,13 @@ impl Heatmap {
         read.is_whole().then_some(read)
     }
 
-    /// Whether each point is where it belongs.
+    /// Whether each point has the values of its place in the grid.
     fn is_whole(&self) -> bool {
         let ([x, y], grid) = (&self.axes, self.grid);
         let fits = |(index, point): (usize, &HeatmapPoint)| {
             (point.x, point.y) == (x.value(index % grid, grid), y.value(index / grid, grid))
         };
-        // None of a file that was not written here may be empty, or larger than numbers can say.
+        // A foreign file may have no points, or a grid whose number of points overflows.
         grid > 0 && grid.checked_mul(grid) == Some(self.points.len()) && self.points.iter().enumerate().all(fits)
     }
 

@@ -25,7 +25,7 @@ pub struct Ledgers {
     /// The environments of each address in a session.
     at: BTreeMap<(SessionId, u64, u32), EnvironmentAddress>,
     refused: Vec<Refused>,
-    /// The end of each server process, written or not.
+    /// The end of each server process; `None` if it is not known.
     over: Vec<Option<Moment>>,
     /// A line that contradicts itself.
     defect: Option<(u64, &'static str)>,
@@ -42,7 +42,7 @@ struct EnvironmentAddress {
     closed: Vec<usize>,
 }
 
-/// The most environments that a line may name.
+/// Maximal number of environments that a line may name.
 const MAX_ENVS: u32 = 1 << 22;
 
 /// The end of a ledger.
@@ -50,18 +50,19 @@ const MAX_ENVS: u32 = 1 << 22;
 pub struct Head {
     /// The file of the ledger.
     pub path: PathBuf,
-    /// Lines.
+    /// Number of lines.
     pub lines: u64,
-    /// The last one's digest.
+    /// The digest of the last line.
     pub digest: String,
-    /// Bytes behind it, of a line that is being written or was not finished.
+    /// Number of bytes behind the last line: a line that is being written or was not finished.
     pub unfinished: u64,
 }
 
 /// The result of the audit of one policy.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct Proof {
-    /// Under which tokens' names its training drew, `None` where none was needed; empty if no ledger has it.
+    /// The names of the tokens under which its training drew, `None` for a session without a token; empty if no ledger has
+    /// the training.
     pub tokens: BTreeSet<Option<String>>,
     /// Sessions of its training.
     pub sessions: usize,
@@ -104,9 +105,9 @@ struct Drawn {
     index: u32,
     /// Index of the first episode.
     first: u64,
-    /// Index of the last episode, if it is known. Below the first if nothing was drawn.
+    /// Index of the last episode, if it is known. Smaller than `first` if nothing was drawn.
     last: LastDraw,
-    /// The time at which the last one ended.
+    /// The time at which the end of its sampling was recorded.
     ended: Option<Moment>,
     region: Arc<Region>,
 }
@@ -128,10 +129,10 @@ struct Refused {
 }
 
 impl Ledgers {
-    /// Reads ledgers and checks their chains. Each digest that is `known` from elsewhere must be one of a line.
+    /// Reads ledgers and checks their chains. `known` are digests from elsewhere, each of which must be that of a line.
     ///
     /// # Errors
-    /// In a sentence, the first that cannot be read or believed.
+    /// A sentence on the first ledger that cannot be read or is not valid.
     pub fn read(paths: &[PathBuf], known: &[String]) -> Result<Self, String> {
         let (mut ledgers, mut missing) = (Self::default(), known.iter().collect::<Vec<_>>());
         for path in paths {
@@ -175,7 +176,7 @@ impl Ledgers {
         let line = |who: LedgerSession| LedgerLine { at, session: (beginning, who.session), who };
         match event {
             LedgerEvent::Began { .. } => {
-                // The one before it, of the same ledger, ended by then.
+                // The earlier server process of this ledger had ended by then.
                 if n > 0
                     && let Some(over) = self.over.last_mut()
                 {
@@ -191,7 +192,7 @@ impl Ledgers {
         }
     }
 
-    /// Takes a sampling record. Its ends come before its beginnings.
+    /// Takes a sampling record. Its ends happened before its beginnings.
     fn take_draws(&mut self, line: LedgerLine, DrawRecord { regions, begins, ends, .. }: DrawRecord) {
         let named = begins.iter().map(|begin| begin.count).chain(ends.iter().map(|end| end.count));
         if named.fold(0, u32::saturating_add) > MAX_ENVS {
@@ -220,7 +221,7 @@ impl Ledgers {
     fn end_one(&mut self, address: (SessionId, u64, u32), end: (Option<u64>, Moment)) {
         let address = self.at.entry(address).or_default();
         address.ends.push(end);
-        // Where nothing was open, what had ended went on after all.
+        // If no environment was drawing, those that had ended before went on.
         let went_on = address.open.is_empty();
         if address.ends.len() < address.open.len() {
             return;
@@ -251,7 +252,7 @@ impl Ledgers {
         records: &Records,
     ) -> Proof {
         let claimed = Region::from_version(environment, training.version, &training.parameters);
-        // Other trainings with its seed, on something else, are told by what they draw from.
+        // Other trainings with the same seed draw from other regions.
         let is_own = |drawn: &&Drawn| {
             drawn.line.who.environment == environment.name
                 && drawn.last != LastDraw::None
@@ -272,7 +273,7 @@ impl Ledgers {
                 format!("of the {episodes} episodes of its training, {name}, {drawn} were drawn: give all ledgers");
             proof.against.push(few);
         }
-        // A session that did not say how far it came went on as long as its server.
+        // A session without a recorded end counts until the end of its server process.
         let end = |drawn: &&Drawn| drawn.ended.or(self.over.get(drawn.line.session.0).copied().flatten());
         let ends: Vec<Option<Moment>> = own.iter().map(end).collect();
         let is_its = |line: &LedgerLine| {
@@ -312,7 +313,7 @@ impl Ledgers {
         let path = self.heads.get(*ledger).map(|head| head.path.display().to_string()).unwrap_or_default();
         let mut sentence = format!("line {} of {path}: {what}", n + 1);
         let token = who.token.as_ref().map_or("without a token".into(), |token| format!("by the token {token:?}"));
-        // A string takes it.
+        // Writing to a string cannot fail.
         let _ = write!(sentence, ", {token}, {} s after 1970", unix_ms / 1000);
         sentence
     }
@@ -325,7 +326,7 @@ fn tested(environment: &proto::Environment, test: &RecordedTest, claimed: &Regio
 }
 
 impl Drawn {
-    /// Returns the number of sampled episodes; the maximum if it is not known.
+    /// Returns the number of sampled episodes; the largest number if it is not known.
     fn episodes(&self) -> u64 {
         match self.last {
             LastDraw::None => 0,

@@ -1,4 +1,4 @@
-//! What ledgers prove, by ledgers that were made up.
+//! Proofs from invented ledgers.
 
 use std::path::{Path, PathBuf};
 
@@ -74,7 +74,7 @@ fn ends(session: u64, token: &str, (seed, index, count, episode): (u64, u32, u32
     LedgerEvent::Draws(DrawRecord { who: who(session, token), regions: Vec::new(), begins: Vec::new(), ends })
 }
 
-/// The training, by ann.
+/// The events of the training, with the token of ann.
 fn trained() -> [LedgerEvent; 2] {
     [begins(0, "ann", R, (1, 0, 2, 0)), ends(0, "ann", (1, 0, 2, 49))]
 }
@@ -126,7 +126,7 @@ fn a_session_without_an_end_lasts_as_long_as_its_server() {
     says(&proof(&[begun.clone(), leak.clone(), again.clone()]), "of the test set E");
     assert!(proof(&[begun.clone(), again.clone(), leak.clone()]).against.is_empty(), "its server had ended by then");
     says(&proof(&[begun.clone(), leak.clone()]), "of the test set E");
-    // Session 0 of another beginning is another session.
+    // Session 0 of another server process is another session.
     let other = [begun, again, begins(0, "bob", E, (9, 0, 1, 0)), ends(0, "bob", (1, 0, 2, 0))];
     assert!(proof(&other).against.is_empty());
 }
@@ -152,14 +152,14 @@ fn an_end_is_that_of_what_was_open_and_of_nothing_later() {
     let reset = [begun.clone(), again.clone(), ends(1, "ann", (7, 0, 1, 0)), again, ended.clone()];
     let found = proof(&reset);
     assert_eq!(found.against.len(), 2, "{found:?}");
-    // Many short ones are not one long one for each.
+    // Many short draws do not add up to a long one for each environment.
     let short: Vec<LedgerEvent> =
         (0..9).flat_map(|_| [begins(0, "ann", R, (1, 0, 2, 0)), ends(0, "ann", (1, 0, 2, 4))]).collect();
     says(&proof(&short), "90 were drawn");
     // A part that was given back early does not end the others.
     let early = [begun.clone(), ends(0, "ann", (1, 0, 1, 49)), begins(1, "ann", E, (9, 0, 1, 0))];
     says(&proof(&early), "of the test set E");
-    // What was refused by the server drew nothing.
+    // The server draws nothing for a refused request.
     let withdrawn = LedgerEvent::Draws(DrawRecord {
         who: who(1, "ann"),
         regions: Vec::new(),

@@ -2,7 +2,7 @@
 //!
 //! - [`ResultsTable`] has every result of studies in one Parquet file, [`StudyEpisodes`] the episodes of one study.
 //! - [`Records`] are the episodes of a policy's tests, in a Parquet file; [`testing`] says which episodes a test plays.
-//! - [`success`] says when an episode is one; [`outcomes`] are success over parameters and thresholds, and the worst episodes.
+//! - [`success`] has the rules of success; [`outcomes`] has success over parameters and thresholds, and tail risk.
 //! - [`statistics`] are means, intervals and tests over runs; [`Metric`] and [`Scenario`] are the paper's.
 //! - [`Heatmap`] is a policy over two parameters; [`ExternalEvaluation`] is an agent that no experiment trained.
 //! - [`comparison`] compares conditions over their seeds and over episodes.

@@ -41,7 +41,7 @@ impl Record {
     }
 }
 
-/// The paper's number for a method in an environment; `None` if it has none. The environment "Average" is all six.
+/// The paper's number for a method in an environment; `None` if it has none. The environment "Average" stands for all six.
 pub fn number(environment: &str, method: &Method, metric: Metric) -> Option<Summary> {
     let record = records().find(|record| record.metric == metric && record.is_of(environment, method))?;
     Some(Summary { mean: record.mean_percent, std: Some(record.std_percent), runs: RUNS })
@@ -66,7 +66,7 @@ pub fn methods(environment: &str) -> Vec<Method> {
     methods
 }
 
-/// The paper's average over `environments`: the published one if they are all six, otherwise the mean of theirs.
+/// The paper's average over `environments`: the published one for all six, otherwise the mean of their published numbers.
 pub fn average(environments: &[&str], method: &Method, metric: Metric) -> Option<Summary> {
     let means: Option<Vec<f64>> = environments.iter().map(|name| Some(number(name, method, metric)?.mean)).collect();
     let means = means?;

@@ -39,9 +39,9 @@ pub enum ColumnValues<'a> {
     OptionalUnsigned64(Vec<Option<u64>>),
     /// Numbers of steps and of environments.
     Unsigned32(Vec<u32>),
-    /// Whether something is so.
+    /// Truth values.
     Flag(Vec<bool>),
-    /// Measured.
+    /// Measured numbers.
     Number(Vec<f64>),
     /// Numbers that some rows lack.
     Optional(Vec<Option<f64>>),
@@ -199,7 +199,7 @@ impl ParquetFile {
 
     /// Opens a file after its checksum was compared.
     pub(crate) fn open(content: Vec<u8>) -> Result<Self, AnyError> {
-        // First of all: the decoder takes what has changed for what it says, and may panic.
+        // This is checked first: the decoder believes what a damaged file says, and may panic.
         checksum::check(&content).map_err(|broken| format!("{broken}; give a copy that is whole, or test again"))?;
         let reader = SerializedFileReader::new(Bytes::from(content))?;
         let metadata = reader.metadata().file_metadata().key_value_metadata();

@@ -20,7 +20,7 @@ pub enum TrainedOn<'a> {
     Version(Version),
     /// The plan's own set of that name.
     Set(&'a str),
-    /// Something that is not known, or none of these: of policies that were trained elsewhere.
+    /// Another or an unknown distribution, for policies that were trained elsewhere.
     Unknown,
 }
 
@@ -63,7 +63,7 @@ impl Scenario {
         Self::pairs(&Version::ALL, &Version::ALL)
     }
 
-    /// All pairs of what was trained on and tested on.
+    /// All pairs of the versions that were trained on and tested on.
     pub fn pairs(trained: &[Version], tested: &[Version]) -> impl Iterator<Item = Scenario> {
         trained.iter().flat_map(|&train| tested.iter().map(move |&test| Scenario { train, test }))
     }
@@ -88,7 +88,7 @@ pub enum Metric {
 }
 
 impl Metric {
-    /// All, in the paper's order.
+    /// All metrics, in the paper's order.
     pub const ALL: [Metric; 3] = [Metric::Default, Metric::Interpolation, Metric::Extrapolation];
 
     /// The scenarios whose geometric mean is Extrapolation.
@@ -98,7 +98,7 @@ impl Metric {
         Scenario { train: Version::R, test: Version::E },
     ];
 
-    /// The metric from the success rates of scenarios; `None` if one that it needs has none.
+    /// The metric from the success rates of scenarios; `None` if a scenario that it needs has no rate.
     pub fn value(self, rate_of: impl Fn(Scenario) -> Option<f64>) -> Option<f64> {
         use Version::{D, R};
         let rate = |train, test| rate_of(Scenario { train, test });

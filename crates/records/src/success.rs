@@ -12,7 +12,7 @@ use perturb_settings::{ValueError, require};
 /// Quantities that count steps.
 const STEPS: [&str; 2] = ["steps", "steps_in_a_row"];
 
-/// A success achieved the threshold, or was better than it.
+/// A criterion of success: an episode succeeds if its quantity reaches the threshold or is better.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Criterion {
@@ -20,17 +20,17 @@ pub struct Criterion {
     pub quantity: String,
     /// The unit; "1" for steps.
     pub unit: String,
-    /// On which side of the threshold successes are.
+    /// The side of the threshold on which episodes are successes.
     pub side: Side,
-    /// In the quantity's unit.
+    /// The threshold, in the quantity's unit.
     pub threshold: f64,
-    /// The maximum value of an episode: the step limit, if steps are compared. Nothing is known of thresholds beyond
-    /// it.
+    /// The maximum value in an episode: the step limit, if steps are compared. Episodes cannot be judged by thresholds
+    /// beyond it.
     #[serde(default)]
     pub most: Option<f64>,
 }
 
-/// A side of a threshold, which itself belongs to it.
+/// A side of a threshold. The threshold itself belongs to both sides.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Side {
@@ -40,12 +40,12 @@ pub enum Side {
     AtMost,
 }
 
-/// A threshold of one's own, written `steps=90`.
+/// A threshold that the user chose, written `steps=90`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Threshold {
     /// The quantity that is compared.
     pub quantity: String,
-    /// In the quantity's unit.
+    /// The threshold, in the quantity's unit.
     pub value: f64,
 }
 
@@ -53,11 +53,11 @@ pub struct Threshold {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Rule {
-    /// The environment's own, which is that of the paper's text.
+    /// The environment's own rule, which is that of the paper's text.
     Text,
     /// The rule of the paper's published code.
     Code,
-    /// Either of them with another threshold, whichever compares that quantity.
+    /// Another threshold for the one of these two rules that compares its quantity.
     At(Threshold),
 }
 
@@ -89,7 +89,7 @@ impl Criterion {
     /// Returns the criterion with another threshold.
     ///
     /// # Errors
-    /// [`ValueError`] if that is one of another quantity.
+    /// [`ValueError`] if the threshold is one of another quantity.
     pub fn with(&self, threshold: &Threshold) -> Result<Self, ValueError> {
         let expected = format!("one of {}, e.g. {}={}", self.quantity, self.quantity, self.threshold);
         require(threshold.quantity == self.quantity, THRESHOLD, threshold, expected)?;
@@ -98,7 +98,7 @@ impl Criterion {
         Ok(Self { threshold: threshold.value, ..self.clone() })
     }
 
-    /// Whether an episode that achieved this is a success; one that achieved nothing is none.
+    /// Whether an episode that achieved this value is a success. Without a value it is none.
     pub fn holds(&self, achieved: Option<f64>) -> bool {
         achieved.is_some_and(|achieved| match self.side {
             Side::AtLeast => achieved >= self.threshold,
@@ -111,7 +111,7 @@ impl Rule {
     /// The criterion by this rule; `text` and `code` are the environment's.
     ///
     /// # Errors
-    /// [`ValueError`] if it is one of another quantity, or if the server does not say what is compared.
+    /// [`ValueError`] if no rule compares the threshold's quantity, or if the server does not say what is compared.
     pub fn criterion(&self, text: Option<&Criterion>, code: Option<&Criterion>) -> Result<Criterion, ValueError> {
         let unknown = |expected| move || ValueError::new("the rule of success", self, expected);
         match self {

@@ -9,7 +9,7 @@ use rand::Rng;
 use crate::heatmap::Heatmap;
 use crate::records::{Difference, EpisodeRecord, RecordedTest, Records};
 
-/// The most environments that are tested together, unless a set has more contexts.
+/// Maximal number of environments that are tested together, unless a set has more contexts.
 const MAX_ENVS: usize = 100;
 
 /// Why a test's episodes are not recorded.
@@ -17,10 +17,10 @@ const MAX_ENVS: usize = 100;
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum NotRecorded {
-    /// Episodes did not run with the parameters that they were to run with.
+    /// Episodes did not run with the requested parameters.
     #[error("testing on {set}: {difference}; its results would be of another environment: mend the server")]
     NotApplied { set: String, difference: Difference },
-    /// The server requested something else of its physics than it was asked for.
+    /// The server requested other parameters of its physics than the client had asked for.
     #[error(
         "testing on {set}: the server was asked for {parameter} in {asked}, but its receipt says {got}; mend the server"
     )]
@@ -29,27 +29,27 @@ pub enum NotRecorded {
 
 /// The seed of the test environments on `version`.
 ///
-/// It is the first, second, third or fourth number (D, R, E, R+E) of the stream of `seed` for `purpose`, which is
-/// [`Purpose::TestEnvironments`] or [`Purpose::SelectionEnvironments`], so that a policy never meets its training episodes
-/// again, whatever seeds are used, nor those that selected it, and the versions are independent. Sets have the seed of
-/// their base version: what differs between two of them is parameters, not initial states.
+/// The seed is the first, second, third or fourth number (D, R, E, R+E) of the stream of `seed` for `purpose`, which is
+/// [`Purpose::TestEnvironments`] or [`Purpose::SelectionEnvironments`]. So a test never repeats episodes of the training or
+/// of the selection, whatever the seeds, and the versions are independent. Sets have the seed of their base version: two
+/// sets differ in parameters, not in initial states.
 pub fn environment_seed(purpose: Purpose, seed: u64, version: Version) -> u64 {
     let mut rng = stream(seed, purpose);
     let drawn: [u64; Version::KNOWN.len()] = std::array::from_fn(|_| rng.next_u64());
     drawn[version as usize]
 }
 
-/// `[N]` how many trials each environment is tested for. Environment i has context i modulo their number, and every
-/// context equally many episodes, at least 1; `contexts` is at least 1.
+/// `[N]` the number of trials for which each environment is tested. Environment i has context i modulo their number. Every
+/// context has equally many episodes, at least 1. `contexts` is at least 1.
 fn quotas(episodes: u64, contexts: usize) -> Vec<u64> {
     let each = episodes.div_ceil(contexts as u64).max(1);
-    // One context has as many environments as it can use, each of several its share.
+    // A single context gets as many environments as it can use. Several contexts share them equally.
     let copies = ((MAX_ENVS / contexts) as u64).clamp(1, each);
     (0..copies).flat_map(|i| vec![each / copies + u64::from(i < each % copies); contexts]).collect()
 }
 
-/// A test under way: of each environment the first trials count, and of each the last episode. Counting the first to end
-/// instead would favour short ones.
+/// Collects the episodes of a running test. The first trials of each environment count, and the last episode of each trial.
+/// Counting the first episodes to end would favour short ones.
 #[derive(Clone, Debug)]
 pub struct TestCollector {
     test: RecordedTest,
@@ -87,9 +87,9 @@ impl TestCollector {
         self.counted.extend(ended.into_iter().filter(counts));
     }
 
-    /// Episodes that were counted, and how many there are to be.
+    /// Number of episodes that were counted, and the number to be reached.
     pub fn progress(&self) -> (u64, u64) {
-        // Saturates: a wrapped sum would end a test of very many episodes before its first one.
+        // Saturates: a sum that overflows would end a test of very many episodes before its first one.
         (self.counted.len() as u64, self.quotas.iter().fold(0, |sum, &quota| sum.saturating_add(quota)))
     }
 
@@ -127,7 +127,7 @@ fn asked(environment: &proto::Environment, set: &TestSet, context: &Context) -> 
     region.boxes().iter().map(in_order).collect()
 }
 
-/// Whether the server requested of its physics what it was asked for: all parameters of one part of the version.
+/// Checks that the server's physics got what was requested: all parameters from one part of the version.
 fn check_requested(
     environment: &proto::Environment,
     set: &TestSet,
@@ -144,7 +144,7 @@ fn check_requested(
     })
 }
 
-/// The first parameter that is not what it may be in any of the parts, all of whose parameters belong together.
+/// The first parameter outside its distribution. All parameters must be from the same part.
 fn wrong(asked: &[Vec<Distribution>], requested: &[f64]) -> Option<usize> {
     let in_part = |asked: &Vec<Distribution>| {
         let requested = requested.iter().copied().chain(std::iter::repeat(f64::NAN));

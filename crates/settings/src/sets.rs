@@ -18,7 +18,7 @@ pub type Parameters = BTreeMap<String, Distribution>;
 /// A value for each of some parameters. The other parameters follow the version.
 pub type Context = BTreeMap<String, f64>;
 
-/// The most contexts of a set: all of them run together.
+/// Maximal number of contexts of a set: all of them run together.
 const MAX_CONTEXTS: usize = DEFAULT_MAX_ENVS;
 
 /// A set of parameters that a policy is tested on.
@@ -49,7 +49,7 @@ impl From<Version> for TestSet {
 }
 
 impl TestSet {
-    /// The version that this is, if nothing was said of its parameters.
+    /// The set's version, if the set replaces none of its parameters.
     pub fn plain(&self) -> Option<Version> {
         match &self.contexts {
             Contexts::Drawn(parameters) if parameters.is_empty() => Some(self.version),
@@ -57,7 +57,7 @@ impl TestSet {
         }
     }
 
-    /// The distributions that replace the version's, in every episode.
+    /// The distributions that replace the version's in every episode.
     pub fn drawn(&self) -> Parameters {
         match &self.contexts {
             Contexts::Drawn(parameters) => parameters.clone(),
@@ -65,7 +65,7 @@ impl TestSet {
         }
     }
 
-    /// The values that replace the version's in one of its contexts.
+    /// The values that replace the version's in `context`.
     pub fn parameters(&self, context: &Context) -> Parameters {
         let mut parameters = self.drawn();
         parameters.extend(context.iter().map(|(name, value)| (name.clone(), Distribution::fixed(*value))));
@@ -82,7 +82,7 @@ impl TestSet {
         drawn.chain(listed.into_iter().flatten().flat_map(BTreeMap::keys)).map(String::as_str)
     }
 
-    /// The set's contexts; one empty one if its parameters are drawn.
+    /// The set's contexts; a single empty context if its parameters are drawn.
     pub fn listed(&self) -> Vec<Context> {
         match &self.contexts {
             Contexts::Drawn(_) => vec![Context::new()],
@@ -90,7 +90,7 @@ impl TestSet {
         }
     }
 
-    /// Whether `environment` has its parameters and accepts all of their values.
+    /// Checks that `environment` has the set's parameters and accepts all of their values.
     ///
     /// # Errors
     /// [`ValueError`], which names the parameter and what is accepted.
@@ -105,7 +105,7 @@ impl TestSet {
     }
 }
 
-/// Whether `environment` has these `parameters` and accepts all of their values; `set` names them in refusals.
+/// Checks that `environment` has these `parameters` and accepts all of their values. `set` is the set's name in errors.
 ///
 /// # Errors
 /// [`ValueError`], which names the parameter and what is accepted.
@@ -136,7 +136,7 @@ pub fn known_names(environment: &proto::Environment) -> String {
     if disturbances.is_empty() { own } else { format!("{own}, or a disturbance: {disturbances}") }
 }
 
-/// Refuses two sets of one name: results are told apart by it.
+/// Refuses two sets with the same name: results are told apart by their set's name.
 ///
 /// # Errors
 /// [`ValueError`], which names the set.
@@ -161,9 +161,9 @@ pub struct Assignment {
 /// The values of a parameter in a set.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Values {
-    /// Drawn.
+    /// A distribution, from which values are drawn.
     Drawn(Distribution),
-    /// Each in turn.
+    /// Points of a grid.
     Points(Vec<f64>),
 }
 
@@ -226,8 +226,8 @@ fn finite(parameter: &str, text: &str, points: Vec<f64>) -> Result<Vec<f64>, Val
     Ok(points)
 }
 
-/// A set called `name` of what `assignments` say over `version`. With points, it is the grid of all their combinations,
-/// the first parameter varying fastest, and the other parameters of the set must have a single value.
+/// Makes a set called `name` from `assignments` over `version`. With points, it is the grid of all their combinations, the
+/// first parameter varying fastest, and the other parameters of the set must have a single value.
 ///
 /// # Errors
 /// [`ValueError`] for a parameter that is named twice, a grid with drawn parameters, or more contexts than one server

@@ -2,7 +2,7 @@
 
 use std::fmt::Display;
 
-/// A value that cannot be.
+/// A value that is not accepted.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{what} is {got}, but must be {expected}")]
 pub struct ValueError {

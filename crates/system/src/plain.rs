@@ -16,7 +16,7 @@ pub fn open_plain(path: &Path) -> Result<(File, Metadata)> {
     require_plain(&std::fs::metadata(path)?)?; // a device may do something when it is opened
     let file = File::options().read(true).custom_flags(nonblocking_flag()).open(path)?;
     let metadata = file.metadata()?;
-    require_plain(&metadata)?; // it may have become another one meanwhile
+    require_plain(&metadata)?; // another file may be at the path meanwhile
     Ok((file, metadata))
 }
 
@@ -43,7 +43,7 @@ pub fn read_plain(path: &Path, max_bytes: u64) -> Result<Vec<u8>> {
 /// Refuses all but plain files.
 ///
 /// # Errors
-/// [`ErrorKind::IsADirectory`] for a folder, [`ErrorKind::InvalidInput`] for what else is no plain file.
+/// [`ErrorKind::IsADirectory`] for a folder, [`ErrorKind::InvalidInput`] for anything else that is no plain file.
 pub fn require_plain(metadata: &Metadata) -> Result<()> {
     match metadata.is_file() {
         true => Ok(()),

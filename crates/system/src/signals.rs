@@ -6,8 +6,8 @@ use rustix::process::Signal;
 use tokio::runtime::Builder;
 use tokio::signal::unix::{SignalKind, signal};
 
-/// Has a write beyond the process's limit of file sizes (`ulimit -f`) fail with EFBIG. Without this, the system ends the
-/// program by SIGXFSZ, without a word. To be called first in `main`; a program that replaces this one must call it again.
+/// Lets a write beyond the process's limit of file sizes (`ulimit -f`) fail with EFBIG. Without this call, SIGXFSZ would
+/// end the program without a message. Call it first in `main`, and again in a program that replaces this one.
 ///
 /// # Errors
 /// The operating system's. The program may continue: only that limit then ends it.

@@ -2,8 +2,8 @@
 
 use std::borrow::Cow;
 
-/// The text with all control characters escaped, newlines and tabs among them, and the characters that reorder a line.
-/// Terminals obey such characters: they colour, move, delete and paste. In a log a newline forges an entry.
+/// The text with control characters escaped, newlines and tabs included, and the characters that reorder a line. A terminal
+/// would obey such characters: they can colour, move, delete and paste text. In a log a newline would forge an entry.
 pub fn escape_terminal(text: &str) -> Cow<'_, str> {
     if !text.chars().any(is_obeyed) {
         return Cow::Borrowed(text);

@@ -38,7 +38,7 @@ pub fn duration(seconds: f64) -> String {
     }
 }
 
-/// A word, the path of a file for instance, as a shell takes it for one.
+/// Quotes a word, e.g. the path of a file, so that a shell takes it as one word.
 pub fn quoted(word: impl AsRef<OsStr>) -> String {
     let word = word.as_ref().to_string_lossy();
     shlex::try_quote(&word).map_or_else(|_| word.to_string(), |quoted| quoted.into_owned())
@@ -47,7 +47,7 @@ pub fn quoted(word: impl AsRef<OsStr>) -> String {
 /// Length to which [`shortened`] cuts texts of unknown origin, characters.
 const MAX_CHARS: usize = 300;
 
-/// A text, of a long one the beginning.
+/// A text, cut after 300 characters, where ` …` shows the cut.
 pub fn shortened(text: impl Into<String>) -> String {
     let mut text = text.into();
     if let Some((end, _)) = text.char_indices().nth(MAX_CHARS) {

@@ -1,4 +1,4 @@
-//! Tables, and what becomes of them: text for a terminal, Markdown, CSV. The same table gives the same bytes everywhere.
+//! Tables, and their forms as text for a terminal, Markdown and CSV. The same table gives the same bytes everywhere.
 
 use std::ops::Range;
 
@@ -10,9 +10,9 @@ use comfy_table::{CellAlignment, TableStyle};
 pub struct Table {
     /// The title, or the name of the file.
     pub title: String,
-    /// From left to right.
+    /// The columns, from left to right.
     pub columns: Vec<Column>,
-    /// Each with an entry for each column.
+    /// The rows, each with an entry for each column.
     pub rows: Vec<Vec<Entry>>,
 }
 
@@ -23,7 +23,7 @@ pub struct Column {
     pub name: String,
     /// A heading over neighbouring columns, if their own headings are not enough.
     pub group: Option<String>,
-    /// Texts stand on the left, numbers on the right.
+    /// Whether entries are numbers, which are aligned to the right; texts are aligned to the left.
     pub is_number: bool,
 }
 
@@ -42,7 +42,7 @@ impl<T: std::fmt::Display> From<T> for Entry {
     }
 }
 
-/// A table that gets its columns, one after the other, from the `R`s that its rows are of.
+/// Builds a table column by column from values `R`, one for each row.
 pub struct TableBuilder<'r, R> {
     sources: &'r [R],
     table: Table,
@@ -55,7 +55,7 @@ impl Table {
         TableBuilder { sources, table: Table { title: title.into(), columns: Vec::new(), rows } }
     }
 
-    /// Columns under each other, without the title.
+    /// Renders the table with its columns side by side, without the title.
     pub fn to_text(&self) -> String {
         self.drawn(NOTHING, str::to_owned).trim_fmt()
     }
@@ -81,8 +81,8 @@ impl Table {
         blocks.join("\n\n")
     }
 
-    /// Whether the column at this place, or the end, can follow a break: one whose name another has, too, is understood
-    /// beside those before it alone.
+    /// Whether a break may come before the column at this place. The end may always follow a break. A column whose name
+    /// another column has, too, must stay beside those before it.
     fn may_begin(&self, place: usize) -> bool {
         let Some(column) = self.columns.get(place) else { return true };
         self.columns.iter().filter(|other| other.name == column.name).count() == 1
@@ -94,12 +94,12 @@ impl Table {
         Table { title: self.title.clone(), columns, rows: self.rows.iter().map(row).collect() }
     }
 
-    /// For GitHub and the like, without the title.
+    /// Renders the table as Markdown of GitHub's kind, without the title.
     pub fn to_markdown(&self) -> String {
         self.drawn(ASCII_MARKDOWN, |text| text.replace('|', "\\|").replace('\n', " ")).to_string()
     }
 
-    /// A line of names and a line for each row.
+    /// Writes the table as CSV: a line of names, and a line for each row.
     pub fn to_csv(&self) -> Vec<u8> {
         let names = self.columns.iter().map(|column| &column.name).collect();
         let rows = self.rows.iter().map(|row| row.iter().map(|entry| &entry.text).collect());
@@ -150,7 +150,7 @@ impl<'r, R> TableBuilder<'r, R> {
         self
     }
 
-    /// With a row for each source.
+    /// Builds the table, with a row for each source.
     pub fn build(self) -> Table {
         self.table
     }

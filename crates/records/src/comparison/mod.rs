@@ -34,7 +34,7 @@ pub enum ComparedScore {
     Length,
 }
 
-/// A condition in a test.
+/// The mean score of a condition in a test.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ConditionMean {
     /// The condition's name.
@@ -45,16 +45,18 @@ pub struct ConditionMean {
     pub by_seed: Vec<f64>,
     /// The mean over policies.
     pub mean: f64,
-    /// The ends of the 95 % t interval over policies, which speaks of other seeds. `None` with fewer than three.
+    /// The ends of the 95 % t interval over policies, for conclusions about other seeds. `None` with fewer than three
+    /// policies.
     pub seeds_95: Option<[f64; 2]>,
     /// Number of episodes of each policy; the smallest one if they differ.
     pub episodes: usize,
-    /// The ends of the 95 % interval over episodes, which speaks of these policies in other episodes. It is Wilson's for success
-    /// rates, where episodes that all policies play count by their effective number, else a t interval.
+    /// The ends of the 95 % interval over episodes, for conclusions about these policies in other episodes. For success
+    /// rates it is Wilson's interval, with an effective number of episodes if all policies played the same ones; otherwise
+    /// it is a t interval.
     pub episodes_95: Option<[f64; 2]>,
 }
 
-/// Two conditions in a test: the difference x − y.
+/// The difference x − y of two conditions in a test.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ConditionDifference {
     /// The name of the condition x.
@@ -80,11 +82,11 @@ pub struct ConditionDifference {
     pub same_episodes: bool,
     /// The probability, 0 … 1, that a policy of x has a higher mean score than one of y.
     pub improvement: f64,
-    /// The p-value of the t test over pairs, or without pairs of Welch's test. `None` where there is no interval.
+    /// The p-value of the t test over pairs, or without pairs of Welch's test. `None` if there is no interval.
     pub p: Option<f64>,
-    /// The same, corrected after Holm for all differences of the comparison.
+    /// The value of `p`, corrected after Holm for all differences of the comparison.
     pub p_holm: Option<f64>,
-    /// A sentence that says no more than that.
+    /// The result in a sentence.
     pub verdict: String,
 }
 
@@ -93,19 +95,19 @@ pub struct ConditionDifference {
 pub struct ConditionComparison {
     /// The score that is compared.
     pub score: ComparedScore,
-    /// By test, then condition.
+    /// The means, ordered by test, then condition.
     pub means: Vec<ConditionMean>,
-    /// By test, then pair of conditions.
+    /// The differences, ordered by test, then pair of conditions.
     pub differences: Vec<ConditionDifference>,
-    /// A sentence on all differences.
+    /// The result of all differences in a sentence.
     pub verdict: String,
 }
 
-/// Compares conditions in the tests on `sets`: each with each before it, or with `baseline` alone.
+/// Compares conditions in the tests on `sets`: every pair of conditions, or each condition with `baseline`.
 ///
 /// # Errors
-/// [`ValueError`] for conditions without policies or of one name, a set that one was not tested on, or that means different
-/// parameters in two of them, policies of different environments or rules of success, and an unknown baseline.
+/// [`ValueError`] for conditions without policies or with the same name, a set that a condition was not tested on or whose
+/// parameters differ between conditions, policies of different environments or success rules, and an unknown baseline.
 pub fn compare(
     conditions: &[ComparedCondition<'_>],
     sets: &[String],
@@ -300,8 +302,8 @@ fn difference(x: &TestedCondition<'_>, y: &TestedCondition<'_>, set: &str) -> Co
     }
 }
 
-/// Returns the places in x and y of policies with the same key, in the order of x. `None` unless both have the same keys, each
-/// once.
+/// Returns the indices in x and y of policies with the same key, in the order of x. `None` unless x and y have the same
+/// keys, each once.
 fn pairs(x: &[&str], y: &[&str]) -> Option<Vec<[usize; 2]>> {
     let distinct: std::collections::BTreeSet<&&str> = x.iter().collect();
     if x.len() != y.len() || distinct.len() != x.len() {

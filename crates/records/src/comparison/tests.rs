@@ -90,13 +90,13 @@ fn success_rates_have_wilsons_interval_over_episodes() {
     assert_eq!((it.means[0].mean, it.means[0].seeds_95, it.means[0].episodes), (75.0, None, 4));
     let got = it.means[0].episodes_95.unwrap();
     assert!((got[0] - 100.0 * low).abs() < 1e-9 && (got[1] - 100.0 * high).abs() < 1e-9, "{got:?}");
-    // Four equal policies know no more of other episodes than one.
+    // Four equal policies give no more information on other episodes than one.
     let four = [one[0].clone(), one[0].clone(), one[0].clone(), one[0].clone()];
     let equal = compared(&four, &four, ComparedScore::Success);
     let of_four = equal.means[0].episodes_95.unwrap();
     assert!((of_four[0] - got[0]).abs() < 1e-9, "{of_four:?}");
     assert_eq!((equal.differences[0].p, equal.differences[0].improvement), (Some(1.0), 0.5));
-    // All succeed: the interval is that of as many episodes, and not closed.
+    // All episodes succeed: the interval is as wide as so few episodes make it, and not a single point.
     let all = [policy(&[9; 4])];
     let [low, high] = compared(&all, &all, ComparedScore::Success).means[0].episodes_95.unwrap();
     assert!(low < 60.0 && high == 100.0, "{low}");

@@ -1,4 +1,4 @@
-//! Comparisons in sentences that say no more than their numbers.
+//! Comparisons in sentences that claim no more than their numbers show.
 
 use super::{ComparedScore, ConditionDifference};
 use crate::statistics::MIN_RUNS_FOR_INTERVAL;
@@ -7,7 +7,8 @@ use crate::statistics::MIN_RUNS_FOR_INTERVAL;
 const MAX_DECIDED_P: f64 = 0.05;
 
 impl ConditionDifference {
-    /// Whether the difference is beyond what seeds do by chance, with Holm's correction for all that are compared.
+    /// Whether the difference is larger than chance explains: its p-value over seeds, with Holm's correction for all
+    /// compared pairs, is below the limit.
     pub fn is_decided(&self) -> bool {
         self.p_holm.is_some_and(|p| p < MAX_DECIDED_P)
     }

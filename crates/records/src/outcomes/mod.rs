@@ -17,7 +17,7 @@ pub use worst::{SHARE, conditional_value_at_risk, worst_contexts};
 /// The tests of a policy.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PolicyOutcomes {
-    /// In the order of [`Outcomes::parameters`].
+    /// The parameters, in the order of [`Outcomes::parameters`].
     pub parameters: Vec<RecordedParameter>,
     /// The success criterion; `None` if the server did not say.
     pub success: Option<Criterion>,
@@ -31,9 +31,9 @@ pub struct Outcomes {
     pub parameters: Vec<Vec<f64>>,
     /// The context of each episode, if the set lists contexts.
     pub contexts: Option<Vec<usize>>,
-    /// Undiscounted.
+    /// The undiscounted return of each episode.
     pub returns: Vec<f64>,
-    /// Whether each was a success.
+    /// Whether each episode was a success.
     pub successes: Vec<bool>,
     /// The quantity of the success criterion in each episode; `None` if it was not reached.
     pub achieved: Vec<Option<f64>>,

@@ -1,14 +1,14 @@
-//! Cuts what episodes were tested on into parts that hold about as many episodes each.
+//! Cuts the parameter space of a test into parts with about equally many episodes.
 
 use super::Outcomes;
 
-/// Intended number of episodes in a part. Half of them estimate its success, to one success in twenty.
+/// Intended number of episodes in a part. Half of them estimate the part's success, in steps of a twentieth.
 const EPISODES: f64 = 40.0;
 
 impl Outcomes {
-    /// The part of the parameter space, from 0, that each episode's parameters lie in: of a set that lists its contexts the
-    /// context; otherwise each parameter that varies is cut at quantiles of its own values, into as many intervals as give
-    /// parts of about 40 episodes. Outcomes have no say in it.
+    /// Returns for each episode the part of the parameter space, counted from 0, in which its parameters lie. If the set
+    /// lists contexts, each context is a part. Otherwise each parameter that varies is cut at quantiles of its own values,
+    /// into so many intervals that a part has about 40 episodes. The outcomes of episodes do not matter.
     pub fn parts(&self) -> Vec<usize> {
         if let Some(contexts) = &self.contexts {
             return contexts.clone();

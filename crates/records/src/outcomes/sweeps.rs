@@ -4,17 +4,17 @@ use super::Outcomes;
 use crate::statistics::wilson;
 use crate::success::Criterion;
 
-/// Parts of a parameter's range.
+/// Number of parts of a parameter's range, if it has values everywhere.
 const BINS: f64 = 10.0;
 /// Steps from the lowest threshold to the highest.
 const THRESHOLDS: usize = 40;
 
-/// Values from `low` on and below `high`, which the last one of an interval includes.
+/// Values from `low` to `high`. `high` belongs only to the last bin of an interval.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bin {
-    /// Belongs to it.
+    /// The lower end, which belongs to the bin.
     pub low: f64,
-    /// Does not, but in the last one.
+    /// The upper end, which belongs only to the last bin of an interval.
     pub high: f64,
 }
 
@@ -23,12 +23,12 @@ pub struct Bin {
 pub struct Counted {
     /// The number of successful episodes.
     pub successes: u64,
-    /// All.
+    /// The number of all episodes.
     pub episodes: u64,
 }
 
 impl Counted {
-    /// %; NaN without episodes.
+    /// The success rate, %; NaN without episodes.
     pub fn rate(self) -> f64 {
         100.0 * self.successes as f64 / self.episodes as f64
     }
@@ -61,8 +61,8 @@ impl std::iter::Sum for Counted {
     }
 }
 
-/// Equal parts of the range that the parameter at `place` has in `tests`, ten if it has values everywhere. Where a tenth of
-/// the range has none, as between E's two intervals, a part ends and another begins. None if it does not vary.
+/// Cuts the range that the parameter at `place` has in `tests` into about ten equal bins. Where a tenth of the range has no
+/// value, as between E's two intervals, one bin ends and another begins. Returns no bins if the parameter does not vary.
 pub fn bins<'a>(tests: impl Iterator<Item = &'a Outcomes>, place: usize) -> Vec<Bin> {
     let values = tests.filter_map(|outcomes| outcomes.parameters.get(place)).flatten();
     let mut values: Vec<f64> = values.copied().filter(|value| value.is_finite()).collect();
@@ -83,7 +83,7 @@ pub fn bins<'a>(tests: impl Iterator<Item = &'a Outcomes>, place: usize) -> Vec<
     values.chunk_by(|a, b| b - a < width).flat_map(of_interval).collect()
 }
 
-/// The episodes of `outcomes` by the bins that the parameter at `place` lies in.
+/// Counts the episodes of `outcomes` by the bin of the parameter at `place`.
 pub fn success_within(outcomes: &Outcomes, place: usize, bins: &[Bin]) -> Vec<Counted> {
     let mut counted = vec![Counted::default(); bins.len()];
     let values = outcomes.parameters.get(place).into_iter().flatten();
@@ -96,8 +96,8 @@ pub fn success_within(outcomes: &Outcomes, place: usize, bins: &[Bin]) -> Vec<Co
     counted
 }
 
-/// The episodes of `outcomes` by the bins that two parameters lie in, those at `x` and `y`: `[Y, X]`, in a row. Nothing if
-/// one of them does not vary.
+/// Counts the episodes of `outcomes` by the bins of two parameters, those at `x` and `y`. Returns `[Y, X]` counts in a row;
+/// none if one of the parameters does not vary.
 pub fn success_within_both(outcomes: &Outcomes, [x, y]: [usize; 2], [over_x, over_y]: [&[Bin]; 2]) -> Vec<Counted> {
     let mut counted = vec![Counted::default(); over_x.len() * over_y.len()];
     let values = |place: usize| outcomes.parameters.get(place).into_iter().flatten();
@@ -110,13 +110,13 @@ pub fn success_within_both(outcomes: &Outcomes, [x, y]: [usize; 2], [over_x, ove
     counted
 }
 
-/// The place of the bin that `value` lies in.
+/// The index of the bin in which `value` lies.
 fn bin_of(value: f64, bins: &[Bin]) -> usize {
     bins.partition_point(|bin| bin.low <= value).saturating_sub(1)
 }
 
-/// Thresholds over all that was achieved in `tests`, in ascending order, with the one of `criterion` among them; whole
-/// ones of what is counted. None if nothing was achieved.
+/// Thresholds from the lowest to the highest value achieved in `tests`, ascending, together with the threshold of
+/// `criterion`. Quantities that are counted have whole thresholds. Returns none if nothing was achieved.
 pub fn thresholds<'a>(tests: impl Iterator<Item = &'a Outcomes>, criterion: &Criterion) -> Vec<f64> {
     let achieved = tests.flat_map(|outcomes| outcomes.achieved.iter().flatten());
     let (low, high) = achieved.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (low.min(*x), high.max(*x)));

@@ -30,13 +30,13 @@ impl ContextGroup {
     }
 }
 
-/// The success rate, %, in the worst tenth of contexts: in those parts of the parameter space with the lowest success rates
-/// that hold a tenth of the episodes.
+/// The success rate, %, in the worst tenth of contexts: in the parts of the parameter space with the lowest success rates,
+/// which together hold a tenth of the episodes.
 ///
-/// To take parts for bad ones by the same episodes that then say how bad they are, would take bad luck for bad contexts. So
-/// the episodes of each part are halved, every other one: one half says which parts are worst, the other what their success
-/// rate is, and the mean of both ways round is given. Of parts that are equally bad each counts as much. Since a half may
-/// take the wrong parts for the worst, the true rate may be lower, never systematically higher.
+/// The estimate is cross-fitted. If the same episodes ranked the parts and measured their success, bad luck would look like
+/// bad contexts. So every other episode of a part belongs to one half: one half ranks the parts, the other measures their
+/// success, and the two ways round are averaged. Equally bad parts count equally. Since a half may rank parts wrongly, the
+/// true rate may be lower, but is never systematically higher.
 ///
 /// `None` if there are fewer than ten parts with two episodes, as where all parameters are fixed.
 pub fn worst_contexts(outcomes: &Outcomes) -> Option<f64> {
@@ -81,7 +81,7 @@ mod tests {
 
     use super::*;
 
-    /// `episodes` in each of `contexts`, which are successes where `success` says so of context and episode.
+    /// `episodes` episodes in each of `contexts` contexts. `success` says whether the episode of a context is a success.
     fn outcomes(contexts: usize, episodes: usize, mut success: impl FnMut(usize, usize) -> bool) -> Outcomes {
         let all = || (0..episodes).flat_map(|episode| (0..contexts).map(move |context| (context, episode)));
         Outcomes {
@@ -104,16 +104,18 @@ mod tests {
     fn the_worst_contexts_are_found_and_parts_of_them_count_in_part() {
         // Of 20 contexts two fail always: the worst tenth.
         assert_eq!(worst_contexts(&outcomes(20, 10, |context, _| context != 3 && context != 17)), Some(0.0));
-        // One that fails is a twentieth: the other half of the tenth are the others, which succeed.
+        // The context that fails is half of the worst tenth. The other half are contexts that succeed.
         assert_eq!(worst_contexts(&outcomes(20, 10, |context, _| context != 3)), Some(50.0));
-        // Context c succeeds in its first c + 1 episodes. By episodes 0, 2, …, contexts 0 and 1 are equally bad; the others
-        // say 0 and 1 of 5. By episodes 1, 3, …, it is context 0; the others say 1 of 5.
+        // Context c succeeds in its first c + 1 episodes. In episodes 0, 2, … contexts 0 and 1 are equally bad; in the
+        // other episodes they have 0 and 1 successes of 5. In episodes 1, 3, … context 0 is the worst; in the other
+        // episodes it has 1 success of 5.
         let rate = worst_contexts(&outcomes(10, 10, |context, episode| episode <= context)).unwrap();
         assert!((rate - (10.0 + 20.0) / 2.0).abs() < 1e-9, "{rate}");
     }
 
-    /// All contexts are alike. Chosen by the same episodes, the worst tenth would look far worse: at 20 episodes each, with
-    /// 0.5 ± 0.11, the two lowest of 20 lie some 0.19 below. 40 repetitions of 40 episodes are uncertain by 0.0125.
+    /// All contexts are alike. If the same episodes ranked them, the worst tenth would look far worse: with 20 episodes
+    /// each, the rates are 0.5 ± 0.11, and the two lowest of 20 lie some 0.19 below. The mean of 40 repetitions with 40
+    /// episodes has a standard error of 0.0125.
     #[test]
     fn bad_luck_is_not_taken_for_bad_contexts() {
         let mut rng = stream(1, Purpose::TestEnvironments);

@@ -28,7 +28,7 @@ pub const ROUNDING: f64 = 1e-9;
 pub struct Records {
     /// Metadata of all episodes.
     pub about: RecordsMetadata,
-    /// In the order of the tests, within one in that of environment and episode indices.
+    /// The episodes, in the order of the tests. Those of a test are in the order of their environment and episode indices.
     pub episodes: Vec<EpisodeRecord>,
 }
 
@@ -43,19 +43,19 @@ pub struct RecordsMetadata {
     pub parameters: Vec<RecordedParameter>,
     /// The names of the quantities that were read back, in the order of the applied values.
     pub applied: Vec<String>,
-    /// Names the policy: its checkpoint's id.
+    /// The id of the policy's checkpoint.
     pub policy: String,
     /// Episodes in a trial. Only the last one is recorded. 1 without trials.
     pub episodes_per_trial: u32,
-    /// The success criterion; `None` if the server judged and did not say by what.
+    /// The success criterion; `None` if the server judged without naming one.
     pub success: Option<Criterion>,
-    /// The rule of the paper's text; `None` in records of programs that knew no other.
+    /// The criterion of the paper's text; `None` in records of older programs, which knew no other criterion.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub text_success: Option<Criterion>,
     /// The criterion of the paper's published code; `None` if the server did not say.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub code_success: Option<Criterion>,
-    /// The quantity of [`EpisodeRecord::also_achieved`], where the two rules compare different ones.
+    /// The quantity of [`EpisodeRecord::also_achieved`], if the two rules compare different quantities.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub also: Option<String>,
     /// The tests, in order.
@@ -101,9 +101,9 @@ pub enum Ending {
 pub struct EpisodeRecord {
     /// The name of the set that it was a test on.
     pub set: String,
-    /// With the two indices that follow its address.
+    /// The seed of the environments. With the two indices that follow it is the episode's address.
     pub seed: u64,
-    /// Among those that were tested together, from 0.
+    /// The environment's index among those that were tested together, from 0.
     pub environment_index: u32,
     /// Counts the environment's episodes from 0.
     pub episode_index: u64,
@@ -119,7 +119,7 @@ pub struct EpisodeRecord {
     pub length: u32,
     /// Whether it was a success.
     pub success: bool,
-    /// The end of the episode.
+    /// The way in which the episode ended.
     pub ending: Ending,
     /// The value of the criterion's quantity; `None` if it was not reached.
     pub achieved: Option<f64>,
@@ -139,13 +139,13 @@ pub struct ParameterCheck {
 /// A parameter that was asked for, and what the physics had instead.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Difference {
-    /// By its name in the catalogue.
+    /// The parameter's name in the catalogue.
     pub parameter: String,
     /// The requested value.
     pub requested: f64,
     /// The applied value.
     pub applied: f64,
-    /// The difference as a share of the requested value; of a requested 0, itself.
+    /// The difference divided by the requested value; the difference itself if the requested value is 0.
     pub relative: f64,
 }
 
@@ -178,12 +178,12 @@ impl RecordsMetadata {
     /// The criterion by `rule`.
     ///
     /// # Errors
-    /// [`ValueError`] for one that these episodes cannot be judged by.
+    /// [`ValueError`] for a rule by which these episodes cannot be judged.
     pub fn criterion(&self, rule: &Rule) -> Result<Criterion, ValueError> {
         rule.criterion(self.text_success.as_ref().or(self.success.as_ref()), self.code_success.as_ref())
     }
 
-    /// Has `rule` decide about success in what is to be recorded.
+    /// Makes `rule` the success criterion of episodes that are recorded from now on.
     ///
     /// # Errors
     /// Those of [`RecordsMetadata::criterion`].
@@ -202,7 +202,7 @@ impl RecordsMetadata {
         if self.is_judged_by_code() { (text.1, text.0) } else { text }
     }
 
-    /// Whether [`EpisodeRecord::achieved`] is what the code's rule compares, and another one than the text's does.
+    /// Whether [`EpisodeRecord::achieved`] is the quantity of the code's rule, which differs from that of the text's rule.
     pub fn is_judged_by_code(&self) -> bool {
         let quantity = |criterion: &Option<Criterion>| criterion.as_ref().map(|it| it.quantity.clone());
         self.also.is_some() && quantity(&self.success) == quantity(&self.code_success)
@@ -236,7 +236,7 @@ impl EpisodeRecord {
 }
 
 impl Records {
-    /// Nothing recorded so far.
+    /// Records of a policy without tests so far.
     pub fn new(about: RecordsMetadata) -> Self {
         Self { about, episodes: Vec::new() }
     }
@@ -258,8 +258,8 @@ impl Records {
         self.episodes.iter().filter(move |episode| episode.set == name)
     }
 
-    /// The figures of the test on the set called `name`; with `criterion`, which must be of a recorded quantity, successes are
-    /// judged anew.
+    /// The figures of the test on the set called `name`. With `criterion`, which must compare a recorded quantity,
+    /// successes are judged anew.
     pub fn result(&self, name: &str, criterion: Option<&Criterion>) -> TestResult {
         let success =
             |episode: &EpisodeRecord| criterion.map_or(episode.success, |c| c.holds(self.achieved(episode, c)));
@@ -293,8 +293,8 @@ impl Records {
         Ok(self)
     }
 
-    /// Judges the episodes by a criterion of a quantity that was not recorded: `[episodes]` its values, NaN where it was not
-    /// reached. The quantity takes the place of the recorded ones.
+    /// Judges the episodes by a criterion whose quantity was not recorded. `values` `[episodes]` holds the quantity, NaN
+    /// where it was not reached, and replaces the recorded ones.
     ///
     /// # Errors
     /// [`ValueError`] for another number of values than of episodes.
@@ -321,7 +321,7 @@ impl Records {
         if self.about.also.as_ref() == Some(&criterion.quantity) { episode.also_achieved } else { episode.achieved }
     }
 
-    /// Compares what every episode was asked to run with and what it ran with.
+    /// Compares the requested with the applied parameters of every episode.
     pub fn agreement(&self) -> ParameterCheck {
         let comparison = ParameterComparison::with(&self.about);
         let of = |episode: &EpisodeRecord| comparison.largest(&episode.requested, &episode.applied);
@@ -346,12 +346,12 @@ impl ParameterComparison {
         Self { parameters: parameters.collect() }
     }
 
-    /// For the receipts of `environment`.
+    /// A comparison for the receipts of `environment`.
     pub fn new(environment: &proto::Environment) -> Self {
         Self::with(&RecordsMetadata::new(environment, String::new(), 1))
     }
 
-    /// The largest difference that is more than rounding.
+    /// The largest difference in a receipt, if it is more than rounding.
     pub fn difference_beyond_rounding(&self, requested: &[f64], applied: &[f64]) -> Option<Difference> {
         self.largest(requested, applied).filter(Difference::exceeds_tolerance)
     }
@@ -378,7 +378,7 @@ impl ParameterComparison {
     }
 }
 
-/// A difference as a share of the requested value; of a requested 0, itself.
+/// The difference divided by the requested value; the difference itself if the requested value is 0.
 fn relative(requested: f64, applied: f64) -> f64 {
     let difference = (applied - requested).abs();
     // Positive, so that NaN counts as the largest of all.
@@ -387,7 +387,7 @@ fn relative(requested: f64, applied: f64) -> f64 {
 }
 
 impl Difference {
-    /// Whether it is more than rounding. NaN is.
+    /// Whether the difference is more than rounding. NaN counts as more.
     pub fn exceeds_tolerance(&self) -> bool {
         self.relative.is_nan() || self.relative > ROUNDING
     }

@@ -49,7 +49,7 @@ pub struct TableRow {
     pub cell: String,
     /// The environment's name.
     pub environment: String,
-    /// The environment's revision; `None` of a failed cell.
+    /// The environment's revision; `None` for a failed cell.
     pub revision: Option<u64>,
     /// SHA-256 of the environment's model; `None` without one.
     pub model_hash: Option<String>,
@@ -63,7 +63,7 @@ pub struct TableRow {
     pub observe: String,
     /// The name of the set or version that it was trained on.
     pub trained_on: String,
-    /// The name of the set or version of the test; `None` of a failed cell.
+    /// The name of the set or version of the test; `None` for a failed cell.
     pub tested_on: Option<String>,
     /// The run, from 1.
     pub run: u32,
@@ -91,7 +91,7 @@ pub struct TableRow {
     pub settings: String,
     /// SHA-256 of the test's episodes; `None` if they were not recorded.
     pub checksum: Option<String>,
-    /// Why the cell failed; `None` of a result.
+    /// Why the cell failed; `None` for a result.
     pub failure: Option<String>,
 }
 
@@ -242,7 +242,7 @@ impl ResultsTable {
 }
 
 impl TableRow {
-    /// Returns the figures of the test; `None` of a failed cell.
+    /// Returns the figures of the test; `None` for a failed cell.
     pub fn result(&self) -> Option<TestResult> {
         let (episodes, successes) = (self.episodes?, self.successes?);
         let (low, high) = wilson(successes, episodes);

@@ -17,7 +17,7 @@ pub struct Bootstrapped {
 }
 
 impl std::fmt::Display for Bootstrapped {
-    /// With as many decimals as are asked for; 1 if none are.
+    /// Formats with the requested number of decimals, by default 1.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let digits = f.precision().unwrap_or(1);
         // Adding 0 makes a negative zero positive.
@@ -38,8 +38,8 @@ impl Bootstrapped {
     }
 }
 
-/// The numbers that `statistic` makes of `strata`, always as many, each with its interval over `resamples`. `None` if there
-/// is no stratum, or one without runs.
+/// Computes the numbers that `statistic` returns for `strata`, each with its interval over `resamples`. The statistic must
+/// always return equally many numbers. `None` if there is no stratum, or a stratum without runs.
 pub fn bootstrap(
     strata: &[Vec<f64>],
     resamples: usize,

@@ -1,8 +1,8 @@
-//! Figures over runs: means and deviations, and with bootstrap intervals what Agarwal et al. (2021, arXiv:2108.13264)
-//! recommend; paired comparisons.
+//! Figures over runs: means and deviations, paired comparisons, and the aggregates with bootstrap intervals that Agarwal et
+//! al. (2021, arXiv:2108.13264) recommend.
 //!
-//! Runs are grouped in strata: the scores of an environment's runs each. All are equal to rliable's on the same data, which
-//! `rliable_tests.rs` compares.
+//! Runs are grouped in strata: a stratum holds the scores of an environment's runs. All figures equal rliable's on the same
+//! data, as `rliable_tests.rs` checks.
 
 mod aggregates;
 mod bootstrap;
@@ -22,9 +22,9 @@ pub use t_interval::{mean_with_t_interval, t_test_p};
 pub struct Summary {
     /// Arithmetic mean.
     pub mean: f64,
-    /// Standard deviation with n in the denominator, not n - 1: that is what the paper's tables hold. Its 0.06 ± 0.12 %
-    /// over five runs of 1000 episodes can only be the rates 0.3, 0, 0, 0, 0, whose deviation with n - 1 were 0.13.
-    /// `None` of a single run, which has none, and where it is not known.
+    /// Standard deviation with n in the denominator, not n - 1, as in the paper's tables. Their 0.06 ± 0.12 % over five
+    /// runs of 1000 episodes can only be the rates 0.3, 0, 0, 0, 0, whose deviation with n - 1 would be 0.13. `None` for a
+    /// single run, and if it is not known.
     pub std: Option<f64>,
     /// The number of runs.
     pub runs: usize,

@@ -1,4 +1,4 @@
-//! Comparisons in pairs: what two methods came to in the same environment, with the same seed.
+//! Paired comparisons: the results of two methods in the same environment with the same seed.
 
 use perturb_policy::random::{Purpose, stream};
 use rand::Rng;
@@ -15,7 +15,7 @@ const CHOICES: u32 = 100_000;
 pub fn sign_flip_p(differences: &[f64], seed: u64) -> f64 {
     let differences: Vec<f64> = differences.iter().copied().filter(|difference| *difference != 0.0).collect();
     let seen: f64 = differences.iter().sum::<f64>().abs();
-    // Sums of the same numbers in another order are equal but for rounding.
+    // Sums of the same numbers in another order are equal up to rounding.
     let rounding = 1e-9 * differences.iter().map(|difference| difference.abs()).sum::<f64>();
     let is_as_far = |signs: u64| {
         let sign = |place: usize| if signs >> (place % 64) & 1 == 1 { 1.0 } else { -1.0 };
@@ -59,7 +59,8 @@ mod tests {
         assert_eq!(sign_flip_p(&[1.0; 16], 1), 2_f64.powi(-15));
     }
 
-    /// 17 pairs: 100 001 choices stand for 131 072. Their share has a deviation of √(p (1 - p) / 100 000), 0.0016 at most.
+    /// With 17 pairs the p-value is estimated from 100 001 of the 131 072 choices of signs. The estimate's standard
+    /// deviation is √(p (1 - p) / 100 000), 0.0016 at most.
     #[test]
     fn of_many_pairs_random_signs_come_to_the_same() {
         let differences: Vec<f64> = (0..17).map(|i| f64::from(i % 5) - 1.2).collect();
@@ -78,7 +79,7 @@ mod tests {
     #[test]
     fn the_smallest_of_many_counts_most() {
         let corrected = holm(&[0.01, 0.04, 0.03, 0.005]);
-        let expected = [0.03, 0.06, 0.06, 0.02]; // 0.005 · 4, 0.01 · 3, 0.03 · 2, and 0.04 · 1 is not less than that
+        let expected = [0.03, 0.06, 0.06, 0.02]; // 0.005 · 4, 0.01 · 3, 0.03 · 2; 0.04 · 1 is raised to the one before
         assert!(corrected.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-15), "{corrected:?}");
         assert_eq!(holm(&[0.6, 0.9]), [1.0, 1.0]);
         assert!(holm(&[]).is_empty());

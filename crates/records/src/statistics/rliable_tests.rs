@@ -1,5 +1,5 @@
-//! Against rliable itself (`tests/fixtures/make_rliable.py`): numbers are equal, intervals are equal over the same draws,
-//! and agree over own ones.
+//! Compares with rliable itself (`tests/fixtures/make_rliable.py`): numbers are equal, intervals are equal over the same
+//! draws, and agree over different draws.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -16,7 +16,7 @@ struct Fixture {
 
 #[derive(Deserialize)]
 struct Case {
-    /// By environment, then run; likewise of another method.
+    /// Scores by environment, then run. `others` are those of another method.
     scores: Vec<Vec<f64>>,
     others: Vec<Vec<f64>>,
     iqm: Numbers,
@@ -25,11 +25,11 @@ struct Case {
     improvement: Numbers,
 }
 
-/// One number, or one for each threshold.
+/// A single number, or a number for each threshold.
 #[derive(Deserialize)]
 struct Numbers {
     point: Vec<f64>,
-    /// A digit for each score: the run that it was taken from; strata are words.
+    /// The runs that scores were drawn from: a digit for each score, a word for each stratum.
     draws: Vec<String>,
     interval_of_draws: Vec<[f64; 2]>,
     interval_95: Vec<[f64; 2]>,
@@ -38,7 +38,7 @@ struct Numbers {
 /// Sums of a few dozen numbers up to 100.
 const ROUNDING: f64 = 1e-9;
 
-/// Our resamples; rliable's interval is over `theirs`.
+/// Number of our resamples. Rliable's interval is over `theirs`.
 const RESAMPLES: usize = 50_000;
 
 fn compare(
@@ -74,8 +74,8 @@ fn compare(
         );
     }
 
-    // Numbers of few scores take few values, so that not the ends are compared but how many of our estimates lie beyond
-    // rliable's: 2.5 %, within five of their own and our deviations.
+    // A statistic of few scores takes few values, so that the ends of intervals are not compared. Instead, 2.5 % of our
+    // estimates must lie beyond each of rliable's ends, within five standard deviations of both.
     let deviation = |resamples: usize| 0.025 * 0.975 / resamples as f64;
     let uncertain = 5.0 * (deviation(RESAMPLES) + deviation(theirs)).sqrt();
     for (estimates, [low, high]) in estimates.into_inner().into_iter().zip(&expected.interval_95) {

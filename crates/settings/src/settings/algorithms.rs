@@ -51,9 +51,9 @@ pub struct A2cConfig {
     pub vf_coef: f64,
     /// Global norm that longer gradients are scaled down to, above 0 (default: `0.5`).
     pub max_grad_norm: f64,
-    /// λ: each gradient step takes learning rate · λ of every weight, not negative and below 1 / `learning_rate` (default:
-    /// `0`). Larger keeps outputs closer to 0, and the deviations of continuous actions closer to 1. It is written only
-    /// where it is not the default: settings from before it stay what they were.
+    /// λ: each gradient step reduces every weight by the share learning rate · λ, not negative and below 1 /
+    /// `learning_rate` (default: `0`). Larger keeps outputs closer to 0, and deviations of continuous actions closer to 1.
+    /// Written only if it is not the default, so that older settings stay the same.
     #[serde(skip_serializing_if = "is_zero")]
     pub weight_decay: f64,
     /// Decay per update of RMSProp's average of squared gradients, 0 … 1 (default: `0.99`).
@@ -139,9 +139,9 @@ pub struct PpoConfig {
     pub vf_coef: f64,
     /// Global norm that longer gradients are scaled down to, above 0 (default: `0.5`).
     pub max_grad_norm: f64,
-    /// λ: each gradient step takes learning rate · λ of every weight, not negative and below 1 / `learning_rate` (default:
-    /// `0`). Larger keeps outputs closer to 0, and the deviations of continuous actions closer to 1. It is written only
-    /// where it is not the default: settings from before it stay what they were.
+    /// λ: each gradient step reduces every weight by the share learning rate · λ, not negative and below 1 /
+    /// `learning_rate` (default: `0`). Larger keeps outputs closer to 0, and deviations of continuous actions closer to 1.
+    /// Written only if it is not the default, so that older settings stay the same.
     #[serde(skip_serializing_if = "is_zero")]
     pub weight_decay: f64,
     /// Adam's ε, above 0 (default: `1e-5`). Limits the step of weights with small gradients.
@@ -208,9 +208,9 @@ pub struct EpoptConfig {
     pub epsilon: f64,
     /// Iterations at the start that learn from all episodes, ε = 1 (default: `100`).
     pub full_iterations: u64,
-    /// The quantity that ranks episodes: "raw", the undiscounted return, or "normalized", the sum of the rewards as the
-    /// policy learns from them (default: `"raw"`; paper: `"normalized"`). The divisor of normalised rewards changes
-    /// during an iteration, so the rank of equal episodes depends on their order.
+    /// The quantity that ranks episodes: "raw", the undiscounted return, or "normalized", the sum of the rewards that the
+    /// policy learns from (default: `"raw"`; paper: `"normalized"`). The divisor of normalised rewards changes during an
+    /// iteration, so the rank of equal episodes depends on their order.
     pub rank_by: Ranking,
     /// Whether each kept episode has an update of its own, one after the other, in place of one update on all (default:
     /// `false`; paper: `true` with RC). PPO takes all its epochs over the row of episodes.
@@ -253,12 +253,11 @@ impl EpoptConfig {
 
 /// Settings of RL², Duan et al. (2016), arXiv:1611.02779, beside those of A2C or PPO, which it is wrapped around.
 ///
-/// A trial is N episodes in one drawn environment. The policy is recurrent, keeps its memory from one episode of a trial
-/// to the next, and gets beside the observation what it did and what came of it
-/// (the learner's `Inputs`); returns and advantages run across the episodes of a trial. So the policy that
-/// does best is one that uses a trial's first steps to find out which environment it is in. The update is that of A2C or
-/// PPO as it is, with [`kl_coef`](PpoConfig::kl_coef) for RL²-PPO: collecting alone differs
-/// .
+/// A trial is N episodes in one drawn environment. The policy is recurrent and keeps its memory from one episode of a trial
+/// to the next. Beside the observation it gets its last action, reward and done flag (the learner's `Inputs`). Returns and
+/// advantages run across the episodes of a trial. So the best policy is one that uses a trial's first steps to find out
+/// which environment it is in. Updates are those of A2C or PPO, with [`kl_coef`](PpoConfig::kl_coef) for RL²-PPO; only the
+/// collection of rollouts differs.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Rl2Config {
@@ -318,7 +317,7 @@ fn check_not_negative(name: &'static str, value: f64) -> Result<(), SettingError
     check(name, value, value >= 0.0, "a number that is not negative")
 }
 
-/// `Ok` if a gradient step leaves something of a weight.
+/// `Ok` if a gradient step does not take the whole weight.
 fn check_weight_decay(weight_decay: f64, learning_rate: f64) -> Result<(), SettingError> {
     let is_decay = weight_decay >= 0.0 && weight_decay * learning_rate < 1.0;
     check("weight_decay", weight_decay, is_decay, "a number that is not negative, and below 1 / learning_rate")

@@ -15,7 +15,7 @@ pub enum Architecture {
 }
 
 impl Architecture {
-    /// All.
+    /// All architectures.
     pub const ALL: [Self; 2] = [Self::Ff, Self::Rc];
     /// The names in settings and options.
     pub const NAMES: [&str; 2] = ["ff", "rc"];

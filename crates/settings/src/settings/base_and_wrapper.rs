@@ -6,14 +6,14 @@ use toml::Table;
 use super::{A2cConfig, Architecture, ConfigError, EpoptConfig, PpoConfig, Rl2Config};
 use crate::value_error::{ValueError, require};
 
-/// Settings of the base algorithm that EPOpt does not use: its iterations are complete episodes in one batch.
+/// Settings of the base algorithm that EPOpt does not use: its iterations consist of complete episodes in one batch.
 const NOT_WITH_EPISODES: [&str; 2] = ["n_steps", "n_minibatches"];
 
-/// The most samples of a rollout: some gigabytes.
+/// Maximal number of samples in a rollout, which take some gigabytes.
 const MAX_SAMPLES: u128 = 1 << 26;
 
-/// Steps of each environment in a long rollout: with fewer, a policy's weights take longer to send than the observations
-/// and actions that several trainings send together.
+/// Minimal number of steps of each environment in a long rollout. With fewer, sending a policy's weights takes longer than
+/// sending the observations and actions of several trainings together.
 const LONG_ROLLOUT: usize = 64;
 
 /// The settings of an algorithm, which say which one it is.
@@ -33,7 +33,7 @@ pub enum Base {
     A2c(A2cConfig),
     /// Proximal policy optimisation.
     Ppo(PpoConfig),
-    /// Nothing: every action is as likely as any other. A line to compare with.
+    /// A random policy, which learns nothing: all actions are equally likely. Serves as a baseline.
     Random,
 }
 
@@ -41,24 +41,24 @@ pub enum Base {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(untagged)]
 pub enum Wrapper {
-    /// Nothing.
+    /// No wrapper.
     Plain,
-    /// Learning from the worst episodes of many.
+    /// EPOpt: learning from the worst of many episodes.
     Epopt(EpoptConfig),
-    /// Trials of several episodes.
+    /// RL²: trials of several episodes.
     Rl2(Rl2Config),
 }
 
 /// The way in which rollouts are collected. Trainings in one batch must collect alike.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum CollectionMode {
-    /// Nothing: a random policy.
+    /// No rollouts: a random policy learns nothing.
     None,
-    /// Few steps, whose messages several trainings share.
+    /// Few steps. Several trainings share the messages.
     Short,
-    /// Many steps, or complete episodes: a server can be sent the weights for each.
+    /// Many steps, or complete episodes. The server can be sent the weights for each rollout.
     Long,
-    /// Any that are seen with noise, which the learner adds where it acts.
+    /// Rollouts with noise on observations, which the learner adds when it chooses actions.
     Noisy,
 }
 
@@ -109,7 +109,7 @@ impl Settings {
         }
     }
 
-    /// Whether there is nothing to be learned.
+    /// Whether the policy learns nothing.
     pub fn is_random(&self) -> bool {
         matches!(self.base, Base::Random)
     }
@@ -119,7 +119,7 @@ impl Settings {
         matches!(self.wrapper, Wrapper::Rl2(_))
     }
 
-    /// The architecture that is trained if none is named: one that learns over trials has to remember.
+    /// The architecture that is trained if none is named. A policy that learns over trials needs a memory.
     pub(super) fn default_architecture(&self) -> Architecture {
         if self.has_trials() { Architecture::Rc } else { Architecture::Ff }
     }
@@ -152,7 +152,7 @@ impl Settings {
         })
     }
 
-    /// γ, per step; 1 where nothing learns.
+    /// γ, per step; 1 for a random policy.
     pub fn gamma(&self) -> f64 {
         match &self.base {
             Base::A2c(settings) => settings.gamma,
@@ -169,7 +169,7 @@ impl Settings {
         }
     }
 
-    /// Refuses values outside their ranges, and those that do not go together.
+    /// Refuses values outside their ranges, and values that contradict each other.
     pub(super) fn validate(&self, architecture: Architecture, num_envs: usize) -> Result<(), ConfigError> {
         match &self.base {
             Base::A2c(settings) => {
@@ -199,14 +199,14 @@ impl Settings {
     }
 }
 
-/// Whether a rollout is one that a machine can hold.
+/// Checks that a machine can hold the rollout.
 fn check_size(n_steps: usize, num_envs: usize) -> Result<(), ValueError> {
     let fits = n_steps as u128 * num_envs as u128 <= MAX_SAMPLES;
     let expected = format!("at most {} with {num_envs} environments", MAX_SAMPLES / num_envs as u128);
     require(fits, "n_steps", n_steps, expected)
 }
 
-/// Whether a pass over a rollout can be parted evenly.
+/// Checks that a pass over a rollout can be cut into equal minibatches.
 fn check_minibatches(settings: &PpoConfig, architecture: Architecture, num_envs: usize) -> Result<(), ValueError> {
     let PpoConfig { n_steps, n_minibatches, .. } = *settings;
     let (whole, count) = match architecture {

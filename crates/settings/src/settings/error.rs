@@ -26,7 +26,7 @@ pub enum ConfigError {
         algorithm: &'static str,
         keys: String,
     },
-    /// The command line says two things of one setting.
+    /// The command line gives one setting two values.
     #[error("{first} and {second} contradict each other: give one of them")]
     Contradiction { first: String, second: String },
     /// A value has the wrong type or lies outside its range.
@@ -37,7 +37,7 @@ pub enum ConfigError {
         "no environment was named: give --env NAME, or `environment` in the configuration file; `perturb envs` lists them"
     )]
     NoEnvironment,
-    /// RL² with a policy that remembers nothing.
+    /// RL² was asked to train a policy without memory.
     #[error(
         "{algorithm} cannot train the architecture ff: RL² learns by what a recurrent policy remembers of a trial; give \
          --architecture rc, or another algorithm"

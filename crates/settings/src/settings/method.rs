@@ -13,7 +13,7 @@ pub struct Method {
     pub algorithm: String,
     /// "ff" or "rc".
     pub architecture: String,
-    /// `None` of algorithms without trials.
+    /// `None` for algorithms without trials.
     pub episodes_per_trial: Option<u32>,
     /// The preset, which decides about the default settings.
     #[serde(default, skip_serializing_if = "Preset::is_default")]
@@ -21,13 +21,14 @@ pub struct Method {
     /// The observation of the policies.
     #[serde(default, skip_serializing_if = "Observe::is_default")]
     pub observe: Observe,
-    /// Whether it is an agent that no cell trained: `algorithm` is what its assessment calls it, and no more is known.
+    /// Whether the method is an agent that no cell trained. `algorithm` is then its name in the assessment, and nothing
+    /// else is known.
     #[serde(alias = "elsewhere", default, skip_serializing_if = "std::ops::Not::not")]
     pub external: bool,
 }
 
 impl Method {
-    /// Whether it learns nothing.
+    /// Whether the method learns nothing.
     pub fn is_random(&self) -> bool {
         self.algorithm == "random" && !self.external
     }

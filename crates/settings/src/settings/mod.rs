@@ -117,9 +117,9 @@ pub struct Common {
     /// Ended episodes between two checkpoints, at least 1 (default: `500`). The first iteration and the last always
     /// write one.
     pub checkpoint_interval: u64,
-    /// Training ends, too, after the iteration in which the last 100 ended episodes have this success rate, 0 … 100 %
-    /// (default: `0`, which is never). Longer training can lose what generalises. It is written only where it is not the
-    /// default: settings from before it stay what they were.
+    /// Training also ends after the iteration in which the last 100 ended episodes have this success rate, 0 … 100 %
+    /// (default: `0`, which is never). Longer training can lose what generalises. Written only if it is not the default, so
+    /// that older settings stay the same.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub stop_at_success: f64,
 }
@@ -157,14 +157,14 @@ impl TrainConfig {
         resolve(layers)
     }
 
-    /// The configuration as TOML, every setting of it.
+    /// The configuration as TOML, with every setting.
     pub fn to_toml(&self) -> String {
         // Serialisation of plain numbers, booleans and names cannot fail.
         toml::to_string(&self.full_table()).unwrap_or_default()
     }
 
-    /// The configuration as a flat table, which [`TrainConfig::from_table`] reads back. Of the preset that stands if none is
-    /// named it lacks settings that are younger than some results and as they were before.
+    /// The configuration as a flat table, which [`TrainConfig::from_table`] reads back. With the default preset it lacks
+    /// settings that are younger than some results, if they have the values with which these results were made.
     pub fn table(&self) -> Table {
         let mut table = self.full_table();
         if self.common.preset.is_default() {
@@ -180,7 +180,7 @@ impl TrainConfig {
         table
     }
 
-    /// Reads a flat table; defaults stand for what it lacks.
+    /// Reads a flat table. Settings that it lacks have their defaults.
     ///
     /// # Errors
     /// [`ConfigError`], which names the key and what is accepted.
@@ -188,7 +188,7 @@ impl TrainConfig {
         resolve(vec![(origin.to_owned(), spelled(origin, table)?)])
     }
 
-    /// The configuration with every key that one of its algorithm may have, as reports compare them.
+    /// The configuration with every key that a training with this algorithm may have, as reports compare configurations.
     pub fn complete_table(&self) -> Table {
         let mut table = defaults_of(self);
         table.extend(self.full_table());
@@ -239,7 +239,7 @@ impl TrainConfig {
     }
 }
 
-/// "Hopper R ppo ff": what is trained, in a few words.
+/// Names the training in a few words, e.g. "Hopper R ppo ff".
 impl std::fmt::Display for TrainConfig {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Common { environment, version, .. } = &self.common;
@@ -271,7 +271,7 @@ fn flag(key: &str, value: &Value) -> String {
     }
 }
 
-/// Refuses a command line that says two things of one setting: nobody can know which was meant.
+/// Refuses a command line that gives one setting two values, because the intended one cannot be known.
 fn refuse_contradictions(typed: &[(String, Table)]) -> Result<(), ConfigError> {
     let same = |a: &Value, b: &Value| match (a, b) {
         (Value::String(a), Value::String(b)) => names::is_spelled(a, b),
@@ -286,10 +286,10 @@ fn refuse_contradictions(typed: &[(String, Table)]) -> Result<(), ConfigError> {
     Ok(())
 }
 
-/// A table with its keys as they are usually spelled. Those that no algorithm has stay as they are.
+/// Returns a table with the usual spelling of its keys. Unknown keys stay as they are.
 ///
 /// # Errors
-/// [`ConfigError::Contradiction`] for a key that is there in two spellings.
+/// [`ConfigError::Contradiction`] for a key that occurs in two spellings.
 pub fn spelled(origin: &str, table: Table) -> Result<Table, ConfigError> {
     let known = &*ALL_KEYS;
     let mut spelled = Table::new();
@@ -315,7 +315,7 @@ static ALL_KEYS: LazyLock<Vec<String>> = LazyLock::new(|| {
 /// Every key that a configuration of this kind may have, with its default.
 fn defaults_of(config: &TrainConfig) -> Table {
     let mut defaults = config.full_table();
-    // By default they are not written.
+    // These are written only if they are not the default.
     defaults.insert(PARAMETERS.into(), Value::Table(Table::new()));
     defaults.insert("stop_at_success".into(), 0.0.into());
     if !config.settings.is_random() {
@@ -326,7 +326,7 @@ fn defaults_of(config: &TrainConfig) -> Table {
     defaults
 }
 
-/// The names that the setting `key` may have; `None` if it is no choice between names.
+/// The names that the setting `key` may have; `None` if it has other values than names.
 fn choices(key: &str) -> Option<Vec<&'static str>> {
     Some(match key {
         ALGORITHM => Settings::names().to_vec(),
@@ -340,9 +340,9 @@ fn choices(key: &str) -> Option<Vec<&'static str>> {
     })
 }
 
-/// Lays `layers` over the defaults of the algorithm that they name.
+/// Merges `layers` over the defaults of the algorithm that they name.
 fn resolve(mut layers: Vec<(String, Table)>) -> Result<TrainConfig, ConfigError> {
-    // Names are spelled as usual from here on.
+    // From here on, names have their usual spelling.
     for (key, value) in layers.iter_mut().flat_map(|(_, table)| table.iter_mut()) {
         let known = choices(key).unwrap_or_default();
         if let Some(place) = value.as_str().and_then(|written| names::find(written, known.iter().copied())) {
@@ -383,7 +383,7 @@ fn resolve(mut layers: Vec<(String, Table)>) -> Result<TrainConfig, ConfigError>
     Ok(config)
 }
 
-/// `key=value`, with the value in TOML; a value that is not TOML is a text.
+/// Parses `key=value` with the value in TOML. A value that is not TOML is a text.
 fn parse_set(set: &str) -> Result<Table, ConfigError> {
     let Some((key, value)) = set.split_once('=') else {
         let reason = "expected key=value, e.g. --set learning_rate=3e-4".into();
@@ -428,7 +428,7 @@ fn check(origin: &str, key: &str, value: &Value, defaults: &Table, algorithm: &'
     Err(ValueError::new(key, value, expected).into())
 }
 
-/// "; it is a setting of rl2-a2c, rl2-ppo", if it is one of some algorithms.
+/// A hint such as "; it is a setting of rl2-a2c, rl2-ppo"; `None` if no algorithm has the setting.
 fn others_setting(key: &str) -> Option<String> {
     let has = |settings: &Settings| {
         defaults_of(&defaults::defaults_for(settings.clone(), Architecture::Rc, Preset::default())).contains_key(key)
@@ -438,7 +438,7 @@ fn others_setting(key: &str) -> Option<String> {
     (!names.is_empty()).then(|| format!("; it is a setting of {}", names.join(", ")))
 }
 
-/// Whether every value of the table `[parameters]` is a distribution.
+/// Checks that every value of the table `[parameters]` is a distribution.
 fn check_parameters(parameters: &Table) -> Result<(), ConfigError> {
     let expected = "a value, or a text such as \"0.3..0.4\" or \"0.3..0.4,0.8..0.9\"";
     for (name, value) in parameters {
@@ -448,7 +448,7 @@ fn check_parameters(parameters: &Table) -> Result<(), ConfigError> {
     Ok(())
 }
 
-/// The place of a value among a few names.
+/// The index of a value among its permitted names.
 fn choice(key: &str, value: &Value, known: &[&str]) -> Result<usize, ConfigError> {
     known.iter().position(|name| value.as_str() == Some(name)).ok_or_else(|| {
         let hint = names::did_you_mean(value.as_str().unwrap_or_default(), known.iter().copied());

@@ -11,8 +11,7 @@ pub enum Observe {
     /// The environment's observation.
     #[default]
     State,
-    /// The parameters of the running episode, too. A line to compare with: what a policy could do that need not find
-    /// out or guess which environment it is in.
+    /// The parameters of the running episode, too. Serves as a reference for policies that have to infer their environment.
     Parameters,
 }
 
@@ -20,7 +19,7 @@ impl Observe {
     /// The names in settings and options.
     pub const NAMES: [&'static str; 2] = ["state", "parameters"];
 
-    /// Whether it is what stands if nothing is said.
+    /// Whether this is the default observation.
     pub fn is_default(&self) -> bool {
         *self == Self::default()
     }
@@ -30,7 +29,7 @@ impl Observe {
         self == Self::Parameters
     }
 
-    /// A note for reports, if the observation is not the usual one.
+    /// A note for reports; `None` for the default observation.
     pub fn note(self) -> Option<&'static str> {
         self.sees_parameters().then_some("sees parameters")
     }

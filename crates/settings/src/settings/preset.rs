@@ -21,12 +21,12 @@ pub enum Preset {
 }
 
 impl Preset {
-    /// Both.
+    /// Both presets.
     pub const ALL: [Self; 2] = [Self::Perturb, Self::Paper];
-    /// Their names, as they are typed.
+    /// The presets' names in settings and options.
     pub const NAMES: [&'static str; 2] = ["perturb", "paper"];
 
-    /// Whether it is what stands if none is named.
+    /// Whether this is the default preset.
     pub fn is_default(&self) -> bool {
         *self == Self::default()
     }
@@ -47,7 +47,7 @@ pub(super) fn apply_paper(TrainConfig { common, settings }: &mut TrainConfig) {
         Base::A2c(a2c) => (a2c.bootstrap_truncation, a2c.vf_coef) = (false, HALF * a2c.vf_coef),
         Base::Ppo(ppo) => {
             (ppo.bootstrap_truncation, ppo.vf_coef, ppo.n_epochs) = (false, HALF * ppo.vf_coef, 10);
-            // Rollouts are an eighth as long. Nothing but the log depends on it.
+            // Rollouts are an eighth as long, so a line of the log covers about as many steps. Nothing else depends on it.
             common.log_interval = if let Wrapper::Epopt(_) = settings.wrapper { 1 } else { 10 };
         }
         Base::Random => {}
@@ -61,8 +61,8 @@ pub(super) fn apply_paper(TrainConfig { common, settings }: &mut TrainConfig) {
 /// The authors' value loss is half of the squared error.
 const HALF: f64 = 0.5;
 
-/// Settings that are younger than some results, with the values that these have. Where they have them, they are left out of
-/// what cells are named by, so that the names of older cells stay.
+/// Leaves out settings that are younger than some results if they have the values with which these results were made. The
+/// names of cells depend on the remaining settings, so older cells keep their names.
 pub(super) fn leave_out_younger(table: &mut Table) {
     let is_older = |key: &str, value: &toml::Value| match key {
         "preset" => value.as_str() == Some("perturb"),

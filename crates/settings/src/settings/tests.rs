@@ -101,7 +101,7 @@ fn of(preset: &str, algorithm: &str, architecture: Architecture, sets: &[&str]) 
     load(None, sets, &flags).unwrap()
 }
 
-/// docs/algorithms.md has these in a table.
+/// A table in docs/algorithms.md has these settings.
 #[test]
 fn the_presets_differ_in_named_settings_and_in_nothing_else() {
     for (algorithm, architecture) in pairs() {
@@ -126,7 +126,7 @@ fn the_presets_differ_in_named_settings_and_in_nothing_else() {
     }
 }
 
-/// Both columns of that table: which settings differ does not say by what.
+/// Checks both columns of that table. The test above checks only which settings differ.
 #[test]
 fn each_preset_has_the_documents_values() {
     let (ff, rc) = (Architecture::Ff, Architecture::Rc);
@@ -159,13 +159,13 @@ fn each_preset_has_the_documents_values() {
         let of_epopt = |values: [Value; 2]| algorithm.starts_with("epopt").then_some(values);
         has("rank_by", of_epopt(["raw", "normalized"].map(Value::from)));
         has("update_per_episode", of_epopt([false, architecture == rc].map(Value::from)));
-        // A penalty that the reference has and does not apply.
+        // The reference has this penalty and does not apply it.
         let penalty = if algorithm == "rl2-ppo" { 0.2 } else { 0.0 };
         has("kl_coef", n_epochs.map(|_| [penalty, penalty].map(Value::from)));
     }
 }
 
-/// What was found on seed 1, and what each algorithm has of its own, in both presets.
+/// Checks the values that were found on seed 1, and the settings of single algorithms, in both presets.
 #[test]
 fn each_algorithm_has_its_recommended_rates_and_lengths() {
     let (ff, rc) = (Architecture::Ff, Architecture::Rc);
@@ -217,7 +217,7 @@ fn the_command_lines_preset_beats_the_files() {
     assert_eq!(loaded(&format!("{file}\npreset = 'perturb'"), "preset = 'paper'"), loaded(&paper, ""));
 }
 
-/// Results of earlier programs are found by what cells are named by.
+/// The names of cells depend on these settings, and must still find the results of earlier programs.
 #[test]
 fn default_preset_omits_younger_settings_with_old_values() {
     for (algorithm, architecture) in pairs() {
