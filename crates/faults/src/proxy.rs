@@ -30,10 +30,10 @@ impl FaultKind {
     pub const LOSSES: [Self; 3] = [Self::Close, Self::Blackhole, Self::HalfClose];
 }
 
-/// A fault of one direction of a connection.
+/// A fault in the bytes of one direction of a connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ByteFault {
-    /// Position of the byte at which it happens, from 0.
+    /// Position of the byte at which the fault happens, from 0.
     pub at: usize,
     /// Kind of the fault.
     pub kind: FaultKind,

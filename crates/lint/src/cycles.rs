@@ -14,13 +14,13 @@ use crate::imports::{ModulePath, PackageImports};
 pub struct Cycle {
     /// Folder of the package.
     pub folder: String,
-    /// Path of their parent; empty for the crate's root.
+    /// Path of the modules' parent; empty for the crate's root.
     pub parent: ModulePath,
     /// Number of the parent's children that take part in imports.
     pub siblings: usize,
     /// Names of all modules of the cycle, in alphabetical order.
     pub modules: Vec<String>,
-    /// A shortest path from one of them back to itself.
+    /// A shortest path of imports from one of these modules back to itself.
     pub path: Vec<Edge>,
 }
 

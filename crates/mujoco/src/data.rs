@@ -10,9 +10,9 @@ use std::{
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Status {
     Sound,
-    /// Until the next reset.
+    /// MuJoCo refuses to compute until the next reset.
     Diverged(Warning),
-    /// A fatal error interrupted MuJoCo in the middle: for good.
+    /// A fatal error interrupted MuJoCo in the middle. The data stay unusable.
     Poisoned,
 }
 
@@ -29,7 +29,8 @@ pub struct Simulation {
     model: Model,
     // Made by mj_makeData for `model`, owned, freed in drop. The model is never replaced by one of other sizes.
     data: NonNull<sys::mjData>,
-    /// Made of `model`, whose arrays it shares; owned, freed in drop. None where the model does not allow for it.
+    /// The pairs of geoms that can touch, made for `model`, whose arrays they share; owned, freed in drop. `None` if the
+    /// model needs the search for near geoms.
     pairs: Option<NonNull<sys::perturb_mj_pairs>>,
     status: Status,
 }
@@ -60,7 +61,8 @@ impl Simulation {
 
     // ---- model edits
 
-    /// The constants that the edits below change, with all that follows from them: [`Model::n_constants`] numbers.
+    /// Writes the constants that the edits below change, with everything that follows from them: [`Model::n_constants`]
+    /// numbers.
     pub fn constants(&self, out: &mut [f64]) {
         assert_eq!(out.len(), self.model.n_constants(), "the constants of another model");
         let mut rest = out;
@@ -70,7 +72,7 @@ impl Simulation {
         }
     }
 
-    /// Takes back what [`constants`](Self::constants) wrote, of this or another simulation of the same model.
+    /// Restores what [`constants`](Self::constants) wrote, for this or another simulation of the same model.
     pub fn set_constants(&mut self, constants: &[f64]) {
         assert_eq!(constants.len(), self.model.n_constants(), "the constants of another model");
         let mut rest = constants;
@@ -89,7 +91,7 @@ impl Simulation {
         }
     }
 
-    /// Takes back what [`fields`](Self::fields) wrote, of this or another simulation of the same model.
+    /// Restores what [`fields`](Self::fields) wrote, for this or another simulation of the same model.
     pub fn set_fields(&mut self, fields: &[Field], values: &[f64]) {
         assert_eq!(values.len(), self.model.n_fields(fields), "the fields of another model");
         let mut rest = values;
@@ -186,8 +188,9 @@ impl Simulation {
         self.run(sys::perturb_mj_step)
     }
 
-    /// [`step`](Self::step), to the same bytes, in less time where only the world's geoms can touch others: MuJoCo then
-    /// need not search for those that are near each other, which it does by all pairs' bounding boxes.
+    /// Does what [`step`](Self::step) does, to the same bytes, but faster if only the world's geoms can touch others.
+    /// MuJoCo then need not search for geoms that are near each other, for which it compares the bounding boxes of all
+    /// pairs.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
@@ -202,8 +205,8 @@ impl Simulation {
         self.pairs.is_some()
     }
 
-    /// Checks positions and velocities, and computes the poses and the velocities of bodies. It is a part of
-    /// [`step1`](Self::step1), of which contacts and forces are left out: they stay those before.
+    /// Checks positions and velocities, and computes the poses and the velocities of bodies. This is a part of
+    /// [`step1`](Self::step1): contacts and forces are not computed, and keep their earlier values.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
@@ -279,7 +282,7 @@ impl Simulation {
         }
         let failed = call(self.model.as_ptr(), self.data.as_ptr());
         self.poison_if(failed)?;
-        // MuJoCo answers a bad number by resetting the state and counting a warning, nothing else.
+        // MuJoCo reports a bad number only by resetting the state and counting a warning.
         match Warning::ALL.into_iter().find(|&warning| self.warnings(warning) != 0) {
             None => Ok(()),
             Some(warning) => {
@@ -299,8 +302,9 @@ impl Simulation {
 
     // ---- state
 
-    /// Writes the complete state, on which all later results depend beside the model, [`Model::n_state`] numbers: time in s, positions `[Q]`,
-    /// velocities `[V]`, activations `[n_act]`, where the constraint solver starts `[V]`, controls `[U]`.
+    /// Writes the complete state, [`Model::n_state`] numbers: time in s, positions `[Q]`, velocities `[V]`, activations
+    /// `[n_act]`, the constraint solver's starting point `[V]`, controls `[U]`. All later results depend on the state and
+    /// the model alone.
     pub fn state(&self, out: &mut [f64]) {
         assert_eq!(out.len(), self.model.n_state(), "the state of another model");
         out[0] = self.time();
@@ -311,7 +315,7 @@ impl Simulation {
         }
     }
 
-    /// Takes back what [`state`](Self::state) wrote, of this or another simulation of the same model. Forgets everything
+    /// Restores what [`state`](Self::state) wrote, for this or another simulation of the same model. Forgets everything
     /// else, divergence included.
     ///
     /// # Errors

@@ -52,7 +52,7 @@ fn open(name: &str) -> Result<Egl, Error> {
     // functions have the types of the EGL registry.
     unsafe { Egl::load_required_from_filename(name) }.map_err(|error| {
         let reason = error.to_string();
-        // These are the dynamic loader's words for a missing file. Without memory or descriptors it has others.
+        // The dynamic loader reports a missing file with these words, and a lack of memory or descriptors with others.
         let is_installed = !reason.contains("No such file or directory");
         Error::NoOpenGl { reason, is_installed }
     })
@@ -137,7 +137,7 @@ impl Gl {
 
 impl Drop for Gl {
     fn drop(&mut self) {
-        // Nobody is left to hear that the driver failed.
+        // A failure of the driver has no consequence here, and cannot be reported from `drop`.
         let _ = self.egl.make_current(self.display, None, None, None);
         if let Some(context) = self.context {
             let _ = self.egl.destroy_context(self.display, context);

@@ -12,9 +12,9 @@ use std::{
     sync::{Mutex, OnceLock, PoisonError},
 };
 
-/// Room for files in MuJoCo's virtual file system, beside the model's text.
+/// Maximal number of files in MuJoCo's virtual file system, beside the model's text.
 const MAX_FILES: usize = 1999;
-/// MuJoCo's room for a file's name is 1000 bytes.
+/// Maximal length of a file's name, in bytes. MuJoCo has space for 1000.
 const MAX_FILE_NAME: usize = 900;
 
 /// A kind of named model element.
@@ -331,7 +331,7 @@ impl Model {
         }
     }
 
-    /// An estimate, from above, of the memory of a simulation of this model in bytes: the model and MuJoCo's data.
+    /// An upper estimate of the memory of a simulation of this model in bytes: the model and MuJoCo's data.
     pub fn simulation_bytes(&self) -> usize {
         let m = self.raw();
         let [nv, njmax, nconmax, nstack, nu, nbody, n_m, nemax] =
@@ -386,8 +386,8 @@ impl Model {
         arrays
     }
 
-    /// The floating-point arrays that edits of masses, inertias and friction change, or mj_setConst from them, with
-    /// their lengths.
+    /// The floating-point arrays that edits of masses, inertias and friction change or that mj_setConst computes from them,
+    /// with their lengths.
     pub(crate) fn constants(&self) -> [(*mut f64, usize); 9] {
         CONSTANTS.map(|field| self.place(field))
     }

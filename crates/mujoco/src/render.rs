@@ -7,9 +7,9 @@ use std::{
     sync::{Mutex, MutexGuard, PoisonError},
 };
 
-/// Room for the geoms of a scene of a small model; each geom of a model gives one.
+/// Minimal number of geoms that a scene has space for. A model needs one for each of its geoms, and some for decorations.
 const MIN_SCENE_GEOMS: usize = 200;
-/// Room for the geoms of a scene of any model.
+/// Maximal number of geoms that a scene has space for.
 const MAX_SCENE_GEOMS: usize = 20_000;
 
 /// The position and direction of a camera.
@@ -55,7 +55,7 @@ fn exclusive() -> MutexGuard<'static, ()> {
 }
 
 impl Renderer {
-    /// Gets ready to draw `model`, at its initial positions, in pictures of about this size in pixels.
+    /// Prepares for drawing `model`, at its initial positions, in pictures of about this size in pixels.
     ///
     /// # Errors
     /// [`Error::NoOpenGl`], and [`Error::Fatal`] if OpenGL cannot do what MuJoCo needs.
@@ -199,7 +199,7 @@ impl Drop for Renderer {
     }
 }
 
-/// Room for the geoms of a scene: one for each geom and site, and some for each joint, actuator and tendon.
+/// Number of geoms that a scene has space for: one for each geom and site, and some for each joint, actuator and tendon.
 fn scene_geoms(model: &Model) -> c_int {
     let count = |kind| model.count(kind);
     let decorations = 4 * (count(Kind::Joint) + count(Kind::Actuator)) + 50 * count(Kind::Tendon);

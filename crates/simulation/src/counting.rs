@@ -89,7 +89,7 @@ impl SessionHandler for CountingSession {
         SessionStats { steps: self.steps, ..SessionStats::default() }
     }
 
-    /// No token has a rate.
+    /// A step costs nothing, since no token has a rate limit.
     fn price(&self, _request: &Self::Request) -> u64 {
         0
     }

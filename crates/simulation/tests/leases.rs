@@ -178,7 +178,8 @@ fn cut_off(seed: u64, gap: Duration) -> (Result<[u64; 2], ClientError>, StepLog)
     (outcome.take().expect("the client was answered"), ledger)
 }
 
-/// Checks that the client took one of two steps, and that its session was gone when it asked to resume it.
+/// Checks that only the client's first step was taken, and that the server no longer knew its session when the client tried
+/// to resume it.
 #[track_caller]
 fn assert_gone(reply: &Result<[u64; 2], ClientError>, ledger: &StepLog) {
     assert!(matches!(reply, Err(ClientError::Lost { request: "a step", .. })), "{reply:?}");

@@ -15,7 +15,7 @@ pub(super) enum Item {
     Path { inside: Vec<String>, names: Vec<String>, line: usize },
 }
 
-/// Reads all items of a file.
+/// Reads all modules, `use` items and paths of a file.
 pub(super) fn items(source: &str) -> Vec<Item> {
     let mut scanner = Scanner { tokens: tokens(source), position: 0, items: Vec::new(), depth: 0, inside: Vec::new() };
     scanner.run();

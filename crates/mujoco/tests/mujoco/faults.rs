@@ -1,9 +1,9 @@
-//! What MuJoCo does when it fails: nothing ends the process, nothing is passed over.
+//! Failures of MuJoCo: none ends the process, and none goes unreported.
 
 use perturb_mujoco::{Error, Model, Simulation, Warning};
 use std::{sync::Barrier, thread};
 
-/// Boxes that fall onto the floor. The stack suffices in flight, where there is no constraint, and not at the impact.
+/// Boxes that fall onto the floor. The stack is large enough in flight, without constraints, and too small at the impact.
 const SMALL_STACK: &str = r#"
 <mujoco>
   <option solver="Newton"/>

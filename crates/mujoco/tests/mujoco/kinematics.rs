@@ -1,10 +1,10 @@
-//! The walk over hinges and slides comes to the bytes of MuJoCo's own.
+//! Our own kinematics of hinges and slides gives the same bytes as MuJoCo's.
 
 use crate::states::state;
 use perturb_mujoco::{Model, Simulation};
 
-/// Joints beside their bodies' origins, axes and frames askew, several joints a body and none, two trees, inertia of its own,
-/// and geoms in the place of their body and elsewhere.
+/// A model with all special cases: joints that are not at their bodies' origins, askew axes and frames, bodies with several
+/// joints or none, two trees, an inertia that is given, and geoms that are at the body's origin or elsewhere.
 const MOBILE: &str = r#"
 <mujoco>
   <size njmax="300" nconmax="60" nstack="60000"/>
@@ -38,7 +38,7 @@ const MOBILE: &str = r#"
   <actuator><velocity joint="elbow" kv="0.1"/></actuator>
 </mujoco>"#;
 
-/// A chain of `n` bodies, hinged in turns, with geoms in the places of their bodies' inertia.
+/// A chain of `n` bodies with one hinge each, whose axes alternate. Each body has one geom, centred at its centre of mass.
 fn chain(n: usize) -> String {
     let link = |i| {
         let axis = if i % 2 == 0 { "0 1 0" } else { "0.6 0 0.8" };
@@ -57,7 +57,7 @@ fn simulation(xml: &str) -> Simulation {
     Simulation::new(Model::from_xml(xml).unwrap()).unwrap()
 }
 
-/// Where all bodies are and how they move, as bits: of two zeros, too, each has its sign.
+/// The poses and velocities of all bodies, as bits, which also distinguish 0 from -0.
 fn bodies(simulation: &Simulation) -> Vec<u64> {
     let of = |body| {
         let places = [simulation.xpos(body), simulation.xipos(body)];
@@ -68,7 +68,7 @@ fn bodies(simulation: &Simulation) -> Vec<u64> {
     (0..simulation.model().n_body()).flat_map(of).collect()
 }
 
-/// Has both go on from several poses; the number of contacts.
+/// Steps both simulations from several poses and compares them. Returns the number of contacts.
 fn compare(xml: &str) -> usize {
     let (mut own, mut mujoco) = (simulation(xml), simulation(xml));
     let mut seen = [simulation(xml), simulation(xml)];
@@ -78,7 +78,7 @@ fn compare(xml: &str) -> usize {
             for simulation in [&mut own, &mut mujoco] {
                 simulation.reset().unwrap();
                 let qpos = simulation.qpos_mut().iter_mut().enumerate();
-                // At first as the model is, and with one joint elsewhere: rotations by nothing.
+                // The first poses are the model's own, with a single joint moved: most rotations are then by 0.
                 qpos.filter(|(i, _)| turn > 200 || turn as usize / 200 == i + 1).for_each(|(i, position)| {
                     *position += f64::from(turn) * 0.0005 * [1.0, -0.3, 0.7][i % 3];
                 });
@@ -86,7 +86,7 @@ fn compare(xml: &str) -> usize {
                 qvel.for_each(|(velocity, scale)| *velocity = scale * f64::from(turn / 200) * 0.1);
             }
         }
-        // Elsewhere, for both write normalised quaternions over those that they are given.
+        // Other simulations compute the poses, because both functions replace the given quaternions by normalised ones.
         for simulation in &mut seen {
             simulation.set_state(&state(&own)).unwrap();
         }
@@ -125,13 +125,13 @@ fn what_is_not_walked_is_mujocos() {
     };
     let swing = r#"<joint type="hinge" axis="0 0 1"/>"#;
     let ball = with(swing, r#"<joint type="ball"/>"#);
-    // What pulls at a site needs its place, …
+    // A force at a site needs the site's position, …
     let site = with(r#"<geom type="box" size=".02"#, r#"<site name="grip" pos=".1 0 0"/><geom type="box" size=".02"#)
         .replace(
             "<actuator>",
             r#"<actuator><general site="grip" gear="1 2 3 0 1 0" biastype="affine" biasprm="0.3 0 0"/>"#,
         );
-    // … and who follows a hand that of the hand.
+    // … and a weld to a mocap body needs that body's pose.
     let hand = with("<worldbody>", r#"<worldbody><body name="led" mocap="true" pos="0.1 0.2 1" quat="1 0.2 0 0"/>"#)
         .replace("<actuator>", r#"<equality><weld body1="led" body2="trunk"/></equality><actuator>"#);
     let tendon = with(swing, r#"<joint name="swing" type="hinge" axis="0 0 1"/>"#).replace(

@@ -1,4 +1,4 @@
-//! A step without the search for near geoms comes to the bytes of MuJoCo's own.
+//! A step without the search for near geoms gives the same bytes as MuJoCo's own step.
 
 use crate::states::state;
 use perturb_mujoco::{Error, Model, Simulation, Warning};
@@ -31,7 +31,7 @@ fn simulation(xml: &str) -> Simulation {
     Simulation::new(Model::from_xml(xml).unwrap()).unwrap()
 }
 
-/// Steps both, now and then with other friction; the number of contacts.
+/// Steps both simulations, with other friction now and then, and compares them. Returns the number of contacts.
 fn compare(xml: &str, speed: f64) -> usize {
     let (mut own, mut mujoco) = (simulation(xml), simulation(xml));
     let mut touched = 0;

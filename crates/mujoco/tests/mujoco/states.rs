@@ -37,7 +37,7 @@ fn constants(simulation: &Simulation) -> Vec<f64> {
     constants
 }
 
-/// Another mass, inertia and friction for each number.
+/// Changes mass, inertia and friction, for each number differently.
 fn edit(simulation: &mut Simulation, number: usize) {
     let block = simulation.model().id(Kind::Body, "block").unwrap();
     let scale = 1.0 + number as f64;
@@ -48,7 +48,7 @@ fn edit(simulation: &mut Simulation, number: usize) {
     simulation.reset().unwrap();
 }
 
-/// Throws the block, another way for each number.
+/// Throws the block, for each number differently.
 fn throw(simulation: &mut Simulation, number: usize) {
     let number = number as f64;
     simulation.qvel_mut()[..6].copy_from_slice(&[3.0, 0.5 * number, 0.0, 0.0, 1.0 + number, 2.0]);
@@ -68,7 +68,7 @@ fn states_in_one_simulation_evolve_as_each_alone() {
     }
     let mut touched = 0;
     for turn in 0..2000 {
-        let number = ((turn * 2_654_435_761) >> 9) % N; // in no order
+        let number = ((turn * 2_654_435_761) >> 9) % N; // in a mixed order
         let (constants, own) = &mut states[number];
         shared.set_constants(constants);
         shared.set_state(own).unwrap();
@@ -80,7 +80,7 @@ fn states_in_one_simulation_evolve_as_each_alone() {
         }
         *own = state(&shared);
         assert_eq!(*own, state(&alone[number]), "number {number} in turn {turn}");
-        // What somebody else does in between, and what becomes of it.
+        // A divergence or an edit in between must have no effect.
         if turn % 5 == 0 {
             shared.qvel_mut()[0] = f64::NAN;
             assert_eq!(shared.step(), Err(Error::Diverged { warning: Warning::BadVelocity }));
