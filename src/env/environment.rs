@@ -27,7 +27,7 @@ pub struct PushSpec {
 pub struct EnvironmentSpec {
     /// The name to open it by.
     pub name: &'static str,
-    /// Raised by every change of dynamics, reward or observation.
+    /// The revision, which is raised by every change of dynamics, reward or observation.
     pub revision: u32,
     /// A description in one sentence.
     pub description: &'static str,
@@ -57,7 +57,7 @@ pub struct EnvironmentSpec {
     pub success: Success,
     /// The success rule of the paper's published code; `None` if it is the same.
     pub code_success: Option<Success>,
-    /// The two parameters, along x and along y, that show best where a policy works.
+    /// The two parameters that heat maps have along x and along y by default.
     pub heatmap_axes: Option<[&'static str; 2]>,
 }
 
@@ -69,14 +69,14 @@ impl fmt::Debug for EnvironmentSpec {
 }
 
 impl EnvironmentSpec {
-    /// Returns the distributions of a version, one for each parameter; for R+E those of R, then those of E, as in
+    /// Returns the distributions of a version, one for each parameter. R+E has those of R, then those of E, as in
     /// [`Settings::distributions`](super::Settings::distributions).
     pub fn distributions(&self, version: Version) -> Vec<Distribution> {
         let of = |&part: &Version| self.parameters.iter().map(move |parameter| parameter.distribution(part));
         version.parts().iter().flat_map(of).collect()
     }
 
-    /// Returns the values that `distributions`, one for each parameter in each box, can give.
+    /// Returns the parameter values that can be drawn from `distributions`, one for each parameter in each box.
     pub fn region(&self, distributions: &[Distribution]) -> Region {
         let names = || self.parameters.iter().map(|parameter| parameter.name.to_owned());
         let boxes = distributions.chunks(self.parameters.len().max(1));
@@ -188,12 +188,12 @@ pub trait Environment: Send {
         None
     }
 
-    /// Takes the address of the random numbers of an episode, before it begins or is loaded, and the steps that it has
-    /// taken. Environments that draw nothing after a reset ignore it.
+    /// Sets the address of an episode's random numbers and the number of its past steps, before the episode begins or
+    /// is loaded. Environments that draw no numbers after a reset ignore it.
     fn set_address(&mut self, _draw: Draw, _steps: u32) {}
 
-    /// Writes the action that does as little as possible, `[A]`, or the number of the choice. By default it is 0 in each
-    /// entry, or the end of its range that is nearest to 0; of an odd number of choices the middle one, else the first.
+    /// Writes the action with the least effect, `[A]`, or the number of the choice. By default each entry is 0, or the
+    /// end of its range that is nearest to 0. Of an odd number of choices it is the middle one, otherwise the first.
     fn neutral_action(&self, out: &mut [f32]) {
         match self.spec().action {
             ActionSpace::Discrete(names) => out.fill(if names.len() % 2 == 1 { (names.len() / 2) as f32 } else { 0.0 }),
@@ -226,7 +226,7 @@ pub trait Environment: Send {
     /// Appends the complete dynamic state: all that the next step depends on besides the parameters.
     fn save(&self, out: &mut Vec<f64>);
 
-    /// Returns how many more numbers [`Environment::save`] may append with other parameters than it does now, at most.
+    /// Returns an upper bound of the additional numbers that [`Environment::save`] may append with other parameters.
     fn max_saved_growth(&self) -> usize {
         0
     }

@@ -12,8 +12,9 @@ pub struct Settings {
     pub seed: u64,
     /// The environment's index: with the seed and an episode's number it fixes all randomness.
     pub environment_index: u32,
-    /// A box is a distribution for each parameter, in the spec's order, within the parameters' bounds. There is one
-    /// box, or there are two, one after the other; each trial is drawn from one of them with equal probability.
+    /// The distributions of one box or of two boxes, one box after the other. A box has a distribution for each
+    /// parameter, in the spec's order, within the parameters' bounds. Each trial is drawn from one of the boxes, with
+    /// equal probability.
     pub distributions: Vec<Distribution>,
     /// Episodes in a trial, at least 1. Parameters are drawn when a trial begins.
     pub episodes_per_trial: u32,
@@ -97,10 +98,10 @@ pub(super) struct Progress {
     pub(super) total_reward: f64,
     /// The first step after which the goal held, counted from 1; 0 if none.
     pub(super) reached_at: u32,
-    /// The number of successive steps up to the last one after all of which the goal held.
+    /// The length, in steps, of the run that ends with the last step and after each step of which the goal held.
     pub(super) held_for: u32,
-    /// The largest number of successive steps after all of which the goal held. Snapshots store it after the others,
-    /// because older snapshots lack it.
+    /// The length, in steps, of the longest run of steps after each of which the goal held. Snapshots store it behind
+    /// the other fields, because older snapshots lack it.
     #[serde(skip)]
     pub(super) held_longest: u32,
     pub(super) ended: bool,
@@ -118,14 +119,14 @@ pub struct Episodes {
     pub(super) seen: Option<Box<SeenParameters>>,
 }
 
-/// Returns the number of boxes that so many distributions are for `n` parameters; `None` if they are no whole number of
-/// boxes. Without parameters there is one box.
+/// Returns the number of boxes in a list of `distributions` distributions for `n` parameters, or `None` if it is not
+/// whole. Without parameters there is one box.
 pub(super) fn boxes(distributions: usize, n: usize) -> Option<usize> {
     (1..=MAX_BOXES).find(|boxes| boxes * n == distributions)
 }
 
 impl Episodes {
-    /// Takes an environment and begins its first episode.
+    /// Makes the episodes of an environment, and begins the first one.
     pub fn new(environment: Box<dyn Environment>, settings: Settings) -> Self {
         let n = environment.spec().parameters.len();
         assert!(
@@ -190,7 +191,7 @@ impl Episodes {
             let mut stream = Stream::new(seed, environment_index.into(), Purpose::Parameters, self.progress.trial);
             let n = self.values.len();
             let boxes = boxes(distributions.len(), n).unwrap_or(1);
-            // A single box takes no random number, so that versions D, R and E draw for the parameters alone.
+            // A single box takes no random number, so that versions D, R and E draw only the parameters.
             let chosen = if boxes > 1 { (stream.unit() * boxes as f64) as usize } else { 0 };
             let parameters = self.environment.spec().parameters;
             for ((value, distribution), parameter) in
@@ -235,7 +236,7 @@ impl Episodes {
         Outcome { reward, terminated: transition.terminated, truncated }
     }
 
-    /// Reads the observed parameters again, after parameters were set.
+    /// Updates the observed parameters after parameters were set.
     pub(super) fn see_parameters(&mut self) {
         if let Some(seen) = &mut self.seen {
             seen.read(self.environment.as_ref());

@@ -39,7 +39,7 @@ pub enum Error {
         /// The fault of the distribution.
         source: DistributionError,
     },
-    /// A parameter leaves its physical range.
+    /// A parameter's value or interval leaves its physical range.
     #[error("parameter {parameter:?} of {environment} may reach {got} {unit}; give values within [{low}, {high}]")]
     OutOfRange {
         /// The environment.
@@ -55,7 +55,7 @@ pub enum Error {
         /// The maximum that is accepted.
         high: f64,
     },
-    /// A session without disturbances is asked for one.
+    /// A disturbance was requested in a session that was opened without disturbances.
     #[error(
         "{environment} was opened without disturbances, so that {name:?} cannot change; open it anew and name a \
          disturbance, such as {name:?} at its default"
@@ -66,7 +66,7 @@ pub enum Error {
         /// The disturbance that was asked for.
         name: String,
     },
-    /// A parameter of whole numbers has an interval without one.
+    /// A parameter takes whole numbers, but an interval of its distribution contains none.
     #[error("parameter {parameter:?} of {environment} takes whole numbers, and {got} has none; give such as 2 or 0..4")]
     NotWhole {
         /// The environment.

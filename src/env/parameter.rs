@@ -86,7 +86,7 @@ impl Parameter {
         Distribution::union(&intervals).expect("the table holds valid sets; a test checks each")
     }
 
-    /// The value at the fraction `u` in [0, 1) of a distribution that was checked against the parameter.
+    /// Returns the value at the fraction `u` in [0, 1) of a distribution, which was checked against the parameter.
     pub fn draw(&self, distribution: &Distribution, u: f64) -> f64 {
         let whole = if self.is_integer { distribution.whole_number_at(u) } else { None };
         whole.unwrap_or_else(|| distribution.at(u))

@@ -35,26 +35,26 @@ pub enum Purpose {
     Parameters = 0,
     /// An episode's initial state.
     InitialState = 1,
-    /// The steps at which an action is held.
+    /// The choice of steps at which an action is held.
     ActionHold = 2,
     /// Noise on an action.
     ActionNoise = 3,
     /// Noise on an observation.
     SensorNoise = 4,
-    /// The entries of an observation that are lost.
+    /// The choice of an observation's entries that are lost.
     SensorDropout = 5,
     /// The steps with a push, and the directions of pushes.
     Push = 6,
 }
 
-/// The address of an episode's random numbers: they follow from it and from the distributions.
+/// The address of an episode's random numbers. With the distributions it determines all of them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Draw {
     /// The seed.
     pub seed: u64,
     /// The environment's index.
     pub environment_index: u32,
-    /// The current episode.
+    /// The index of the current episode.
     pub episode_index: u64,
 }
 

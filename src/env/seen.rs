@@ -1,4 +1,4 @@
-//! Parameters at the end of an observation, for policies that are to see them.
+//! Parameters at the end of an observation, for policies that observe them.
 
 use super::{Environment, EnvironmentSpec, Parameter};
 

@@ -7,7 +7,7 @@ use super::{
 };
 use serde::{Deserialize, Serialize};
 
-/// The layout of snapshots. Raised by every change of [`Saved`] or of what follows it.
+/// The layout of snapshots. It is raised by every change of [`Saved`] or of the bytes behind it.
 const FORMAT: u32 = 3;
 /// The last layout without a checksum. Later snapshots end with one: CRC-32C, little-endian, of everything before it.
 const UNSEALED: u32 = 2;
@@ -19,7 +19,7 @@ const FIRST: u32 = 1;
 /// actions and observations, 80 KiB.
 pub const MAX_SNAPSHOT_BYTES: usize = 320 << 10;
 
-/// The most bytes by which a snapshot's counters can grow: small numbers have short encodings.
+/// An upper bound of the growth of a snapshot's counters, bytes. Small numbers have shorter encodings.
 const MAX_COUNTERS_GROWTH_BYTES: usize = 64;
 
 /// Maximum episode index that a snapshot may have, so that counts do not overflow.
@@ -111,7 +111,7 @@ impl Episodes {
         state
     }
 
-    /// Decodes a snapshot and checks all that can be wrong with it, short of the physics' own state.
+    /// Decodes a snapshot and checks everything except the state of the physics.
     fn check(&self, snapshot: &[u8]) -> Result<(Saved, Vec<Distribution>), Error> {
         let (saved, distributions) = Saved::read(self.spec(), snapshot)?;
         if saved.model_hash != self.environment.model_hash() {
@@ -138,7 +138,7 @@ pub struct SavedDraw {
     pub values: Vec<f64>,
 }
 
-/// Reads what a snapshot draws from, without restoring it.
+/// Reads the draws of a snapshot without restoring it.
 ///
 /// # Errors
 /// [`Error::Snapshot`].
@@ -153,7 +153,7 @@ impl Saved {
     fn read(spec: &'static EnvironmentSpec, snapshot: &[u8]) -> Result<(Self, Vec<Distribution>), Error> {
         let refuse = |reason: String| Err(Error::Snapshot { reason });
         let unreadable = || refuse(format!("its {} bytes are not a snapshot", snapshot.len()));
-        // A list's entry in a snapshot may be one byte, and takes more than twenty in memory.
+        // An entry of a list may have one byte in a snapshot, but takes more than twenty in memory.
         if snapshot.len() > MAX_SNAPSHOT_BYTES {
             return unreadable();
         }
@@ -169,7 +169,7 @@ impl Saved {
             (format, _) => return refuse(format!("its format is {format}, but this server reads 1 to {FORMAT}")),
         };
         saved.progress.held_longest = match (saved.format, rest) {
-            // The first layout has the last run only; a longer one before it is lost.
+            // The first layout stores only the last run. A longer run before it is lost.
             (FIRST, []) => saved.progress.held_for,
             (FIRST, _) => return unreadable(),
             (_, rest) => match postcard::take_from_bytes(rest) {

@@ -11,8 +11,8 @@ pub struct Channel {
     pub low: f64,
     /// Maximum; may be `+inf`.
     pub high: f64,
-    /// The size that a disturbance of the entry is measured by, in its unit: half of its range, or 1 without one, unless
-    /// it is declared. 0 declares an entry that is constant, which nothing disturbs.
+    /// The scale of disturbances of the entry, in the entry's unit. By default it is half of the range, or 1 without a
+    /// finite range. An entry with scale 0 is constant and is not disturbed.
     pub scale: f64,
 }
 

@@ -23,9 +23,9 @@ pub enum Achievement {
     Length,
     /// The first step after which the goal held, counted from 1; no value if it never held.
     FirstGoal,
-    /// The number of successive steps up to the last one after all of which the goal held.
+    /// The length, in steps, of the run that ends with the last step and after each step of which the goal held.
     LastGoals,
-    /// The largest number of successive steps after all of which the goal held.
+    /// The length, in steps, of the longest run of steps after each of which the goal held.
     LongestGoals,
     /// The value of [`Environment::achieved`](super::Environment::achieved).
     Own(Quantity),

@@ -3,7 +3,7 @@
 
 use crate::env::{Action, Error, Stream};
 
-/// The choice that a validated action holds. The pool checks actions against the space before they get here.
+/// Returns the choice of an action. The pool has already checked the action against the space.
 pub(super) fn choice(action: Action<'_>) -> u32 {
     match action {
         Action::Discrete(choice) => choice,
@@ -11,8 +11,8 @@ pub(super) fn choice(action: Action<'_>) -> u32 {
     }
 }
 
-/// Takes over the state that the dynamics computed. If it cannot be observed as f32, keeps the last one: the dynamics
-/// diverged, which extreme parameters or states can cause. Returns whether they diverged.
+/// Adopts the state that the dynamics computed. If it is not finite as f32, the dynamics diverged, as extreme
+/// parameters or states can cause, and the previous state is kept. Returns whether the dynamics diverged.
 pub(super) fn advance<const N: usize>(state: &mut [f64; N], next: [f64; N]) -> bool {
     let diverged = !observable(&next);
     if !diverged {

@@ -1,5 +1,5 @@
-//! The built-in environments, one folder each, and their catalogue. The module `folder` reads environments that are an
-//! MJCF model and a TOML file.
+//! The built-in environments, each in a folder of its own, and their catalogue. The module `folder` reads environments
+//! that consist of an MJCF model and a TOML file.
 //!
 //! The files of a folder have the same parts in the same order: specification with parameters, derived quantities, reset,
 //! dynamics, reward and termination; and the content of pictures.

@@ -1,31 +1,31 @@
-//! The way of an action to the physics: late, held, noisy, scaled.
+//! Applies the disturbances of actions: delay, hold, noise and scale.
 
 use super::parameters::DisturbanceValues;
 use crate::env::{Action, ActionSpace, Draw, Error, Purpose, Stream};
 
-/// The actions of one environment that are under way. A choice is one number here.
+/// The disturbed actions of one environment. A choice is stored as one number.
 pub(super) struct ActionPath {
     space: ActionSpace,
-    /// The action that acts before any other arrives, `[A]`.
+    /// The action that the physics gets before the first action arrives, `[A]`.
     neutral: Vec<f32>,
-    /// The actions that have not acted yet, a ring of `action_delay` times `[A]`.
+    /// A ring buffer of the delayed actions, which the physics has not got yet, `[action_delay, A]`.
     late: Vec<f32>,
-    /// The place of the oldest of them, in numbers.
+    /// The offset of the oldest action in `late`, in numbers.
     oldest: usize,
-    /// The last action that acted, without its noise and scale, `[A]`.
+    /// The last action that the physics got, before noise and scale, `[A]`.
     held: Vec<f32>,
-    /// The action that acts, `[A]`.
+    /// The action that the physics gets, `[A]`.
     acting: Vec<f32>,
 }
 
 impl ActionPath {
-    /// The path of an environment with this neutral action, `[A]`.
+    /// Makes the path of an environment's actions. `neutral` is its neutral action, `[A]`.
     pub(super) fn new(space: ActionSpace, neutral: Vec<f32>) -> Self {
         let (held, acting) = (neutral.clone(), neutral.clone());
         Self { space, neutral, late: Vec::new(), oldest: 0, held, acting }
     }
 
-    /// Begins an episode: the neutral action acts until the first one arrives.
+    /// Begins an episode. The physics gets the neutral action until the first action arrives.
     pub(super) fn begin(&mut self, values: &DisturbanceValues) {
         self.late.clear();
         for _ in 0..values.action_delay {
@@ -35,7 +35,7 @@ impl ActionPath {
         self.held.copy_from_slice(&self.neutral);
     }
 
-    /// Takes the action of step number `step` and returns the one that acts.
+    /// Takes the client's action of step number `step`. Returns the action for the physics.
     pub(super) fn pass(
         &mut self,
         values: &DisturbanceValues,
@@ -46,7 +46,7 @@ impl ActionPath {
         let choice;
         let action = match action {
             Action::Continuous(action) => action,
-            // Choices are few: f32 has them all.
+            // There are so few choices that f32 represents each exactly.
             Action::Discrete(number) => {
                 choice = [number as f32];
                 &choice
@@ -92,21 +92,21 @@ impl ActionPath {
         }
     }
 
-    /// The numbers that [`ActionPath::save`] appends.
+    /// The number of numbers that [`ActionPath::save`] appends.
     pub(super) fn n_saved(&self, values: &DisturbanceValues) -> usize {
         (1 + values.action_delay) * self.neutral.len()
     }
 
-    /// Appends the last action and those that have not acted yet, from the oldest on.
+    /// Appends the held action, then the delayed ones from the oldest on.
     pub(super) fn save(&self, out: &mut Vec<f64>) {
         let (newer, older) = self.late.split_at(self.oldest);
         out.extend([&self.held[..], older, newer].into_iter().flatten().map(|&number| f64::from(number)));
     }
 
-    /// Takes back what was saved, as many numbers as [`ActionPath::n_saved`].
+    /// Loads the numbers that [`ActionPath::save`] appended, [`ActionPath::n_saved`] of them.
     ///
     /// # Errors
-    /// [`Error::Snapshot`] for a number that no action has; the path is undefined then.
+    /// [`Error::Snapshot`] for a number that no action can have. The path is undefined then.
     pub(super) fn load(&mut self, values: &DisturbanceValues, saved: &[f64]) -> Result<(), Error> {
         let is_legal = |&number: &f64| match self.space {
             ActionSpace::Discrete(names) => number.fract() == 0.0 && (0.0..names.len() as f64).contains(&number),

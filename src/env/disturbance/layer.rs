@@ -10,8 +10,8 @@ use crate::{
     scene::Scene,
 };
 
-/// An environment whose actions and observations are disturbed. Rewards, ends, success and pictures are those of the
-/// physics, which know nothing of it.
+/// An environment whose actions and observations are disturbed. Rewards, ends, success and pictures come from the
+/// undisturbed environment inside.
 pub(super) struct Disturbed {
     inner: Box<dyn Environment>,
     spec: &'static EnvironmentSpec,
@@ -27,7 +27,7 @@ pub(super) struct Disturbed {
 }
 
 impl Disturbed {
-    /// The environment of a twin's spec, without disturbances until they are set.
+    /// Wraps `inner` as the disturbed twin with this spec. The disturbances have no effect until they are set.
     pub(super) fn new(
         inner: Box<dyn Environment>,
         spec: &'static EnvironmentSpec,
@@ -50,7 +50,7 @@ impl Disturbed {
         disturbed
     }
 
-    /// Begins an episode at the state of the physics.
+    /// Begins an episode from the present state of the physics.
     fn begin(&mut self) {
         self.steps = 0;
         self.actions.begin(&self.values);
@@ -125,7 +125,8 @@ impl Environment for Disturbed {
         transition
     }
 
-    /// Appends the state of the physics, then what is late. What is seen follows from it and from the address.
+    /// Appends the state of the physics, then the delayed actions and observations. The observation that the policy
+    /// sees is computed from these and from the address of the random numbers.
     fn save(&self, out: &mut Vec<f64>) {
         self.inner.save(out);
         self.actions.save(out);

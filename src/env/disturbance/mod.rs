@@ -18,7 +18,7 @@ use layer::Disturbed;
 use parameters::DisturbanceSet;
 use std::sync::{Mutex, OnceLock, PoisonError};
 
-/// An environment and its twin. Both live as long as the process.
+/// An environment and its disturbed twin. Both live as long as the process.
 #[derive(Clone, Copy)]
 struct Twin {
     base: &'static EnvironmentSpec,
@@ -26,10 +26,10 @@ struct Twin {
     disturbances: &'static [Parameter],
 }
 
-/// The twins that were made so far, at most one of each environment.
+/// The disturbed twins that were made so far, at most one of each environment.
 static TWINS: Mutex<Vec<Twin>> = Mutex::new(Vec::new());
 
-/// The disturbances that an environment can have beside its own parameters.
+/// Returns the disturbances that an environment can have besides its own parameters.
 pub fn disturbances(spec: &'static EnvironmentSpec) -> &'static [Parameter] {
     twin(spec).disturbances
 }
@@ -50,18 +50,19 @@ pub fn declare(spec: &'static EnvironmentSpec, declared: &[Parameter]) -> &'stat
     disturbed
 }
 
-/// The environment with the disturbances as further parameters.
+/// Returns the disturbed twin of an environment, which has the disturbances as further parameters.
 pub fn disturbed(spec: &'static EnvironmentSpec) -> &'static EnvironmentSpec {
     twin(spec).disturbed
 }
 
-/// The environment without disturbances: itself, or that of which it is the twin.
+/// Returns the environment without disturbances: `spec` itself, or the environment whose disturbed twin it is.
 pub fn undisturbed(spec: &EnvironmentSpec) -> &EnvironmentSpec {
     let twins = TWINS.lock().unwrap_or_else(PoisonError::into_inner);
     twins.iter().find(|twin| std::ptr::eq(twin.disturbed, spec)).map_or(spec, |twin| twin.base)
 }
 
-/// The environment that has the parameters of these names: itself, or its twin if a name is that of a disturbance.
+/// Returns the environment that has the parameters of these names: `spec` itself, or its disturbed twin if one of them
+/// names a disturbance.
 ///
 /// # Errors
 /// [`Error::UnknownParameter`] for a name that is neither a parameter nor a disturbance.
@@ -85,10 +86,10 @@ pub fn with_parameters<'a>(
     Ok(found)
 }
 
-/// Checks that an environment that is open already has the parameters of these names.
+/// Checks that the environment of an open session has the parameters of these names.
 ///
 /// # Errors
-/// [`Error::UnknownParameter`], or [`Error::NotDisturbed`] for a disturbance that only its twin has.
+/// [`Error::UnknownParameter`], or [`Error::NotDisturbed`] for a disturbance that only the disturbed twin has.
 pub fn check_open<'a>(spec: &'static EnvironmentSpec, names: impl IntoIterator<Item = &'a str>) -> Result<(), Error> {
     for name in names {
         if !std::ptr::eq(with_parameters(spec, [name])?, spec) {
@@ -98,7 +99,7 @@ pub fn check_open<'a>(spec: &'static EnvironmentSpec, names: impl IntoIterator<I
     Ok(())
 }
 
-/// Returns the twin of an environment, which is made at the first time. A twin is its own.
+/// Returns an environment with its disturbed twin, which is made at the first call. `spec` may be either of the two.
 fn twin(spec: &'static EnvironmentSpec) -> Twin {
     let mut twins = TWINS.lock().unwrap_or_else(PoisonError::into_inner);
     let is_known = |twin: &&Twin| std::ptr::eq(twin.base, spec) || std::ptr::eq(twin.disturbed, spec);

@@ -1,26 +1,26 @@
-//! The disturbances of an environment, as parameters, and the values that are in force.
+//! The disturbances of an environment as parameters, and their present values.
 
 use crate::env::{ActionSpace, EnvironmentSpec, Parameter};
 use perturb_protocol::disturbance::DEFAULT_PUSH_INTERVAL;
 
 /// The longest delay, in steps.
 const MAX_DELAY: usize = 100;
-/// Limit of the numbers of actions that are under way, so that a snapshot has room for them.
+/// Limit of the numbers of delayed actions, so that a snapshot has room for them.
 const MAX_LATE_ACTION_NUMBERS: usize = 2048;
-/// Limit of the numbers of observations that are under way.
+/// Limit of the numbers of delayed observations, so that a snapshot has room for them.
 const MAX_LATE_OBSERVATION_NUMBERS: usize = 8192;
-/// The most actuators that have a scale of their own.
+/// The maximum number of actuators that have their own scale.
 const MAX_SCALED_ACTUATORS: usize = 32;
-/// The largest noise, and the largest scale.
+/// The maximum of noise and of scales, without a unit.
 const MAX_FACTOR: f64 = 10.0;
 /// The largest impulse of a push, in its unit.
 const MAX_PUSH: f64 = 1000.0;
 /// The longest mean interval of pushes, in steps.
 const MAX_PUSH_INTERVAL: f64 = 1e6;
-/// The name of the scale of all actuators, and how those of single ones begin.
+/// The name of the scale of all actuators, and the prefix of the names of single actuators' scales.
 const ACTION_SCALE: &str = "action_scale";
 
-/// The kind of a disturbance, by which its value is applied.
+/// The kind of a disturbance. It decides how the value is applied.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum DisturbanceKind {
     ActionDelay,
@@ -39,17 +39,17 @@ pub(super) enum DisturbanceKind {
 /// The disturbances of one environment.
 pub(super) struct DisturbanceSet {
     entries: Vec<(DisturbanceKind, Parameter)>,
-    /// A: entries of an action, 1 where an action is a choice.
+    /// A: the number of entries of an action, 1 if an action is a choice.
     pub(super) action_width: usize,
 }
 
-/// The values of the disturbances that are in force.
+/// The present values of the disturbances.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct DisturbanceValues {
     pub(super) action_delay: usize,
     pub(super) action_hold: f64,
     pub(super) action_noise: f64,
-    /// The scale of each actuator, `[A]`: that of all times its own.
+    /// The scale of each actuator, `[A]`: the scale of all actuators times the actuator's own.
     pub(super) action_scales: Vec<f64>,
     /// The size of pushes.
     pub(super) push: f64,
@@ -84,7 +84,7 @@ impl DisturbanceSet {
                 share("action_hold", "probability that the last action acts again", 1.0).off(0.0),
             ),
         ];
-        // A choice has no size: it cannot be noisy or weak.
+        // A choice has no magnitude, so it can have neither noise nor a scale.
         if let Some(channels) = actuators {
             let noise = share("action_noise", "standard deviation of actions, as a share of their range", MAX_FACTOR);
             entries.push((DisturbanceKind::ActionNoise, noise.off(0.0)));
@@ -146,7 +146,7 @@ impl DisturbanceSet {
         self.entries.iter().map(|(_, parameter)| *parameter)
     }
 
-    /// Returns the most numbers of late actions, and of late observations of `observation_size` numbers.
+    /// Returns how many numbers delayed actions, and delayed observations of `observation_size` numbers, may have.
     pub(super) fn max_late_numbers(&self, observation_size: usize) -> (usize, usize) {
         let longest = |wanted: DisturbanceKind| {
             let entry = self.entries.iter().find(|(kind, _)| *kind == wanted);
@@ -156,7 +156,7 @@ impl DisturbanceSet {
         (actions, longest(DisturbanceKind::SensorDelay) * observation_size)
     }
 
-    /// The values of no disturbance.
+    /// Returns the values at which no disturbance has an effect.
     pub(super) fn defaults(&self) -> DisturbanceValues {
         DisturbanceValues {
             action_delay: 0,
@@ -171,7 +171,7 @@ impl DisturbanceSet {
         }
     }
 
-    /// Takes a value for each disturbance, in order, each within its bounds.
+    /// Sets the value of each disturbance from `numbers`, in order. Each is within its bounds.
     pub(super) fn set(&self, values: &mut DisturbanceValues, numbers: &[f64]) {
         values.action_scales.fill(1.0);
         for (&(kind, _), &number) in self.entries.iter().zip(numbers) {

@@ -1,27 +1,28 @@
-//! The way of an observation to the policy: late, noisy, lost.
+//! Applies the disturbances of observations: delay, noise and dropout.
 
 use super::parameters::DisturbanceValues;
 use crate::env::{Channel, Draw, Error, Purpose, Stream};
 
-/// The observations of one environment that are under way.
+/// The disturbed observations of one environment.
 pub(super) struct SensorPath {
     channels: &'static [Channel],
-    /// The exact observations that have not been seen yet, with the last one that was: a ring of `sensor_delay` + 1 times
-    /// `[O]`.
+    /// A ring buffer of exact observations, `[sensor_delay + 1, O]`: the one that the policy sees now, and those that
+    /// it has not seen yet.
     exact: Vec<f32>,
-    /// The place of the newest of them, in numbers.
+    /// The offset of the newest observation in `exact`, in numbers.
     newest: usize,
-    /// The observation that is seen, `[O]`.
+    /// The disturbed observation, which the policy sees, `[O]`.
     seen: Vec<f32>,
 }
 
 impl SensorPath {
-    /// The path of an environment with these entries of observations.
+    /// Makes the path of an environment's observations, whose entries are `channels`.
     pub(super) fn new(channels: &'static [Channel]) -> Self {
         Self { channels, exact: vec![0.0; channels.len()], newest: 0, seen: vec![0.0; channels.len()] }
     }
 
-    /// Begins an episode with its first exact observation, which `observe` writes. It is seen until the next one arrives.
+    /// Begins an episode with its first exact observation, which `observe` writes. The policy sees it until the next
+    /// one arrives.
     pub(super) fn begin(&mut self, values: &DisturbanceValues, draw: &Draw, observe: impl FnOnce(&mut [f32])) {
         let width = self.channels.len();
         self.exact.resize((values.sensor_delay + 1) * width, 0.0);
@@ -32,7 +33,7 @@ impl SensorPath {
         self.see(values, draw, 0);
     }
 
-    /// Takes the exact observation after so many steps, which `observe` writes.
+    /// Takes the exact observation after `steps` steps of the episode, which `observe` writes.
     pub(super) fn pass(
         &mut self,
         values: &DisturbanceValues,
@@ -46,12 +47,12 @@ impl SensorPath {
         self.see(values, draw, steps);
     }
 
-    /// The observation that is seen, `[O]`.
+    /// The disturbed observation, which the policy sees, `[O]`.
     pub(super) fn seen(&self) -> &[f32] {
         &self.seen
     }
 
-    /// Computes what is seen: the oldest observation of the ring, disturbed.
+    /// Computes the observation that the policy sees: the oldest one of the ring buffer, with noise and dropout.
     fn see(&mut self, values: &DisturbanceValues, draw: &Draw, steps: u32) {
         let width = self.channels.len();
         let oldest = (self.newest + width) % self.exact.len().max(1);
@@ -79,23 +80,23 @@ impl SensorPath {
         }
     }
 
-    /// The numbers that [`SensorPath::save`] appends.
+    /// The number of numbers that [`SensorPath::save`] appends.
     pub(super) fn n_saved(&self, values: &DisturbanceValues) -> usize {
         values.sensor_delay * self.channels.len()
     }
 
-    /// Appends the exact observations but the newest, from the oldest on.
+    /// Appends the exact observations from the oldest on, without the newest.
     pub(super) fn save(&self, out: &mut Vec<f64>) {
         let (newer, older) = self.exact.split_at(self.newest);
         let older = &older[self.channels.len()..];
         out.extend(older.iter().chain(newer).map(|&number| f64::from(number)));
     }
 
-    /// Takes back what was saved, as many numbers as [`SensorPath::n_saved`], with the newest exact observation, which
-    /// `observe` writes.
+    /// Loads the numbers that [`SensorPath::save`] appended, [`SensorPath::n_saved`] of them. `observe` writes the
+    /// newest exact observation.
     ///
     /// # Errors
-    /// [`Error::Snapshot`] for a number that cannot be observed; the path is undefined then.
+    /// [`Error::Snapshot`] for a number that cannot be observed. The path is undefined then.
     pub(super) fn load(
         &mut self,
         values: &DisturbanceValues,

@@ -6,12 +6,12 @@ use std::f64::consts::FRAC_PI_2;
 
 const LINK: f64 = 0.2;
 
-/// The angles are the first link's from hanging, and the second's from the first, anticlockwise.
+/// Draws the links. The first angle is measured from hanging, the second from the first link, both anticlockwise.
 pub(super) fn drawing(angles: [f64; 2], link_length: f64) -> Drawing {
     let half = (2.2 * link_length).max(3.3); // the longest links of version E have room
     let mut drawing = Drawing::new([-half, -half], [half, half]);
 
-    // The task's height is in lengths of a link: it adds cosines.
+    // The task adds cosines, so its height is in lengths of a link.
     let goal_height = HEIGHT * link_length;
     drawing.rectangle([f64::NEG_INFINITY, goal_height], [f64::INFINITY; 2], colour::PALE_GREEN);
     drawing.dashes(&[[f64::NEG_INFINITY, goal_height], [f64::INFINITY, goal_height]], 0.05, colour::GREEN);

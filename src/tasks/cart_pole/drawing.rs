@@ -8,7 +8,8 @@ const CART: Point = [0.25, 0.22]; // half width, height
 const WHEEL: f64 = 0.07;
 const POLE: f64 = 0.09;
 
-/// The angle is the pole's from upright, clockwise. Lengths are true: a longer pole looks longer.
+/// Draws the cart and its pole, whose angle is measured from upright, clockwise. Lengths are true to scale, so a longer
+/// pole looks longer.
 pub(super) fn drawing(position: f64, angle: f64, half_pole_length: f64) -> Drawing {
     let hinge = [position, WHEEL + CART[1] - 0.04];
     let pole = 2.0 * half_pole_length;

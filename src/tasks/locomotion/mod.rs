@@ -1,7 +1,7 @@
 //! The task that Hopper and HalfCheetah share, Roboschool's (Brockman et al., 2016; Schulman et al., 2017) on MuJoCo 2.2.2.
 //!
-//! [`Walker`] is the task. Environments take turns in a simulation of their thread (`shared.rs`). The robots' folders
-//! have the differences. The models are in `models/`, with the source of each number.
+//! [`Walker`] is the task. Environments take turns in a simulation of their thread (`shared.rs`). Each robot's folder
+//! has the robot's own numbers. The models are in `models/`, with the source of each number.
 
 pub(super) mod channels;
 pub(super) mod colours;
@@ -29,7 +29,7 @@ pub(super) struct Robot {
     pub look: Look,
     pub names: Names,
     pub alive: fn(&Posture<'_>) -> bool,
-    /// The compiled model, which is compiled once in the process.
+    /// The model, which is compiled once in the process.
     pub pristine: OnceLock<Result<Pristine, Error>>,
 }
 

@@ -53,7 +53,7 @@ const MAX_OBSERVATION: usize = N_TORSO + 2 * MAX_JOINTS + MAX_JOINTS;
 pub struct Walker {
     robot: &'static Robot,
     pristine: &'static Pristine,
-    /// The model's part of the parameters.
+    /// The change of the model that the parameters make.
     edit: Arc<RobotEdit>,
     power: f64,
     /// The state as of [`Simulation::state`]. Undefined once the physics diverged.
@@ -123,7 +123,7 @@ impl Walker {
         &mut self.state[..self.pristine.state.len()]
     }
 
-    /// Positions and velocities; the time stands before them.
+    /// Returns positions and velocities, which follow the time in the state.
     fn positions_mut(&mut self) -> (&mut [f64], &mut [f64]) {
         let model = &self.pristine.model;
         let (qpos, rest) = self.state[1..].split_at_mut(model.n_q());

@@ -14,7 +14,8 @@ fn arc(centre: Point, radius: f64, from: f64, to: f64) -> Vec<Point> {
     (0..=SMOOTH).map(|i| polar(centre, radius, from + (to - from) * i as f64 / SMOOTH as f64)).collect()
 }
 
-/// The angle is from upright, anticlockwise; the torque the last step's, if a step led to this state.
+/// Draws the rod. The angle is measured from upright, anticlockwise. `torque` is that of the last step, if a step led
+/// to this state.
 pub(super) fn drawing(angle: f64, length: f64, torque: Option<f64>) -> Drawing {
     let half = (1.2 * length).max(1.8); // the longest rod of version E has room
     let mut drawing = Drawing::new([-half, -half], [half, half]);
@@ -28,7 +29,7 @@ pub(super) fn drawing(angle: f64, length: f64, torque: Option<f64>) -> Drawing {
     // A very small torque has no arrow, because the arrow's head has a fixed size.
     let share = torque.map(|torque| torque / MAX_TORQUE);
     if let Some(share) = share.filter(|share| share.abs() > 0.01) {
-        // From below the pivot, in the direction of the turn, as far as the torque is large.
+        // The arrow starts below the pivot and follows the direction of the turn. Its length shows the torque.
         let turn = MAX_TURN * share;
         let (start, end) = (-FRAC_PI_2 - 0.5 * turn, -FRAC_PI_2 + 0.5 * turn);
         drawing.line(&arc(pivot, RADIUS, start, end), 0.035, colour::BLUE);
