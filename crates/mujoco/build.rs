@@ -22,9 +22,9 @@ fn main() {
     println!("cargo:rustc-link-search=native={}", library_folder(&prefix).display());
     let mut shim = cc::Build::new();
     shim.files(["src/shim.c", "src/kinematics.c"]).include(&include).std("c11").opt_level(2);
-    // Debian's MuJoCo fuses no products and sums, and kinematics.c has to come to its bytes.
+    // Debian's MuJoCo fuses no products and sums, and kinematics.c must give the same bytes.
     shim.flag("-ffp-contract=off").compile("perturb_mujoco_shim");
-    // After the shim, which needs it.
+    // The shim needs MuJoCo, so this comes after it.
     println!("cargo:rustc-link-lib=dylib=mujoco");
 }
 

@@ -77,7 +77,7 @@ pub struct State {
     pub commits: Vec<String>,
 }
 
-/// The state of a training beside its policy, from which it resumes.
+/// The state of a training in addition to its policy, from which it resumes.
 #[derive(Clone, Debug)]
 pub struct Resume {
     /// The file of arrays, whose name begins with [`RESUME_PREFIX`].

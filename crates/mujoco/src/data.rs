@@ -171,8 +171,8 @@ impl Simulation {
         self.run(sys::perturb_mj_step1)
     }
 
-    /// Applies the controls and advances positions, velocities and time by one timestep. Poses, contacts and all else
-    /// that [`step1`](Self::step1) computes stay those before.
+    /// Applies the controls and advances positions, velocities and time by one timestep. Poses, contacts and everything
+    /// else that [`step1`](Self::step1) computes keep their earlier values.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
@@ -180,7 +180,8 @@ impl Simulation {
         self.run(sys::perturb_mj_step2)
     }
 
-    /// Advances by one timestep: [`step1`](Self::step1), then [`step2`](Self::step2). So contacts are those before.
+    /// Advances by one timestep: [`step1`](Self::step1), then [`step2`](Self::step2). So contacts are those before the
+    /// timestep.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].

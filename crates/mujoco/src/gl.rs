@@ -1,7 +1,7 @@
 //! An OpenGL context without a display, through EGL.
 //!
-//! libEGL is opened when the first context is made, so that programs run without it. Drivers do not survive being
-//! unloaded: the library stays, and so do the displays, which the process shares.
+//! libEGL is opened when the first context is made, so that programs run without it. Drivers do not survive being unloaded.
+//! So the library stays open, with its displays, which the process shares.
 
 use crate::Error;
 use khronos_egl as egl;

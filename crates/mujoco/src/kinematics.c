@@ -9,7 +9,7 @@
 
 #ifdef __x86_64__
 
-// The centres of mass of more are MuJoCo's.
+// Models with more bodies have their centres of mass computed by MuJoCo.
 enum { MOST_BODIES = 32 };
 
 static inline int is_identity(const mjtNum* q) { return q[0] == 1 && q[1] == 0 && q[2] == 0 && q[3] == 0; }
@@ -88,7 +88,7 @@ static inline void matrix(mjtNum* m, const mjtNum* q) {
   m[8] = ww - xx - yy + zz;
 }
 
-// Moves a body by one of its joints, and notes where that is.
+// Moves a body by one of its joints, and stores the joint's anchor and axis.
 static inline void move(const mjModel* m, mjData* d, int joint, mjtNum* position, mjtNum* orientation) {
   mjtNum* anchor = d->xanchor + 3 * joint;
   mjtNum* axis = d->xaxis + 3 * joint;
@@ -109,8 +109,8 @@ static inline void move(const mjModel* m, mjData* d, int joint, mjtNum* position
   for (int i = 0; i < 3; i++) position[i] += (anchor[i] - position[i]) - back[i];
 }
 
-// The pose of what is fixed to a body, by what MuJoCo's compiler found it to share with it: nothing, the body's frame, or
-// that of its inertia.
+// Computes the pose of an element that is fixed to a body. `same` says what MuJoCo's compiler found it to share with the
+// body: nothing, the body's frame, or the frame of the body's inertia.
 static inline void attach(const mjData* d, int body, mjtByte same, const mjtNum* position, const mjtNum* orientation,
                           mjtNum* to, mjtNum* rotation) {
   if (same) {

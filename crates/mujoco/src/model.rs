@@ -12,7 +12,7 @@ use std::{
     sync::{Mutex, OnceLock, PoisonError},
 };
 
-/// Maximal number of files in MuJoCo's virtual file system, beside the model's text.
+/// Maximal number of files in MuJoCo's virtual file system, in addition to the model's text.
 const MAX_FILES: usize = 1999;
 /// Maximal length of a file's name, in bytes. MuJoCo has space for 1000.
 const MAX_FILE_NAME: usize = 900;

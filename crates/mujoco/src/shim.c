@@ -127,7 +127,7 @@ struct perturb_mj_pairs {
   int geoms[];   // for each pair the geom whose contacts it has: that of higher priority
 };
 
-// MuJoCo's rules for geoms that no pair of the model's own names.
+// MuJoCo's rules for two geoms that the model does not declare as a pair.
 static int can_touch(const mjModel* m, int a, int b) {
   return ((m->geom_contype[a] & m->geom_conaffinity[b]) || (m->geom_contype[b] & m->geom_conaffinity[a])) &&
          m->body_weldid[m->geom_bodyid[a]] != m->body_weldid[m->geom_bodyid[b]];
@@ -142,7 +142,7 @@ perturb_mj_pairs* perturb_mj_make_pairs(const mjModel* m) {
   for (int a = 0; a < m->ngeom; a++) {
     for (int b = a + 1; b < m->ngeom; b++) {
       if (!can_touch(m, a, b)) continue;
-      // Of two other bodies the search decides whether they are near each other, and no pair of theirs could take its place.
+      // For geoms of two moving bodies only the search knows whether they are near each other, so pairs cannot replace it.
       if (m->geom_bodyid[a] != 0 || m->geom_priority[a] == m->geom_priority[b]) return NULL;
       n++;
     }
@@ -164,7 +164,7 @@ perturb_mj_pairs* perturb_mj_make_pairs(const mjModel* m) {
   view->pair_solimp = view->pair_solref + mjNREF * n;
   view->pair_margin = view->pair_solimp + mjNIMP * n;
   view->pair_gap = view->pair_margin + n;
-  // By bodies, and within one by the world's geoms: the order of contacts.
+  // Sorted by body, then by the world's geom, which is MuJoCo's order of contacts.
   int i = 0;
   for (int body = 1; body < m->nbody; body++) {
     for (int a = m->body_geomadr[0]; a < m->body_geomadr[0] + m->body_geomnum[0]; a++) {
@@ -190,7 +190,7 @@ perturb_mj_pairs* perturb_mj_make_pairs(const mjModel* m) {
 void perturb_mj_free_pairs(perturb_mj_pairs* pairs) { free(pairs); }
 
 static void collide(const mjModel* model, perturb_mj_pairs* pairs, mjData* data) {
-  // Friction is edited.
+  // The friction may have been edited since the pairs were made.
   for (int i = 0; i < pairs->view.npair; i++) {
     const mjtNum* from = model->geom_friction + 3 * pairs->geoms[i];
     mjtNum* to = pairs->view.pair_friction + 5 * i;
@@ -201,7 +201,7 @@ static void collide(const mjModel* model, perturb_mj_pairs* pairs, mjData* data)
   mj_collision(&pairs->view, data);
 }
 
-// mj_checkPos and mj_checkVel, which look at each number by a call.
+// Does what mj_checkPos and mj_checkVel do, which call a function for each number.
 static void check(const mjModel* m, mjData* d) {
   int good = 1;
   for (int i = 0; i < m->nq; i++) good &= fabs(d->qpos[i]) <= mjMAXVAL;
@@ -211,7 +211,7 @@ static void check(const mjModel* m, mjData* d) {
   mj_checkVel(m, d);
 }
 
-// mj_fwdVelocity.
+// Does what mj_fwdVelocity does.
 static void velocity(const mjModel* m, mjData* d) {
   if (m->ntendon) {
     mj_fwdVelocity(m, d);
@@ -225,7 +225,7 @@ static void velocity(const mjModel* m, mjData* d) {
 }
 
 int perturb_mj_step_pairs(const mjModel* model, perturb_mj_pairs* pairs, mjData* data) {
-  // mj_step1 by its parts, some of which are others.
+  // These are the parts of mj_step1, some of them replaced by faster ones.
   GUARDED(check(model, data); perturb_kinematics(model, data); perturb_com_pos(model, data); mj_camlight(model, data);
           mj_tendon(model, data); mj_crb(model, data); mj_factorM(model, data); collide(model, pairs, data);
           mj_makeConstraint(model, data); mj_transmission(model, data); mj_projectConstraint(model, data);
@@ -261,7 +261,8 @@ int perturb_mjv_make_scene(const mjModel* model, mjvScene* scene, int most_geoms
 
 int perturb_mjv_update_scene(const mjModel* model, mjData* data, const mjvOption* option, mjvCamera* camera,
                              mjvScene* scene) {
-  // The headlight is put where the scene's camera is before mjv_updateScene moves it: a picture would depend on the last.
+  // The camera is moved first: mjv_updateScene puts the headlight at the scene's camera before it moves the camera, so that
+  // a picture would depend on the one before.
   GUARDED(mjv_updateCamera(model, data, camera, scene);
           mjv_updateScene(model, data, option, NULL, camera, mjCAT_ALL, scene))
   return failed;
@@ -270,8 +271,8 @@ int perturb_mjv_update_scene(const mjModel* model, mjData* data, const mjvOption
 int perturb_mjr_make_context(mjModel* model, mjrContext* context, int width, int height) {
   model->vis.global.offwidth = width;
   model->vis.global.offheight = height;
-  // MuJoCo's loader of OpenGL, which this calls, is C++. It raises an error only where no library of OpenGL is loaded;
-  // the current context is of one.
+  // This calls MuJoCo's loader of OpenGL, which is C++. It raises an error only if no OpenGL library is loaded, but the
+  // current context belongs to one.
   GUARDED(mjr_makeContext(model, context, mjFONTSCALE_50); mjr_setBuffer(mjFB_OFFSCREEN, context))
   if (!failed && context->currentBuffer != mjFB_OFFSCREEN) {
     snprintf(last_error, sizeof last_error, "OpenGL has no off-screen framebuffer");

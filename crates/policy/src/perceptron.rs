@@ -74,7 +74,7 @@ impl Perceptron {
         self.layers.iter().map(|layer| Rows::new(n, layer.outputs)).collect()
     }
 
-    /// Loads weights and biases of each layer in turn from the front of `numbers`, and removes them there.
+    /// Loads weights and biases, layer by layer, from the front of `numbers`, and removes them there.
     pub(crate) fn load(&mut self, numbers: &mut &[f32]) {
         self.layers.iter_mut().for_each(|layer| layer.load(numbers));
     }

@@ -33,7 +33,8 @@ pub fn stream(seed: u64, purpose: Purpose) -> ChaCha8Rng {
     rng
 }
 
-/// The stream of `seed` for `purpose` in one trial of one environment: a trial can be played again without those before it.
+/// The stream of `seed` for `purpose` in one trial of one environment. A trial can thus be replayed without the earlier
+/// ones.
 pub fn trial_stream(seed: u64, purpose: Purpose, environment_index: u32, trial_index: u64) -> ChaCha8Rng {
     let mut key = [0; 32];
     key[..8].copy_from_slice(&seed.to_le_bytes());

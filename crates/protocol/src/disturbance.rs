@@ -1,4 +1,5 @@
-//! The names of disturbances: parameters that every environment can have beside its own, with the same meaning in all.
+//! The names of disturbances: parameters that every environment can have in addition to its own, with the same meaning in
+//! all.
 
 /// Disturbances with 0 as their default.
 const NAMES: [&str; 7] =

@@ -46,7 +46,7 @@ pub struct PrivateServer {
     process: Process,
     address: Address,
     workers: Option<usize>,
-    /// Folders of tasks that it serves beside the built-in environments.
+    /// Folders of tasks that it serves in addition to the built-in environments.
     tasks: Vec<PathBuf>,
     /// The directory of the socket, which only its owner may enter.
     directory: TempDir,

@@ -28,7 +28,7 @@ pub trait Algorithm: Send {
     /// step.
     fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats>;
 
-    /// Everything beside the policy's weights that a later update depends on.
+    /// Everything that later updates depend on, except the policy's weights.
     fn state(&self) -> AlgorithmState;
 
     /// Restores a saved state. Later updates give the same bytes as without the break.

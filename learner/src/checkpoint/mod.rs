@@ -1,4 +1,5 @@
-//! [Checkpoints](perturb_checkpoint) with the state that a training needs beside its policy to be resumed exactly.
+//! [Checkpoints](perturb_checkpoint) with everything that a training needs, in addition to its policy, to be resumed
+//! exactly.
 //!
 //! Large arrays are in a file of their own, which a test does not read; the rest is `resume` in `checkpoint.json`.
 
@@ -18,7 +19,7 @@ use crate::logging::{EpisodeFigures, LogLengths, TimeShares};
 use crate::rollout::CollectorState;
 pub use perturb_checkpoint::{Changed, Checkpoint, CheckpointError, EnvironmentSummary, State, find_policy};
 
-/// The state of a training between two iterations, beside what a [`Checkpoint`] holds.
+/// The state of a training between two iterations, without the parts that a [`Checkpoint`] holds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ResumeState {
     /// Environments, observations, memories, the stream of actions.

@@ -9,7 +9,7 @@ use perturb_text::quoted;
 
 use crate::checkpoint::{Checkpoint, CheckpointError, ResumeState};
 
-/// The directory of a run. While this value lives, and its process with it, no other process can train in there.
+/// The directory of a run. As long as this value and its process live, no other process can train in the directory.
 #[derive(Debug)]
 pub struct RunDirectory {
     path: PathBuf,

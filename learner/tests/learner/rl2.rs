@@ -43,7 +43,7 @@ fn as_bits(flag: bool) -> f32 {
     f32::from(u8::from(flag))
 }
 
-/// The numbers that an input has beside the observation: last action, last reward, and 0, because no episode has ended.
+/// The numbers that follow the observation in an input: last action, last reward, and 0, because no episode has ended.
 fn beside(action: ActionKind, taken: f32, reward: f32) -> Vec<f32> {
     let mut beside: Vec<f32> = match action {
         ActionKind::Discrete { n } => (0..n).map(|j| as_bits(taken == j as f32)).collect(),

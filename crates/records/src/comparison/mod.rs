@@ -267,7 +267,8 @@ fn difference(x: &TestedCondition<'_>, y: &TestedCondition<'_>, set: &str) -> Co
     let [of_x, of_y] = [x.by_seed(), y.by_seed()];
     let pairs = pairs(&x.keys, &y.keys);
     let by_seed: Vec<f64> = pairs.iter().flatten().map(|&[x, y]| of_x[x] - of_y[y]).collect();
-    // Without pairs: the mean of both strata is half of the difference, and so are the ends of its interval.
+    // Without pairs: the mean of both strata is half of the difference. The ends of its interval are halved in the same
+    // way.
     let (strata, scale) = match pairs {
         Some(_) => (vec![by_seed.clone()], 1.0),
         None => (vec![of_x.clone(), of_y.iter().map(|score| -score).collect()], 2.0),

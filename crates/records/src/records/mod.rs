@@ -1,4 +1,4 @@
-//! Recorded test episodes: what each was asked to run with, what it ran with, and what came of it.
+//! Recorded test episodes: the requested parameters of each, the applied parameters, and the outcome.
 //!
 //! One Parquet file holds the tests of one policy. Every figure of a result follows from it, at any threshold of success,
 //! and each episode can be played again from its address: seed, environment index and episode index.

@@ -1,7 +1,7 @@
 //! Aggregate metrics over all environments after Agarwal et al. (2021, arXiv:2108.13264). Scores are by environment,
 //! then run. All scores count equally unless stated otherwise.
 
-/// The mean of what is left when the ⌊n/4⌋ lowest and the ⌊n/4⌋ highest of n scores are taken away; NaN if there are none.
+/// The mean without the ⌊n/4⌋ lowest and the ⌊n/4⌋ highest of n scores; NaN if there are none.
 pub fn interquartile_mean(strata: &[Vec<f64>]) -> f64 {
     let mut scores = strata.concat();
     scores.sort_unstable_by(f64::total_cmp);

@@ -251,7 +251,7 @@ impl EpoptConfig {
     }
 }
 
-/// Settings of RL², Duan et al. (2016), arXiv:1611.02779, beside those of A2C or PPO, which it is wrapped around.
+/// Settings of RL², Duan et al. (2016), arXiv:1611.02779, in addition to those of the A2C or PPO that it wraps.
 ///
 /// A trial is N episodes in one drawn environment. The policy is recurrent and keeps its memory from one episode of a trial
 /// to the next. Beside the observation it gets its last action, reward and done flag (the learner's `Inputs`). Returns and
