@@ -1,4 +1,4 @@
-//! Edits that can do nothing are refused when a folder is loaded.
+//! Refuses, when a folder is loaded, edits that cannot have an effect.
 
 use super::{
     elements::Elements,
@@ -9,8 +9,9 @@ use super::{
 };
 use perturb_mujoco::{Field, Index, Kind, Model, Options};
 
-/// Contact dimensions from which torsional and rolling friction count.
+/// The smallest dimension of a contact with torsional friction.
 const TORSION_DIMENSION: i32 = 4;
+/// The smallest dimension of a contact with rolling friction.
 const ROLL_DIMENSION: i32 = 6;
 
 /// Refuses the edits that cannot change the physics.
@@ -46,7 +47,7 @@ pub(super) fn check(
     Ok(())
 }
 
-/// Refuses a number that two parameters edit, or one twice.
+/// Refuses a parameter that edits a number twice, or a number that an earlier parameter edits.
 fn same_number(table: &Table<'_>, parameter: &EditedParameter, earlier: &[EditedParameter]) -> Result<()> {
     let mut seen = std::collections::HashMap::new();
     for other in earlier {
@@ -68,7 +69,7 @@ fn same_number(table: &Table<'_>, parameter: &EditedParameter, earlier: &[Edited
     Ok(())
 }
 
-/// Refuses edits of what the model's flags switch off.
+/// Refuses edits of forces and effects that the model's flags switch off.
 fn switched_off(table: &Table<'_>, edit: &Edit, model: &Model) -> Result<()> {
     let flags = model.options().disable_flags;
     let (bits, what) = match (edit.targets.subject, edit.targets.field) {
@@ -87,7 +88,7 @@ fn switched_off(table: &Table<'_>, edit: &Edit, model: &Model) -> Result<()> {
     Err(without_effect(table, format_args!("the model switches {what} off by a <flag>; leave the flag out")))
 }
 
-/// Refuses ranges of elements without limits.
+/// Refuses edits of the ranges of elements that have no limits.
 fn limits(table: &Table<'_>, edit: &Edit, model: &Model) -> Result<()> {
     let free = edit.targets.ids.iter().zip(&edit.targets.names);
     let mut free = free.filter(|(id, _)| !is_limited(model, edit.targets.subject, **id));
@@ -101,7 +102,7 @@ fn limits(table: &Table<'_>, edit: &Edit, model: &Model) -> Result<()> {
     }
 }
 
-/// Refuses wind without air.
+/// Refuses edits of the wind in a model without a medium.
 fn wind(table: &Table<'_>, parameters: &[EditedParameter], model: &Model) -> Result<()> {
     let is_edited = |field: Field| parameters.iter().any(|other| other.places().any(|(edited, _)| edited == field));
     let has_medium =
@@ -112,7 +113,7 @@ fn wind(table: &Table<'_>, parameters: &[EditedParameter], model: &Model) -> Res
     Err(without_effect(table, "there is no air; give the model <option density=\"1.2\" viscosity=\"0.00002\"/>"))
 }
 
-/// Refuses frictions that no contact has.
+/// Refuses edits of a friction that MuJoCo uses in no contact.
 fn friction(
     table: &Table<'_>,
     edit: &Edit,
@@ -146,7 +147,7 @@ fn friction(
             ),
         ));
     }
-    // Friction of others that this parameter or another one edits, too, is no bound.
+    // The friction of a geom that some parameter edits is no bound.
     let edited: Vec<usize> = parameters
         .iter()
         .flat_map(EditedParameter::places)
@@ -165,8 +166,8 @@ fn friction(
             model.field(Field::GeomFriction)[3 * contact.other + column]
         }
     };
-    // Robots walk on geoms that are fixed, of which the largest friction counts. Without one the smallest friction of moving
-    // geoms counts.
+    // Robots walk on fixed geoms, so the largest friction of these is the bound. Without a fixed geom the bound is the
+    // smallest friction of the moving ones.
     let fixed = others.clone().filter(|contact| contact.other_is_fixed).max_by(|a, b| limit(a).total_cmp(&limit(b)));
     let moving = others.min_by(|a, b| limit(a).total_cmp(&limit(b)));
     let counts = |contact: &&Contact| contact.dimension >= needed;
@@ -191,7 +192,7 @@ fn friction(
     }))
 }
 
-/// The smallest number that the parameter sets.
+/// Returns the smallest number that the parameter can write into the model, at one of its bounds.
 fn smallest(edit: &Edit, parameter: &EditedParameter, model: &Model) -> f64 {
     let bounds = parameter.parameter.bounds;
     let numbers = edit
@@ -212,9 +213,9 @@ struct Contact {
     other_is_fixed: bool,
 }
 
-/// The contacts of a geom, but those of declared pairs.
+/// Returns the possible contacts of a geom, without those of declared pairs.
 fn contacts_of(model: &Model, geom: usize) -> Vec<Contact> {
-    // 1: declared pairs only.
+    // The value 1 means that MuJoCo finds contacts of declared pairs only.
     if model.options().collision == 1 {
         return Vec::new();
     }
@@ -229,7 +230,7 @@ fn contacts_of(model: &Model, geom: usize) -> Vec<Contact> {
     let weld_of = |geom: usize| weld[body[geom] as usize];
     let can_touch = |&other: &usize| {
         let (own, its) = (weld_of(geom), weld_of(other));
-        // The body that the parent of a group of welded bodies is welded to.
+        // Bodies that are welded together count as one. This is the body that the parent of such a group belongs to.
         let parent_of = |body: i32| weld[parent[body as usize] as usize];
         let fits = contact_type[geom] & affinity[other] != 0 || contact_type[other] & affinity[geom] != 0;
         let related = own != 0 && its != 0 && (parent_of(own) == its || parent_of(its) == own);

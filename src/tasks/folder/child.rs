@@ -1,4 +1,5 @@
-//! The first load of a folder, in a process of its own: MuJoCo 2.2.2 aborts on some models, and compiles others for ever.
+//! Loads a folder for the first time in a process of its own, because MuJoCo 2.2.2 aborts on some models and compiles
+//! others for ever.
 
 use super::error::{LoadError, escaped};
 use rustix::process::{Resource, Rlimit, setrlimit};
@@ -16,9 +17,9 @@ use tokio::time::Instant;
 const MAX_MEMORY_BYTES: u64 = 2 << 30;
 const MAX_CPU_SECONDS: u64 = 60;
 const MAX_WALL_SECONDS: u64 = 120;
-/// Interval between looks at the process.
+/// Interval at which the process is checked.
 const POLL_INTERVAL: Duration = Duration::from_millis(2);
-/// Limit of what is kept of the process's words, in bytes.
+/// Limit of the process's output that is kept, in bytes.
 const MAX_OUTPUT_BYTES: u64 = 1 << 20;
 
 /// Limits this process before it loads a folder that was never loaded before.
@@ -29,16 +30,16 @@ pub fn limit_this_process() -> io::Result<()> {
     let limit = |resource, most: u64| setrlimit(resource, Rlimit { current: Some(most), maximum: Some(most) });
     limit(Resource::As, MAX_MEMORY_BYTES)?;
     limit(Resource::Cpu, MAX_CPU_SECONDS)?;
-    // A crash need not leave a file of two gigabytes.
+    // Without this limit a crash could leave a core file of two gigabytes.
     limit(Resource::Core, 0)?;
     Ok(())
 }
 
-/// Loads a folder in a process of `program`, a `perturb-server`, and returns what it is, as `--check` prints it; with its
-/// speed if `measured`.
+/// Loads a folder in a process of `program`, a `perturb-server`, and returns the report that `--check` prints. The
+/// report has the speed if `measured`.
 ///
 /// # Errors
-/// [`LoadError`] with the process's sentence, or with how it ended if it could not say why.
+/// [`LoadError`] with the error that the process printed, or with its exit status if it printed none.
 pub fn check(program: &Path, folder: &Path, measured: bool) -> Result<String, LoadError> {
     let refuse = |problem: String| LoadError::new(folder, problem);
     let mut child = Command::new(program)

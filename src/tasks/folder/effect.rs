@@ -1,15 +1,15 @@
-//! Edits without an effect that can be seen: the physics is the same, byte for byte, at both ends of E.
+//! Finds edits without a visible effect: the physics is the same, byte for byte, at both ends of E.
 
 use super::{environment::Task, template};
 use crate::env::{Purpose, Stream};
 use perturb_mujoco::{Error, Simulation};
 use std::sync::Arc;
 
-/// Timesteps of random controls from the initial state.
+/// Number of timesteps of random controls from the initial state.
 const N_STEPS: usize = 200;
 
-/// The parameters whose edits change nothing in 200 timesteps of random controls from the initial state. They may have an
-/// effect elsewhere: a friction has none before the robot falls.
+/// Returns the parameters whose edits change nothing in 200 timesteps of random controls from the initial state. They
+/// may still have an effect in other states: a friction has none before the robot falls.
 ///
 /// # Errors
 /// MuJoCo's fatal ones.
@@ -31,7 +31,7 @@ pub(super) fn unseen(task: &'static Task) -> Result<Vec<&'static str>, Error> {
     Ok(unseen)
 }
 
-/// The states, as bits, of timesteps of random controls; they end where the physics diverge.
+/// Returns the states, as bits, after each timestep of random controls, until the physics diverge.
 fn trajectory(task: &'static Task, values: &[f64]) -> Result<Vec<u64>, Error> {
     template::with(&task.template, |shared| {
         let edit = shared.edit(&task.parameters, values)?;

@@ -1,4 +1,4 @@
-//! The elements of a model by name, as a task names them.
+//! Finds the elements of a model by the names that a task gives.
 
 use super::{
     error::{Result, escaped, listed},
@@ -98,7 +98,8 @@ pub(super) fn actuated_joint(model: &Model, actuator: usize) -> Option<usize> {
 fn matches(pattern: &str, name: &str) -> bool {
     let (pattern, name): (Vec<char>, Vec<char>) = (pattern.chars().collect(), name.chars().collect());
     let (mut p, mut n) = (0, 0);
-    // The last star and the name's place where it was met: from there it is tried with one more character.
+    // The position of the last star in the pattern, and the position in the name up to which the star has matched. On a
+    // mismatch the star matches one more character.
     let mut star: Option<(usize, usize)> = None;
     while n < name.len() {
         match pattern.get(p) {

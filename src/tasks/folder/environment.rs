@@ -1,4 +1,4 @@
-//! The environment of a folder: physics by MuJoCo, and observations, rewards and ends as its file says.
+//! The environment of a folder. MuJoCo computes the physics; the file defines observations, rewards and ends.
 
 use super::{
     number::{Context, Stage},
@@ -16,21 +16,21 @@ use crate::{
 use perturb_mujoco::{Error as SimulationError, Simulation};
 use std::sync::Arc;
 
-/// Limit of positions and velocities in a saved state: MuJoCo's own, beyond which it takes them for divergence.
+/// Limit of positions and velocities in a saved state. Beyond this value MuJoCo itself reports divergence.
 const MAX_STATE: f64 = 1e10;
-/// A worker that panics of it loses the batch, not the server.
+/// The message of an `expect`. A worker that panics with it loses its batch, not the server.
 const NO_MEMORY: &str = "there is memory for the one simulation of this thread";
 
-/// The time of the poses of bodies that a step's readings see.
+/// The state whose body poses a step's readings have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Poses {
-    /// They are those of MuJoCo's step: of the state at the beginning of the last timestep, or of the last stage of RK4.
+    /// The poses of MuJoCo's step: those at the beginning of the last timestep, or in the last stage of RK4.
     Before,
-    /// They are computed anew for the state after the step.
+    /// The poses after the step, which are computed for this purpose.
     After,
 }
 
-/// A task as its folder says, compiled. It lives as long as the process.
+/// The compiled task of a folder. It lives as long as the process.
 pub(super) struct Task {
     pub(super) spec: EnvironmentSpec,
     pub(super) template: Template,
@@ -55,21 +55,21 @@ pub(super) struct Task {
     /// The disturbances with sets of R and E, which the catalogue has among the parameters.
     pub(super) disturbances: Vec<Parameter>,
     pub(super) needs: Needs,
-    /// Whether the model's text scales its masses to a total, which edited masses are not.
+    /// Whether the model's text scales its masses to a total. Edited masses are not scaled.
     pub(super) has_total_mass: bool,
 }
 
-/// The computations that readings need, all of them together.
+/// The computations that all readings together need in each step.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Needs {
     pub(super) stage: Stage,
     pub(super) external_forces: bool,
-    /// The numbers that terms remember from one step to the next.
+    /// The number of numbers that terms remember from one step to the next.
     pub(super) n_remembered: usize,
 }
 
 impl Needs {
-    /// The needs of a task's readings.
+    /// Returns the computations that the readings of a task need.
     pub(super) fn new(observation: &[Reading], reward: &[Term], healthy: &[Range], goal: &Goal) -> Self {
         let ranges = healthy.iter().chain(&goal.ranges).map(Range::reading);
         let achieved = goal.achieved.iter().map(|(_, reading)| reading);
@@ -89,16 +89,16 @@ impl Needs {
 /// A step sets the controls to the action, clipped to their range, and holds them for `frame_skip` timesteps. Then come,
 /// in this order, what is healthy, the reward's terms, the observation, and what was achieved; all see the same state.
 ///
-/// If the physics diverge (MuJoCo warns of a number, or of lost contacts, or fails, or a number that is read is not
-/// finite), the step terminates, all terms are 0 but those of health, and the observation stays that of the step before;
-/// after a reset to a state that diverges at once it is zeros.
+/// The physics diverge if MuJoCo warns of a number or of lost contacts, if it fails, or if a number that is read is not
+/// finite. Then the step terminates, all terms except those of health are 0, and the observation stays that of the step
+/// before. After a reset to a state that diverges at once the observation is zeros.
 ///
-/// It has no simulation of its own: it is what a simulation of its model is given before it runs for it, and what is kept
-/// of it afterwards.
+/// An environment has no simulation of its own. It holds the parameters and the state that a shared simulation gets
+/// before it runs for this environment, and the results that are kept afterwards.
 pub(super) struct FolderEnvironment {
     task: &'static Task,
     edit: Arc<ModelEdit>,
-    /// State of MuJoCo, as [`Simulation::state`] has it. Undefined once the physics diverged.
+    /// State of MuJoCo as [`Simulation::state`] writes it. Undefined once the physics diverged.
     state: Box<[f64]>,
     /// The numbers that terms remember.
     remembered: Box<[f64]>,
@@ -108,7 +108,7 @@ pub(super) struct FolderEnvironment {
     achieved: f64,
     /// The force on the pushed body in the next step, N.
     push: Option<[f64; 3]>,
-    /// Until the next reset.
+    /// Whether the physics have diverged since the last reset.
     diverged: bool,
 }
 
@@ -136,14 +136,14 @@ impl FolderEnvironment {
         Ok(environment)
     }
 
-    /// Positions and velocities; the time stands before them.
+    /// Returns positions and velocities, which follow the time in the state.
     fn positions_mut(&mut self) -> (&mut [f64], &mut [f64]) {
         let model = &self.task.template.model;
         let (qpos, rest) = self.state[1..].split_at_mut(model.n_q());
         (qpos, &mut rest[..model.n_v()])
     }
 
-    /// The model's initial state.
+    /// Sets the model's initial state.
     fn clear(&mut self) {
         self.state.copy_from_slice(&self.task.template.state);
         self.action.fill(0.0);
@@ -151,12 +151,12 @@ impl FolderEnvironment {
         self.achieved = 0.0;
     }
 
-    /// Begins an episode at the state.
+    /// Begins an episode from the present state.
     fn start(&mut self) {
         let task = self.task;
         let started = template::with(&task.template, |shared| {
             let (simulation, numbers) = shared.at(&self.edit, &self.state)?;
-            // Forces that another environment left must not be seen. Sensors may compute them again.
+            // Forces that another environment left must not be read. Sensors may compute them again.
             simulation.clear_external_forces();
             simulation.forward()?;
             simulation.state(&mut self.state);
@@ -175,7 +175,7 @@ impl FolderEnvironment {
         self.diverged = !matches!(started, Ok(true));
     }
 
-    /// Computes the observation and what is achieved, and keeps them if all numbers are finite.
+    /// Computes the observation and the achieved value, and stores them if all numbers are finite.
     fn observe_now(
         &mut self,
         simulation: &Simulation,
@@ -211,7 +211,7 @@ impl FolderEnvironment {
         true
     }
 
-    /// Advances by one step. Returns none if a number that follows is not finite.
+    /// Advances by one step. Returns `None` if a resulting number is not finite.
     fn advance(
         &mut self,
         (simulation, numbers): (&mut Simulation, &mut Vec<f64>),
@@ -267,7 +267,7 @@ impl FolderEnvironment {
         Ok(Some(Transition { terminated, goal, diverged: false }))
     }
 
-    /// Writes the terms after divergence, which ends the episode.
+    /// Writes the reward terms of a step whose physics diverged. Returns its transition, which ends the episode.
     fn fail(&mut self, reward_terms: &mut [f64]) -> Transition {
         self.diverged = true;
         for (value, term) in reward_terms.iter_mut().zip(&self.task.reward) {
@@ -319,7 +319,7 @@ impl Environment for FolderEnvironment {
         &self.task.hash
     }
 
-    /// Writes the action whose controls are as near to 0 as they can be.
+    /// Writes the action whose controls are as near to 0 as their ranges allow.
     fn neutral_action(&self, out: &mut [f32]) {
         for (entry, &(low, high)) in out.iter_mut().zip(&self.task.controls) {
             let control = 0.0_f64.clamp(low, high);

@@ -38,7 +38,7 @@ pub struct LoadError {
 }
 
 impl LoadError {
-    /// The error that loading `folder` ended with.
+    /// Makes the error with which loading `folder` failed.
     pub fn new(folder: &Path, problem: impl fmt::Display) -> Self {
         Self { folder: escaped(&folder.display().to_string()), problem: problem.to_string() }
     }
@@ -49,7 +49,7 @@ impl LoadError {
     }
 }
 
-/// A text of a file, for an error or a log: control characters are escaped, long texts are cut.
+/// Prepares a text of a file for an error or a log: escapes control characters and shortens long texts.
 pub(crate) fn escaped(text: &str) -> String {
     const MAX_CHARS: usize = 100;
     let mut shown: String = text.chars().take(MAX_CHARS).flat_map(char::escape_debug).collect();
@@ -59,7 +59,7 @@ pub(crate) fn escaped(text: &str) -> String {
     shown.replace("\\'", "'").replace("\\\"", "\"")
 }
 
-/// The first names of a list, for an error.
+/// Joins the first names of a list for an error.
 pub(crate) fn listed<'a>(names: impl Iterator<Item = &'a str> + Clone) -> String {
     const MAX_NAMES: usize = 12;
     let mut shown = names.clone().take(MAX_NAMES).map(escaped).collect::<Vec<_>>().join(", ");

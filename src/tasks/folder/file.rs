@@ -1,4 +1,4 @@
-//! The file `task.toml` as a whole: reads it, compiles the model, and puts the task together.
+//! Reads the file `task.toml`, compiles the model and assembles the task.
 
 use super::{
     checks,
@@ -329,7 +329,7 @@ fn parameters(
     Ok((parameters, applied))
 }
 
-/// The two parameters that a heat map shows: as given, or the first two.
+/// Returns the two parameters that a heat map shows: those that the file names, or else the first two.
 fn heatmap_axes(top: &Table<'_>, parameters: &[EditedParameter]) -> Result<Option<[&'static str; 2]>> {
     let names: Vec<&'static str> = parameters.iter().map(|edited| edited.parameter.name).collect();
     let Some(value) = top.get("heatmap") else {

@@ -1,4 +1,4 @@
-//! The files of a folder: read once, none from outside of the folder, within limits, hashed.
+//! The files of a folder. Each is read once, within limits and only inside the folder, and counts for the hash.
 
 use super::error::{Error, Result, escaped};
 use sha2::{Digest, Sha256};
@@ -14,7 +14,7 @@ use std::{
 pub(super) const TASK: &str = "task.toml";
 /// Limit of all files that are read, in bytes.
 const MAX_BYTES: u64 = 64 << 20;
-/// Limit of the files that are read. MuJoCo has room for 1999 beside the model's text.
+/// Limit of the number of files that are read. MuJoCo has room for 1999 besides the model's text.
 const MAX_FILES: usize = 1900;
 /// Limit of the task's own file, in bytes.
 const MAX_TASK_BYTES: usize = 1 << 20;
@@ -38,7 +38,7 @@ impl Files {
     /// Opens a folder and reads its task.
     ///
     /// # Errors
-    /// [`Error`] if it is no folder, or has no task that can be read.
+    /// [`Error`] if `folder` is not a folder, or has no readable task.
     pub(super) fn open(folder: &Path) -> Result<Self> {
         let refuse = |problem: String| Error::folder(problem);
         let root = folder.canonicalize().map_err(|error| refuse(format!("the folder cannot be opened: {error}")))?;
@@ -63,7 +63,7 @@ impl Files {
     /// Reads a file, given by its path within the folder. `who` names it in errors, for instance `robot.xml`.
     ///
     /// # Errors
-    /// [`Error`] if the path leaves the folder, if the file cannot be read, or beyond the limits.
+    /// [`Error`] if the path leaves the folder, if the file cannot be read, or if a limit is exceeded.
     pub(super) fn read(&mut self, path: &str, who: &str) -> Result<&[u8]> {
         let name = self.resolve(path, who)?;
         if !self.read.contains_key(&name) {
@@ -73,7 +73,7 @@ impl Files {
         Ok(self.read.get(&name).map_or(&[], |file| file.bytes.as_slice()))
     }
 
-    /// A path within the folder without `.` and `..`, after all links are followed.
+    /// Returns a path within the folder without `.`, `..` and links.
     fn resolve(&self, path: &str, who: &str) -> Result<String> {
         let shown = escaped(path);
         let refuse = |problem: &str| Error::folder(format_args!("{who} names the file {shown:?}, which {problem}"));

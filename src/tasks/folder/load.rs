@@ -36,7 +36,7 @@ impl fmt::Debug for Folder {
     }
 }
 
-/// Loads a folder. What it holds stays in memory until the process ends, so that sessions keep what they opened.
+/// Loads a folder. Its contents stay in memory until the process ends, because sessions refer to them.
 ///
 /// A model may abort the process or take all of its memory: load folders that were never loaded before in a process of
 /// their own.
@@ -51,7 +51,7 @@ pub fn load(folder: &Path) -> Result<Folder, Error> {
     }
     let files: &'static Files = Box::leak(Box::new(files));
     let task: &'static mut Task = Box::leak(Box::new(task));
-    // The closure needs the task's address, which the spec within it needs.
+    // The spec's closure needs the address of the task, and the task contains the spec.
     let address: &'static OnceLock<&'static Task> = Box::leak(Box::default());
     task.spec.make = Box::leak(Box::new(move || match address.get() {
         Some(task) => Ok(Box::new(FolderEnvironment::new(task)?) as Box<dyn env::Environment>),
@@ -64,7 +64,7 @@ pub fn load(folder: &Path) -> Result<Folder, Error> {
     Ok(Folder { task, spec, files })
 }
 
-/// Reads the model `main` of a folder and what it includes, without MuJoCo: for tests of what strangers may write.
+/// Reads the model `main` of a folder and its includes, without MuJoCo. It is meant for tests with untrusted files.
 ///
 /// # Errors
 /// [`Error`] with the place and the remedy.

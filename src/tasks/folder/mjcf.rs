@@ -1,5 +1,5 @@
-//! The MJCF of a folder: its includes are resolved here, inside the folder only, and MuJoCo is given a text and files of
-//! our own, so that it reads nothing from the disk.
+//! Reads the MJCF of a folder. Includes are resolved here, only inside the folder. MuJoCo gets a rewritten text and the
+//! files from memory, so that it reads nothing from the disk.
 //!
 //! The physics' text lacks textures, materials, skins and `<visual>`, which cost memory in every simulation and change no
 //! byte of the physics; the picture's text has them.
@@ -12,12 +12,12 @@ use super::{
 use roxmltree::{Document, Node, ParsingOptions};
 use std::{collections::BTreeMap, fmt::Write};
 
-/// Limit of the depth of elements; MuJoCo's and this file's recursions follow it.
+/// Limit of the depth of elements. The recursions of MuJoCo and of this file go as deep.
 const MAX_DEPTH: usize = 200;
 /// Limit of the elements, attributes and texts of one file.
 const MAX_NODES: u32 = 2_000_000;
-/// Limit of the elements of a composite. Each has a degree of freedom at least, but those inside a box, so that more would
-/// be beyond the limit of these anyway, after minutes of compilation.
+/// Limit of the elements of a composite. Except inside a box each has at least one degree of freedom, so a composite
+/// with more would exceed the limit of these anyway, after minutes of compilation.
 const MAX_COMPOSITE_ELEMENTS: f64 = 10_000.0;
 /// Attributes that name files, by element. `true`: the physics needs the file.
 const FILE_ATTRIBUTES: [(&str, &[&str], bool); 4] = [
@@ -27,7 +27,7 @@ const FILE_ATTRIBUTES: [(&str, &[&str], bool); 4] = [
     ("skin", &["file"], false),
 ];
 
-/// A model as MuJoCo is given it.
+/// A model in the form that MuJoCo gets.
 #[derive(Debug)]
 pub(super) struct Mjcf {
     /// Text that the physics is compiled from.
@@ -40,7 +40,7 @@ pub(super) struct Mjcf {
     pub(super) has_total_mass: bool,
 }
 
-/// A text of one element a line, and the files that it names.
+/// A text with one element per line, and the files that it names.
 #[derive(Debug, Default)]
 pub(super) struct Text {
     pub(super) xml: String,
@@ -48,7 +48,7 @@ pub(super) struct Text {
     pub(super) files: Vec<(String, Vec<u8>)>,
     /// For each line of the text the file and the line it comes from.
     lines: Vec<(usize, u32)>,
-    /// The files that lines come from.
+    /// The names of the files that the lines come from.
     sources: Vec<String>,
 }
 
@@ -241,7 +241,7 @@ impl Folders {
     }
 }
 
-/// The texts that an element stands in.
+/// The texts that an element is written to.
 #[derive(Clone, Copy, PartialEq)]
 enum Kept {
     Both,
@@ -254,7 +254,7 @@ struct Writer<'a> {
     folders: Folders,
     physics: Text,
     picture: Text,
-    /// The files of the physics' text, by their paths.
+    /// The names under which MuJoCo finds the files of the physics' text, by their paths in the folder.
     physics_names: BTreeMap<String, String>,
     picture_names: BTreeMap<String, String>,
 }
@@ -287,7 +287,7 @@ impl Writer<'_> {
             }
             write_attribute(&mut picture, key, &picture_value);
         }
-        // Without a name the element would be called after its file, which has another name now.
+        // MuJoCo names an element without a name after its file. The file is renamed here, so the name is written out.
         if let Some(file) = node.attribute("file").filter(|_| names_file(tag, "file").is_some())
             && !node.has_attribute("name")
             && !in_defaults(&node)
@@ -327,7 +327,8 @@ impl Writer<'_> {
         Ok(())
     }
 
-    /// The names of a file in both texts. Files of pictures alone are read, too: they count for the hash.
+    /// Returns the names of a file in the text of the physics and in that of the picture. Files that only pictures need
+    /// are read, too, because they count for the hash.
     fn file(&mut self, part: usize, node: &Node<'_, '_>, value: &str, needed: bool) -> Result<(String, String)> {
         let source = &self.parts[part];
         let path = self.folders.path(node.tag_name().name(), value);
@@ -345,7 +346,7 @@ fn names_file(tag: &str, key: &str) -> Option<bool> {
     FILE_ATTRIBUTES.iter().find(|(element, keys, _)| *element == tag && keys.contains(&key)).map(|entry| entry.2)
 }
 
-/// Whether an element concerns pictures alone.
+/// Whether an element concerns only pictures.
 fn is_visual(node: &Node<'_, '_>) -> bool {
     match node.tag_name().name() {
         "visual" | "texture" | "material" => true,
@@ -392,14 +393,14 @@ pub(super) fn explain(text: &Text, main: &str, reason: &str) -> Error {
     }
 }
 
-/// MuJoCo's words without its own line and column, which are those of the rewritten text.
+/// Returns MuJoCo's message without its line and column, which refer to the rewritten text.
 fn escaped_reason(reason: &str) -> String {
     let cut = reason.find(", line ").unwrap_or(reason.len());
     let words: String = reason[..cut].chars().flat_map(char::escape_debug).collect();
     words.replace("\\'", "'").replace("\\\"", "\"").trim().to_owned()
 }
 
-/// Words of newer versions of MJCF, and what to write for 2.2.2.
+/// Keywords of newer versions of MJCF, each with what to write for 2.2.2.
 const HINTS: [(&str, &str); 14] = [
     ("actuatorfrcrange", "limit the actuator's force by its forcerange"),
     ("actuatorfrclimited", "limit the actuator's force by its forcerange"),

@@ -3,10 +3,11 @@
 //! A folder is loaded in this order:
 //!
 //! - `files` reads what the folder holds, and nothing outside of it; `table` reads TOML with places for errors.
-//! - `mjcf` resolves includes and gives MuJoCo texts of our own; `elements` knows the model's names.
-//! - `file` puts the task together of `reading` with its `number`s, `reward`, `rules`, `reset` and `parameter` with its `target`s.
-//! - `checks` refuses edits that can do nothing, and `effect` looks for edits without an effect that can be seen.
-//! - `environment` is the environment, whose simulations `template` shares among all of a thread.
+//! - `mjcf` resolves includes and writes the texts for MuJoCo; `elements` finds elements by name.
+//! - `file` assembles the task from `reading` with its `number`s, `reward`, `rules`, `reset` and `parameter` with its
+//!   `target`s.
+//! - `checks` refuses edits that cannot have an effect, and `effect` looks for edits without a visible effect.
+//! - `environment` is the environment. `template` has the simulations, which all environments of a thread share.
 //! - `child` loads a folder for the first time in a process of its own, and `report` says what `--check` prints.
 
 mod checks;

@@ -1,15 +1,15 @@
-//! The numbers of readings, and how each is read.
+//! The numbers that a reading consists of, and the way in which each is read.
 
 use perturb_mujoco::{Field, Model, Reading as Array, Simulation};
 
-/// The computation that a reading needs before it is read.
+/// The computation that MuJoCo must have done before a reading. Each stage includes the previous one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Stage {
-    /// Positions, velocities, actions: they are always there.
+    /// No computation: positions, velocities and actions are always known.
     State,
-    /// Poses and velocities of bodies.
+    /// The computation of poses and velocities of bodies.
     Motion,
-    /// Contacts, forces and sensors.
+    /// The computation of contacts, forces and sensors.
     Forward,
 }
 
@@ -52,14 +52,14 @@ pub(super) struct Point {
     pub(super) id: usize,
 }
 
-/// A number's name within the language, such as `root.x`, its name as a channel, and its unit and range.
+/// A number's name in `task.toml`, such as `root.x`, its name as a channel, and its unit and range.
 #[derive(Debug, Clone)]
 pub(super) struct Entry {
     /// Name by which `without` and `axes` find it.
     pub(super) name: String,
     /// The element's name alone.
     pub(super) element: String,
-    /// The kind of element, to tell names apart that occur twice.
+    /// The kind of element, which distinguishes equal names.
     pub(super) kind: &'static str,
     /// Name as a channel of the observation.
     pub(super) channel: String,
@@ -68,7 +68,7 @@ pub(super) struct Entry {
     pub(super) high: f64,
 }
 
-/// The actions that numbers of a step follow from, beside the simulation.
+/// The actions from which a step's numbers are computed, besides the simulation.
 pub(super) struct Context<'a> {
     /// The action as received, `[A]`.
     pub(super) action: &'a [f32],
@@ -76,7 +76,7 @@ pub(super) struct Context<'a> {
     pub(super) previous_action: &'a [f32],
 }
 
-/// The names of numbers as channels, each unique.
+/// Returns a unique channel name for each number.
 pub(super) fn unique_channels<'a>(entries: impl Iterator<Item = &'a Entry>) -> Vec<String> {
     let mut names: Vec<String> = Vec::new();
     let mut taken = std::collections::BTreeSet::new();
@@ -110,13 +110,13 @@ pub(super) fn entry(element: &str, part: &str, suffix: String, unit: &'static st
     }
 }
 
-/// A text as a channel's name: letters, digits and underscores, and `#` before the number of an element without a name.
+/// Converts a text to a channel's name: letters, digits and underscores. `#` stays before an unnamed element's number.
 pub(super) fn channel_name(text: &str) -> String {
     text.chars().map(|c| if c.is_alphanumeric() || c == '#' { c } else { '_' }).collect()
 }
 
 impl Number {
-    /// Returns the computation that is needed before.
+    /// Returns the computation that is needed before the number is read.
     pub(super) fn stage(&self) -> Stage {
         use Array::{
             Activations, BodyCentres, BodyInertias, BodyPositions, BodyRotations, BodyVelocities, Controls,

@@ -84,7 +84,7 @@ impl EditedParameter {
         Ok(())
     }
 
-    /// The numbers of the model that the parameter edits.
+    /// The array and the index of each number of the model that the parameter edits.
     pub(super) fn places(&self) -> impl Iterator<Item = (Field, usize)> + '_ {
         self.targets().map(Target::place)
     }
@@ -116,7 +116,8 @@ impl EditedParameter {
         })
     }
 
-    /// The parameter's value as the model has it: of all targets the value that is farthest from the requested one.
+    /// Reads the parameter's value back from the model. Of the values of all targets it returns the one that is
+    /// farthest from the requested value.
     pub(super) fn read_back(&self, pristine: &Model, model: &Model, requested: f64) -> f64 {
         let values = self.edits.iter().flat_map(|edit| {
             edit.targets.all.iter().map(|target| match edit.change {
@@ -156,7 +157,7 @@ impl Edit {
         Ok(Self { targets: Targets::new(table, model, elements, change)?, change, factor })
     }
 
-    /// The number that a value makes of the pristine number.
+    /// Returns the number that an edit with `value` writes in place of the pristine number `own`.
     pub(super) fn number(&self, own: f64, value: f64) -> f64 {
         match self.change {
             Change::Set => self.factor * value,
@@ -165,7 +166,7 @@ impl Edit {
         }
     }
 
-    /// The value that makes a number.
+    /// Returns the value with which an edit writes this number, or adds it.
     fn unscaled(&self, number: f64) -> f64 {
         if self.factor.abs() == 1.0 { number * self.factor } else { number / self.factor }
     }
@@ -185,7 +186,7 @@ impl Edit {
     }
 }
 
-/// The value of version D: as given, or as the model has it.
+/// Returns the value of version D: the file's, or else the model's.
 fn default(table: &Table<'_>, model: &Model, edits: &[Edit]) -> Result<f64> {
     if let Some(default) = table.number("default")? {
         return Ok(default);
@@ -244,7 +245,7 @@ pub(super) fn sets(table: &Table<'_>, bounds: (f64, f64), default: f64) -> Resul
     Ok((Interval::new(random.0, random.1), [Interval::new(below.0, below.1), Interval::new(above.0, above.1)]))
 }
 
-/// A number of the model that receipts have beside the parameters.
+/// A number of the model that receipts have besides the parameters.
 #[derive(Debug, Clone)]
 pub(super) struct AppliedQuantity {
     pub(super) quantity: Quantity,

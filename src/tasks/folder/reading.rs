@@ -89,7 +89,7 @@ impl Reading {
         &self.entries
     }
 
-    /// Returns the computation that is needed before.
+    /// Returns the computation that is needed before the numbers are read.
     pub(super) fn stage(&self) -> Stage {
         self.numbers.iter().map(Number::stage).max().unwrap_or(Stage::State)
     }

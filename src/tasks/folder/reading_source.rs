@@ -1,4 +1,4 @@
-//! The numbers that a reading of the file names.
+//! Resolves a reading of the file to numbers of the simulation.
 
 use super::{
     elements::{Elements, actuator_name},
@@ -28,7 +28,7 @@ const OF_A_GEOM: &[&str] = &["position", "touching"];
 const OF_AN_ACTUATOR: &[&str] = &["control", "force", "activation"];
 const OF_TWO_POINTS: &[&str] = &["vector", "distance"];
 
-/// The arguments of a reading that is being read from the file.
+/// The table of a reading, with the model and its elements, to which the table refers.
 pub(super) struct Source<'a> {
     pub(super) table: &'a Table<'a>,
     pub(super) model: &'a Model,
@@ -82,7 +82,7 @@ impl Source<'_> {
         })
     }
 
-    /// Refuses `get` where there is one thing to be read.
+    /// Refuses the key `get` for a subject with only one quantity.
     fn no_get(&self, subject: &str) -> Result<()> {
         match self.table.get("get") {
             None => Ok(()),

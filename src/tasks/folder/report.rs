@@ -18,7 +18,7 @@ const TIMED: Duration = Duration::from_millis(200);
 const MAX_LISTED: usize = 24;
 
 impl Folder {
-    /// The parameters whose edits have no effect that can be seen in some steps from the initial state.
+    /// Returns the parameters whose edits have no visible effect in some steps from the initial state.
     ///
     /// # Errors
     /// [`Error`] if MuJoCo raises a fatal error.
@@ -27,8 +27,8 @@ impl Folder {
     }
 }
 
-/// Loads a folder and describes it: model, observations, actions, rewards, ends, parameters, sizes, speed, and which
-/// edits have no effect that can be seen. The speed is measured if `measured`.
+/// Loads a folder and describes it: model, observations, actions, rewards, ends, parameters, sizes, and the edits
+/// without a visible effect. The speed is measured and reported if `measured`.
 ///
 /// # Errors
 /// [`LoadError`] with the place and the remedy.

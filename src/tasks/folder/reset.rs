@@ -1,7 +1,7 @@
 //! The initial state of an episode: the model's, or a keyframe's, with noise.
 //!
 //! Numbers are drawn from the episode's stream in this order: the positions that have noise, in the model's order; the
-//! velocities likewise; then for each entry of `joints` its positions and its velocities.
+//! velocities that have noise, in the same order; then for each entry of `joints` its positions and its velocities.
 
 use super::{
     elements::Elements,
@@ -16,15 +16,15 @@ const RESET: &[&str] = &["keyframe", "position", "velocity", "joints"];
 const NOISE: &[&str] = &["uniform", "normal"];
 const JOINTS: &[&str] = &["joint", "position", "velocity"];
 const PLACEMENT: &[&str] = &["uniform", "normal", "disc", "box", "beyond"];
-/// Limit of the draws of a point of a box outside of a circle. The last draw counts.
+/// Limit of the draws of a point of a box until one lies outside of a circle. After the limit the last draw counts.
 const MAX_DRAWS: usize = 1000;
 
 /// Noise that is added to a number.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Noise {
-    /// Uniform in ± this.
+    /// Uniform, from minus this number to this number.
     Uniform(f64),
-    /// Normal, of this standard deviation.
+    /// Normal with mean 0 and this standard deviation.
     Normal(f64),
 }
 
@@ -35,11 +35,11 @@ enum Placement {
     Noise(Noise),
     /// This number.
     Fixed(f64),
-    /// Each uniform in this interval.
+    /// Each number is uniform in this interval.
     Interval(f64, f64),
     /// Two numbers, uniform in a disc of this radius about 0.
     Disc(f64),
-    /// Each uniform in its interval, and all together farther than this from 0.
+    /// Each number is uniform in its interval, and the distance of their vector from 0 is larger than this.
     Box(Vec<(f64, f64)>, f64),
 }
 
@@ -48,9 +48,9 @@ enum Placement {
 pub(super) struct Reset {
     /// Positions, then velocities, without noise: `[Q + V]`.
     base: Vec<f64>,
-    /// The numbers that each kind of noise is added to.
+    /// The numbers that get noise, by their index in `base`.
     noise: Vec<(usize, Noise)>,
-    /// The numbers that are placed together.
+    /// The numbers, by their indices in `base`, that are drawn together by a rule.
     placed: Vec<(Vec<usize>, Placement)>,
 }
 
@@ -140,7 +140,7 @@ impl Noise {
 }
 
 impl Placement {
-    /// Reads how `n` numbers are placed.
+    /// Reads the rule by which `n` numbers are drawn.
     fn new(value: &Value<'_>, n: usize) -> Result<Self> {
         if value.is_list() {
             let (low, high) = value.interval()?;

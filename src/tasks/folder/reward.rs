@@ -51,7 +51,7 @@ pub(super) struct Term {
 #[derive(Debug, Clone)]
 enum TermKind {
     Value(Reading),
-    /// The first of its numbers among those of the step before.
+    /// The change of a reading per second, with the index of its first number in [`Step::before`].
     Rate(Reading, usize),
     Squared(Reading),
     Norm(Reading),
@@ -66,9 +66,9 @@ enum TermKind {
         reading: Reading,
         sigma: f64,
     },
-    /// For each actuator its number and the entry of `qvel`.
+    /// The mechanical power of actuators. Each has its number and the entry of its joint in `qvel`.
     Power(Vec<(usize, usize)>),
-    /// For each joint its number and the entry of `qpos`.
+    /// The number of joints at a limit. Each joint has its number and its entry in `qpos`.
     Limits(Vec<(usize, usize)>),
     Healthy {
         otherwise: f64,
@@ -85,7 +85,7 @@ enum MarginShape {
     Gaussian,
 }
 
-/// Values that terms follow from, beside the simulation.
+/// The values from which terms are computed, besides the simulation.
 pub(super) struct Step<'a> {
     pub(super) context: Context<'a>,
     pub(super) healthy: bool,
@@ -96,7 +96,7 @@ pub(super) struct Step<'a> {
 }
 
 impl Term {
-    /// Reads the table of a term; `n_remembered` is the number of numbers that earlier terms remember.
+    /// Reads the table of a term. `n_remembered` is how many numbers the terms before it remember.
     pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements, n_remembered: usize) -> Result<Self> {
         let name = table.require("name", "\"forward\"")?;
         let name = identifier(&name, name.text()?)?;
@@ -230,7 +230,7 @@ impl Term {
         }
     }
 
-    /// Returns the computation that is needed before.
+    /// Returns the computation that is needed before the term is computed.
     pub(super) fn stage(&self) -> Stage {
         self.kind.reading().map_or(Stage::State, Reading::stage)
     }
@@ -240,7 +240,7 @@ impl Term {
         self.kind.reading().is_some_and(Reading::needs_external_forces)
     }
 
-    /// The term after a step. `numbers` is scratch.
+    /// Computes the term after a step. `numbers` is a scratch buffer.
     pub(super) fn compute(&self, simulation: &Simulation, step: &Step<'_>, numbers: &mut Vec<f64>) -> f64 {
         numbers.clear();
         if let Some(reading) = self.kind.reading() {
@@ -297,7 +297,7 @@ impl Term {
         if self.mean { sum / n } else { sum }
     }
 
-    /// The numbers less the target.
+    /// Returns the numbers minus the target.
     fn differences<'a>(&'a self, numbers: &'a [f64]) -> impl ExactSizeIterator<Item = f64> + 'a {
         let target = |i: usize| self.target.get(i).or(self.target.first()).copied().unwrap_or(0.0);
         numbers.iter().enumerate().map(move |(i, x)| x - target(i))

@@ -1,4 +1,4 @@
-//! Ranges that readings keep to: what is healthy, and what a goal is. And the success of an episode.
+//! Ranges of readings, which define health and goals, and the success rule of an episode.
 
 use super::{
     elements::Elements,
@@ -74,7 +74,7 @@ impl Range {
         &self.reading
     }
 
-    /// Whether all numbers lie in it. A number that is not finite lies in none. `numbers` is scratch.
+    /// Whether all numbers are finite and lie in the range. `numbers` is a scratch buffer.
     pub(super) fn holds(&self, simulation: &Simulation, context: &Context<'_>, numbers: &mut Vec<f64>) -> bool {
         numbers.clear();
         self.reading.read(simulation, context, numbers);
@@ -88,7 +88,7 @@ impl Range {
     }
 }
 
-/// Rule by which the number that an episode achieves follows from a reading.
+/// The rule by which the readings of an episode's steps give the value that it achieved.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Best {
     Greatest,
@@ -96,12 +96,12 @@ pub(super) enum Best {
     Last,
 }
 
-/// The rule of success, as far as the environment computes it.
+/// The part of the success rule that the environment computes.
 #[derive(Debug, Clone)]
 pub(super) struct Goal {
     /// Reading that the rule compares, if it compares one.
     pub(super) achieved: Option<(Best, Reading)>,
-    /// The goal whose steps are counted, if the rule does.
+    /// The ranges of the goal, if the rule counts the steps at which the goal holds.
     pub(super) ranges: Vec<Range>,
     pub(super) rule: Success,
 }
@@ -168,7 +168,7 @@ impl Goal {
     }
 }
 
-/// A text that lives as long as the process, as all that is fixed about an environment does.
+/// Leaks a text, so that it lives as long as the process. The fixed description of an environment needs such texts.
 pub(super) fn leaked(text: &str) -> &'static str {
     Box::leak(text.to_owned().into_boxed_str())
 }

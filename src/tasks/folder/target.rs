@@ -34,9 +34,9 @@ pub(super) enum Target {
     Number(Field, usize),
     /// Two numbers that are always the same: (array, first).
     Twins(Field, usize),
-    /// Both ends of a range: the lower end is the negative of the upper end. (array, lower)
+    /// Both ends of a range, if the lower end is the negative of the upper end: (array, index of the lower end).
     Symmetric(Field, usize),
-    /// Both ends of a range, which are scaled together. (array, lower)
+    /// Both ends of a range, which are scaled together: (array, index of the lower end).
     Ends(Field, usize),
     /// A body's mass. Its inertia follows in proportion.
     Mass(usize),
@@ -64,7 +64,7 @@ pub(super) struct Targets {
     pub(super) names: Vec<String>,
 }
 
-/// Rule by which a value enters a target.
+/// The rule by which a value changes a target.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Change {
     Set,
@@ -73,7 +73,7 @@ pub(super) enum Change {
 }
 
 impl Targets {
-    /// Reads what a table names.
+    /// Reads the targets that a table names.
     pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements, change: Change) -> Result<Self> {
         let subjects = ["body", "geom", "pair", "joint", "actuator", "tendon", "option"];
         let (subject, value) = table.one_of(&subjects)?;
@@ -174,7 +174,8 @@ impl Targets {
         Ok(Self { all, subject: "option", field: option, ids: Vec::new(), names: vec![option.to_owned()] })
     }
 
-    /// The values that are physical, as (least, whether it is excluded): masses are positive, most others not negative.
+    /// The minimum of physical values, and whether it is excluded. Masses are positive, and most other values not
+    /// negative.
     pub(super) fn least(&self) -> Option<(f64, bool)> {
         match (self.subject, self.field) {
             ("body", _) => Some((0.0, true)),
@@ -243,7 +244,7 @@ fn velocity_gain(model: &Model, actuator: usize) -> Option<Target> {
 }
 
 impl Target {
-    /// The array that holds the value, and its place there.
+    /// The array that holds the value, and its index there.
     pub(super) fn place(self) -> (Field, usize) {
         match self {
             Self::Number(field, at) | Self::Twins(field, at) => (field, at),
@@ -264,12 +265,12 @@ impl Target {
         }
     }
 
-    /// Whether derived constants have to be computed anew after an edit.
+    /// Whether derived constants must be computed again after an edit.
     pub(super) fn changes_constants(self) -> bool {
         matches!(self.place().0, Field::BodyMass | Field::DofArmature | Field::ActuatorGear)
     }
 
-    /// Whether the value is what both ends of a symmetric range say.
+    /// Whether both ends of a symmetric range have the same absolute value. True for other targets.
     fn is_consistent(self, model: &Model) -> bool {
         match self {
             Self::Symmetric(field, at) => model.field(field)[at] == -model.field(field)[at + 1],
@@ -277,14 +278,14 @@ impl Target {
         }
     }
 
-    /// The value in a model.
+    /// Returns the target's value in a model.
     pub(super) fn value(self, model: &Model) -> f64 {
         let (field, at) = self.place();
         let value = model.field(field)[at];
         if matches!(self, Self::ActuatorDamping(_)) { -value } else { value }
     }
 
-    /// Sets the value in a simulation's model, which has the values of `pristine` there.
+    /// Sets the value in a simulation's model, which still has the pristine value.
     pub(super) fn set(self, pristine: &Model, simulation: &mut Simulation, value: f64) {
         let (field, at) = self.place();
         let own = self.value(pristine);
@@ -293,7 +294,7 @@ impl Target {
             Self::Number(..) | Self::ActuatorDamping(_) => {}
             Self::Twins(..) => simulation.field_mut(field)[at + 1] = value,
             Self::Symmetric(..) => simulation.field_mut(field)[at - 1] = -value,
-            // Both ends are scaled only.
+            // Ranges with two ends are only scaled, never set.
             Self::Ends(..) => {}
             Self::Mass(body) => {
                 let factor = value / own;
@@ -314,7 +315,7 @@ impl Target {
         }
     }
 
-    /// Multiplies the value, and all that belongs to it, by a factor.
+    /// Multiplies the value and the numbers that follow it by a factor.
     pub(super) fn scale(self, pristine: &Model, simulation: &mut Simulation, factor: f64) {
         let (field, at) = self.place();
         let mut multiply =
@@ -331,7 +332,7 @@ impl Target {
         }
     }
 
-    /// The factor by which the value was multiplied.
+    /// Returns the factor by which the value in `model` differs from the pristine one.
     pub(super) fn factor(self, pristine: &Model, model: &Model) -> f64 {
         let (field, at) = self.place();
         let own = pristine.field(field)[at];
@@ -342,7 +343,7 @@ impl Target {
         }
     }
 
-    /// Whether a factor has no effect.
+    /// Whether the pristine value is 0, so that a factor has no effect on it.
     pub(super) fn is_zero(self, pristine: &Model) -> bool {
         let (field, at) = self.place();
         let lower = matches!(self, Self::Ends(..)).then(|| pristine.field(field)[at - 1]);
@@ -358,7 +359,7 @@ pub(super) fn is_limited(model: &Model, subject: &str, id: usize) -> bool {
     }
 }
 
-/// An error that an edit can have no effect, in one wording.
+/// Makes the error that an edit cannot have an effect, always in the same wording.
 pub(super) fn without_effect(table: &Table<'_>, why: impl std::fmt::Display) -> Error {
     table.error(format_args!("it has no effect: {why}"))
 }

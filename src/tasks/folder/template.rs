@@ -1,31 +1,31 @@
-//! A folder's model as compiled, and the edits of it that environments share simulations by.
+//! The compiled model of a folder, its edits, and the simulations that environments share.
 
 use super::parameter::EditedParameter;
 use perturb_mujoco::{Error, Field, Model, Simulation};
 use std::{cell::RefCell, ptr, sync::Arc};
 
 thread_local! {
-    /// The simulations that nobody uses at the moment.
+    /// The simulations of this thread that are not in use.
     static IDLE: RefCell<Vec<SharedSimulation>> = const { RefCell::new(Vec::new()) };
 }
 
-/// A model as compiled: nothing changes it.
+/// A compiled model, which nothing changes.
 #[derive(Debug)]
 pub(super) struct Template {
     pub(super) model: Model,
     /// The initial [state](Simulation::state), `[n_state]`.
     pub(super) state: Vec<f64>,
-    /// The fields that edits change, and those that follow from them.
+    /// The fields that edits change, and the fields that are derived from these.
     fields: Vec<Field>,
-    /// These fields of the pristine model.
+    /// The contents of `fields` in the pristine model.
     pristine: Vec<f64>,
-    /// Whether derived fields have to be computed after an edit.
+    /// Whether derived fields must be computed after an edit.
     derives: bool,
     /// The entries of [`Field::Statistic`] that the model's text gives.
     statistic: Vec<usize>,
 }
 
-/// A change of the model: the parameters, and the fields that come of them.
+/// A change of the model: the parameters, and the fields that result from them.
 #[derive(Debug)]
 pub(super) struct ModelEdit {
     /// The parameters, `[P]`.
@@ -34,7 +34,7 @@ pub(super) struct ModelEdit {
 }
 
 impl Template {
-    /// A template of a compiled model. `statistic` names the attributes of the text's `<statistic>`.
+    /// Makes a template of a compiled model. `statistic` names the attributes of the text's `<statistic>`.
     ///
     /// # Errors
     /// [`Error::Fatal`] without memory.
@@ -47,7 +47,7 @@ impl Template {
         Ok(Self { model, state, fields: Vec::new(), pristine: Vec::new(), derives: false, statistic })
     }
 
-    /// Prepares for the edits of these parameters.
+    /// Prepares the template for edits by these parameters.
     pub(super) fn prepare(&mut self, parameters: &[EditedParameter]) {
         let targets = || parameters.iter().flat_map(EditedParameter::targets);
         self.derives = targets().any(super::target::Target::changes_constants);
@@ -64,13 +64,13 @@ impl Template {
 
 /// A simulation of a thread, which environments take turns in, and the edit that its model was last given.
 ///
-/// A model with MuJoCo's data takes megabytes; what tells two environments from each other is some hundred bytes. No
-/// environment sees what another did: everything that follows is written into the simulation before it runs.
+/// A model with MuJoCo's data takes megabytes, but two environments differ in some hundred bytes. An environment cannot
+/// see what another one did: its whole state is written into the simulation before it runs.
 pub(super) struct SharedSimulation {
     template: &'static Template,
     simulation: Simulation,
     edit: Option<Arc<ModelEdit>>,
-    /// Scratch for readings.
+    /// A scratch buffer for readings.
     pub(super) numbers: Vec<f64>,
 }
 
@@ -102,7 +102,7 @@ pub(super) fn with<T>(
 }
 
 impl SharedSimulation {
-    /// The edit to these parameters; the state is undefined then.
+    /// Makes the edit for these parameter values. The state is undefined afterwards.
     ///
     /// # Errors
     /// MuJoCo's fatal ones.
@@ -134,7 +134,7 @@ impl SharedSimulation {
         Ok(edit)
     }
 
-    /// The simulation with the edited model; its state is undefined.
+    /// Returns the simulation with the edited model. Its state is undefined.
     pub(super) fn edited(&mut self, edit: &Arc<ModelEdit>) -> &mut Simulation {
         let is_in_force =
             self.edit.as_ref().is_some_and(|own| Arc::ptr_eq(own, edit) || is_same(&own.values, &edit.values));
@@ -145,8 +145,8 @@ impl SharedSimulation {
         &mut self.simulation
     }
 
-    /// The simulation with the edited model in this [state](Simulation::state), from which nothing is computed yet, and
-    /// the scratch for readings.
+    /// Returns the simulation with the edited model in this [state](Simulation::state), and the scratch buffer for
+    /// readings. Nothing is computed from the state yet.
     ///
     /// # Errors
     /// MuJoCo's fatal ones.
@@ -160,7 +160,7 @@ impl SharedSimulation {
     }
 }
 
-/// Whether values are the same, bit for bit: 0 and -0 make different models.
+/// Whether values are the same bit for bit, because 0 and -0 make different models.
 fn is_same(a: &[f64], b: &[f64]) -> bool {
     a.len() == b.len() && a.iter().zip(b).all(|(a, b)| a.to_bits() == b.to_bits())
 }
