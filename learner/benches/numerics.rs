@@ -41,7 +41,7 @@ fn observations(size: usize) -> Vec<f32> {
     (0..size).map(|_| normal(&mut rng) as f32).collect()
 }
 
-/// A rollout of the policy itself on noise.
+/// A rollout that the policy itself played on noise.
 fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
     let spec = policy.spec();
     let mut actor = Actor::new(spec, n_envs);

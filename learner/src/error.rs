@@ -36,7 +36,7 @@ pub enum Error {
     Episode {
         /// The environment, from 0.
         environment: usize,
-        /// The step after its last.
+        /// The number of the step after the episode's last one.
         end: usize,
         /// The number of steps.
         length: usize,

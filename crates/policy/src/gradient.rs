@@ -16,7 +16,8 @@ pub trait GradientBackend {
     /// Arrays whose lengths do not fit, or what libtorch refuses.
     fn batch<'a>(&self, sequences: &SequenceSamples<'a>) -> Result<GradientBatch<'a>>;
 
-    /// Takes the policy with `weights` `[P]` for the one that acted in `batch`. The KL divergence is measured from it.
+    /// Stores the distributions of the policy with `weights` `[P]` as those of the policy that acted in `batch`. The KL
+    /// divergence is measured from them.
     ///
     /// # Errors
     /// A batch of other observations, or another number of weights.

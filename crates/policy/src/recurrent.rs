@@ -22,7 +22,8 @@ pub trait RecurrentBatch {
     /// N, the number of sequences.
     fn count(&self) -> usize;
 
-    /// Takes the policy with `weights` `[P]` for the one that acted. The KL divergence is measured from it.
+    /// Stores the distributions of the policy with `weights` `[P]` as those of the policy that acted. The KL divergence is
+    /// measured from them.
     ///
     /// # Errors
     /// Another number of weights.

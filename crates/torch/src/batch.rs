@@ -65,7 +65,8 @@ impl TensorBatch {
         })
     }
 
-    /// Takes `policy` with its present weights for the one that acted. The KL divergence is measured from it.
+    /// Stores the distributions of `policy` with its present weights as those of the policy that acted. The KL divergence
+    /// is measured from them.
     pub(crate) fn remember_acting(&mut self, policy: &TorchPolicy) {
         self.acting = Some(policy.distributions(&self.sequences));
     }

@@ -67,7 +67,7 @@ fn alone(name: &str, servers: &Servers) -> Result<()> {
         }
     })?;
 
-    // What was timed really happened: the steps, the updates, and learning.
+    // Checks that the timed work was done: the steps, the updates, and learning.
     let progress = outcome.progress;
     assert_eq!(progress.timesteps, ITERATIONS * 8 * 128);
     assert_eq!(progress.update.n_updates, ITERATIONS * 10);

@@ -22,7 +22,7 @@ const PARTIAL_RECONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 pub struct Backoff {
     waited: Duration,
     attempts: u32,
-    /// Whether any progress was made: then the servers had room once.
+    /// Whether any progress was made. Then the servers had room at least once, so that a full server may have room again.
     has_begun: bool,
 }
 

@@ -24,7 +24,7 @@ pub struct OpenOptions {
     pub seed: u64,
     /// Episodes in a trial.
     pub episodes_per_trial: u32,
-    /// The entries of observations; the same in all options of a session.
+    /// The content of observations; the same in all options of a session.
     pub observe: Observe,
 }
 

@@ -41,8 +41,8 @@ impl<'a> Session<'a> {
         Self::open_together(servers, std::slice::from_ref(options), observations)
     }
 
-    /// Opens the environments of several `options`, one after the other. All must name the same environment and observe the
-    /// same.
+    /// Opens the environments of several `options`, one after the other. All options must name the same environment and the
+    /// same observation.
     ///
     /// # Errors
     /// Those of [`Session::open`].

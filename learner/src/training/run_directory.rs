@@ -14,7 +14,7 @@ use crate::checkpoint::{Checkpoint, CheckpointError, ResumeState};
 pub struct RunDirectory {
     path: PathBuf,
     overwrite: bool,
-    /// Taken as soon as the directory exists.
+    /// The lock of the directory, taken as soon as the directory exists.
     lock: OnceCell<Lock>,
     /// Whether the files in the directory are of this run. Files of an earlier run are there until
     /// [`RunDirectory::prepare`].

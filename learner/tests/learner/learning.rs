@@ -1,4 +1,4 @@
-//! Whether the algorithms learn, on tasks of seconds; and what their updates promise.
+//! Tests that the algorithms learn, on tasks of seconds, and that their updates keep their guarantees.
 
 use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Ppo};
 use perturb_learner::error::Error;

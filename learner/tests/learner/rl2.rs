@@ -1,5 +1,4 @@
-//! RL²: what the policy sees and remembers of a trial, what the update sees of it, what a test counts, and that it learns to
-//! learn.
+//! Tests of RL²: inputs and memories in a trial, updates, tests of policies, and whether a policy learns within a trial.
 
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::algorithm::{A2c, Algorithm, Ppo, gae};

@@ -1,4 +1,5 @@
-//! A training's bytes are its own: alone or in any group, stopped and resumed in another, and wherever actions are chosen.
+//! A training gives the same bytes alone and in any group, stopped and resumed in another group, and wherever actions are
+//! chosen.
 
 use std::path::Path;
 

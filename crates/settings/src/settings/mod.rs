@@ -102,8 +102,8 @@ pub struct Common {
     /// Whether observations are normalised by their running mean and variance (default: `true`).
     pub normalize_observations: bool,
     /// Standard deviation of normal noise that is added to every number of an observation in training, after normalisation
-    /// if there is any, 0 … 100 (default: `0`). Tests have none. It is written only where it is not the default: settings
-    /// from before it stay what they were.
+    /// if there is any, 0 … 100 (default: `0`). Tests have none. Written only if it is not the default, so that older
+    /// settings stay the same.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub observation_noise: f64,
     /// Whether rewards are divided by the running deviation of the discounted return (default: `true`).
