@@ -306,7 +306,7 @@ impl Batch {
         Ok(self.observations(&slots))
     }
 
-    /// The distributions in force in a slot, one for each parameter.
+    /// The present distributions of a slot, one for each parameter.
     pub fn distributions(&self, slot: usize) -> Vec<Distribution> {
         lock(&self.job.shards[slot / self.shard_size]).distributions(slot).to_vec()
     }
@@ -321,7 +321,7 @@ impl Batch {
         self.drop_hook = Some(hook);
     }
 
-    /// Frees the environments. Resolves when they are freed, so that there is room for others.
+    /// Frees the environments. Resolves when they are freed and others have room.
     pub fn close(mut self) -> impl Future<Output = ()> + Send + use<> {
         let (freed, is_freed) = oneshot::channel();
         self.freed = Some(freed);

@@ -26,7 +26,7 @@ impl Capacity {
         self.used.load(Ordering::Relaxed)
     }
 
-    /// The most environments there may be.
+    /// The maximum number of environments.
     pub(super) fn limit(&self) -> usize {
         self.limit
     }

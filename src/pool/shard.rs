@@ -1,4 +1,4 @@
-//! A part of a batch: what one worker runs at a time.
+//! A shard: the part of a batch that one worker runs at a time.
 
 use super::{
     receipts::ReceiptColumns,
@@ -157,7 +157,7 @@ impl Shard {
         ended.map(|(slot, _)| self.first_slot + slot)
     }
 
-    /// The distributions in force in a slot of the batch.
+    /// The present distributions of a slot of the batch.
     pub(super) fn distributions(&self, slot: usize) -> &[Distribution] {
         &self.slots[slot - self.first_slot].settings().distributions
     }

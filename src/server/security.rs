@@ -48,7 +48,7 @@ impl Security {
         Ok(guards)
     }
 
-    /// Has the files of tokens and TLS read again at once.
+    /// Returns a reloader, which makes the files of tokens and TLS be read again at once.
     pub fn reloader(&self) -> Reloader {
         Reloader::new(&self.watches)
     }

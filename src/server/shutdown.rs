@@ -7,7 +7,7 @@ use tokio::sync::watch;
 pub enum ShutdownPhase {
     /// Serving.
     Running,
-    /// New sessions are refused, running ones go on.
+    /// New sessions are refused, and running ones continue.
     Draining,
     /// Running sessions are ended.
     Closed,

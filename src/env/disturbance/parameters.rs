@@ -190,8 +190,8 @@ impl DisturbanceSet {
         }
     }
 
-    /// Reads the values back from those in force, in order. The scale of all actuators and that of one are known by their
-    /// product alone, so `numbers`, what was set, tells them apart.
+    /// Reads the values of the disturbances back, in order. Only the product of the scale of all actuators and an
+    /// actuator's own scale is stored, so both scales are taken from `numbers`, the values that were set.
     pub(super) fn read(&self, values: &DisturbanceValues, numbers: &[f64], out: &mut [f64]) {
         for ((&(kind, _), &number), out) in self.entries.iter().zip(numbers).zip(out) {
             *out = match kind {

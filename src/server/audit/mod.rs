@@ -1,4 +1,4 @@
-//! Sampling of parameters: what a role allows, and the ledger of what was sampled.
+//! The audit of draws: the check of a token's role, and the ledger.
 
 pub mod draws;
 mod error;

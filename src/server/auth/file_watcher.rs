@@ -17,17 +17,18 @@ const MAX_FILE_BYTES: u64 = 1 << 20;
 /// Watches files, on a thread of its own, until it and its [reloaders](Reloader) are dropped.
 pub struct FileWatcher(Sender<()>);
 
-/// Has watched files read again at once.
+/// Makes watchers read their files again at once.
 #[derive(Clone, Default)]
 pub struct Reloader(Vec<Sender<()>>);
 
 impl Reloader {
-    /// Has the files of these watchers read again at once.
+    /// Makes a reloader of the files of these watchers.
     pub fn new(watchers: &[FileWatcher]) -> Self {
         Self(watchers.iter().map(|FileWatcher(look)| look.clone()).collect())
     }
 
-    /// Has the files read again, whether or not they have changed. Returns whether there are some.
+    /// Makes the watchers read their files again at once, even if they have not changed. Returns whether there is a
+    /// watcher.
     pub fn reload(&self) -> bool {
         for look in &self.0 {
             let _ = look.send(()); // a watcher that is gone needs no files

@@ -44,7 +44,7 @@ pub struct Token {
     quotas: Arc<Quotas>,
 }
 
-/// A token's quotas, and counters of what was done with it.
+/// A token's quotas and counters.
 #[derive(Default)]
 struct Quotas {
     sessions: Quota,

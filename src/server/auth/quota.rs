@@ -1,4 +1,4 @@
-//! Limits on what a token may hold at a time.
+//! Limits on the sessions, environments and bytes that a token may hold at a time.
 
 use super::{Bearer, Error, Token};
 use std::sync::atomic::{AtomicUsize, Ordering};

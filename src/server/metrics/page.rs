@@ -54,7 +54,7 @@ impl Collector for MetricsCollector {
 }
 
 impl MetricsCollector {
-    /// Writes what is in use, and the limits.
+    /// Writes the resources that are in use, and their limits.
     fn capacity(&self, page: &mut Page<'_>) -> EncodeResult {
         let MetricsSources { pool, sessions, leases, connections, budget, ledger, .. } = &*self.0;
         if let Some(status) = ledger.as_ref().map(Ledger::status) {

@@ -65,7 +65,7 @@ impl Sessions {
         }
     }
 
-    /// A view for a new session, which counts as running as long as it holds this.
+    /// Returns a view for a new session, which counts as running as long as it holds the view.
     pub(super) fn enter(&self) -> Self {
         Self { drain: self.drain.enter(), ..self.clone() }
     }
@@ -82,7 +82,7 @@ impl Sessions {
         }
     }
 
-    /// Counts an error, also for the token that the stream has.
+    /// Counts an error, and counts it also for the stream's token.
     pub(super) fn count(&self, error: &impl RequestError, bearer: Option<&Bearer>) {
         self.counters.count(error.kind());
         if let Some(bearer) = bearer {
@@ -105,7 +105,7 @@ impl Sessions {
 
 /// The way in which a stream was admitted.
 pub(super) enum Admission {
-    /// Admitted with a permit of its own, and one of its token.
+    /// Admitted with its own permit, and with a part of its token's quota.
     Own(#[expect(dead_code, reason = "held")] PeerPermit, #[expect(dead_code, reason = "held")] Option<QuotaGuard>),
     /// Admitted although the server is full. If its first request does not resume a session, it ends with this error.
     ResumeOnly(#[expect(dead_code, reason = "held")] CountGuard, Error),

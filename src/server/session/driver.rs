@@ -38,7 +38,7 @@ use tonic::Status;
 /// The maximum length of a session's stored replies, bytes. The last reply is stored even if it is longer. A client
 /// that has missed more than this should continue from a snapshot.
 const MAX_STORED_BYTES: usize = 4 << 20;
-/// The memory of a stored reply beside its encoded length, bytes.
+/// The memory of a stored reply in addition to its encoded length, bytes.
 const REPLY_OVERHEAD_BYTES: usize = 512;
 
 /// Responses as they come, or the status that ends the stream.
@@ -48,7 +48,7 @@ impl Sessions {
     /// Begins a session in a task of its own: the handler answers the requests of the stream.
     ///
     /// # Errors
-    /// If the server is shutting down or has no room for another session, or its token may have no more.
+    /// If the server is shutting down or full, or the quota of the stream's token is used up.
     pub fn begin<H: SessionHandler>(
         &self,
         requests: MessageReader,

@@ -66,7 +66,7 @@ pub trait SessionHandler: Send + 'static {
     /// The environment of the session, and its steps so far.
     fn stats(&self) -> SessionStats;
 
-    /// The price of a request beside its steps, in steps of an environment. A token's rate counts both.
+    /// The price of a request besides that of its steps, in steps of an environment. A token's rate counts both.
     fn price(&self, request: &Self::Request) -> u64;
 
     /// Frees the session's resources. Resolves when they are free, so that another session like it has room.

@@ -19,7 +19,8 @@ use tonic::{Code, Status, body::Body};
 
 /// The length of a message's header: a flag and a length.
 const HEADER_BYTES: usize = 5;
-/// The first bytes of a message, so many that they do not count against the memory budget. Every stream may send them.
+/// The number of a message's first bytes that do not count against the memory budget, so that every stream may send a
+/// small message.
 const UNBUDGETED_BYTES: usize = 64 << 10;
 /// The minimum average rate of a message, bytes per second. A message may take [`StreamLimits::limit`] longer than at
 /// this rate.

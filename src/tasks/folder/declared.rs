@@ -1,4 +1,4 @@
-//! The disturbances of a task: what is pushed, and the sets of R and E that it declares.
+//! The disturbances of a task: the element that is pushed, and the sets of R and E that the file declares.
 
 use super::{
     elements::Elements,

@@ -86,8 +86,8 @@ impl Needs {
 
 /// An environment of a folder.
 ///
-/// A step sets the controls to the action, clipped to their range, and holds them for `frame_skip` timesteps. Then come,
-/// in this order, what is healthy, the reward's terms, the observation, and what was achieved; all see the same state.
+/// A step sets the controls to the action, clipped to their range, and holds them for `frame_skip` timesteps. Then
+/// health, the reward's terms, the observation and the achieved value are computed in this order, from the same state.
 ///
 /// The physics diverge if MuJoCo warns of a number or of lost contacts, if it fails, or if a number that is read is not
 /// finite. Then the step terminates, all terms except those of health are 0, and the observation stays that of the step

@@ -172,10 +172,10 @@ fn check_root(name: &str, root: &Node<'_, '_>) -> Result<()> {
     }
 }
 
-/// Refuses a composite of so many elements that MuJoCo would compile it for minutes.
+/// Refuses a composite with more elements than [`MAX_COMPOSITE_ELEMENTS`], which would compile for minutes.
 fn check_composite(name: &str, node: &Node<'_, '_>) -> Result<()> {
     let count = node.attribute("count").unwrap_or_default();
-    // MuJoCo itself refuses what is no number.
+    // Counts that are not numbers are refused by MuJoCo itself.
     let elements: f64 = count.split_whitespace().filter_map(|number| number.parse::<f64>().ok()).product();
     if elements <= MAX_COMPOSITE_ELEMENTS {
         return Ok(());

@@ -24,7 +24,7 @@ const SUBJECTS: [&str; 12] = [
     "constant",
     "time",
 ];
-/// The keys of a reading beside its subject.
+/// The keys of a reading besides its subject.
 const OPTIONS: [&str; 6] = ["to", "get", "axes", "without", "scale", "clip"];
 
 /// A list of numbers.

@@ -50,7 +50,7 @@ const BALL: i32 = 1;
 const SLIDE: i32 = 2;
 
 impl Source<'_> {
-    /// The numbers of a subject, whose key has this value.
+    /// Returns the numbers of a subject. `value` is the value of the subject's key.
     pub(super) fn numbers(&self, subject: &str, value: &Value<'_>) -> Result<Numbers> {
         match subject {
             "joint" => self.joints(value),

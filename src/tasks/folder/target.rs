@@ -18,7 +18,7 @@ pub(super) const EDITABLE: [(&str, Kind, &[&str]); 6] = [
 ];
 /// The options that can be edited.
 pub(super) const OPTIONS: &[&str] = &["gravity", "wind", "density", "viscosity"];
-/// The keys that say what is edited.
+/// The keys that name the edited numbers.
 pub(super) const KEYS: [&str; 10] =
     ["body", "geom", "pair", "joint", "actuator", "tendon", "option", "field", "axis", "end"];
 

@@ -11,8 +11,8 @@ const PIXELS_PER_STEP: u64 = 1024;
 /// The fixed price of each request other than `open`, `step` and `act`.
 const REQUEST_PRICE: u64 = 1;
 
-/// The price of a request beside the steps that it takes. Nothing is added for `step` and `act`. The environments of an
-/// `open` are charged when they are made.
+/// The price of a request besides that of its steps. It is 0 for `step` and `act`. The environments of an `open` are
+/// charged separately when they are made.
 pub fn price(request: Option<&Request>, batch: Option<&Batch>) -> u64 {
     let size = batch.map_or(0, Batch::size);
     let selected = |mask: &[u8]| if mask.is_empty() { size } else { mask.iter().filter(|&&entry| entry != 0).count() };
