@@ -38,6 +38,7 @@ use crate::{
 use std::{future::Future, io, sync::Arc, time::Duration};
 use tokio::{task::JoinSet, time::timeout};
 use tonic::{
+    codec::CompressionEncoding,
     server::NamedService,
     transport::{Server, server::Router},
 };
@@ -261,7 +262,9 @@ fn router<H: Health>(
     let auth = AuthLayer::new(tokens, state.errors.clone());
     let perturb = PerturbServer::new(service)
         .max_decoding_message_size(MAX_UNARY_BYTES) // of all but sessions
-        .max_encoding_message_size(usize::MAX);
+        .max_encoding_message_size(usize::MAX)
+        .accept_compressed(CompressionEncoding::Gzip)
+        .accept_compressed(CompressionEncoding::Deflate);
     let perturb = ServiceBuilder::new()
         .layer(auth.clone())
         .layer(RawBodyLayer::new(ENDPOINT, state.transit.clone()))
@@ -269,7 +272,12 @@ fn router<H: Health>(
     let worlds = ServiceBuilder::new()
         .layer(auth.clone())
         .layer(RawBodyLayer::new(dm_env_rpc::service::ENDPOINT, state.transit.clone()))
-        .service(EnvironmentServer::new(worlds).max_encoding_message_size(usize::MAX));
+        .service(
+            EnvironmentServer::new(worlds)
+                .max_encoding_message_size(usize::MAX)
+                .accept_compressed(CompressionEncoding::Gzip)
+                .accept_compressed(CompressionEncoding::Deflate),
+        );
     let (reflection_v1, reflection_v1alpha) = (reflection().build_v1()?, reflection().build_v1alpha()?);
     let keepalive = Duration::from_secs(config.keepalive_seconds);
     let streams = u32::try_from(config.max_sessions.saturating_add(MAX_OTHER_STREAMS)).unwrap_or(u32::MAX);

@@ -39,6 +39,14 @@ pub enum Error {
         /// The minimum average rate of a message, bytes per second.
         rate: usize,
     },
+    /// A compressed message is larger than its stream may send now.
+    #[error(
+        "a compressed message has more than {limit} bytes when it is decompressed; at most {limit} are read here now"
+    )]
+    DecompressedTooLarge {
+        /// The most there may be.
+        limit: usize,
+    },
     /// A message is longer than the limit that applies to its stream at this moment.
     #[error("a message of {got} bytes came; at most {limit} are read here now")]
     TooLarge {
@@ -56,7 +64,7 @@ impl RequestError for Error {
             Self::Value(error) => error.kind(),
             Self::MemoryFull { .. } => ErrorKind::MemoryFull,
             Self::Unfinished { .. } => ErrorKind::UnfinishedMessage,
-            Self::TooLarge { .. } => ErrorKind::TooLarge,
+            Self::DecompressedTooLarge { .. } | Self::TooLarge { .. } => ErrorKind::TooLarge,
         }
     }
 }

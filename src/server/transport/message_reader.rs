@@ -8,13 +8,17 @@
 use super::{
     Error,
     budget::{Budget, MemoryReservation, PendingReservations},
+    compression::Compression,
 };
 use crate::server::{auth::Bearer, limits::RequestLimits, net::managed_io::Connection};
 use bytes::{Buf, Bytes, BytesMut};
 use http_body::Body as _;
 use http_body_util::BodyExt;
-use std::time::Duration;
-use tokio::time::{Instant, timeout_at};
+use std::{io::Read, time::Duration};
+use tokio::{
+    task::yield_now,
+    time::{Instant, timeout_at},
+};
 use tonic::{Code, Status, body::Body};
 
 /// The length of a message's header: a flag and a length.
@@ -25,6 +29,8 @@ const UNBUDGETED_BYTES: usize = 64 << 10;
 /// The minimum average rate of a message, bytes per second. A message may take [`StreamLimits::limit`] longer than at
 /// this rate.
 const MIN_BYTES_PER_SECOND: usize = 64 << 10;
+/// The bytes of a compressed message that are decompressed before other streams have a turn.
+const DECOMPRESSED_PART_BYTES: usize = 64 << 10;
 /// A message of at least this length gets an allocation of its own.
 const OWN_BUFFER_MIN_BYTES: usize = 1 << 20;
 
@@ -42,6 +48,8 @@ pub struct StreamLimits {
 /// Reads the messages of a request's body.
 pub struct MessageReader {
     body: Body,
+    /// The compression of messages that say that they are compressed.
+    compression: Option<Compression>,
     /// The bytes that have arrived and were not returned yet.
     buffer: BytesMut,
     message: Option<PartialMessage>,
@@ -62,6 +70,8 @@ pub struct MessageReader {
 enum PartialMessage {
     /// The length of the message.
     Wanted(usize),
+    /// The length of the compressed message, and its compression.
+    Compressed(usize, Compression),
     /// The budget has no room for the message. Has the number of its bytes that are yet to arrive and to be discarded.
     Refused(usize, Error),
 }
@@ -105,6 +115,7 @@ impl MessageReader {
     /// The messages of this body.
     pub fn new(
         body: Body,
+        compression: Option<Compression>,
         transit: StreamLimits,
         connection: Option<Connection>,
         bearer: Option<Bearer>,
@@ -112,6 +123,7 @@ impl MessageReader {
     ) -> Self {
         Self {
             body,
+            compression,
             buffer: BytesMut::new(),
             message: None,
             due: None,
@@ -131,7 +143,8 @@ impl MessageReader {
     /// Moves the reader out and leaves an exhausted one behind.
     pub fn detach(&mut self) -> Self {
         let (connection, bearer) = (self.connection.clone(), self.bearer.clone());
-        let left = Self::new(Body::empty(), self.transit.clone(), connection, bearer, PendingReservations::default());
+        let outbox = PendingReservations::default();
+        let left = Self::new(Body::empty(), None, self.transit.clone(), connection, bearer, outbox);
         std::mem::replace(self, left)
     }
 
@@ -147,6 +160,9 @@ impl MessageReader {
             }
             if let Some(whole) = self.complete() {
                 return Ok(Some(whole));
+            }
+            if let Some(decompressed) = self.decompress(limits).await? {
+                return Ok(Some(decompressed));
             }
             match self.frame().await? {
                 Some(Ok(frame)) => {
@@ -180,18 +196,23 @@ impl MessageReader {
 
     /// Reads a frame's header.
     fn begin(&mut self, limits: RequestLimits) -> Result<PartialMessage, StreamStop> {
-        match self.buffer.get_u8() {
-            0 => {}
-            1 => return Err(Status::internal("a message came compressed; send it as it is").into()),
+        let compression = match self.buffer.get_u8() {
+            0 => None,
+            1 => Some(self.compression.ok_or_else(|| {
+                Status::internal(
+                    "a message came compressed, but its call has no header grpc-encoding with gzip or deflate",
+                )
+            })?),
             flag => return Err(Status::internal(format!("a frame began with {flag}; expected 0: is it gRPC?")).into()),
-        }
+        };
         let length = self.buffer.get_u32() as usize;
         if length > limits.bytes {
             return Err(StreamStop::Refused(Error::TooLarge { got: length, limit: limits.bytes }));
         }
         let longest = |limit| limit + Duration::from_secs((length / MIN_BYTES_PER_SECOND) as u64);
         self.due = self.transit.limit.map(|limit| Instant::now() + longest(limit));
-        Ok(PartialMessage::Wanted(length))
+        Ok(compression
+            .map_or(PartialMessage::Wanted(length), |compression| PartialMessage::Compressed(length, compression)))
     }
 
     /// Returns the partly read message, if it is complete.
@@ -222,11 +243,39 @@ impl MessageReader {
         }
     }
 
+    /// Decompresses the partly read message, if it is compressed and complete. Dropping the future loses nothing.
+    async fn decompress(&mut self, limits: RequestLimits) -> Result<Option<Message>, StreamStop> {
+        let Some(PartialMessage::Compressed(length, compression)) = self.message else { return Ok(None) };
+        let Some(compressed) = self.buffer.get(..length) else { return Ok(None) };
+        let mut reader = compression.reader(compressed);
+        let mut share = self.transit.budget.empty();
+        let mut bytes = Vec::new();
+        let message = loop {
+            let part = reader.by_ref().take(DECOMPRESSED_PART_BYTES as u64).read_to_end(&mut bytes);
+            let part = part.map_err(|error| Status::internal(format!("a message is not {compression}: {error}")))?;
+            if bytes.len() > limits.bytes {
+                return Err(StreamStop::Refused(Error::DecompressedTooLarge { limit: limits.bytes }));
+            }
+            let budgeted = bytes.len().saturating_sub(unbudgeted(limits));
+            if let Err(refusal) = share.grow(budgeted - share.bytes()) {
+                break Message::Refused(refusal);
+            }
+            if part < DECOMPRESSED_PART_BYTES {
+                break Message::Whole(bytes.into(), share);
+            }
+            yield_now().await;
+        };
+        drop(reader);
+        self.buffer.advance(length);
+        self.share = self.transit.budget.empty();
+        self.message = None;
+        Ok(Some(message))
+    }
+
     /// Appends bytes that have arrived, and reserves memory for them.
     fn push_data(&mut self, data: &[u8], limits: RequestLimits) {
-        if let Some(PartialMessage::Wanted(length)) = self.message {
-            let free = limits.covered.max(UNBUDGETED_BYTES);
-            let beyond = |bytes: usize| bytes.min(length).saturating_sub(free);
+        if let Some(PartialMessage::Wanted(length) | PartialMessage::Compressed(length, _)) = self.message {
+            let beyond = |bytes: usize| bytes.min(length).saturating_sub(unbudgeted(limits));
             let (before, after) = (beyond(self.buffer.len()), beyond(self.buffer.len() + data.len()));
             if let Err(refusal) = self.share.grow(after - before) {
                 self.share = self.transit.budget.empty();
@@ -242,4 +291,9 @@ impl MessageReader {
         }
         self.buffer.extend_from_slice(data);
     }
+}
+
+/// Returns the bytes of a message that need no reservation.
+fn unbudgeted(limits: RequestLimits) -> usize {
+    limits.covered.max(UNBUDGETED_BYTES)
 }

@@ -2,6 +2,7 @@
 
 use super::{
     budget::PendingReservations,
+    compression::Compression,
     message_reader::{MessageReader, StreamLimits},
     watched_body::{ReadTimeouts, WatchedBody},
 };
@@ -85,7 +86,8 @@ where
             let bearer = request.extensions_mut().remove::<Bearer>();
             let transit = StreamLimits { budget: self.transit.budget.for_token(bearer.clone()), ..self.transit };
             let body = std::mem::take(request.body_mut());
-            let reader = MessageReader::new(body, transit, connection.clone(), bearer, outbox.clone());
+            let compression = Compression::from_headers(request.headers());
+            let reader = MessageReader::new(body, compression, transit, connection.clone(), bearer, outbox.clone());
             request.extensions_mut().insert(RawBody(Arc::new(Mutex::new(Some(reader)))));
         }
         let response = self.service.call(request);

@@ -38,12 +38,18 @@ impl Connection {
 
     /// Begins a call. None if the server takes no more calls, or is gone.
     pub async fn call(&mut self, path: &str) -> Option<Call> {
+        self.call_compressed(path, "identity").await
+    }
+
+    /// The same, whose header names this compression of its messages.
+    pub async fn call_compressed(&mut self, path: &str, encoding: &str) -> Option<Call> {
         let request = Request::builder()
             .method(Method::POST)
             .version(Version::HTTP_2)
             .uri(format!("http://localhost{path}"))
             .header("content-type", "application/grpc")
             .header("te", "trailers")
+            .header("grpc-encoding", encoding)
             .body(())
             .unwrap();
         self.requests = within(self.requests.clone().ready()).await.ok()?;
@@ -119,6 +125,11 @@ impl Call {
 /// The first bytes of a message of that length.
 pub fn framed(length: usize, bytes: &[u8]) -> Bytes {
     [&[0], &(length as u32).to_be_bytes()[..], bytes].concat().into()
+}
+
+/// A message whose header says that it is compressed.
+pub fn framed_compressed(bytes: &[u8]) -> Bytes {
+    [&[1], &(bytes.len() as u32).to_be_bytes()[..], bytes].concat().into()
 }
 
 fn status(headers: &http::HeaderMap) -> Option<(i32, String)> {

@@ -3,6 +3,7 @@
 pub mod client;
 #[cfg(feature = "mujoco")]
 mod closing;
+mod compressed;
 mod memory;
 mod messages;
 mod pictures;
