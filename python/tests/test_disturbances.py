@@ -86,6 +86,25 @@ def test_holds_agree_with_gymnasiums_sticky_actions(server: str, identifier: str
     np.testing.assert_array_equal(play(RecordedSticky(plain, 0.4, 7)), play(held))
 
 
+def test_noise_is_that_of_numpys_streams(server: str) -> None:
+    exact = observations(20, server=server)
+    noisy = observations(20, server=server, parameters={"sensor_noise": 0.01})
+    ends = np.array([[-1, -1, -8], [1, 1, 8]], dtype=np.float32)
+    for step, (row, seen) in enumerate(zip(exact.astype(np.float64), noisy, strict=True)):
+        key = np.array([5, 0], dtype=np.uint64)
+        counter = np.array([0, 0, 4, step], dtype=np.uint64)
+        normal = np.random.Generator(np.random.Philox(key=key, counter=counter)).standard_normal(3)
+        expected = np.clip(row + 0.01 * np.array([1, 1, 8]) * normal, *ends)
+        np.testing.assert_allclose(seen, expected, rtol=0, atol=1e-6)  # float32 of numbers up to 8
+
+
+def test_physics_change_within_an_episode(server: str) -> None:
+    before = observations(30, server=server)
+    after = observations(30, server=server, parameters={"change_at": 10, "changed_length": 1.2})
+    np.testing.assert_array_equal(after[:11], before[:11])
+    assert (after[11:] != before[11:]).any(axis=1).all()
+
+
 def test_infos_and_observations_have_disturbances(server: str) -> None:
     contexts = [{"action_delay": 2}, {"length": 1.2}]
     environment = gym.make_vec(

@@ -5,6 +5,7 @@ pub mod disturbance;
 mod environment;
 mod episode;
 mod error;
+mod normal;
 mod parameter;
 mod seeding;
 mod seen;

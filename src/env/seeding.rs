@@ -23,10 +23,11 @@
 //! | purpose | step | draws, in order |
 //! |---|---|---|
 //! | 2 | of the action, from 0 | one below `action_hold` to keep the last action |
-//! | 3 | of the action, from 0 | a [normal](Stream::normals) number for each entry of the action |
-//! | 4 | of the observation, 0 after a reset | a [normal](Stream::normals) number for each entry of the observation |
+//! | 3 | of the action, from 0 | a [normal](Stream::normal) number for each entry of the action |
+//! | 4 | of the observation, 0 after a reset | a [normal](Stream::normal) number for each entry of the observation |
 //! | 5 | of the observation, 0 after a reset | for each entry of the observation one below `sensor_dropout` to lose it |
 //! | 6 | of the action, from 0 | one below 1 / `push_interval` to push, then those of the [direction](Stream::direction) |
+//! | 7 | of the action, from 1 | one below `change_probability` to change the physics before it |
 
 /// The purpose of a stream: the third word of the counter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -45,6 +46,8 @@ pub enum Purpose {
     SensorDropout = 5,
     /// The steps with a push, and the directions of pushes.
     Push = 6,
+    /// The steps between which the physics change.
+    Change = 7,
 }
 
 /// The address of an episode's random numbers. With the distributions it determines all of them.
@@ -98,14 +101,6 @@ impl Stream {
     /// Uniform in [0, 1): the upper 53 bits over 2^53.
     pub fn unit(&mut self) -> f64 {
         (self.next_u64() >> 11) as f64 * (1.0 / (1u64 << 53) as f64)
-    }
-
-    /// Two independent standard normal numbers by Box and Muller (1958), from two uniform ones u and v: the cosine and the
-    /// sine of 2πv, each times √(-2 ln(1 - u)). The functions are libm's, whose bytes are the same on every processor.
-    pub fn normals(&mut self) -> [f64; 2] {
-        let radius = (-2.0 * libm::log(1.0 - self.unit())).sqrt();
-        let (sin, cos) = libm::sincos(std::f64::consts::TAU * self.unit());
-        [radius * cos, radius * sin]
     }
 
     /// A random direction along `n` axes: ±1 for one; uniform on the circle for two, by its angle; uniform on the sphere for

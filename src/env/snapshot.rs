@@ -14,10 +14,10 @@ const UNSEALED: u32 = 2;
 /// The first layout. Later snapshots have [`Progress::held_longest`] after [`Saved`].
 const FIRST: u32 = 1;
 
-/// Limit of a snapshot in bytes. The largest has a distribution of 64 intervals for each of 32 parameters and 39
-/// disturbances, of R and of E, 142 KiB, the numbers of a state and an observation of 4096 entries, some 50 KiB, and late
+/// Limit of a snapshot in bytes. The largest has a distribution of 64 intervals for each of 32 parameters and 76
+/// disturbances, of R and of E, 216 KiB, the numbers of a state and an observation of 4096 entries, some 50 KiB, and late
 /// actions and observations, 80 KiB.
-pub const MAX_SNAPSHOT_BYTES: usize = 320 << 10;
+pub const MAX_SNAPSHOT_BYTES: usize = 384 << 10;
 
 /// An upper bound of the growth of a snapshot's counters, bytes. Small numbers have shorter encodings.
 const MAX_COUNTERS_GROWTH_BYTES: usize = 64;

@@ -198,8 +198,7 @@ fn sets_are_tested_rescored_and_replayed() {
 #[test]
 fn disturbed_episodes_are_recorded_and_replayed() {
     let directory = experiment();
-    let late =
-        "[sets.late]\naction_delay = '0..2'\nsensor_noise = '0.01..0.1'\n\n[sets.grid]\nsensor_delay = '0..2/3'\n";
+    let late = "[sets.late]\naction_delay = '0..2'\nsensor_noise = '0.01..0.1'\npush = 0.5\npush_interval = 5\nchange_at = '0..9'\nchanged_length = '0.8..1'\n\n[sets.grid]\nsensor_delay = '0..2/3'\n";
     let plan = PLAN
         .replace("versions = ['D', 'long_poles']", "versions = ['D', 'late']")
         .replace("test_versions = ['E', 'long_poles', 'corners', 'rows']", "test_versions = ['D', 'late', 'grid']")
@@ -225,8 +224,9 @@ fn disturbed_episodes_are_recorded_and_replayed() {
         assert_eq!(values("grid", "sensor_delay").iter().sum::<f64>(), 12.0, "each delay in as many episodes");
     }
     let refused = perturb(&["train", "--env", "CartPole", "--parameters", "action_dely=2"]).output().unwrap();
-    let expected = "one of force, length, mass, or a disturbance: action_delay, action_hold, push, push_interval, sensor_delay, sensor_noise, \
-                    sensor_dropout (did you mean `action_delay`?)";
+    let expected = "one of force, length, mass, or a disturbance: action_delay, action_hold, push, push_interval, \
+                    sensor_delay, sensor_noise, sensor_dropout, change_at, change_every, change_probability, changed_force, \
+                    changed_length, changed_mass (did you mean `action_delay`?)";
     assert!(stderr(&refused).contains(expected), "{}", stderr(&refused));
 }
 

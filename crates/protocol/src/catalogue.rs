@@ -53,24 +53,13 @@ impl Environment {
     pub fn disturbed(&self) -> Self {
         let mut disturbed = self.clone();
         for disturbance in &self.disturbances {
-            let Parameter { name, unit, low, high, default_value, .. } = disturbance;
+            let Parameter { name, unit, .. } = disturbance;
             if self.parameters.iter().any(|parameter| parameter.name == *name) {
                 continue;
             }
             disturbed.parameters.push(disturbance.clone());
             disturbed.applied.push(Quantity { name: name.clone(), unit: unit.clone() });
-            // A disturbance has one value in all versions, from which it is observed.
-            let entry = Channel {
-                name: format!("parameter_{name}"),
-                unit: "1".into(),
-                low: low - default_value,
-                high: high - default_value,
-            };
-            disturbed.parameter_observations.push(ParameterObservation {
-                entry: Some(entry),
-                at_minus_one: *default_value,
-                at_plus_one: *default_value,
-            });
+            disturbed.parameter_observations.push(observation(disturbance));
         }
         disturbed
     }
@@ -84,6 +73,26 @@ impl Environment {
         }
         session
     }
+}
+
+/// How a disturbance is observed: from the least to the greatest value that it has in R and E, which most have one of.
+fn observation(disturbance: &Parameter) -> ParameterObservation {
+    let sets = [&disturbance.random, &disturbance.extreme].into_iter().flatten();
+    let intervals = sets.flat_map(|set| &set.intervals).map(|interval| (interval.low, interval.high));
+    let default = (disturbance.default_value, disturbance.default_value);
+    let widest = |a: (f64, f64), b: (f64, f64)| (a.0.min(b.0), a.1.max(b.1));
+    let (low, high) = intervals.reduce(widest).unwrap_or(default);
+    let observed = |value: f64| {
+        let distance = value - low;
+        f64::from((if high > low { 2.0 * distance / (high - low) - 1.0 } else { distance }) as f32)
+    };
+    let entry = Channel {
+        name: format!("parameter_{}", disturbance.name),
+        unit: "1".into(),
+        low: observed(disturbance.low),
+        high: observed(disturbance.high),
+    };
+    ParameterObservation { entry: Some(entry), at_minus_one: low, at_plus_one: high }
 }
 
 /// An environment as JSON, see [`to_json`].

@@ -5,7 +5,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::disturbance::{default_value, is_disturbance};
+use crate::disturbance::{CHANGED, CHANGES, default_value, is_disturbance};
 use crate::version::Version;
 use crate::{Distribution, DistributionError, proto};
 
@@ -69,18 +69,41 @@ impl Region {
         &self.0
     }
 
+    /// The boxes of the physics: those before a change within an episode, and, where there can be one, those after it, which
+    /// have the sets of `changed_mass` for `mass`. What says when the physics change is left out.
+    fn physics(&self) -> Vec<ParameterBox> {
+        let is_never = |values: &Distribution| values.range() == (0.0, 0.0);
+        let of_box = |values: &ParameterBox| {
+            let is_changing = CHANGES.iter().any(|name| values.get(*name).is_some_and(|values| !is_never(values)));
+            let is_kept = |name: &str| !CHANGES.contains(&name) && !name.starts_with(CHANGED);
+            let mut before = values.clone();
+            before.retain(|name, _| is_kept(name));
+            let mut after = before.clone();
+            for (name, values) in values {
+                if let Some(own) = name.strip_prefix(CHANGED).and_then(|name| after.get_mut(name)) {
+                    *own = values.clone();
+                }
+            }
+            if is_changing { vec![before, after] } else { vec![before] }
+        };
+        self.0.iter().flat_map(of_box).collect()
+    }
+
     /// Whether each box of this region is inside one of the boxes of `others`. A disturbance that only one of two boxes
-    /// names has its default in the other.
-    pub fn is_within<'a>(&self, others: impl IntoIterator<Item = &'a Self> + Clone) -> bool {
+    /// names has its default in the other. Physics that change within an episode have a box before and one after.
+    pub fn is_within<'a>(&self, others: impl IntoIterator<Item = &'a Self>) -> bool {
         let is_in =
             |own: &ParameterBox, other: &ParameterBox| pairs(own, other, Distribution::is_within, default_value);
-        self.0.iter().all(|own| others.clone().into_iter().flat_map(Self::boxes).any(|other| is_in(own, other)))
+        let others: Vec<ParameterBox> = others.into_iter().flat_map(Self::physics).collect();
+        self.physics().iter().all(|own| others.iter().any(|other| is_in(own, other)))
     }
 
     /// Whether a part of this region is in `other`, see [`Distribution::overlaps`]. A disturbance that only one of two
     /// boxes names is not compared. So a region that was held out without disturbances is also held out with any.
     pub fn overlaps(&self, other: &Self) -> bool {
-        self.0.iter().any(|own| other.0.iter().any(|other| pairs(own, other, Distribution::overlaps, |_| None)))
+        let others = other.physics();
+        let overlap = |own, other| pairs(own, other, Distribution::overlaps, |_| None);
+        self.physics().iter().any(|own| others.iter().any(|other| overlap(own, other)))
     }
 }
 
@@ -183,6 +206,25 @@ mod tests {
         assert!(!late(R, "3").overlaps(&region(E, &[])) && !late(E, "3").overlaps(&late(E, "4")));
         assert!(late(R, "0").is_within([&region(R, &[])]) && !late(R, "0..3").is_within([&region(R, &[])]));
         assert!(region(D, &[]).is_within([&late(R, "0..3")]) && !region(D, &[]).is_within([&late(R, "1..3")]));
+    }
+
+    #[test]
+    fn changes_within_an_episode_do_not_lead_around_a_region() {
+        use Version::{E, R};
+        let changing = |version, values: &[(&str, &str)]| {
+            let Region(mut boxes) = region(version, &[]);
+            for own in &mut boxes {
+                own.extend(values.iter().map(|(name, values)| ((*name).to_owned(), values.parse().unwrap())));
+            }
+            Region(boxes)
+        };
+        let at_once = |at: &str| changing(R, &[("change_at", at), ("changed_mass", "0.2"), ("changed_length", "0.2")]);
+        assert!(at_once("1").overlaps(&region(E, &[])) && region(E, &[]).overlaps(&at_once("0..1")));
+        assert!(!at_once("0").overlaps(&region(E, &[])), "nothing changes");
+        assert!(!at_once("1").is_within([&region(R, &[])]) && at_once("0").is_within([&region(R, &[])]));
+        assert!(at_once("1").is_within([&region(R, &[]), &region(E, &[])]));
+        let within = changing(R, &[("change_every", "9"), ("changed_mass", "1"), ("changed_length", "0.6..0.7")]);
+        assert!(within.is_within([&region(R, &[])]) && !within.overlaps(&region(E, &[])));
     }
 
     #[test]

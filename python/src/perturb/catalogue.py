@@ -64,6 +64,8 @@ class Description:
     disturbances: Mapping[str, Range] = field(default_factory=dict, compare=False)
     # By name the value of each disturbance that disturbs nothing.
     undisturbed: Mapping[str, float] = field(default_factory=dict, compare=False)
+    # By name the range in which each disturbance is observed.
+    disturbance_observations: Mapping[str, Range] = field(default_factory=dict, compare=False)
     # An episode is truncated after so many steps; None if that is not known.
     step_limit: int | None = field(default=None, compare=False)
     # SHA-256 of the model in hexadecimal digits; empty without a model.
@@ -89,6 +91,7 @@ class Description:
             parameters={it["name"]: (it["low"], it["high"]) for it in entry.get("parameters", [])},
             disturbances={it["name"]: (it["low"], it["high"]) for it in entry.get("disturbances", [])},
             undisturbed={it["name"]: it["D"] for it in entry.get("disturbances", [])},
+            disturbance_observations={it["name"]: _observed(it) for it in entry.get("disturbances", [])},
             step_limit=entry.get("step_limit"),
             model_hash=entry.get("model_hash", ""),
         )
@@ -98,8 +101,7 @@ class Description:
         added = {name: ends for name, ends in self.disturbances.items() if name not in self.parameters}
         if added.keys().isdisjoint(names):
             return self
-        none = self.undisturbed
-        seen = tuple((low - none[name], high - none[name]) for name, (low, high) in added.items())
+        seen = tuple(self.disturbance_observations[name] for name in added)
         return replace(
             self,
             parameters={**self.parameters, **added},
@@ -150,6 +152,18 @@ class Description:
                 f"the files of {self.name} changed since it was made: its model was {self.model_hash}, the server's is "
                 f"{served.model_hash}; make it anew"
             )
+
+
+def _observed(disturbance: Mapping[str, Any]) -> Range:
+    """The range in which a disturbance is observed: -1 to 1 are its least and its greatest value in R and E."""
+    ends = [end for interval in (*disturbance["R"], *disturbance["E"]) for end in interval]
+    least, greatest = min(ends), max(ends)
+
+    def seen(value: float) -> float:
+        distance = value - least
+        return float(np.float32(2 * distance / (greatest - least) - 1 if greatest > least else distance))
+
+    return seen(disturbance["low"]), seen(disturbance["high"])
 
 
 def _box(ranges: tuple[Range, ...]) -> spaces.Box:

@@ -1,6 +1,6 @@
 //! Applies the disturbances of actions: delay, hold, noise and scale.
 
-use super::parameters::DisturbanceValues;
+use super::{next_place, parameters::DisturbanceValues};
 use crate::env::{Action, ActionSpace, Draw, Error, Purpose, Stream};
 
 /// The disturbed actions of one environment. A choice is stored as one number.
@@ -66,7 +66,7 @@ impl ActionPath {
                 self.held.copy_from_slice(place);
             }
             place.copy_from_slice(action);
-            self.oldest = (self.oldest + width) % self.late.len();
+            self.oldest = next_place(self.oldest, width, self.late.len());
         }
         self.acting.copy_from_slice(&self.held);
         match self.space {
@@ -74,11 +74,9 @@ impl ActionPath {
             ActionSpace::Continuous(channels) => {
                 if values.action_noise > 0.0 {
                     let mut stream = Stream::at_step(draw, Purpose::ActionNoise, step);
-                    for (entries, channels) in self.acting.chunks_mut(2).zip(channels.chunks(2)) {
-                        for ((entry, channel), normal) in entries.iter_mut().zip(channels).zip(stream.normals()) {
-                            let noise = values.action_noise * (channel.high - channel.low) * normal;
-                            *entry = finite(f64::from(*entry) + noise);
-                        }
+                    for (entry, channel) in self.acting.iter_mut().zip(channels) {
+                        let noise = values.action_noise * (channel.high - channel.low) * stream.normal();
+                        *entry = finite(f64::from(*entry) + noise);
                     }
                 }
                 for ((entry, neutral), &scale) in self.acting.iter_mut().zip(&self.neutral).zip(&values.action_scales) {

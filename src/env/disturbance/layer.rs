@@ -2,6 +2,7 @@
 
 use super::{
     actions::ActionPath,
+    changes::ChangingPhysics,
     parameters::{DisturbanceSet, DisturbanceValues},
     sensors::SensorPath,
 };
@@ -13,7 +14,7 @@ use crate::{
 /// An environment whose actions and observations are disturbed. Rewards, ends, success and pictures come from the
 /// undisturbed environment inside.
 pub(super) struct Disturbed {
-    inner: Box<dyn Environment>,
+    physics: ChangingPhysics,
     spec: &'static EnvironmentSpec,
     set: &'static DisturbanceSet,
     /// The values of the disturbances as they were set, in order.
@@ -36,7 +37,7 @@ impl Disturbed {
         let mut neutral = vec![0.0; set.action_width];
         inner.neutral_action(&mut neutral);
         let mut disturbed = Self {
-            inner,
+            physics: ChangingPhysics::new(inner),
             spec,
             set,
             numbers: set.parameters().map(|parameter| parameter.default).collect(),
@@ -54,7 +55,7 @@ impl Disturbed {
     fn begin(&mut self) {
         self.steps = 0;
         self.actions.begin(&self.values);
-        self.sensors.begin(&self.values, &self.draw, |out| self.inner.observe(out));
+        self.sensors.begin(&self.values, &self.draw, |out| self.physics.environment.observe(out));
     }
 }
 
@@ -65,41 +66,43 @@ impl Environment for Disturbed {
 
     fn set_parameters(&mut self, values: &[f64]) {
         let (own, disturbances) = values.split_at(values.len() - self.numbers.len());
-        self.inner.set_parameters(own);
         self.numbers.copy_from_slice(disturbances);
         self.set.set(&mut self.values, disturbances);
+        self.physics.set_parameters(own, &self.values);
     }
 
     fn applied(&self, out: &mut [f64]) {
         let (own, disturbances) = out.split_at_mut(out.len() - self.numbers.len());
-        self.inner.applied(own);
-        self.set.read(&self.values, &self.numbers, disturbances);
+        self.physics.applied(own);
+        self.set.read(&self.values, &self.numbers, |parameter| self.physics.changed(parameter), disturbances);
     }
 
     fn model_hash(&self) -> &str {
-        self.inner.model_hash()
+        self.physics.environment.model_hash()
     }
 
     fn achieved(&self) -> Option<f64> {
-        self.inner.achieved()
+        self.physics.environment.achieved()
     }
 
     fn set_address(&mut self, draw: Draw, steps: u32) {
         (self.draw, self.steps) = (draw, steps);
-        self.inner.set_address(draw, steps);
+        self.physics.environment.set_address(draw, steps);
     }
 
     fn neutral_action(&self, out: &mut [f32]) {
-        self.inner.neutral_action(out);
+        self.physics.environment.neutral_action(out);
     }
 
     fn reset(&mut self, stream: &mut Stream) {
-        self.inner.reset(stream);
+        self.physics.begin();
+        self.physics.environment.reset(stream);
         self.begin();
     }
 
     fn reset_to(&mut self, state: &[f64]) {
-        self.inner.reset_to(state);
+        self.physics.begin();
+        self.physics.environment.reset_to(state);
         self.begin();
     }
 
@@ -108,7 +111,7 @@ impl Environment for Disturbed {
     }
 
     fn scene(&self) -> Option<Scene> {
-        self.inner.scene()
+        self.physics.environment.scene()
     }
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
@@ -117,18 +120,24 @@ impl Environment for Disturbed {
             && let Some(push) = self.spec.push
             && let Some(impulse) = impulse(&self.values, &self.draw, self.steps, push.axes)
         {
-            self.inner.push(impulse);
+            self.physics.environment.push(impulse);
         }
-        let transition = self.inner.step(action, reward_terms);
+        let transition = match self.physics.pass(&self.values, &self.draw, self.steps) {
+            Ok(()) => self.physics.environment.step(action, reward_terms),
+            Err(_) => {
+                reward_terms.fill(0.0);
+                Transition { terminated: true, goal: false, diverged: true }
+            }
+        };
         self.steps += 1;
-        self.sensors.pass(&self.values, &self.draw, self.steps, |out| self.inner.observe(out));
+        self.sensors.pass(&self.values, &self.draw, self.steps, |out| self.physics.environment.observe(out));
         transition
     }
 
     /// Appends the state of the physics, then the delayed actions and observations. The observation that the policy
     /// sees is computed from these and from the address of the random numbers.
     fn save(&self, out: &mut Vec<f64>) {
-        self.inner.save(out);
+        self.physics.save(out);
         self.actions.save(out);
         self.sensors.save(out);
     }
@@ -136,7 +145,7 @@ impl Environment for Disturbed {
     fn max_saved_growth(&self) -> usize {
         let (actions, sensors) = self.set.max_late_numbers(self.spec.observation.len());
         let now = self.actions.n_saved(&self.values) - self.set.action_width + self.sensors.n_saved(&self.values);
-        self.inner.max_saved_growth() + (actions + sensors).saturating_sub(now)
+        self.physics.environment.max_saved_growth() + (actions + sensors).saturating_sub(now)
     }
 
     fn load(&mut self, state: &[f64]) -> Result<(), Error> {
@@ -147,10 +156,10 @@ impl Environment for Disturbed {
         };
         let (own, late) = state.split_at(own);
         let (late_actions, late_observations) = late.split_at(actions);
-        self.inner.load(own)?;
+        self.physics.load(own)?;
         self.actions.load(&self.values, late_actions)?;
         let address = (&self.draw, self.steps);
-        self.sensors.load(&self.values, address, late_observations, |out| self.inner.observe(out))
+        self.sensors.load(&self.values, address, late_observations, |out| self.physics.environment.observe(out))
     }
 }
 

@@ -7,8 +7,10 @@
 //!
 //! - `parameters` lists the disturbances of an environment.
 //! - `layer` is the twin's environment: it passes actions by `actions` to the physics, and observations by `sensors` back.
+//! - `changes` has the physics, which may change within an episode.
 
 mod actions;
+mod changes;
 mod layer;
 mod parameters;
 mod sensors;
@@ -127,4 +129,10 @@ fn with_set(spec: &'static EnvironmentSpec, set: DisturbanceSet) -> &'static Env
         Ok(Box::new(Disturbed::new((spec.make)()?, disturbed, set)) as Box<dyn Environment>)
     }));
     address.get_or_init(|| Box::leak(Box::new(disturbed)))
+}
+
+/// The place after `place` in a ring of `length` numbers with entries of `width`. A remainder would cost a division a step.
+fn next_place(place: usize, width: usize, length: usize) -> usize {
+    let next = place + width;
+    if next < length { next } else { 0 }
 }

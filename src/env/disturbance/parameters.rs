@@ -1,7 +1,7 @@
 //! The disturbances of an environment as parameters, and their present values.
 
 use crate::env::{ActionSpace, EnvironmentSpec, Parameter};
-use perturb_protocol::disturbance::DEFAULT_PUSH_INTERVAL;
+use perturb_protocol::disturbance::{CHANGED, DEFAULT_PUSH_INTERVAL};
 
 /// The longest delay, in steps.
 const MAX_DELAY: usize = 100;
@@ -17,6 +17,8 @@ const MAX_FACTOR: f64 = 10.0;
 const MAX_PUSH: f64 = 1000.0;
 /// The longest mean interval of pushes, in steps.
 const MAX_PUSH_INTERVAL: f64 = 1e6;
+/// The most steps until a change of the physics.
+const MAX_CHANGE_STEPS: f64 = 1e6;
 /// The name of the scale of all actuators, and the prefix of the names of single actuators' scales.
 const ACTION_SCALE: &str = "action_scale";
 
@@ -34,6 +36,11 @@ pub(super) enum DisturbanceKind {
     SensorDelay,
     SensorNoise,
     SensorDropout,
+    ChangeAt,
+    ChangeEvery,
+    ChangeProbability,
+    /// The value of a parameter of the environment's own, by its place, after a change of the physics.
+    Changed(usize),
 }
 
 /// The disturbances of one environment.
@@ -58,6 +65,44 @@ pub(super) struct DisturbanceValues {
     pub(super) sensor_delay: usize,
     pub(super) sensor_noise: f64,
     pub(super) sensor_dropout: f64,
+    /// The number of steps after which the physics change; 0 for never.
+    pub(super) change_at: u32,
+    /// The number of steps between changes of the physics; 0 for never.
+    pub(super) change_every: u32,
+    pub(super) change_probability: f64,
+    /// The values of the environment's own parameters after a change, `[P]`.
+    pub(super) changed: Vec<f64>,
+}
+
+impl DisturbanceValues {
+    /// Whether the physics can change within an episode.
+    pub(super) fn is_changing(&self) -> bool {
+        self.change_at > 0 || self.change_every > 0 || self.change_probability > 0.0
+    }
+}
+
+/// The disturbances by which the physics change within an episode, with a parameter for each of the environment's own: its
+/// value after a change, which has the same sets.
+fn changes(spec: &EnvironmentSpec) -> Vec<(DisturbanceKind, Parameter)> {
+    if spec.parameters.is_empty() {
+        return Vec::new();
+    }
+    let steps = |name, description| Parameter::new(name, "1", description, (0.0, MAX_CHANGE_STEPS)).off(0.0).integer();
+    let probability = "probability that the physics change between two steps";
+    let mut entries = vec![
+        (DisturbanceKind::ChangeAt, steps("change_at", "number of steps after which the physics change; 0: never")),
+        (DisturbanceKind::ChangeEvery, steps("change_every", "number of steps between changes; 0: never")),
+        (
+            DisturbanceKind::ChangeProbability,
+            Parameter::new("change_probability", "1", probability, (0.0, 1.0)).off(0.0),
+        ),
+    ];
+    entries.extend(spec.parameters.iter().enumerate().map(|(place, parameter)| {
+        let name: &'static str = String::leak(format!("{CHANGED}{}", parameter.name));
+        let description: &'static str = String::leak(format!("{} after a change", parameter.description));
+        (DisturbanceKind::Changed(place), Parameter { name, description, applied: name, ..*parameter })
+    }));
+    entries
 }
 
 impl DisturbanceSet {
@@ -125,6 +170,7 @@ impl DisturbanceSet {
                 share("sensor_dropout", "probability that an observed number is lost", 1.0).off(0.0),
             ),
         ]);
+        entries.extend(changes(spec));
         let is_free = |name: &str| {
             spec.parameters.iter().all(|own| own.name != name) && spec.applied.iter().all(|own| own.name != name)
         };
@@ -158,6 +204,7 @@ impl DisturbanceSet {
 
     /// Returns the values at which no disturbance has an effect.
     pub(super) fn defaults(&self) -> DisturbanceValues {
+        let is_changed = |kind: &DisturbanceKind| matches!(kind, DisturbanceKind::Changed(_));
         DisturbanceValues {
             action_delay: 0,
             action_hold: 0.0,
@@ -168,6 +215,10 @@ impl DisturbanceSet {
             sensor_delay: 0,
             sensor_noise: 0.0,
             sensor_dropout: 0.0,
+            change_at: 0,
+            change_every: 0,
+            change_probability: 0.0,
+            changed: self.entries.iter().filter(|(kind, _)| is_changed(kind)).map(|(_, own)| own.default).collect(),
         }
     }
 
@@ -186,13 +237,24 @@ impl DisturbanceSet {
                 DisturbanceKind::SensorDelay => values.sensor_delay = number as usize,
                 DisturbanceKind::SensorNoise => values.sensor_noise = number,
                 DisturbanceKind::SensorDropout => values.sensor_dropout = number,
+                DisturbanceKind::ChangeAt => values.change_at = number as u32,
+                DisturbanceKind::ChangeEvery => values.change_every = number as u32,
+                DisturbanceKind::ChangeProbability => values.change_probability = number,
+                DisturbanceKind::Changed(place) => values.changed[place] = number,
             }
         }
     }
 
     /// Reads the values of the disturbances back, in order. Only the product of the scale of all actuators and an
     /// actuator's own scale is stored, so both scales are taken from `numbers`, the values that were set.
-    pub(super) fn read(&self, values: &DisturbanceValues, numbers: &[f64], out: &mut [f64]) {
+    /// `changed` returns the value that the physics has for a parameter after a change, if it can change.
+    pub(super) fn read(
+        &self,
+        values: &DisturbanceValues,
+        numbers: &[f64],
+        changed: impl Fn(usize) -> Option<f64>,
+        out: &mut [f64],
+    ) {
         for ((&(kind, _), &number), out) in self.entries.iter().zip(numbers).zip(out) {
             *out = match kind {
                 DisturbanceKind::ActionDelay => values.action_delay as f64,
@@ -204,6 +266,10 @@ impl DisturbanceSet {
                 DisturbanceKind::SensorDelay => values.sensor_delay as f64,
                 DisturbanceKind::SensorNoise => values.sensor_noise,
                 DisturbanceKind::SensorDropout => values.sensor_dropout,
+                DisturbanceKind::ChangeAt => values.change_at.into(),
+                DisturbanceKind::ChangeEvery => values.change_every.into(),
+                DisturbanceKind::ChangeProbability => values.change_probability,
+                DisturbanceKind::Changed(place) => changed(place).unwrap_or(number),
             };
         }
     }

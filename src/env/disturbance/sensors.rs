@@ -1,6 +1,6 @@
 //! Applies the disturbances of observations: delay, noise and dropout.
 
-use super::parameters::DisturbanceValues;
+use super::{next_place, parameters::DisturbanceValues};
 use crate::env::{Channel, Draw, Error, Purpose, Stream};
 
 /// The disturbed observations of one environment.
@@ -42,7 +42,7 @@ impl SensorPath {
         observe: impl FnOnce(&mut [f32]),
     ) {
         let width = self.channels.len();
-        self.newest = (self.newest + width) % self.exact.len().max(1);
+        self.newest = next_place(self.newest, width, self.exact.len());
         observe(&mut self.exact[self.newest..][..width]);
         self.see(values, draw, steps);
     }
@@ -55,17 +55,16 @@ impl SensorPath {
     /// Computes the observation that the policy sees: the oldest one of the ring buffer, with noise and dropout.
     fn see(&mut self, values: &DisturbanceValues, draw: &Draw, steps: u32) {
         let width = self.channels.len();
-        let oldest = (self.newest + width) % self.exact.len().max(1);
+        let oldest = next_place(self.newest, width, self.exact.len());
         self.seen.copy_from_slice(&self.exact[oldest..][..width]);
         if values.sensor_noise > 0.0 {
             let mut stream = Stream::at_step(draw, Purpose::SensorNoise, steps);
-            for (entries, channels) in self.seen.chunks_mut(2).zip(self.channels.chunks(2)) {
-                for ((entry, channel), normal) in entries.iter_mut().zip(channels).zip(stream.normals()) {
-                    if channel.scale > 0.0 {
-                        let noisy = f64::from(*entry) + values.sensor_noise * channel.scale * normal;
-                        let (low, high) = (channel.low.max(f32::MIN.into()), channel.high.min(f32::MAX.into()));
-                        *entry = noisy.clamp(low, high) as f32;
-                    }
+            for (entry, channel) in self.seen.iter_mut().zip(self.channels) {
+                let normal = stream.normal();
+                if channel.scale > 0.0 {
+                    let noisy = f64::from(*entry) + values.sensor_noise * channel.scale * normal;
+                    let (low, high) = (channel.low.max(f32::MIN.into()), channel.high.min(f32::MAX.into()));
+                    *entry = noisy.clamp(low, high) as f32;
                 }
             }
         }

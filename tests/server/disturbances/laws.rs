@@ -41,6 +41,12 @@ fn stream(purpose: Purpose, step: u32) -> Stream {
     Stream::at_step(&draw, purpose, step)
 }
 
+/// The first normal numbers of the stream of a step of the first episode.
+fn normals<const N: usize>(purpose: Purpose, step: u32) -> [f64; N] {
+    let mut stream = stream(purpose, step);
+    std::array::from_fn(|_| stream.normal())
+}
+
 /// Checks that a sample is of the normal distribution with this mean and standard deviation.
 fn assert_normal(sample: Vec<f64>, mean: f64, deviation: f64) {
     assert_distributed(sample, |x| 0.5 * libm::erfc(-(x - mean) / (deviation * std::f64::consts::SQRT_2)));
@@ -70,6 +76,30 @@ fn assert_frequency(count: usize, n: usize, probability: f64) {
     assert!(deviations.abs() < MAX_DEVIATIONS, "{count} of {n}, {deviations} deviations from {expected}");
 }
 
+/// `numpy.random.Generator(Philox(key=[5, 9], counter=[0, 3, 4, 7])).standard_normal(10**6)` by NumPy 2.4: the first four
+/// numbers, the last one, and the sum.
+const NUMPY: ([f64; 4], f64, f64) = (
+    [1.3611326763840133, -1.7000479093337983, 0.7246232653554274, -1.43594102052377],
+    0.24873658710877308,
+    910.3647237267187,
+);
+
+#[test]
+fn normal_numbers_are_those_of_numpy() {
+    let draw = Draw { seed: ADDRESS.0, environment_index: ADDRESS.1, episode_index: 3 };
+    let mut stream = Stream::at_step(&draw, Purpose::SensorNoise, 7);
+    let numbers: Vec<f64> = (0..1_000_000).map(|_| stream.normal()).collect();
+    let (first, last, sum) = NUMPY;
+    // Each number is rounded by some 1e-13 of itself. A single other decision would shift all that follow.
+    let is_near = |a: f64, b: f64| (a - b).abs() < 1e-11;
+    assert!(numbers.iter().zip(first).all(|(&a, b)| is_near(a, b)), "{:?}", &numbers[..4]);
+    assert!(is_near(numbers[numbers.len() - 1], last), "{}", numbers[numbers.len() - 1]);
+    assert!((numbers.iter().sum::<f64>() - sum).abs() < 1e-6);
+    // 3.65 is the edge of the tail, which is drawn in another way.
+    assert!((200..400).contains(&numbers.iter().filter(|number| number.abs() > 3.65).count()));
+    assert_normal(numbers, 0.0, 1.0);
+}
+
 #[test]
 fn late_actions_act_after_the_delay() {
     let acted = acted(&mut echo(&[("action_delay", 3.0)]), 20, action);
@@ -94,7 +124,7 @@ fn held_actions_act_again() {
 fn noise_on_actions_is_normal_and_a_share_of_the_range() {
     let acted = acted(&mut echo(&[("action_noise", 0.1)]), DRAWS, |_| [0.25, 1.0]);
     for (t, acted) in (0..DRAWS).zip(&acted) {
-        let [left, right] = stream(Purpose::ActionNoise, t).normals();
+        let [left, right] = normals(Purpose::ActionNoise, t);
         assert_eq!(*acted, [(0.25 + 0.1 * 2.0 * left) as f32, (1.0 + 0.1 * 2.0 * right) as f32], "step {t}");
     }
     assert_normal(acted.iter().map(|acted| acted[0].into()).collect(), 0.25, 0.2);
@@ -119,7 +149,7 @@ fn actions_pass_delay_hold_noise_and_scale_in_order() {
         if t == 0 || stream(Purpose::ActionHold, t).unit() >= 0.5 {
             held = if t < 2 { NEUTRAL } else { action(t - 2) };
         }
-        let normals = stream(Purpose::ActionNoise, t).normals();
+        let normals: [f64; 2] = normals(Purpose::ActionNoise, t);
         let expected: [f32; 2] = std::array::from_fn(|i| {
             let noisy = (f64::from(held[i]) + 0.1 * 2.0 * normals[i]) as f32;
             let neutral = f64::from(NEUTRAL[i]);
@@ -155,8 +185,7 @@ fn noise_on_observations_is_normal_and_a_share_of_the_scale() {
     let exact = |t: u32| if t == 0 { [0.0, 0.0] } else { action(t - 1).map(f64::from) };
     let mut noise = [Vec::new(), Vec::new()];
     for (t, seen) in (0..=DRAWS).zip(&seen) {
-        let mut stream = stream(Purpose::SensorNoise, t);
-        let ([left, right], [steps, _]) = (stream.normals(), stream.normals());
+        let [left, right, steps] = normals(Purpose::SensorNoise, t);
         let expected = [exact(t)[0] + 0.1 * left, exact(t)[1] + 0.1 * 3.0 * right, f64::from(t) + 0.1 * steps];
         assert_eq!(seen[..3], expected.map(|x| x as f32), "step {t}");
         assert_eq!(seen[3], echo::CONSTANT, "step {t}");
@@ -189,8 +218,8 @@ fn lost_observations_read_zero() {
 fn observations_pass_delay_noise_and_dropout_in_order() {
     let values = [("sensor_delay", 2.0), ("sensor_noise", 0.1), ("sensor_dropout", 0.3)];
     for (t, seen) in (0..=300).zip(seen(&mut echo(&values), 300)) {
-        let (mut noise, mut dropout) = (stream(Purpose::SensorNoise, t), stream(Purpose::SensorDropout, t));
-        let (_, [steps, _]) = (noise.normals(), noise.normals());
+        let [_, _, steps] = normals(Purpose::SensorNoise, t);
+        let mut dropout = stream(Purpose::SensorDropout, t);
         let (_, _, is_lost) = (dropout.unit(), dropout.unit(), dropout.unit() < 0.3);
         let expected = if is_lost { 0.0 } else { f64::from(t.saturating_sub(2)) + 0.1 * steps };
         assert_eq!(seen[2], expected as f32, "step {t}");

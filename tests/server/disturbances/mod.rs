@@ -1,12 +1,13 @@
 //! Disturbances: their laws, what they leave alone, and sessions with them.
 
+mod changes;
 mod echo;
 mod environments;
 mod laws;
 mod pushes;
 mod sessions;
 
-use perturb::env::{Distribution, EnvironmentSpec, Episodes, Settings, Version, disturbance, resolve};
+use perturb::env::{Distribution, EnvironmentSpec, Episodes, Parameter, Settings, Version, disturbance, resolve};
 
 /// Settings of a disturbed environment with these values beside those of the version.
 fn settings(
@@ -33,14 +34,17 @@ fn disturbed(
 
 /// A value that disturbs, of each disturbance that the environment can have.
 fn all(spec: &'static EnvironmentSpec) -> Vec<(&'static str, f64)> {
-    let value = |name: &str| match name {
+    let value = |parameter: &Parameter| match parameter.name {
         "action_delay" => 3.0,
         "sensor_delay" => 2.0,
         "action_scale" => 0.8,
         "push_interval" => 10.0,
         name if name.starts_with("action_scale_") => 0.9,
         "action_noise" | "sensor_noise" => 0.05,
+        "change_at" => 5.0,
+        "change_every" => 13.0,
+        name if name.starts_with("changed_") => 0.5 * (parameter.random.low + parameter.random.high),
         _ => 0.1,
     };
-    disturbance::disturbances(spec).iter().map(|parameter| (parameter.name, value(parameter.name))).collect()
+    disturbance::disturbances(spec).iter().map(|parameter| (parameter.name, value(parameter))).collect()
 }

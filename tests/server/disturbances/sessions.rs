@@ -12,6 +12,9 @@ fn disturbed(open: Open) -> Open {
     let values = parameters(&[
         ("action_delay", &[(0.0, 3.0)]),
         ("action_hold", &[(0.1, 0.3)]),
+        ("push", &[(0.0, 0.1)]),
+        ("push_interval", &[(5.0, 10.0)]),
+        ("change_probability", &[(0.0, 0.2)]),
         ("sensor_delay", &[(0.0, 2.0)]),
         ("sensor_noise", &[(0.0, 0.1)]),
         ("sensor_dropout", &[(0.0, 0.1)]),

@@ -129,6 +129,10 @@ sensor_noise = { random = [0.0, 0.05], extreme = [[0.0, 0.0], [0.05, 0.1]] }
         "sensor_delay",
         "sensor_noise",
         "sensor_dropout",
+        "change_at",
+        "change_every",
+        "change_probability",
+        "changed_pole_mass",
     ];
     assert_eq!(names, expected);
     assert!(environment.disturbances.is_empty(), "nothing is left beside the parameters");
@@ -147,7 +151,7 @@ sensor_noise = { random = [0.0, 0.05], extreme = [[0.0, 0.0], [0.05, 0.1]] }
     let seen = Open { observe_parameters: true, version: Version::Default.into(), ..open("CartAndPole", 1, 1) };
     let (_, opened) = Session::open(server.tcp(), seen).await;
     let observation = floats(&opened.observations);
-    assert_eq!(observation[observation.len() - 9], -1.0, "a delay of 0 is the least of R and E");
+    assert_eq!(observation[observation.len() - 13], -1.0, "a delay of 0 is the least of R and E");
     let checked = server::command().args(["--check", "--task", path]).output().unwrap();
     let printed = String::from_utf8(checked.stdout).unwrap();
     let line = "  disturbance   action_delay (1): D 0, R [0, 2.5], E [0, 0] and [2.5, 5], within [0, 100]: ";

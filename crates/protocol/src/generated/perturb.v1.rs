@@ -75,8 +75,9 @@ pub struct Environment {
     /// Disturbances: parameters of the way between a client and the physics, such as the delay of actions. They may be
     /// named wherever parameters are. A session whose `open` names one has all of them at the end of its `parameters`, in
     /// this order, with a quantity of the same name for each at the end of `applied`, and an entry for each at the end of
-    /// `parameter_observations`. In all versions they have their default value, which disturbs nothing. Empty from older
-    /// servers.
+    /// `parameter_observations`. In all versions they disturb nothing: they have their default value, but for those whose name
+    /// is `changed_` and that of a parameter. These have the parameter's sets, and are in force after a change of the physics,
+    /// which there is none of by default. Empty from older servers.
     #[prost(message, repeated, tag = "17")]
     pub disturbances: ::prost::alloc::vec::Vec<Parameter>,
 }
