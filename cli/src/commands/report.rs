@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 
 use perturb_experiment::{BudgetAxis, Folder, Results, read_curves};
 use perturb_files::{require_writable, write_atomically};
+use perturb_report::curves_table;
 use perturb_report::plot::{CurveQuantity, draw_curves, save};
 use perturb_report::{ReportInputs, save_heatmaps};
-use perturb_report::{curves_table, old_file_name};
 
 use super::args::{CurvesArgs, ReportArgs};
 use super::display::{note, output, terminal_width};
@@ -43,8 +43,7 @@ pub(super) fn write(sources: ReportInputs, out: Option<PathBuf>, page: Option<&P
         let report = &whole.report;
         write_atomically(&out.join("report.md"), report.markdown().as_bytes())?;
         for table in report.files() {
-            let names = std::iter::once(table.title.as_str()).chain(old_file_name(&table.title));
-            names.map(|name| out.join(name)).try_for_each(|path| write_atomically(&path, &table.to_csv()))?;
+            write_atomically(&out.join(&table.title), &table.to_csv())?;
         }
         report.pictures().iter().try_for_each(|picture| picture.save(&out))?;
         save_heatmaps(whole.heatmaps, &out)?;

@@ -28,7 +28,7 @@ LOOK = """
   const seen = element => { const box = element.getBoundingClientRect(); return box.width > 0 && box.height > 0; };
   const rows = id => document.querySelectorAll(`#${id} tbody tr`).length;
   return {
-    rows: Object.fromEntries(['metrics', 'iqm', 'scenarios', 'cells'].map(id => [id, rows(id)])),
+    rows: Object.fromEntries(['metrics', 'scenarios'].map(id => [id, rows(id)])),
     uneven: [...document.querySelectorAll('table')].filter(table => {
       const width = table.querySelector('thead tr:last-child').cells.length;
       return [...table.querySelectorAll('tbody tr')].some(row => row.cells.length !== width);
@@ -37,9 +37,8 @@ LOOK = """
     curves: [...document.querySelectorAll('#curves svg')].filter(seen).length,
     findings: [...document.querySelectorAll('#finding svg, #metrics svg')].filter(seen).length,
     first: document.querySelector('main svg').closest('section').id,
-    pictures: [...document.querySelectorAll('#profiles svg, #gains svg, #parameters svg, #thresholds svg')].filter(seen).length,
+    pictures: [...document.querySelectorAll('#statistics svg')].filter(seen).length,
     heatmaps: [...document.querySelectorAll('#heatmaps svg')].filter(seen).length,
-    without_heatmap: [...document.querySelectorAll('#heatmaps figure.missing')].filter(seen).length,
     without_curves: [...document.querySelectorAll('#provenance li')].filter(li => li.textContent.includes('monitor.csv')).length,
     unnamed: [...document.querySelectorAll('svg')].filter(picture => !picture.closest('[aria-label]')).length,
     dangling: [...document.querySelectorAll('nav a')].map(link => link.getAttribute('href'))
@@ -211,12 +210,10 @@ def lines(path):
 def expectations(directory):
     """What the page must have, by the report's tables and the folder's pictures."""
     report = directory / "report"
-    metrics, iqm, scenarios, selected = (
-        lines(report / f"{name}.csv") for name in ("metrics", "iqm", "scenarios", "selected")
-    )
-    several = len({line["environment"] for line in scenarios}) > 1
+    metrics, scenarios, selected = (lines(report / f"{name}.csv") for name in ("metrics", "scenarios", "selected"))
+    environments = {line["environment"] for line in scenarios}
+    several = len(environments) > 1
     shown = [line for line in metrics if several or line["environment"] != "Average"]
-    failures = [path for path in directory.glob("cells/*/failure.json") if not (path.parent / "result.json").exists()]
     with_curves = {
         line["environment"]
         for line in selected
@@ -227,29 +224,20 @@ def expectations(directory):
         for line in selected
         if any((directory / "heatmaps").glob(f"{line['cell']}-*.csv"))
     }
-    environments = len({line["environment"] for line in scenarios})
-    compared = sum((report / f"{name}.csv").exists() for name in ("comparisons", "gains"))
-    settings = (report / "settings.csv").exists()
-    files = [path for path in (report / "cvar.csv", report / "sample_efficiency.csv") if path.exists()]
-    detailed = sum(len({line["environment"] for line in lines(path)}) for path in files)
+    pairs = (report / "comparisons.csv").exists()
     return {
         "rows": {
             "metrics": len(shown) // 3,  # three metrics in a row
-            "iqm": len(iqm) // 3,
             "scenarios": len(scenarios) // 3,  # three tests in a row
-            "cells": len(selected) + len(failures),
         },
-        # Metrics, two over all environments, methods and versions compared, Extrapolation and scenarios, worst and footing, settings, cells.
-        "tables": environments + several + 2 + compared + 2 * environments + detailed + settings + 1 + bool(failures),
+        # Metrics, scenarios, interquartile means and pairs.
+        "tables": 2 * len(environments) + several + 1 + pairs,
         "findings": len(list(report.glob("*finding.svg"))),
         "first": "finding",
         "curves": 4 * len(with_curves),
-        "pictures": sum(
-            len(list(report.glob(f"*{name}.svg"))) for name in ("profiles", "gains", "-parameters", "-thresholds")
-        ),
-        "without_curves": environments - len(with_curves),
-        "heatmaps": len(tested),
-        "without_heatmap": len(scenarios) // 9 - len(tested),
+        "pictures": len(list(report.glob("profiles.svg"))),
+        "without_curves": len(environments - with_curves),
+        "heatmaps": len(tested) + len(list(report.glob("*-parameters.svg"))),
     }
 
 

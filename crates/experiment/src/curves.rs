@@ -101,18 +101,6 @@ impl Curve {
         Self { method: method.clone(), version, lines: BudgetAxis::ALL.map(|footing| line(runs, footing)) }
     }
 
-    /// Without points.
-    pub fn new(method: &Method, version: Version) -> Self {
-        Self { method: method.clone(), version, lines: Default::default() }
-    }
-
-    /// Adds a point after all others.
-    pub fn add(&mut self, by: BudgetAxis, point: CurvePoint) {
-        let line = &mut self.lines[by as usize];
-        line.total = point.progress;
-        line.points.push(point);
-    }
-
     /// In order.
     pub fn points(&self, by: BudgetAxis) -> &[CurvePoint] {
         &self.lines[by as usize].points
@@ -121,12 +109,6 @@ impl Curve {
     /// Returns the length of a training, episodes or steps, as the mean over runs.
     pub fn total(&self, by: BudgetAxis) -> f64 {
         self.lines[by as usize].total
-    }
-
-    /// The last point that is not beyond `progress`, or the first of all.
-    pub fn at(&self, by: BudgetAxis, progress: f64) -> Option<&CurvePoint> {
-        let points = self.points(by);
-        points.get(points.partition_point(|point| point.progress <= progress).saturating_sub(1))
     }
 }
 
@@ -283,8 +265,6 @@ mod tests {
         let curve = Curve::from_runs(&method, Version::D, &[run]);
         let places = |by| curve.points(by).iter().map(|point| point.progress).collect::<Vec<_>>();
         assert_eq!(places(BudgetAxis::Steps), [30.0, 90.0]);
-        let at = |progress: f64| curve.at(BudgetAxis::Steps, progress).unwrap().progress;
-        assert_eq!([0.0, 89.9, 90.0, 999.0].map(at), [30.0, 30.0, 90.0, 90.0]);
     }
 
     #[rstest]

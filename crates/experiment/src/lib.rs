@@ -49,7 +49,7 @@ pub use selection::{
 };
 pub use states::{CellStates, DoneCells, LayeredStates, StudyResults};
 pub use tuning::{Chosen, Tuned, tuned};
-pub use verify::{VerifyError, verify};
+pub use verify::VerifyError;
 
 /// The version, and the commit that was built, e.g. "0.1.0 (1a2b3c4d5e6f)"; "-dirty" follows a commit whose files were
 /// changed.

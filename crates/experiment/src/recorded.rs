@@ -8,8 +8,7 @@ use perturb_records::outcomes::PolicyOutcomes;
 use crate::folder::CellResult;
 use crate::selection::{MethodResults, Reported};
 
-/// The recorded episodes of selected policies, by their cells' ids. Filled while the records are read for
-/// [`verify`](crate::verify::verify), so that no file is read twice.
+/// The recorded episodes of selected policies, by their cells' ids.
 #[derive(Clone, Debug, Default)]
 pub struct Recorded {
     wanted: BTreeSet<String>,
@@ -24,9 +23,14 @@ impl Recorded {
         Self { wanted: selected.map(|selected| selected.cell.id.clone()).collect(), policies: BTreeMap::new() }
     }
 
+    /// Whether a cell is one of those that were selected.
+    pub fn wants(&self, cell: &str) -> bool {
+        self.wanted.contains(cell)
+    }
+
     /// Keeps what is needed of a cell's `records`, if it is one of those that were selected.
     pub fn add(&mut self, result: &CellResult, records: &Records) {
-        if self.wanted.contains(&result.id) {
+        if self.wants(&result.id) {
             let names = result.results.keys().map(String::as_str);
             self.policies.insert(result.id.clone(), PolicyOutcomes::new(records, names));
         }

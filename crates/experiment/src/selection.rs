@@ -321,7 +321,7 @@ impl<'a> Selected<'a> {
     }
 
     /// The figures of the test that selects.
-    pub fn own_test(&self) -> Option<&'a TestResult> {
+    fn own_test(&self) -> Option<&'a TestResult> {
         self.test(&self.cell.trained_on().to_string())
     }
 

@@ -5,8 +5,7 @@ use std::path::Path;
 
 use perturb_records::{ParameterCheck, Records, RecordsError, TestResult};
 
-use crate::folder::{CellResult, Folder};
-use crate::selection::Results;
+use crate::folder::CellResult;
 
 /// Why results are not trusted.
 #[derive(Debug, thiserror::Error)]
@@ -36,31 +35,6 @@ pub enum VerifyError {
          otherwise; delete result.json to have the tests done again"
     )]
     ParameterCheck { cell: String },
-}
-
-/// Computes every result again from its recorded episodes, where they are there, and hands them to `each`; gives how many
-/// results have them.
-///
-/// # Errors
-/// [`VerifyError`] for the first result that is another one.
-pub fn verify(
-    results: &Results<'_>,
-    folder: &Folder,
-    mut each: impl FnMut(&CellResult, &Records),
-) -> Result<usize, VerifyError> {
-    let mut verified = 0;
-    for result in results.done() {
-        let place = folder.cell(&result.id);
-        let of_marks = result.marks.iter().map(|(&mark, of)| (place.mark(mark), &of.results, Some(&of.agreement)));
-        if let Some(records) = follows(result, place.path(), &result.results, result.agreement.as_ref())? {
-            each(result, &records);
-            verified += 1;
-        }
-        of_marks
-            .map(|(path, results, agreement)| follows(result, &path, results, agreement))
-            .collect::<Result<Vec<_>, _>>()?;
-    }
-    Ok(verified)
 }
 
 /// The episodes in `path`, from which these figures of a result then follow; `None` if there are none.
@@ -93,7 +67,7 @@ mod tests {
 
     use super::*;
     use crate::fixture;
-    use crate::folder::{CellState, IntermediateEvaluation};
+    use crate::folder::{CellState, Folder};
     use crate::plan::Plan;
     use perturb_protocol::Version;
     use perturb_records::{Ending, EpisodeRecord, RecordedTest, RecordsMetadata};
@@ -150,9 +124,10 @@ mod tests {
         result.results = [("D".to_owned(), records.result("D", None))].into();
         result.agreement = Some(records.agreement());
         change(result);
-        let mut handed = 0;
-        match (verify(&results, &folder, |_, records| handed += records.episodes.len()), refused) {
-            (Ok(verified), None) => assert_eq!((verified, handed), (1, 3)),
+        let result = result.clone();
+        let found = follows(&result, folder.cell(&result.id).path(), &result.results, result.agreement.as_ref());
+        match (found, refused) {
+            (Ok(found), None) => assert_eq!(found, Some(records)),
             (Err(error), Some(expected)) => {
                 let message = error.to_string();
                 assert!(message.contains(expected) && message.contains(&plan.cells[0].id), "{message}");
@@ -162,33 +137,10 @@ mod tests {
     }
 
     #[test]
-    fn so_is_that_of_an_earlier_moment() {
-        let plan = Plan::parse("test", PLAN.into()).unwrap();
-        let directory = tempfile::tempdir().unwrap();
-        let folder = Folder::new(directory.path());
-        let records = records();
-        records.write(&folder.cell(&plan.cells[0].id).mark(5).join(perturb_records::FILE)).unwrap();
-        for (wrong, refused) in [(0.0, false), (1.0, true)] {
-            let mut results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
-            let CellState::Done(result) = &mut results.states[0] else { unreachable!("it is done") };
-            let mut test = records.result("D", None);
-            test.mean_length += wrong;
-            let of_mark = [("D".to_owned(), test)].into();
-            let of_mark = IntermediateEvaluation {
-                counters: Default::default(),
-                results: of_mark,
-                agreement: records.agreement(),
-            };
-            result.marks.insert(5, of_mark);
-            assert_eq!(verify(&results, &folder, |_, _| ()).is_err(), refused);
-        }
-    }
-
-    #[test]
     fn a_result_of_an_earlier_program_has_no_episodes_to_compare() {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let directory = tempfile::tempdir().unwrap();
-        let results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
-        assert_eq!(verify(&results, &Folder::new(directory.path()), |_, _| panic!("none")).unwrap(), 0);
+        let result = fixture::result(&plan.cells[0], [0.0; 3], 0.0);
+        assert_eq!(follows(&result, directory.path(), &result.results, None).unwrap(), None);
     }
 }

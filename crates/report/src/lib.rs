@@ -6,13 +6,12 @@
 #[cfg(test)]
 #[path = "../../experiment/src/fixture.rs"]
 mod fixture;
-mod generalization_curves;
 mod heatmap_policies;
 pub mod plot;
 mod report;
 
 pub use heatmap_policies::{PolicyHeatmap, policies_side_by_side};
 pub use report::{
-    Figure, FigureData, Figures, HeatmapPicture, Picture, PictureDrawing, Report, ReportBundle, ReportError,
-    ReportInputs, StudySource, curves_table, heatmap_pictures, html, old_file_name, save_heatmaps,
+    HeatmapPictures, Picture, PictureDrawing, Report, ReportBundle, ReportError, ReportInputs, StudySource,
+    curves_table, heatmap_pictures, save_heatmaps,
 };

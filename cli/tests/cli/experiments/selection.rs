@@ -131,6 +131,6 @@ fn selected_cells_run_alone_and_both_rules_report() {
     let papers = report(&["--selection", "paper"]);
     assert!(papers.contains("4 of 4 cells are done") && papers.contains("Selection: `paper`"), "{papers}");
     let at = |name: &str| experiment.out("out/report").join(name).is_file();
-    assert!(at("tuning.csv") && at("paper/metrics.csv") && !at("paper/tuning.csv"));
+    assert!(at("selected.csv") && at("paper/metrics.csv"));
     assert_eq!(experiment.plan.selection, Selection::Clean);
 }

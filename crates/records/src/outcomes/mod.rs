@@ -1,4 +1,4 @@
-//! Recorded episodes by column, for success over parameters and thresholds and for tail risk.
+//! Recorded episodes by column, for success over parameters and for tail risk.
 
 mod partition;
 mod sweeps;
@@ -7,11 +7,9 @@ mod worst;
 use std::collections::BTreeMap;
 
 use crate::records::{RecordedParameter, RecordedTest, Records};
-use crate::success::Criterion;
 
 use perturb_settings::sets::Contexts;
 pub use sweeps::{Bin, Counted, bins, success_within, success_within_both};
-pub use sweeps::{success_at, thresholds};
 pub use worst::{SHARE, conditional_value_at_risk, worst_contexts};
 
 /// The tests of a policy.
@@ -19,8 +17,6 @@ pub use worst::{SHARE, conditional_value_at_risk, worst_contexts};
 pub struct PolicyOutcomes {
     /// The parameters, in the order of [`Outcomes::parameters`].
     pub parameters: Vec<RecordedParameter>,
-    /// The success criterion; `None` if the server did not say.
-    pub success: Option<Criterion>,
     tests: BTreeMap<String, Outcomes>,
 }
 
@@ -35,15 +31,13 @@ pub struct Outcomes {
     pub returns: Vec<f64>,
     /// Whether each episode was a success.
     pub successes: Vec<bool>,
-    /// The quantity of the success criterion in each episode; `None` if it was not reached.
-    pub achieved: Vec<Option<f64>>,
 }
 
 impl PolicyOutcomes {
     /// Collects the tests on the sets with these names.
     pub fn new<'a>(records: &Records, names: impl Iterator<Item = &'a str>) -> Self {
         let tests = names.map(|name| (name.to_owned(), Outcomes::new(records, name))).collect();
-        Self { parameters: records.about.parameters.clone(), success: records.about.success.clone(), tests }
+        Self { parameters: records.about.parameters.clone(), tests }
     }
 
     /// Returns the test on a set; `None` if there was none.
@@ -68,7 +62,6 @@ impl Outcomes {
             contexts: contexts.map(|n| rows().map(|row| row.environment_index as usize % n).collect()),
             returns: rows().map(|row| row.episode_return).collect(),
             successes: rows().map(|row| row.success).collect(),
-            achieved: rows().map(|row| row.achieved).collect(),
         }
     }
 }

@@ -1,13 +1,10 @@
-//! Success over a parameter, and over the threshold of success.
+//! Success over a parameter.
 
 use super::Outcomes;
 use crate::statistics::wilson;
-use crate::success::Criterion;
 
 /// Number of parts of a parameter's range, if it has values everywhere.
 const BINS: f64 = 10.0;
-/// Steps from the lowest threshold to the highest.
-const THRESHOLDS: usize = 40;
 
 /// Values from `low` to `high`. `high` belongs only to the last bin of an interval.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -42,13 +39,6 @@ impl Counted {
     /// Returns the interval; `None` without episodes.
     pub fn known(self) -> Option<[f64; 2]> {
         (self.episodes > 0).then(|| self.interval())
-    }
-
-    fn count(successes: impl Iterator<Item = bool>) -> Self {
-        successes.fold(Self::default(), |Self { successes, episodes }, success| Self {
-            successes: successes + u64::from(success),
-            episodes: episodes + 1,
-        })
     }
 }
 
@@ -115,39 +105,15 @@ fn bin_of(value: f64, bins: &[Bin]) -> usize {
     bins.partition_point(|bin| bin.low <= value).saturating_sub(1)
 }
 
-/// Thresholds from the lowest to the highest value achieved in `tests`, ascending, together with the threshold of
-/// `criterion`. Quantities that are counted have whole thresholds. Returns none if nothing was achieved.
-pub fn thresholds<'a>(tests: impl Iterator<Item = &'a Outcomes>, criterion: &Criterion) -> Vec<f64> {
-    let achieved = tests.flat_map(|outcomes| outcomes.achieved.iter().flatten());
-    let (low, high) = achieved.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (low.min(*x), high.max(*x)));
-    if low > high {
-        return Vec::new();
-    }
-    let at = |step: usize| low + (high - low) * step as f64 / THRESHOLDS as f64;
-    let shown = |threshold: f64| if criterion.unit == "1" { threshold.round() } else { threshold };
-    let mut all: Vec<f64> = (0..=THRESHOLDS).map(|step| shown(at(step))).chain([criterion.threshold]).collect();
-    all.sort_unstable_by(f64::total_cmp);
-    all.dedup();
-    all
-}
-
-/// The episodes of `outcomes`, judged by another threshold.
-pub fn success_at(outcomes: &Outcomes, criterion: &Criterion, threshold: f64) -> Counted {
-    let criterion = Criterion { threshold, ..criterion.clone() };
-    Counted::count(outcomes.achieved.iter().map(|achieved| criterion.holds(*achieved)))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::success::Side;
 
     fn outcomes() -> Outcomes {
         Outcomes {
             parameters: vec![vec![1.0; 4], vec![0.15, 0.95, 1.0, 0.0]],
             returns: vec![0.0; 4],
             successes: vec![true, false, true, true],
-            achieved: vec![Some(10.0), None, Some(90.0), Some(80.0)],
             contexts: None,
         }
     }
@@ -168,18 +134,5 @@ mod tests {
         assert_eq!([0, 1, 2, 3, 4].map(of), [(1, 1), (1, 1), (0, 0), (0, 0), (1, 2)], "0.95 fails");
         assert!(super::bins([&outcomes()].into_iter(), 0).is_empty(), "it does not vary");
         assert_eq!(counted.into_iter().sum::<Counted>(), Counted { successes: 3, episodes: 4 });
-    }
-
-    #[test]
-    fn what_achieved_nothing_is_a_success_at_no_threshold() {
-        let criterion =
-            Criterion { quantity: "steps".into(), unit: "1".into(), side: Side::AtMost, threshold: 33.3, most: None };
-        let thresholds = thresholds([&outcomes()].into_iter(), &criterion);
-        assert_eq!((thresholds[0], thresholds[1], thresholds.last().copied()), (10.0, 12.0, Some(90.0)));
-        assert!(thresholds.contains(&33.3) && thresholds.is_sorted());
-        let rate = |threshold| success_at(&outcomes(), &criterion, threshold).rate();
-        assert_eq!([9.0, 10.0, 80.0, 90.0].map(rate), [0.0, 25.0, 50.0, 75.0]);
-        let nothing = Outcomes { achieved: vec![None], ..outcomes() };
-        assert!(super::thresholds([&nothing].into_iter(), &criterion).is_empty());
     }
 }

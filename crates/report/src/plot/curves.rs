@@ -42,16 +42,6 @@ impl std::fmt::Display for CurveQuantity {
 
 /// The picture of training curves, a panel for each version that is trained on.
 pub fn draw_curves(curves: &EnvironmentCurves, quantity: CurveQuantity, by: BudgetAxis) -> Panels {
-    draw(curves, None, quantity, by)
-}
-
-/// The picture of tests of what was trained on a version, a panel for each version that is tested on.
-pub(crate) fn draw_tests(curves: &EnvironmentCurves, trained_on: Version, quantity: CurveQuantity) -> Panels {
-    draw(curves, Some(trained_on), quantity, BudgetAxis::Episodes)
-}
-
-/// `trained_on` is `None` of training curves.
-fn draw(curves: &EnvironmentCurves, trained_on: Option<Version>, quantity: CurveQuantity, by: BudgetAxis) -> Panels {
     let methods = distinct(curves.curves.iter().map(|curve| curve.method.clone()));
     let what = match quantity {
         CurveQuantity::Return => "mean return",
@@ -59,14 +49,10 @@ fn draw(curves: &EnvironmentCurves, trained_on: Option<Version>, quantity: Curve
     };
     let environment = &curves.environment;
     let shown = what.trim_end_matches(", %");
-    let of = match trained_on {
-        None => format!("{environment}: {shown} while training, over {by}"),
-        Some(version) => format!("{environment}, trained on {version}: {shown} in tests after so many episodes"),
-    };
     let (x, y) = ranges(&curves.curves, quantity, by);
     let versions = versions(|version| curves.curves.iter().any(|curve| curve.version == version));
     let panel = |version: Version| PlotPanel {
-        caption: format!("{} {version}", if trained_on.is_some() { "tested on" } else { "trained on" }),
+        caption: format!("trained on {version}"),
         x_name: by.to_string(),
         x: x.clone(),
         y_name: what.into(),
@@ -77,10 +63,9 @@ fn draw(curves: &EnvironmentCurves, trained_on: Option<Version>, quantity: Curve
             .filter(|curve| curve.version == version)
             .map(|curve| line(curve, quantity, by, &methods))
             .collect(),
-        mark: None,
     };
     Panels {
-        title: of,
+        title: format!("{environment}: {shown} while training, over {by}"),
         panels: versions.into_iter().map(panel).collect(),
         legend: methods.iter().map(ToString::to_string).collect(),
         note: "Lines: means over runs; bands: their standard deviation.".into(),

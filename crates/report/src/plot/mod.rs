@@ -22,7 +22,6 @@ use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
 
 pub use colours::{is_dark, shade};
-pub(crate) use curves::draw_tests;
 pub use curves::{CurveQuantity, draw_curves};
 pub use heatmap::{HeatmapColumn, HeatmapPanels, common_returns};
 pub use intervals::IntervalPlot;

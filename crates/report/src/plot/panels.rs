@@ -7,7 +7,6 @@ use plotters::coord::Shift;
 use plotters::prelude::*;
 
 use super::canvas::{INSIDE, LINE, LineStyle, MARGIN, PlotCanvas, TextAnchor, text_width, wrapped};
-use super::colours::FRAME;
 use super::frame::{Frame, NAME, NUMBERS, y_numbers_width};
 use super::{Plot, PlotError, WIDTH};
 
@@ -20,8 +19,6 @@ const SAMPLE: f64 = 30.0;
 const BETWEEN: f64 = 16.0;
 /// Radius of a line's only point.
 const DOT: f64 = 3.0;
-/// A value that is marked.
-const MARK: LineStyle = LineStyle { colour: FRAME, width: 2, dashes: Some((2, 3)) };
 
 /// The range of a success rate, %, with room for lines at its ends.
 pub(crate) const RATES: Range<f64> = -2.0..102.0;
@@ -48,8 +45,6 @@ pub(crate) struct PlotPanel {
     pub(crate) y_name: String,
     pub(crate) y: Range<f64>,
     pub(crate) lines: Vec<PanelLine>,
-    /// A marked value of x.
-    pub(crate) mark: Option<f64>,
 }
 
 /// A line with its band.
@@ -190,9 +185,6 @@ impl PlotPanel {
         canvas.x_ticks(frame, numbers)?;
         canvas.y_ticks(frame, true)?;
         canvas.upright(&self.y_name, (MARGIN + LINE / 2.0, frame.middle().1))?;
-        if let Some(mark) = self.mark {
-            canvas.line(&[(frame.x(mark), frame.top), (frame.x(mark), frame.bottom())], MARK)?;
-        }
         // What lies beyond the axis is at its end.
         let within = |y: f64| frame.y(y).clamp(frame.top, frame.bottom());
         for PanelLine { index, points } in &self.lines {

@@ -38,7 +38,6 @@ fn pictures() -> Vec<String> {
         y_name: "success rate, %".into(),
         y: panels::RATES,
         lines: vec![PanelLine { index: 0, points: vec![point(10.0), point(90.0)] }],
-        mark: Some(50.0),
     };
     let panels = Panels {
         title: "CartPole: success rate while training".into(),
@@ -67,7 +66,6 @@ fn a_line_of_one_point_is_seen() {
         y_name: "success rate, %".into(),
         y: panels::RATES,
         lines,
-        mark: None,
     };
     let drawn = |lines| {
         svg(&Panels {

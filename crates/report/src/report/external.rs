@@ -4,34 +4,14 @@ use std::collections::BTreeMap;
 
 use perturb_experiment::{MethodResults, Results, distinct, elsewhere};
 use perturb_records::{ExternalEvaluation, ExternalPolicy};
-use perturb_text::Table;
-
-use super::numbers::or_empty;
-use super::{MISSING, Report};
-
-/// A policy that no cell trained.
-pub(super) struct ExternalRow<'a> {
-    agent: &'a ExternalEvaluation,
-    policy: &'a ExternalPolicy,
-    run: u32,
-}
-
-/// In the order of `selections`.
-pub(super) fn all<'a>(selections: &[MethodResults<'a>]) -> Vec<ExternalRow<'a>> {
-    elsewhere(selections).into_iter().map(|(agent, policy, run)| ExternalRow { agent, policy, run }).collect()
-}
 
 /// Returns the notes that precede the agents' numbers.
-pub(super) fn overview(results: &Results<'_>, selections: &[MethodResults<'_>]) -> Vec<String> {
+pub(super) fn sentences(results: &Results<'_>, selections: &[MethodResults<'_>]) -> Vec<String> {
     let agents = distinct(selections.iter().filter(|row| row.method.external).map(|row| row.method.clone()));
     if agents.is_empty() {
         return Vec::new();
     }
-    let (count, verb) = if agents.len() == 1 {
-        ("1 agent was".to_owned(), "its")
-    } else {
-        (format!("{} agents were", agents.len()), "their")
-    };
+    let count = if agents.len() == 1 { "1 agent was".to_owned() } else { format!("{} agents were", agents.len()) };
     let compared = if results.plan.cells.is_empty() {
         ""
     } else {
@@ -39,36 +19,29 @@ pub(super) fn overview(results: &Results<'_>, selections: &[MethodResults<'_>]) 
          paired with the experiment's: seeds of trainings and tests are others."
     };
     let mut lines = vec![format!(
-        "{count} trained elsewhere, by settings that are not known here, and only tested; rows say so. The last table has \
-         what is known of {verb} policies.{compared}"
+        "{count} trained elsewhere, by settings that are not known here, and only tested; rows say so.{compared}"
     )];
-    let mut revisions: BTreeMap<&str, u32> = BTreeMap::new();
+    let mut known: BTreeMap<&str, (u32, &str)> = BTreeMap::new();
     for result in results.done() {
-        revisions.entry(&result.training.environment).or_insert(result.training.environment_revision);
+        let training = &result.training;
+        known.entry(&training.environment).or_insert((training.environment_revision, &training.model_hash));
     }
-    for (agent, policy, _) in elsewhere(selections) {
-        let (name, got) = (agent.environment(), policy.records.about.revision);
-        let known = *revisions.entry(name).or_insert(got);
-        if known != got {
+    for (agent, policy, run) in elsewhere(selections) {
+        lines.push(policy_sentence(agent, policy, run));
+        let (name, revision) = (agent.environment(), policy.records.about.revision);
+        let Some(episode) = policy.records.episodes.first() else { continue };
+        let model = episode.model_hash.as_str();
+        let (first, first_model) = *known.entry(name).or_insert((revision, model));
+        let others = "their numbers are of different environments.";
+        if first != revision {
             lines.push(format!(
-                "{} was tested in revision {got} of {name}, others in revision {known}: their numbers are of different \
-                 environments.",
+                "{} was tested in revision {revision} of {name}, others in revision {first}: {others}",
                 agent.agent
             ));
         }
-    }
-    let mut models: BTreeMap<&str, &str> = BTreeMap::new();
-    for result in results.done() {
-        models.entry(&result.training.environment).or_insert(&result.training.model_hash);
-    }
-    for (agent, policy, _) in elsewhere(selections) {
-        let Some(episode) = policy.records.episodes.first() else { continue };
-        let (name, got) = (agent.environment(), episode.model_hash.as_str());
-        let known = *models.entry(name).or_insert(got);
-        if known != got {
+        if first_model != model {
             lines.push(format!(
-                "{} was tested with the model {got} of {name}, others with {known}: their numbers are of different \
-                 environments.",
+                "{} was tested with the model {model} of {name}, others with {first_model}: {others}",
                 agent.agent
             ));
         }
@@ -76,50 +49,22 @@ pub(super) fn overview(results: &Results<'_>, selections: &[MethodResults<'_>]) 
     distinct(lines.into_iter())
 }
 
-impl ExternalRow<'_> {
-    /// Returns the success criterion in words.
-    fn success(&self) -> String {
-        self.policy.records.about.success.as_ref().map_or_else(|| MISSING.to_owned(), ToString::to_string)
-    }
-}
-
-impl Report<'_> {
-    /// `None` without such agents.
-    pub(super) fn elsewhere_table(&self) -> Option<Table> {
-        let title = "Trained elsewhere: policies that were only tested (external.csv has the seeds of their tests)";
-        let table = Table::builder(title, &self.elsewhere)
-            .text("environment", |row| row.agent.environment())
-            .text("agent", |row| &row.agent.agent)
-            .text("trained on", |row| row.policy.trained_on())
-            .text("run", |row| row.run)
-            .number("steps of training", |row| {
-                row.policy.known.timesteps.map_or("not known".into(), |it| it.to_string())
-            })
-            .text("policy", |row| &row.policy.records.about.policy)
-            .text("success", ExternalRow::success)
-            .number("episodes of a test", |row| row.policy.known.episodes)
-            .text("assessment", |row| if row.agent.name.is_empty() { "not saved" } else { &row.agent.name })
-            .build();
-        (!table.rows.is_empty()).then_some(table)
-    }
-
-    pub(super) fn elsewhere_file(&self) -> Table {
-        Table::builder("external.csv", &self.elsewhere)
-            .text("environment", |row| row.agent.environment())
-            .text("agent", |row| &row.agent.agent)
-            .text("train", |row| row.policy.trained_on())
-            .number("run", |row| row.run)
-            .number("timesteps", |row| or_empty(row.policy.known.timesteps))
-            .text("policy", |row| &row.policy.records.about.policy)
-            .text("observe", |row| row.policy.known.observe)
-            .text("deterministic", |row| or_empty(row.policy.known.deterministic))
-            .text("success", ExternalRow::success)
-            .number("revision", |row| row.policy.records.about.revision)
-            .number("seed", |row| row.policy.known.seed)
-            .number("episodes", |row| row.policy.known.episodes)
-            .text("assessment", |row| &row.agent.name)
-            .build()
-    }
+/// Returns what is known of a policy.
+fn policy_sentence(agent: &ExternalEvaluation, policy: &ExternalPolicy, run: u32) -> String {
+    let ExternalPolicy { known, records, .. } = policy;
+    let saved = if agent.name.is_empty() { "not saved".into() } else { format!("saved as `{}`", agent.name) };
+    let steps = known.timesteps.map_or("not known".into(), |steps| steps.to_string());
+    let success = records.about.success.as_ref().map_or("not judged".into(), ToString::to_string);
+    format!(
+        "{} on {}, run {run}: trained on {}, steps of training {steps}, policy `{}`; {} episodes a test with seed {}, \
+         success: {success}; {saved}.",
+        agent.agent,
+        agent.environment(),
+        policy.trained_on(),
+        records.about.policy,
+        known.episodes,
+        known.seed,
+    )
 }
 
 #[cfg(test)]

@@ -4,10 +4,10 @@
 use perturb_experiment::{Selection, distinct};
 use perturb_records::statistics::Bootstrapped;
 use perturb_records::{Metric, Scenario};
-use perturb_text::{Table, count};
+use perturb_text::count;
 
-use super::columns::MethodColumns;
-use super::numbers::{AVERAGE, MethodMetrics, or_empty};
+use super::csv::metrics_file;
+use super::numbers::{AVERAGE, MethodMetrics};
 use super::pictures::{Picture, PictureDrawing};
 use super::{MISSING, Report};
 use crate::plot::intervals::{Group, IntervalRow};
@@ -58,23 +58,14 @@ impl<'a> Report<'a> {
         format!("Average over {environments}")
     }
 
-    /// Numbers of all environments together and of each, with their intervals.
-    pub(super) fn finding_file(&self) -> Table {
-        let averages = self.averages.iter().filter(|_| self.has_average());
-        finding_table("finding.csv", &averages.chain(&self.metrics).collect::<Vec<_>>())
-    }
-
     fn finding_picture(&self, rows: &[MethodMetrics<'_>]) -> Picture {
         let is_average = rows[0].environment == AVERAGE;
         let of = self.finding_of(rows);
         let file = if is_average { "finding".to_owned() } else { format!("{of}-finding") };
         let over = if is_average { "environments and runs" } else { "runs" };
         let of_rows = |has: &dyn Fn(&MethodMetrics<'_>) -> bool| rows.iter().any(has);
-        let intervals = match of_rows(&|row| row.means.values().any(|mean| mean.interval_95.is_some())) {
-            true if is_average => " with 95 % t intervals",
-            true => " with 95 % t intervals",
-            false => "",
-        };
+        let has_intervals = of_rows(&|row| row.means.values().any(|mean| mean.interval_95.is_some()));
+        let intervals = if has_intervals { " with 95 % t intervals" } else { "" };
         let papers = if of_rows(&|row| !row.papers.is_empty()) { ", beside the paper's means" } else { "" };
         let conditional = match self.plan.selection {
             Selection::Paper if !intervals.is_empty() && self.plan.selects() => {
@@ -105,7 +96,7 @@ impl<'a> Report<'a> {
             caption: format!(
                 "{of}: Default, Interpolation and Extrapolation; means over {over}{intervals}{papers}.{said}{conditional}"
             ),
-            data: finding_table(&format!("{file}.csv"), &rows.iter().collect::<Vec<_>>()),
+            data: metrics_file(&format!("{file}.csv"), &rows.iter().collect::<Vec<_>>()),
             file,
             drawing: PictureDrawing::Intervals(drawing),
         }
@@ -197,24 +188,6 @@ fn shown(mean: Bootstrapped) -> String {
 /// Rounds to the shown digits, without a negative zero.
 fn rounded(points: f64) -> f64 {
     (10.0 * points).round() / 10.0 + 0.0
-}
-
-fn finding_table(name: &str, rows: &[&MethodMetrics<'_>]) -> Table {
-    let lines: Vec<_> = rows.iter().flat_map(|row| Metric::ALL.map(|metric| (*row, metric))).collect();
-    let mean = |(row, metric): &(&MethodMetrics<'_>, Metric)| row.means.get(metric).copied();
-    let end = move |line: &(&MethodMetrics<'_>, Metric), which: usize| {
-        or_empty(mean(line).and_then(|mean| Some(mean.interval_95?[which])))
-    };
-    Table::builder(name, &lines)
-        .text("environment", |(row, _)| row.environment)
-        .method(|(row, _)| &row.method)
-        .text("metric", |(_, metric)| metric)
-        .number("runs", move |line| mean(line).map_or(0, |mean| mean.runs))
-        .number("mean", move |line| or_empty(mean(line).map(|mean| mean.point)))
-        .number("low_95", move |line| end(line, 0))
-        .number("high_95", move |line| end(line, 1))
-        .number("paper_mean", |(row, metric)| or_empty(row.papers.get(metric).map(|paper| paper.mean)))
-        .build()
 }
 
 /// Names the numbers that have no interval; `None` if all have one.

@@ -9,33 +9,24 @@ use perturb_experiment::{
     Folder, FolderError, HeatmapPlace, HeatmapRecord, MethodResults, NoHeatmap, Reported, distinct, heatmap_kinds,
     heatmap_places,
 };
-use perturb_files::{delete, list, write_atomically};
+use perturb_files::{delete, list};
+use perturb_protocol::Version;
 use perturb_records::{Heatmap, HeatmapKind, HeatmapPoint, TrainedOn};
 use perturb_settings::Method;
 use perturb_text::{Table, count};
 
-use super::figure::{Figure, FigureData};
-use super::pictures::file_name;
-use crate::plot::{HeatmapColumn, HeatmapPanels, PlotError, common_returns, save, svg};
+use super::pictures::{Picture, PictureDrawing, file_name};
+use crate::plot::{HeatmapColumn, HeatmapPanels, PlotError, common_returns};
 
-/// A method's heatmaps over two parameters, with a column for each training distribution. Each is the mean over runs.
-#[derive(Clone, Debug, PartialEq)]
-pub struct HeatmapPicture {
-    /// The environment's name.
-    pub environment: String,
-    /// The names of the files, without extension.
-    pub file: String,
-    /// A few words for those who do not see it.
-    pub name: String,
-    /// The caption, or the reason why the picture is missing.
-    pub caption: String,
-    /// `None` if nothing is there.
-    pub panels: Option<HeatmapPanels>,
-    /// The numbers, as `FILE.csv`.
-    pub figures: Table,
-    /// Heatmaps that it could be of.
-    pub wanted: usize,
-    /// Why others of these are not there.
+/// Heatmaps as pictures: one for each environment, pair of parameters and method, with a column for each training
+/// distribution. Each column is the mean over runs.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct HeatmapPictures {
+    /// Those of which something is there.
+    pub pictures: Vec<Picture>,
+    /// Number of heatmaps that there could be.
+    pub total: usize,
+    /// Reasons why others of these are not there.
     pub missing: Vec<NoHeatmap>,
 }
 
@@ -81,10 +72,10 @@ struct Origin {
 pub fn heatmap_pictures(
     selections: &[MethodResults<'_>],
     folder: Option<&Folder>,
-) -> Result<Vec<HeatmapPicture>, FolderError> {
+) -> Result<HeatmapPictures, FolderError> {
     let places = heatmap_places(selections);
     let of_cells = folder.map_or_else(|| Ok(BTreeMap::new()), |folder| heatmap_kinds(folder, &places))?;
-    let mut pictures = Vec::new();
+    let mut all = HeatmapPictures::default();
     for rows in selections.chunk_by(|a, b| a.environment == b.environment) {
         let environment = rows[0].environment;
         let places: Vec<_> = places.iter().filter(|place| place.environment == environment).collect();
@@ -110,9 +101,12 @@ pub fn heatmap_pictures(
         drafts.retain(|draft| !draft.columns.is_empty());
         let means = drafts.iter().flat_map(|draft| &draft.columns).filter_map(|column| column.mean.as_ref());
         let returns = common_returns(environment, means);
-        pictures.extend(drafts.iter().map(|draft| draft.picture(&returns)));
+        all.pictures.extend(drafts.iter().filter_map(|draft| draft.picture(&returns)));
+        let columns = || drafts.iter().flat_map(|draft| &draft.columns);
+        all.total += columns().map(|column| column.policies).sum::<usize>();
+        all.missing.extend(columns().flat_map(|column| column.missing.iter().map(|(_, why)| *why)));
     }
-    Ok(pictures)
+    Ok(all)
 }
 
 /// The heatmap of a cell.
@@ -177,43 +171,28 @@ impl<'a> Draft<'a> {
         Self { environment, method, kind, columns }
     }
 
-    fn picture(&self, returns: &Range<f64>) -> HeatmapPicture {
+    /// Returns `None` if nothing is there.
+    fn picture(&self, returns: &Range<f64>) -> Option<Picture> {
         let Self { environment, method, kind, columns } = self;
-        let over = kind.map_or_else(String::new, |kind| {
-            let HeatmapKind { parameters: [x, y], base } = kind;
-            let drawn = if *base == perturb_protocol::Version::D {
-                String::new()
-            } else {
-                format!(", the others drawn from {base}")
-            };
-            format!(" over {x} and {y}{drawn}")
-        });
-        let of = format!("{environment}, {method}: mean return and success{over}");
-        let first = columns.iter().find_map(|column| column.mean.as_ref());
-        let tested = first.map(|Heatmap { grid, episodes, .. }| {
-            format!("{grid} × {grid} points of {}", count(*episodes as usize, "episode"))
-        });
-        let panels = first.zip(tested.as_ref()).map(|(heatmap, tested)| HeatmapPanels {
-            title: vec![format!("{environment}, {method}"), format!("{tested} of each policy; {}", heatmap.others())],
-            axes: heatmap.axes.clone(),
-            returns: returns.clone(),
-            columns: columns.iter().map(PictureColumn::panel).collect(),
-        });
-        HeatmapPicture {
+        let kind = (*kind)?;
+        let first = columns.iter().find_map(|column| column.mean.as_ref())?;
+        let HeatmapKind { parameters: [x, y], base } = kind;
+        let drawn = if *base == Version::D { String::new() } else { format!(", the others drawn from {base}") };
+        let name = format!("{environment}, {method}: mean return and success over {x} and {y}{drawn}");
+        let tested = format!("{0} × {0} points of {1}", first.grid, count(first.episodes as usize, "episode"));
+        Some(Picture {
             environment: (*environment).to_owned(),
-            file: kind.map_or_else(String::new, |kind| format!("{environment}-{}-heatmap-{kind}", file_name(method))),
-            caption: tested.map_or_else(|| format!("{of}: {}.", self.why()), |tested| self.caption(&of, &tested)),
-            name: of,
-            panels,
-            figures: self.figures(),
-            wanted: columns.iter().map(|column| column.policies).sum(),
-            missing: columns.iter().flat_map(|column| column.missing.iter().map(|(_, why)| *why)).collect(),
-        }
-    }
-
-    /// Why nothing is there.
-    fn why(&self) -> String {
-        said(self.columns.iter().flat_map(|column| &column.missing))
+            file: format!("{environment}-{}-heatmap-{kind}", file_name(method)),
+            caption: self.caption(&name, &tested),
+            name,
+            drawing: PictureDrawing::Heatmaps(HeatmapPanels {
+                title: vec![format!("{environment}, {method}"), format!("{tested} of each policy; {}", first.others())],
+                axes: first.axes.clone(),
+                returns: returns.clone(),
+                columns: columns.iter().map(PictureColumn::panel).collect(),
+            }),
+            data: self.table(kind),
+        })
     }
 
     fn caption(&self, of: &str, tested: &str) -> String {
@@ -231,14 +210,14 @@ impl<'a> Draft<'a> {
     }
 
     /// A line for each column and point.
-    fn figures(&self) -> Table {
+    fn table(&self, kind: &HeatmapKind) -> Table {
         let of_column = |column: &'_ PictureColumn<'a>| {
             let (trained_on, runs) = (column.trained_on.to_string(), column.origins.len());
             let points = column.mean.iter().flat_map(|mean| mean.points.clone());
             points.map(move |point| (trained_on.clone(), runs, point)).collect::<Vec<_>>()
         };
         let lines: Vec<(String, usize, HeatmapPoint)> = self.columns.iter().flat_map(of_column).collect();
-        let [x, y] = self.kind.map_or_else(Default::default, |kind| kind.parameters.clone());
+        let [x, y] = kind.parameters.clone();
         Table::builder(self.environment, &lines)
             .text("train", |(trained_on, ..)| trained_on)
             .number("runs", |(_, runs, _)| runs)
@@ -274,41 +253,29 @@ impl PictureColumn<'_> {
     }
 }
 
-impl HeatmapPicture {
-    /// Returns the figure for the page.
-    pub(super) fn figure(&self) -> Result<Figure, PlotError> {
-        let Self { environment, file, name, caption, panels, figures, .. } = self.clone();
-        let picture = match panels {
-            Some(panels) => FigureData::Svg { svg: svg(&panels)?, csv: figures.to_csv() },
-            None => FigureData::Missing,
-        };
-        Ok(Figure { environment, file, name, caption, picture })
-    }
-
-    /// Writes it into the folder `out` as SVG, PNG and CSV; whether there is something to write.
-    ///
-    /// # Errors
-    /// [`PlotError`].
-    fn save(&self, out: &Path) -> Result<bool, PlotError> {
-        let Some(panels) = &self.panels else { return Ok(false) };
-        save(panels, &out.join(&self.file))?;
-        write_atomically(&out.join(format!("{}.csv", self.file)), &self.figures.to_csv())?;
-        Ok(true)
+impl HeatmapPictures {
+    /// Returns advice about the missing heatmaps.
+    pub(super) fn advice(&self) -> Vec<String> {
+        let waiting = self.missing.iter().filter(|why| **why == NoHeatmap::NoResult).count();
+        let (makeable, all) = (self.missing.len() - waiting, self.total);
+        let make = format!(
+            "Heatmaps that are not there: {makeable} of {all}. `perturb heatmap DIR` makes them, where DIR is the folder \
+             of these results; `--x`, `--y` and `--base-version` say over what."
+        );
+        let wait = format!("Heatmaps that wait for the results of their trainings: {waiting} of {all}.");
+        let notes = [(makeable, make), (waiting, wait)].into_iter().filter(|(count, _)| *count > 0);
+        notes.map(|(_, advice)| advice).collect()
     }
 }
 
-/// Writes `pictures` into the folder `out`, and deletes those that it has of heatmaps that are gone; the names, without
+/// Writes all pictures into the folder `out`, and deletes those that it has of heatmaps that are gone; the names, without
 /// endings, of what was written.
 ///
 /// # Errors
 /// [`PlotError`].
-pub fn save_heatmaps<'a>(pictures: &'a [HeatmapPicture], out: &Path) -> Result<Vec<&'a str>, PlotError> {
-    let mut written = Vec::new();
-    for picture in pictures {
-        if picture.save(out)? {
-            written.push(picture.file.as_str());
-        }
-    }
+pub fn save_heatmaps<'a>(all: &'a HeatmapPictures, out: &Path) -> Result<Vec<&'a str>, PlotError> {
+    all.pictures.iter().try_for_each(|picture| picture.save(out))?;
+    let written: Vec<&str> = all.pictures.iter().map(|picture| picture.file.as_str()).collect();
     for path in list(out)? {
         let name = path.file_stem().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         if name.contains("-heatmap-") && !written.contains(&name.as_str()) {

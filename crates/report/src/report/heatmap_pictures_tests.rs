@@ -1,10 +1,12 @@
 use perturb_experiment::{Cell, Plan, add_assessed, store_heatmap};
+use perturb_files::write_atomically;
 use perturb_protocol::Version;
 use perturb_records::{ExternalEvaluation, ExternalPolicy, HeatmapOptions, RecordedTest};
 use perturb_settings::sets::{Context, Contexts, TestSet};
 
 use super::*;
 use crate::fixture;
+use crate::plot::svg;
 
 const PLAN: &str = "environments = ['Pendulum', 'Elsewhere']\nruns = 2
     [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
@@ -29,7 +31,12 @@ fn store(folder: &Folder, cell: &Cell, heatmap: &Heatmap) {
     store_heatmap(folder, cell, "1".into(), options, heatmap).unwrap();
 }
 
-fn pictures(plan: &Plan, folder: &Folder) -> Vec<HeatmapPicture> {
+fn panels(picture: &Picture) -> &HeatmapPanels {
+    let PictureDrawing::Heatmaps(panels) = &picture.drawing else { unreachable!("heatmaps") };
+    panels
+}
+
+fn pictures(plan: &Plan, folder: &Folder) -> HeatmapPictures {
     let results = fixture::results(plan, |_| Some(([0.0; 3], 0.0)));
     heatmap_pictures(&results.select(), Some(folder)).unwrap()
 }
@@ -58,9 +65,9 @@ fn a_picture_is_of_the_mean_over_runs_and_says_how_many() {
     let made = |cell: &Cell| (is_of(cell, "Pendulum", "a2c") && is_there(cell)).then(|| trained(cell));
     let directory = folder(&plan, made);
     let pictures = pictures(&plan, &Folder::new(directory.path()));
-    assert_eq!(pictures.len(), 4, "of two environments and methods");
-    let picture = &pictures[0];
-    let panels = picture.panels.as_ref().unwrap();
+    assert_eq!(pictures.pictures.len(), 1, "nothing of PPO and in the other environment");
+    let picture = &pictures.pictures[0];
+    let panels = panels(picture);
     let captions: Vec<&str> = panels.columns.iter().map(|column| column.caption.as_str()).collect();
     assert_eq!(captions, ["trained on D, 2 runs", "trained on R, 1 of 2 runs", "trained on E, 0 of 2 runs"]);
     let runs: Vec<Heatmap> = plan.cells.iter().filter_map(made).collect();
@@ -77,17 +84,11 @@ fn a_picture_is_of_the_mean_over_runs_and_says_how_many() {
          made, run 2: the heatmap has not been made). 6 × 6 points of 20 episodes of each policy, test seeds 1, 2. perturb \
          VERSION."
     );
-    assert_eq!((picture.wanted, picture.missing.len()), (6, 3));
-    let csv = String::from_utf8(picture.figures.to_csv()).unwrap();
+    assert_eq!((pictures.total, pictures.missing.len()), (24, 3 + 18));
+    let csv = String::from_utf8(picture.data.to_csv()).unwrap();
     assert!(csv.starts_with("train,runs,mass,length,mean_return,success_percent\nD,2,0.5833333333333334,"), "{csv}");
     assert_eq!((csv.lines().count(), csv.lines().filter(|line| line.starts_with("R,1,")).count()), (73, 36));
 
-    let nothing = &pictures[1];
-    assert_eq!((&nothing.panels, nothing.missing.len()), (&None, 6), "nothing of PPO");
-    assert_eq!(
-        nothing.caption,
-        "Pendulum, ppo ff: mean return and success over mass and length: the heatmap has not been made."
-    );
     let out = tempfile::tempdir().unwrap();
     let others = ["iqm.csv", "Pendulum-a2c-ff-heatmap-mass-length-R.svg"];
     for name in others {
@@ -117,10 +118,9 @@ fn returns_use_the_environments_scale() {
     let cell = plan.cells.iter().find(|cell| is_of(cell, "Pendulum", "ppo")).unwrap();
     store(&folder, cell, &Heatmap { base: Version::R, ..fixture::heatmap(3, |_, _| (-9000.0, 0.0)) });
     let pictures = pictures(&plan, &folder);
-    let scales: Vec<_> = pictures
-        .iter()
-        .filter_map(|picture| Some((picture.file.as_str(), picture.panels.as_ref()?.returns.clone())))
-        .collect();
+    let pictures = pictures.pictures;
+    let scales: Vec<_> =
+        pictures.iter().map(|picture| (picture.file.as_str(), panels(picture).returns.clone())).collect();
     let (pendulum, elsewhere) = (-1600.0..-200.0, 5.7..6.3);
     assert_eq!(
         scales,
@@ -134,7 +134,7 @@ fn returns_use_the_environments_scale() {
     );
     let drawn = pictures.iter().find(|picture| picture.file == "Pendulum-ppo-ff-heatmap-mass-length-R").unwrap();
     assert!(drawn.caption.contains("over mass and length, the others drawn from R."), "{}", drawn.caption);
-    assert!(drawn.panels.as_ref().unwrap().title[1].ends_with("other parameters drawn from R"));
+    assert!(panels(drawn).title[1].ends_with("other parameters drawn from R"));
 }
 
 #[test]
@@ -144,10 +144,9 @@ fn mean_needs_equal_points_and_episodes() {
     for other in [fixture::heatmap(3, |_, _| (9.0, 9.0)), Heatmap { episodes: 5, ..first.clone() }] {
         let directory = folder(&plan, |cell| Some(if cell.run == 1 { first.clone() } else { other.clone() }));
         let pictures = pictures(&plan, &Folder::new(directory.path()));
-        let panels = pictures[0].panels.as_ref().unwrap();
-        assert!(panels.columns.iter().all(|column| column.content.as_ref() == Ok(&first)));
-        assert_eq!(pictures[0].missing, [NoHeatmap::NotAlike; 3]);
-        assert!(pictures[0].caption.contains("1 of 2 runs trained on E (run 2: the heatmap has another grid"));
+        assert!(panels(&pictures.pictures[0]).columns.iter().all(|column| column.content.as_ref() == Ok(&first)));
+        assert_eq!(pictures.missing, [NoHeatmap::NotAlike; 12]);
+        assert!(pictures.pictures[0].caption.contains("1 of 2 runs trained on E (run 2: the heatmap has another grid"));
     }
 }
 
@@ -158,15 +157,10 @@ fn of_an_experiment_without_heatmaps_it_is_said_why() {
     let folder = Folder::new(directory.path());
     let results = fixture::results(&plan, |cell| is_of(cell, "Pendulum", "a2c").then_some(([0.0; 3], 0.0)));
     let pictures = heatmap_pictures(&results.select(), Some(&folder)).unwrap();
-    let captions: Vec<&str> = pictures.iter().map(|picture| picture.caption.as_str()).collect();
-    assert_eq!(captions.len(), 4);
-    assert_eq!(captions[0], "Pendulum, a2c ff: mean return and success: the heatmap has not been made.");
-    assert!(
-        captions[1..].iter().all(|caption| caption.ends_with("no heatmap, since this training has no result yet."))
-    );
-    assert!(
-        pictures.iter().all(|picture| picture.panels.is_none() && picture.wanted == 6 && picture.missing.len() == 6)
-    );
+    assert_eq!((pictures.pictures.len(), pictures.total), (0, 24));
+    let advice = pictures.advice();
+    assert!(advice[0].starts_with("Heatmaps that are not there: 6 of 24."), "{advice:?}");
+    assert_eq!(advice[1], "Heatmaps that wait for the results of their trainings: 18 of 24.");
 }
 
 /// An agent whose policies were tested over mass and length, four episodes a point: of each what it was trained on, and how
@@ -197,10 +191,10 @@ fn external_agents_have_heatmap_pictures() {
     let alone = heatmap_pictures(&selections, Some(&Folder::new(directory.path()))).unwrap();
     add_assessed(&mut selections, &assessed);
     let pictures = heatmap_pictures(&selections, Some(&Folder::new(directory.path()))).unwrap();
-    let (here, elsewhere): (Vec<_>, Vec<_>) = pictures.into_iter().partition(|it| !it.name.contains("pushes"));
-    assert_eq!(here, alone, "those of cells are the same");
+    let (here, elsewhere): (Vec<_>, Vec<_>) = pictures.pictures.into_iter().partition(|it| !it.name.contains("pushes"));
+    assert_eq!(here, alone.pictures, "those of cells are the same");
     assert_eq!(elsewhere.len(), 1);
-    let panels = elsewhere[0].panels.as_ref().unwrap();
+    let panels = panels(&elsewhere[0]);
     let captions: Vec<&str> = panels.columns.iter().map(|column| column.caption.as_str()).collect();
     assert_eq!(captions, ["trained on D, 2 runs", "trained on E, 1 run"]);
     let success = |column: usize| panels.columns[column].content.as_ref().unwrap().points[0].success_percent;
@@ -211,12 +205,12 @@ fn external_agents_have_heatmap_pictures() {
     // By itself, without an experiment.
     let mut selections = Vec::new();
     add_assessed(&mut selections, &assessed);
-    assert_eq!(heatmap_pictures(&selections, None).unwrap(), elsewhere);
+    assert_eq!(heatmap_pictures(&selections, None).unwrap().pictures, elsewhere);
     // What was tested on other sets has none.
     let mut others = assessed[1].policies()[0].clone();
     others.records.about.tests.iter_mut().for_each(|test| test.axes = None);
     let others = [ExternalEvaluation::new(String::new(), "other".into(), vec![others]).unwrap()];
     let mut selections = Vec::new();
     add_assessed(&mut selections, &others);
-    assert_eq!(heatmap_pictures(&selections, None).unwrap(), []);
+    assert_eq!(heatmap_pictures(&selections, None).unwrap().pictures, []);
 }

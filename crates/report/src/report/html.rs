@@ -2,30 +2,28 @@
 //! lead to.
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
+use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, percent_encode};
+use perturb_experiment::BudgetAxis;
 use perturb_text::{Column, Entry, Table};
 
-use super::links::data_uri;
-use super::{Figure, FigureData, Figures, MISSING, Report};
-use crate::plot;
+use super::{MISSING, Picture, PictureDrawing, Report, ReportBundle};
+use crate::plot::{self, CurveQuantity, PlotError, draw_curves, svg};
 
 pub(super) const STYLE: &str = include_str!("style.css");
 const METRICS: &str = "Default is the success rate of policies that were trained and tested on D, Interpolation that of \
                        policies trained and tested on R. Extrapolation is the geometric mean of three: trained on D and \
                        tested on R, trained on D and tested on E, trained on R and tested on E.";
-const HEATMAPS: &str = "How the selected policies do over two parameters: means over runs. Colours are mean return and success \
-                        rate, the same in all pictures of an environment; what lies beyond their scale has the colour of its \
-                        end. Boxes are R's and E's, the ring is D.";
-const COMPARISONS: &str = "Runs of two methods with the same seed, in each of the environments. P(X > Y) is the probability that \
-                           a run of X is better than one of Y, where equal ones count half. Corrected p-values up to 0.05 \
-                           are, all together, wrong with a probability of 5 % at most.";
-const GAINS: &str = "Policies of the same method and seed, one trained on R and one on D, each with the configuration that was \
-                     selected for what it was trained on, both tested on E, where neither was trained.";
-const WORST: &str = "Mean return of the worst tenth of a test's episodes, and success in those parts of the parameter space that \
-                     hold the worst tenth of contexts: half of the episodes say which these are, the other half their \
-                     success. From recorded episodes; mean and deviation over runs.";
-const FOOTING: &str = "How long the selected trainings were, of all environments together, and the success rate in training \
-                       after as many steps, and as many episodes, as the trainings of all methods have.";
-const SCENARIOS: &str = "The darker, the higher the success rate.";
+const SCENARIOS: &str = "Mean ± standard deviation over runs, and in brackets how well the episodes determine the rate of \
+                         these policies. The darker, the higher the success rate.";
+const STATISTICS: &str = "Pairs are runs of two methods with the same seed, in each of the environments. P(X > Y) is the \
+                          probability that a run of X is better than one of Y, where equal ones count half. Corrected \
+                          p-values up to 0.05 are, all together, wrong with a probability of 5 % at most.";
+const SURFACES: &str = "How the selected policies do over parameters. Heatmaps are means over runs; colours are mean return \
+                        and success rate, the same in all pictures of an environment; what lies beyond their scale has the \
+                        colour of its end. Boxes are R's and E's, the ring is D.";
+/// Characters of a file that its address writes in hexadecimal digits.
+const ENCODED: &AsciiSet =
+    &NON_ALPHANUMERIC.remove(b'-').remove(b'_').remove(b'.').remove(b',').remove(b'/').remove(b'=');
 /// Length from which a text is broken into lines, bytes.
 const LONG: usize = 60;
 
@@ -33,7 +31,7 @@ const LONG: usize = 60;
 struct Section {
     id: &'static str,
     title: &'static str,
-    notes: Markup,
+    notes: &'static str,
     subsections: Vec<Subsection>,
 }
 
@@ -42,64 +40,75 @@ struct Subsection {
     content: Markup,
 }
 
-/// The page.
-pub fn html(report: &Report<'_>, figures: &Figures) -> String {
-    let plain = |table: Table| table_subsection(&table, false);
-    let shaded = |table: Table| table_subsection(&table, true);
-    let section = |id, title, notes, subsections| Section { id, title, notes, subsections };
-    let tables = |tables: Vec<Table>| tables.into_iter().map(plain).collect();
-    let said = |text: &str| html! { p { (text) } };
-    let gap_and_profiles = report.gap_table().into_iter().map(plain).chain(by_environment(&figures.profiles)).collect();
-    let cells = report.tuned_table().into_iter().chain(report.selected_table()).chain(report.failure_table());
-    let elsewhere = report.elsewhere_table().into_iter().collect();
-    let cells = cells.map(plain).collect();
-    let marks = report.marks_table().into_iter().map(plain).chain(by_environment(&figures.marks)).collect();
-    let metrics = metrics(report, &figures.metrics);
-    let settings = report.settings_table().into_iter().map(plain).chain(by_environment(&figures.settings)).collect();
-    let scenarios = report.scenario_tables().into_iter().map(shaded).collect();
-    let worst = report.worst_tables().into_iter().map(shaded).collect();
-    let comparisons = report.comparisons_table().into_iter().collect();
-    let gains = report.gains_table().into_iter().map(plain).chain(by_environment(&figures.gains)).collect();
-    let sets = report.set_table().into_iter().collect();
-    let heatmap_notes = html! { p { (HEATMAPS) } };
-    let sections = [
-        section("metrics", "Default, Interpolation, Extrapolation", said(METRICS), metrics),
-        section("iqm", "Interquartile means", html! {}, report.iqm_table().into_iter().map(plain).collect()),
-        section("profiles", "Optimality gap and performance profiles", html! {}, gap_and_profiles),
-        section("comparisons", "Methods in pairs", said(COMPARISONS), tables(comparisons)),
-        section("gains", "What training on R brings", said(GAINS), gains),
-        section("extrapolation", "What Extrapolation is made of", html! {}, tables(report.extrapolation_tables())),
-        section("scenarios", "The nine scenarios", said(SCENARIOS), scenarios),
-        section("worst", "The worst tenth", said(WORST), worst),
-        section("parameters", "Success over parameters", html! {}, by_environment(&figures.parameters)),
-        section("thresholds", "Success over the threshold", html! {}, by_environment(&figures.thresholds)),
-        section("sets", "Own sets of parameters", html! {}, tables(sets)),
-        section("marks", "Generalisation against training", html! {}, marks),
-        section("settings", "What settings do", html! {}, settings),
-        section("footing", "Trainings on an equal footing", said(FOOTING), tables(report.footing_tables())),
-        section("curves", "Training curves", html! {}, by_environment(&figures.curves)),
-        section("heatmaps", "Heatmaps", heatmap_notes, by_environment(&figures.heatmaps)),
-        section("cells", "Cells", html! {}, cells),
-        section("elsewhere", "Trained elsewhere", html! {}, tables(elsewhere)),
-    ];
-    let shown: Vec<&Section> = sections.iter().filter(|section| !section.subsections.is_empty()).collect();
-    let missing: Vec<String> = figures.no_curves.iter().chain(&figures.no_heatmaps).cloned().collect();
-    page(report, &figures.finding, &shown, &missing).into_string()
-}
+impl ReportBundle<'_> {
+    /// Everything as one HTML page that needs nothing else.
+    ///
+    /// # Errors
+    /// [`PlotError`].
+    pub fn page(&self) -> Result<String, PlotError> {
+        let report = &self.report;
+        let finding = report.finding_pictures().iter().map(figure).collect::<Result<Vec<_>, _>>()?;
+        let tables = report.iqm_table().into_iter().chain(report.comparisons_table());
+        let mut statistics: Vec<_> = tables.map(|table| table_subsection(&table, false)).collect();
+        statistics.extend(by_environment(&Vec::from_iter(report.profiles_picture()))?);
+        let scenarios = report.scenario_tables().iter().map(|table| table_subsection(table, true)).collect();
+        let mut surfaces = report.parameter_pictures();
+        surfaces.extend(self.heatmaps.pictures.iter().cloned());
+        let place = |name: &str| report.scope.environments.iter().position(|known| *known == name);
+        surfaces.sort_by_key(|picture| place(&picture.environment));
+        let section = |id, title, notes, subsections| Section { id, title, notes, subsections };
+        let sections = [
+            section("metrics", "Default, Interpolation, Extrapolation", METRICS, self.metrics()?),
+            section("scenarios", "The nine scenarios", SCENARIOS, scenarios),
+            section("statistics", "Statistics over environments", STATISTICS, statistics),
+            section("curves", "Training curves", "", by_environment(&self.curve_pictures())?),
+            section("heatmaps", "Success over parameters", SURFACES, by_environment(&surfaces)?),
+        ];
+        let shown: Vec<&Section> = sections.iter().filter(|section| !section.subsections.is_empty()).collect();
+        let without = self.curves.iter().filter(|of| of.curves.is_empty());
+        let without = without.map(|of| format!("{}: no training with a result has its monitor.csv.", of.environment));
+        let missing: Vec<String> = without.chain(self.heatmaps.advice()).collect();
+        Ok(page(report, &finding, &shown, &missing).into_string())
+    }
 
-/// Tables, of each environment with its figure.
-fn metrics(report: &Report<'_>, figures: &[Figure]) -> Vec<Subsection> {
-    let with_figure = |table: Table| {
-        let Subsection { title, content } = table_subsection(&table, false);
-        let figures: Vec<&Figure> = figures.iter().filter(|figure| figure.environment == title).collect();
-        Subsection { title, content: html! { (content) @if !figures.is_empty() { (figure_grid(&figures)) } } }
-    };
-    let ties = report.ties_table().map(|table| table_subsection(&table, false));
-    report.metrics_tables().into_iter().map(with_figure).chain(ties).collect()
+    /// Tables, of each environment with its figure.
+    fn metrics(&self) -> Result<Vec<Subsection>, PlotError> {
+        let pictures = self.report.environment_pictures();
+        let with_figure = |table: Table| {
+            let Subsection { title, content } = table_subsection(&table, false);
+            let own: Vec<_> = pictures.iter().filter(|picture| picture.environment == title).cloned().collect();
+            let figures = figures(&own)?;
+            Ok(Subsection { title, content: html! { (content) (figures) } })
+        };
+        self.report.metrics_tables().into_iter().map(with_figure).collect()
+    }
+
+    fn curve_pictures(&self) -> Vec<Picture> {
+        let mut pictures = Vec::new();
+        for curves in self.curves.iter().filter(|of| !of.curves.is_empty()) {
+            let environment = &curves.environment;
+            let both = BudgetAxis::ALL.into_iter().flat_map(|by| CurveQuantity::ALL.map(|quantity| (by, quantity)));
+            pictures.extend(both.map(|(by, quantity)| {
+                let panels = draw_curves(curves, quantity, by);
+                let name = format!("{environment}: {quantity} while training, over {by}");
+                Picture {
+                    environment: environment.clone(),
+                    file: format!("{environment}-{quantity}-over-{by}"),
+                    caption: format!(
+                        "{name}, of the selected configurations. Lines are means over runs, bands their standard deviation."
+                    ),
+                    name,
+                    data: panels.table(),
+                    drawing: PictureDrawing::Panels(panels),
+                }
+            }));
+        }
+        pictures
+    }
 }
 
 /// Results come first, and last how they were made and which figures are missing.
-fn page(report: &Report<'_>, finding: &[Figure], sections: &[&Section], missing: &[String]) -> Markup {
+fn page(report: &Report<'_>, finding: &[Markup], sections: &[&Section], missing: &[String]) -> Markup {
     let title = report.title();
     html! {
         (DOCTYPE)
@@ -127,13 +136,13 @@ fn page(report: &Report<'_>, finding: &[Figure], sections: &[&Section], missing:
                     }
                     section id="finding" aria-label="Finding" {
                         @for said in report.finding_sentences() { p { (prose(&said)) } }
-                        @for one in finding { div.opening { (figure(one)) } }
+                        @for one in finding { div.opening { (one) } }
                     }
                     @for section in sections { (section.body()) }
                     section id="provenance" {
                         h2 { "Provenance" }
-                        (facts(report))
-                        div.notes { @for line in &report.overview { p { (prose(line)) } } (list(missing)) }
+                        (plan(report))
+                        div.notes { @for line in &report.provenance { p { (prose(line)) } } (list(missing)) }
                     }
                 }
             }
@@ -141,20 +150,18 @@ fn page(report: &Report<'_>, finding: &[Figure], sections: &[&Section], missing:
     }
 }
 
-/// Names with what there is to say, and the plan's files.
-fn facts(report: &Report<'_>) -> Markup {
+/// The plan's date and files.
+fn plan(report: &Report<'_>) -> Markup {
     html! {
-        dl.facts {
-            @if !report.plan.text.is_empty() {
-                dt { "plan" }
-                dd {
-                    @for (i, (name, content)) in report.plan.files().enumerate() {
-                        @if i > 0 { ", " }
-                        a download=(name) href=(data_uri("text/plain", content)) { (name) }
-                    }
+        @if !report.plan.text.is_empty() {
+            p.notes {
+                @if !report.plan.date.is_empty() { (report.plan.date) ". " }
+                "Plan: "
+                @for (i, (name, content)) in report.plan.files().enumerate() {
+                    @if i > 0 { ", " }
+                    a download=(name) href=(data_uri("text/plain", content)) { (name) }
                 }
             }
-            @for (name, said) in report.facts() { dt { (name) } dd { (prose(&said)) } }
         }
     }
 }
@@ -186,12 +193,9 @@ impl Section {
         html! {
             section id=(self.id) {
                 h2 { (self.title) }
-                (self.notes)
-                // Tables of few columns stand side by side where there is room.
-                div class=[(self.id == "scenarios").then_some("columns")] {
-                    @for (i, subsection) in self.subsections.iter().enumerate() {
-                        div id=(self.subsection_id(i)) { (subsection.content) }
-                    }
+                @if !self.notes.is_empty() { p { (self.notes) } }
+                @for (i, subsection) in self.subsections.iter().enumerate() {
+                    div id=(self.subsection_id(i)) { (subsection.content) }
                 }
             }
         }
@@ -267,43 +271,42 @@ fn classes(names: &[(&str, bool)]) -> Option<String> {
     (!applying.is_empty()).then(|| applying.join(" "))
 }
 
-fn by_environment(figures: &[Figure]) -> Vec<Subsection> {
-    let of_environments = figures.chunk_by(|a, b| a.environment == b.environment);
-    let subsection = |of: &[Figure]| Subsection {
-        title: of[0].environment.clone(),
-        content: html! {
-            @if !of[0].environment.is_empty() { h3 { (of[0].environment) } }
-            (figure_grid(&of.iter().collect::<Vec<_>>()))
-        },
+fn by_environment(pictures: &[Picture]) -> Result<Vec<Subsection>, PlotError> {
+    let subsection = |of: &[Picture]| {
+        let (title, figures) = (of[0].environment.clone(), figures(of)?);
+        let content = html! { @if !title.is_empty() { h3 { (title) } } (figures) };
+        Ok(Subsection { title, content })
     };
-    of_environments.map(subsection).collect()
+    pictures.chunk_by(|a, b| a.environment == b.environment).map(subsection).collect()
 }
 
 /// Side by side where there is room.
-fn figure_grid(figures: &[&Figure]) -> Markup {
-    html! { div.figures { @for one in figures { (figure(one)) } } }
+fn figures(pictures: &[Picture]) -> Result<Markup, PlotError> {
+    let figures = pictures.iter().map(figure).collect::<Result<Vec<_>, _>>()?;
+    Ok(html! { @if !figures.is_empty() { div.figures { @for one in figures { (one) } } } })
 }
 
-fn figure(Figure { file, name, caption, picture, .. }: &Figure) -> Markup {
-    html! {
-        figure class=[matches!(picture, FigureData::Missing).then_some("missing")] {
-            @match picture {
-                FigureData::Missing => figcaption { (caption) },
-                FigureData::Svg { svg, csv } => {
-                    // Named for those who do not see it.
-                    div role="img" aria-label=(name) { (PreEscaped(svg)) }
-                    figcaption {
-                        (caption)
-                        span.files {
-                            a download=(format!("{file}.svg")) href=(data_uri("image/svg+xml", svg.as_bytes())) { "SVG" }
-                            " "
-                            a download=(format!("{file}.csv")) href=(data_uri("text/csv", csv)) { "CSV" }
-                        }
-                    }
+fn figure(Picture { file, name, caption, drawing, data, .. }: &Picture) -> Result<Markup, PlotError> {
+    let svg = svg(drawing)?;
+    Ok(html! {
+        figure {
+            // Named for those who do not see it.
+            div role="img" aria-label=(name) { (PreEscaped(&svg)) }
+            figcaption {
+                (caption)
+                span.files {
+                    a download=(format!("{file}.svg")) href=(data_uri("image/svg+xml", svg.as_bytes())) { "SVG" }
+                    " "
+                    a download=(format!("{file}.csv")) href=(data_uri("text/csv", &data.to_csv())) { "CSV" }
                 }
             }
         }
-    }
+    })
+}
+
+/// An address that has `content` in it, so that links lead somewhere wherever the page is.
+fn data_uri(media_type: &str, content: &[u8]) -> String {
+    format!("data:{media_type};charset=utf-8,{}", percent_encode(content, ENCODED))
 }
 
 fn list(notes: &[String]) -> Markup {

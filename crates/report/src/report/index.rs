@@ -1,5 +1,7 @@
 //! Rows and columns of a report, from its plan and from externally trained agents.
 
+use std::collections::BTreeSet;
+
 use perturb_experiment::{MethodResults, Plan, distinct, elsewhere};
 use perturb_protocol::Version;
 use perturb_records::TrainedOn;
@@ -14,7 +16,7 @@ pub(super) struct ReportIndex<'a> {
     pub(super) environments: Vec<&'a str>,
     /// All that have rows.
     pub(super) methods: Vec<Method>,
-    /// The names of what was tested on, versions first.
+    /// The names of what was tested on.
     pub(super) tested_on: Vec<&'a str>,
 }
 
@@ -26,7 +28,9 @@ impl<'a> ReportIndex<'a> {
         let assessed = elsewhere(selections);
         let of_others = assessed.iter().flat_map(|(_, policy, _)| &policy.records.about.tests).map(|test| &test.set);
         let mut tested_on = distinct(of_plan.chain(of_others).map(|set| set.name.as_str()));
-        tested_on.sort_by_key(|name| version(name).map_or(Version::KNOWN.len(), |version| version as usize));
+        // Of agents alone, their own sets come first.
+        let set = if plan.cells.is_empty() { -1 } else { Version::KNOWN.len() as i32 };
+        tested_on.sort_by_key(|name| version(name).map_or(set, |version| version as i32));
         Self { averaged, environments, methods: distinct(selections.iter().map(|row| row.method.clone())), tested_on }
     }
 }
@@ -38,14 +42,11 @@ pub(super) fn version(name: &str) -> Option<Version> {
 
 /// Whether a row has places among the scenarios: nobody knows what some agents were trained on.
 pub(super) fn has_scenarios(row: &MethodResults<'_>) -> bool {
-    !row.method.external || Version::KNOWN.into_iter().any(|version| is_trained_on(row, version))
+    !row.method.external || trained_on(row).iter().any(|one| matches!(one, TrainedOn::Version(_)))
 }
 
-/// Whether a row of tables of scenarios is wanted: of agents that were trained elsewhere what was trained on is all.
-pub(super) fn has_scenarios_of(row: &MethodResults<'_>, version: Version) -> bool {
-    !row.method.external || is_trained_on(row, version)
-}
-
-fn is_trained_on(row: &MethodResults<'_>, version: Version) -> bool {
-    row.runs.values().any(|run| run.selected.contains_key(&TrainedOn::Version(version)))
+/// Returns what the policies of a row were trained on. A run of an agent that was trained elsewhere may lack what another
+/// one has.
+pub(super) fn trained_on<'a>(row: &MethodResults<'a>) -> BTreeSet<TrainedOn<'a>> {
+    row.runs.values().flat_map(|run| run.selected.keys().copied()).collect()
 }

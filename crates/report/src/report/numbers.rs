@@ -10,7 +10,7 @@ use perturb_records::statistics::{Bootstrapped, Summary, interquartile_mean, mea
 use perturb_records::{Metric, Scenario, TestResult, TrainedOn, paper};
 use perturb_settings::Method;
 
-use super::index::{ReportIndex, has_scenarios, version};
+use super::index::{ReportIndex, has_scenarios};
 
 /// Resamples of a bootstrap, as many as rliable takes.
 const RESAMPLES: usize = 50_000;
@@ -43,16 +43,6 @@ pub(super) struct MethodMetrics<'a> {
     pub(super) reselected: BTreeMap<Metric, [Bootstrapped; 2]>,
     pub(super) done: usize,
     pub(super) cells: usize,
-}
-
-/// A test that the paper has no place for: of a policy that was trained on one of the plan's own sets, or on one.
-pub(super) struct SetTest<'a> {
-    pub(super) environment: &'a str,
-    pub(super) method: &'a Method,
-    pub(super) trained_on: TrainedOn<'a>,
-    pub(super) tested_on: &'a str,
-    pub(super) success: Option<Summary>,
-    pub(super) mean_return: Option<Summary>,
 }
 
 impl MethodMetrics<'_> {
@@ -133,38 +123,10 @@ pub(super) fn averages<'a>(
     methods.cloned().map(of_method).collect()
 }
 
-/// In the order of `selections`, of what they were trained on, and of the plan's tests.
-pub(super) fn set_tests<'a>(scope: &ReportIndex<'a>, selections: &'a [MethodResults<'a>]) -> Vec<SetTest<'a>> {
-    let mut tests = Vec::new();
-    for selection in selections {
-        // A run of an agent that was trained elsewhere may lack what another one has.
-        let trained: BTreeSet<TrainedOn<'a>> =
-            selection.runs.values().flat_map(|run| run.selected.keys().copied()).collect();
-        for trained_on in trained {
-            let is_of_set = !matches!(trained_on, TrainedOn::Version(_));
-            let names = scope.tested_on.iter().filter(|name| is_of_set || version(name).is_none());
-            let is_wanted = |test: &SetTest<'_>| !test.method.external || test.success.is_some();
-            tests.extend(
-                names
-                    .map(|&tested_on| SetTest {
-                        environment: selection.environment,
-                        method: &selection.method,
-                        trained_on,
-                        tested_on,
-                        success: selection.test(trained_on, tested_on, |test| test.success_percent),
-                        mean_return: selection.test(trained_on, tested_on, |test| test.mean_return),
-                    })
-                    .filter(is_wanted),
-            );
-        }
-    }
-    tests
-}
-
-/// The test episodes of a scenario, of all runs and tied configurations together.
-pub(super) fn counted(selection: &MethodResults<'_>, Scenario { train, test }: Scenario) -> Counted {
-    let trained = selection.runs.values().flat_map(|run| run.tied_on(TrainedOn::Version(train)));
-    let tests = trained.filter_map(|selected| selected.test(&test.to_string()));
+/// The test episodes of all runs and tied configurations together.
+pub(super) fn counted(selection: &MethodResults<'_>, trained_on: TrainedOn<'_>, tested_on: &str) -> Counted {
+    let trained = selection.runs.values().flat_map(|run| run.tied_on(trained_on));
+    let tests = trained.filter_map(|selected| selected.test(tested_on));
     let of = |test: &TestResult| Counted {
         successes: (test.success_percent * test.episodes as f64 / 100.0).round() as u64,
         episodes: test.episodes,

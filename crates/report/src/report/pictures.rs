@@ -8,9 +8,7 @@ use perturb_text::Table;
 use plotters::coord::Shift;
 use plotters::prelude::{DrawingArea, DrawingBackend};
 
-use super::Report;
-use super::figure::{Figure, FigureData};
-use crate::plot::{IntervalPlot, Panels, Plot, PlotError, save, svg};
+use crate::plot::{HeatmapPanels, IntervalPlot, Panels, Plot, PlotError, save};
 
 /// A picture.
 #[derive(Clone, Debug, PartialEq)]
@@ -36,6 +34,8 @@ pub enum PictureDrawing {
     Panels(Panels),
     /// Numbers with intervals.
     Intervals(IntervalPlot),
+    /// Surfaces over two parameters.
+    Heatmaps(HeatmapPanels),
 }
 
 impl Plot for PictureDrawing {
@@ -43,6 +43,7 @@ impl Plot for PictureDrawing {
         match self {
             Self::Panels(panels) => panels.height(),
             Self::Intervals(intervals) => intervals.height(),
+            Self::Heatmaps(heatmaps) => heatmaps.height(),
         }
     }
 
@@ -50,18 +51,19 @@ impl Plot for PictureDrawing {
         match self {
             Self::Panels(panels) => panels.draw(area, scale),
             Self::Intervals(intervals) => intervals.draw(area, scale),
+            Self::Heatmaps(heatmaps) => heatmaps.draw(area, scale),
+        }
+    }
+
+    fn finish(&self, svg: String) -> String {
+        match self {
+            Self::Heatmaps(heatmaps) => heatmaps.finish(svg),
+            Self::Panels(_) | Self::Intervals(_) => svg,
         }
     }
 }
 
 impl Picture {
-    /// Returns the figure for the page.
-    pub(super) fn figure(&self) -> Result<Figure, PlotError> {
-        let Self { environment, file, name, caption, drawing, data } = self.clone();
-        let picture = FigureData::Svg { svg: svg(&drawing)?, csv: data.to_csv() };
-        Ok(Figure { environment, file, name, caption, picture })
-    }
-
     /// Writes it into the folder `out` as SVG, PNG and CSV.
     ///
     /// # Errors
@@ -69,17 +71,6 @@ impl Picture {
     pub fn save(&self, out: &Path) -> Result<(), PlotError> {
         save(&self.drawing, &out.join(&self.file))?;
         Ok(write_atomically(&out.join(format!("{}.csv", self.file)), &self.data.to_csv())?)
-    }
-}
-
-impl Report<'_> {
-    /// All of them: what the page opens with, performance profiles, what training on R brings, success over parameters and
-    /// over the threshold, what settings do, as far as there are numbers.
-    pub fn pictures(&self) -> Vec<Picture> {
-        let finding = self.finding_pictures().into_iter().chain(self.environment_pictures());
-        let profiles = finding.chain(self.profiles_picture()).chain(self.gains_picture());
-        let swept = self.parameter_pictures().into_iter().chain(self.threshold_pictures());
-        profiles.chain(swept).chain(self.settings_pictures()).collect()
     }
 }
 

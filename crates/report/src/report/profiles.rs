@@ -83,7 +83,6 @@ impl Report<'_> {
             y_name: "share of runs, %".into(),
             y: RATES,
             lines: self.profiles.iter().filter(|profile| profile.metric == metric).map(line).collect(),
-            mark: None,
         };
         Some(Picture {
             environment: String::new(),

@@ -4,16 +4,20 @@
 use std::path::{Path, PathBuf};
 
 use perturb_experiment::{
-    CellStates, EnvironmentCurves, Folder, FolderError, Plan, PlanError, Recorded, Results, Selection, StudyResults,
-    VerifyError, add_assessed, judged_as_in, read_curves, verify,
+    CellStates, EnvironmentCurves, ExportError, Folder, FolderError, Plan, PlanError, Recorded, Results, Selection,
+    StudyResults, add_assessed, export, judged_as_in, read_curves,
 };
 use perturb_records::{
-    ExternalEvaluation, ExternalEvaluationError, RecordsError, ResultsTable, StudyEpisodes, TableError,
+    ExternalEvaluation, ExternalEvaluationError, FILE, ParameterCheck, Records, RecordsError, ResultsTable,
+    StudyEpisodes, TableError,
 };
 use perturb_settings::ValueError;
 
-use super::{Figures, HeatmapPicture, Report, heatmap_pictures, html};
+use super::{HeatmapPictures, Report, heatmap_pictures};
 use crate::plot::PlotError;
+
+/// The name of a folder's study in its table.
+const EXPORTED: &str = "experiment";
 
 /// The inputs of a report.
 #[derive(Clone, Debug, Default)]
@@ -55,7 +59,7 @@ pub enum ReportError {
     #[error(transparent)]
     Value(#[from] ValueError),
     #[error(transparent)]
-    Verify(#[from] VerifyError),
+    Export(#[from] ExportError),
     #[error(transparent)]
     Records(#[from] RecordsError),
     #[error(transparent)]
@@ -85,7 +89,7 @@ pub struct ReportBundle<'a> {
     /// The training curves.
     pub curves: &'a [EnvironmentCurves],
     /// The heatmaps.
-    pub heatmaps: &'a [HeatmapPicture],
+    pub heatmaps: &'a HeatmapPictures,
 }
 
 impl ReportInputs {
@@ -133,11 +137,13 @@ impl ReportInputs {
     /// [`ReportError`], and those of `make`.
     pub fn read<T, E: From<ReportError>>(self, make: impl FnOnce(ReportBundle<'_>) -> Result<T, E>) -> Result<T, E> {
         let Self { folder, study, rule, assessed } = self;
-        let rows = study.as_ref().map(|study| StudyResults::new(&study.table, &study.name));
-        let states = match (&folder, &rows) {
-            (Some(folder), _) => Some(folder as &dyn CellStates),
-            (None, rows) => rows.as_ref().map(|rows| rows as &dyn CellStates),
+        let mut checks = Vec::new();
+        let study = match &folder {
+            Some(folder) => Some(StudySource::exported(folder, &mut checks)?),
+            None => study,
         };
+        let rows = study.as_ref().map(|study| StudyResults::new(&study.table, &study.name));
+        let states = rows.as_ref().map(|rows| rows as &dyn CellStates);
         let plan = match (&folder, &study) {
             (Some(folder), _) => Plan::load(&folder.require_plan().map_err(ReportError::from)?),
             (None, Some(study)) => study.plan(),
@@ -152,35 +158,58 @@ impl ReportInputs {
         };
         let mut selections = results.select();
         let mut recorded = Recorded::new(&selections);
-        let mut curves = Vec::new();
-        if let Some(folder) = &folder {
-            verify(&results, folder, |result, records| recorded.add(result, records)).map_err(ReportError::from)?;
-            curves = read_curves(&selections, folder).map_err(ReportError::from)?;
-        } else if let Some(study) = &study {
-            let episodes =
-                StudyEpisodes::read_if_there(&study.episodes).map_err(ReportError::from)?.unwrap_or_default();
-            for result in results.done() {
-                episodes.of_cell(&result.id).into_iter().for_each(|records| recorded.add(result, records));
-            }
+        if let Some(study) = &study {
+            study.add_episodes(folder.as_ref(), &results, &mut recorded, &mut checks)?;
         }
+        let curves = folder.as_ref().map(|folder| read_curves(&selections, folder)).transpose();
+        let curves = curves.map_err(ReportError::from)?.unwrap_or_default();
         add_assessed(&mut selections, &assessed);
         let heatmaps = heatmap_pictures(&selections, folder.as_ref()).map_err(ReportError::from)?;
-        let report = Report::new(&results, &selections, &recorded, &curves);
+        let report = Report::new(&results, &selections, &recorded, &checks);
         make(ReportBundle { report, curves: &curves, heatmaps: &heatmaps })
     }
 }
 
-impl ReportBundle<'_> {
-    /// Everything as one HTML page that needs nothing else.
-    ///
-    /// # Errors
-    /// [`PlotError`].
-    pub fn page(&self) -> Result<String, PlotError> {
-        Ok(html(&self.report, &Figures::draw(&self.report, self.curves, self.heatmaps)?))
-    }
-}
-
 impl StudySource {
+    /// Exports the results in `folder` to a table. Adds the comparisons of requested with applied parameters to `checks`.
+    fn exported(folder: &Folder, checks: &mut Vec<ParameterCheck>) -> Result<Self, ReportError> {
+        let plan = Plan::load(&folder.require_plan()?)?;
+        let rows = export(&plan, folder, EXPORTED, |_, records| checks.push(records.agreement()))?;
+        let mut table = ResultsTable::default();
+        table.merge(EXPORTED, plan.for_table(), rows);
+        let path = folder.path().to_owned();
+        Ok(Self { table, name: EXPORTED.into(), episodes: PathBuf::new(), path })
+    }
+
+    /// Reads the recorded episodes of selected cells, where they are there. Those of `folder` were compared before.
+    fn add_episodes(
+        &self,
+        folder: Option<&Folder>,
+        results: &Results<'_>,
+        recorded: &mut Recorded,
+        checks: &mut Vec<ParameterCheck>,
+    ) -> Result<(), ReportError> {
+        let Some(folder) = folder else {
+            let episodes = StudyEpisodes::read_if_there(&self.episodes)?.unwrap_or_default();
+            for result in results.done() {
+                let records = episodes.of_cell(&result.id);
+                checks.extend(records.map(Records::agreement));
+                records.into_iter().for_each(|records| recorded.add(result, records));
+            }
+            return Ok(());
+        };
+        for result in results.done() {
+            if !recorded.wants(&result.id) {
+                continue;
+            }
+            match Records::read(&folder.cell(&result.id).path().join(FILE)) {
+                Err(RecordsError::Missing { .. }) => {}
+                records => recorded.add(result, &records?),
+            }
+        }
+        Ok(())
+    }
+
     /// Finds the study that `path` names: FILE.parquet/STUDY, or FILE.parquet with a single study. Returns `None` if no
     /// part of `path` is a Parquet file.
     fn find(path: &Path) -> Result<Option<Self>, ReportError> {

@@ -1,49 +1,41 @@
-//! Success over parameters and over the threshold, of all runs together.
+//! Success over a parameter, of all runs together.
 
-use perturb_experiment::{MethodResults, Recorded};
-use perturb_records::outcomes::{Bin, Counted, bins, success_at, success_within, thresholds};
-use perturb_records::success::{Criterion, Side};
+use perturb_experiment::{MethodResults, Recorded, distinct};
+use perturb_protocol::Version;
+use perturb_records::outcomes::{Bin, Counted, Outcomes, PolicyOutcomes, bins, success_within};
 use perturb_records::{RecordedParameter, TrainedOn};
 use perturb_settings::Method;
-use perturb_text::{Table, TableBuilder};
+use perturb_text::Table;
 
 use super::Report;
 use super::columns::MethodColumns;
-use super::index::ReportIndex;
-use super::tested::{PolicyGroup, trained};
-use crate::plot::panels::PanelPoint;
+use super::index::{ReportIndex, trained_on};
+use super::pictures::{Picture, PictureDrawing};
+use crate::plot::panels::{PanelLine, PanelPoint, Panels, PlotPanel, RATES, index_of};
 
-/// Successes of all runs together at one place of a sweep.
-pub(super) struct SweepPoint<'a, P> {
-    pub(super) environment: &'a str,
-    pub(super) method: &'a Method,
-    pub(super) trained_on: TrainedOn<'a>,
-    pub(super) tested_on: &'a str,
-    pub(super) at: P,
+/// Successes of all runs together in a part of a parameter's range.
+pub(super) struct SweepPoint<'a> {
+    environment: &'a str,
+    method: &'a Method,
+    trained_on: TrainedOn<'a>,
+    tested_on: &'a str,
+    parameter: &'a RecordedParameter,
+    bin: Bin,
     runs: usize,
-    pub(super) counted: Counted,
+    counted: Counted,
 }
 
-/// A part of a parameter's range.
-#[derive(Clone, Copy)]
-pub(super) struct AtParameter<'a> {
-    pub(super) parameter: &'a RecordedParameter,
-    pub(super) bin: Bin,
-}
-
-/// A threshold in place of the criterion's own.
-#[derive(Clone, Copy)]
-pub(super) struct AtThreshold<'a> {
-    pub(super) criterion: &'a Criterion,
-    pub(super) threshold: f64,
+/// The selected policies of a method that have recorded episodes.
+struct PolicyGroup<'a> {
+    method: &'a Method,
+    trained_on: TrainedOn<'a>,
+    policies: Vec<&'a PolicyOutcomes>,
 }
 
 impl<'a> PolicyGroup<'a> {
-    fn swept<P>(&self, tested_on: &'a str, at: P, counted: impl Iterator<Item = Counted>) -> Option<SweepPoint<'a, P>> {
-        let counted: Vec<Counted> = counted.collect();
-        let (runs, counted): (_, Counted) = (counted.len(), counted.into_iter().sum());
-        let &Self { environment, method, trained_on, .. } = self;
-        (counted.episodes > 0).then_some(SweepPoint { environment, method, trained_on, tested_on, at, runs, counted })
+    /// Returns the tests of each run.
+    fn tests(&self, tested_on: &'a str) -> impl Iterator<Item = &'a Outcomes> {
+        self.policies.iter().filter_map(move |policy| policy.test(tested_on))
     }
 }
 
@@ -52,48 +44,43 @@ pub(super) fn over_parameters<'a>(
     scope: &ReportIndex<'a>,
     selections: &'a [MethodResults<'a>],
     recorded: &'a Recorded,
-) -> Vec<SweepPoint<'a, AtParameter<'a>>> {
+) -> Vec<SweepPoint<'a>> {
     let mut all = Vec::new();
-    for of_environment in trained(selections, recorded) {
-        let Some(parameters) = of_environment.first().map(|trained| &trained.policies[0].parameters) else { continue };
+    for rows in selections.chunk_by(|a, b| a.environment == b.environment) {
+        let environment = rows[0].environment;
+        let group = |row: &'a MethodResults<'a>, trained_on: TrainedOn<'a>| {
+            let selected = row.runs.values().filter_map(|run| run.trained_on(trained_on));
+            let policies = selected.filter_map(|selected| recorded.policy(&selected)).collect();
+            PolicyGroup { method: &row.method, trained_on, policies }
+        };
+        let groups =
+            rows.iter().flat_map(|row| trained_on(row).into_iter().map(move |trained_on| group(row, trained_on)));
+        let groups: Vec<_> = groups.filter(|group| !group.policies.is_empty()).collect();
+        let Some(parameters) = groups.first().map(|group| &group.policies[0].parameters) else { continue };
         for &tested_on in &scope.tested_on {
             for (place, parameter) in parameters.iter().enumerate() {
-                let bins = bins(of_environment.iter().flat_map(|trained| trained.tests(tested_on)), place);
-                for trained in &of_environment {
-                    let by_run: Vec<Vec<Counted>> =
-                        trained.tests(tested_on).map(|test| success_within(test, place, &bins)).collect();
-                    all.extend(bins.iter().enumerate().filter_map(|(index, &bin)| {
-                        let at = AtParameter { parameter, bin };
-                        trained.swept(tested_on, at, by_run.iter().map(|bins| bins[index]))
-                    }));
+                let bins = bins(groups.iter().flat_map(|group| group.tests(tested_on)), place);
+                for group in &groups {
+                    let tests = group.tests(tested_on);
+                    let by_run: Vec<Vec<Counted>> = tests.map(|test| success_within(test, place, &bins)).collect();
+                    let PolicyGroup { method, trained_on, .. } = *group;
+                    for (index, &bin) in bins.iter().enumerate() {
+                        let counted: Counted = by_run.iter().map(|bins| bins[index]).sum();
+                        let runs = by_run.len();
+                        if counted.episodes > 0 {
+                            all.push(SweepPoint {
+                                environment,
+                                method,
+                                trained_on,
+                                tested_on,
+                                parameter,
+                                bin,
+                                runs,
+                                counted,
+                            });
+                        }
+                    }
                 }
-            }
-        }
-    }
-    all
-}
-
-/// Success over the threshold, in environments whose success compares something with one.
-pub(super) fn over_thresholds<'a>(
-    scope: &ReportIndex<'a>,
-    selections: &'a [MethodResults<'a>],
-    recorded: &'a Recorded,
-) -> Vec<SweepPoint<'a, AtThreshold<'a>>> {
-    let mut all = Vec::new();
-    for of_environment in trained(selections, recorded) {
-        let first = of_environment.first().and_then(|trained| trained.policies[0].success.as_ref());
-        let Some(criterion) = first else { continue };
-        let tests = of_environment.iter().flat_map(|trained| {
-            let trained = trained.clone();
-            scope.tested_on.iter().flat_map(move |tested_on| trained.tests(tested_on))
-        });
-        let thresholds = thresholds(tests, criterion);
-        for trained in &of_environment {
-            for &tested_on in &scope.tested_on {
-                all.extend(thresholds.iter().filter_map(|&threshold| {
-                    let counted = trained.tests(tested_on).map(|test| success_at(test, criterion, threshold));
-                    trained.swept(tested_on, AtThreshold { criterion, threshold }, counted)
-                }));
             }
         }
     }
@@ -102,55 +89,92 @@ pub(super) fn over_thresholds<'a>(
 
 impl Report<'_> {
     pub(super) fn parameters_file(&self) -> Table {
-        let table = swept("parameters.csv", &self.over_parameters)
-            .text("parameter", |row| &row.at.parameter.name)
-            .text("unit", |row| &row.at.parameter.unit)
-            .number("low", |row| row.at.bin.low)
-            .number("high", |row| row.at.bin.high);
-        counted(table)
+        Table::builder("parameters.csv", &self.over_parameters)
+            .text("environment", |row| row.environment)
+            .method(|row| row.method)
+            .text("train", |row| row.trained_on)
+            .text("test", |row| row.tested_on)
+            .text("parameter", |row| &row.parameter.name)
+            .text("unit", |row| &row.parameter.unit)
+            .number("low", |row| row.bin.low)
+            .number("high", |row| row.bin.high)
+            .number("runs", |row| row.runs)
+            .number("episodes", |row| row.counted.episodes)
+            .number("successes", |row| row.counted.successes)
+            .number("success_percent", |row| row.counted.rate())
+            .number("low_95", |row| row.counted.interval()[0])
+            .number("high_95", |row| row.counted.interval()[1])
+            .build()
     }
 
-    pub(super) fn thresholds_file(&self) -> Table {
-        let table = swept("thresholds.csv", &self.over_thresholds)
-            .text("quantity", |row| &row.at.criterion.quantity)
-            .text("unit", |row| &row.at.criterion.unit)
-            .text("side", |row| side(row.at.criterion))
-            .number("threshold", |row| row.at.threshold);
-        counted(table)
+    /// Returns a picture for each environment and training distribution, with a panel for each parameter.
+    pub(super) fn parameter_pictures(&self) -> Vec<Picture> {
+        let is_of_version = |row: &&SweepPoint<'_>| Version::ALL.iter().any(|it| it.to_string() == row.tested_on);
+        let all: Vec<_> = self.over_parameters.iter().filter(is_of_version).collect();
+        let mut pictures = Vec::new();
+        for &environment in &self.scope.environments {
+            for trained_on in Version::KNOWN.map(TrainedOn::Version).into_iter().chain([TrainedOn::Unknown]) {
+                let is_of = |row: &&SweepPoint<'_>| (row.environment, row.trained_on) == (environment, trained_on);
+                let rows: Vec<_> = all.iter().copied().filter(is_of).collect();
+                if !rows.is_empty() {
+                    pictures.push(self.parameter_picture(environment, trained_on, &rows));
+                }
+            }
+        }
+        pictures
     }
-}
 
-impl<P> SweepPoint<'_, P> {
-    /// With its Wilson interval.
-    pub(super) fn point(&self, x: f64) -> PanelPoint {
-        let [low, high] = self.counted.interval();
-        PanelPoint { x, y: self.counted.rate(), low, high }
+    fn parameter_picture(&self, environment: &str, trained_on: TrainedOn<'_>, rows: &[&SweepPoint<'_>]) -> Picture {
+        let trained = match trained_on {
+            TrainedOn::Unknown => "whose training's parameters are not known".to_owned(),
+            trained_on => format!("trained on {trained_on}"),
+        };
+        let parameters = distinct(rows.iter().map(|row| &row.parameter.name));
+        let of = |name: &String| rows.iter().copied().filter(|row| row.parameter.name == *name).collect::<Vec<_>>();
+        let panels = Panels {
+            title: format!("{environment}, {trained}: success over each parameter"),
+            panels: parameters.iter().map(|name| self.parameter_panel(&of(name))).collect(),
+            legend: self.scope.methods.iter().map(ToString::to_string).collect(),
+            note: "All runs together; bands: 95 % Wilson intervals.".into(),
+        };
+        Picture {
+            environment: environment.into(),
+            file: format!("{environment}-{}-parameters", trained_on.file_name()),
+            name: format!("{environment}: success over each parameter, {trained}"),
+            caption: format!(
+                "{environment}: success of policies {trained}, by the value that a parameter had in tests on R \
+                 (inside) and on E (outside), where the others are drawn, too. All runs together; bands are 95 % Wilson \
+                 intervals."
+            ),
+            data: panels.table(),
+            drawing: PictureDrawing::Panels(panels),
+        }
     }
-}
 
-fn swept<'r, 'a, P>(name: &str, rows: &'r [SweepPoint<'a, P>]) -> TableBuilder<'r, SweepPoint<'a, P>> {
-    Table::builder(name, rows)
-        .text("environment", |row| row.environment)
-        .method(|row| row.method)
-        .text("train", |row| row.trained_on)
-        .text("test", |row| row.tested_on)
-}
-
-fn counted<'r, 'a, P>(table: TableBuilder<'r, SweepPoint<'a, P>>) -> Table {
-    table
-        .number("runs", |row| row.runs)
-        .number("episodes", |row| row.counted.episodes)
-        .number("successes", |row| row.counted.successes)
-        .number("success_percent", |row| row.counted.rate())
-        .number("low_95", |row| row.counted.interval()[0])
-        .number("high_95", |row| row.counted.interval()[1])
-        .build()
-}
-
-/// In words.
-pub(super) fn side(criterion: &Criterion) -> &'static str {
-    match criterion.side {
-        Side::AtLeast => "at least",
-        Side::AtMost => "at most",
+    /// `rows` are those of one parameter.
+    fn parameter_panel(&self, rows: &[&SweepPoint<'_>]) -> PlotPanel {
+        let RecordedParameter { name, unit, .. } = rows[0].parameter;
+        // A line ends where a test ends, and where it draws nothing.
+        let joined = |a: &&SweepPoint<'_>, b: &&SweepPoint<'_>| {
+            (a.method, a.tested_on, a.bin.high) == (b.method, b.tested_on, b.bin.low)
+        };
+        let point = |SweepPoint { bin, counted, .. }: &&SweepPoint<'_>| {
+            let [low, high] = counted.interval();
+            PanelPoint { x: (bin.low + bin.high) / 2.0, y: counted.rate(), low, high }
+        };
+        let line = |rows: &[&SweepPoint<'_>]| PanelLine {
+            index: index_of(&self.scope.methods, rows[0].method),
+            points: rows.iter().map(point).collect(),
+        };
+        let low = rows.iter().map(|row| row.bin.low).fold(f64::INFINITY, f64::min);
+        let high = rows.iter().map(|row| row.bin.high).fold(f64::NEG_INFINITY, f64::max);
+        PlotPanel {
+            caption: name.clone(),
+            x_name: if unit == "1" { name.clone() } else { format!("{name}, {unit}") },
+            x: low..high,
+            y_name: "success rate, %".into(),
+            y: RATES,
+            lines: rows.chunk_by(joined).map(line).collect(),
+        }
     }
 }

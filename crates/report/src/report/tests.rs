@@ -1,4 +1,4 @@
-use perturb_experiment::{CellState, Failure, Folder, IntermediateEvaluation, SELECTION_TEST};
+use perturb_experiment::{Cell, CellState, Failure, Folder, SELECTION_TEST};
 use perturb_protocol::Version;
 use perturb_records::{Difference, Metric, ParameterCheck, TestResult};
 use rstest::rstest;
@@ -56,38 +56,13 @@ fn results(plan: &Plan) -> Results<'_> {
     results
 }
 
-fn figures() -> Figures {
-    let drawn = || FigureData::Svg { svg: "<svg></svg>".into(), csv: "x,y\n1,2\n".into() };
-    let figure = |environment: &str, picture: FigureData| Figure {
-        environment: environment.into(),
-        file: format!("{environment}-return"),
-        name: format!("{environment}: return"),
-        caption: "Mean & deviation".into(),
-        picture,
-    };
-    Figures {
-        finding: vec![figure("", drawn())],
-        metrics: vec![figure("CartPole", drawn())],
-        profiles: vec![figure("", drawn())],
-        curves: vec![figure("CartPole", drawn())],
-        marks: Vec::new(),
-        no_curves: vec!["Pendulum: no training with a result has its monitor.csv.".into()],
-        heatmaps: vec![figure("CartPole", drawn()), figure("CartPole", FigureData::Missing)],
-        no_heatmaps: vec!["1 of 2. `perturb heatmap DIR` makes them.".into()],
-        ..Figures::default()
-    }
-}
-
 /// The name of a snapshot is that of its file, so that files can move with the module.
 #[rstest]
 #[case("text", |report: &Report<'_>| report.text(usize::MAX))]
-#[case("markdown", |report: &Report<'_>| report.markdown())]
 #[case("csv", |report: &Report<'_>| {
     let lines = |table: Table| format!("{}\n{}", table.title, String::from_utf8(table.to_csv()).unwrap());
-    let files = report.files().into_iter().filter(|table| table.title != "profiles.csv"); // hundreds of lines
-    files.map(lines).collect::<Vec<_>>().join("\n")
+    report.files().into_iter().map(lines).collect::<Vec<_>>().join("\n")
 })]
-#[case("html", |report: &Report<'_>| html(report, &figures()).replace(html::STYLE, "").replace("><", ">\n<"))]
 fn a_report_has_all_its_numbers(#[case] name: &str, #[case] document: fn(&Report<'_>) -> String) {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
     let results = results(&plan);
@@ -100,82 +75,27 @@ fn a_report_has_all_its_numbers(#[case] name: &str, #[case] document: fn(&Report
 }
 
 #[test]
-fn custom_sets_have_a_table_of_their_own() {
+fn custom_sets_stand_beside_the_scenarios() {
     let plan = Plan::parse("test", SETS.into()).unwrap();
     let mut results = fixture::results(&plan, |_| Some(([90.0, 40.0, 20.0], 1.0)));
-    for (state, relative) in results.states.iter_mut().zip([0.0, 2e-16]) {
+    for state in &mut results.states {
         let CellState::Done(result) = state else { unreachable!("all are done") };
         let test = result.results["D"].clone();
         for (name, success_percent) in [("long", 75.0), ("corners", 55.0)] {
             result.results.insert(name.into(), TestResult { success_percent, ..test.clone() });
         }
+    }
+    let selections = results.select();
+    let recorded = Recorded::default();
+    let checks = [(4000, 0.0), (4000, 2e-16)].map(|(episodes, relative)| {
         let largest = Difference { parameter: "length".into(), requested: 0.7, applied: 0.7, relative };
-        result.agreement = Some(ParameterCheck { episodes: 4000, largest: Some(largest) });
-    }
-    let selections = results.select();
-    let recorded = Recorded::default();
-    let report = Report::new(&results, &selections, &recorded, &[]);
-    insta::assert_snapshot!(report.set_table().unwrap().to_text(), @r"
-     environment  method  trained on  tested on  success, %  mean return  runs
-     CartPole     ppo ff  D           long             75.0          1.0     1
-     CartPole     ppo ff  D           corners          55.0          1.0     1
-     CartPole     ppo ff  long        D                90.0          1.0     1
-     CartPole     ppo ff  long        R                40.0          1.0     1
-     CartPole     ppo ff  long        E                20.0          1.0     1
-     CartPole     ppo ff  long        long             75.0          1.0     1
-     CartPole     ppo ff  long        corners          55.0          1.0     1
-    ");
+        ParameterCheck { episodes, largest: Some(largest) }
+    });
+    let report = Report::new(&results, &selections, &recorded, &checks);
+    insta::assert_snapshot!(report.scenario_tables()[0].to_text());
     assert_eq!((selections.len(), selections[0].cells), (1, 1), "selected among those that are trained on versions");
-    assert!(report.files().iter().any(|file| file.title == "sets.csv"));
     let told = "compared in 8000 of 10000 test episodes; the largest relative difference is 2.0e-16, of length.";
-    assert!(report.overview.iter().any(|line| line.contains(told)), "{:?}", report.overview);
-}
-
-#[test]
-fn tests_at_marks_have_a_table_with_the_end_as_its_last_line() {
-    let text =
-        "environments = ['CartPole']\nversions = ['R']\nruns = 2\nevaluate_at = [5, 20]\nsettings = { episodes = 50 }
-        [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
-    let plan = Plan::parse("test", text.into()).unwrap();
-    let mut results = fixture::results(&plan, |cell| Some(([90.0, 40.0, 20.0 + f64::from(cell.run)], 1.0)));
-    let CellState::Done(result) = &mut results.states[0] else { unreachable!("it is done") };
-    for mark in [5, 20] {
-        let success_percent = mark as f64;
-        let test = TestResult { success_percent, mean_return: -success_percent, ..result.results["D"].clone() };
-        let agreement = ParameterCheck { episodes: 1, largest: None };
-        let of_mark = IntermediateEvaluation {
-            counters: Default::default(),
-            results: [("E".to_owned(), test)].into(),
-            agreement,
-        };
-        result.marks.insert(mark, of_mark);
-    }
-    let selections = results.select();
-    let recorded = Recorded::default();
-    let report = Report::new(&results, &selections, &recorded, &[]);
-    insta::assert_snapshot!(report.marks_table().unwrap().to_text(), @r"
-     environment  method  trained on  episodes        on D        on R        on E
-     CartPole     ppo ff  R                  5     missing     missing         5.0
-     CartPole     ppo ff  R                 20     missing     missing        20.0
-     CartPole     ppo ff  R                 50  90.0 ± 0.0  40.0 ± 0.0  21.5 ± 0.5
-    ");
-    let marks = report.files().into_iter().find(|table| table.title == "evaluations.csv").unwrap();
-    let marks = String::from_utf8(marks.to_csv()).unwrap();
-    assert!(
-        marks.contains("CartPole,ppo,ff,,R,20,E,1,20,,-20\n") && marks.contains("R,50,E,2,21.5,0.5,1\n"),
-        "{marks}"
-    );
-    let figures = Figures::draw(&report, &[], &[]).unwrap();
-    let names: Vec<&str> = figures.marks.iter().map(|figure| figure.name.as_str()).collect();
-    assert_eq!(names.len(), 2, "return and success");
-    assert_eq!(names[1], "CartPole, trained on R: success in tests after so many episodes");
-    let FigureData::Svg { svg, .. } = &figures.marks[1].picture else { unreachable!("it is drawn") };
-    assert!(svg.contains("tested on E") && svg.contains("CartPole, trained on R: success rate in"), "{svg}");
-    let page = html(&report, &figures);
-    assert!(page.contains("id=\"marks\"") && page.contains(names[0]));
-    let without = fixture::results(&plan, |_| Some(([90.0, 40.0, 20.0], 1.0)));
-    let selections = without.select();
-    assert!(Report::new(&without, &selections, &recorded, &[]).marks_table().is_none());
+    assert!(report.provenance.iter().any(|line| line.contains(told)), "{:?}", report.provenance);
 }
 
 /// Two configurations and two tuning seeds. One cell of what is selected failed; what is trained on E waits, and on R nothing
@@ -214,7 +134,7 @@ fn clean_report_names_rule_seeds_and_selection() {
     let selections = results.select();
     let recorded = Recorded::default();
     let report = Report::new(&results, &selections, &recorded, &[]);
-    let told = report.overview.join("\n");
+    let told = report.provenance.join("\n");
     for part in [
         "Selection: `clean`. Configurations were selected by 70 selection episodes of every training on seeds 1 to 2; \
          those that are reported were trained anew on seeds 3 to 4, and tested on other episodes.",
@@ -226,36 +146,37 @@ fn clean_report_names_rule_seeds_and_selection() {
         assert!(told.contains(part), "{told}");
     }
     let table = |title: &str| report.files().into_iter().find(|table| table.title == title).unwrap();
-    let rows: Vec<String> =
-        String::from_utf8(table("tuning.csv").to_csv()).unwrap().lines().map(str::to_owned).collect();
-    assert!(
-        rows[1].starts_with("CartPole,ppo,ff,,D,4,3,1,CartPole-ppo-ff-D-") && rows[1].contains("-s1,1,75,1,"),
-        "{rows:?}"
-    );
-    assert!(rows[1].contains("n_steps=128") && !rows[1].contains("seed"), "{rows:?}");
-    assert_eq!(rows[2..], ["CartPole,ppo,ff,,R,4,0,4,,0,,,", "CartPole,ppo,ff,,E,4,3,0,,0,,,"]);
     let metrics = String::from_utf8(table("metrics.csv").to_csv()).unwrap();
     // 13 and 14 of what was trained anew, not the 90s that were not selected.
     assert!(metrics.contains("CartPole,ppo,ff,,Default,2,13.5,0.5"), "{metrics}");
-    assert!(
-        report.markdown().contains("| CartPole    | ppo ff | D          | CartPole-ppo-ff-D-"),
-        "{}",
-        report.markdown()
-    );
+    let selected = String::from_utf8(table("selected.csv").to_csv()).unwrap();
+    assert_eq!(selected.matches("\nCartPole,ppo,ff,,D,").count(), 2, "{selected}");
 }
 
 #[rstest]
-#[case("", None)]
+#[case(
+    "",
+    "Trainings of 15000 episodes (as the paper's) on D, R and E with the preset `perturb`; tests of 1000 episodes (as the paper's)"
+)]
 #[case(
     "settings = { episodes = 300 }\ntest_episodes = 50",
-    Some("300 episodes in a training, where the paper has 15000, and 50 in a test")
+    "Trainings of 300 episodes (the paper's: 15000) on D, R and E"
 )]
-#[case("test_episodes = 999", Some("999 in a test, where it has 1000"))]
-fn other_budgets_than_the_papers_are_told(#[case] given: &str, #[case] told: Option<&str>) {
+#[case(
+    "test_episodes = 999",
+    "tests of 999 episodes (the paper's: 1000) each on D, R and E; success as the paper's text says."
+)]
+fn budgets_and_rules_are_told(#[case] given: &str, #[case] expected: &str) {
     let text = format!("environments = ['CartPole']\n{given}\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']");
-    let budgets = budgets(&Plan::parse("test", text).unwrap());
-    assert_eq!(budgets.is_some(), told.is_some());
-    assert!(budgets.unwrap_or_default().contains(told.unwrap_or_default()));
+    let plan = Plan::parse("test", text).unwrap();
+    let told = with_no_result(&plan, |report| report.provenance.join("\n"));
+    assert!(told.contains(expected), "{told}");
+}
+
+fn with_no_result<T>(plan: &Plan, of: impl FnOnce(&Report<'_>) -> T) -> T {
+    let results = fixture::results(plan, |_| None);
+    let selections = results.select();
+    of(&Report::new(&results, &selections, &Recorded::default(), &[]))
 }
 
 #[test]
@@ -268,7 +189,7 @@ fn a_single_row_lacks_cells_and_several_lack_them() {
             (!is_missing).then_some(([50.0; 3], 1.0))
         });
         let selections = results.select();
-        Report::new(&results, &selections, &Recorded::default(), &[]).overview.join("\n")
+        Report::new(&results, &selections, &Recorded::default(), &[]).provenance.join("\n")
     };
     assert!(told(&["Pendulum"]).contains("1 of 4 rows lacks cells; the column"));
     assert!(told(&["Pendulum", "CartPole"]).contains("2 of 4 rows lack cells; the column"));
@@ -277,14 +198,12 @@ fn a_single_row_lacks_cells_and_several_lack_them() {
 #[test]
 fn what_is_not_done_is_missing_and_has_no_colour() {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
-    let results = fixture::results(&plan, |_| None);
-    let selections = results.select();
-    let recorded = Recorded::default();
-    let report = Report::new(&results, &selections, &recorded, &[]);
-    let tables = report.number_tables().filter(|table| table.columns.len() > 4);
-    let entries: Vec<_> = tables.flat_map(|table| table.rows.into_iter().flatten()).collect();
+    let entries: Vec<_> =
+        with_no_result(&plan, |report| report.tables().flat_map(|table| table.rows.into_iter().flatten()).collect());
     assert!(entries.iter().all(|entry| entry.heat.is_none()));
-    assert_eq!(entries.iter().filter(|entry| entry.text == MISSING).count(), 3 * (4 + 2 + 2 + 2) + 4 * 4 + 9 * 4);
+    // Metrics of three tables; scenarios of three and two trainings in two environments; IQM and gap.
+    let expected = 3 * 2 * 3 + 3 * (3 + 2) * 2 + 2 * 3 * 2;
+    assert_eq!(entries.iter().filter(|entry| entry.text == MISSING).count(), expected);
 }
 
 /// What is trained on both is a line to compare with.
