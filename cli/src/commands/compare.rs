@@ -5,11 +5,13 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use perturb_files::interrupt::StopFlag;
+use perturb_files::{require_writable, write_atomically};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::evaluation::{TestOptions, Tester};
-use perturb_records::comparison::{ComparedCondition, ComparedScore, ConditionComparison, compare};
+use perturb_records::comparison::{ComparedCondition, ComparedScore, compare};
 use perturb_records::success::{Criterion, Rule};
 use perturb_records::{ExternalEvaluation, FILE, Records};
+use perturb_report::{EnvironmentComparison, INTERVALS_NOTE, comparison_page};
 use perturb_settings::sets::TestSet;
 use perturb_text::Table;
 use serde_json::json;
@@ -18,12 +20,6 @@ use super::args::CompareArgs;
 use super::display::{Display, note, output};
 use super::error::{CommandError, Result, system};
 use super::{playing_servers, sets};
-
-/// Explanation of the intervals, printed below the tables.
-const INTERVALS_NOTE: &str = "\
-Intervals have 95 %. Those over seeds are t intervals, which cover the mean in 95 % also with three seeds if the means of\n\
-seeds are normally distributed; fewer than three seeds have none. Those over episodes speak of these policies in other\n\
-episodes. p is of t tests over seeds, corrected after Holm.";
 
 /// The extension of a policy in a single file.
 const POLICY_EXTENSION: &str = "safetensors";
@@ -47,6 +43,7 @@ struct NamedPolicies {
 
 pub(super) fn run(args: &CompareArgs) -> Result<()> {
     args.json.check()?;
+    args.html.as_deref().map_or(Ok(()), require_writable)?;
     let conditions = args.conditions.iter().map(|text| condition(text)).collect::<Result<Vec<_>>>()?;
     let sets = tested_sets(args, &conditions)?;
     let tested = test(args, conditions, &sets)?;
@@ -59,9 +56,13 @@ pub(super) fn run(args: &CompareArgs) -> Result<()> {
     };
     let comparison = compare(&compared, &names, score, args.baseline.as_deref())?;
     let about = &tested[0].1[0].1.about;
+    let of = EnvironmentComparison { environment: about.environment.clone(), comparison };
+    if let Some(path) = &args.html {
+        write_atomically(path, comparison_page(&of).as_bytes())?;
+    }
     if args.json.json.is_some() {
         let success = about.success.as_ref().map(ToString::to_string);
-        let mut document = json!(comparison);
+        let mut document = json!(of.comparison);
         document["environment"] = json!(about.environment);
         document["success"] = json!(success);
         args.json.write(document)?;
@@ -71,11 +72,10 @@ pub(super) fn run(args: &CompareArgs) -> Result<()> {
     }
     let success = about.success.as_ref().map(|criterion| format!(", success: {criterion}")).unwrap_or_default();
     let mut out = output();
-    writeln!(out, "{}{success}\n{}", about.environment, means_table(&comparison).to_text())?;
-    if !comparison.differences.is_empty() {
-        writeln!(out, "\n{}", differences_table(&comparison).to_text())?;
-    }
-    Ok(writeln!(out, "\n{}.\n\n{INTERVALS_NOTE}", comparison.verdict)?)
+    writeln!(out, "{}{success}", about.environment)?;
+    let tables: Vec<String> = of.tables().iter().map(Table::to_text).collect();
+    writeln!(out, "{}", tables.join("\n\n"))?;
+    Ok(writeln!(out, "\n{}.\n\n{INTERVALS_NOTE}", of.comparison.verdict)?)
 }
 
 fn by_reference((name, policies): &TestedPolicies) -> ComparedCondition<'_> {
@@ -226,47 +226,4 @@ fn judged(records: Records, rule: Option<&Rule>) -> Result<Records> {
     let text = about.text_success.as_ref().or(about.success.as_ref());
     let rule = sets::normalize_rule(rule, text, about.code_success.as_ref())?;
     Ok(records.judged_by(&rule)?)
-}
-
-fn means_table(comparison: &ConditionComparison) -> Table {
-    let score = match comparison.score {
-        ComparedScore::Success => "success, %",
-        ComparedScore::Return => "return",
-        ComparedScore::Length => "length",
-    };
-    Table::builder("", &comparison.means)
-        .text("condition", |row| &row.condition)
-        .text("tested on", |row| &row.tested_on)
-        .number("seeds", |row| row.by_seed.len())
-        .number(score, |row| format!("{:.1}", row.mean))
-        .number("95 % over seeds", |row| interval(row.seeds_95))
-        .number("episodes", |row| row.episodes)
-        .number("95 % over episodes", |row| interval(row.episodes_95))
-        .build()
-}
-
-fn differences_table(comparison: &ConditionComparison) -> Table {
-    let unit = match comparison.score {
-        ComparedScore::Success => "points",
-        ComparedScore::Return => "difference",
-        ComparedScore::Length => "steps",
-    };
-    let number = |number: &f64| format!("{:+.1}", number + 0.0);
-    Table::builder("", &comparison.differences)
-        .text("difference", |row| format!("{} − {}", row.x, row.y))
-        .text("tested on", |row| &row.tested_on)
-        .number(unit, move |row| number(&row.difference))
-        .number("by seed", move |row| match row.paired {
-            true => row.by_seed.iter().map(number).collect::<Vec<_>>().join(", "),
-            false => "unpaired".into(),
-        })
-        .number("95 % over seeds", |row| interval(row.seeds_95))
-        .number("95 % over episodes", |row| interval(row.episodes_95))
-        .number("P(x > y)", |row| format!("{:.2}", row.improvement))
-        .number("p, Holm", |row| row.p_holm.map_or_else(String::new, |p| format!("{p:.3}")))
-        .build()
-}
-
-fn interval(ends: Option<[f64; 2]>) -> String {
-    ends.map_or_else(String::new, |[low, high]| format!("[{:.1}, {:.1}]", low + 0.0, high + 0.0))
 }

@@ -23,6 +23,10 @@ fn conditions_are_compared_over_seeds_and_episodes() {
     let [plain, random] = ["plain", "random"].map(path);
     let text = printed(&[&["compare", &plain, &random], &episodes[..]].concat());
     assert!(text.contains("random − plain") && text.contains("two seeds decide nothing."), "{text}");
+    let page = path("compared.html");
+    printed(&[&["compare", &plain, &random, "--html", &page], &episodes[..]].concat());
+    let page = std::fs::read_to_string(page).expect("a page");
+    assert!(page.contains("random − plain") && page.contains("two seeds decide nothing."), "{page}");
     let named = [format!("a={plain}/1,{plain}/2"), format!("b={random}/2")];
     let json = printed(&[&["compare", &named[0], &named[1], "--json"], &episodes[..]].concat());
     let told: serde_json::Value = serde_json::from_str(&json).expect("JSON and nothing else");

@@ -1,5 +1,7 @@
 //! Arguments of `perturb compare`.
 
+use std::path::PathBuf;
+
 use clap::Args;
 use perturb_protocol::Version;
 use perturb_records::success::Rule;
@@ -40,6 +42,9 @@ pub struct CompareArgs {
     /// Random seed of the tests, the same for all trainings.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = natural::<u64>)]
     pub seed: u64,
+    /// Write the comparison to this file as HTML, as the section of a report.
+    #[arg(long, value_name = "FILE")]
+    pub html: Option<PathBuf>,
     #[command(flatten)]
     pub json: JsonArgs,
     #[command(flatten)]

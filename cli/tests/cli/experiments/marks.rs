@@ -7,7 +7,7 @@ use perturb_experiment::Folder;
 use perturb_learner::checkpoint::Checkpoint;
 
 use super::{Experiment, kill_all, succeeded};
-use crate::common::{perturb, stderr, wait_for};
+use crate::common::{perturb, wait_for};
 
 /// A plan with two cells that reach every number of episodes exactly, and one of EPOpt, which learns from a part of its
 /// episodes.

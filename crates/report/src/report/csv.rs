@@ -9,6 +9,9 @@ use super::Report;
 use super::columns::MethodColumns;
 use super::numbers::{MethodMetrics, counted, or_empty};
 
+/// A number of a method by a metric.
+type BootstrappedOf = fn(&MethodMetrics<'_>, Metric) -> Option<Bootstrapped>;
+
 impl Report<'_> {
     /// Returns the files that a report has beside its documents and pictures, by their titles.
     pub fn files(&self) -> Vec<Table> {
@@ -27,8 +30,7 @@ impl Report<'_> {
             .number("runs", |(row, metric)| row.iqms.get(metric).map_or(0, |iqm| iqm.runs))
             .number("iqm", |(row, metric)| or_empty(row.iqms.get(metric).map(|iqm| iqm.point)))
             .number("optimality_gap", |(row, metric)| or_empty(row.gaps.get(metric).map(|gap| gap.point)));
-        type Number = fn(&MethodMetrics<'_>, Metric) -> Option<Bootstrapped>;
-        let numbers: [(&str, Number); 4] = [
+        let numbers: [(&str, BootstrappedOf); 4] = [
             ("", |row, metric| row.iqms.get(&metric).copied()),
             ("gap_", |row, metric| row.gaps.get(&metric).copied()),
             ("selection_", |row, metric| row.reselected.get(&metric).map(|both| both[0])),

@@ -108,6 +108,16 @@ fn evaluations_alone_have_a_page_without_cells() {
 }
 
 #[test]
+fn several_agents_have_a_section_that_compares_them() {
+    let assessed =
+        ["PPO", "SAC"].map(|agent| fixture::assessed(agent, "CartPole", &[Some(Version::D)], [200, 190, 100]));
+    let page = ReportInputs { assessed: assessed.into(), ..ReportInputs::default() }
+        .read(|whole| whole.page().map_err(ReportError::from))
+        .unwrap();
+    assert!(page.contains("id=\"comparison\"") && page.contains("SAC − PPO"), "{page}");
+}
+
+#[test]
 fn a_folder_is_an_experiment_or_an_assessment() {
     let directory = tempfile::tempdir().unwrap();
     let mut sources = ReportInputs::default();

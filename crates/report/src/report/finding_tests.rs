@@ -204,7 +204,7 @@ fn page(plan: &Plan) -> String {
     let selections = results.select();
     let recorded = Recorded::default();
     let report = Report::new(&results, &selections, &recorded, &[]);
-    ReportBundle { report, curves: &[], heatmaps: &HeatmapPictures::default() }.page().unwrap()
+    ReportBundle { report, curves: &[], comparisons: Vec::new(), heatmaps: &HeatmapPictures::default() }.page().unwrap()
 }
 
 #[test]

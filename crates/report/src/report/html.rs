@@ -3,9 +3,11 @@
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, percent_encode};
-use perturb_experiment::BudgetAxis;
+use perturb_experiment::{BudgetAxis, distinct};
 use perturb_text::{Column, Entry, Table};
 
+use super::comparison::{EnvironmentComparison, INTERVALS_NOTE};
+use super::finding::listed;
 use super::{MISSING, Picture, PictureDrawing, Report, ReportBundle};
 use crate::plot::{self, CurveQuantity, PlotError, draw_curves, svg};
 
@@ -59,6 +61,7 @@ impl ReportBundle<'_> {
         let section = |id, title, notes, subsections| Section { id, title, notes, subsections };
         let sections = [
             section("metrics", "Default, Interpolation, Extrapolation", METRICS, self.metrics()?),
+            section("comparison", "Comparison", "", self.comparisons.iter().map(comparison_subsection).collect()),
             section("scenarios", "The nine scenarios", SCENARIOS, scenarios),
             section("statistics", "Statistics over environments", STATISTICS, statistics),
             section("curves", "Training curves", "", by_environment(&self.curve_pictures())?),
@@ -113,14 +116,7 @@ fn page(report: &Report<'_>, finding: &[Markup], sections: &[&Section], missing:
     html! {
         (DOCTYPE)
         html lang="en" {
-            head {
-                meta charset="utf-8";
-                meta name="viewport" content="width=device-width, initial-scale=1";
-                meta name="color-scheme" content="light dark";
-                title { (title) " · perturb" }
-                link rel="icon" href="data:,";
-                style { (PreEscaped(STYLE)) }
-            }
+            (head(&title))
             body {
                 nav aria-label="Contents" {
                     ol {
@@ -148,6 +144,44 @@ fn page(report: &Report<'_>, finding: &[Markup], sections: &[&Section], missing:
             }
         }
     }
+}
+
+fn head(title: &str) -> Markup {
+    html! {
+        head {
+            meta charset="utf-8";
+            meta name="viewport" content="width=device-width, initial-scale=1";
+            meta name="color-scheme" content="light dark";
+            title { (title) " · perturb" }
+            link rel="icon" href="data:,";
+            style { (PreEscaped(STYLE)) }
+        }
+    }
+}
+
+/// Returns a comparison as a page of its own.
+pub fn comparison_page(of: &EnvironmentComparison) -> String {
+    let conditions = distinct(of.comparison.means.iter().map(|row| row.condition.as_str()));
+    let title = format!("{} on {}", listed(&conditions), of.environment);
+    let content = comparison_subsection(of).content;
+    let page = html! {
+        (DOCTYPE)
+        html lang="en" {
+            (head(&title))
+            body.single { main { h1 { (title) } section id="comparison" { (content) } } }
+        }
+    };
+    page.into_string()
+}
+
+fn comparison_subsection(of: &EnvironmentComparison) -> Subsection {
+    let tables = of.tables().into_iter().map(|table| table_subsection(&table, false).content);
+    let content = html! {
+        p { (of.comparison.verdict) "." }
+        @for table in tables { (table) }
+        p.notes { (INTERVALS_NOTE) }
+    };
+    Subsection { title: of.environment.clone(), content }
 }
 
 /// The plan's date and files.

@@ -4,6 +4,7 @@
 //! them, [`Report::files`] CSV. Nothing in them depends on when, where or in how many attempts the cells were done.
 
 mod columns;
+mod comparison;
 mod comparisons;
 mod csv;
 mod curves;
@@ -27,8 +28,10 @@ use numbers::MethodMetrics;
 use profiles::Profile;
 use sweeps::SweepPoint;
 
+pub use comparison::{EnvironmentComparison, INTERVALS_NOTE};
 pub use curves::curves_table;
 pub use heatmap_pictures::{HeatmapPictures, heatmap_pictures, save_heatmaps};
+pub use html::comparison_page;
 use perturb_experiment::{MethodResults, Plan, Recorded, Reported, Results, Selected, SelectionBootstrap};
 use perturb_records::ParameterCheck;
 use perturb_text::Table;

@@ -13,7 +13,8 @@ use perturb_records::{
 };
 use perturb_settings::ValueError;
 
-use super::{HeatmapPictures, Report, heatmap_pictures};
+use super::comparison::comparisons_of;
+use super::{EnvironmentComparison, HeatmapPictures, Report, heatmap_pictures};
 use crate::plot::PlotError;
 
 /// The name of a folder's study in its table.
@@ -88,6 +89,8 @@ pub struct ReportBundle<'a> {
     pub report: Report<'a>,
     /// The training curves.
     pub curves: &'a [EnvironmentCurves],
+    /// Agents that were trained elsewhere, compared where there are several.
+    pub comparisons: Vec<EnvironmentComparison>,
     /// The heatmaps.
     pub heatmaps: &'a HeatmapPictures,
 }
@@ -166,7 +169,7 @@ impl ReportInputs {
         add_assessed(&mut selections, &assessed);
         let heatmaps = heatmap_pictures(&selections, folder.as_ref()).map_err(ReportError::from)?;
         let report = Report::new(&results, &selections, &recorded, &checks);
-        make(ReportBundle { report, curves: &curves, heatmaps: &heatmaps })
+        make(ReportBundle { report, curves: &curves, comparisons: comparisons_of(&assessed), heatmaps: &heatmaps })
     }
 }
 

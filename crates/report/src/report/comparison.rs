@@ -1,0 +1,125 @@
+//! Conditions compared over seeds and episodes: tables, and a section of pages.
+
+use perturb_experiment::distinct;
+use perturb_records::comparison::{ComparedCondition, ComparedScore, ConditionComparison, compare};
+use perturb_records::{ExternalEvaluation, ExternalPolicy, Records};
+use perturb_text::Table;
+
+/// Explanation of the intervals of a comparison.
+pub const INTERVALS_NOTE: &str = "\
+Intervals have 95 %. Those over seeds are t intervals, which cover the mean in 95 % also with three seeds if the means of\n\
+seeds are normally distributed; fewer than three seeds have none. Those over episodes speak of these policies in other\n\
+episodes. p is of t tests over seeds, corrected after Holm.";
+
+/// A comparison in an environment.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EnvironmentComparison {
+    /// The environment's name.
+    pub environment: String,
+    /// The numbers.
+    pub comparison: ConditionComparison,
+}
+
+/// Compares the success of externally trained agents in the tests that all of them have, in each environment where there
+/// are several. Policies of an agent that were trained on the same are its seeds.
+pub(super) fn comparisons_of(assessed: &[ExternalEvaluation]) -> Vec<EnvironmentComparison> {
+    let environments = distinct(assessed.iter().map(ExternalEvaluation::environment));
+    environments.into_iter().filter_map(|environment| comparison_in(environment, assessed)).collect()
+}
+
+fn comparison_in(environment: &str, assessed: &[ExternalEvaluation]) -> Option<EnvironmentComparison> {
+    let here = assessed.iter().filter(|one| one.environment() == environment);
+    let policies: Vec<(&str, &ExternalPolicy)> =
+        here.flat_map(|one| one.policies().iter().map(|policy| (one.agent.as_str(), policy))).collect();
+    let kinds = distinct(policies.iter().map(|(agent, policy)| (*agent, policy.trained_on())));
+    let agents = distinct(kinds.iter().map(|(agent, _)| *agent));
+    if agents.len() < 2 {
+        return None;
+    }
+    let condition = |&(agent, trained_on)| {
+        let own = policies.iter().filter(|(name, policy)| (*name, policy.trained_on()) == (agent, trained_on));
+        let keyed = own.enumerate().map(|(index, (_, policy))| ((index + 1).to_string(), &policy.records));
+        let name = if kinds.len() > agents.len() { format!("{agent} on {trained_on}") } else { agent.to_owned() };
+        ComparedCondition { name, policies: keyed.collect() }
+    };
+    let conditions: Vec<ComparedCondition<'_>> = kinds.iter().map(condition).collect();
+    let names = |records: &Records| records.about.tests.iter().map(|test| test.set.name.clone()).collect::<Vec<_>>();
+    let mut common = names(&policies[0].1.records);
+    common.retain(|name| policies.iter().all(|(_, policy)| names(&policy.records).contains(name)));
+    // Agents that were tested or judged otherwise are not compared.
+    let comparison = compare(&conditions, &common, ComparedScore::Success, None).ok()?;
+    Some(EnvironmentComparison { environment: environment.to_owned(), comparison })
+}
+
+impl EnvironmentComparison {
+    /// Returns the tables of means and, of several conditions, of differences.
+    pub fn tables(&self) -> Vec<Table> {
+        let differences = (!self.comparison.differences.is_empty()).then(|| self.differences_table());
+        std::iter::once(self.means_table()).chain(differences).collect()
+    }
+
+    fn means_table(&self) -> Table {
+        let score = match self.comparison.score {
+            ComparedScore::Success => "success, %",
+            ComparedScore::Return => "return",
+            ComparedScore::Length => "length",
+        };
+        Table::builder(format!("{}: conditions", self.environment), &self.comparison.means)
+            .text("condition", |row| &row.condition)
+            .text("tested on", |row| &row.tested_on)
+            .number("seeds", |row| row.by_seed.len())
+            .number(score, |row| format!("{:.1}", row.mean))
+            .number("95 % over seeds", |row| interval(row.seeds_95))
+            .number("episodes", |row| row.episodes)
+            .number("95 % over episodes", |row| interval(row.episodes_95))
+            .build()
+    }
+
+    fn differences_table(&self) -> Table {
+        let unit = match self.comparison.score {
+            ComparedScore::Success => "points",
+            ComparedScore::Return => "difference",
+            ComparedScore::Length => "steps",
+        };
+        let number = |number: &f64| format!("{:+.1}", number + 0.0);
+        Table::builder(format!("{}: differences", self.environment), &self.comparison.differences)
+            .text("difference", |row| format!("{} − {}", row.x, row.y))
+            .text("tested on", |row| &row.tested_on)
+            .number(unit, move |row| number(&row.difference))
+            .number("by seed", move |row| match row.paired {
+                true => row.by_seed.iter().map(number).collect::<Vec<_>>().join(", "),
+                false => "unpaired".into(),
+            })
+            .number("95 % over seeds", |row| interval(row.seeds_95))
+            .number("95 % over episodes", |row| interval(row.episodes_95))
+            .number("P(x > y)", |row| format!("{:.2}", row.improvement))
+            .number("p, Holm", |row| row.p_holm.map_or_else(String::new, |p| format!("{p:.3}")))
+            .build()
+    }
+}
+
+fn interval(ends: Option<[f64; 2]>) -> String {
+    ends.map_or_else(String::new, |[low, high]| format!("[{:.1}, {:.1}]", low + 0.0, high + 0.0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fixture;
+    use perturb_protocol::Version;
+
+    #[test]
+    fn agents_of_an_environment_are_compared_over_their_policies() {
+        let agent = |name: &str, environment: &str, successes| {
+            fixture::assessed(name, environment, &[Some(Version::R)], [200, successes, 100])
+        };
+        let assessed = [agent("PPO", "CartPole", 200), agent("SAC", "CartPole", 190), agent("PPO", "Pendulum", 200)];
+        let compared = comparisons_of(&assessed);
+        let [EnvironmentComparison { environment, comparison }] = &compared[..] else { panic!("{compared:?}") };
+        assert_eq!((environment.as_str(), comparison.means.len()), ("CartPole", 2 * 3), "two agents in three tests");
+        let on_r = comparison.differences.iter().find(|row| row.tested_on == "R").unwrap();
+        assert_eq!((on_r.x.as_str(), on_r.y.as_str(), on_r.seeds), ("SAC", "PPO", [1, 1]));
+        assert_eq!(compared[0].tables().len(), 2);
+        assert!(comparisons_of(&assessed[1..]).is_empty(), "one agent in each environment");
+    }
+}
