@@ -177,6 +177,8 @@ pub fn polar(from: Point, distance: f64, angle: f64) -> Point {
 pub struct PosedModel {
     /// The model and its look, which do not change.
     pub look: &'static Look,
+    /// The MJCF with other lengths, if they are not those of the look.
+    pub edited: Option<String>,
     /// The positions, `[Q]`.
     pub qpos: Vec<f64>,
 }

@@ -43,7 +43,8 @@ impl Client {
         values: &[(&str, f64)],
     ) -> Result<Self, Failure> {
         let connection = Connection::open(&Address::Unix(socket.into())).await?;
-        Self::with_spec(&connection, tasks::catalogue().find(name)?, batch, values).await
+        let fixed: Vec<_> = values.iter().map(|&(name, value)| (name, Distribution::fixed(value))).collect();
+        Self::with_spec(&connection, tasks::catalogue().find(name)?, batch, &fixed).await
     }
 
     /// Opens an environment that need not be built in.
@@ -53,23 +54,34 @@ impl Client {
         spec: &'static EnvironmentSpec,
         batch: usize,
     ) -> Result<Self, Failure> {
-        Self::with_spec(&Connection::open(&Address::Unix(socket.into())).await?, spec, batch, &[]).await
+        Self::open_drawn(socket, spec, batch, &[]).await
+    }
+
+    /// Opens an environment that need not be built in, with parameters from these distributions.
+    #[cfg(feature = "mujoco")]
+    pub(crate) async fn open_drawn(
+        socket: &Path,
+        spec: &'static EnvironmentSpec,
+        batch: usize,
+        drawn: &[(&str, Distribution)],
+    ) -> Result<Self, Failure> {
+        Self::with_spec(&Connection::open(&Address::Unix(socket.into())).await?, spec, batch, drawn).await
     }
 
     async fn with_spec(
         connection: &Connection,
         spec: &'static EnvironmentSpec,
         batch: usize,
-        values: &[(&str, f64)],
+        drawn: &[(&str, Distribution)],
     ) -> Result<Self, Failure> {
-        let fixed = |&(name, value): &(&str, f64)| (name.to_owned(), (&Distribution::fixed(value)).into());
+        let named = |(name, distribution): &(&str, Distribution)| ((*name).to_owned(), distribution.into());
         let open = proto::Open {
             environment: spec.name.into(),
             version: proto::Version::Default.into(),
             batch_size: batch as u32,
             seed: SEED,
             autoreset_mode: proto::AutoresetMode::SameStep.into(),
-            parameters: values.iter().map(fixed).collect(),
+            parameters: drawn.iter().map(named).collect(),
             ..Default::default()
         };
         let (session, _) = Session::open(connection, open).await?;

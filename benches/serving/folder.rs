@@ -4,7 +4,10 @@
 //!   steps a second of 64 environments on one server of two workers.
 //! - `step/folder/Walker2d`, `Ant` and `Humanoid`: Gymnasium's tasks, 64 environments, the server's CPU time against a bare
 //!   loop that calls the same MuJoCo functions as often: mj_step, and mj_rnePostConstraint where contact forces are read.
-//!   They need Gymnasium's models; `PERTURB_TEST_GYMNASIUM_ASSETS` names their folder.
+//! - `step/folder/lengths`: Walker2d on R, 64 environments, with a length that is drawn at each reset, against the same
+//!   length fixed; and the memory of an environment.
+//!
+//!   All but the first need Gymnasium's models; `PERTURB_TEST_GYMNASIUM_ASSETS` names their folder.
 
 use crate::{
     Failure,
@@ -14,7 +17,7 @@ use crate::{
 };
 use bytes::Bytes;
 use perturb::{
-    env::{Action, EnvironmentSpec, Episodes, Settings, Version},
+    env::{Action, Distribution, EnvironmentSpec, Episodes, Parameter, Settings, Version},
     tasks::folder,
 };
 use perturb_mujoco::{Model, Simulation};
@@ -23,8 +26,11 @@ use tempfile::TempDir;
 
 const BATCH: usize = 64;
 const ROUNDS: usize = 11;
-/// Environment steps of a round.
-const STEPS: usize = 1 << 13;
+/// Environment steps of a round, by the estimated cost of one: Humanoid's round would take three seconds otherwise.
+fn steps_of_a_round(spec: &EnvironmentSpec) -> usize {
+    const ROUND_US: f64 = 500_000.0;
+    ((ROUND_US / spec.step_cost) as usize / BATCH).clamp(16, 128) * BATCH
+}
 
 /// The built-in Hopper's task, as far as a folder can say it: roboschool's terms, and its observation without the
 /// clipping of single entries.
@@ -66,7 +72,10 @@ const GYMNASIUM: [(&str, &str, bool); 3] =
 
 /// The identifiers of the figures.
 pub(crate) fn ids() -> impl Iterator<Item = String> {
-    std::iter::once("Hopper").chain(GYMNASIUM.map(|(name, ..)| name)).map(|name| format!("step/folder/{name}"))
+    std::iter::once("Hopper")
+        .chain(GYMNASIUM.map(|(name, ..)| name))
+        .chain(["lengths"])
+        .map(|name| format!("step/folder/{name}"))
 }
 
 /// Prints the figures of one identifier.
@@ -79,14 +88,68 @@ pub(crate) async fn served(id: &str) -> Result<(), Failure> {
         println!("{id:<22} not measured: PERTURB_TEST_GYMNASIUM_ASSETS does not name gymnasium's envs/mujoco/assets");
         return Ok(());
     };
+    let read = |file: &str| -> Result<(String, String, String), Failure> {
+        let text = fs::read_to_string(format!("python/src/perturb/task_files/{file}.toml"))?;
+        let model =
+            text.split("model = \"").nth(1).and_then(|rest| rest.split('"').next()).ok_or("no model")?.to_owned();
+        let mjcf = fs::read_to_string(Path::new(&assets).join(&model))?;
+        Ok((text, model, mjcf))
+    };
+    if name == "lengths" {
+        let (text, model, mjcf) = read("walker2d_v5")?;
+        return with_lengths(id, written(&(text + LENGTH), &model, &mjcf)?.path()).await;
+    }
     for (task, file, external_forces) in GYMNASIUM {
         if task == name {
-            let text = fs::read_to_string(format!("python/src/perturb/task_files/{file}.toml"))?;
-            let model = text.split("model = \"").nth(1).and_then(|rest| rest.split('"').next()).ok_or("no model")?;
-            let mjcf = fs::read_to_string(Path::new(&assets).join(model))?;
-            let folder = written(&text, model, &mjcf)?;
+            let (text, model, mjcf) = read(file)?;
+            let folder = written(&text, &model, &mjcf)?;
             beside_mujoco(id, folder.path(), &mjcf, external_forces).await?;
         }
+    }
+    Ok(())
+}
+
+/// A length of Walker2d.
+const LENGTH: &str = r#"
+[[parameter]]
+name = "thigh_length"
+unit = "m"
+description = "length of both thighs, whose mass follows"
+edit = [{ body = ["thigh", "thigh_left"], field = "length", by = "set" }]
+bounds = [0.2, 0.8]
+random = [0.4, 0.5]
+extreme = [[0.3, 0.4], [0.5, 0.6]]
+"#;
+
+async fn with_lengths(id: &str, path: &Path) -> Result<(), Failure> {
+    const TRIPS: usize = 64;
+    const MORE: usize = 1024;
+    let spec = folder::load(path)?.spec();
+    let server = ServerProcess::with_flags(2, &["--task".as_ref(), path])?;
+    let distributions = |is_drawn: bool| -> Vec<(&str, Distribution)> {
+        let of = |parameter: &Parameter| match parameter.name {
+            "thigh_length" if !is_drawn => Distribution::fixed(parameter.default),
+            _ => parameter.distribution(Version::R),
+        };
+        spec.parameters.iter().map(|parameter| (parameter.name, of(parameter))).collect()
+    };
+    let mut fixed = Client::open_drawn(&server.socket, spec, BATCH, &distributions(false)).await?;
+    let mut drawn = Client::open_drawn(&server.socket, spec, BATCH, &distributions(true)).await?;
+    let (mut ratios, mut steps) = (Vec::new(), Vec::new());
+    for _ in 0..2 * ROUNDS {
+        let expected = TRIPS as f64 / fixed.run(TRIPS).await?;
+        let found = TRIPS as f64 / drawn.run(TRIPS).await?;
+        ratios.push(found / expected);
+        steps.push(found * BATCH as f64);
+    }
+    println!("{id:<22} {:>8.0} env steps/s with a length that is drawn at each reset", median(&mut steps));
+    println!("{id:<22} {:>8.3} of those with a fixed length", median(&mut ratios));
+    for (is_drawn, about) in [(false, "a fixed length"), (true, "its own length")] {
+        let before = server.resident()?;
+        let mut many = Client::open_drawn(&server.socket, spec, MORE, &distributions(is_drawn)).await?;
+        many.run(5).await?;
+        let each = (server.resident()? - before) / 1e3 / MORE as f64;
+        println!("{id:<22} {each:>8.1} kB of the server for each environment with {about}");
     }
     Ok(())
 }
@@ -124,8 +187,9 @@ async fn beside_mujoco(id: &str, path: &Path, mjcf: &str, external_forces: bool)
     let before = server.resident()?;
     let mut bare = Bare::new(spec, mjcf, external_forces)?;
     let (mut served_ratios, mut own_ratios, mut micros) = (Vec::new(), Vec::new(), Vec::new());
+    let steps = steps_of_a_round(spec);
     for _ in 0..ROUNDS {
-        let actions: Vec<Bytes> = (0..STEPS / BATCH).map(|_| client.actions()).collect();
+        let actions: Vec<Bytes> = (0..steps / BATCH).map(|_| client.actions()).collect();
         let own = bare.environments(&actions)?;
         let mujoco = bare.run(&actions)?;
         let cpu = process_cpu(&server.proc())?;
@@ -133,7 +197,7 @@ async fn beside_mujoco(id: &str, path: &Path, mjcf: &str, external_forces: bool)
         let served = process_cpu(&server.proc())? - cpu;
         served_ratios.push(served / mujoco);
         own_ratios.push(own / mujoco);
-        micros.push(mujoco * 1e6 / STEPS as f64);
+        micros.push(mujoco * 1e6 / steps as f64);
     }
     println!("{id:<22} {:>8.2} us of CPU time an env step in the bare loop", median(&mut micros));
     println!("{id:<22} {:>8.3} of it in the server (at most 1.10)", median(&mut served_ratios));

@@ -1,8 +1,8 @@
 //! Pictures of MuJoCo's models, by MuJoCo and OpenGL.
 //!
 //! The models that run the physics have no colours, textures and lights, which would make each simulation larger. So
-//! pictures show another model: the same MJCF with scenery. Only positions are copied to it; the parameters (power,
-//! density, friction) cannot be seen.
+//! pictures show another model: the same MJCF with scenery. Positions are copied to it, and lengths if they are edited; the
+//! other parameters (power, density, friction) cannot be seen.
 
 use super::{Error, Size};
 use crate::scene::{Look, ModelView, PosedModel, Scenery};
@@ -26,6 +26,8 @@ pub(super) struct Models {
 struct ShownModel {
     look: &'static Look,
     renderer: mujoco::Renderer,
+    /// The MJCF with other lengths that is shown.
+    edited: Option<String>,
     /// The body that the camera follows, and its position at the initial positions, m.
     followed: Option<(usize, [f64; 3])>,
 }
@@ -54,15 +56,26 @@ impl Models {
                 self.drawn.len() - 1
             }
         };
-        self.drawn[index].draw(&model.qpos, size)
+        let shown = &mut self.drawn[index];
+        if shown.edited != model.edited {
+            let files = files(model.look);
+            let edited = mujoco::Model::from_files(model.edited.as_deref().unwrap_or(model.look.mjcf), &files)?;
+            shown.renderer.simulation().set_model(&edited)?;
+            shown.edited.clone_from(&model.edited);
+        }
+        shown.draw(&model.qpos, size)
     }
+}
+
+/// The files that a look's MJCF names.
+fn files(look: &Look) -> Vec<(&str, &[u8])> {
+    look.files.iter().map(|(name, bytes)| (name.as_str(), bytes.as_slice())).collect()
 }
 
 impl ShownModel {
     fn new(look: &'static Look, size: Size) -> Result<Self, mujoco::Error> {
         let compile = |reason: String| mujoco::Error::Compile { reason };
-        let files: Vec<(&str, &[u8])> =
-            look.files.iter().map(|(name, bytes)| (name.as_str(), bytes.as_slice())).collect();
+        let files = files(look);
         let (own, _) = look.mjcf.rsplit_once(END_OF_MODEL).ok_or_else(|| compile("the model has no end".into()))?;
         let scenery = look.scenery.map_or("", |scenery| scenery.mjcf);
         let model = mujoco::Model::from_files(&format!("{own}{scenery}{END_OF_MODEL}"), &files)?;
@@ -86,7 +99,7 @@ impl ShownModel {
             rgba[4 * geom..][..3].copy_from_slice(&rgb);
             rgba[4 * geom + 3] = opacity;
         }
-        Ok(Self { look, renderer, followed })
+        Ok(Self { look, renderer, edited: None, followed })
     }
 
     fn draw(&mut self, qpos: &[f64], size: Size) -> Result<Vec<u8>, mujoco::Error> {

@@ -9,6 +9,8 @@ mod analytic;
 pub mod folder;
 #[cfg(feature = "mujoco")]
 pub mod locomotion;
+#[cfg(feature = "mujoco")]
+mod shared;
 
 pub mod acrobot;
 pub mod cart_pole;

@@ -99,11 +99,13 @@ fn a_failed_drawing_fails_alone() {
         tasks,
     };
 
-    let Some(Scene::Model(PosedModel { look, qpos })) = tasks::hopper::hopper().unwrap().scene() else {
+    let Some(Scene::Model(PosedModel { look, qpos, .. })) = tasks::hopper::hopper().unwrap().scene() else {
         panic!("a new hopper can be seen")
     };
     let renderer = Renderer::new();
-    let draw = |look, qpos: &[f64]| run(renderer.draw(Scene::Model(PosedModel { look, qpos: qpos.to_vec() }), SIZE));
+    let draw = |look, qpos: &[f64]| {
+        run(renderer.draw(Scene::Model(PosedModel { look, edited: None, qpos: qpos.to_vec() }), SIZE))
+    };
     let expected = draw(look, &qpos).unwrap();
     // A defect: positions of another robot.
     assert_eq!(draw(look, &qpos[1..]), Err(Error::Defect));

@@ -1836,6 +1836,12 @@ unsafe extern "C" {
     pub fn perturb_mj_make_data(model: *const mjModel) -> *mut mjData;
 }
 unsafe extern "C" {
+    pub fn perturb_mj_same_sizes(a: *const mjModel, b: *const mjModel) -> ::std::os::raw::c_int;
+}
+unsafe extern "C" {
+    pub fn perturb_mj_set_model(model: *mut mjModel, source: *const mjModel) -> ::std::os::raw::c_int;
+}
+unsafe extern "C" {
     pub fn perturb_mj_set_const(model: *mut mjModel, data: *mut mjData) -> ::std::os::raw::c_int;
 }
 unsafe extern "C" {

@@ -59,6 +59,25 @@ impl Simulation {
         &self.model
     }
 
+    /// Replaces the model by a copy of another one of the same sizes, with its edits. What was computed is undefined then;
+    /// the state is not.
+    ///
+    /// # Errors
+    /// [`Error::Fatal`], [`Error::Poisoned`].
+    ///
+    /// # Panics
+    /// If a size differs.
+    pub fn set_model(&mut self, source: &Model) -> Result<(), Error> {
+        assert!(self.model.has_sizes_of(source), "the model has other sizes");
+        if self.status == Status::Poisoned {
+            return Err(Error::Poisoned);
+        }
+        // SAFETY: two valid models of the same sizes, of which `&mut self` lends the one that is written to nobody else. Its
+        // arrays stay where they are, so that the pairs' addresses remain valid.
+        let failed = unsafe { sys::perturb_mj_set_model(self.model.as_ptr(), source.as_ptr()) };
+        self.poison_if(failed)
+    }
+
     // ---- model edits
 
     /// Writes the constants that the edits below change, with everything that follows from them: [`Model::n_constants`]

@@ -84,6 +84,12 @@ float_fields! {
     BodySubtreeMass = body_subtreemass: |m| m.nbody,
     /// Mean inverse inertia of bodies in the initial pose, `[B, 2]`.
     BodyInvWeight = body_invweight0: |m| 2 * m.nbody,
+    /// Positions of bodies' frames in those of their parents in m, `[B, 3]`.
+    BodyPosition = body_pos: |m| 3 * m.nbody,
+    /// Rotations of bodies' frames in those of their parents, as quaternions, `[B, 4]`.
+    BodyRotation = body_quat: |m| 4 * m.nbody,
+    /// Sizes of geoms in m, `[G, 3]`: of a sphere the radius, of a capsule or cylinder the radius and half of the length.
+    GeomSize = geom_size: |m| 3 * m.ngeom,
     /// Sliding, torsional and rolling friction of geoms, `[G, 3]`.
     GeomFriction = geom_friction: |m| 3 * m.ngeom,
     /// Friction of declared pairs: two sliding, one torsional, two rolling, `[P, 5]`.
@@ -102,6 +108,8 @@ float_fields! {
     JointStiffness = jnt_stiffness: |m| m.njnt,
     /// Limits of joints in rad or m, `[J, 2]`.
     JointRange = jnt_range: |m| 2 * m.njnt,
+    /// Anchors of joints in the frames of their bodies in m, `[J, 3]`.
+    JointAnchor = jnt_pos: |m| 3 * m.njnt,
     /// Initial positions, `[Q]`.
     InitialPositions = qpos0: |m| m.nq,
     /// Gears of actuators, `[U, 6]`.
@@ -173,6 +181,10 @@ model_arrays! {
         JointPosition = jnt_qposadr: |m| m.njnt,
         /// First entries of joints in `qvel`, `[J]`.
         JointVelocity = jnt_dofadr: |m| m.njnt,
+        /// Bodies of joints, `[J]`.
+        JointBody = jnt_bodyid: |m| m.njnt,
+        /// Types of geoms, of `mjtGeom`: 2 sphere, 3 capsule, 5 cylinder, 7 mesh, `[G]`.
+        GeomType = geom_type: |m| m.ngeom,
         /// Bodies of geoms, `[G]`.
         GeomBody = geom_bodyid: |m| m.ngeom,
         /// Contact types of geoms, `[G]`.

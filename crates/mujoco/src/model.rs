@@ -168,6 +168,12 @@ impl Model {
         NonNull::new(pointer).map(|pointer| Self { pointer }).ok_or_else(last_error)
     }
 
+    /// Whether all sizes of two models are the same: the numbers of elements, of names and of memory.
+    pub fn has_sizes_of(&self, other: &Self) -> bool {
+        // SAFETY: two valid models, only read.
+        unsafe { sys::perturb_mj_same_sizes(self.pointer.as_ptr(), other.pointer.as_ptr()) != 0 }
+    }
+
     /// The number of the element of that kind and name.
     ///
     /// # Errors

@@ -5,6 +5,7 @@
 #include <math.h>
 #include <mujoco/mjxmacro.h>
 #include <setjmp.h>
+#include <stddef.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -89,6 +90,16 @@ mjModel* perturb_mj_copy_model(const mjModel* source) {
   mjModel* volatile copy = NULL;
   GUARDED(copy = mj_copyModel(NULL, source))
   return failed ? NULL : copy;
+}
+
+int perturb_mj_same_sizes(const mjModel* a, const mjModel* b) {
+  // The sizes stand at the beginning, before the options.
+  return memcmp(&a->nq, &b->nq, offsetof(mjModel, opt) - offsetof(mjModel, nq)) == 0;
+}
+
+int perturb_mj_set_model(mjModel* model, const mjModel* source) {
+  GUARDED(mj_copyModel(model, source))
+  return failed;
 }
 
 mjData* perturb_mj_make_data(const mjModel* model) {

@@ -20,6 +20,11 @@ mjModel* perturb_mj_load(const char* xml, int xml_size, int n_files, const char*
 mjModel* perturb_mj_copy_model(const mjModel* source);
 mjData* perturb_mj_make_data(const mjModel* model);
 
+// Whether all sizes of two models are the same.
+int perturb_mj_same_sizes(const mjModel* a, const mjModel* b);
+// Copies a model of the same sizes into another one, whose arrays stay where they are. Nonzero on failure.
+int perturb_mj_set_model(mjModel* model, const mjModel* source);
+
 // Nonzero on failure.
 int perturb_mj_set_const(mjModel* model, mjData* data);
 int perturb_mj_reset(const mjModel* model, mjData* data);

@@ -37,6 +37,7 @@ pub(super) fn check(
                 ));
             }
             match (edit.targets.subject, edit.targets.field) {
+                ("geom", "radius") => {}
                 ("geom", field) => friction(table, edit, (parameter, parameters), model, elements, field)?,
                 ("joint", "range") | ("actuator", "forcerange") => limits(table, edit, model)?,
                 ("option", "wind") => wind(table, parameters, model)?,
@@ -211,6 +212,12 @@ struct Contact {
     has_priority: bool,
     other_has_priority: bool,
     other_is_fixed: bool,
+}
+
+/// Whether a geom can touch another one.
+pub(super) fn can_touch(model: &Model, geom: usize) -> bool {
+    let mut declared = model.index_array(Index::PairGeom1).iter().chain(model.index_array(Index::PairGeom2));
+    declared.any(|&other| other as usize == geom) || !contacts_of(model, geom).is_empty()
 }
 
 /// Returns the possible contacts of a geom, without those of declared pairs.

@@ -1,9 +1,11 @@
 //! Finds edits without a visible effect: the physics is the same, byte for byte, at both ends of E.
 
-use super::{environment::Task, template};
-use crate::env::{Purpose, Stream};
+use super::environment::Task;
+use crate::{
+    env::{Purpose, Stream},
+    tasks::shared,
+};
 use perturb_mujoco::{Error, Simulation};
-use std::sync::Arc;
 
 /// Number of timesteps of random controls from the initial state.
 const N_STEPS: usize = 200;
@@ -33,9 +35,9 @@ pub(super) fn unseen(task: &'static Task) -> Result<Vec<&'static str>, Error> {
 
 /// Returns the states, as bits, after each timestep of random controls, until the physics diverge.
 fn trajectory(task: &'static Task, values: &[f64]) -> Result<Vec<u64>, Error> {
-    template::with(&task.template, |shared| {
-        let edit = shared.edit(&task.parameters, values)?;
-        let (simulation, _) = shared.at(&Arc::clone(&edit), &task.template.state)?;
+    let edit = task.template.edit(&task.parameters, values)?;
+    shared::with(&task.template, |shared| {
+        let (simulation, _) = shared.at(&edit, &task.template.state)?;
         let mut stream = Stream::new(0, 0, Purpose::InitialState, 0);
         let mut states = Vec::new();
         for _ in 0..N_STEPS {

@@ -7,13 +7,14 @@ use super::{
     reset::Reset,
     reward::{Step, Term},
     rules::{Best, Goal, Range},
-    template::{self, ModelEdit, Template},
+    template::{ModelEdit, Template},
 };
 use crate::{
     env::{Action, Environment, EnvironmentSpec, Error, Parameter, Stream, Transition},
     scene::{Look, PosedModel, Scene},
+    tasks::shared,
 };
-use perturb_mujoco::{Error as SimulationError, Simulation};
+use perturb_mujoco::{Error as SimulationError, Field, Simulation};
 use std::sync::Arc;
 
 /// Limit of positions and velocities in a saved state. Beyond this value MuJoCo itself reports divergence.
@@ -110,6 +111,9 @@ pub(super) struct FolderEnvironment {
     push: Option<[f64; 3]>,
     /// Whether the physics have diverged since the last reset.
     diverged: bool,
+    /// Whether the model could not be compiled with the lengths of the last parameters: it has those before, and each
+    /// episode begins diverged.
+    is_impossible: bool,
 }
 
 impl FolderEnvironment {
@@ -119,7 +123,9 @@ impl FolderEnvironment {
     /// [`Error::Model`] if there is no memory for a simulation.
     pub(super) fn new(task: &'static Task) -> Result<Self, Error> {
         let defaults: Vec<f64> = task.spec.parameters.iter().map(|parameter| parameter.default).collect();
-        let edit = template::with(&task.template, |shared| shared.edit(&task.parameters, &defaults))
+        let edit = task
+            .template
+            .edit(&task.parameters, &defaults)
             .map_err(|error| Error::Model { environment: task.spec.name, reason: error.to_string() })?;
         let mut environment = Self {
             task,
@@ -131,6 +137,7 @@ impl FolderEnvironment {
             achieved: 0.0,
             push: None,
             diverged: false,
+            is_impossible: false,
         };
         environment.start();
         Ok(environment)
@@ -154,7 +161,7 @@ impl FolderEnvironment {
     /// Begins an episode from the present state.
     fn start(&mut self) {
         let task = self.task;
-        let started = template::with(&task.template, |shared| {
+        let started = shared::with(&task.template, |shared| {
             let (simulation, numbers) = shared.at(&self.edit, &self.state)?;
             // Forces that another environment left must not be read. Sensors may compute them again.
             simulation.clear_external_forces();
@@ -172,7 +179,7 @@ impl FolderEnvironment {
             self.remembered.copy_from_slice(&remembered);
             Ok(is_finite(&self.remembered) && self.observe_now(simulation, &context, numbers, true))
         });
-        self.diverged = !matches!(started, Ok(true));
+        self.diverged = self.is_impossible || !matches!(started, Ok(true));
     }
 
     /// Computes the observation and the achieved value, and stores them if all numbers are finite.
@@ -292,18 +299,24 @@ impl Environment for FolderEnvironment {
 
     fn set_parameters(&mut self, values: &[f64]) {
         let task = self.task;
-        let edit = || template::with(&task.template, |shared| shared.edit(&task.parameters, values));
+        let edit = || task.template.edit(&task.parameters, values);
         // A fatal error needs a second attempt, with a new simulation.
-        self.edit = edit().or_else(|_| edit()).expect(NO_MEMORY);
+        match edit().or_else(|_| edit()) {
+            Err(SimulationError::Compile { .. }) => self.is_impossible = true,
+            edited => {
+                self.edit = edited.expect(NO_MEMORY);
+                self.is_impossible = false;
+            }
+        }
     }
 
     fn applied(&self, out: &mut [f64]) {
         let task = self.task;
-        let read = template::with(&task.template, |shared| {
-            let model = shared.edited(&self.edit).model();
+        let read = shared::with(&task.template, |shared| {
+            let model = shared.edited(&self.edit)?.model();
             let parameters = task.parameters.iter().zip(&self.edit.values);
-            let read_back =
-                parameters.map(|(parameter, &value)| parameter.read_back(&task.template.model, model, value));
+            let pristine = (&*task.template.model, &*self.edit.compiled);
+            let read_back = parameters.map(|(parameter, &value)| parameter.read_back(pristine, model, value));
             let values = read_back.chain(task.applied.iter().map(|quantity| quantity.read(model)));
             out.iter_mut().zip(values).for_each(|(out, value)| *out = value);
             Ok(())
@@ -337,6 +350,13 @@ impl Environment for FolderEnvironment {
         let reset = &self.task.reset;
         let (qpos, qvel) = self.positions_mut();
         reset.draw(stream, qpos, qvel);
+        // The initial position of a free body is where the model has it.
+        let (own, compiled) = (Arc::clone(&self.task.template.model), Arc::clone(&self.edit.compiled));
+        if !Arc::ptr_eq(&own, &compiled) {
+            let initial = own.field(Field::InitialPositions).iter().zip(compiled.field(Field::InitialPositions));
+            let (qpos, _) = self.positions_mut();
+            qpos.iter_mut().zip(initial).for_each(|(q, (own, compiled))| *q += compiled - own);
+        }
         self.start();
     }
 
@@ -355,7 +375,9 @@ impl Environment for FolderEnvironment {
 
     fn scene(&self) -> Option<Scene> {
         let qpos = &self.state[1..][..self.task.template.model.n_q()];
-        (!self.diverged).then(|| Scene::Model(PosedModel { look: &self.task.look, qpos: qpos.to_vec() }))
+        let edited = || self.task.template.recompilation.as_ref()?.picture(&self.edit.values);
+        let posed = || PosedModel { look: &self.task.look, edited: edited(), qpos: qpos.to_vec() };
+        (!self.diverged).then(|| Scene::Model(posed()))
     }
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
@@ -365,7 +387,7 @@ impl Environment for FolderEnvironment {
         }
         let edit = Arc::clone(&self.edit);
         let push = self.push.take().zip(self.task.pushed_body);
-        let stepped = template::with(&self.task.template, |shared| {
+        let stepped = shared::with(&self.task.template, |shared| {
             let (simulation, numbers) = shared.at(&edit, &self.state)?;
             push.into_iter().for_each(|(force, body)| simulation.set_force(body, force));
             let stepped = self.advance((&mut *simulation, numbers), action, reward_terms);
@@ -406,7 +428,7 @@ impl Environment for FolderEnvironment {
         if physics[1..][..model.n_q() + model.n_v()].iter().any(|value| value.abs() > MAX_STATE) {
             return refuse("its state diverges".into());
         }
-        self.diverged = diverged;
+        self.diverged = diverged || self.is_impossible;
         self.state.copy_from_slice(physics);
         self.remembered.copy_from_slice(take(self.remembered.len()));
         let single =

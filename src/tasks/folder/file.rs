@@ -1,7 +1,7 @@
 //! Reads the file `task.toml`, compiles the model and assembles the task.
 
 use super::{
-    checks,
+    attributes, checks,
     declared::{self, Push},
     elements::{Elements, actuator_name},
     environment::{Needs, Poses, Task},
@@ -12,6 +12,7 @@ use super::{
     parameter::{AppliedQuantity, EditedParameter},
     picture,
     reading::Reading,
+    recompilation::Recompilation,
     reset::Reset,
     reward::Term,
     rules::{Goal, Range, leaked},
@@ -80,9 +81,21 @@ pub(super) fn read(files: &mut Files) -> Result<Task> {
     top.only(KEYS)?;
     let about = Header::new(&top)?;
     let main = top.require("model", "\"robot.xml\"")?.text()?;
-    let mjcf = mjcf::read(files, main)?;
+    let mut mjcf = mjcf::read(files, main)?;
+    // Numbers of elements are those of the model as it stands in the folder.
+    if edits_lengths(&top) && !text.contains("\"#") && !text.contains("'#") {
+        mjcf.physics = attributes::without_shown(&mjcf.physics)?;
+        mjcf.leaves_out = true;
+    }
     let model = compile(&mjcf, main)?;
     assemble(&top, about, (mjcf, model, main), files.hash())
+}
+
+/// Whether a parameter may need the model to be compiled again. What is wrong about it is told later.
+fn edits_lengths(top: &Table<'_>) -> bool {
+    let parameters = top.tables("parameter").unwrap_or_default();
+    let mut edits = parameters.iter().flat_map(|table| table.tables("edit").unwrap_or_default());
+    edits.any(|edit| matches!(edit.text("field"), Ok(Some("length" | "size" | "position" | "radius"))))
 }
 
 /// Settings that do not need the model.
@@ -191,10 +204,11 @@ fn assemble(top: &Table<'_>, about: Header, (mjcf, model, main): (Mjcf, Model, &
     let view = picture::view(picture.as_ref(), &model, &elements)?;
     let (controls, scaled) = controls(top, &model, &elements)?;
     let (parameters, applied) = parameters(top, &model, &elements)?;
+    let recompilation = Recompilation::new(&top.tables("parameter")?, &parameters, &mjcf, &model)?;
     let heatmap_axes = heatmap_axes(top, &parameters)?;
     let Mjcf { picture, statistic, .. } = mjcf;
     let mut template = Template::new(model, &statistic).map_err(|error| Error::file(main, error))?;
-    template.prepare(&parameters);
+    template.prepare(&parameters, recompilation);
     let push = top.get("push").map(|value| value.table()).transpose()?;
     let push = Push::new(push.as_ref(), &template.model, &elements)?;
     let needs = Needs::new(&observation, &reward, &healthy, &goal);

@@ -38,6 +38,8 @@ pub(super) struct Mjcf {
     pub(super) statistic: Vec<String>,
     /// Whether the model's masses are scaled to a total.
     pub(super) has_total_mass: bool,
+    /// Whether the physics' text lacks the geoms that only pictures show.
+    pub(super) leaves_out: bool,
 }
 
 /// A text with one element per line, and the files that it names.
@@ -57,6 +59,17 @@ impl Text {
     pub(super) fn source(&self, line: usize) -> Option<(&str, u32)> {
         let (file, line) = *self.lines.get(line.checked_sub(1)?)?;
         Some((self.sources.get(file)?, line))
+    }
+
+    /// The text without some lines, counted from 1.
+    pub(super) fn without(&self, rows: &[u32]) -> Self {
+        let mut kept =
+            Self { xml: String::new(), files: self.files.clone(), lines: Vec::new(), sources: self.sources.clone() };
+        let lines = self.xml.lines().zip(&self.lines).enumerate();
+        for (_, (line, &source)) in lines.filter(|(i, _)| !rows.contains(&(*i as u32 + 1))) {
+            kept.push(line, source);
+        }
+        kept
     }
 
     fn push(&mut self, element: &str, (file, line): (usize, u32)) {
@@ -115,7 +128,8 @@ pub(super) fn read(files: &mut Files, main: &str) -> Result<Mjcf> {
     writer.picture.sources.clone_from(&writer.physics.sources);
     writer.element(0, root, Kept::Both, 0)?;
     let Writer { physics, picture, .. } = writer;
-    Ok(Mjcf { physics, picture, statistic, has_total_mass: compiler.iter().any(|name| name == "settotalmass") })
+    let has_total_mass = compiler.iter().any(|name| name == "settotalmass");
+    Ok(Mjcf { physics, picture, statistic, has_total_mass, leaves_out: false })
 }
 
 /// Reads a file and those that it includes, each once.
@@ -140,7 +154,7 @@ fn collect(files: &mut Files, path: &str, who: &str, sources: &mut Vec<(String, 
     Ok(())
 }
 
-fn parse<'a>(name: &str, text: &'a str) -> Result<Document<'a>> {
+pub(super) fn parse<'a>(name: &str, text: &'a str) -> Result<Document<'a>> {
     let options = ParsingOptions { allow_dtd: false, nodes_limit: MAX_NODES, ..ParsingOptions::default() };
     let document = Document::parse_with_options(text, options).map_err(|error| {
         let line = error.pos().row as usize;
@@ -360,7 +374,7 @@ fn in_defaults(node: &Node<'_, '_>) -> bool {
     node.ancestors().any(|ancestor| ancestor.has_tag_name("default"))
 }
 
-fn write_attribute(element: &mut String, key: &str, value: &str) {
+pub(super) fn write_attribute(element: &mut String, key: &str, value: &str) {
     let _ = write!(element, " {key}=\""); // writing to a String cannot fail
     for character in value.chars() {
         match character {
@@ -394,7 +408,7 @@ pub(super) fn explain(text: &Text, main: &str, reason: &str) -> Error {
 }
 
 /// Returns MuJoCo's message without its line and column, which refer to the rewritten text.
-fn escaped_reason(reason: &str) -> String {
+pub(super) fn escaped_reason(reason: &str) -> String {
     let cut = reason.find(", line ").unwrap_or(reason.len());
     let words: String = reason[..cut].chars().flat_map(char::escape_debug).collect();
     words.replace("\\'", "'").replace("\\\"", "\"").trim().to_owned()

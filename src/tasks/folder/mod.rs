@@ -7,9 +7,12 @@
 //! - `file` assembles the task from `reading` with its `number`s, `reward`, `rules`, `reset` and `parameter` with its
 //!   `target`s.
 //! - `checks` refuses edits that cannot have an effect, and `effect` looks for edits without a visible effect.
+//! - `attributes` looks up attributes of the model's elements, `lengths` edits the model's text, and `recompilation`
+//!   compiles it for each other value.
 //! - `environment` is the environment. `template` has the simulations, which all environments of a thread share.
 //! - `child` loads a folder for the first time in a process of its own, and `report` says what `--check` prints.
 
+mod attributes;
 mod checks;
 pub mod child;
 mod declared;
@@ -19,6 +22,7 @@ mod environment;
 mod error;
 mod file;
 mod files;
+mod lengths;
 mod load;
 mod mjcf;
 mod number;
@@ -26,6 +30,7 @@ mod parameter;
 mod picture;
 mod reading;
 mod reading_source;
+mod recompilation;
 mod report;
 mod reset;
 mod reward;

@@ -94,10 +94,10 @@ impl EditedParameter {
         self.edits.iter().flat_map(|edit| edit.targets.all.iter().copied())
     }
 
-    /// Applies a value to a simulation that has the pristine model.
+    /// Applies a value to a simulation that has the pristine model. What is compiled is in that model already.
     pub(super) fn apply(&self, pristine: &Model, simulation: &mut Simulation, value: f64) {
         for edit in &self.edits {
-            for &target in &edit.targets.all {
+            for &target in edit.targets.all.iter().filter(|target| !target.is_recompiled()) {
                 match edit.change {
                     Change::Scale => target.scale(pristine, simulation, value),
                     _ => target.set(pristine, simulation, edit.number(target.value(pristine), value)),
@@ -109,7 +109,7 @@ impl EditedParameter {
     /// Whether the value leaves the pristine model as it is.
     pub(super) fn is_pristine(&self, pristine: &Model, value: f64) -> bool {
         self.edits.iter().all(|edit| {
-            edit.targets.all.iter().all(|target| {
+            edit.targets.all.iter().filter(|target| !target.is_recompiled()).all(|target| {
                 let own = target.value(pristine);
                 edit.number(own, value).to_bits() == own.to_bits()
             })
@@ -117,13 +117,17 @@ impl EditedParameter {
     }
 
     /// Reads the parameter's value back from the model. Of the values of all targets it returns the one that is
-    /// farthest from the requested value.
-    pub(super) fn read_back(&self, pristine: &Model, model: &Model, requested: f64) -> f64 {
+    /// farthest from the requested value. `own` is the model as it stands in the folder, `compiled` the one that was
+    /// compiled with the lengths.
+    pub(super) fn read_back(&self, (own, compiled): (&Model, &Model), model: &Model, requested: f64) -> f64 {
         let values = self.edits.iter().flat_map(|edit| {
-            edit.targets.all.iter().map(|target| match edit.change {
-                Change::Set => edit.unscaled(target.value(model)),
-                Change::Scale => target.factor(pristine, model),
-                Change::Add => edit.unscaled(target.value(model) - target.value(pristine)),
+            edit.targets.all.iter().map(|target| {
+                let pristine = if target.is_recompiled() { own } else { compiled };
+                match edit.change {
+                    Change::Set => edit.unscaled(target.value(model)),
+                    Change::Scale => target.factor(pristine, model),
+                    Change::Add => edit.unscaled(target.value(model) - target.value(pristine)),
+                }
             })
         });
         let farther = |a: f64, b: f64| if (b - requested).abs() > (a - requested).abs() { b } else { a };
@@ -259,6 +263,9 @@ impl AppliedQuantity {
         let name = table.require("name", "\"torso_mass\"")?;
         let name = identifier(&name, name.text()?)?;
         let targets = Targets::new(table, model, elements, Change::Scale)?;
+        if targets.field == "size" {
+            return Err(table.error("a size is no number; name a length or a radius"));
+        }
         let [target] = targets.all[..] else {
             let problem = format!("this names {} numbers; name one", targets.all.len());
             return Err(table.error(problem));

@@ -6,14 +6,17 @@ use super::{
     error::{Error, LoadError},
     files::Files,
     load::{Folder, load},
+    recompilation::Recompilation,
 };
-use crate::env::{Action, ActionSpace, Channel, Episodes, Purpose, Settings, Stream, Version};
+use crate::env::{Action, ActionSpace, Channel, Episodes, Parameter, Purpose, Settings, Stream, Version};
 use perturb_mujoco::Kind;
 use std::{fmt::Write, path::Path, time::Duration};
 use tokio::time::Instant;
 
 /// Duration for which steps are timed.
 const TIMED: Duration = Duration::from_millis(200);
+/// Number of compilations that are timed.
+const N_COMPILATIONS: u32 = 9;
 /// Lists longer than this are shortened.
 const MAX_LISTED: usize = 24;
 
@@ -41,7 +44,41 @@ pub fn report(path: &Path, measured: bool) -> Result<String, LoadError> {
     let mut text = String::new();
     // Writing to a String cannot fail.
     let _ = describe(&mut text, folder.task, folder.files, &unseen, trial);
+    if let Some(recompilation) = &folder.task.template.recompilation {
+        let time = measured.then(|| compilation_time(folder.task, recompilation)).transpose();
+        let _ = lengths(&mut text, folder.task, recompilation, time.map_err(|error| LoadError::new(path, error))?);
+    }
     Ok(text)
+}
+
+/// Describes what parameters cost that need another compilation.
+fn lengths(out: &mut String, task: &Task, recompilation: &Recompilation, time: Option<Duration>) -> std::fmt::Result {
+    let names: Vec<&str> = recompilation.parameters(&task.parameters).collect();
+    let kilobytes = task.template.model.model_bytes() / 1000;
+    let time = time.map_or(String::new(), |time| format!(", {:.2} ms", 1e3 * time.as_secs_f64()));
+    writeln!(
+        out,
+        "  lengths       {}: another value compiles the model again{time}, and an environment keeps {kilobytes} kB more",
+        names.join(", ")
+    )
+}
+
+/// The median time of a compilation with other lengths, near the upper ends of E.
+fn compilation_time(task: &Task, recompilation: &Recompilation) -> Result<Duration, perturb_mujoco::Error> {
+    let mut times = Vec::new();
+    for i in 1..=N_COMPILATIONS {
+        let share = 1.0 - f64::from(i) * 1e-6; // values that are not cached
+        let value = |parameter: &Parameter| {
+            let high = parameter.extreme[1].high;
+            parameter.default + share * (high - parameter.default)
+        };
+        let values: Vec<f64> = task.spec.parameters.iter().map(value).collect();
+        let start = Instant::now();
+        recompilation.model(&task.template.model, &values)?;
+        times.push(start.elapsed());
+    }
+    times.sort_unstable();
+    Ok(times[times.len() / 2])
 }
 
 fn describe(out: &mut String, task: &Task, files: &Files, unseen: &[&str], trial: Option<Trial>) -> std::fmt::Result {

@@ -9,8 +9,8 @@ use perturb_mujoco::{Field, Flags, Index, Kind, Model, Simulation};
 
 /// The kinds of elements that can be edited, by the key that names them, with their fields.
 pub(super) const EDITABLE: [(&str, Kind, &[&str]); 6] = [
-    ("body", Kind::Body, &["mass"]),
-    ("geom", Kind::Geom, &["friction", "friction_torsion", "friction_roll"]),
+    ("body", Kind::Body, &["mass", "length", "size", "position"]),
+    ("geom", Kind::Geom, &["friction", "friction_torsion", "friction_roll", "radius"]),
     ("pair", Kind::Pair, &["friction"]),
     ("joint", Kind::Joint, &["damping", "armature", "frictionloss", "stiffness", "range"]),
     ("actuator", Kind::Actuator, &["gear", "kp", "kv", "forcerange"]),
@@ -48,6 +48,14 @@ pub(super) enum Target {
     VelocityGain(usize),
     /// The damping of an actuator with an affine bias.
     ActuatorDamping(usize),
+    /// The length of a body, which is that of its longest capsule or cylinder. (body, geom)
+    Length(usize, usize),
+    /// The size of a body in all directions, of which there are multiples only. (body, one of its geoms)
+    Size(usize, usize),
+    /// The radius of a sphere, a capsule or a cylinder.
+    Radius(usize),
+    /// A coordinate of a body's frame in that of its parent. (body, axis)
+    Position(usize, usize),
 }
 
 /// Several targets, and the element and field that they have in common.
@@ -90,8 +98,8 @@ impl Targets {
             let known = fields.join(", ");
             field_value.error(format_args!("{:?} is unknown; of a {subject} there are {known}", escaped(name)))
         })?;
-        if let Some(axis) = table.get("axis") {
-            return Err(axis.error("axis goes with the options gravity and wind"));
+        if let Some(axis) = table.get("axis").filter(|_| field != "position") {
+            return Err(axis.error("axis goes with the options gravity and wind, and with the position of a body"));
         }
         if let Some(end) = table.get("end").filter(|_| !matches!(field, "range" | "forcerange")) {
             return Err(end.error("end goes with the fields range and forcerange"));
@@ -105,7 +113,23 @@ impl Targets {
             };
             let refuse = |problem: &str| value.error(format_args!("{subject} {:?} {problem}", escaped(&shown)));
             match (subject, field) {
-                ("body", _) => all.push(mass(model, id).ok_or_else(|| refuse("has no mass, or is the world"))?),
+                ("body", "mass") => all.push(mass(model, id).ok_or_else(|| refuse("has no mass, or is the world"))?),
+                ("body", "length") => {
+                    let refused =
+                        || refuse("has no capsule and no cylinder, so it has no length; use field = \"size\"");
+                    all.push(length(model, id).ok_or_else(refused)?);
+                }
+                ("body", "size") if change != Change::Scale => return Err(refuse("has a size by = \"scale\" only")),
+                ("body", "size") => {
+                    let refused = || refuse("has no geom of its own that could be scaled; use field = \"position\"");
+                    all.push(size(model, id).ok_or_else(refused)?);
+                }
+                ("body", _) if id == 0 => return Err(refuse("has no position")),
+                ("body", _) => all.push(Target::Position(id, axis(table, "position")?)),
+                ("geom", "radius") => {
+                    let refused = || refuse("is no sphere, capsule or cylinder, so it has no radius");
+                    all.push(radius(model, id).ok_or_else(refused)?);
+                }
                 ("geom", _) => all.push(Target::Number(Field::GeomFriction, 3 * id + friction_column(field))),
                 ("pair", _) => all.push(Target::Twins(Field::PairFriction, 5 * id)),
                 ("joint", "stiffness") => all.push(Target::Number(Field::JointStiffness, id)),
@@ -154,15 +178,10 @@ impl Targets {
             }
         }
         let has_axes = matches!(option, "gravity" | "wind");
-        let axis = match table.get("axis") {
-            None if has_axes => return Err(table.error(format_args!("{option} has three axes; give axis = \"z\""))),
+        let axis = match table.get("axis").filter(|_| !has_axes) {
+            Some(axis) => return Err(axis.error(format_args!("{option} has no axes; leave axis out"))),
+            None if has_axes => axis(table, option)?,
             None => 0,
-            Some(axis) if !has_axes => return Err(axis.error(format_args!("{option} has no axes; leave axis out"))),
-            Some(axis) => {
-                let text = axis.text()?;
-                let found = ["x", "y", "z"].iter().position(|&known| known == text);
-                found.ok_or_else(|| axis.error(format_args!("{:?} is no axis; expected x, y or z", escaped(text))))?
-            }
         };
         let field = match option {
             "gravity" => Field::Gravity,
@@ -178,12 +197,50 @@ impl Targets {
     /// negative.
     pub(super) fn least(&self) -> Option<(f64, bool)> {
         match (self.subject, self.field) {
-            ("body", _) => Some((0.0, true)),
+            ("body", "position") => None,
+            ("body", _) | ("geom", "radius") => Some((0.0, true)),
             ("option", "gravity" | "wind") | ("actuator", "gear") | ("joint", "range") => None,
             ("actuator", "forcerange") if matches!(self.all[..], [Target::Number(..), ..]) => None,
             _ => Some((0.0, false)),
         }
     }
+}
+
+/// The number of the axis that a table names.
+fn axis(table: &Table<'_>, of: &str) -> Result<usize> {
+    let axis = table.get("axis").ok_or_else(|| table.error(format_args!("{of} has three axes; give axis = \"z\"")))?;
+    let text = axis.text()?;
+    let found = ["x", "y", "z"].iter().position(|&known| known == text);
+    found.ok_or_else(|| axis.error(format_args!("{:?} is no axis; expected x, y or z", escaped(text))))
+}
+
+/// MuJoCo's types of geoms.
+const SPHERE: i32 = 2;
+const CAPSULE: i32 = 3;
+const CYLINDER: i32 = 5;
+const BOX: i32 = 6;
+
+/// The geoms of a body, each with its type.
+fn geoms(model: &Model, body: usize) -> impl Iterator<Item = (usize, i32)> + '_ {
+    let types = model.index_array(Index::GeomType).iter().copied().enumerate();
+    types.filter(move |(geom, _)| model.index_array(Index::GeomBody)[*geom] as usize == body)
+}
+
+fn length(model: &Model, body: usize) -> Option<Target> {
+    let long = geoms(model, body).filter(|(_, kind)| matches!(*kind, CAPSULE | CYLINDER)).map(|(geom, _)| geom);
+    let half = |geom: &usize| model.field(Field::GeomSize)[3 * geom + 1];
+    // Of equal ones the first.
+    let longest = long.reduce(|a, b| if half(&b) > half(&a) { b } else { a })?;
+    (body > 0).then_some(Target::Length(body, longest))
+}
+
+fn size(model: &Model, body: usize) -> Option<Target> {
+    let first = geoms(model, body).find(|(_, kind)| (SPHERE..=BOX).contains(kind))?;
+    (body > 0).then_some(Target::Size(body, first.0))
+}
+
+fn radius(model: &Model, geom: usize) -> Option<Target> {
+    matches!(model.index_array(Index::GeomType)[geom], SPHERE | CAPSULE | CYLINDER).then_some(Target::Radius(geom))
 }
 
 fn friction_column(field: &str) -> usize {
@@ -253,7 +310,15 @@ impl Target {
             Self::Gear(actuator) => (Field::ActuatorGear, N_GEAR * actuator),
             Self::PositionGain(actuator) | Self::VelocityGain(actuator) => (Field::ActuatorGain, N_GAIN * actuator),
             Self::ActuatorDamping(actuator) => (Field::ActuatorBias, N_GAIN * actuator + 2),
+            Self::Length(_, geom) => (Field::GeomSize, 3 * geom + 1),
+            Self::Size(_, geom) | Self::Radius(geom) => (Field::GeomSize, 3 * geom),
+            Self::Position(body, axis) => (Field::BodyPosition, 3 * body + axis),
         }
+    }
+
+    /// Whether the value enters the model's text, which is compiled again.
+    pub(super) fn is_recompiled(self) -> bool {
+        matches!(self, Self::Length(..) | Self::Size(..) | Self::Radius(_) | Self::Position(..))
     }
 
     /// The arrays that an edit changes itself.
@@ -282,7 +347,11 @@ impl Target {
     pub(super) fn value(self, model: &Model) -> f64 {
         let (field, at) = self.place();
         let value = model.field(field)[at];
-        if matches!(self, Self::ActuatorDamping(_)) { -value } else { value }
+        match self {
+            Self::ActuatorDamping(_) => -value,
+            Self::Length(..) => 2.0 * value,
+            _ => value,
+        }
     }
 
     /// Sets the value in a simulation's model, which still has the pristine value.
@@ -292,6 +361,7 @@ impl Target {
         simulation.field_mut(field)[at] = if matches!(self, Self::ActuatorDamping(_)) { -value } else { value };
         match self {
             Self::Number(..) | Self::ActuatorDamping(_) => {}
+            Self::Length(..) | Self::Size(..) | Self::Radius(_) | Self::Position(..) => {} // they are compiled
             Self::Twins(..) => simulation.field_mut(field)[at + 1] = value,
             Self::Symmetric(..) => simulation.field_mut(field)[at - 1] = -value,
             // Ranges with two ends are only scaled, never set.
@@ -323,6 +393,7 @@ impl Target {
         multiply(field, at);
         match self {
             Self::Number(..) | Self::ActuatorDamping(_) => {}
+            Self::Length(..) | Self::Size(..) | Self::Radius(_) | Self::Position(..) => {} // they are compiled
             Self::Twins(..) => multiply(field, at + 1),
             Self::Symmetric(..) | Self::Ends(..) => multiply(field, at - 1),
             Self::Mass(body) => (0..3).for_each(|i| multiply(Field::BodyInertia, 3 * body + i)),

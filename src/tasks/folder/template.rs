@@ -1,24 +1,20 @@
-//! The compiled model of a folder, its edits, and the simulations that environments share.
+//! The compiled model of a folder, and its edits.
 
-use super::parameter::EditedParameter;
+use super::{parameter::EditedParameter, recompilation::Recompilation, target::Target};
+use crate::tasks::shared;
 use perturb_mujoco::{Error, Field, Model, Simulation};
-use std::{cell::RefCell, ptr, sync::Arc};
-
-thread_local! {
-    /// The simulations of this thread that are not in use.
-    static IDLE: RefCell<Vec<SharedSimulation>> = const { RefCell::new(Vec::new()) };
-}
+use std::sync::Arc;
 
 /// A compiled model, which nothing changes.
 #[derive(Debug)]
 pub(super) struct Template {
-    pub(super) model: Model,
+    pub(super) model: Arc<Model>,
     /// The initial [state](Simulation::state), `[n_state]`.
     pub(super) state: Vec<f64>,
     /// The fields that edits change, and the fields that are derived from these.
     fields: Vec<Field>,
-    /// The contents of `fields` in the pristine model.
-    pristine: Vec<f64>,
+    /// The edits of lengths, if there are any.
+    pub(super) recompilation: Option<Recompilation>,
     /// Whether derived fields must be computed after an edit.
     derives: bool,
     /// The entries of [`Field::Statistic`] that the model's text gives.
@@ -30,6 +26,8 @@ pub(super) struct Template {
 pub(super) struct ModelEdit {
     /// The parameters, `[P]`.
     pub(super) values: Box<[f64]>,
+    /// The model with the lengths of these parameters, and without the other edits.
+    pub(super) compiled: Arc<Model>,
     fields: Box<[f64]>,
 }
 
@@ -44,119 +42,99 @@ impl Template {
         let given = |name: &str| statistic.iter().any(|given| given == name);
         let names = ["meaninertia", "meanmass", "meansize", "extent", "center", "center", "center"];
         let statistic = (0..names.len()).filter(|&i| given(names[i])).collect();
-        Ok(Self { model, state, fields: Vec::new(), pristine: Vec::new(), derives: false, statistic })
+        let model = Arc::new(model);
+        Ok(Self { model, state, fields: Vec::new(), recompilation: None, derives: false, statistic })
     }
 
     /// Prepares the template for edits by these parameters.
-    pub(super) fn prepare(&mut self, parameters: &[EditedParameter]) {
-        let targets = || parameters.iter().flat_map(EditedParameter::targets);
-        self.derives = targets().any(super::target::Target::changes_constants);
+    pub(super) fn prepare(&mut self, parameters: &[EditedParameter], recompilation: Option<Recompilation>) {
+        self.recompilation = recompilation;
+        let edited = || parameters.iter().flat_map(EditedParameter::targets);
+        let targets = || edited().filter(|target| !target.is_recompiled());
+        self.derives = targets().any(Target::changes_constants);
         let derived = if self.derives { &Field::DERIVED[..] } else { &[] };
         self.fields.clear();
-        for field in targets().flat_map(super::target::Target::fields).chain(derived.iter().copied()) {
+        for field in targets().flat_map(Target::fields).chain(derived.iter().copied()) {
             if !self.fields.contains(&field) {
                 self.fields.push(field);
             }
         }
-        self.pristine = self.fields.iter().flat_map(|&field| self.model.field(field)).copied().collect();
     }
-}
 
-/// A simulation of a thread, which environments take turns in, and the edit that its model was last given.
-///
-/// A model with MuJoCo's data takes megabytes, but two environments differ in some hundred bytes. An environment cannot
-/// see what another one did: its whole state is written into the simulation before it runs.
-pub(super) struct SharedSimulation {
-    template: &'static Template,
-    simulation: Simulation,
-    edit: Option<Arc<ModelEdit>>,
-    /// A scratch buffer for readings.
-    pub(super) numbers: Vec<f64>,
-}
-
-/// Runs `work` with this thread's simulation of the model. It is made when it is first needed, and again after a fatal
-/// error.
-///
-/// # Errors
-/// Those of `work`, and [`Error::Fatal`] without memory for a simulation.
-pub(super) fn with<T>(
-    template: &'static Template,
-    work: impl FnOnce(&mut SharedSimulation) -> Result<T, Error>,
-) -> Result<T, Error> {
-    let idle = IDLE.with_borrow_mut(|idle| {
-        let place = idle.iter().position(|shared| ptr::eq(shared.template, template))?;
-        Some(idle.swap_remove(place))
-    });
-    let mut shared = match idle {
-        Some(shared) => shared,
-        None => {
-            let simulation = Simulation::new(template.model.try_clone()?)?;
-            SharedSimulation { template, simulation, edit: None, numbers: Vec::new() }
+    /// The model with the lengths of these parameters.
+    fn compiled(&self, values: &[f64]) -> Result<Arc<Model>, Error> {
+        match &self.recompilation {
+            None => Ok(Arc::clone(&self.model)),
+            Some(recompilation) => recompilation.model(&self.model, values),
         }
-    };
-    let result = work(&mut shared);
-    if !shared.simulation.is_poisoned() {
-        IDLE.with_borrow_mut(|idle| idle.push(shared));
     }
-    result
 }
 
-impl SharedSimulation {
-    /// Makes the edit for these parameter values. The state is undefined afterwards.
+impl Template {
+    /// The edit to these parameters, by this thread's simulation.
     ///
     /// # Errors
-    /// MuJoCo's fatal ones.
-    pub(super) fn edit(&mut self, parameters: &[EditedParameter], values: &[f64]) -> Result<Arc<ModelEdit>, Error> {
-        if let Some(edit) = self.edit.as_ref().filter(|edit| is_same(&edit.values, values)) {
-            return Ok(Arc::clone(edit));
+    /// MuJoCo's fatal ones, and [`Error::Compile`] if the model cannot have these lengths.
+    pub(super) fn edit(&'static self, parameters: &[EditedParameter], values: &[f64]) -> Result<Arc<ModelEdit>, Error> {
+        shared::with(self, |shared| {
+            shared.edit(
+                |edit| is_same(&edit.values, values),
+                |own, simulation| own.new_edit(simulation, parameters, values),
+            )
+        })
+    }
+
+    fn new_edit(
+        &self,
+        simulation: &mut Simulation,
+        parameters: &[EditedParameter],
+        values: &[f64],
+    ) -> Result<ModelEdit, Error> {
+        let compiled = self.compiled(values)?;
+        if self.recompilation.is_some() {
+            simulation.set_model(&compiled)?;
         }
-        let Self { template, simulation, .. } = self;
-        self.edit = None;
-        simulation.set_fields(&template.fields, &template.pristine);
-        let pristine = &template.model;
+        let pristine = &*compiled;
+        for &field in &self.fields {
+            simulation.field_mut(field).copy_from_slice(pristine.field(field));
+        }
         let is_pristine =
             parameters.iter().zip(values).all(|(parameter, &value)| parameter.is_pristine(pristine, value));
         if !is_pristine {
             for (parameter, &value) in parameters.iter().zip(values) {
                 parameter.apply(pristine, simulation, value);
             }
-            if template.derives {
+            if self.derives {
                 simulation.set_const()?;
-                for &entry in &template.statistic {
+                for &entry in &self.statistic {
                     simulation.field_mut(Field::Statistic)[entry] = pristine.field(Field::Statistic)[entry];
                 }
             }
         }
-        let mut fields = vec![0.0; template.pristine.len()].into_boxed_slice();
-        simulation.fields(&template.fields, &mut fields);
-        let edit = Arc::new(ModelEdit { values: values.into(), fields });
-        self.edit = Some(Arc::clone(&edit));
-        Ok(edit)
+        let mut fields = vec![0.0; pristine.n_fields(&self.fields)].into_boxed_slice();
+        simulation.fields(&self.fields, &mut fields);
+        Ok(ModelEdit { values: values.into(), compiled, fields })
+    }
+}
+
+impl shared::SharedModel for Template {
+    type Edit = ModelEdit;
+
+    fn model(&self) -> &Model {
+        &self.model
     }
 
-    /// Returns the simulation with the edited model. Its state is undefined.
-    pub(super) fn edited(&mut self, edit: &Arc<ModelEdit>) -> &mut Simulation {
-        let is_in_force =
-            self.edit.as_ref().is_some_and(|own| Arc::ptr_eq(own, edit) || is_same(&own.values, &edit.values));
-        if !is_in_force {
-            self.simulation.set_fields(&self.template.fields, &edit.fields);
-            self.edit = Some(Arc::clone(edit));
+    fn is_same(a: &ModelEdit, b: &ModelEdit) -> bool {
+        is_same(&a.values, &b.values)
+    }
+
+    fn write(&self, simulation: &mut Simulation, before: Option<&ModelEdit>, edit: &ModelEdit) -> Result<(), Error> {
+        let has_lengths = before.is_some_and(|before| Arc::ptr_eq(&before.compiled, &edit.compiled));
+        if self.recompilation.is_some() && !has_lengths {
+            simulation.set_model(&edit.compiled)?;
         }
-        &mut self.simulation
-    }
-
-    /// Returns the simulation with the edited model in this [state](Simulation::state), and the scratch buffer for
-    /// readings. Nothing is computed from the state yet.
-    ///
-    /// # Errors
-    /// MuJoCo's fatal ones.
-    pub(super) fn at(
-        &mut self,
-        edit: &Arc<ModelEdit>,
-        state: &[f64],
-    ) -> Result<(&mut Simulation, &mut Vec<f64>), Error> {
-        self.edited(edit).set_state(state)?;
-        Ok((&mut self.simulation, &mut self.numbers))
+        simulation.set_fields(&self.fields, &edit.fields);
+        Ok(())
     }
 }
 

@@ -1,13 +1,14 @@
 //! The task that Hopper and HalfCheetah share, Roboschool's (Brockman et al., 2016; Schulman et al., 2017) on MuJoCo 2.2.2.
 //!
-//! [`Walker`] is the task. Environments take turns in a simulation of their thread (`shared.rs`). Each robot's folder
+//! [`Walker`] is the task. Environments take turns in a simulation of their thread (`tasks/shared.rs`). Each robot's folder
 //! has the robot's own numbers. The models are in `models/`, with the source of each number.
 
 pub(super) mod channels;
 pub(super) mod colours;
 mod model_edit;
 mod pristine;
-mod shared;
+#[cfg(test)]
+mod tests;
 mod walker;
 
 pub use walker::Walker;

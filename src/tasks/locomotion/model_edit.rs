@@ -17,7 +17,7 @@ pub(super) struct EditedElements {
 
 /// A change of the model: the parameters, and the [constants](Simulation::constants) that result from them.
 #[derive(Debug)]
-pub(super) struct RobotEdit {
+pub struct RobotEdit {
     /// The torso's density, kg/m³.
     pub(super) density: f64,
     /// The sliding friction of every geom but the floor.

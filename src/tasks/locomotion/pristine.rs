@@ -1,9 +1,13 @@
 //! A robot's compiled model, and the positions of its parts in MuJoCo's arrays.
 
-use super::{Robot, model_edit::EditedElements};
+use super::{
+    Robot,
+    model_edit::{EditedElements, RobotEdit},
+};
+use crate::tasks::shared::{self, SharedModel};
 use perturb_mujoco::{Error, Kind, Model, Simulation};
 use sha2::{Digest, Sha256};
-use std::fmt::Write;
+use std::{fmt::Write, sync::Arc};
 
 const TIMESTEP: f64 = 0.004125;
 /// Number of joints before those with motors: root_x, root_z, root_pitch.
@@ -97,5 +101,37 @@ impl Pristine {
             }
         }
         touching
+    }
+}
+
+impl Pristine {
+    /// The edit to these parameters, by this thread's simulation.
+    ///
+    /// # Errors
+    /// MuJoCo's fatal ones.
+    pub(super) fn edit(&'static self, density: f64, friction: f64) -> Result<Arc<RobotEdit>, Error> {
+        shared::with(self, |shared| {
+            shared.edit(
+                |edit| edit.is_of(density, friction),
+                |own, simulation| RobotEdit::new(own.targets, &own.constants, simulation, density, friction),
+            )
+        })
+    }
+}
+
+impl SharedModel for Pristine {
+    type Edit = RobotEdit;
+
+    fn model(&self) -> &Model {
+        &self.model
+    }
+
+    fn is_same(a: &RobotEdit, b: &RobotEdit) -> bool {
+        a.is_of(b.density, b.friction)
+    }
+
+    fn write(&self, simulation: &mut Simulation, _: Option<&RobotEdit>, edit: &RobotEdit) -> Result<(), Error> {
+        simulation.set_constants(&edit.constants);
+        Ok(())
     }
 }

@@ -5,11 +5,11 @@ use super::{
     channels::{CLIP, CONTROL_TIMESTEP},
     model_edit::RobotEdit,
     pristine::{MAX_JOINTS, MAX_STATE, Pristine},
-    shared,
 };
 use crate::{
     env::{Action, Environment, EnvironmentSpec, Error, Stream, Transition},
     scene::{PosedModel, Scene},
+    tasks::shared,
 };
 use perturb_mujoco::{Error as SimulationError, Simulation};
 use std::sync::Arc;
@@ -79,7 +79,7 @@ impl Walker {
         let refuse = |error: &SimulationError| Error::Model { environment: robot.spec.name, reason: error.to_string() };
         let pristine = robot.pristine.get_or_init(|| Pristine::compile(robot)).as_ref().map_err(refuse)?;
         let [power, density, friction] = std::array::from_fn(|i| robot.spec.parameters[i].default);
-        let edit = shared::with(pristine, |shared| shared.edit(density, friction)).map_err(|error| refuse(&error))?;
+        let edit = pristine.edit(density, friction).map_err(|error| refuse(&error))?;
         let mut walker = Self {
             robot,
             pristine,
@@ -105,7 +105,7 @@ impl Walker {
     /// # Errors
     /// MuJoCo's fatal ones.
     pub fn inspect<T>(&self, look: impl FnOnce(&Simulation) -> T) -> Result<T, SimulationError> {
-        shared::with(self.pristine, |shared| Ok(look(shared.at(&self.edit, self.state())?)))
+        shared::with(self.pristine, |shared| Ok(look(shared.at(&self.edit, self.state())?.0)))
     }
 
     /// The model's MJCF text, with default parameters.
@@ -144,7 +144,7 @@ impl Walker {
         self.greatest_x = 0.0;
         let pristine = self.pristine;
         let seen = shared::with(pristine, |shared| {
-            let simulation = shared.at(&self.edit, self.state())?;
+            let (simulation, _) = shared.at(&self.edit, self.state())?;
             simulation.motion()?;
             self.x = pristine.track_position(simulation);
             (self.greatest_x, self.initial_height) = pristine.torso(simulation);
@@ -256,7 +256,7 @@ impl Walker {
     fn contacts(&self) -> [bool; MAX_JOINTS] {
         let computed = || {
             shared::with(self.pristine, |shared| {
-                let simulation = shared.at(&self.edit, self.state())?;
+                let (simulation, _) = shared.at(&self.edit, self.state())?;
                 let _ = simulation.step1(); // the contacts are there; the next step repeats any warning
                 Ok(self.pristine.touching(simulation))
             })
@@ -278,7 +278,7 @@ impl Environment for Walker {
             unreachable!("a walker is given its three validated parameters")
         };
         self.power = power;
-        let edit = || shared::with(self.pristine, |shared| shared.edit(density, friction));
+        let edit = || self.pristine.edit(density, friction);
         // A fatal error needs a second attempt, with a new simulation.
         self.edit = edit().or_else(|_| edit()).expect(NO_MEMORY);
     }
@@ -286,7 +286,7 @@ impl Environment for Walker {
     fn applied(&self, out: &mut [f64]) {
         let Pristine { targets, model: pristine, .. } = self.pristine;
         let read = shared::with(self.pristine, |shared| {
-            let model = shared.edited(&self.edit).model();
+            let model = shared.edited(&self.edit)?.model();
             let density = targets.density(model, pristine);
             out.copy_from_slice(&[targets.torso_mass(model), targets.friction(model), self.power, density]);
             Ok(())
@@ -331,7 +331,7 @@ impl Environment for Walker {
 
     fn scene(&self) -> Option<Scene> {
         let qpos = &self.state[1..][..self.pristine.model.n_q()];
-        (!self.diverged).then(|| Scene::Model(PosedModel { look: &self.robot.look, qpos: qpos.to_vec() }))
+        (!self.diverged).then(|| Scene::Model(PosedModel { look: &self.robot.look, edited: None, qpos: qpos.to_vec() }))
     }
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
@@ -342,7 +342,7 @@ impl Environment for Walker {
         let push = self.push.take();
         let torso = self.pristine.torso;
         let stepped = shared::with(self.pristine, |shared| {
-            let simulation = shared.at(&self.edit, self.state())?;
+            let (simulation, _) = shared.at(&self.edit, self.state())?;
             push.into_iter().for_each(|force| simulation.set_force(torso, force));
             let stepped = self.advance(simulation, action, reward_terms);
             push.into_iter().for_each(|_| simulation.set_force(torso, [0.0; 3]));
@@ -385,7 +385,7 @@ impl Environment for Walker {
         let pristine = self.pristine;
         self.state_mut().copy_from_slice(take(pristine.state.len()));
         let placed = shared::with(pristine, |shared| {
-            let simulation = shared.at(&self.edit, self.state())?;
+            let (simulation, _) = shared.at(&self.edit, self.state())?;
             simulation.motion()?;
             Ok((pristine.track_position(simulation), pristine.torso(simulation).0))
         });

@@ -7,12 +7,36 @@ use perturb::env::{
     Action, ActionSpace, Catalogue, EnvironmentSpec, Episodes, Outcome, Purpose, Settings, Stream, Version,
 };
 
-/// The folders of examples/tasks.
+/// A folder like the reaching arm's, with a length as its last parameter, and the folders of examples/tasks.
 #[cfg(feature = "mujoco")]
 pub fn folders() -> Vec<std::path::PathBuf> {
+    static WITH_LENGTH: std::sync::OnceLock<std::path::PathBuf> = std::sync::OnceLock::new();
     let examples = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/tasks");
-    ["quadruped", "reaching_arm"].map(|name| examples.join(name)).into()
+    let with_length = WITH_LENGTH.get_or_init(|| {
+        let (arm, folder) =
+            (examples.join("reaching_arm"), std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("stretched_arm"));
+        let task =
+            std::fs::read_to_string(arm.join("task.toml")).unwrap().replace("\"ReachingArm\"", "\"StretchedArm\"");
+        std::fs::create_dir_all(&folder).unwrap();
+        std::fs::write(folder.join("task.toml"), task + UPPER_LENGTH).unwrap();
+        std::fs::copy(arm.join("arm.xml"), folder.join("arm.xml")).unwrap();
+        folder
+    });
+    [with_length.clone(), examples.join("quadruped"), examples.join("reaching_arm")].into()
 }
+
+/// A length of the reaching arm.
+#[cfg(feature = "mujoco")]
+pub const UPPER_LENGTH: &str = r#"
+[[parameter]]
+name = "upper_length"
+unit = "m"
+description = "length of the upper arm, whose mass follows, and at whose end the lower arm stays"
+edit = [{ body = "upper", field = "length", by = "set" }]
+bounds = [0.05, 1.0]
+random = [0.3, 0.4]
+extreme = [[0.25, 0.3], [0.4, 0.45]]
+"#;
 
 /// The built-in environments, and those of the folders in examples/tasks.
 pub fn catalogue() -> Catalogue {

@@ -180,10 +180,24 @@ fn with_scaled_masses(mjcf: &str, factor: f64) -> String {
     mjcf.split('<').map(scaled).collect::<Vec<_>>().join("<")
 }
 
+/// A text with the numbers of an attribute multiplied in each element of a kind; `None` if that changes nothing.
+fn scaled(mjcf: &str, element: &str, key: &str, factor: f64) -> Option<String> {
+    let mark = format!(" {key}=");
+    let part = |part: &str| {
+        let at = part.find(&mark).filter(|_| part.starts_with(&format!("{element} ")));
+        let Some(start) = at.map(|at| at + mark.len() + 1) else { return part.to_owned() };
+        let end = start + part[start..].find(['"', '\'']).unwrap();
+        let scale = |number: &str| (factor * number.parse::<f64>().unwrap()).to_string();
+        let numbers: Vec<String> = part[start..end].split_whitespace().map(scale).collect();
+        format!("{}{}{}", &part[..start], numbers.join(" "), &part[end..])
+    };
+    let text = mjcf.split('<').map(part).collect::<Vec<_>>().join("<");
+    (text != mjcf).then_some(text)
+}
+
 /// Edits of Gymnasium's models: what an edit makes of the text. Frictions differ too much from text to text; edits.rs has a
 /// model for them.
 fn recompiled(mjcf: &str, edit: &str) -> Option<String> {
-    let attributes = |name: &str| mjcf.matches(&format!(" {name}=\"")).count();
     let option = |attribute: &str| {
         let (before, after) = mjcf.split_once("<option ")?;
         let name = attribute.split('=').next()?;
@@ -194,16 +208,8 @@ fn recompiled(mjcf: &str, edit: &str) -> Option<String> {
         "gravity" => option("gravity=\"0 0 -6.5\""),
         "density" => option("density=\"700\""),
         "viscosity" => option("viscosity=\"0.7\""),
-        "gear" if attributes("gear") > 0 => {
-            let mut text = String::new();
-            for (i, part) in mjcf.split(" gear=\"").enumerate() {
-                match (i, part.split_once('"')) {
-                    (0, _) | (_, None) => text += part,
-                    (_, Some((own, rest))) => text += &format!(" gear=\"{}\"{rest}", 1.5 * own.parse::<f64>().unwrap()),
-                }
-            }
-            Some(text)
-        }
+        "gear" => scaled(mjcf, "motor", "gear", 1.5),
+        "damping" | "armature" | "stiffness" => scaled(mjcf, "joint", edit, 1.5),
         _ => None,
     }
 }
@@ -226,6 +232,9 @@ fn edits_of_gymnasiums_models_are_recompiled_texts() {
             ("density", "option = \"density\", by = \"set\"", 700.0),
             ("viscosity", "option = \"viscosity\", by = \"set\"", 0.7),
             ("gear", "actuator = \"*\", field = \"gear\", by = \"scale\"", 1.5),
+            ("damping", "joint = \"*\", field = \"damping\", by = \"scale\"", 1.5),
+            ("armature", "joint = \"*\", field = \"armature\", by = \"scale\"", 1.5),
+            ("stiffness", "joint = \"*\", field = \"stiffness\", by = \"scale\"", 1.5),
             ("mass", "body = \"*\", field = \"mass\", by = \"scale\"", 0.8),
         ] {
             let Some(text) = recompiled(&mjcf, edit) else { continue };
@@ -264,5 +273,5 @@ fn edits_of_gymnasiums_models_are_recompiled_texts() {
             compared += 1;
         }
     }
-    assert!(compared >= 46, "{compared} edits of eleven models");
+    assert!(compared >= 65, "{compared} edits of eleven models");
 }

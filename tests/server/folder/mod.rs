@@ -3,6 +3,7 @@
 mod edits;
 mod gymnasium;
 mod hostile;
+mod lengths;
 mod readings;
 mod refused;
 mod served;

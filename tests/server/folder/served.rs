@@ -157,3 +157,22 @@ sensor_noise = { random = [0.0, 0.05], extreme = [[0.0, 0.0], [0.05, 0.1]] }
     let line = "  disturbance   action_delay (1): D 0, R [0, 2.5], E [0, 0] and [2.5, 5], within [0, 100]: ";
     assert!(printed.contains(line), "{printed}");
 }
+
+#[tokio::test]
+async fn pictures_show_the_lengths_of_the_episode() {
+    let server = Server::with_folders(&[]);
+    let environment = server::environment(server.tcp(), "StretchedArm").await;
+    let (mut session, _) = Session::open(server.tcp(), open("StretchedArm", 1, 1)).await;
+    let states = doubles(&vec![0.0; environment.state.len()]);
+    let mut pictures = Vec::new();
+    for length in [0.35, 0.25, 0.45, 0.25, 0.35] {
+        let parameters = parameters(&[("upper_length", &[(length, length)])]);
+        let started = session.ask(Reset { parameters, states: states.clone(), ..Reset::default() }).await.started;
+        let receipt = started[0].receipt.as_ref().unwrap();
+        let applied = receipt.applied[environment.parameters.len() - 1];
+        assert!((applied - length).abs() < 1e-14, "{applied} for {length}");
+        pictures.push(session.render(0, (160, 120)).await);
+    }
+    assert!(pictures[0] != pictures[1] && pictures[1] != pictures[2] && pictures[0] != pictures[2]);
+    assert!(pictures[0] == pictures[4] && pictures[1] == pictures[3]);
+}

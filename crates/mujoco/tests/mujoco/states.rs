@@ -133,3 +133,34 @@ fn motion_is_step1_without_contacts() {
         part.motion().unwrap();
     }
 }
+
+#[test]
+fn a_simulation_takes_over_models_of_the_same_sizes() {
+    let models = ["\".02\"", "\".05\""].map(|radius| Model::from_xml(&BLOCK.replace("\".02\"", radius)).unwrap());
+    let run = |simulation: &mut Simulation| {
+        (0..100).for_each(|_| simulation.step().unwrap());
+        state(simulation)
+    };
+    let mut used = simulation();
+    throw(&mut used, 2);
+    run(&mut used);
+    let alone = models.each_ref().map(|model| {
+        let mut fresh = Simulation::new(model.try_clone().unwrap()).unwrap();
+        throw(&mut fresh, 1);
+        let start = state(&fresh);
+        (start, run(&mut fresh))
+    });
+    assert_ne!(alone[0].1, alone[1].1);
+    for i in [1, 0, 1] {
+        used.set_model(&models[i]).unwrap();
+        used.set_state(&alone[i].0).unwrap();
+        assert_eq!(run(&mut used), alone[i].1);
+    }
+}
+
+#[test]
+#[should_panic(expected = "the model has other sizes")]
+fn a_model_of_other_sizes_is_refused() {
+    let other = Model::from_xml(&BLOCK.replace("<geom type=\"plane\" size=\"5 5 1\"/>", "")).unwrap();
+    let _ = simulation().set_model(&other);
+}

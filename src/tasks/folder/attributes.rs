@@ -1,0 +1,84 @@
+//! Attributes of the elements of a model's text, as the elements or their classes of defaults have them, and the geoms that
+//! only pictures show.
+
+use super::{
+    error::Result,
+    mjcf::{Text, parse},
+};
+use roxmltree::{Document, Node};
+
+/// A model's text, parsed.
+#[derive(Clone, Copy)]
+pub(super) struct ModelText<'a, 'input> {
+    pub(super) document: &'a Document<'input>,
+}
+
+impl<'a, 'input> ModelText<'a, 'input> {
+    /// All elements of a name.
+    pub(super) fn elements(self, tag: &'a str) -> impl Iterator<Item = Node<'a, 'input>> {
+        self.document.descendants().filter(move |node| node.has_tag_name(tag))
+    }
+
+    /// An attribute of an element, or of its class of defaults.
+    pub(super) fn get(self, node: Node<'a, 'input>, key: &str) -> Option<&'a str> {
+        if let Some(own) = node.attribute(key) {
+            return Some(own);
+        }
+        let childclass = || node.ancestors().skip(1).find_map(|ancestor| ancestor.attribute("childclass"));
+        let class = node.attribute("class").or_else(childclass);
+        let is_default = |node: &Node<'a, 'input>| node.has_tag_name("default");
+        let is_class = |found: &Node<'a, 'input>| is_default(found) && found.attribute("class") == class;
+        let nested = class.and_then(|_| self.document.descendants().find(is_class));
+        let nested = nested.into_iter().flat_map(|found| found.ancestors().take_while(is_default));
+        let top = self.document.root_element().children().filter(is_default);
+        let of_class = |found: Node<'a, 'input>| {
+            let elements = found.children().filter(|child| child.tag_name() == node.tag_name());
+            elements.filter_map(|element| element.attribute(key)).last()
+        };
+        nested.chain(top).find_map(of_class)
+    }
+
+    /// An attribute of the compiler.
+    pub(super) fn compiler(self, key: &str) -> Option<&'a str> {
+        self.elements("compiler").filter_map(|node| node.attribute(key)).last()
+    }
+
+    /// The `<inertial>` of a body, if the compiler takes it.
+    pub(super) fn inertial(self, body: Node<'a, 'input>) -> Option<Node<'a, 'input>> {
+        let inertial = body.children().find(|child| child.has_tag_name("inertial"));
+        inertial.filter(|_| self.compiler("inertiafromgeom") != Some("true"))
+    }
+
+    /// Whether a geom is a mesh that can touch nothing and gives its body no mass.
+    pub(super) fn is_shown_only(self, geom: Node<'a, 'input>) -> bool {
+        let is_zero = |key| self.get(geom, key).unwrap_or("1").trim() == "0";
+        let is_mesh = self.get(geom, "type") == Some("mesh") && self.get(geom, "mesh").is_some();
+        let has_inertia = geom.parent_element().is_some_and(|body| self.inertial(body).is_some());
+        is_mesh && has_inertia && is_zero("contype") && is_zero("conaffinity")
+    }
+
+    /// Whether a geom is left out of the text of the physics: only pictures show it, and nothing can name it.
+    pub(super) fn is_left_out(self, geom: Node<'a, 'input>) -> bool {
+        !geom.has_attribute("name") && self.is_shown_only(geom)
+    }
+}
+
+/// The text without the geoms that only pictures show, and without the meshes that only these have: no byte of the
+/// physics depends on them, and meshes take most of the time of a compilation.
+///
+/// # Errors
+/// [`super::Error`] if the text is no XML.
+pub(super) fn without_shown(text: &Text) -> Result<Text> {
+    let document = parse("the model", &text.xml)?;
+    let attributes = ModelText { document: &document };
+    let is_in_tree = |geom: &Node<'_, '_>| geom.ancestors().any(|ancestor| ancestor.has_tag_name("worldbody"));
+    let (out, kept): (Vec<_>, Vec<_>) =
+        attributes.elements("geom").partition(|geom| is_in_tree(geom) && attributes.is_left_out(*geom));
+    let meshes = kept.iter().filter_map(|geom| attributes.get(*geom, "mesh")).collect::<Vec<_>>();
+    let is_used = |mesh: &Node<'_, '_>| mesh.attribute("name").is_none_or(|name| meshes.contains(&name));
+    let unused = attributes.elements("mesh").filter(|mesh| !out.is_empty() && !is_used(mesh));
+    let is_single = |node: &Node<'_, '_>| !node.children().any(|child| child.is_element());
+    let rows = out.iter().copied().chain(unused).filter(is_single);
+    let rows: Vec<u32> = rows.map(|node| document.text_pos_at(node.range().start).row).collect();
+    Ok(text.without(&rows))
+}

@@ -1,0 +1,428 @@
+//! A text of the model in which lengths and sizes are edited: the numbers that take part, and what each becomes.
+//!
+//! A scaled body is scaled about the anchor of its first hinge or ball joint, so that it stays attached; without one, about
+//! the origin of its frame. The anchors of the bodies that it carries move with it; these keep their own sizes.
+
+use super::{
+    attributes::ModelText,
+    checks::can_touch,
+    error::Result,
+    mjcf::{Text, parse, write_attribute},
+    parameter::{Edit, EditedParameter},
+    target::{Change, Target},
+};
+use perturb_mujoco::{Field, Index, Model};
+use roxmltree::Node;
+use std::collections::BTreeMap;
+
+/// A number of the model that takes a parameter's value by another compilation.
+#[derive(Debug)]
+pub(super) struct Slot {
+    /// The number of the parameter.
+    pub(super) parameter: usize,
+    edit: Edit,
+    target: Target,
+    /// The target's value in the model as compiled.
+    own: f64,
+}
+
+impl Slot {
+    /// The slots of all parameters.
+    pub(super) fn all(parameters: &[EditedParameter], model: &Model) -> Vec<Self> {
+        let mut slots = Vec::new();
+        for (parameter, edited) in parameters.iter().enumerate() {
+            for edit in &edited.edits {
+                let targets = edit.targets.all.iter().filter(|target| target.is_recompiled());
+                let slot = |&target: &Target| Self { parameter, edit: edit.clone(), target, own: target.value(model) };
+                slots.extend(targets.map(slot));
+            }
+        }
+        slots
+    }
+
+    /// The factor of a length or size, or the shift of a position in m.
+    pub(super) fn amount(&self, values: &[f64]) -> f64 {
+        let value = values[self.parameter];
+        match self.target {
+            Target::Position(..) => self.edit.number(self.own, value) - self.own,
+            _ if self.edit.change == Change::Scale => value,
+            _ => self.edit.number(self.own, value) / self.own,
+        }
+    }
+
+    /// The amount that changes nothing.
+    pub(super) fn neutral(&self) -> f64 {
+        if matches!(self.target, Target::Position(..)) { 0.0 } else { 1.0 }
+    }
+}
+
+/// A part of a number: a coefficient, times the amount of a slot if it has one.
+#[derive(Debug, Clone, Copy)]
+struct Summand {
+    coefficient: f64,
+    slot: Option<usize>,
+    squared: bool,
+}
+
+impl Summand {
+    fn new(coefficient: f64, slot: Option<usize>) -> Self {
+        Self { coefficient, slot, squared: false }
+    }
+}
+
+/// A number of the text: the sum of its parts, or its own value where no slot of it changes anything.
+#[derive(Debug)]
+struct EditedNumber {
+    own: f64,
+    parts: Vec<Summand>,
+}
+
+impl EditedNumber {
+    fn value(&self, slots: &[Slot], amounts: &[f64]) -> f64 {
+        let changes = |slot: usize| amounts[slot].to_bits() != slots[slot].neutral().to_bits();
+        if !self.parts.iter().filter_map(|part| part.slot).any(changes) {
+            return self.own;
+        }
+        let value = |&Summand { coefficient, slot, squared }: &Summand| match slot.map(|slot| amounts[slot]) {
+            None => coefficient,
+            Some(amount) if squared => coefficient * (amount * amount),
+            Some(amount) => coefficient * amount,
+        };
+        self.parts.iter().map(value).reduce(|sum, part| sum + part).unwrap_or(self.own)
+    }
+}
+
+/// An attribute with its numbers.
+type Attribute = (&'static str, Vec<EditedNumber>);
+
+#[derive(Debug)]
+enum Piece {
+    Text(String),
+    /// An element: its beginning, the edited attributes, and its end.
+    Element(String, Vec<Attribute>, &'static str),
+}
+
+/// A text whose numbers depend on the amounts of slots.
+#[derive(Debug)]
+pub(super) struct EditedText {
+    pieces: Vec<Piece>,
+}
+
+impl EditedText {
+    /// Prepares a text. `leaves_out` says whether the model lacks the geoms that only pictures show. `refuse` makes the error of a slot.
+    ///
+    /// # Errors
+    /// Those of `refuse`: what has no such length, or could not follow.
+    pub(super) fn new(
+        text: &Text,
+        model: &Model,
+        slots: &[Slot],
+        leaves_out: bool,
+        refuse: &dyn Fn(usize, &str) -> super::error::Error,
+    ) -> Result<Self> {
+        let document = parse("the model", &text.xml)?;
+        let mut editor = Editor {
+            attributes: ModelText { document: &document },
+            model,
+            slots,
+            leaves_out,
+            refuse,
+            edited: BTreeMap::new(),
+        };
+        editor.edit()?;
+        let mut edited = editor.edited;
+        let mut pieces = vec![Piece::Text(String::new())];
+        for (row, line) in text.xml.lines().enumerate() {
+            match (edited.remove(&(row as u32 + 1)), pieces.last_mut()) {
+                (None, Some(Piece::Text(text))) => {
+                    text.push_str(line);
+                    text.push('\n');
+                }
+                (None, _) => pieces.push(Piece::Text(format!("{line}\n"))),
+                (Some((head, numbers)), _) => {
+                    let end = if line.ends_with("/>") { "/>\n" } else { ">\n" };
+                    pieces.push(Piece::Element(head, numbers, end));
+                }
+            }
+        }
+        Ok(Self { pieces })
+    }
+
+    /// The text with these amounts of the slots.
+    pub(super) fn write(&self, slots: &[Slot], amounts: &[f64]) -> String {
+        let mut text = String::new();
+        for piece in &self.pieces {
+            match piece {
+                Piece::Text(fixed) => text.push_str(fixed),
+                Piece::Element(head, attributes, end) => {
+                    text.push_str(head);
+                    for (key, numbers) in attributes {
+                        let numbers = numbers.iter().map(|number| number.value(slots, amounts).to_string());
+                        write_attribute(&mut text, key, &numbers.collect::<Vec<_>>().join(" "));
+                    }
+                    text.push_str(end);
+                }
+            }
+        }
+        text
+    }
+}
+
+/// The slots that scale a body.
+#[derive(Clone, Copy, Default)]
+struct Scaling {
+    /// The slot that scales positions and lengths.
+    along: Option<usize>,
+    /// The slot that scales all else, too.
+    size: Option<usize>,
+}
+
+struct Editor<'a, 'input> {
+    attributes: ModelText<'a, 'input>,
+    model: &'a Model,
+    slots: &'a [Slot],
+    /// Whether the physics' text lacks the geoms that only pictures show.
+    leaves_out: bool,
+    refuse: &'a dyn Fn(usize, &str) -> super::error::Error,
+    /// For each line of an edited element its beginning, without the edited attributes, and these.
+    edited: BTreeMap<u32, (String, Vec<Attribute>)>,
+}
+
+impl<'a, 'input> Editor<'a, 'input> {
+    fn edit(&mut self) -> Result<()> {
+        let bodies: Vec<Node<'a, 'input>> = self.attributes.elements("body").collect();
+        if bodies.len() + 1 != self.model.n_body() {
+            return Err((self.refuse)(0, "lengths of a model with composites cannot be edited"));
+        }
+        if self.attributes.compiler("coordinate") == Some("global") {
+            return Err((self.refuse)(
+                0,
+                "lengths need coordinate=\"local\", which newer models have; convert the model",
+            ));
+        }
+        let scalings: Vec<Scaling> = (0..self.model.n_body()).map(|body| self.scaling(body)).collect::<Result<_>>()?;
+        self.constraints(&bodies, &scalings)?;
+        for (i, &node) in bodies.iter().enumerate() {
+            self.frame(node, i + 1, &scalings)?;
+        }
+        let worlds = self.attributes.elements("worldbody");
+        let mut ranks = vec![0; self.model.n_body()];
+        for (body, node) in
+            worlds.map(|node| (0, node)).chain(bodies.iter().enumerate().map(|(i, &node)| (i + 1, node)))
+        {
+            self.content(node, body, scalings[body], &mut ranks[body])?;
+        }
+        Ok(())
+    }
+
+    /// The slots that scale a body, of which there may be one.
+    fn scaling(&self, body: usize) -> Result<Scaling> {
+        let mut scaling = Scaling::default();
+        for (slot, Slot { target, .. }) in self.slots.iter().enumerate() {
+            let size = match *target {
+                Target::Length(of, _) if of == body => None,
+                Target::Size(of, _) if of == body => Some(slot),
+                _ => continue,
+            };
+            if scaling.along.is_some() {
+                return Err((self.refuse)(slot, "another edit scales this body, too; let one edit do it"));
+            }
+            scaling = Scaling { along: Some(slot), size };
+        }
+        Ok(scaling)
+    }
+
+    /// Refuses constraints between bodies whose anchors would not follow.
+    fn constraints(&self, bodies: &[Node<'a, 'input>], scalings: &[Scaling]) -> Result<()> {
+        for constraint in self.attributes.elements("connect").chain(self.attributes.elements("weld")) {
+            for name in ["body1", "body2"].into_iter().filter_map(|key| constraint.attribute(key)) {
+                let found = bodies.iter().position(|node| node.attribute("name") == Some(name));
+                if let Some(slot) = found.and_then(|i| scalings[i + 1].along) {
+                    let problem =
+                        format!("an equality constraint names body {name:?}, and its anchor would not follow");
+                    return Err((self.refuse)(slot, &problem));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// The position of a body's frame: its anchor moves with its parent, and it is scaled about its anchor.
+    fn frame(&mut self, node: Node<'a, 'input>, body: usize, scalings: &[Scaling]) -> Result<()> {
+        let parent = self.model.index_array(Index::BodyParent)[body] as usize;
+        let (carried, own) = (scalings[parent].along, scalings[body].along);
+        let shift = |axis: usize| {
+            let shifts =
+                |slot: &Slot| matches!(slot.target, Target::Position(of, along) if (of, along) == (body, axis));
+            self.slots.iter().position(shifts)
+        };
+        let shifts: [Option<usize>; 3] = std::array::from_fn(shift);
+        let anchor = attachment(self.model, body);
+        let is_offset = anchor != [0.0; 3];
+        let own = own.filter(|_| is_offset);
+        if carried.is_none() && own.is_none() && shifts == [None; 3] {
+            return Ok(());
+        }
+        if let Some(slot) = shifts.into_iter().flatten().next()
+            && (carried.is_some() || own.is_some())
+        {
+            let problem = "a length moves this body, too; edit one of both";
+            return Err((self.refuse)(slot, problem));
+        }
+        let position = self.numbers(node, "pos", &[0.0; 3])?;
+        let number = |axis: usize| {
+            let mut parts = vec![Summand::new(position[axis] + anchor[axis], carried)];
+            parts.extend(shifts[axis].map(|slot| Summand::new(1.0, Some(slot))));
+            if anchor[axis] != 0.0 {
+                parts.push(Summand::new(-anchor[axis], own));
+            }
+            EditedNumber { own: position[axis], parts }
+        };
+        self.set(node, "pos", (0..3).map(number).collect());
+        Ok(())
+    }
+
+    /// The elements of a body. `rank` counts its geoms.
+    fn content(&mut self, node: Node<'a, 'input>, body: usize, scaling: Scaling, rank: &mut usize) -> Result<()> {
+        let inertial = self.attributes.inertial(node);
+        for child in node.children().filter(Node::is_element) {
+            match child.tag_name().name() {
+                "geom" if self.attributes.is_left_out(child) && self.leaves_out => {
+                    self.scale(child, "pos", &[], scaling.along)?;
+                }
+                "geom" => {
+                    let geom = self.geom_of(body, *rank);
+                    *rank += 1;
+                    self.geom(child, geom, scaling, inertial.is_some())?;
+                }
+                "joint" => self.scale(child, "pos", &[], scaling.along)?,
+                "site" => {
+                    self.scale(child, "pos", &[], scaling.along)?;
+                    self.scale(child, "fromto", &[], scaling.along)?;
+                    self.scale(child, "size", &[], scaling.size)?;
+                }
+                _ => {}
+            }
+        }
+        let (Some(inertial), Some(slot)) = (inertial, scaling.along) else { return Ok(()) };
+        if scaling.size.is_none() {
+            let problem =
+                "the body has <inertial>, whose moments do not follow a length; leave it out, or use field = \"size\"";
+            return Err((self.refuse)(slot, problem));
+        }
+        self.scale(inertial, "pos", &[], scaling.along)?;
+        for key in ["diaginertia", "fullinertia"] {
+            let own = self.numbers(inertial, key, &[])?;
+            let part = |coefficient: f64| Summand { coefficient, slot: scaling.size, squared: true };
+            let number = |&own: &f64| EditedNumber { own, parts: vec![part(own)] };
+            self.set(inertial, key, own.iter().map(number).collect());
+        }
+        Ok(())
+    }
+
+    /// The number of a body's geom of this rank.
+    fn geom_of(&self, body: usize, rank: usize) -> Option<usize> {
+        let bodies = self.model.index_array(Index::GeomBody).iter().enumerate();
+        bodies.filter(|(_, of)| **of as usize == body).nth(rank).map(|(geom, _)| geom)
+    }
+
+    fn geom(
+        &mut self,
+        node: Node<'a, 'input>,
+        geom: Option<usize>,
+        Scaling { along, size }: Scaling,
+        has_inertial: bool,
+    ) -> Result<()> {
+        let radius = |slot: &Slot| matches!(slot.target, Target::Radius(of) if Some(of) == geom);
+        let radius = self.slots.iter().position(radius);
+        if let (Some(_), Some(slot)) = (radius, size) {
+            return Err((self.refuse)(slot, "another edit sets the radius of one of its geoms, too; edit one of both"));
+        }
+        let Some(slot) = along.or(radius) else { return Ok(()) };
+        let kind = self.attributes.get(node, "type").unwrap_or("sphere");
+        let (none, touches) = (along.is_none() && has_inertial, geom.is_some_and(|geom| can_touch(self.model, geom)));
+        if none && !touches {
+            let problem =
+                "it has no effect: one of its geoms can touch nothing, and its body has an <inertial> of its own";
+            return Err((self.refuse)(slot, problem));
+        }
+        if self.attributes.get(node, "mesh").is_some() || matches!(kind, "mesh" | "hfield" | "plane") {
+            if !self.attributes.is_shown_only(node) {
+                let problem = "a mesh, a height field or a plane cannot be scaled, and one of its geoms is one";
+                return Err((self.refuse)(slot, problem));
+            }
+            return self.scale(node, "pos", &[], along);
+        }
+        let has_ends = self.attributes.get(node, "fromto").is_some();
+        self.scale(node, if has_ends { "fromto" } else { "pos" }, &[], along)?;
+        let wide = size.or(radius);
+        match kind {
+            "sphere" => self.scale(node, "size", &[wide], None),
+            "capsule" | "cylinder" if has_ends => self.scale(node, "size", &[wide], None),
+            "capsule" | "cylinder" => self.scale(node, "size", &[wide, along], None),
+            _ if size.is_none() => {
+                let problem = format!("the body has a {kind}, which has no length; use field = \"size\"");
+                Err((self.refuse)(slot, &problem))
+            }
+            _ => self.scale(node, "size", &[], size),
+        }
+    }
+
+    /// Scales the numbers of an attribute by the slots of each, and all others by `rest`.
+    fn scale(
+        &mut self,
+        node: Node<'a, 'input>,
+        key: &'static str,
+        first: &[Option<usize>],
+        rest: Option<usize>,
+    ) -> Result<()> {
+        let slot = |i: usize| first.get(i).copied().unwrap_or(rest);
+        let own = self.numbers(node, key, &[])?;
+        if (0..own.len()).all(|i| slot(i).is_none() || own[i] == 0.0) {
+            return Ok(());
+        }
+        let number = |(i, &own): (usize, &f64)| EditedNumber { own, parts: vec![Summand::new(own, slot(i))] };
+        self.set(node, key, own.iter().enumerate().map(number).collect());
+        Ok(())
+    }
+
+    /// The numbers of an attribute, as the element or its defaults have it.
+    fn numbers(&self, node: Node<'a, 'input>, key: &str, absent: &[f64]) -> Result<Vec<f64>> {
+        let Some(text) = self.attributes.get(node, key) else { return Ok(absent.to_vec()) };
+        let numbers = text.split_whitespace().map(|number| number.parse().ok()).collect::<Option<Vec<f64>>>();
+        numbers.ok_or_else(|| (self.refuse)(0, &format!("{key}=\"{text}\" of the model is no list of numbers")))
+    }
+
+    /// Replaces an attribute of an element.
+    fn set(&mut self, node: Node<'a, 'input>, key: &'static str, numbers: Vec<EditedNumber>) {
+        if numbers.is_empty() {
+            return;
+        }
+        let row = self.attributes.document.text_pos_at(node.range().start).row;
+        let (head, attributes) = self.edited.entry(row).or_default();
+        attributes.push((key, numbers));
+        *head = format!("<{}", node.tag_name().name());
+        for attribute in node.attributes().filter(|own| attributes.iter().all(|(edited, _)| *edited != own.name())) {
+            write_attribute(head, attribute.name(), attribute.value());
+        }
+    }
+}
+
+/// The point of a body, in the axes of its parent and from the body's origin, at which it is attached: the anchor of its
+/// first hinge or ball joint.
+pub(super) fn attachment(model: &Model, body: usize) -> [f64; 3] {
+    let (types, bodies) = (model.index_array(Index::JointType), model.index_array(Index::JointBody));
+    let is_own = |&joint: &usize| bodies[joint] as usize == body && matches!(types[joint], 1 | 3);
+    let Some(joint) = (0..model.n_joint()).find(is_own) else { return [0.0; 3] };
+    let anchor: [f64; 3] = std::array::from_fn(|i| model.field(Field::JointAnchor)[3 * joint + i]);
+    let rotation = &model.field(Field::BodyRotation)[4 * body..][..4];
+    if anchor == [0.0; 3] || *rotation == [1.0, 0.0, 0.0, 0.0] {
+        return anchor;
+    }
+    // v + 2 w (u × v) + 2 u × (u × v), where the quaternion is w and u.
+    let (w, u) = (rotation[0], [rotation[1], rotation[2], rotation[3]]);
+    let cross =
+        |a: [f64; 3], b: [f64; 3]| [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+    let (once, twice) = (cross(u, anchor), cross(u, cross(u, anchor)));
+    std::array::from_fn(|i| anchor[i] + 2.0 * (w * once[i] + twice[i]))
+}

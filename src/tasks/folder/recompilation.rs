@@ -1,0 +1,151 @@
+//! Models with other lengths: compiled again from the edited text, and cached by the values of the parameters that change
+//! it.
+
+use super::{
+    error::Result,
+    lengths::{EditedText, Slot},
+    mjcf::{Mjcf, escaped_reason},
+    parameter::EditedParameter,
+    table::Table,
+};
+use perturb_mujoco::{Error, Model};
+use std::{
+    collections::{HashMap, VecDeque},
+    sync::{Arc, Mutex, PoisonError},
+};
+
+/// Limit of a model whose lengths are edited, in bytes: each environment has one of its own.
+const MAX_MODEL_BYTES: usize = 1 << 20;
+/// Limits of the cache of a task.
+const MAX_CACHE_BYTES: usize = 8 << 20;
+const MAX_CACHED: usize = 1024;
+
+/// The texts of a model with edited lengths, and the models that were compiled from them.
+#[derive(Debug)]
+pub(super) struct Recompilation {
+    slots: Vec<Slot>,
+    physics: EditedText,
+    picture: EditedText,
+    files: Vec<(String, Vec<u8>)>,
+    cache: Mutex<CompiledModels>,
+}
+
+#[derive(Debug, Default)]
+struct CompiledModels {
+    models: HashMap<Box<[u64]>, Arc<Model>>,
+    /// The keys, the oldest first.
+    order: VecDeque<Box<[u64]>>,
+}
+
+impl Recompilation {
+    /// Prepares for the parameters that need it; `None` if none does. The model is compiled at the ends of their bounds, of
+    /// R and of E.
+    ///
+    /// # Errors
+    /// [`super::Error`] with the parameter and the value, if an edit cannot be made.
+    pub(super) fn new(
+        tables: &[Table<'_>],
+        parameters: &[EditedParameter],
+        mjcf: &Mjcf,
+        model: &Model,
+    ) -> Result<Option<Self>> {
+        let slots = Slot::all(parameters, model);
+        let error = |parameter: usize, problem: String| {
+            let name = parameters[parameter].parameter.name;
+            tables[parameter].clone().at(format!("parameter {name}")).error(problem)
+        };
+        let Some(first) = slots.first() else { return Ok(None) };
+        if model.model_bytes() > MAX_MODEL_BYTES {
+            let (own, most) = (model.model_bytes() / 1000, MAX_MODEL_BYTES / 1000);
+            return Err(error(
+                first.parameter,
+                format!("the model takes {own} kB, and each environment would have its own; the limit is {most} kB"),
+            ));
+        }
+        let refuse = |slot: usize, problem: &str| error(slots[slot].parameter, problem.to_owned());
+        let physics = EditedText::new(&mjcf.physics, model, &slots, mjcf.leaves_out, &refuse)?;
+        let picture = EditedText::new(&mjcf.picture, model, &slots, mjcf.leaves_out, &refuse)?;
+        let own = Self { slots, physics, picture, files: mjcf.physics.files.clone(), cache: Mutex::default() };
+        let defaults: Vec<f64> = parameters.iter().map(|edited| edited.parameter.default).collect();
+        for (i, parameter) in parameters.iter().map(|edited| &edited.parameter).enumerate() {
+            if own.slots.iter().all(|slot| slot.parameter != i) {
+                continue;
+            }
+            let [below, above] = parameter.extreme;
+            for value in [parameter.bounds, parameter.random, below, above].map(|set| [set.low, set.high]).concat() {
+                let mut values = defaults.clone();
+                values[i] = value;
+                own.compile(model, &own.amounts(&values)).map_err(|failure| {
+                    let said = match failure {
+                        Error::Compile { reason } => escaped_reason(&reason),
+                        other => other.to_string(),
+                    };
+                    error(i, format!("with {value} MuJoCo 2.2.2 says: {said}; narrow the bounds"))
+                })?;
+            }
+        }
+        Ok(Some(own))
+    }
+
+    /// The names of the parameters whose values need another compilation.
+    pub(super) fn parameters<'a>(
+        &'a self,
+        parameters: &'a [EditedParameter],
+    ) -> impl Iterator<Item = &'static str> + 'a {
+        let is_own = |i: usize| self.slots.iter().any(|slot| slot.parameter == i);
+        parameters.iter().enumerate().filter(move |(i, _)| is_own(*i)).map(|(_, edited)| edited.parameter.name)
+    }
+
+    fn amounts(&self, values: &[f64]) -> Vec<f64> {
+        self.slots.iter().map(|slot| slot.amount(values)).collect()
+    }
+
+    fn is_neutral(&self, amounts: &[f64]) -> bool {
+        self.slots.iter().zip(amounts).all(|(slot, amount)| amount.to_bits() == slot.neutral().to_bits())
+    }
+
+    /// The model with the lengths of these parameters: `own`, which is the model as it stands in the folder, if none is
+    /// changed.
+    ///
+    /// # Errors
+    /// [`Error::Compile`].
+    pub(super) fn model(&self, own: &Arc<Model>, values: &[f64]) -> std::result::Result<Arc<Model>, Error> {
+        let amounts = self.amounts(values);
+        if self.is_neutral(&amounts) {
+            return Ok(Arc::clone(own));
+        }
+        let key: Box<[u64]> = amounts.iter().map(|amount| amount.to_bits()).collect();
+        // Nothing in the cache can be half-written by a panic.
+        let lock = || self.cache.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(found) = lock().models.get(&key) {
+            return Ok(Arc::clone(found));
+        }
+        let model = Arc::new(self.compile(own, &amounts)?);
+        let capacity = (MAX_CACHE_BYTES / model.model_bytes()).clamp(1, MAX_CACHED);
+        let mut cache = lock();
+        if cache.models.insert(key.clone(), Arc::clone(&model)).is_none() {
+            cache.order.push_back(key);
+        }
+        while cache.order.len() > capacity {
+            let oldest = cache.order.pop_front().unwrap_or_default();
+            cache.models.remove(&oldest);
+        }
+        Ok(model)
+    }
+
+    /// The model that pictures show, as MJCF; `None` if no length is changed.
+    pub(super) fn picture(&self, values: &[f64]) -> Option<String> {
+        let amounts = self.amounts(values);
+        (!self.is_neutral(&amounts)).then(|| self.picture.write(&self.slots, &amounts))
+    }
+
+    fn compile(&self, own: &Model, amounts: &[f64]) -> std::result::Result<Model, Error> {
+        let files: Vec<(&str, &[u8])> =
+            self.files.iter().map(|(name, bytes)| (name.as_str(), bytes.as_slice())).collect();
+        let model = Model::from_files(&self.physics.write(&self.slots, amounts), &files)?;
+        if model.has_sizes_of(own) {
+            return Ok(model);
+        }
+        Err(Error::Compile { reason: "the model has other numbers of elements than as it stands in the folder".into() })
+    }
+}
