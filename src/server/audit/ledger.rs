@@ -208,7 +208,7 @@ impl LedgerWriter {
                 tracing::error!(
                     lines,
                     head,
-                    "the ledger {}: {reason}; nothing new is drawn until then",
+                    "the ledger {}: {reason}; nothing new is drawn before that",
                     self.path.display()
                 );
             }

@@ -23,7 +23,8 @@ pub enum Error {
     },
     /// The request would exceed a quota of the token.
     #[error(
-        "the token {name:?} may have {limit} {what} here, and {wanted} more would be too many; ask for less, or close"
+        "the token {name:?} may have {limit} {what} here, and {wanted} more would be too many; ask for less, or \
+         close a session"
     )]
     QuotaExceeded {
         /// The token's name.
@@ -37,7 +38,7 @@ pub enum Error {
     },
     /// A token's environments have stepped too fast for too long.
     #[error(
-        "the token {name:?} may take {rate} steps a second here, other requests counted in steps, and its sessions are \
+        "the token {name:?} may take {rate} steps a second here, including the price of other requests, and its sessions are \
          {seconds} s ahead of that; step fewer environments at a time or in fewer sessions, or try again later"
     )]
     TooFast {

@@ -58,7 +58,7 @@ impl Role {
         let spec = disturbance::undisturbed(spec);
         let overlaps = |set: &&DrawSet| set.region(spec).is_some_and(|never| region.overlaps(&never));
         if let Some(never) = self.never.iter().find(overlaps) {
-            return Err(format!("it may never draw from {never}, which that overlaps"));
+            return Err(format!("it may never draw from {never}, and this region overlaps that set"));
         }
         let Some(draws) = &self.draws else { return Ok(()) };
         let within: Vec<Region> = draws.iter().filter_map(|set| set.region(spec)).collect();

@@ -98,7 +98,7 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
         if known_sets.insert(name.clone(), own).is_some() {
             return Err(TokenFileError {
                 line,
-                what: format!("there are two sets called {name:?}, of which versions are some"),
+                what: format!("there are two sets called {name:?}; the letters of versions are names of sets, too"),
             });
         }
     }
@@ -114,7 +114,9 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
             // A draw just beside the forbidden set would be allowed, so `never` alone forbids nothing.
             return Err(TokenFileError {
                 line,
-                what: format!("the role {name:?} has never without draws: say what it may draw from"),
+                what: format!(
+                    "the role {name:?} has the key never without the key draws; add draws with what it may draw from"
+                ),
             });
         }
         if known_roles.insert(name.clone(), Arc::new(Role { name: name.clone(), draws, never })).is_some() {
@@ -131,7 +133,10 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
             return Err(TokenFileError { line, what: format!("there are two tokens called {:?}", entry.name) });
         }
         if !digests.insert(digest) {
-            return Err(TokenFileError { line, what: format!("the token of {:?} is another one's, too", entry.name) });
+            return Err(TokenFileError {
+                line,
+                what: format!("the token of {:?} is also the token of another entry", entry.name),
+            });
         }
         let role = entry.role.as_ref().map(|role| found("role", role, &known_roles)).transpose();
         let role = role.map_err(|what| TokenFileError { line, what })?;
@@ -159,11 +164,11 @@ fn own_set(catalogue: &Catalogue, set: SetEntry) -> Result<DrawSet, String> {
     Ok(DrawSet::Own { name, environment: spec.name, region: spec.region(&distributions) })
 }
 
-/// The digest of an entry's token, or what is wrong with the entry.
+/// Returns the digest of an entry's token, or the fault of the entry.
 fn digest(entry: &TokenEntry) -> Result<[u8; 32], String> {
     let name = &entry.name;
     if name.is_empty() || name.chars().any(char::is_control) {
-        return Err(format!("{name:?} is no name"));
+        return Err(format!("the name {name:?} is empty or has control characters"));
     }
     for (key, limit) in [
         ("max_sessions", entry.max_sessions),
@@ -191,7 +196,7 @@ fn digest(entry: &TokenEntry) -> Result<[u8; 32], String> {
             Err(format!("the token of {name:?} has fewer than {MIN_TOKEN_CHARS} characters"))
         }
         (None, Some(token)) if !token.bytes().all(|byte| byte.is_ascii_graphic()) => {
-            Err(format!("the token of {name:?} has characters that are no visible ones of ASCII"))
+            Err(format!("the token of {name:?} has characters other than visible ASCII"))
         }
         (None, Some(token)) => Ok(Sha256::digest(token).into()),
         (Some(_), Some(_)) => Err(format!("{name:?} has both sha256 and token; one of them is expected")),

@@ -38,7 +38,8 @@ pub enum Error {
     },
     /// The session sent nothing for too long.
     #[error(
-        "the session was idle for {seconds} s, or was not opened in them, the most this server allows; start a new one"
+        "the session was idle for {seconds} s, or was not opened within this time, the limit of this server; start a new \
+         one"
     )]
     Idle {
         /// The limit.

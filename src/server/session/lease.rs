@@ -36,7 +36,7 @@ pub enum Error {
     OtherToken,
     /// The client names a reply that was never sent.
     #[error(
-        "last_reply is {got}, but {last} is the last that there is; opened is 0, and each response after it one more"
+        "last_reply is {got}, but {last} is the last reply so far; opened is 0, and each response after it one more"
     )]
     NoReply {
         /// The number that came.
@@ -56,7 +56,7 @@ pub enum Error {
         first: u64,
     },
     /// Another stream has resumed the session.
-    #[error("another stream has taken up this session by its lease; go on there")]
+    #[error("another stream has resumed this session by its lease; continue there")]
     TakenUp,
 }
 

@@ -17,8 +17,8 @@ pub enum Error {
     Value(#[from] InvalidValue),
     /// The budget of bytes in flight is used up.
     #[error(
-        "this needs {wanted} bytes, but {used} of the server's {limit} for what is in flight are in use; ask for less at \
-         a time, read the replies that wait, or try again later"
+        "this needs {wanted} bytes, but {used} of the server's {limit} bytes for requests and replies are in use; ask for \
+         less at a time, read the replies that wait, or try again later"
     )]
     MemoryFull {
         /// The bytes that were requested.
@@ -30,8 +30,8 @@ pub enum Error {
     },
     /// The rest of a message did not arrive in time.
     #[error(
-        "a message began, and nothing more of it came for {seconds} s, or less than {rate} bytes a second in all; send \
-         messages whole"
+        "a message is incomplete: no byte of it came for {seconds} s, or it came at less than {rate} bytes a second; send \
+         each message without pauses"
     )]
     Unfinished {
         /// The maximum pause within a message, s.

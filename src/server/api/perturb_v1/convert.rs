@@ -37,7 +37,7 @@ pub fn open(catalogue: &Catalogue, max_envs: usize, request: proto::Open) -> Res
             return Err(Error::value(
                 "open.groups",
                 got,
-                format!("at most {max_envs}, as this server has environments"),
+                format!("at most {max_envs}, the number of environments of this server"),
             ));
         }
         let numbered = request.groups.into_iter().enumerate();
