@@ -9,7 +9,7 @@ const ENCODING_HEADER: &str = "grpc-encoding";
 
 /// A compression that the server reads. Its replies are never compressed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Compression {
+pub(super) enum Compression {
     /// `gzip`.
     Gzip,
     /// `deflate`, which is zlib's format in gRPC.
@@ -18,7 +18,7 @@ pub enum Compression {
 
 impl Compression {
     /// Returns the compression of a call's messages, or `None` if they may not be compressed. tonic refuses other names.
-    pub fn from_headers(headers: &HeaderMap) -> Option<Self> {
+    pub(super) fn from_headers(headers: &HeaderMap) -> Option<Self> {
         match headers.get(ENCODING_HEADER)?.as_bytes() {
             b"gzip" => Some(Self::Gzip),
             b"deflate" => Some(Self::Deflate),
@@ -27,7 +27,7 @@ impl Compression {
     }
 
     /// Returns a reader of the decompressed message.
-    pub fn reader<'a>(self, compressed: &'a [u8]) -> Box<dyn Read + Send + 'a> {
+    pub(super) fn reader<'a>(self, compressed: &'a [u8]) -> Box<dyn Read + Send + 'a> {
         match self {
             Self::Gzip => Box::new(GzDecoder::new(compressed)),
             Self::Deflate => Box::new(ZlibDecoder::new(compressed)),

@@ -113,7 +113,7 @@ impl<E> From<Status> for StreamStop<E> {
 
 impl MessageReader {
     /// The messages of this body.
-    pub fn new(
+    pub(super) fn new(
         body: Body,
         compression: Option<Compression>,
         transit: StreamLimits,
