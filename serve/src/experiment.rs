@@ -77,7 +77,7 @@ struct ReportFiles {
 #[derive(Debug, Serialize)]
 pub(crate) struct CellCurve {
     pub(crate) id: String,
-    /// Environment, method and training version or set.
+    /// Environment, method, and version or set of the training.
     pub(crate) kind: String,
     /// Number of episodes at the middle of each point.
     pub(crate) episodes: Vec<f64>,

@@ -22,7 +22,7 @@ pub(crate) struct ServerMonitor {
     response_times: Mutex<VecDeque<Duration>>,
 }
 
-/// An answer of the server.
+/// The status of a perturb-server, as of its last answer.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct ServerStatus {
     /// Version of the server's program.

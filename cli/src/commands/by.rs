@@ -12,7 +12,7 @@ use perturb_text::Table;
 use super::error::{CommandError, Result};
 use super::sets::parameter;
 
-/// The word that stands for all parameters of a listed context together.
+/// Value of --by that groups episodes by their context, i.e. by all of its parameters together.
 const CONTEXT: &str = "context";
 
 /// The episodes of a test that have something in common.

@@ -9,8 +9,8 @@ pub(super) const UNCHANGED: u8 = 0;
 const MAX_COLOURS: usize = 255;
 /// Number of colours that are learned from the first frame. The others are for later frames.
 const FIRST_FRAME_COLOURS: usize = 128;
-/// Minimum distance of a new colour from all others, in steps of 0 to 255 of red, green or blue. It grows when few
-/// colours are left.
+/// Minimum Euclidean distance of a new colour from all others, in the space of red, green and blue from 0 to 255. It grows
+/// when few colours can still be added.
 const MIN_NEW_DISTANCE: u32 = 16;
 
 type PixelColour = [u8; 3];

@@ -13,9 +13,10 @@ use crate::patience::PPO_CART_POLE;
 
 /// Number of connections with a fault. Later connections have none, so that the training ends.
 const FAULTY: usize = 4;
-/// Minimum position of the first fault. A client that cannot even begin fails at once and does not wait.
+/// Minimum number of bytes before the first fault of a connection. A client whose first requests fail ends at once and does
+/// not wait.
 const BEGUN: usize = 20_000;
-/// Maximum position of a fault. A training's connection carries more bytes in both directions.
+/// Maximum number of bytes before a fault. A training's connection carries more bytes in both directions.
 const MOST: u64 = 200_000;
 
 /// Trains at this address.

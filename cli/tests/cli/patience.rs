@@ -25,7 +25,7 @@ pub const A2C_PENDULUM: &str = "environment = 'Pendulum'\nversion = 'R'\nalgorit
 enum Victim {
     /// The only server, a private one.
     Private,
-    /// The only server, which is restarted.
+    /// The only server, which the command line names. It is restarted.
     Named,
     /// One of two servers, which is restarted.
     OneOfTwo,

@@ -20,8 +20,8 @@ pub struct ArraysFile {
 }
 
 impl ArraysFile {
-    /// Writes `content` under a name of its own, which begins with `prefix`: that of [`RESUME_PREFIX`](super::RESUME_PREFIX)
-    /// or of the weights.
+    /// Writes `content` to a file with a unique name, which begins with `prefix`: [`RESUME_PREFIX`](super::RESUME_PREFIX) or
+    /// the prefix of weights.
     ///
     /// # Errors
     /// The operating system's.

@@ -52,7 +52,7 @@ pub const RESUME_PREFIX: &str = "resume-";
 pub struct Checkpoint {
     /// Everything but the weights.
     pub state: State,
-    /// The shape of the policy; that of [`State::policy`] if it was trained.
+    /// The shape of the policy. If the policy was trained by perturb, it is that of [`State::policy`].
     pub policy: PolicySpec,
     /// The policy's weights, in the order of [`PolicySpec::layout`].
     pub weights: Weights,

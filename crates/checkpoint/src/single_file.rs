@@ -43,7 +43,7 @@ impl Checkpoint {
     /// Reads the policy in the file `path`.
     ///
     /// # Errors
-    /// [`CheckpointError`](super::CheckpointError), also if it is not what was written.
+    /// [`CheckpointError`](super::CheckpointError), also if the checksum does not match.
     pub(crate) fn load_file(path: &Path) -> Result<Self> {
         let content = files::read(path)?;
         let text = decode_document(&content).map_err(|reason| damaged(path, reason))?;

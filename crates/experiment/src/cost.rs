@@ -1,9 +1,9 @@
 //! The cost of a plan, from short measurements.
 //!
-//! A step costs what its environment costs plus what its method costs. So each environment is measured with one
-//! method, and each method in one environment, in groups as large as those of a run; the other pairs follow. How many
-//! steps there are depends on what is learned, so that only the most can be said beforehand; what cells of the same
-//! environment and method took, which are done, says it better: [`CellDurations`](crate::CellDurations).
+//! A step costs what its environment costs plus what its method costs. So each environment is measured with one method, and
+//! each method in one environment, in groups as large as those of a run. The speeds of the other pairs are computed from
+//! these. The number of steps depends on what is learned, so only an upper bound is known beforehand. Durations of finished
+//! cells with the same environment and method are better estimates: [`CellDurations`](crate::CellDurations).
 
 use std::collections::HashMap;
 use std::iter::Sum;
@@ -12,19 +12,19 @@ use perturb_settings::{Method, TrainConfig, Wrapper};
 
 use crate::plan::{Cell, Grouping, Plan, distinct};
 
-/// Seconds of a process that a step of one environment takes, with all that belongs to it.
+/// Process time for one step of one environment, s. It includes the policy's share of that step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Speed {
-    /// With rollouts and updates.
+    /// In training, with rollouts and updates.
     pub training: f64,
-    /// In testing: without the updates.
+    /// In tests, which have no updates.
     pub testing: f64,
 }
 
 /// A group of trainings that was measured.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Measurement {
-    /// By its name in the catalogue.
+    /// The environment's name in the catalogue.
     pub environment: String,
     /// The measured method.
     pub method: Method,
@@ -34,16 +34,16 @@ pub struct Measurement {
     pub speed: Speed,
 }
 
-/// Upper bound of the cost of cells, if every episode lasts until the step limit. Seconds are those of processes.
+/// Upper bound of the cost of cells: every episode is assumed to last until the step limit. Seconds are process time.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Estimate {
     /// Steps of training. With EPOpt, all generated episodes count.
     pub training_steps: f64,
-    /// Steps of tests. With RL², whole trials count.
+    /// Steps of tests. With RL², the steps of all episodes of a trial count.
     pub testing_steps: f64,
-    /// With rollouts and updates.
+    /// Process time of trainings with rollouts and updates, s.
     pub training_seconds: f64,
-    /// Without updates.
+    /// Process time of tests, s.
     pub testing_seconds: f64,
 }
 
@@ -65,9 +65,9 @@ impl Sum for Estimate {
     }
 }
 
-/// The groups of trainings to measure for `cells`, places in the plan: of each environment with its first method, and of
-/// each method in its first environment, as many cells as are in a group of a run, evenly from all over the grid. The
-/// one in its middle is the first.
+/// Returns the groups of trainings to measure for `cells`, which are indices in the plan. Each environment has a group with
+/// its first method, and each method a group in its first environment. A group has as many cells as a group of the run,
+/// evenly spread over the grid. The cell in the middle of the grid is the first of its group.
 pub fn benchmark_cells<'a>(plan: &'a Plan, cells: &[usize], grouping: Grouping) -> Vec<Vec<&'a Cell>> {
     let groups = plan.groups(cells, grouping);
     let pair_at = |&cell: &usize| pair(&plan.cells[cell]);
@@ -132,7 +132,8 @@ pub fn tested_episodes(cell: &Cell) -> f64 {
     trials * f64::from(cell.config.settings.episodes_per_trial())
 }
 
-/// A pair's speed: measured, or the method's in another environment plus what this environment takes more.
+/// Returns the speed of a pair. If it was not measured, it is the method's speed in another environment plus the additional
+/// time that this environment takes.
 fn speed_of((environment, method): &(&str, Method), measurements: &[Measurement]) -> Speed {
     let find = |environment: &str, method: &Method| {
         measurements.iter().find(|known| known.environment == environment && known.method == *method)

@@ -17,17 +17,17 @@ const MIN_EPISODES_PER_POINT: usize = 20;
 /// Maximum number of points of a curve.
 const MAX_POINTS: usize = 100;
 
-/// By what trainings are compared.
+/// Quantity by which the progress of trainings is compared: the horizontal axis of their curves.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BudgetAxis {
     /// Episodes that ended, also those that EPOpt generates and does not learn from.
     Episodes,
-    /// Steps of these episodes, of all environments together.
+    /// Steps of these episodes, added over all environments.
     Steps,
 }
 
 impl BudgetAxis {
-    /// Both.
+    /// Episodes and steps.
     pub const ALL: [BudgetAxis; 2] = [BudgetAxis::Episodes, BudgetAxis::Steps];
 
     /// Returns the share of the budget that an episode takes.
@@ -53,7 +53,7 @@ impl std::fmt::Display for BudgetAxis {
 pub struct EnvironmentCurves {
     /// The environment's name.
     pub environment: String,
-    /// For each method and training version that has a finished training.
+    /// A curve for each method and training version that has a finished training.
     pub curves: Vec<Curve>,
 }
 
@@ -75,12 +75,12 @@ struct AxisCurve {
     points: Vec<CurvePoint>,
 }
 
-/// Part of a training.
+/// Averages over one part of each training.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CurvePoint {
-    /// Episodes, or steps, in the middle of it; mean over runs.
+    /// Number of episodes or steps at the middle of the part, as the mean over runs.
     pub progress: f64,
-    /// The mean undiscounted return of the episodes that had their middle in it, over runs.
+    /// The mean undiscounted return of the episodes whose middle is in this part, over runs.
     pub episode_return: Summary,
     /// The success rate of these episodes, %, over runs.
     pub success: Summary,
@@ -101,7 +101,7 @@ impl Curve {
         Self { method: method.clone(), version, lines: BudgetAxis::ALL.map(|footing| line(runs, footing)) }
     }
 
-    /// In order.
+    /// Returns the points in order.
     pub fn points(&self, by: BudgetAxis) -> &[CurvePoint] {
         &self.lines[by as usize].points
     }
@@ -112,7 +112,7 @@ impl Curve {
     }
 }
 
-/// Reads the curves of all selected trainings; those whose `monitor.csv` is gone are left out.
+/// Reads the curves of all selected trainings. Trainings without a `monitor.csv` are left out.
 ///
 /// # Errors
 /// [`FolderError`] if a file is there that cannot be read.
@@ -133,7 +133,7 @@ pub fn read_curves(selections: &[MethodResults<'_>], folder: &Folder) -> Result<
     Ok(all)
 }
 
-/// The episodes of each run that has some.
+/// Returns the episodes of each run that has any.
 fn read_runs(
     selection: &MethodResults<'_>,
     version: Version,
@@ -149,7 +149,7 @@ fn read_runs(
     Ok(runs)
 }
 
-/// The episodes in the order in which they ended; none without a file.
+/// Reads the episodes in the order in which they ended. Returns none if there is no file.
 fn read_monitor(path: &Path) -> Result<Vec<MonitorEpisode>, FolderError> {
     let Some(content) = read_if_there(path)? else { return Ok(Vec::new()) };
     let damaged = |error: AnyError| FolderError::Damaged { path: path.to_owned(), reason: error.to_string() };
@@ -181,8 +181,9 @@ fn parse_monitor(content: &[u8]) -> Result<Vec<MonitorEpisode>, AnyError> {
     Ok(episodes)
 }
 
-/// Parts each run evenly by `footing`, and averages each part over runs. What is averaged are equal shares of a training,
-/// since trainings end some episodes after their budget. A part in which no episode had its middle has no point.
+/// Divides each run into equal parts by `footing`, and averages each part over runs. Parts are shares of a training, not
+/// absolute numbers, because trainings end some episodes after their budget. A part that contains no episode's middle has no
+/// point.
 fn line(runs: &[Vec<MonitorEpisode>], footing: BudgetAxis) -> AxisCurve {
     let shortest = runs.iter().map(Vec::len).min().unwrap_or_default();
     let count = (shortest / MIN_EPISODES_PER_POINT).clamp(usize::from(shortest > 0), MAX_POINTS);
@@ -204,7 +205,7 @@ fn line(runs: &[Vec<MonitorEpisode>], footing: BudgetAxis) -> AxisCurve {
     AxisCurve { total, points: (0..count).filter_map(point).collect() }
 }
 
-/// `count` parts of `run`, by where the middles of its episodes are.
+/// Divides `run` into `count` parts. An episode belongs to the part that contains its middle.
 fn split(run: &[MonitorEpisode], count: usize, total: f64, footing: BudgetAxis) -> Vec<&[MonitorEpisode]> {
     let mut before = 0.0;
     let mut part_of = Vec::with_capacity(run.len());

@@ -24,10 +24,10 @@ pub enum ExportError {
     Verify(#[from] VerifyError),
 }
 
-/// Returns the rows of all cells of `plan` that are done or failed in `folder`, in the plan's order. Cells that are
-/// selected follow the others, and results of cells that the plan does not have come last, by their ids. Results with
-/// recorded episodes are compared with them. `each` gets the cell's id and the episodes of every final policy that has
-/// some.
+/// Returns the rows of all cells of `plan` that are done or failed in `folder`, in the plan's order. Selected cells follow
+/// the others. Results of cells that are not in the plan come last, ordered by id. Results are compared with their recorded
+/// episodes, if there are any. Calls `each` with the cell's id and the episodes of every final policy that has recorded
+/// episodes.
 ///
 /// # Errors
 /// [`ExportError`].
@@ -100,7 +100,7 @@ fn add_done(
         TableRow {
             tested_on: Some(name.clone()),
             episodes: Some(figures.episodes),
-            // Exact: the rate was computed from this number.
+            // This is exact, because the rate was computed from this number.
             successes: Some((figures.success_percent * figures.episodes as f64 / 100.0).round() as u64),
             mean_return: Some(figures.mean_return),
             mean_length: Some(figures.mean_length),

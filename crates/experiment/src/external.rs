@@ -1,4 +1,4 @@
-//! Agents that no cell of an experiment trained, as rows of a report beside the experiment's own.
+//! Agents that were not trained by a cell of the experiment. They are additional rows of its report.
 
 use std::collections::BTreeMap;
 
@@ -9,7 +9,8 @@ use perturb_settings::ValueError;
 use crate::plan::Plan;
 use crate::selection::{MethodResults, Reported, SelectedRun};
 
-/// An assessment with success judged by the rule of the plan's cells in its environment, where the plan has some.
+/// Returns the assessment with its success judged by the rule that the plan's cells have in this environment. Without such
+/// cells it is unchanged.
 ///
 /// # Errors
 /// [`ValueError`] if the episodes cannot be judged by it.
@@ -19,9 +20,9 @@ pub fn judged_as_in(plan: &Plan, assessed: ExternalEvaluation) -> Result<Externa
     assessed.judged_by(&cell.tests.success.clone().unwrap_or(Rule::Text))
 }
 
-/// Adds the agents of `assessed` to the rows of a report: behind the others of their environment. Assessments of one agent
-/// are runs of it; of those that have nothing in common of what they were trained on one run is made. An assessment is
-/// never of two runs.
+/// Adds the agents of `assessed` to the rows of a report, after the other rows of their environment. Assessments of the same
+/// agent become its runs. Assessments share a run if they have no training distribution in common. An assessment is never
+/// split over two runs.
 pub fn add_assessed<'a>(selections: &mut Vec<MethodResults<'a>>, assessed: &'a [ExternalEvaluation]) {
     for one in assessed {
         let (environment, method) = (one.environment(), one.method());
@@ -41,7 +42,7 @@ pub fn add_assessed<'a>(selections: &mut Vec<MethodResults<'a>>, assessed: &'a [
     }
 }
 
-/// The agents of `selections` that something else trained, with their policies and the numbers of their runs, in order.
+/// Returns the externally trained agents of `selections`, with their policies and run numbers, in order.
 pub fn elsewhere<'a>(selections: &[MethodResults<'a>]) -> Vec<(&'a ExternalEvaluation, &'a ExternalPolicy, u32)> {
     let runs = selections.iter().flat_map(|row| &row.runs);
     let policies = runs.flat_map(|(run, of)| of.selected.values().flatten().map(|reported| (*run, reported)));

@@ -36,7 +36,7 @@ fn external_agents_follow_their_environment_as_rows() {
     assert_eq!(selections[1].metric(perturb_records::Metric::Default), [(1, 100.0), (2, 50.0)].into());
 }
 
-/// Each letter is what a policy was trained on.
+/// Each letter is the training distribution of a policy.
 #[rstest]
 #[case("D,DRE", "D,DRE")]
 #[case("DR,RE", "DR,RE")]

@@ -1,4 +1,4 @@
-//! Results for tests, as if cells had been done, and what the fixture of the records has.
+//! Made-up results of cells for tests. It re-exports the fixture of the crate of records.
 #![allow(dead_code, unused_imports, reason = "each crate that includes it needs a part")]
 
 use perturb_checkpoint::Counters;
@@ -45,7 +45,7 @@ pub fn result(cell: &Cell, [d, r, e]: [f64; 3], mean_return: f64) -> CellResult 
     }
 }
 
-/// Cells that `known` has no rates and mean return of are missing.
+/// Returns results of the cells for which `known` gives success rates and a mean return. All other cells are missing.
 pub fn results(plan: &Plan, known: impl Fn(&Cell) -> Option<([f64; 3], f64)>) -> Results<'_> {
     let state = |cell: &Cell| match known(cell) {
         Some((rates, mean_return)) => CellState::Done(Box::new(result(cell, rates, mean_return))),

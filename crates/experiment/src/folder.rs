@@ -32,9 +32,9 @@ use serde_json::Value;
 
 use crate::plan::Plan;
 
-/// Format of `result.json`; raised when older programs could misread it.
+/// Format of `result.json`. It is raised when older programs could misread the file.
 const FORMAT_VERSION: u32 = 1;
-/// A record of a cell is shorter, bytes.
+/// Maximum size of a cell's record, in bytes.
 const MAX_BYTES: u64 = 64 << 20;
 
 /// The folder of an experiment.
@@ -51,7 +51,7 @@ pub struct CellFolder {
     path: PathBuf,
 }
 
-/// Tells one record of a failure from the next, even if both say the same.
+/// Identity of a failure record. A later record has another identity, even with the same content.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FailureId {
     /// The inode. Another file may get it after this one is deleted.
@@ -67,7 +67,7 @@ pub enum CellState {
     Done(Box<CellResult>),
     /// The cell failed.
     Failed(Failure),
-    /// Neither.
+    /// There is neither a result nor a failure.
     Missing,
 }
 
@@ -81,8 +81,7 @@ pub struct CellResult {
     pub id: String,
     /// The training.
     pub training: Training,
-    /// Success, return and length, by the name of the set that was tested: "D", "R", "E", "R+E" or one of the plan's
-    /// own.
+    /// Success, return and length for each test set, by its name: "D", "R", "E", "R+E" or a set of the plan.
     pub results: BTreeMap<String, TestResult>,
     /// Tests of intermediate policies, by the episodes of the budget after which they were stored.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
@@ -92,7 +91,7 @@ pub struct CellResult {
     pub agreement: Option<ParameterCheck>,
     /// The program's version and the commit that it was built from.
     pub commit: String,
-    /// Other programs that did a part of the training before it was broken off, in order.
+    /// Versions of earlier programs that did a part of the training before an interruption, in order.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub earlier_commits: Vec<String>,
     /// The command that gives the same numbers without the plan.
@@ -118,17 +117,17 @@ pub struct Training {
     pub environment: String,
     /// The environment's revision on the server. Changes of dynamics raise it.
     pub environment_revision: u32,
-    /// SHA-256 of its model; empty without one.
+    /// SHA-256 of the environment's model; empty if it has none.
     pub model_hash: String,
     /// The distribution of parameters that the settings do not list.
     pub version: Version,
-    /// The name of the plan's own set of parameters, if it was trained on one.
+    /// The name of the plan's set of parameters on which it was trained; `None` if it was trained on a version.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub set: Option<String>,
     /// The method.
     #[serde(flatten)]
     pub method: Method,
-    /// Names the settings.
+    /// Hash of the settings, see [`Cell::configuration`](crate::plan::Cell::configuration).
     pub configuration: String,
     /// The run, from 1.
     pub run: u32,
@@ -156,7 +155,7 @@ pub struct Failure {
     pub requires_restart: bool,
 }
 
-/// The value for documents of earlier programs.
+/// Default value for documents of earlier programs, which do not have the field.
 fn yes() -> bool {
     true
 }
@@ -165,8 +164,8 @@ fn yes() -> bool {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Timing {
-    /// Seconds from the beginning to the result, without what an attempt took that was broken off. Where a process does
-    /// several cells at a time, each moment counts as its part of it: the seconds of all cells add up to the process's.
+    /// Seconds from the beginning to the result, without interrupted attempts. If a process runs several cells together,
+    /// they share its time, so the seconds of all cells add up to the process's time.
     pub seconds: f64,
 }
 
@@ -178,14 +177,14 @@ pub enum FolderError {
     /// The operating system refused a file.
     #[error(transparent)]
     File(#[from] FileError),
-    /// A file is damaged, or of a program that is too different.
+    /// A file is damaged, or a program with another format wrote it.
     #[error("{} is not understood: {reason}; delete it to have the cell done again", path.display())]
     Damaged {
         path: PathBuf,
         /// The fault.
         reason: String,
     },
-    /// A result is of another model than the servers have.
+    /// The model of a result differs from that of the servers.
     #[error(
         "cell {cell} was trained in {environment} with the model {trained}, the server's has {served}: serve the task's \
          files as they were, or give another --out"
@@ -197,7 +196,7 @@ pub enum FolderError {
          compared: delete those of one model, and have them done again"
     )]
     Models { environment: String, cells: Box<[String; 2]>, hashes: Box<[String; 2]> },
-    /// The rows of a cell in a results table.
+    /// The rows of a cell in a results table are invalid.
     #[error("the rows of cell {cell} are not understood: {reason}; export the cell's folder again")]
     Row {
         cell: String,
@@ -212,7 +211,7 @@ pub enum FolderError {
 type Result<T> = std::result::Result<T, FolderError>;
 
 impl Folder {
-    /// The folder at `path`, which need not exist.
+    /// Returns the folder at `path`, which need not exist.
     pub fn new(path: &Path) -> Self {
         Self { path: path.to_owned(), new_heatmaps: None }
     }
@@ -227,22 +226,22 @@ impl Folder {
         &self.path
     }
 
-    /// The folders of heatmaps. New ones are written to the first.
+    /// Returns the folders of heatmaps. New heatmaps are written to the first one.
     pub fn heatmaps(&self) -> Vec<PathBuf> {
         self.new_heatmaps.iter().cloned().chain([self.path.join("heatmaps")]).collect()
     }
 
-    /// The folder of a cell.
+    /// Returns the folder of a cell.
     pub fn cell(&self, id: &str) -> CellFolder {
         CellFolder { path: self.path.join("cells").join(id) }
     }
 
-    /// The copy of the experiment file.
+    /// Returns the path of the copy of the experiment file.
     pub fn plan_path(&self) -> PathBuf {
         self.path.join("plan.toml")
     }
 
-    /// The copy of the experiment file, which must be there.
+    /// Returns the path of the copy of the experiment file, which must exist.
     ///
     /// # Errors
     /// [`FolderError::NoPlan`].
@@ -251,7 +250,8 @@ impl Folder {
         if plan.is_file() { Ok(plan) } else { Err(FolderError::NoPlan { path: self.path.clone() }) }
     }
 
-    /// Keeps a copy of the experiment file, with the files that it names; says whether there was another one.
+    /// Copies the experiment file and the files that it names into the folder. Returns whether this replaced a different
+    /// one.
     ///
     /// # Errors
     /// [`FileError`].
@@ -267,8 +267,8 @@ impl Folder {
         Ok(earlier.is_some() && !same)
     }
 
-    /// Refuses an environment whose model is another one than that of the plan's first result in it. The other results
-    /// have the model of the first: [`Results::read`](crate::Results::read) refuses a mixture.
+    /// Compares the environment's model with that of the plan's first result in this environment. The first result is
+    /// enough, because [`Results::read`](crate::Results::read) refuses results with different models.
     ///
     /// # Errors
     /// [`FolderError::OtherModel`], and those of [`CellFolder::state`].
@@ -344,7 +344,7 @@ impl CellFolder {
         Ok(read(&self.path.join("failure.json"))?.map_or(CellState::Missing, CellState::Failed))
     }
 
-    /// Whether there is a result or, unless `failed_too` is off, a failure. Reads neither.
+    /// Returns whether there is a result, or with `failed_too` a failure. Reads neither file.
     pub fn is_settled(&self, failed_too: bool) -> bool {
         self.path.join("result.json").exists() || (failed_too && self.path.join("failure.json").exists())
     }
@@ -364,7 +364,7 @@ impl CellFolder {
         Lock::try_take(&self.path)
     }
 
-    /// Makes the result appear, complete.
+    /// Writes the result atomically.
     ///
     /// # Errors
     /// [`FileError`].
@@ -380,10 +380,11 @@ impl CellFolder {
         write(&self.path.join("failure.json"), failure)
     }
 
-    /// Forgets a failure, and the training that led to it if another attempt [must begin anew](Failure::requires_restart).
+    /// Deletes the failure record. Also deletes the training that led to it if another attempt [must restart
+    /// it](Failure::requires_restart).
     ///
     /// # Errors
-    /// [`FileError`]; nothing was forgotten then.
+    /// [`FileError`]; nothing was deleted then.
     pub fn clear_failure(&self) -> files::Result<()> {
         let path = self.path.join("failure.json");
         match read::<Failure>(&path) {
@@ -395,7 +396,7 @@ impl CellFolder {
         files::delete(&path)
     }
 
-    /// Forgets the failure `mark`, and no other. Says whether that was possible: not while somebody works on the cell.
+    /// Deletes the failure record if it is still `mark`. Returns false if another process works on the cell.
     ///
     /// # Errors
     /// [`FileError`].
@@ -425,13 +426,13 @@ impl CellResult {
     /// The layout that this program writes.
     pub const FORMAT_VERSION: u32 = FORMAT_VERSION;
 
-    /// All programs that it comes from, in order.
+    /// Returns the versions of all programs that contributed to the result, in order.
     pub fn commits(&self) -> impl Iterator<Item = &str> {
         self.earlier_commits.iter().chain([&self.commit]).map(String::as_str)
     }
 }
 
-/// A JSON file, whose checksum is the right one, if it has any; `None` if it is not there.
+/// Reads a JSON file and verifies its checksum, if it has one. Returns `None` if there is no file.
 pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
     let Some(text) = files::read_plain(path, MAX_BYTES)? else { return Ok(None) };
     let damaged = |reason: String| FolderError::Damaged { path: path.to_owned(), reason };

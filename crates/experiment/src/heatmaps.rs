@@ -1,4 +1,4 @@
-//! The heatmaps of an experiment: of each policy that was selected in a run, over any two parameters.
+//! The heatmaps of an experiment: the success of each selected policy over any two parameters.
 //!
 //! ```text
 //! DIR/heatmaps/ID-X-Y.csv .parquet  of the cell ID, over the parameters X and Y: figures and episodes
@@ -6,8 +6,8 @@
 //! DIR/heatmaps/ID-X-Y-R.…           the same with the other parameters drawn from R
 //! ```
 //!
-//! The record holds checksums of the figures and of the cell's result. Figures of two records, or of a result that has
-//! been replaced since, are therefore never taken for current ones. Pictures are drawn from figures when they are wanted.
+//! The record holds checksums of the figures and of the cell's result. Figures of two records, or of a result that has been
+//! replaced since, are therefore never taken for current ones. Pictures are drawn from the figures when they are needed.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -21,7 +21,7 @@ use crate::folder::{Folder, FolderError};
 use crate::plan::Cell;
 use crate::selection::{MethodResults, Selected};
 
-/// Format of the records; raised when older programs could misread them.
+/// Format of the records. It is raised when older programs could misread them.
 const FORMAT_VERSION: u32 = 2;
 
 /// A policy that an experiment has heatmaps of, or could have.
@@ -39,7 +39,7 @@ pub struct HeatmapPlace<'a> {
     pub selected: Option<Selected<'a>>,
 }
 
-/// `ID-X-Y.json`: what a heatmap shows. It depends on nothing but the results, the program and the settings.
+/// `ID-X-Y.json`: describes a heatmap. It depends only on the results, the program and the settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct HeatmapRecord {
     /// The format of the document.
@@ -78,18 +78,19 @@ pub enum NoHeatmap {
     /// The training was not done yet.
     #[error("no heatmap, since this training has no result yet")]
     NoResult,
-    /// Nor is one that was not made completely.
+    /// No heatmap was completed.
     #[error("the heatmap has not been made")]
     NotMade,
     /// The result has been replaced.
     #[error("the heatmap is of an earlier result")]
     Outdated,
-    /// Means are over the same points and as many episodes.
+    /// The heatmap differs from that of an earlier run in its points or in its number of episodes, so no mean over both is
+    /// possible.
     #[error("the heatmap has another grid or other episodes than that of an earlier run")]
     NotAlike,
 }
 
-/// The policies that a plan has heatmaps of, in the order of `selections`, of what it trains on and of runs.
+/// Returns the places of a plan's heatmaps, ordered by `selections`, training distribution and run.
 pub fn heatmap_places<'a>(selections: &'a [MethodResults<'a>]) -> Vec<HeatmapPlace<'a>> {
     let mut places = Vec::new();
     for MethodResults { environment, method, runs, .. } in selections.iter().filter(|row| !row.method.external) {
@@ -136,7 +137,7 @@ impl HeatmapRecord {
 }
 
 impl HeatmapPlace<'_> {
-    /// The heatmap of `kind` that is there, or why there is none.
+    /// Reads the heatmap of `kind`, or returns the reason why there is none.
     ///
     /// # Errors
     /// [`FolderError`] if a file is there that cannot be read.
@@ -153,7 +154,7 @@ impl HeatmapPlace<'_> {
         Ok(Err(missing))
     }
 
-    /// The heatmap at `path`, which has no extension.
+    /// Reads the heatmap at `path`, which has no extension.
     fn read_at(
         &self,
         path: &Path,
@@ -176,7 +177,7 @@ impl HeatmapPlace<'_> {
 }
 
 impl HeatmapRecord {
-    /// Without points.
+    /// Returns a heatmap without points.
     fn blank(&self, environment: &str) -> Heatmap {
         let HeatmapOptions { base, grid, episodes, fixed, .. } = self.options.clone();
         let (environment, axes) = (environment.to_owned(), self.axes.clone());
@@ -199,10 +200,10 @@ fn heatmap_name(cell: &Cell, kind: &HeatmapKind) -> String {
     format!("{}-{kind}", cell.id)
 }
 
-/// Keeps `heatmap` of the policy called `checkpoint` as that of `cell`.
+/// Stores `heatmap`, which shows the policy `checkpoint`, for `cell`.
 ///
 /// # Errors
-/// The operating system's; then there is none.
+/// The operating system's. There is no heatmap then.
 pub fn store_heatmap(
     folder: &Folder,
     cell: &Cell,

@@ -1,9 +1,9 @@
-//! Experiments: what is asked for, doing it, and what came of it, as plain data.
+//! Experiments: their plans, their execution and their results, as plain data.
 //!
-//! - [`Plan`] expands an experiment file to cells, [`Folder`] is where they are kept, [`scheduler`] has processes or a
-//!   cluster do them.
-//! - [`runs`] finds trainings and experiments, and says how far they are.
-//! - [`Results`] reads them back and selects; [`export`](export()) makes rows of a table of them.
+//! - [`Plan`] expands an experiment file to cells, [`Folder`] stores them, and [`scheduler`] runs them in processes or on a
+//!   cluster.
+//! - [`runs`] finds trainings and experiments, and reports their progress.
+//! - [`Results`] reads the cells' results and selects configurations; [`export`](export()) turns them into rows of a table.
 #![forbid(unsafe_code)]
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! The recorded episodes of the policies that a report is of.
+//! The recorded episodes of the policies in a report.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -23,12 +23,12 @@ impl Recorded {
         Self { wanted: selected.map(|selected| selected.cell.id.clone()).collect(), policies: BTreeMap::new() }
     }
 
-    /// Whether a cell is one of those that were selected.
+    /// Returns whether a cell was selected.
     pub fn wants(&self, cell: &str) -> bool {
         self.wanted.contains(cell)
     }
 
-    /// Keeps what is needed of a cell's `records`, if it is one of those that were selected.
+    /// Keeps the required part of a cell's `records`, if the cell was selected.
     pub fn add(&mut self, result: &CellResult, records: &Records) {
         if self.wants(&result.id) {
             let names = result.results.keys().map(String::as_str);
@@ -41,7 +41,7 @@ impl Recorded {
         (self.policies.len(), self.wanted.len())
     }
 
-    /// The policy that is reported; `None` without recorded episodes.
+    /// Returns the recorded episodes of the reported policy; `None` if there are none.
     pub fn policy<'a>(&'a self, reported: &Reported<'a>) -> Option<&'a PolicyOutcomes> {
         match reported {
             Reported::Cell(selected) => self.policies.get(&selected.cell.id),

@@ -1,14 +1,13 @@
-//! Selection inside the bootstrap: what a number would have been, had chance selected another configuration.
+//! Selection inside the bootstrap: how a number varies because chance influences the selected configuration.
 //!
-//! Each resample draws runs anew within each environment, as one without selection does, and has every selection of the
-//! plan made anew by the plan's rule: the episodes of the tests that select are drawn anew, so that each has a binomial
-//! number of successes with the measured rate, and so are tuning seeds. Reported is what was measured of the configuration
-//! that then comes first, since the highest of several redrawn rates would flatter it a second time: configurations are
-//! selected by other numbers than the reported ones, as Tsamardinos, Greasidou and Borboudakis (2018,
-//! <https://doi.org/10.1007/s10994-018-5714-4>) do.
+//! Each resample draws runs within each environment, like a bootstrap without selection. It also repeats every selection by
+//! the plan's rule: it draws tuning seeds, and the number of successes of each selecting test from a binomial distribution
+//! with the measured rate. The measured results of the configuration with the highest rank are reported, not its redrawn
+//! rate, because the maximum of several redrawn rates is biased upwards. So the numbers that select are not the reported
+//! ones, as in Tsamardinos, Greasidou and Borboudakis (2018, <https://doi.org/10.1007/s10994-018-5714-4>).
 //!
-//! By the paper's rule every configuration has been tested in every run. By the clean one a configuration that was not
-//! selected has no reported runs: in the place of each stand the tests of a drawn tuning cell of this configuration.
+//! With the paper's rule every configuration has been tested in every run. With the clean rule a configuration that was not
+//! selected has no reported runs. Each of them is replaced by the tests of a drawn tuning cell of this configuration.
 
 use std::collections::HashMap;
 
@@ -27,7 +26,7 @@ const RUNS_SEED: u64 = 1;
 /// The seed for drawing selections. Separate draws leave the drawn runs unchanged.
 const SELECTION_SEED: u64 = 2;
 
-/// All selections of a plan, and among what they are made.
+/// All selections of a plan, with their candidates.
 pub struct SelectionBootstrap<'a> {
     contests: HashMap<(&'a str, Method, TrainedOn<'a>, Option<u32>), Candidates<'a>>,
     rule: Selection,
@@ -45,7 +44,7 @@ struct SelectableCell<'a> {
     tests: Vec<SelectionTest>,
 }
 
-/// A cell's test that selects.
+/// A cell's selecting test.
 struct SelectionTest {
     seed: u64,
     successes: Binomial,
@@ -54,7 +53,7 @@ struct SelectionTest {
     rates: [Option<f64>; 3],
 }
 
-/// A run that is reported, with the places of the selections that it comes from, by what it was trained on.
+/// A reported run, with the indices of the selections of its policies by training distribution.
 struct DrawnPolicy<'a> {
     score: f64,
     selected: [Option<(usize, Selected<'a>)>; 3],
@@ -79,8 +78,9 @@ impl<'a> SelectionBootstrap<'a> {
         Self { contests, rule }
     }
 
-    /// The numbers that `statistic` makes of a metric's scores, %, by `selections`, then by the runs that all of them have,
-    /// as [`bootstrap`](perturb_records::statistics::bootstrap) does, but with every selection made anew in each of the `resamples`.
+    /// Returns `statistic` of a metric's scores, %, for each of the `resamples`. Scores are ordered by `selections`, then by
+    /// the runs that all of them have. It works like [`bootstrap`](perturb_records::statistics::bootstrap), but repeats
+    /// every selection in each resample.
     pub fn bootstrap(
         &self,
         selections: &[&MethodResults<'a>],
@@ -142,7 +142,7 @@ impl<'a> SelectionBootstrap<'a> {
     }
 }
 
-/// By the paper's rule each run selects for itself, by the clean one all tuning cells for all runs.
+/// With the paper's rule each run has its own selection. With the clean rule all tuning cells select for all runs.
 fn key(cell: &Cell, rule: Selection, run: u32) -> (&str, Method, TrainedOn<'_>, Option<u32>) {
     let run = (rule == Selection::Paper).then_some(run);
     (&cell.config.common.environment, cell.method(), cell.trained_on(), run)
@@ -159,8 +159,8 @@ impl<'a> Candidates<'a> {
         }
     }
 
-    /// The candidate with the highest rank when episodes and seeds are drawn again, one of several that tie at random;
-    /// `None` if no candidate has a drawn seed.
+    /// Draws episodes and seeds, and returns the candidate with the highest rank. Ties are broken at random. Returns `None`
+    /// if no candidate has a drawn seed.
     fn decide(&self, uniform: &mut impl FnMut() -> f64) -> Option<&SelectableCell<'a>> {
         if let [only] = &self.candidates[..] {
             return Some(only);
@@ -190,7 +190,7 @@ impl<'a> Candidates<'a> {
 }
 
 impl SelectableCell<'_> {
-    /// Success rate and mean return over the `seeds` that it has a test of.
+    /// Returns the redrawn success rate and the mean return over those of `seeds` for which it has a test.
     fn rank(&self, seeds: &[u64], uniform: &mut impl FnMut() -> f64) -> Option<(f64, f64)> {
         let found = seeds.iter().filter_map(|seed| self.tests.iter().find(|test| test.seed == *seed));
         let tests: Vec<(f64, f64)> =
@@ -211,7 +211,7 @@ impl SelectionTest {
 }
 
 impl DrawnPolicy<'_> {
-    /// The metric of this run if `winners` had been selected; the reported score if a test is missing.
+    /// Returns the metric of this run as if `winners` had been selected. Returns the reported score if a test is missing.
     fn score_of(
         &self,
         metric: Metric,
@@ -236,7 +236,8 @@ fn draw<'t, T>(all: &'t [T], uniform: &mut impl FnMut() -> f64) -> &'t T {
     &all[(uniform() * all.len() as f64) as usize]
 }
 
-/// The number of successes among n episodes that are drawn again from n, of which k were successes.
+/// Distribution of the number of successes among n episodes that are drawn with replacement from n episodes with k
+/// successes.
 struct Binomial {
     /// Cumulative weights of 0, 1 … n successes, not normalised.
     cumulative: Vec<f64>,
@@ -262,7 +263,7 @@ impl Binomial {
         Self { cumulative: weights.into_iter().scan(0.0, sum).collect() }
     }
 
-    /// The share of successes, %, at `place` of the distribution, 0 … 1.
+    /// Returns the share of successes, %, at the quantile `place` of the distribution, 0 … 1.
     fn draw_percent(&self, place: f64) -> f64 {
         let n = self.cumulative.len() - 1;
         let successes = self.cumulative.partition_point(|below| *below <= place * self.cumulative[n]).min(n);

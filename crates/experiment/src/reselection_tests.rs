@@ -26,7 +26,7 @@ fn is_a(cell: &Cell) -> bool {
     cell.config.table()["learning_rate"].as_float() == Some(7e-3)
 }
 
-/// The intervals of a metric's interquartile mean without and with selection.
+/// Returns the intervals of a metric's interquartile mean, without and with selection inside the bootstrap.
 fn intervals(results: &Results<'_>, metric: Metric) -> [[f64; 2]; 2] {
     let selections = results.select();
     let both: Vec<_> = selections.iter().collect();
@@ -37,7 +37,7 @@ fn intervals(results: &Results<'_>, metric: Metric) -> [[f64; 2]; 2] {
     [without, with].map(|number| number.interval_95.unwrap())
 }
 
-/// A comes first in each run with 60 % or more, B, which does nothing else well, is `behind` it.
+/// In each run A has a success rate of 60 % or more. The rate of B is lower by `behind`, and B is bad in all other tests.
 fn by_paper(behind: f64, metric: Metric) -> [[f64; 2]; 2] {
     let plan = plan("");
     let results = fixture::results(&plan, |cell| {
@@ -60,15 +60,15 @@ fn doubtful_selection_widens_the_interval() {
     // Ranks are 0.1 apart, with a deviation of some 1.5: B is selected about as often, and extrapolates to nothing.
     let [without, with] = by_paper(0.1, Metric::Extrapolation);
     assert!(without[0] > 50.0 && with[0] == 0.0 && with[1] <= without[1], "{without:?} {with:?}");
-    // Redrawn rates are not reported: nothing is better than what was measured of the best.
+    // Redrawn rates are not reported, so no number is better than the best measured one.
     let [without, with] = by_paper(1.0, Metric::Default);
     assert!(with[0] < without[0] && with[1] <= without[1] && with[0] > without[0] - 1.01, "{without:?} {with:?}");
 }
 
 const CLEAN: &str = "selection = 'clean'\ntuning_runs = 2\nselection_episodes = 1000\n";
 
-/// `selecting` has the rates in selection episodes, by configuration and tuning run. What tuning cells of A are reported
-/// with in tests is 90, of B 10; what was trained anew has 80.
+/// `selecting` gives the rates in selection episodes, by configuration and tuning run. In tests the tuning cells of A have
+/// 90 %, those of B 10 %, and the cells that were trained after the selection 80 %.
 fn by_clean(selecting: fn(bool, u32) -> f64) -> [[f64; 2]; 2] {
     let mut plan = plan(CLEAN);
     let tuning = plan.cells.len();
@@ -97,10 +97,11 @@ fn by_clean(selecting: fn(bool, u32) -> f64) -> [[f64; 2]; 2] {
 
 #[test]
 fn tuning_cells_replace_missing_final_cells() {
-    // On both seeds A is better: whatever is drawn, it stays so, and only what was trained anew is reported.
+    // A is better on both seeds, so it is selected in every resample, and only its cells from after the selection are
+    // reported.
     let [without, with] = by_clean(|is_a, _| if is_a { 70.0 } else { 30.0 });
     assert_eq!(without, with);
-    // A is better by the mean over both seeds only. Where the second is drawn twice, B is: 10.
+    // A is better only in the mean over both seeds. If the second seed is drawn twice, B is selected, which has 10 %.
     let [without, with] = by_clean(|is_a, run| {
         if is_a == (run == 1) {
             70.0

@@ -1,12 +1,12 @@
-//! From the results of cells to the paper's numbers.
+//! Computes the paper's numbers from the results of cells.
 //!
-//! By the clean rule, what is reported are the cells that were trained anew ([`tuned`](super::tuned) says how they are
-//! selected). By the paper's rule every cell may be: per environment, method, training version and run, one configuration is selected: the one with the highest success
-//! rate when tested on the version that it was trained on. Ties go to the higher mean return in the same test.
-//! Configurations that still tie are all reported: numbers are means over them, since the rule cannot choose among them.
-//! The first of them in the plan's order stands for them where one cell is needed, as in `selected.csv` and heatmaps. It
-//! is also taken where the training version was not tested. Like in the paper, the selecting test is also the reported
-//! one; with a large grid that makes Default and Interpolation a little optimistic.
+//! With the clean rule, the cells that were trained after the selection are reported; see [`tuned`](super::tuned). With the
+//! paper's rule, one configuration is selected per environment, method, training version and run: the one with the highest
+//! success rate on its training version. Ties go to the higher mean return in the same test. Configurations that still tie
+//! are all reported: numbers are means over them, since the rule cannot choose among them. Where one cell is needed, as in
+//! `selected.csv` and heatmaps, it is the first of them in the plan's order. The first configuration is also selected if the
+//! training version was not tested. As in the paper, the selecting test is also the reported one. With a large grid that
+//! makes Default and Interpolation a little optimistic.
 
 use std::collections::BTreeMap;
 
@@ -25,7 +25,7 @@ use crate::tuning::{Tuned, tuned};
 pub struct Results<'a> {
     /// The plan.
     pub plan: &'a Plan,
-    /// By the cells' indices.
+    /// The state of each cell, by its index.
     pub states: Vec<CellState>,
 }
 
@@ -36,12 +36,12 @@ pub struct MethodResults<'a> {
     pub environment: &'a str,
     /// The method.
     pub method: Method,
-    /// Cells that the plan has for it, also those that it will have, without those that are trained on its own sets.
+    /// Number of cells that the plan has or will have for this row, without those that are trained on the plan's own sets.
     pub cells: usize,
     /// Number of these cells with a result. If some are missing, the selection was among fewer configurations than the
     /// plan has.
     pub done: usize,
-    /// By the runs' numbers, from 1.
+    /// The runs by their numbers, from 1.
     pub runs: BTreeMap<u32, SelectedRun<'a>>,
 }
 
@@ -157,7 +157,8 @@ impl<'a> Results<'a> {
 }
 
 impl<'a> MethodResults<'a> {
-    /// Counts a tuning cell; the first one that is trained on something, also those that are trained on it anew.
+    /// Counts a tuning cell. For the first one of a training distribution, also counts the `runs` cells that are trained
+    /// after the selection.
     fn tune(&mut self, cell: &'a Cell, state: &'a CellState, runs: u32) {
         let is_papers = usize::from(cell.set.is_none());
         self.cells += is_papers;
@@ -170,7 +171,7 @@ impl<'a> MethodResults<'a> {
         }
     }
 
-    /// Takes `cell` into account, which comes after all cells that the plan lists before it.
+    /// Adds `cell` to the selection. Cells must be added in the plan's order.
     fn consider(&mut self, cell: &'a Cell, state: &'a CellState) {
         let is_papers = usize::from(cell.set.is_none());
         let run = self.runs.entry(cell.run).or_default();
@@ -187,7 +188,7 @@ impl<'a> MethodResults<'a> {
         }
     }
 
-    /// A metric of each run that has it, %, by the run's number; the mean over tied configurations.
+    /// Returns a metric of each run that has it, %, by the run's number. It is the mean over tied configurations.
     pub fn metric(&self, metric: Metric) -> BTreeMap<u32, f64> {
         let of_run = |(&number, run): (&u32, &SelectedRun<'_>)| {
             let values = run.metric_by_choice(metric);
@@ -207,17 +208,17 @@ impl<'a> MethodResults<'a> {
         Some(TieRange { choices, low, high })
     }
 
-    /// A metric's mean and deviation over runs, %.
+    /// Returns a metric's mean and deviation over runs, %.
     pub fn summary(&self, metric: Metric) -> Option<Summary> {
         Summary::from_values(&self.metric(metric).into_values().collect::<Vec<_>>())
     }
 
-    /// A scenario's success rate over runs, %.
+    /// Returns a scenario's success rate over runs, %.
     pub fn scenario(&self, Scenario { train, test }: Scenario) -> Option<Summary> {
         self.test(TrainedOn::Version(train), &test.to_string(), |test| test.success_percent)
     }
 
-    /// A figure of the tests on a set or version, over runs; in a run the mean over tied configurations.
+    /// Returns a figure of the tests on a set or version over runs. In each run it is the mean over tied configurations.
     pub fn test(&self, trained_on: TrainedOn<'_>, tested_on: &str, figure: fn(&TestResult) -> f64) -> Option<Summary> {
         let of_run = |run: &SelectedRun<'_>| run.mean_over_ties(trained_on, tested_on, figure);
         Summary::from_values(&self.runs.values().filter_map(of_run).collect::<Vec<_>>())
@@ -225,12 +226,12 @@ impl<'a> MethodResults<'a> {
 }
 
 impl<'a> SelectedRun<'a> {
-    /// The selected policy that was trained on this; the first of tied ones.
+    /// Returns the selected policy of this training distribution, the first one of tied policies.
     pub fn trained_on(&self, trained_on: TrainedOn<'_>) -> Option<Reported<'a>> {
         self.selected.get(&trained_on).copied().flatten()
     }
 
-    /// The selected policy that was trained on this, and those that tie with it, in the plan's order.
+    /// Returns the selected policy of this training distribution and those that tie with it, in the plan's order.
     pub fn tied_on(&self, trained_on: TrainedOn<'_>) -> Vec<Reported<'a>> {
         let tied = self.tied.get(&trained_on).into_iter().flatten().copied().map(Reported::Cell);
         self.trained_on(trained_on).into_iter().chain(tied).collect()
@@ -251,7 +252,7 @@ impl<'a> SelectedRun<'a> {
     /// A metric for each choice among tied configurations, %; empty if the run does not have it.
     fn metric_by_choice(&self, metric: Metric) -> Vec<f64> {
         let choices = Version::ALL.map(|train| {
-            // The metric does not depend on a policy without whose scenarios it is known.
+            // If the metric is known without a policy's scenarios, it does not depend on this policy.
             let matters = metric.value(|scenario| (scenario.train != train).then_some(0.0)).is_none();
             let tied = self.tied_on(TrainedOn::Version(train)).into_iter().map(Some).take(if matters {
                 usize::MAX
@@ -275,19 +276,19 @@ impl<'a> SelectedRun<'a> {
         values
     }
 
-    /// The cell that was trained on this; `None` of an agent that was trained elsewhere.
+    /// Returns the selected cell of this training distribution; `None` for an externally trained agent.
     pub fn cell_trained_on(&self, trained_on: TrainedOn<'_>) -> Option<Selected<'a>> {
         self.trained_on(trained_on)?.cell()
     }
 
-    /// The success rate of a scenario, %, as the mean over tied configurations; `None` if nothing was tested there.
+    /// Returns the success rate of a scenario, %, as the mean over tied configurations; `None` without a test.
     pub fn rate(&self, Scenario { train, test }: Scenario) -> Option<f64> {
         self.mean_over_ties(TrainedOn::Version(train), &test.to_string(), |test| test.success_percent)
     }
 }
 
 impl<'a> Reported<'a> {
-    /// The cell; `None` of an agent that was trained elsewhere.
+    /// Returns the cell; `None` for an externally trained agent.
     pub fn cell(&self) -> Option<Selected<'a>> {
         match self {
             Self::Cell(selected) => Some(*selected),
@@ -320,19 +321,18 @@ impl<'a> Selected<'a> {
         Some(self.test(&version.to_string())?.success_percent)
     }
 
-    /// The figures of the test that selects.
+    /// Returns the figures of the selecting test.
     fn own_test(&self) -> Option<&'a TestResult> {
         self.test(&self.cell.trained_on().to_string())
     }
 
-    /// The highest is selected.
+    /// Returns success rate and mean return in the selecting test. The cell with the highest rank is selected.
     fn rank(&self) -> Option<(f64, f64)> {
         self.own_test().map(|test| (test.success_percent, test.mean_return))
     }
 }
 
-/// A metric averaged over the environments of `selections`, in each run that all of them have; mean and deviation over
-/// these runs.
+/// Returns mean and deviation, over the runs that all `selections` have, of a metric averaged over their environments.
 pub fn average(selections: &[&MethodResults<'_>], metric: Metric) -> Option<Summary> {
     let runs = common_runs(selections, metric);
     Summary::from_values(&runs.into_iter().map(|(_, numbers)| mean(numbers.into_iter())).collect::<Vec<_>>())
@@ -351,19 +351,19 @@ pub fn average_tie_range(selections: &[&MethodResults<'_>], metric: Metric) -> O
     Some(TieRange { choices, low: ends[0], high: ends[1] })
 }
 
-/// The interquartile mean of a metric over the environments of `selections` and the runs that all of them have, with
+/// Returns the interquartile mean of a metric over the environments of `selections` and the runs that all of them have, with
 /// its bootstrap interval.
 pub fn interquartile(selections: &[&MethodResults<'_>], metric: Metric, resamples: usize) -> Option<Bootstrapped> {
     Bootstrapped::new(&scores(selections, metric), resamples, 1, interquartile_mean)
 }
 
-/// A metric by `selections`, then by the runs that all of them have.
+/// Returns a metric by `selections`, then by the runs that all of them have.
 pub fn scores(selections: &[&MethodResults<'_>], metric: Metric) -> Vec<Vec<f64>> {
     let runs = common_runs(selections, metric);
     (0..selections.len()).map(|i| runs.iter().map(|(_, numbers)| numbers[i]).collect()).collect()
 }
 
-/// Each run that all `selections` have, with the metric in each of them.
+/// Returns each run that all `selections` have, with the metric in each of them.
 pub(crate) fn common_runs(selections: &[&MethodResults<'_>], metric: Metric) -> Vec<(u32, Vec<f64>)> {
     let by_environment: Vec<BTreeMap<u32, f64>> = selections.iter().map(|selection| selection.metric(metric)).collect();
     let of_run = |run: &u32| {

@@ -18,7 +18,7 @@ fn plan() -> Plan {
 /// Success rates on D, R and E and a mean return, by environment, training version, configuration ("A" or "B") and run.
 type PolicyMetadata<'f> = &'f dyn Fn(&str, Version, &str, u32) -> Option<([f64; 3], f64)>;
 
-/// What `rates` does not know is missing.
+/// Returns the results of the cells for which `rates` gives numbers. All others are missing.
 fn results<'a>(plan: &'a Plan, rates: PolicyMetadata<'_>) -> Results<'a> {
     fixture::results(plan, |cell| {
         let common = &cell.config.common;
@@ -110,7 +110,7 @@ fn metrics_are_those_computed_by_hand() {
     assert_summary(average(&both, Metric::Interpolation), 52.5, 7.5, 2);
     let [first, second] = [20.0 / 2.0, (40.0 + second) / 2.0];
     assert_summary(average(&both, Metric::Extrapolation), (first + second) / 2.0, (second - first) / 2.0, 2);
-    // Of 90, 80, 50, 60 the lowest and the highest go.
+    // The interquartile mean drops the lowest and the highest of 90, 80, 50 and 60.
     let iqm = interquartile(&both, Metric::Default, 100).unwrap();
     close(iqm.point, 70.0);
     assert_eq!(iqm.runs, 2);

@@ -1,4 +1,4 @@
-//! Where the states of cells are read from: an experiment's folder, a table of results, or both.
+//! Sources of the states of cells: an experiment's folder, a table of results, or both.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
@@ -12,7 +12,7 @@ use crate::plan::{Cell, Plan, PlanError};
 /// Separates the programs of a result in a table.
 pub(crate) const COMMIT_SEPARATOR: &str = "; ";
 
-/// A place that has the states of cells.
+/// A source of the states of cells.
 pub trait CellStates {
     /// Reads the state of `cell`.
     ///
@@ -62,8 +62,7 @@ impl CellStates for StudyResults<'_> {
     }
 }
 
-/// Cells that are done in a table, of whatever study. A cell counts if a study's plan has it with the same settings and
-/// the same tests.
+/// Cells that are done in any study of a table. A cell counts if the study's plan has it with the same settings and tests.
 #[derive(Debug)]
 pub struct DoneCells<'a> {
     studies: Vec<(Plan, StudyResults<'a>)>,
@@ -98,11 +97,11 @@ impl CellStates for DoneCells<'_> {
     }
 }
 
-/// The states in `first`; those of cells without any are in `then`.
+/// The states in `first`. Cells that are missing there have the state in `then`.
 pub struct LayeredStates<'a> {
-    /// Asked first.
+    /// The first source.
     pub first: &'a dyn CellStates,
-    /// Asked for cells that are missing in the other.
+    /// The source for cells that are missing in the first one.
     pub then: Option<&'a dyn CellStates>,
 }
 
@@ -136,7 +135,7 @@ impl Plan {
     }
 }
 
-/// The state that a cell's rows say, which are in the order of their export: those of the final policy come last.
+/// Returns the state of a cell from its rows. They are in the order of the export: those of the final policy come last.
 fn state_of(cell: &Cell, rows: &[&TableRow]) -> Result<CellState, String> {
     let Some(last) = rows.last() else { return Ok(CellState::Missing) };
     let commits: Vec<String> = last.commit.split(COMMIT_SEPARATOR).map(str::to_owned).collect();

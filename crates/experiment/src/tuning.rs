@@ -1,10 +1,10 @@
-//! The clean rule of selection: what is tuned, what is selected, and which cells follow from that.
+//! The clean rule of selection: tuning cells, selected configurations, and the cells that are trained after the selection.
 //!
-//! Per environment, method and training version one configuration is selected: the one with the highest success rate in
-//! selection episodes on the version that it was trained on, as the mean over tuning seeds; of equal ones the one with the
-//! higher mean return in the same test, of still equal ones the one that the plan lists first. Nothing is selected before
-//! every tuning cell has a result or has failed. A configuration some of whose cells failed counts with the others', which
-//! [`Chosen::seeds`] tells; one without any result is not selected.
+//! One configuration is selected per environment, method and training version: the one with the highest mean success rate
+//! over tuning seeds, in selection episodes on its training version. Ties go to the higher mean return in the same test,
+//! then to the plan's order. Nothing is selected before every tuning cell has a result or has failed. A configuration with
+//! some failed cells is ranked by its other cells, whose number is [`Chosen::seeds`]. A configuration without any result is
+//! not selected.
 
 use std::collections::HashMap;
 
@@ -23,17 +23,17 @@ pub struct Tuned<'a> {
     pub environment: &'a str,
     /// The method.
     pub method: Method,
-    /// On what, also in selection episodes.
+    /// The training distribution, which is also that of the selection episodes.
     pub trained_on: TrainedOn<'a>,
-    /// Tuning cells.
+    /// Number of tuning cells.
     pub cells: usize,
     /// Number of these cells with a result.
     pub done: usize,
     /// Number of these cells that failed.
     pub failed: usize,
-    /// Tuning seeds.
+    /// Number of tuning seeds.
     pub seeds: usize,
-    /// The selected configuration; `None` while cells are left, or if all failed.
+    /// The selected configuration; `None` while tuning cells are unfinished, or if all of them failed.
     pub chosen: Option<Chosen<'a>>,
 }
 
@@ -46,12 +46,12 @@ pub struct Chosen<'a> {
     pub success_percent: f64,
     /// Their mean return.
     pub mean_return: f64,
-    /// On how many tuning seeds it has results.
+    /// Number of tuning seeds for which it has results.
     pub seeds: usize,
 }
 
 impl Tuned<'_> {
-    /// Whether every tuning cell has a result or has failed.
+    /// Returns whether every tuning cell has a result or has failed.
     pub fn is_complete(&self) -> bool {
         self.done + self.failed == self.cells
     }
@@ -111,13 +111,14 @@ impl<'a> Chosen<'a> {
     }
 }
 
-/// Environment, method and what is trained on: what has one configuration selected.
+/// Returns environment, method and training distribution. One configuration is selected for each such key.
 fn kind(cell: &Cell) -> (&str, Method, TrainedOn<'_>) {
     (&cell.config.common.environment, cell.method(), cell.trained_on())
 }
 
 impl Plan {
-    /// The plan with all cells that are known by `states`: those whose configurations are selected follow its own.
+    /// Returns the plan with all cells that are known from `states`: its own cells, then those of the selected
+    /// configurations.
     ///
     /// # Errors
     /// [`FolderError`] for a state that cannot be read.

@@ -1,4 +1,4 @@
-//! Whether results follow from the episodes that were recorded with them.
+//! Checks that results follow from their recorded episodes.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -7,7 +7,7 @@ use perturb_records::{ParameterCheck, Records, RecordsError, TestResult};
 
 use crate::folder::CellResult;
 
-/// Why results are not trusted.
+/// Errors of the check.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
@@ -15,7 +15,7 @@ pub enum VerifyError {
     /// Recorded episodes cannot be read.
     #[error(transparent)]
     Records(#[from] RecordsError),
-    /// A test's figures are others than those of its episodes.
+    /// A test's figures differ from those of its recorded episodes.
     #[error(
         "the result of cell {cell} does not follow from its recorded episodes: its test on {test} has {kept} in \
          result.json, but {recorded} in {file}; delete result.json to have the tests done again",
@@ -29,7 +29,7 @@ pub enum VerifyError {
         /// The figures of the episodes.
         recorded: Box<TestResult>,
     },
-    /// Requested and applied parameters were compared with another outcome.
+    /// The comparison of requested and applied parameters in the result differs from that of the recorded episodes.
     #[error(
         "the result of cell {cell} does not follow from its recorded episodes: requested and applied parameters differ \
          otherwise; delete result.json to have the tests done again"
@@ -37,7 +37,8 @@ pub enum VerifyError {
     ParameterCheck { cell: String },
 }
 
-/// The episodes in `path`, from which these figures of a result then follow; `None` if there are none.
+/// Reads the episodes in `path` and checks that these figures of a result follow from them. Returns `None` if there are
+/// none.
 pub(crate) fn follows(
     result: &CellResult,
     path: &Path,

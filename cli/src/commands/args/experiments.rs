@@ -148,8 +148,9 @@ pub struct ExportArgs {
   perturb report runs/quick assessed/mine --out report
   perturb report results/results.parquet/classic-ff --out classic-ff")]
 pub struct ReportArgs {
-    /// The --out folder of `perturb run`, a study of a results table (FILE.parquet/STUDY), folders that
-    /// `Assessment.save` wrote in Python, or one experiment or study and any number of assessments. Tables and pictures then have all agents together.
+    /// The --out folder of `perturb run`, a study of a results table (FILE.parquet/STUDY), or folders that `Assessment.save`
+    /// wrote in Python. One experiment or study and any number of assessments can be given together; tables and pictures
+    /// then show all agents.
     #[arg(required = true, value_name = "DIR")]
     pub dirs: Vec<PathBuf>,
     /// Folder for tables and pictures [default: report/ in the experiment's folder; required with assessments and tables].

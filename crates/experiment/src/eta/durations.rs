@@ -33,7 +33,7 @@ impl<'a> CellDurations<'a> {
         durations
     }
 
-    /// Adds a finished cell, which took `seconds` of a process.
+    /// Adds a finished cell, which took `seconds` of process time.
     pub(crate) fn add(&mut self, cell: &'a Cell, seconds: f64) {
         let sum = self.by_kind.entry((&cell.config.common.environment, cell.method())).or_default();
         sum.seconds += seconds;
@@ -41,7 +41,7 @@ impl<'a> CellDurations<'a> {
         self.count += 1;
     }
 
-    /// Returns the mean duration of cells with the environment and method of `cell`, s of a process; `None` if there are
+    /// Returns the mean process time of cells with the environment and method of `cell`, s. Returns `None` if there are
     /// none.
     pub fn seconds(&self, cell: &Cell) -> Option<f64> {
         let sum = self.by_kind.get(&(cell.config.common.environment.as_str(), cell.method()))?;

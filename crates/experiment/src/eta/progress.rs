@@ -15,7 +15,7 @@ const EARLY_SHARE: f64 = 0.25;
 /// The progress of one training in one process.
 #[derive(Clone, Debug, Default)]
 pub struct TrainingProgress {
-    /// Episodes and steps before this process.
+    /// Numbers of episodes and steps before this process started; `None` before the first update.
     first: Option<(f64, f64)>,
     /// Episodes and steps until now.
     last: (f64, f64),
@@ -24,7 +24,7 @@ pub struct TrainingProgress {
 }
 
 impl TrainingProgress {
-    /// Takes the number of episodes and steps until now. The first call gives those before this process.
+    /// Sets the number of episodes and steps so far. The first call must give the numbers from before this process started.
     pub fn update(&mut self, episodes: f64, steps: u64) {
         let steps = steps as f64;
         if self.first.is_none() {
@@ -40,7 +40,7 @@ impl TrainingProgress {
         self.last = (episodes, steps);
     }
 
-    /// Returns the number of episodes before this process.
+    /// Returns the number of episodes from before this process started.
     pub fn first_episodes(&self) -> f64 {
         self.first.map_or(0.0, |(episodes, _)| episodes)
     }
@@ -76,7 +76,7 @@ mod tests {
         assert_eq!(progress.remaining_ratio(100.0), Some(9.0));
         (2..=5).for_each(|i| progress.update(10.0 * f64::from(i), 100 + 1000 * u64::from(i as u32 - 1)));
         let left = progress.remaining_ratio(100.0).unwrap();
-        // 4100 steps were done; the other half of the episodes takes 5000 at the last length, which is known in part.
+        // 4100 steps were done. At the last length, which the average has reached only in part, the other half takes 5000.
         assert!((0.9..1.22).contains(&left), "{left}");
         progress.update(100.0, 9100);
         assert_eq!(progress.remaining_ratio(100.0), Some(0.0));
@@ -104,7 +104,7 @@ mod tests {
         progress.update(502.0, 50_000 + 2 * 1000);
         let after = progress.remaining_ratio(2000.0).unwrap();
         assert!((before - 3.0).abs() < 1e-9 && (1.0..1.2).contains(&(after / before)), "{before}, then {after}");
-        // However stretches are cut, episodes that are twice as long for long enough are believed.
+        // The average follows episodes that stay twice as long, whatever the distance between updates.
         (1..=200).for_each(|i| progress.update(502.0 + 2.0 * f64::from(i), 52_000 + 400 * i as u64));
         let length = progress.remaining_ratio(2000.0).unwrap() * 132_000.0 / (2000.0 - 902.0);
         assert!((190.0..=210.0).contains(&length), "{length}");

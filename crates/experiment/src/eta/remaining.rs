@@ -24,7 +24,7 @@ pub(crate) struct UnfinishedCell<'a> {
     pub(crate) elapsed_seconds: Option<f64>,
     /// Remaining work divided by the work since the cell began; `None` if it is not known.
     pub(crate) remaining_ratio: Option<f64>,
-    /// Upper bound of the whole cell by a measurement, s of a process; `None` without a measurement.
+    /// Measured upper bound of the whole cell's process time, s; `None` without a measurement.
     pub(crate) max_seconds: Option<f64>,
 }
 
@@ -75,7 +75,7 @@ mod tests {
     const PLAN: &str = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 2
         [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
 
-    /// A cell that waits, or has been under way for so long with so much left.
+    /// A cell, and if it is running its elapsed seconds and its remaining ratio.
     type OfCell<'a> = (&'a Cell, Option<(f64, Option<f64>)>);
 
     fn seconds(durations: &CellDurations<'_>, cells: &[OfCell<'_>], at_a_time: usize) -> Option<f64> {

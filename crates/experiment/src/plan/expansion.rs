@@ -1,4 +1,4 @@
-//! From an experiment file to its cells.
+//! Expands an experiment file to its cells.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -94,7 +94,7 @@ impl Expansion<'_> {
         })
     }
 
-    /// Every run of a configuration; if the reported tests do not select, its tuning runs first.
+    /// Adds the cells of every run of a configuration. With `selection = "clean"` its tuning runs come first.
     fn add_runs(&mut self, name: &str, config: TrainConfig, trained_on: &str) -> Result<()> {
         let file = self.file;
         let sets = file.test_versions.iter().map(|name| self.set(name).cloned());
@@ -149,7 +149,7 @@ impl Expansion<'_> {
     }
 }
 
-/// All combinations of a grid's values, the last key varying fastest; one empty combination of an empty grid.
+/// Returns all combinations of a grid's values, the last key varying fastest. An empty grid has one empty combination.
 fn grid_points(name: &str, grid: &Table) -> Result<Vec<Table>, ValueError> {
     let mut points = vec![Table::new()];
     for (key, values) in grid {
@@ -185,12 +185,12 @@ fn place_of(error: &ConfigError, name: &str, block: &Block, common: &Table) -> S
     }
 }
 
-/// Settings and tests, without environment, version and seed, as eight hexadecimal digits.
+/// Returns a hash of settings and tests, without environment, version and seed, as eight hexadecimal digits.
 fn fingerprint(config: &TrainConfig, tests: &Tests) -> String {
     let mut table = config.table();
     table.remove("environment");
     table.remove("seed");
-    // The id names the version; of a set of the plan's own it has the name alone.
+    // The id contains the version, or only the name of the plan's set. Parameters of a set therefore belong to the hash.
     if config.common.parameters.is_empty() {
         table.remove("version");
     }

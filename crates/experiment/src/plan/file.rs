@@ -1,4 +1,4 @@
-//! The experiment file as it is written, and the checks before it is expanded.
+//! The experiment file as users write it, and its checks before the expansion.
 
 use std::collections::BTreeMap;
 
@@ -17,7 +17,7 @@ use super::{Selection, distinct};
 
 /// Settings that the plan itself decides for each cell.
 const OWN_KEYS: [&str; 7] = ["preset", "environment", "version", "parameters", "algorithm", "architecture", "seed"];
-/// The most cells of a plan.
+/// Maximum number of cells of a plan.
 const MAX_CELLS: usize = 1_000_000;
 
 /// The file's keys.
@@ -82,9 +82,9 @@ pub(super) struct File {
 #[derive(Deserialize)]
 #[serde(untagged, expecting = "\"text\", \"code\", or a table of environments with \"text\", \"code\" or thresholds")]
 enum SuccessRules {
-    /// In every environment.
+    /// One rule for every environment.
     All(Rule),
-    /// In these, and as ever in the others.
+    /// Rules by environment. Other environments have the preset's rule.
     Some(BTreeMap<String, Rule>),
 }
 
@@ -125,7 +125,7 @@ fn selection<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Selection, D:
     one_of(deserializer, &Selection::NAMES)
 }
 
-/// Reads the value that one of the `known` names stands for, in any spelling.
+/// Reads one of the `known` names, in any spelling, and returns its value.
 fn one_of<'de, T: DeserializeOwned, D: Deserializer<'de>>(
     deserializer: D,
     known: &'static [&'static str],
@@ -148,8 +148,8 @@ fn a_thousand() -> u64 {
 }
 
 impl File {
-    /// Spells names as they are spelled everywhere, and gives the revisions of environments that are asked for. An
-    /// environment that is not of the paper is one that a server has by just this name.
+    /// Replaces names by their canonical spelling, and returns the requested revisions of environments. Names of
+    /// environments that are not in the paper are kept as written, because only servers know them.
     pub(super) fn spell(&mut self) -> Result<BTreeMap<String, u32>, AnyError> {
         self.settings = spelled("[settings]", std::mem::take(&mut self.settings))?;
         for (index, block) in self.algorithm.iter_mut().enumerate() {
@@ -220,17 +220,17 @@ impl File {
         Some(given.cloned().unwrap_or(usual)).filter(|rule| *rule != Rule::Text)
     }
 
-    /// Runs whose tests select and are not reported.
+    /// Returns the number of runs whose tests only select a configuration and are not reported.
     pub(super) fn tuning_runs(&self) -> u32 {
         if self.selection == Selection::Clean { self.tuning_runs.unwrap_or(1) } else { 0 }
     }
 
-    /// Episodes of the test that selects and nothing else; `None` if there is none.
+    /// Returns the number of episodes of the separate selecting test; `None` if the reported tests select.
     pub(super) fn selection_episodes(&self) -> Option<u64> {
         (self.selection == Selection::Clean).then(|| self.selection_episodes.unwrap_or(self.test_episodes))
     }
 
-    /// Refuses what does not depend on a table `[[algorithm]]`.
+    /// Checks all keys outside of the tables `[[algorithm]]`.
     pub(super) fn check(&self) -> Result<(), ValueError> {
         let most = i64::MAX as u64 - 2 * u64::from(u32::MAX);
         require(self.runs > 0, "runs", self.runs, "at least 1")?;
@@ -272,7 +272,7 @@ impl File {
         require(is_free, key, format!("`{SELECTION_TEST}`"), "another name: the test that selects has this one")
     }
 
-    /// Refuses what `block`, which is called `name` in refusals, has beside its grid; `before` cells stand before its own.
+    /// Checks all keys of `block` other than its grid. Errors call it `name`. The plan has `before` cells of earlier tables.
     pub(super) fn check_block(&self, name: &str, block: &Block, before: usize) -> Result<(), ValueError> {
         let environments = self.environments_of(block);
         let key = format!("{name}: environments");
@@ -286,7 +286,7 @@ impl File {
         self.check_size(name, block, before)
     }
 
-    /// Settings belong to trainings, not to the plan, and stand in one place.
+    /// Refuses settings that the plan decides itself, and settings that are given twice.
     fn check_keys(&self, name: &str, block: &Block) -> Result<(), ValueError> {
         let expected =
             "left out: the plan's own keys decide it (preset, environments, versions, sets, name, architectures, seed)";
@@ -305,7 +305,7 @@ impl File {
         })
     }
 
-    /// Refuses more cells than anybody can do, before they fill the memory.
+    /// Refuses more than [`MAX_CELLS`] cells before they are expanded in memory.
     fn check_size(&self, name: &str, block: &Block, before: usize) -> Result<(), ValueError> {
         let lists = [self.environments_of(block), self.versions_of(block), &block.architectures].map(<[_]>::len);
         let runs = self.runs as usize + self.tuning_runs() as usize;
@@ -325,13 +325,13 @@ fn environment(written: &str) -> (String, Option<u32>) {
     (known.map_or(name, |place| ENVIRONMENTS[place].to_owned()), revision)
 }
 
-/// A list must name something, and nothing twice.
+/// Refuses an empty list, and a list that has an element twice.
 fn check_list(key: &str, list: &[String]) -> Result<(), ValueError> {
     require(!list.is_empty(), key, "empty", "a list of at least one name")?;
     require(distinct(list.iter()).len() == list.len(), key, list.join(", "), "a list without repetitions")
 }
 
-/// Whether a name is one that can stand in a cell's id.
+/// Returns whether a name may be a part of a cell's id.
 pub(super) fn is_plain(name: &str) -> bool {
     name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
 }

@@ -1,8 +1,8 @@
 //! Groups of cells that one process trains together.
 //!
-//! A group's cells have the same environment and architecture and see the same, so that their steps can be one batch,
-//! which only those with short rollouts make: all of a group wait for its slowest. A random policy, which takes none, is no
-//! cell to measure others by. What a cell comes to does not depend on its group.
+//! A group's cells have the same environment, architecture and kind of observation, so that their steps can be one batch.
+//! Only cells with short rollouts share batches, because all cells of a group wait for the slowest one. A random policy
+//! makes no rollouts, so its time says nothing about the time of others. A cell's result does not depend on its group.
 
 use std::ops::Range;
 
@@ -14,15 +14,16 @@ use super::{Cell, Plan, distinct};
 /// The size of groups.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Grouping {
-    /// The most cells in one, at least 1.
+    /// Maximum number of cells in a group, at least 1.
     pub max_cells: usize,
-    /// Number of groups at a time, at least 1. Each kind of cells makes a multiple of this number of groups, as far as
-    /// it has cells, so that all processes have work.
+    /// Number of groups that run at the same time, at least 1. Each kind of cells is divided into a multiple of this number
+    /// of groups, if it has enough cells, so that all processes have work.
     pub at_a_time: usize,
 }
 
 impl Grouping {
-    /// The most cells in a group, unless said otherwise: with more, a step's fixed cost is small already.
+    /// Default maximum number of cells in a group. Larger groups save little, because the fixed cost of a step is already
+    /// small compared with the rest.
     pub const USUAL: usize = 36;
     /// A group for each kind of cells.
     pub const BY_KIND: Self = Self { max_cells: usize::MAX, at_a_time: 1 };
@@ -35,8 +36,8 @@ impl Grouping {
 }
 
 impl Cell {
-    /// Environment, architecture, what is observed, what rollouts are like, and whether there are disturbances: cells that
-    /// have all in common may be in one group.
+    /// Returns environment, architecture, kind of observation, kind of rollouts, and whether there are disturbances. Cells
+    /// may be in one group if they have all of these in common.
     pub fn kind(&self) -> (&str, Architecture, Observe, CollectionMode, bool) {
         let TrainConfig { common, .. } = &self.config;
         let is_disturbed = common.parameters.keys().any(|name| is_disturbance(name));
@@ -45,8 +46,8 @@ impl Cell {
 }
 
 impl Plan {
-    /// Puts `cells`, places in the plan in ascending order, into groups: neighbours, which have the most in common, in
-    /// the plan's order. Depends on nothing but the arguments.
+    /// Divides `cells`, ascending indices in the plan, into groups of neighbours, which have the most in common. Groups are
+    /// in the plan's order and depend only on the arguments.
     pub fn groups(&self, cells: &[usize], grouping: Grouping) -> Vec<Vec<usize>> {
         let mut groups: Vec<Vec<usize>> = Vec::new();
         for kind in distinct(cells.iter().map(|&cell| self.cells[cell].kind())) {

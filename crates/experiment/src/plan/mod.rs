@@ -1,9 +1,9 @@
-//! An experiment file, and the cells that it expands to.
+//! Experiment files and their expansion to cells.
 //!
-//! A cell is one training and its tests. Cells are the product of environments, algorithms, architectures, grid,
-//! training versions and runs, in this order, the last one varying fastest. All cells of a run have the same seed, so
-//! that two of them differ in nothing but what the file says. With `selection = "clean"` these are tuning cells, which
-//! select what is trained anew.
+//! A cell is one training and its tests. Cells are the product of environments, algorithms, architectures, grid, training
+//! versions and runs, in this order, the last one varying fastest. All cells of a run have the same seed, so that two of
+//! them differ in nothing but what the file says. With `selection = "clean"` these are tuning cells. The configurations that
+//! they select are trained again with other seeds.
 
 mod expansion;
 mod file;
@@ -26,29 +26,30 @@ use perturb_settings::sets::{Contexts, TestSet, check as check_parameters};
 use perturb_settings::{Method, TrainConfig, ValueError, require};
 use sets::ReadBeside;
 
-/// Everything that an experiment file asks for.
+/// The content of an experiment file, with its cells.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// The file as it was written, but for absolute paths of `tasks`, so that a copy elsewhere names the same folders.
+    /// The text of the file. Paths of `tasks` were made absolute, so that a copy elsewhere names the same folders.
     pub text: String,
     /// The heading of reports; empty if the file has none.
     pub title: String,
     /// The date as written in the file; empty if the file has none.
     pub date: String,
-    /// The files beside it that its sets name, with their content.
+    /// The files in the same folder that its sets name, with their content.
     pub beside: BTreeMap<String, Vec<u8>>,
     /// The folders of tasks that private servers also serve, absolute.
     pub tasks: Vec<PathBuf>,
-    /// The revisions of environments that it asks for, `perturb/CartPole-v1`; any of those that are missing.
+    /// The requested revisions of environments, as in `perturb/CartPole-v1`. Environments that are not listed may have any
+    /// revision.
     pub revisions: BTreeMap<String, u32>,
-    /// By which rule configurations are selected.
+    /// The rule that selects configurations.
     pub selection: Selection,
-    /// Number of repetitions of what is reported, each with another seed.
+    /// Number of reported repetitions, each with another seed.
     pub runs: u32,
-    /// Number of repetitions before that, with separate seeds, to select configurations; 0 if the reported tests
-    /// select.
+    /// Number of earlier repetitions, with separate seeds, that select configurations; 0 if the reported tests select.
     pub tuning_runs: u32,
-    /// All cells that are known before anything is done, tuning cells if there are any. A cell's index is its place here.
+    /// All cells that are known before the run: the tuning cells, if there are any. A cell's index is its position in this
+    /// list.
     pub cells: Vec<Cell>,
     /// Cells that are added when their configuration is selected, with the following indices.
     /// [`Plan::with_selected_cells`] adds them.
@@ -62,8 +63,8 @@ pub enum Selection {
     /// The paper's rule: the reported tests select.
     #[default]
     Paper,
-    /// By selection episodes of trainings on tuning seeds. What is selected is trained anew on other seeds, and tested on
-    /// other episodes.
+    /// Separate selection episodes of trainings on tuning seeds select. The selected configurations are trained again on
+    /// other seeds, and tested on other episodes.
     Clean,
 }
 
@@ -99,13 +100,14 @@ pub struct Cell {
     /// The cell's name: environment, algorithm, architecture, training version, configuration and seed. It depends on
     /// nothing else in the plan, so a cell keeps its results when others are added.
     pub id: String,
-    /// Names the settings, without environment, version and seed, in eight hexadecimal digits.
+    /// A hash of the settings without environment, version and seed, in eight hexadecimal digits.
     pub configuration: String,
     /// The run, from 1. Tuning cells have separate runs.
     pub run: u32,
-    /// The configuration of the tuning cells that select this one, if it is trained anew; `None` of a cell of the grid.
+    /// For a cell that is trained after the selection, the configuration of the tuning cells that select it. `None` for a
+    /// cell of the grid.
     pub tuned_as: Option<String>,
-    /// The name of the plan's own set of parameters, if it is trained on one.
+    /// The name of the plan's set of parameters on which it is trained; `None` if it is trained on a version.
     pub set: Option<String>,
     /// The configuration of the training.
     pub config: TrainConfig,
@@ -118,12 +120,12 @@ pub struct Cell {
 pub struct Tests {
     /// Episodes of each test.
     pub episodes: u64,
-    /// On what: versions in the order D, R, E, R+E, then the plan's own sets in theirs.
+    /// The test sets: versions in the order D, R, E, R+E, then the plan's own sets in the plan's order.
     pub sets: Vec<TestSet>,
-    /// Episodes of the test that selects and nothing else, on what was trained on; `None` if there is none.
+    /// Episodes of the separate selecting test on the training distribution; `None` if the reported tests select.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub selection: Option<u64>,
-    /// Episodes of the training's budget, ascending and fewer than it has: the policies of these moments are tested, too.
+    /// Numbers of training episodes after which the intermediate policy is tested too, ascending and below the budget.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub marks: Vec<u64>,
     /// The success rule; `None` for the environment's own rule.
@@ -158,7 +160,7 @@ pub enum PlanError {
     Refused {
         /// The path as it was given.
         path: String,
-        /// Names the table, the key and what is accepted.
+        /// The table, the key and the accepted values.
         reason: AnyError,
     },
 }
@@ -180,7 +182,7 @@ impl Plan {
         Self::parse(&path.display().to_string(), files::read_toml(path)?)
     }
 
-    /// The sets of the file at `path`, by their names.
+    /// Returns the sets of the file at `path`.
     ///
     /// # Errors
     /// [`PlanError`], which names the table and the key.
@@ -194,7 +196,7 @@ impl Plan {
         Ok(sets.into_values().filter(|set| set.plain().is_none()).collect())
     }
 
-    /// The files that it consists of, by their names: `plan.toml` and those that its sets name.
+    /// Returns the names and contents of the plan's files: `plan.toml` and the files that its sets name.
     pub fn files(&self) -> impl Iterator<Item = (&str, &[u8])> {
         let beside = self.beside.iter().map(|(name, content)| (name.as_str(), content.as_slice()));
         beside.chain([("plan.toml", self.text.as_bytes())]) // last: it names the others
@@ -237,10 +239,11 @@ impl Plan {
         Ok(Self { selection, runs, tuning_runs, cells, candidates, title, date, beside, tasks, text, revisions })
     }
 
-    /// Whether `environment` has the revision, the parameters and thresholds that the plan's cells name for it.
+    /// Checks that `environment` has the revision, the parameters and the quantities of success rules that the plan's cells
+    /// name for it.
     ///
     /// # Errors
-    /// [`ValueError`] for one that it does not take.
+    /// [`ValueError`] for the first of these that it does not have.
     pub fn check(&self, environment: &proto::Environment) -> Result<(), ValueError> {
         if let Some(asked) = self.revisions.get(&environment.name) {
             let (name, served) = (&environment.name, environment.revision);
@@ -278,10 +281,11 @@ impl Plan {
         }
     }
 
-    /// Changes the selection rule of the same results. With the paper's rule, a plan's tuning cells are reported.
+    /// Returns the plan with another selection rule for the same results. With the paper's rule, its tuning cells are
+    /// reported.
     ///
     /// # Errors
-    /// [`ValueError`] for `clean` of a plan that was not made for it.
+    /// [`ValueError`] for `clean` if the plan has no tuning cells.
     pub fn with_rule(self, rule: Selection) -> Result<Self, ValueError> {
         match (self.selection, rule) {
             (Selection::Clean, Selection::Paper) => {
@@ -295,24 +299,25 @@ impl Plan {
         }
     }
 
-    /// The cell or candidate with this id, or with this index.
+    /// Returns the cell or candidate with this id or index.
     pub fn find(&self, name: &str) -> Option<&Cell> {
         let all = || self.cells.iter().chain(&self.candidates);
         let by_index = |index: usize| all().find(|cell| cell.index == index);
         all().find(|cell| cell.id == name).or_else(|| name.parse().ok().and_then(by_index))
     }
 
-    /// The environments, in the plan's order.
+    /// Returns the environments in the plan's order.
     pub fn environments(&self) -> Vec<&str> {
         distinct(self.cells.iter().map(|cell| cell.config.common.environment.as_str()))
     }
 
-    /// The methods, in the plan's order.
+    /// Returns the methods in the plan's order.
     pub fn methods(&self) -> Vec<Method> {
         distinct(self.cells.iter().map(Cell::method))
     }
 
-    /// Whether there is a choice: configurations of one method that are trained on the same.
+    /// Returns whether a selection is needed: whether a method has several configurations with the same training
+    /// distribution.
     pub fn selects(&self) -> bool {
         let place = |cell: &&Cell| (cell.config.common.environment.clone(), cell.method(), cell.config.common.version);
         let places = distinct(self.cells.iter().map(|cell| place(&cell))).len();
@@ -331,7 +336,7 @@ impl Cell {
         format!("{} {}, trained on {}", self.config.common.environment, self.method(), self.trained_on())
     }
 
-    /// The test that selects and nothing else, if it has one.
+    /// Returns the separate selecting test and its number of episodes; `None` if the reported tests select.
     pub fn selection_test(&self) -> Option<(TestSet, u64)> {
         let parameters = Contexts::Drawn(self.config.common.parameters.clone());
         let set = TestSet { name: SELECTION_TEST.into(), version: self.config.common.version, contexts: parameters };
@@ -344,7 +349,7 @@ impl Cell {
     }
 }
 
-/// The elements of `items` without repetitions, in order.
+/// Returns the elements of `items` without repetitions, in order.
 pub fn distinct<T: Eq + std::hash::Hash + Clone>(items: impl Iterator<Item = T>) -> Vec<T> {
     let mut seen = HashSet::new();
     items.filter(|item| seen.insert(item.clone())).collect()

@@ -18,7 +18,7 @@ const FILE: &str = "file";
 /// Reads a file by its name. The error says what was found instead.
 pub(super) type ReadBeside<'a> = dyn Fn(&str) -> Result<Vec<u8>, String> + 'a;
 
-/// The versions and the sets of `tables`, by their names; `beside` gets the files that these name.
+/// Returns the versions and the sets of `tables` by name. Adds the files that the sets name to `beside`.
 pub(super) fn read(
     tables: &BTreeMap<String, Table>,
     read_beside: &ReadBeside<'_>,

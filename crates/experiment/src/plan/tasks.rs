@@ -23,7 +23,7 @@ pub(super) fn resolve(
         require(!name.is_empty(), KEY, "an empty name", expected)?;
         let path = std::path::absolute(folder.join(name))
             .map_err(|error| ValueError::new(KEY, format!("`{name}` ({error})"), expected))?;
-        // Without `.` and `..` where a name precedes it, as long as no link changes its meaning.
+        // Resolves `.`, `..` and links if the folder exists. Otherwise the absolute path stays as written.
         Ok(path.canonicalize().unwrap_or(path))
     };
     let tasks = written.iter().map(|name| absolute(name.get_ref())).collect::<Result<Vec<_>, _>>()?;
@@ -31,7 +31,7 @@ pub(super) fn resolve(
         let got = format!("`{}` twice", task.display());
         require(!tasks[..place].contains(task), KEY, got, "a list without repetitions")?;
     }
-    // From the last one on, so that the places of those before it stay.
+    // Replaces from the end, so that the positions of earlier paths stay valid.
     for (name, task) in written.iter().zip(&tasks).rev() {
         let path = task.to_str().ok_or_else(|| ValueError::new(KEY, format!("{task:?}"), "a path in UTF-8"))?;
         text.replace_range(name.span(), &Value::from(path).to_string());
@@ -43,7 +43,7 @@ pub(super) fn resolve(
 mod tests {
     use crate::plan::Plan;
 
-    /// A plan with these tasks.
+    /// Returns a plan with these tasks.
     fn plan(tasks: &str) -> String {
         format!(
             "tasks = {tasks} # two\nenvironments = ['Walker', 'Arm']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']"

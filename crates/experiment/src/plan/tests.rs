@@ -123,7 +123,7 @@ fn an_id_names_a_cell_whatever_else_the_plan_has() {
     assert_eq!(plan.find("104"), None);
 }
 
-/// What is tested is the same whichever version the file names first.
+/// The tests are the same, whichever version the file lists first.
 #[test]
 fn the_order_of_a_list_without_order_changes_no_id() {
     let with = |versions: &str| parse(&SMALL.replacen("runs = 2", &format!("runs = 2\ntest_versions = {versions}"), 1));
@@ -328,7 +328,7 @@ fn preset_of_plan_or_table_decides_success_rule() {
     }
 }
 
-/// As the program before presets named them.
+/// These are the ids of the program before it had presets.
 #[test]
 fn cells_of_the_usual_preset_keep_their_names() {
     let names = |text: &str| -> Vec<String> { parse(text).unwrap().cells.into_iter().map(|cell| cell.id).collect() };

@@ -18,12 +18,12 @@ const MAX_FOLLOWED_CELLS: usize = 50_000;
 /// The text for files behind a link that leads out of the shown folder.
 pub const LEADS_OUT: &str = "a link that leads out of the folder";
 
-/// An experiment, as its folder has it.
+/// The status of an experiment, as read from its folder.
 #[derive(Clone, Debug)]
 pub struct ExperimentStatus {
     /// The folder of the experiment.
     pub folder: Folder,
-    /// With all cells that are known by now.
+    /// The plan with all cells that are known so far.
     pub plan: Plan,
     /// The status of each cell, in the plan's order.
     pub cells: Vec<CellStatus>,
@@ -44,11 +44,11 @@ pub enum CellStatus {
     Failed(String),
     /// The cell's files cannot be read.
     NotUnderstood(String),
-    /// Somebody works on it.
+    /// A process works on the cell.
     InWork,
     /// The cell waits.
     Waiting {
-        /// Whether it has a folder.
+        /// Whether the cell has a folder.
         begun: bool,
     },
 }
@@ -83,7 +83,7 @@ impl ExperimentStatus {
         Ok(Self { folder, plan, cells, stamp, records, within })
     }
 
-    /// Looks again, at what may have changed: the plan, and cells with another result or failure than before, or none.
+    /// Reads the plan and the records of results and failures again where they have changed.
     ///
     /// # Errors
     /// If the plan cannot be read.
@@ -100,14 +100,14 @@ impl ExperimentStatus {
                 self.records[place] = records;
             }
         }
-        // What is selected may have become known.
+        // The tuning cells may have selected a configuration meanwhile.
         if !self.plan.candidates.is_empty() && self.count(CellStatus::is_settled) != before {
             self.replan()?;
         }
         Ok(())
     }
 
-    /// Reads the plan again; cells that it had are as they were.
+    /// Reads the plan again. Cells that it had before keep their status.
     fn replan(&mut self) -> Result<(), AnyError> {
         let within = self.within.as_deref();
         let plan = read_plan(&self.folder, within)?;
@@ -132,7 +132,7 @@ impl ExperimentStatus {
         self.cells.iter().filter(|cell| is(cell)).count()
     }
 
-    /// The cells that are done, with their results.
+    /// Returns the cells that are done, with their results.
     pub fn done(&self) -> impl Iterator<Item = (&Cell, &CellResult)> {
         self.plan.cells.iter().zip(&self.cells).filter_map(|(cell, status)| match status {
             CellStatus::Done(result) => Some((cell, &**result)),
@@ -140,7 +140,7 @@ impl ExperimentStatus {
         })
     }
 
-    /// Success of the cells that are done, by their kinds.
+    /// Returns the success of the cells that are done, by kind of cell.
     pub fn rates(&self) -> Vec<Rate> {
         let mut rates = Rates::default();
         self.done().for_each(|(cell, result)| rates.add(cell, result));
@@ -152,7 +152,7 @@ impl ExperimentStatus {
         CellDurations::read(&self.plan, &self.folder)
     }
 
-    /// "in work", "finished", "with failures" or "broken off".
+    /// Returns "in work", "finished", "with failures" or "broken off".
     pub fn state(&self) -> &'static str {
         let any = |is: fn(&CellStatus) -> bool| self.cells.iter().any(is);
         match () {
@@ -163,7 +163,7 @@ impl ExperimentStatus {
         }
     }
 
-    /// In a few figures.
+    /// Returns the summary of the experiment.
     pub fn summary(&self) -> RunSummary {
         let rates: Vec<f64> =
             self.done().flat_map(|(_, result)| result.results.values().map(|test| test.success_percent)).collect();
@@ -183,7 +183,7 @@ impl ExperimentStatus {
 }
 
 impl CellStatus {
-    /// Whether it is done or has failed.
+    /// Returns whether the cell is done or has failed.
     pub fn is_settled(&self) -> bool {
         matches!(self, Self::Done(_) | Self::Failed(_))
     }

@@ -1,4 +1,4 @@
-//! The trainings and experiments below a folder: what is trained, how far it is, what came of it.
+//! The trainings and experiments below a folder, with their kind, progress and success.
 
 mod experiment;
 mod progress;
@@ -15,7 +15,7 @@ pub use self::progress::{LastProgress, last_progress};
 pub use self::training::TrainingStatus;
 use perturb_files::{self as files, AnyError, leads_out};
 
-/// Maximum number of folders that are looked at behind symbolic links, which may lead to a whole disk.
+/// Maximum number of folders that are searched behind symbolic links, since a link may lead to a whole disk.
 const MAX_FOLDERS_BEHIND_LINKS: usize = 10_000;
 
 /// A folder that holds a run.
@@ -47,7 +47,7 @@ impl RunKind {
     }
 }
 
-/// Why nothing can be looked for in what is no folder, and what to do.
+/// Returns the error message for a `path` that should be a folder and is none.
 pub fn no_folder(path: &Path) -> String {
     format!("there is no folder {}: give the one that your runs are in", path.display())
 }
@@ -55,22 +55,21 @@ pub fn no_folder(path: &Path) -> String {
 /// The runs below a folder.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RunFolders {
-    /// The runs, in the order of their paths. Nothing is looked for in a run.
+    /// The runs, in the order of their paths. Folders inside of a run are not searched.
     pub runs: Vec<RunFolder>,
-    /// All other folders, the first one itself among them.
+    /// All other searched folders, including the first one.
     pub others: Vec<PathBuf>,
-    /// Links to folders out of the folder that the search must stay in.
+    /// Links to folders outside of the folder in which the search must stay.
     pub links_out: Vec<PathBuf>,
-    /// Whether there are more folders than were looked at.
+    /// Whether there are more folders than were searched.
     pub more: bool,
 }
 
-/// Looks for runs in `folder`, in at most `most` folders. Symbolic links are followed after all folders that are no links,
-/// and each folder is looked at once. With `within`, which is absolute and without links, links that lead out of it are
-/// not followed.
+/// Looks for runs in `folder` and below, in at most `most` folders. Symbolic links are followed after all other folders, and
+/// each folder is searched once. With `within`, an absolute path without links, links that lead out of it are not followed.
 ///
 /// # Errors
-/// The operating system's, of `folder` itself; what else cannot be listed is passed over.
+/// The operating system's, if `folder` itself cannot be listed. Other folders that cannot be listed are skipped.
 pub fn places(folder: &Path, most: usize, within: Option<&Path>) -> files::Result<RunFolders> {
     let mut found = RunFolders::default();
     let mut search = FolderSearch::default();
@@ -121,7 +120,7 @@ pub fn places(folder: &Path, most: usize, within: Option<&Path>) -> files::Resul
 struct FolderSearch {
     /// Links to folders, which are followed last.
     links: VecDeque<PathBuf>,
-    /// Device and inode of the folders that were looked at.
+    /// Device and inode of the searched folders.
     seen: HashSet<(u64, u64)>,
     is_behind_link: bool,
     /// Number of folders that were found behind links.
@@ -129,7 +128,7 @@ struct FolderSearch {
 }
 
 impl FolderSearch {
-    /// Notes a folder. Returns whether it was not looked at before.
+    /// Marks a folder as searched. Returns whether it is new.
     fn is_new(&mut self, path: &Path) -> bool {
         let Ok(metadata) = path.metadata() else { return false };
         let is_new = self.seen.insert((metadata.dev(), metadata.ino()));
@@ -148,7 +147,7 @@ pub struct RunSummary {
     pub what: String,
     /// Number of finished episodes of a training, or finished cells of an experiment.
     pub done: u64,
-    /// Number of all these episodes or cells.
+    /// Total number of these episodes or cells.
     pub budget: u64,
     /// "episodes" or "cells".
     pub unit: &'static str,

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use perturb_files::open_plain;
 
-/// A line and its names are shorter.
+/// Maximum size in bytes of a line, and of the header.
 const MAX_LINE_BYTES: u64 = 16 * 1024;
 
 /// The progress of a training and the figures of its last update.
@@ -19,12 +19,12 @@ impl LastProgress {
         self.0.get(column).copied()
     }
 
-    /// Success of the last 100 episodes, %.
+    /// Returns the success of the last 100 episodes, %.
     pub fn success_percent(&self) -> Option<f64> {
         self.get("rollout/success_rate").map(|rate| 100.0 * rate)
     }
 
-    /// Episodes that the budget counts.
+    /// Returns the number of episodes that the budget counts.
     pub fn episodes(&self) -> Option<u64> {
         self.get("rollout/episodes").map(|episodes| episodes as u64)
     }

@@ -9,20 +9,20 @@ use perturb_text::shortened;
 
 use super::{LastProgress, RunSummary, last_progress};
 
-/// Number of episodes after which the success rate may end a training.
+/// Number of episodes over which the success rate that may end a training is averaged, and the minimum number of episodes.
 const RECENT: u64 = 100;
 
-/// A training, as its folder has it.
+/// The status of a training, as read from its folder.
 #[derive(Clone, Debug)]
 pub struct TrainingStatus {
     /// The folder of the training.
     pub path: PathBuf,
     /// The settings.
     pub config: TrainConfig,
-    /// Episodes of the budget: of the last line of the log while it is in work, otherwise of the last checkpoint, from
-    /// which it would go on.
+    /// Number of finished episodes of the budget. It is read from the log's last line while the training runs, otherwise
+    /// from the last checkpoint, from which it would be resumed.
     pub episodes: u64,
-    /// The last line of its log; `None` before the first.
+    /// The last line of the log; `None` before the first line.
     pub progress: Option<LastProgress>,
     /// Episodes of the last checkpoint; `None` if there is none.
     pub saved: Option<u64>,
@@ -70,7 +70,7 @@ impl TrainingStatus {
         self.config.to_string()
     }
 
-    /// In a few figures.
+    /// Returns the summary of the training.
     pub fn summary(&self) -> RunSummary {
         RunSummary {
             path: self.path.clone(),

@@ -17,7 +17,7 @@ use crate::folder::FailureId;
 const INTERVAL: Duration = Duration::from_secs(1);
 /// Maximum factor by which the interval grows with the number of the worker's cells.
 const MAX_INTERVALS: u32 = 10;
-/// Number of bytes at the end of a log in which its last words are looked for.
+/// Maximum number of bytes at the end of a log that are searched for its last line with words.
 const MAX_LAST_WORDS_BYTES: u64 = 64 << 10;
 
 /// The only line that a worker reads. It stops when its standard input is closed, which also happens when the process
@@ -74,19 +74,20 @@ pub enum CellEvent {
     FileFault { reason: String },
     /// This signal asked to end. What was trained is kept.
     Stopped { signal: i32 },
-    /// The order makes no sense to the worker.
+    /// The worker does not know a cell of its job.
     Refused { reason: String },
     /// The worker ended without a last line about the cell. The process that started the worker says how.
     Killed { reason: String },
 }
 
 impl CellEvent {
-    /// Whether a cell's turn has come: a server is there for a whole group from the beginning.
+    /// Returns whether the event shows that the worker has started with the cell. A server is no such event, because a whole
+    /// group gets its server at the beginning.
     pub(super) fn is_a_turn(&self) -> bool {
         !matches!(self, Self::Server { .. })
     }
 
-    /// Whether it ends an attempt.
+    /// Returns whether the event ends an attempt.
     pub fn is_last(&self) -> bool {
         !matches!(self, Self::Server { .. } | Self::Training { .. } | Self::Testing { .. })
     }
@@ -134,7 +135,7 @@ impl<W: Write> EventLineWriter<W> {
         Self { out, interval: INTERVAL * intervals, last: HashMap::new() }
     }
 
-    /// Writes a line about the cell with this id, unless it says hardly more than one of a moment ago.
+    /// Writes a line about the cell with this id. Skips it if a line of the same stage was written within the interval.
     pub fn write(&mut self, cell: &str, event: CellEvent) {
         let said =
             |(last, time): &(CellEvent, Instant)| time.elapsed() < self.interval && last.stage() == event.stage();
@@ -155,8 +156,8 @@ pub fn write_line(out: &mut impl Write, line: &impl Serialize) {
     }
 }
 
-/// The lines that were completed in `file` since `offset`, which goes on behind them. Others may write there too, a
-/// cluster's prologue for instance: what is no such line is passed over.
+/// Reads the lines that were completed in `file` since `offset`, and moves `offset` behind them. Skips all other text,
+/// because for example a cluster's prologue may write to the same file.
 pub(super) fn read_lines(file: &File, offset: &mut u64) -> std::io::Result<Vec<EventLine>> {
     let mut new = Vec::new();
     let mut piece = [0; 1 << 14];
@@ -171,7 +172,7 @@ pub(super) fn read_lines(file: &File, offset: &mut u64) -> std::io::Result<Vec<E
     Ok(new[..end].split(|&byte| byte == b'\n').filter_map(|line| serde_json::from_slice(line).ok()).collect())
 }
 
-/// The last line with words that was written to `log` behind its byte `start`, which may say why a process ended.
+/// Returns the last line with words in `log` after byte `start`. It may contain the reason why a process ended.
 pub(super) fn last_words(log: &Path, start: u64) -> Option<String> {
     let (mut file, metadata) = open_plain(log).ok()?;
     let mut text = Vec::new();

@@ -1,4 +1,4 @@
-//! Cells in processes of this machine, a group in each.
+//! Runs cells in worker processes on this machine, a group of cells in each process.
 
 use std::collections::{BTreeMap, HashSet};
 use std::fs::File;
@@ -23,20 +23,20 @@ pub struct Local<'a> {
     command: &'a dyn Fn(usize) -> Command,
     server: &'a dyn Fn() -> Option<BackendEvent>,
     workers: Vec<Worker>,
-    /// Measured upper bounds of the cells' durations, s of a process.
+    /// Measured upper bounds of the cells' durations by index, s of process time.
     max_seconds: Vec<Option<f64>>,
 }
 
 struct Worker {
-    /// The cells without a last line: their places in the plan, by id.
+    /// The unfinished cells: the index in the plan by the cell's id.
     cells: BTreeMap<String, usize>,
     /// The cells that have begun.
     begun: HashSet<usize>,
-    /// The lowest number that no other worker has.
+    /// The lowest number that no other worker had at the start.
     slot: usize,
     child: Child,
     events: File,
-    /// Up to where they were read.
+    /// Number of bytes of `events` that were read.
     offset: u64,
     log: PathBuf,
     /// The start of the worker's output in the log, bytes.
@@ -57,7 +57,7 @@ impl<'a> Local<'a> {
         Self { plan, folder, grouping, command, server, workers: Vec::new(), max_seconds: Vec::new() }
     }
 
-    /// Sets the measured upper bounds of the cells' durations by index, s of a process.
+    /// Sets the measured upper bounds of the cells' durations by index, s of process time.
     pub fn with_max_seconds(self, max_seconds: Vec<Option<f64>>) -> Self {
         Self { max_seconds, ..self }
     }
@@ -73,7 +73,7 @@ impl<'a> Local<'a> {
         let mut command = (self.command)(slot);
         let program = PathBuf::from(command.get_program());
         let mut start = || {
-            // A file, not a pipe: nobody has to read while the worker writes.
+            // Events go to a file. A pipe would block the worker while nobody reads it.
             let events = temporary_file()?;
             let spawned = command.stdin(Stdio::piped()).stdout(events.try_clone()?).stderr(log.try_clone()?).spawn();
             let failed = |error: std::io::Error| std::io::Error::new(error.kind(), spawn_failure(&error));
@@ -88,7 +88,7 @@ impl<'a> Local<'a> {
         Ok(Some(Worker { cells, begun: HashSet::new(), slot, child, events, offset: 0, log: path, log_start }))
     }
 
-    /// The log of a group, which is that of its first cell; the others' say so.
+    /// Opens the log of a group, which is the log of its first cell. The logs of the other cells refer to it.
     fn open_logs(&self, group: &[PendingCell]) -> Result<(File, PathBuf), FileError> {
         let open = |offer: &PendingCell| {
             let place = self.folder.cell(self.id(offer.cell));
@@ -106,7 +106,8 @@ impl<'a> Local<'a> {
         Ok(first)
     }
 
-    /// Runs of single cells, as a cluster's jobs are, do not all begin with the same of several servers.
+    /// Returns the index of the first server to use. It depends on the cell, so that separate runs of single cells, such as
+    /// a cluster's jobs, do not all begin with the same server.
     fn first_turn(&self) -> usize {
         self.plan.cells.first().map_or(0, |cell| crc32c::crc32c(cell.id.as_bytes()) as usize)
     }
@@ -138,7 +139,7 @@ impl Worker {
             killed.sort_unstable();
             news.extend(killed.into_iter().map(|cell| match self.begun.is_empty() || self.begun.contains(&cell) {
                 true => BackendEvent::Event(cell, CellEvent::Killed { reason: reason.clone() }),
-                // A process that did other cells is no fault of one that had no turn.
+                // The end of the process does not count against a cell that it had not started.
                 false => BackendEvent::Returned(cell),
             }));
         }
@@ -219,7 +220,7 @@ mod tests {
     /// Two cells.
     const PLAN: &str = "environments = ['CartPole']\nversions = ['D']\nruns = 2
         [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
-    /// What every worker of these tests begins with: it reads its order, and works in its cell's folder.
+    /// Start of the script of every worker in these tests. It reads its job and changes to its cell's folder.
     const BEGIN: &str = r#"read -r order; id=${order#*:\"}; id=${id%%\"*}; cd "cells/$id"; echo "$order" >>orders
         echo "$SEAT" >>seats
         say() { echo "{\"cell\":\"$id\",\"event\":$1}"; };"#;
@@ -311,7 +312,7 @@ mod tests {
         let (_directory, folder, _) = place();
         let plan = Plan::parse("test", PLAN.replace("runs = 2", "runs = 3")).unwrap();
         let [first, second, third] = [0, 1, 2].map(|cell: usize| plan.cells[cell].id.clone());
-        // The second works until the others are done, the third loses its first server.
+        // The second cell runs until the others are done. The third one loses its first server.
         let script = format!(
             r#"case "$id" in
                 {second}) for _ in $(seq 2000); do
@@ -356,7 +357,8 @@ mod tests {
     fn dead_worker_loses_only_its_running_cells() {
         let (.., ids) = place();
         let [first, second] = &ids;
-        // Done with the first, the worker dies; the second is begun again, and where its log was then is said.
+        // The worker dies after the first cell. The second cell is started again, and the reason for the worker's end
+        // contains the last line of the log.
         let script = format!(
             r#"case "$order" in
                 *{first}*) echo x >result.json; say '"done"'; id={second}; say '"server","address":"unix:/x"'

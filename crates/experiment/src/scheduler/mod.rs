@@ -1,8 +1,8 @@
-//! Doing the cells of a plan: on this machine, or on a cluster.
+//! Runs the cells of a plan on this machine or on a cluster.
 //!
-//! [`run()`] is one state machine over a [`Backend`] that begins groups of cells and tells what becomes of each cell:
-//! [`Local`] in processes of this machine, [`slurm`] in jobs. Whatever is told, the folder says what is done: a cell is
-//! settled when its result is there, or a failure that counts. So several runs, of both kinds, may share a folder.
+//! [`run()`] is a state machine over a [`Backend`], which starts groups of cells and reports events of each cell: [`Local`]
+//! in processes of this machine, [`slurm`] in jobs. The folder alone decides whether a cell is settled: it has a result
+//! there, or a failure that counts. So several runs, of both kinds, may share a folder.
 
 mod event;
 mod local;
@@ -35,9 +35,10 @@ pub const MAX_ATTEMPTS: u32 = 3;
 const MAX_FAULTS: u32 = 5;
 /// Minimum time that a cell waits for a server before the run ends, since a server may be restarted.
 const MIN_SERVER_WAIT: Duration = Duration::from_secs(15);
-/// A cell that had a server for so long made some progress: what is lost then is not lost in a row.
+/// Time with a server after which a cell counts as having made progress. A later loss of the server starts a new row of
+/// losses.
 const STABLE_CONNECTION: Duration = Duration::from_secs(60);
-/// First pause after a cell had no server or no disk. Every further failure in a row doubles the pause.
+/// First pause after a cell lost its server or could not use the disk. Every further failure in a row doubles the pause.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 /// Maximum pause.
 const MAX_PAUSE: Duration = Duration::from_secs(30);
@@ -52,10 +53,10 @@ const TICK: Duration = Duration::from_millis(50);
 pub trait Backend {
     /// Returns the size of groups.
     fn grouping(&self) -> Grouping;
-    /// Whether a cell that is broken off too often has failed. If not, its machines may be to blame: nothing is
-    /// recorded, and the next run tries again.
+    /// Returns whether a cell that was interrupted too often is recorded as failed. If not, machines may be the cause, so
+    /// nothing is recorded and the next run tries again.
     fn records_crashes_as_failures(&self) -> bool;
-    /// Whether the backend reports the end of every cell that has begun, so that a run can wait for it.
+    /// Returns whether the backend reports the end of every started cell, so that a run can wait for it.
     fn tells_ends(&self) -> bool;
     /// Returns the events since the last call.
     ///
@@ -64,19 +65,19 @@ pub trait Backend {
     fn poll(&mut self, now: Instant) -> Result<Vec<BackendEvent>>;
     /// Returns the number of groups that can begin now.
     fn free_slots(&self) -> usize;
-    /// Begins with some of `groups`, none of them empty, and gives the cells that it took: these, and those that it has
-    /// in work already.
+    /// Starts some of `groups`, none of which is empty. Returns the cells that are now in work: the started ones, and those
+    /// that were already in work.
     ///
     /// # Errors
     /// The run cannot go on.
     fn begin(&mut self, groups: &[Vec<PendingCell>]) -> Result<Vec<usize>>;
     /// Describes the backend's activity, and returns the number of groups at a time.
     fn load(&self) -> (String, usize);
-    /// Returns the measured upper bound of a cell's duration, s of a process.
+    /// Returns the measured upper bound of a cell's duration, s of process time.
     fn max_seconds(&self, _cell: usize) -> Option<f64> {
         None
     }
-    /// Ends all that cannot go on without this process, and names what can.
+    /// Ends all work that needs this process. Returns names of the work that continues without it.
     fn stop(&mut self) -> Vec<String>;
 }
 
@@ -85,9 +86,9 @@ pub trait Backend {
 pub struct PendingCell {
     /// The index in the plan.
     pub cell: usize,
-    /// The failure that is retryable it.
+    /// The recorded failure that this attempt may replace; `None` if there is none.
     pub retry: Option<FailureId>,
-    /// The number of its group in this run, also if it is offered alone.
+    /// The number of the cell's group in this run. A cell that runs alone keeps it.
     pub group: usize,
     /// The number of servers that were lost.
     pub lost_servers: usize,
@@ -100,11 +101,11 @@ pub struct PendingCell {
 pub enum BackendEvent {
     /// Something happened to a cell.
     Event(usize, CellEvent),
-    /// A cell was given back before its turn came.
+    /// A cell was given back before it was started.
     Returned(usize),
     /// The servers are gone, for this reason.
     NoServer(String),
-    /// A sentence.
+    /// A sentence for the user.
     Note(String),
 }
 
@@ -143,10 +144,10 @@ pub struct RunStatus {
 pub enum RunEnd {
     /// All cells have a result or have failed; these have failed.
     Finished {
-        /// Ids.
+        /// The ids of the failed cells.
         failed: Vec<String>,
     },
-    /// This signal ended it. Calling it again goes on.
+    /// A signal ended the run. The same command resumes it.
     Stopped {
         /// The signal's number.
         signal: i32,
@@ -171,7 +172,7 @@ pub enum RunError {
     /// Files of a cell cannot be read or written.
     #[error("the run cannot go on: {0}; when that is mended, the same command goes on from what was trained")]
     FileFault(String),
-    /// Cells were tried several times, which did not bring them any further.
+    /// Several attempts at a cell ended without progress.
     #[error(
         "{} without a result after {MAX_ATTEMPTS} attempts, the first is {}: {words}; when that is mended, the same \
          command tries again",
@@ -179,7 +180,7 @@ pub enum RunError {
         ids[0]
     )]
     GaveUp {
-        /// At least one.
+        /// The ids of these cells, at least one.
         ids: Vec<String>,
         /// The end of the last attempt at the first cell.
         words: String,
@@ -191,9 +192,9 @@ pub enum RunError {
 
 type Result<T, E = RunError> = std::result::Result<T, E>;
 
-/// Does every cell of `plan` that has no result in `folder`, also those that had failed as is `retryable` them, by their ids.
-/// Returns when no cell is left, also none that another run works on. A cell that has lost its server goes on from its last
-/// checkpoint, if need be for `server_wait`, or fifteen seconds, until there is one.
+/// Runs every cell of `plan` that has no result in `folder`. Failed cells are run again if their failure is in `retryable`,
+/// by id. Returns when all cells are settled, including those that another run works on. A cell that has lost its server
+/// waits for one for at most `server_wait`, or fifteen seconds if that is longer, and then resumes from its last checkpoint.
 ///
 /// # Errors
 /// [`RunError`]; the backend has then been stopped.
@@ -212,7 +213,7 @@ pub fn run(
             (Ok(None), None) => std::thread::sleep(TICK),
             (Ok(Some(failed)), _) => break Ok(RunEnd::Finished { failed }),
             (Err(error), None) => break Err(error),
-            // Whoever stops a run may end its servers and commands too.
+            // The signal may have ended servers and commands too, so their errors do not count.
             (_, Some(signal)) => break Ok(RunEnd::Stopped { signal, left: scheduler.backend.stop() }),
         }
     };
@@ -224,7 +225,7 @@ pub fn run(
 #[derive(Debug, Default)]
 struct Tracked {
     phase: CellPhase,
-    /// The number of its group.
+    /// The number of the cell's group.
     group: usize,
     /// Whether the cell runs alone, because an attempt ended without progress. Alone, it cannot end the attempts of
     /// other cells.
@@ -233,7 +234,8 @@ struct Tracked {
     retryable: Option<FailureId>,
     /// Attempts in a row without progress.
     attempts: u32,
-    /// Steps of its training that are in a checkpoint, and that were when the last attempt began its training.
+    /// Number of training steps in the last checkpoint. `saved_before` is its value when the last attempt began its
+    /// training.
     saved: u64,
     saved_before: Option<u64>,
     /// The progress of this attempt.
@@ -257,7 +259,7 @@ enum CellPhase {
     #[default]
     Waiting,
     Running,
-    /// Others work on it.
+    /// Another process works on the cell.
     LockedByOther,
     Done,
     Failed,
@@ -270,9 +272,9 @@ struct Scheduler<'a> {
     folder: &'a Folder,
     backend: &'a mut dyn Backend,
     report: &'a mut dyn FnMut(ProgressEvent<'_>),
-    /// By the cells' places in the plan.
+    /// The state of each cell, by its index in the plan.
     cells: Vec<Tracked>,
-    /// The cells that wait, in order.
+    /// Indices of the waiting cells, in order.
     queue: VecDeque<usize>,
     durations: CellDurations<'a>,
     rates: Rates,
@@ -313,7 +315,7 @@ impl<'a> Scheduler<'a> {
         scheduler
     }
 
-    /// Takes note of what happened and begins what can be begun. At the end gives the ids of the cells that failed.
+    /// Handles new events and starts the cells that can start. At the end of the run returns the ids of the failed cells.
     fn step(&mut self, now: Instant) -> Result<Option<Vec<String>>> {
         for news in self.backend.poll(now)? {
             match news {
@@ -358,7 +360,7 @@ impl<'a> Scheduler<'a> {
         Ok(())
     }
 
-    /// Decides what becomes of a cell whose attempt ended without settling it.
+    /// Decides whether a cell whose attempt ended without a result waits, fails or ends the run.
     fn on_exit(&mut self, cell: usize, end: CellEvent, now: Instant) -> Result<()> {
         let tracked = &mut self.cells[cell];
         match end {
@@ -413,14 +415,15 @@ impl<'a> Scheduler<'a> {
         Ok(())
     }
 
-    /// Begins nothing until then, and this cell first: if it cannot go on, the run ends soon, however many cells it has.
+    /// Starts no cell before `until`, and then this cell first. So a run whose first cell cannot continue ends soon, even if
+    /// it has many cells.
     fn pause(&mut self, cell: usize, until: Instant) {
         self.paused_until = self.paused_until.max(Some(until));
         self.cells[cell].phase = CellPhase::Waiting;
         self.queue.push_front(cell);
     }
 
-    /// Records the failure of a worker that could not do so itself.
+    /// Records a cell's failure for a worker that could not do so itself.
     fn record_failure(&mut self, cell: usize, reason: String) -> Result<()> {
         let place = self.folder.cell(self.id(cell));
         let Some(_lock) = place.try_lock()? else {
@@ -439,7 +442,7 @@ impl<'a> Scheduler<'a> {
         Ok(())
     }
 
-    /// Whether a cell has a result, or has failed and that counts.
+    /// Returns whether a cell has a result, or a failure that is not retried.
     fn settled(&mut self, cell: usize) -> bool {
         let Tracked { phase, retryable, .. } = &mut self.cells[cell];
         let place = self.folder.cell(&self.plan.cells[cell].id);
@@ -450,7 +453,7 @@ impl<'a> Scheduler<'a> {
             if let Some(timing) = place.timing() {
                 self.durations.add(&self.plan.cells[cell], timing.seconds);
             }
-            // One that cannot be read is left out: the report says what is wrong with it.
+            // A result that cannot be read is left out here. The report names its fault.
             if let Ok(CellState::Done(result)) = place.state() {
                 self.rates.add(&self.plan.cells[cell], &result);
             }
@@ -466,7 +469,7 @@ impl<'a> Scheduler<'a> {
         let waits = self.backend.tells_ends();
         for cell in 0..self.cells.len() {
             let Tracked { phase, begun, .. } = self.cells[cell];
-            // Whoever does it for this run has yet to say so: a result is written before that.
+            // The worker of this run writes the result first and reports it later, so wait for its report.
             let is_to_be_told = waits && phase == CellPhase::Running && begun.is_some();
             if !is_to_be_told
                 && !self.settled(cell)
@@ -476,7 +479,7 @@ impl<'a> Scheduler<'a> {
                 self.wait(cell);
             }
         }
-        // A folder of many cells on a slow file system is not looked at all the time.
+        // Reading takes at most a twentieth of the time, also for many cells on a slow file system.
         self.next_poll = Some(now + POLL_INTERVAL.max(begun.elapsed() * 20));
         Ok(())
     }
@@ -491,7 +494,7 @@ impl<'a> Scheduler<'a> {
         for cell in self.queue.clone() {
             let Tracked { retryable: retry, group, alone, lost_servers, .. } = self.cells[cell];
             let place = places.get(&group).copied().filter(|_| !alone);
-            // Another run may have done it meanwhile.
+            // Another run may have finished the cell meanwhile.
             if (place.is_none() && offers.len() >= room) || self.settled(cell) {
                 continue;
             }
@@ -525,7 +528,7 @@ impl<'a> Scheduler<'a> {
         self.queue.push_back(cell);
     }
 
-    /// The ids of the cells that failed; `None` while cells are left.
+    /// Returns the ids of the failed cells; `None` while some cells are not settled.
     fn end(&self) -> Result<Option<Vec<String>>> {
         let in_phase = |phase| (0..self.cells.len()).filter(move |&cell| self.cells[cell].phase == phase);
         let left = [CellPhase::Waiting, CellPhase::Running, CellPhase::LockedByOther];
@@ -593,7 +596,7 @@ fn rest(cell: &Cell, event: &CellEvent, progress: &TrainingProgress) -> Option<f
     }
 }
 
-/// Episodes of a cell's tests: all of them, or those before the test of this name.
+/// Returns the number of test episodes of a cell: of all tests, or of those before the test with this name.
 fn test_episodes(cell: &Cell, before: Option<&str>) -> f64 {
     let Tests { episodes, sets, selection, marks, .. } = &cell.tests;
     let of_mark = marks.iter().map(|mark| format!(" after {mark} episodes"));

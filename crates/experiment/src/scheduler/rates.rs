@@ -7,23 +7,23 @@ use perturb_text::count;
 use crate::folder::CellResult;
 use crate::plan::Cell;
 
-/// Success of the cells of an environment, a learner and what it was trained on: means over settings and runs.
+/// Mean success of the cells with the same environment, method and training distribution, over settings and runs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Rate {
     /// The kind of the cells, see [`Cell::described`].
     pub kind: String,
     /// The number of cells.
     pub cells: usize,
-    /// By the name of the set that was tested, %.
+    /// Success for each test set by its name, %.
     pub success: Vec<(String, f64)>,
 }
 
-/// Collects them, in the order of the plan.
+/// Collects the success rates, in the order of the plan.
 #[derive(Debug, Default)]
 pub(crate) struct Rates(BTreeMap<usize, (Rate, Vec<f64>)>);
 
 impl Rates {
-    /// A cell that is done.
+    /// Adds the result of a finished cell.
     pub(crate) fn add(&mut self, cell: &Cell, result: &CellResult) {
         let kind = cell.described();
         let known = self.0.iter().find(|(_, (rate, _))| rate.kind == kind).map(|(&index, _)| index);

@@ -6,12 +6,12 @@ use std::fmt;
 use super::CellEvent;
 use crate::plan::Cell;
 
-/// Cells that are done together, or, on a cluster, are of one kind.
+/// Cells that run together or, on a cluster, are of one kind.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RunningGroup {
     /// Environment and architecture.
     pub kind: String,
-    /// The ids of the cells, at least one, and what is being done with them.
+    /// The ids of the cells, at least one, each with its last event.
     pub cells: Vec<(String, CellEvent)>,
 }
 
@@ -45,12 +45,12 @@ impl fmt::Display for RunningGroup {
 #[derive(Default)]
 pub(super) struct Running {
     pub(super) groups: Vec<RunningGroup>,
-    /// Places in `groups`, by the groups' numbers.
+    /// Indices in `groups`, by the groups' numbers.
     places: HashMap<usize, usize>,
 }
 
 impl Running {
-    /// A cell of the group with this number, or one that is done alone.
+    /// Adds a cell of the group with this number, or a cell that runs alone.
     pub(super) fn add(&mut self, cell: &Cell, group: Option<usize>, event: &CellEvent) {
         let entry = (cell.id.clone(), event.clone());
         if let Some(&place) = group.and_then(|number| self.places.get(&number)) {

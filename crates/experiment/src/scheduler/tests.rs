@@ -1,4 +1,4 @@
-//! The rules of the state machine, with a backend that follows a script and a clock of its own.
+//! Tests of the state machine, with a backend that follows a script and a simulated clock.
 
 use rstest::rstest;
 use tempfile::TempDir;
@@ -9,7 +9,7 @@ use super::*;
 const PLAN: &str = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 2
     [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
 
-/// What an attempt does, an act a second.
+/// Act of an attempt. Each takes a second.
 #[derive(Clone, Debug)]
 enum Act {
     Say(CellEvent),
@@ -19,7 +19,7 @@ enum Act {
     /// A failure is recorded.
     Failure,
     End(CellEvent),
-    /// Its turn does not come.
+    /// The cell is given back before it was started.
     Return,
 }
 use Act::{Failure as Fails, Result as Succeeds, Return, Say, Wait};
@@ -48,16 +48,16 @@ fn done() -> Vec<Act> {
     vec![Succeeds, ends(CellEvent::Done)]
 }
 
-/// Follows a script: what the nth attempt at a cell does, n from 1.
+/// Backend that follows a script, which gives the acts of the nth attempt at a cell, n from 1.
 struct Fake<'a, const CONVICTS: bool> {
     place: &'a Place,
     script: &'a dyn Fn(usize, usize) -> Vec<Act>,
     grouping: Grouping,
     start: Instant,
     now: Instant,
-    /// Groups of cells, and what they do still.
+    /// The running groups: each cell with its remaining acts.
     running: Vec<Vec<(usize, VecDeque<Act>)>>,
-    /// For each attempt its cell, when it began, and how many servers the cell had lost.
+    /// For each attempt its cell, the time of its start, s, and the number of servers that the cell had lost.
     begun: Vec<(usize, u64, usize)>,
     groups: Vec<Vec<usize>>,
     most_at_a_time: usize,
@@ -106,7 +106,7 @@ impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
         for group in groups {
             let mut running = Vec::new();
             for offer in group {
-                // As a worker does.
+                // A worker does the same.
                 if let Some(failure) = offer.retry {
                     self.place.folder.cell(self.place.id(offer.cell)).clear_failure_if(failure).unwrap();
                 }
@@ -137,7 +137,7 @@ struct Place {
     plan: Plan,
 }
 
-/// What a run came to.
+/// Result of a run.
 #[derive(Debug)]
 struct Ran {
     end: Result<Vec<String>, String>,
@@ -146,17 +146,17 @@ struct Ran {
     most_at_a_time: usize,
     notes: Vec<String>,
     statuses: Vec<RunStatus>,
-    /// Cells that were told to be done.
+    /// Cells that were reported as done.
     told: Vec<String>,
 }
 
 impl Ran {
-    /// How often the cells were begun.
+    /// Returns the number of attempts at each cell.
     fn attempts(&self) -> Vec<usize> {
         (0..4).map(|cell| self.begun.iter().filter(|(begun, ..)| *begun == cell).count()).collect()
     }
 
-    /// When cell 0 was begun, s.
+    /// Returns the times at which cell 0 was started, s.
     fn times(&self) -> Vec<u64> {
         self.begun.iter().filter(|(cell, ..)| *cell == 0).map(|(_, time, _)| *time).collect()
     }
@@ -295,7 +295,7 @@ fn server_waits_double_and_end() {
     let ran = place.run(&|_, _| vec![lost()]);
     let message = format!("the run cannot go on without a server: {}: gone; what is done is kept", place.id(0));
     assert!(ran.end.as_ref().is_err_and(|error| error.starts_with(&message)), "{:?}", ran.end);
-    // The loss is heard a second after the beginning; then 1, 2, 4 and 8 s are waited.
+    // Each loss is reported a second after the start. The pauses are 1, 2, 4 and 8 s.
     assert_eq!(ran.times(), [0, 2, 5, 10, 19], "at the front of the queue");
     assert_eq!(ran.attempts(), [5, 0, 0, 0]);
     assert_eq!(ran.begun.iter().map(|(.., lost)| *lost).collect::<Vec<_>>(), [0, 1, 2, 3, 4], "for their turns");
@@ -313,7 +313,7 @@ fn full_disk_ends_the_run_without_a_failed_cell() {
     let message = format!("the run cannot go on: {}: no space left; when that is mended", place.id(0));
     assert!(ran.end.as_ref().is_err_and(|error| error.starts_with(&message)), "{:?}", ran.end);
     assert!((0..4).all(|cell| !place.folder.cell(place.id(cell)).is_settled(true)), "no cell is blamed");
-    // A fault after servers were lost is the first one.
+    // A disk failure after losses of servers counts as the first in its row.
     let place = Place::new();
     let ran = place.run(&|cell, attempt| match (cell, attempt) {
         (0, 1..=4) => vec![lost()],
@@ -321,7 +321,7 @@ fn full_disk_ends_the_run_without_a_failed_cell() {
         _ => done(),
     });
     assert_eq!(ran.end, place.finished(&[]));
-    // One that gets further each time may go on.
+    // A cell that makes progress in each attempt may continue.
     let place = Place::new();
     let ran = place.run(&|cell, attempt| match (cell, attempt) {
         (0, 1..=7) => vec![saved(100 * attempt as u64), saved(100 * attempt as u64 + 50), full()],
@@ -350,7 +350,7 @@ fn an_earlier_failure_counts_unless_it_is_forgiven() {
     let place = Place::new();
     place.fail(2);
     assert_eq!(place.run(&|_, _| done()).end, place.finished(&[2]));
-    // While others try again it does not count; a failure that they record does.
+    // A retried failure does not count, even if the first attempt loses its server.
     let ran = place.run_on::<true>(1, true, &|_, attempt| if attempt == 1 { vec![lost()] } else { done() });
     assert_eq!((ran.end, ran.begun.len()), (place.finished(&[]), 2));
 }
@@ -359,7 +359,7 @@ fn an_earlier_failure_counts_unless_it_is_forgiven() {
 fn a_failure_that_another_run_records_meanwhile_counts() {
     let place = Place::new();
     place.fail(2);
-    // While cell 0 is done, another run tries cell 2 again, in vain.
+    // While cell 0 runs, another run retries cell 2, which fails again.
     let script = |cell, _| {
         if cell == 0 {
             place.folder.cell(place.id(2)).clear_failure().unwrap();
@@ -379,7 +379,7 @@ fn a_cell_that_others_work_on_is_waited_for_and_taken_over() {
     let script = |cell, attempt| match (cell, attempt) {
         (1, 1) => vec![ends(CellEvent::Busy)],
         (3, 1) => {
-            // Others give cell 1 up while cell 3 is done.
+            // Another process gives up cell 1 while cell 3 runs.
             drop(lock.take());
             vec![Wait(30), Succeeds, ends(CellEvent::Done)]
         }
@@ -499,7 +499,7 @@ fn what_is_left_is_grouped_anew() {
 #[test]
 fn a_cell_that_kills_its_process_convicts_only_itself() {
     let place = Place::of(GROUPS);
-    // Nobody got any further: the killer is not known.
+    // No cell made progress, so the cell that ends the process is not known.
     let script = |cell, attempt| if cell == 1 || (cell < 3 && attempt == 1) { vec![killed()] } else { done() };
     let ran = place.run_in::<true>(THREES, false, &script);
     assert_eq!(ran.groups, [vec![0, 1, 2], vec![3, 4, 5], vec![0], vec![1], vec![2], vec![1]]);
@@ -555,12 +555,13 @@ fn cells_of_a_group_share_the_time_of_its_process() {
         0..3 => done(),
         _ => vec![server(), Wait(9), Succeeds, ends(CellEvent::Done)],
     };
-    // Each took 10 s of its process.
+    // Each cell took 10 s of its process.
     place.plan.cells[..3].iter().for_each(|cell| {
         place.folder.cell(&cell.id).write_timing(&crate::folder::Timing { seconds: 10.0 }).unwrap();
     });
     let ran = place.run_in::<true>(THREES, false, &script);
     let left = |second: usize| ran.statuses[second].remaining.map(|left| left.time.as_secs());
-    // The second group begins at 2 s and is heard of a second later; 6 s after that, each of its cells has had 2 s.
+    // The second group starts at 2 s, and its first event arrives a second later. After another 6 s, each of its cells has
+    // had 2 s.
     assert_eq!((left(2), left(3), left(9)), (Some(30), Some(30), Some(24)));
 }

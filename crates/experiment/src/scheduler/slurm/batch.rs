@@ -66,7 +66,7 @@ fn cut(group: &[CellLoad], size: JobSize) -> Vec<Vec<usize>> {
 mod tests {
     use super::*;
 
-    /// One group.
+    /// Returns one group of cells with these estimated durations, s.
     fn loads(seconds: &[f64]) -> Vec<Vec<CellLoad>> {
         vec![seconds.iter().enumerate().map(|(cell, &seconds)| CellLoad { cell, seconds }).collect()]
     }

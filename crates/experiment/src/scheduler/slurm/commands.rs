@@ -1,4 +1,4 @@
-//! Slurm's commands, and what they answer.
+//! Slurm's commands and their answers.
 
 use std::ffi::OsStr;
 use std::fs::File;
@@ -23,7 +23,7 @@ const TICK: Duration = Duration::from_millis(20);
 const FIELDS: &str = "%F|%K|%T|%r|%N|%j";
 /// Separates the fields of squeue's lines.
 const SEPARATOR: char = '|';
-/// Begins the lines that squeue prints above the jobs of each cluster where there are several, with --noheader, too.
+/// Prefix of the lines that squeue prints above the jobs of each cluster if there are several, also with --noheader.
 const CLUSTER_HEADING: &str = "CLUSTER:";
 
 /// Slurm on this machine.
@@ -40,7 +40,7 @@ impl Default for Slurm {
 }
 
 impl Slurm {
-    /// With the commands in `directory` instead of those on the PATH, which may take `limit` to answer.
+    /// Uses the commands in `directory` instead of those on the PATH. A command may take `limit` to answer.
     pub fn in_directory(directory: PathBuf, limit: Duration) -> Self {
         Self { directory: Some(directory), limit }
     }
@@ -48,15 +48,15 @@ impl Slurm {
     /// Refuses machines without Slurm's commands.
     ///
     /// # Errors
-    /// [`SlurmError::NotInstalled`], or what the commands say.
+    /// [`SlurmError::NotInstalled`], or the commands' own errors.
     pub fn check(&self, stop: &StopFlag) -> Result<(), SlurmError> {
         ["sbatch", "squeue", "scontrol"].into_iter().try_for_each(|name| self.call(name, ["--version"], stop).map(drop))
     }
 
-    /// The jobs of arrays with these names, also those that ended a short time ago.
+    /// Returns the jobs of arrays with these names, including jobs that ended a short time ago.
     ///
     /// # Errors
-    /// What squeue says, or that it says nothing.
+    /// The error of squeue, or that it did not answer.
     pub(super) fn queue(&self, names: &[&str], stop: &StopFlag) -> Result<QueueAnswer, SlurmError> {
         if names.is_empty() {
             return Ok(QueueAnswer::default());
@@ -70,7 +70,7 @@ impl Slurm {
     /// Returns the maximum number of jobs in an array.
     ///
     /// # Errors
-    /// What scontrol says, or that it says nothing.
+    /// The error of scontrol, or that it did not answer.
     pub(super) fn max_jobs(&self, stop: &StopFlag) -> Result<usize, SlurmError> {
         let text = self.call("scontrol", ["show", "config"], stop)?;
         match parse_setting(&text, "MaxArraySize").map(str::parse::<usize>) {
@@ -80,14 +80,15 @@ impl Slurm {
         }
     }
 
-    /// Submits; gives the array's number. Not to be stopped: then nobody would know whether it was accepted.
+    /// Submits an array and returns its number. A signal does not interrupt it, because then nobody would know whether Slurm
+    /// accepted the array.
     ///
     /// # Errors
-    /// What sbatch says, or that it says nothing.
+    /// The error of sbatch, or that it did not answer.
     pub(super) fn submit(&self, submission: &Submission, options: &SlurmOptions) -> Result<String, SlurmError> {
         let arguments = sbatch_arguments(submission, options)?;
         let text = self.call("sbatch", &arguments, &StopFlag::default())?;
-        // With several clusters: NUMBER;CLUSTER. Plugins may say more on other lines.
+        // With several clusters the format is NUMBER;CLUSTER. Plugins may print other lines.
         let number = text.lines().rev().find_map(|line| {
             let number = line.trim().split(';').next().unwrap_or_default();
             number.parse::<u64>().ok().map(|_| number.to_owned())
@@ -95,7 +96,7 @@ impl Slurm {
         number.ok_or_else(|| not_understood("sbatch", "the number of a job", &text))
     }
 
-    /// Runs a command to its end, and gives what it printed.
+    /// Runs a command to its end, and returns its standard output.
     fn call<S: AsRef<OsStr>>(
         &self,
         name: &'static str,
@@ -104,12 +105,12 @@ impl Slurm {
     ) -> Result<String, SlurmError> {
         let program = self.directory.as_ref().map_or_else(|| PathBuf::from(name), |directory| directory.join(name));
         let failed = |source| SlurmError::System { program: name, source };
-        // Files, not pipes: nobody has to read while the command runs.
+        // Output goes to files. Pipes would block the command while nobody reads them.
         let (mut output, mut errors) = (temporary_file().map_err(failed)?, temporary_file().map_err(failed)?);
         let mut command = Command::new(program);
         command.args(arguments).stdin(Stdio::null());
         command.stdout(output.try_clone().map_err(failed)?).stderr(errors.try_clone().map_err(failed)?);
-        // A user's defaults would leave jobs out. sbatch's are welcome: accounts, memory and the like.
+        // A user's default filters of squeue would hide jobs. Defaults of sbatch are kept, such as accounts and memory.
         for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("SQUEUE_")) {
             command.env_remove(key);
         }
@@ -174,7 +175,7 @@ fn sbatch_arguments(submission: &Submission, options: &SlurmOptions) -> Result<V
 #[derive(Debug, Default)]
 pub(super) struct QueueAnswer {
     pub(super) jobs: Vec<QueuedJob>,
-    /// Lines that are no jobs: words of a site's wrapper or plugin.
+    /// Lines that are no jobs, for example from a site's wrapper or plugin.
     pub(super) foreign: Vec<String>,
 }
 
@@ -197,14 +198,14 @@ fn parse_job(line: &str) -> Result<QueuedJob, SlurmError> {
     let [array, index, state, reason, node, name] = fields[..] else {
         return Err(not_understood("squeue", FIELDS, line));
     };
-    // CANCELLED may be followed by who did it.
+    // CANCELLED may be followed by the user who cancelled the job.
     let state = state.split([' ', '+']).next().unwrap_or_default();
     let index = index.parse().map_err(|_| not_understood("squeue", "an index of an array", line))?;
     let [array, state, reason, node, name] = [array, state, reason, node, name].map(str::to_owned);
     Ok(QueuedJob { array, index, state, reason, node, name })
 }
 
-/// The value of `KEY = VALUE` in what `scontrol show config` prints.
+/// Returns the value of `KEY = VALUE` in the output of `scontrol show config`.
 fn parse_setting<'a>(text: &'a str, key: &str) -> Option<&'a str> {
     text.lines().find_map(|line| {
         let (name, value) = line.split_once('=')?;

@@ -1,4 +1,4 @@
-//! Why cells cannot be done by Slurm.
+//! Errors of running cells with Slurm.
 
 use std::time::Duration;
 
@@ -8,31 +8,31 @@ use super::super::count;
 use super::options::OptionError;
 use crate::folder::FolderError;
 
-/// Why cells cannot be done by Slurm.
+/// Cells cannot be run with Slurm.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum SlurmError {
-    /// Slurm's commands are not here.
+    /// Slurm's commands are not on the PATH.
     #[error("there is no `{program}` here: start this on a machine that submits to Slurm, or install slurm-client")]
     NotInstalled { program: &'static str },
     /// A command could not be run.
     #[error("cannot run {program}: {source}")]
     System { program: &'static str, source: std::io::Error },
-    /// Slurm said no.
+    /// A command ended with an error.
     #[error("{program} refused: {words}")]
     Refused { program: &'static str, words: String },
-    /// Slurm said nothing.
+    /// A command did not answer in time.
     #[error("{program} did not answer within {} s; is Slurm's controller up? The same command goes on", limit.as_secs())]
     Silent {
         program: &'static str,
-        /// The time that was waited.
+        /// The time limit of the answer.
         limit: Duration,
     },
-    /// Slurm said something else than expected.
+    /// A command's output does not have the expected format.
     #[error("{program} printed `{got}`, expected {expected}")]
     NotUnderstood { program: &'static str, expected: &'static str, got: String },
-    /// Slurm has no arrays.
+    /// This Slurm is configured without job arrays.
     #[error("this Slurm takes no job arrays (MaxArraySize = 0), which --engine slurm needs; use `perturb run --cell`")]
     NoArrays,
     /// An option was refused.
@@ -47,7 +47,7 @@ pub enum SlurmError {
     /// The cost of cells cannot be estimated.
     #[error("cannot estimate what cells cost, which says how many a job does: {0}; give --cells-per-job instead")]
     Cost(AnyError),
-    /// Somebody cancelled everything.
+    /// All jobs of the run were cancelled.
     #[error(
         "Slurm job {} was cancelled; the same command submits what has no result again: {}",
         arrays.join(", "),

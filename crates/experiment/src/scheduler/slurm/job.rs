@@ -1,6 +1,6 @@
 //! A job in Slurm's queue.
 
-/// States of jobs that will not run again; in every other state a job is in the queue still.
+/// States of jobs that will not run again. In every other state a job is still in the queue.
 const ENDED: [&str; 10] = [
     "BOOT_FAIL",
     "CANCELLED",
@@ -19,11 +19,11 @@ const ENDED: [&str; 10] = [
 pub struct QueuedJob {
     /// The array's number.
     pub array: String,
-    /// The job's index in it.
+    /// The job's index in the array.
     pub index: usize,
     /// The state, e.g. RUNNING.
     pub state: String,
-    /// Why it is in this state; "None" often.
+    /// Slurm's reason for the state, often "None".
     pub reason: String,
     /// The node that runs or ran the job; empty while it waits.
     pub node: String,
@@ -38,7 +38,7 @@ impl QueuedJob {
         Self { array, index, state, reason: String::new(), node: String::new(), name }
     }
 
-    /// Whether it runs, or will.
+    /// Returns whether the job runs or will run.
     pub fn is_live(&self) -> bool {
         !ENDED.contains(&self.state.as_str())
     }

@@ -1,4 +1,4 @@
-//! Submitting cells as arrays, and noticing what becomes of their jobs.
+//! Submits cells as job arrays, and follows their jobs.
 
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
@@ -21,10 +21,10 @@ use super::submission::{self, Submission};
 use crate::folder::Folder;
 use crate::plan::{Grouping, Plan, distinct};
 
-/// Maximum number of different foreign lines of squeue that are told.
+/// Maximum number of different lines of squeue without a job that are reported.
 const MAX_FOREIGN_LINES: usize = 10;
 
-/// The jobs of a folder in Slurm's queue. Those that are there when the process ends stay there.
+/// The jobs of a folder in Slurm's queue. Jobs that are in the queue when this process ends stay there.
 pub struct Jobs<'a> {
     plan: &'a Plan,
     folder: &'a Folder,
@@ -33,34 +33,34 @@ pub struct Jobs<'a> {
     costs: &'a dyn Fn() -> Result<Vec<f64>, AnyError>,
     known_costs: Option<Vec<f64>>,
     stop: &'a StopFlag,
-    /// Places in the plan, by id.
+    /// Indices in the plan, by the cells' ids.
     places: HashMap<&'a str, usize>,
     submissions: Vec<Submission>,
-    /// The last job that had a cell: which of the submissions, and its index.
+    /// The last job of each cell: the index of its submission, and its index in the array.
     last: HashMap<usize, (usize, usize)>,
-    /// Slurm's last answer, and how many there were.
+    /// Slurm's last answer, and the number of answers so far.
     queue: Vec<QueuedJob>,
     answers: u32,
     /// Positions in the jobs' event files, by submission and index.
     told: HashMap<(u32, usize), LogCursor>,
     /// Submissions that this process has seen in the queue.
     watched: HashSet<u32>,
-    /// Cells that were taken and not given back.
+    /// Cells that the scheduler handed to this backend and that were not given back.
     taken: HashSet<usize>,
-    /// Cells that were taken and were not in Slurm's last answer.
+    /// Cells in `taken` that were missing in Slurm's last answer.
     suspects: HashSet<usize>,
-    /// Locked while this process decides, from the question what is in the queue to the submission.
+    /// Lock on the decision what to submit. It is held from the request for the queue to the submission.
     deciding: Option<Lock>,
     ask_at: Option<Instant>,
-    /// Lines of squeue that were no jobs, which were told.
+    /// Lines of squeue without a job that were reported already.
     foreign: HashSet<String>,
-    /// Why Slurm cannot be asked, or takes nothing.
+    /// The reason why Slurm does not answer or does not accept jobs.
     trouble: Option<String>,
-    /// For the next call.
+    /// Events for the next call of `poll`.
     news: Vec<BackendEvent>,
 }
 
-/// Up to where it was read what a job tells, and the cells whose turn has come by that.
+/// Read position in the event file of a job, and the cells that the job has started according to these events.
 #[derive(Default)]
 struct LogCursor {
     offset: u64,
@@ -103,7 +103,7 @@ impl<'a> Jobs<'a> {
         }
     }
 
-    /// Asks Slurm for the jobs of this folder that may matter still.
+    /// Asks Slurm for the jobs of all submissions with unfinished cells of the plan.
     fn ask(&mut self) -> Result<()> {
         let mut submissions = submission::list(self.folder).map_err(SlurmError::from)?;
         let matters = |id: &String| self.places.contains_key(&**id) && !self.folder.cell(id).is_settled(false);
@@ -117,7 +117,7 @@ impl<'a> Jobs<'a> {
                 self.news.push(BackendEvent::Note(format!("squeue printed a line that is no job, ignored: {line}")));
             }
         }
-        // A folder that was deleted and made again has names that were used before.
+        // If the folder was deleted and made again, its names also belong to older arrays.
         self.queue.retain(|job| submissions.iter().any(|submission| submission.has(job)));
         self.submissions = submissions;
         self.last.clear();
@@ -127,7 +127,7 @@ impl<'a> Jobs<'a> {
         Ok(())
     }
 
-    /// Takes note of the cells of a submission.
+    /// Records the last job of each cell in a submission.
     fn remember(&mut self, submission: usize) {
         for (index, cells) in self.submissions[submission].jobs.iter().enumerate() {
             let cells = cells.iter().filter_map(|id| self.places.get(&**id));
@@ -135,7 +135,7 @@ impl<'a> Jobs<'a> {
         }
     }
 
-    /// Goes on without an answer.
+    /// Continues without an answer of Slurm, and reports the error once.
     fn put_up_with(&mut self, error: &RunError) {
         let words = error.to_string();
         if self.trouble.as_ref() != Some(&words) {
@@ -144,7 +144,7 @@ impl<'a> Jobs<'a> {
         }
     }
 
-    /// Takes note of the arrays in the queue, and of numbers that were never heard.
+    /// Records which arrays are in the queue, and the numbers of arrays whose submission was interrupted.
     fn adopt(&mut self) -> Result<()> {
         for submission in &mut self.submissions {
             let jobs: Vec<_> = self.queue.iter().filter(|job| job.is_live() && submission.has(job)).collect();
@@ -167,7 +167,7 @@ impl<'a> Jobs<'a> {
         if !path.exists() {
             return Ok(()); // it has not begun
         }
-        // Opened each time, which is when a network file system looks for what is new.
+        // The file is opened each time, because a network file system then looks for new content.
         let (file, _) = open_plain(&path).map_err(io("open", &path))?;
         let told = self.told.entry((submission.number, index)).or_default();
         for line in read_lines(&file, &mut told.offset).map_err(io("read", &path))? {
@@ -175,7 +175,7 @@ impl<'a> Jobs<'a> {
             if line.event.is_a_turn() {
                 told.cells.insert(cell);
             }
-            // An attempt that ended is the job's own affair, as long as the job goes on.
+            // A job repeats attempts itself, so an attempt's end is not reported while the job runs.
             if !line.event.is_last() {
                 self.news.push(BackendEvent::Event(cell, line.event));
             }
@@ -183,8 +183,8 @@ impl<'a> Jobs<'a> {
         Ok(())
     }
 
-    /// Reads what the jobs that run have told, and gives back the cells whose jobs have left the queue. They must be missing
-    /// from two answers in succession: a result may be seen here a little later than the end of its job.
+    /// Reads the events of running jobs, and gives back the cells whose jobs have left the queue. A job must be missing in
+    /// two answers in succession, because a result may become visible here a little after the end of its job.
     fn give_back(&mut self) -> Result<()> {
         let jobs: HashSet<(usize, usize)> = self.taken.iter().filter_map(|cell| self.last.get(cell).copied()).collect();
         for (submission, index) in jobs {
@@ -205,7 +205,7 @@ impl<'a> Jobs<'a> {
             self.taken.remove(&cell);
             let job = self.last.get(&cell).map(|&(submission, index)| (self.submissions[submission].number, index));
             let told = job.and_then(|job| self.told.get(&job)).map(|told| &told.cells);
-            // A job that did other cells is no fault of one that had no turn.
+            // The end of a job does not count against a cell that the job had not started.
             let had_its_turn = told.is_none_or(|cells| cells.is_empty() || cells.contains(&cell));
             self.news.push(match had_its_turn {
                 true => BackendEvent::Event(cell, CellEvent::Killed { reason: self.how_it_ended(cell) }),
@@ -216,7 +216,7 @@ impl<'a> Jobs<'a> {
         Ok(())
     }
 
-    /// If somebody cancelled everything, that was meant.
+    /// Ends the run if all jobs of the missing cells were cancelled, because that was intended.
     fn refuse_cancelled(&self, missing: &HashSet<usize>) -> Result<()> {
         let submission = |cell| self.last.get(cell).map(|&(submission, _)| &self.submissions[submission]);
         let cancelled = |cell| {
@@ -243,7 +243,7 @@ impl<'a> Jobs<'a> {
         self.news.push(BackendEvent::Note(format!("{cells} left Slurm's queue without a result ({})", how.join(", "))));
     }
 
-    /// Names the last job that had a cell, and the state that it ended in.
+    /// Returns the name of the last job of a cell, and its final state.
     fn end_of(&self, cell: usize) -> (String, &str) {
         let Some(&(submission, index)) = self.last.get(&cell) else { return ("a job".into(), "gone") };
         let submission = &self.submissions[submission];
@@ -264,7 +264,7 @@ impl<'a> Jobs<'a> {
         }
     }
 
-    /// Submits the cells of `groups`, as far as Slurm takes them, and gives these.
+    /// Submits the cells of `groups` that Slurm accepts, and returns them.
     fn submit(&mut self, groups: &[Vec<PendingCell>]) -> Result<Vec<usize>> {
         let max_jobs = match self.slurm.max_jobs(self.stop) {
             Ok(number) => number,
@@ -298,7 +298,8 @@ impl<'a> Jobs<'a> {
         Ok(cells)
     }
 
-    /// While jobs are in the queue, a refusal may be for their sake: limits on how many there are. Then nothing is taken.
+    /// Handles a refused submission. While jobs are in the queue, the cause may be a limit on their number, so the cells
+    /// wait for a later attempt. Otherwise the error ends the run.
     fn put_off(&mut self, error: RunError) -> Result<Vec<usize>> {
         if self.live().next().is_none() {
             return Err(error);
@@ -315,7 +316,7 @@ impl<'a> Jobs<'a> {
         }
     }
 
-    /// Estimates the duration of each cell, by finished cells of its kind or by measurement.
+    /// Estimates the duration of each cell from finished cells of its kind or from a measurement.
     fn loads(&mut self, groups: &[Vec<PendingCell>]) -> Result<Vec<Vec<CellLoad>>> {
         let unknown = groups.iter().flatten().any(|offer| offer.seconds.is_none());
         if self.options.cells_per_job.is_none() && unknown && self.known_costs.is_none() {
@@ -333,7 +334,7 @@ impl<'a> Jobs<'a> {
         self.queue.iter().filter(|job| job.is_live())
     }
 
-    /// The cells of the jobs in the queue.
+    /// Returns the cells of the jobs in the queue.
     fn queued(&self) -> HashSet<usize> {
         let cells =
             |job: &QueuedJob| self.submissions.iter().find(|submission| submission.has(job))?.jobs.get(job.index);
@@ -346,7 +347,7 @@ impl<'a> Jobs<'a> {
 }
 
 impl Backend for Jobs<'_> {
-    /// A job has cells of one kind, and cuts them into groups itself.
+    /// Returns one group for each kind of cells. A job divides its cells into groups itself.
     fn grouping(&self) -> Grouping {
         Grouping::BY_KIND
     }
@@ -355,7 +356,7 @@ impl Backend for Jobs<'_> {
         false
     }
 
-    /// Results are seen in the folder.
+    /// Returns false, because a run finds the results in the folder.
     fn tells_ends(&self) -> bool {
         false
     }
@@ -364,7 +365,7 @@ impl Backend for Jobs<'_> {
         self.deciding = None;
         if self.ask_at.is_none_or(|time| now >= time) {
             self.ask_at = Some(now + self.options.queue_interval);
-            // Only one process decides at a time.
+            // Only one process at a time decides what to submit.
             let directory = submission::directory(self.folder);
             create_folder(&directory)?;
             self.deciding = Lock::try_take(&directory)?;
@@ -395,14 +396,14 @@ impl Backend for Jobs<'_> {
             for offer in group {
                 let place = self.folder.cell(self.id(offer.cell));
                 match offer.retry {
-                    // The job that had it then is through with it, also if it has others to do.
+                    // The job that recorded this failure has finished with the cell, although it may still run others.
                     Some(failure) if place.failure_id() == Some(failure) => {
                         if place.clear_failure_if(failure)? {
                             left.push(*offer);
                         }
                     }
                     _ if queued.contains(&offer.cell) => taken.push(offer.cell),
-                    // An earlier process submitted it: it must be missing from two answers.
+                    // An earlier process submitted this cell, so it must be missing in two answers.
                     _ if self.answers == 1 && self.last.contains_key(&offer.cell) => {}
                     _ => left.push(*offer),
                 }

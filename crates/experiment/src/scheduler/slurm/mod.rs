@@ -1,9 +1,9 @@
-//! Doing a plan's cells as jobs of Slurm, over a folder that all its nodes see.
+//! Runs a plan's cells as jobs of Slurm, in a folder that all its nodes can read and write.
 //!
-//! The folder says what is done, whatever Slurm says. Slurm is asked for one thing only: which of the cells without a
-//! result are still in its queue. The others are submitted, as an array whose jobs do several cells of one kind each, in
-//! groups. So a watching process remembers nothing that a later one would need, and what happens while nobody watches is
-//! noticed later: a node that was lost, a time limit, a job that was cancelled.
+//! Results in the folder alone decide which cells are done. Slurm only tells which of the other cells are still in its
+//! queue. The remaining cells are submitted as an array, whose jobs each run several cells of one kind in groups. So a
+//! watching process has no state that a later one would need. A lost node, a time limit or a cancelled job is noticed by the
+//! next process that watches.
 //!
 //! ```text
 //! DIR/slurm/lock               locked while one of several watching processes decides and submits
@@ -29,7 +29,7 @@ pub use job::QueuedJob;
 pub use jobs::Jobs;
 pub use options::{JobCommand, OptionError, SlurmOptions, TimeLimit};
 
-/// The most cells of a job: their ids must fit in one argument of a command, which Linux limits to 128 KiB.
+/// Maximum number of cells of a job. Their ids must fit in one argument of a command, which Linux limits to 128 KiB.
 pub const MAX_CELLS_PER_JOB: usize = 1000;
 
 #[cfg(test)]

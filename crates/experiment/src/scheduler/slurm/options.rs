@@ -1,4 +1,4 @@
-//! Options for Slurm, which are checked before anything is submitted.
+//! Options for Slurm. They are checked before the first submission.
 
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -15,7 +15,7 @@ pub struct SlurmOptions {
     pub time: Option<TimeLimit>,
     /// Maximum number of running jobs of an array, at least 1; `None` for no limit.
     pub array_limit: Option<u32>,
-    /// Number of cells of a job, 1 to [`MAX_CELLS_PER_JOB`]; `None` for some minutes of work.
+    /// Number of cells of a job, 1 to [`MAX_CELLS_PER_JOB`]. With `None` a job gets as many cells as take some minutes.
     pub cells_per_job: Option<usize>,
     /// The command of a job.
     pub task: JobCommand,
@@ -28,11 +28,11 @@ pub struct SlurmOptions {
 pub struct JobCommand {
     /// The program `perturb`, at a place that all nodes see.
     pub program: PathBuf,
-    /// Groups of cells at a time, at least 1.
+    /// Number of groups of cells that run at the same time, at least 1.
     pub jobs: usize,
-    /// The most cells in a group, at least 1.
+    /// Maximum number of cells in a group, at least 1.
     pub group: usize,
-    /// Physics threads of each of the `jobs` servers that the job starts on its node, at least 1; without meaning if there
+    /// Number of physics threads of each of the `jobs` servers that the job starts on its node, at least 1. Unused if there
     /// are `servers`.
     pub workers: usize,
     /// Folders of tasks that these servers also serve, absolute.
@@ -44,28 +44,28 @@ pub struct JobCommand {
 }
 
 impl JobCommand {
-    /// The cores that a job asks for. A group's trainings and their environments take turns, so that one does for both;
-    /// further threads of its server have a core each.
+    /// Returns the number of cores that a job requests. A group's trainings and their environments run alternately, so they
+    /// share one core. Each further thread of its server has a core.
     pub fn cores(&self) -> usize {
         if self.servers.is_empty() { self.jobs.saturating_mul(self.workers) } else { self.jobs }
     }
 }
 
-/// Why options were refused.
+/// Errors of options.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum OptionError {
-    /// A time limit that Slurm would not understand.
+    /// The time limit has a format that Slurm does not accept.
     #[error(
         "`{got}` is no time limit: expected minutes, or one of Slurm's other forms MM:SS, HH:MM:SS, DAYS-HH, \
          DAYS-HH:MM, DAYS-HH:MM:SS, e.g. 90 or 1-12:00:00, and more than zero"
     )]
     Time { got: String },
-    /// A number of cells that cannot be.
+    /// The number of cells is out of range.
     #[error("{got} cells a job: expected 1 to {MAX_CELLS_PER_JOB}")]
     CellsPerJob { got: usize },
-    /// A path that cannot stand in a script and in Slurm's options.
+    /// The path has characters that are not allowed in a script or in Slurm's options.
     #[error("{path:?} cannot be handed to Slurm: {reason}; use another folder")]
     Path {
         path: PathBuf,
@@ -75,7 +75,7 @@ pub enum OptionError {
 }
 
 impl SlurmOptions {
-    /// Checks what does not check itself.
+    /// Checks the options that their types do not check.
     ///
     /// # Errors
     /// [`OptionError`].
@@ -90,14 +90,14 @@ impl SlurmOptions {
     }
 }
 
-/// A path as the text that scripts and Slurm's options can hold.
+/// Returns a path as text for scripts and Slurm's options.
 pub(super) fn text_of(path: &Path) -> Result<&str, OptionError> {
     let refuse = |reason| OptionError::Path { path: path.to_owned(), reason };
     let text = path.to_str().ok_or_else(|| refuse("it is not UTF-8"))?;
     if !path.is_absolute() {
         return Err(refuse("it does not begin with /"));
     }
-    // Slurm reads a backslash in the name of a log as an order to take the rest literally.
+    // Slurm reads a backslash in the name of a log as the start of literal text.
     if text.contains(|character: char| character.is_control() || character == '\\') {
         return Err(refuse("it has a control character or a backslash"));
     }

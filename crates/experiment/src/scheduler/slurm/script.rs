@@ -1,10 +1,10 @@
-//! The script of the jobs of an array.
+//! The script that all jobs of an array run.
 
 use std::path::Path;
 
 use super::options::{JobCommand, OptionError, text_of};
 
-/// The script of the submission in `submission`, for the experiment in `folder`.
+/// Returns the script of the submission in `submission`, for the experiment in `folder`.
 ///
 /// `exec` makes the program the process that Slurm signals: it then finishes its iterations and writes checkpoints.
 pub(super) fn script(task: &JobCommand, folder: &Path, submission: &Path) -> Result<String, OptionError> {

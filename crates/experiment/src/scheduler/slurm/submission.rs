@@ -13,16 +13,16 @@ use crate::plan::Plan;
 const CELLS: &str = "cells.txt";
 const DOCUMENT: &str = "submission.json";
 
-/// An array that was submitted, or was about to be.
+/// An array that was submitted, or was prepared for a submission.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Submission {
-    /// From 1.
+    /// Number of the submission, from 1.
     pub(super) number: u32,
     /// The folder of the submission.
     pub(super) path: PathBuf,
     /// The ids of each job's cells, by the job's index in the array.
     pub(super) jobs: Vec<Vec<String>>,
-    /// Names in Slurm.
+    /// The array's name and number in Slurm.
     pub(super) names: SlurmNames,
 }
 
@@ -30,8 +30,8 @@ pub(super) struct Submission {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct SlurmNames {
-    /// The array's name in the queue, which is known before Slurm accepts it: should this process end before it hears
-    /// the number, the next one finds the array by its name.
+    /// The array's name in the queue. It is chosen before the submission. If this process ends before it receives the
+    /// number, the next process finds the array by its name.
     pub(super) name: String,
     /// The array's number; `None` until it is known.
     pub(super) job: Option<String>,
@@ -45,7 +45,7 @@ pub(super) fn directory(folder: &Folder) -> PathBuf {
     folder.path().join("slurm")
 }
 
-/// All submissions, the first one first.
+/// Returns all submissions, the oldest first.
 pub(super) fn list(folder: &Folder) -> Result<Vec<Submission>, FolderError> {
     let directory = directory(folder);
     let mut submissions = Vec::new();
@@ -55,7 +55,7 @@ pub(super) fn list(folder: &Folder) -> Result<Vec<Submission>, FolderError> {
     Ok(submissions)
 }
 
-/// The numbers of the submissions, also of unfinished ones, in order.
+/// Returns the numbers of the submissions in order, including incomplete ones.
 fn numbers(directory: &Path) -> files::Result<Vec<u32>> {
     let paths = files::list(directory)?;
     let mut numbers: Vec<u32> = paths.iter().filter_map(|path| path.file_name()?.to_str()?.parse().ok()).collect();
@@ -63,7 +63,7 @@ fn numbers(directory: &Path) -> files::Result<Vec<u32>> {
     Ok(numbers)
 }
 
-/// The submission in `path`; `None` if it was broken off before Slurm could hear of it.
+/// Reads the submission in `path`. Returns `None` if its preparation was interrupted before it was sent to Slurm.
 fn read(path: &Path, number: u32) -> Result<Option<Submission>, FolderError> {
     let Some(names) = folder::read(&path.join(DOCUMENT))? else { return Ok(None) };
     let text = files::read_plain_text(&path.join(CELLS), MAX_CELLS_BYTES)?;
@@ -71,7 +71,7 @@ fn read(path: &Path, number: u32) -> Result<Option<Submission>, FolderError> {
     Ok(Some(Submission { number, path: path.to_owned(), jobs, names }))
 }
 
-/// Writes down what is about to be submitted, `submission.json` last.
+/// Writes the files of a submission before it is sent to Slurm, `submission.json` last.
 pub(super) fn create(
     folder: &Folder,
     plan: &Plan,
@@ -94,18 +94,18 @@ pub(super) fn create(
 }
 
 impl Submission {
-    /// Writes down the number that Slurm gave.
+    /// Stores the number that Slurm returned.
     pub(super) fn accepted(&mut self, job: &str) -> files::Result<()> {
         self.names.job = Some(job.to_owned());
         self.write()
     }
 
-    /// Whether squeue's `job` is of this array.
+    /// Returns whether `job` belongs to this array.
     pub(super) fn has(&self, job: &QueuedJob) -> bool {
         job.name == self.names.name && self.names.job.as_ref().is_none_or(|array| *array == job.array)
     }
 
-    /// The lines that job `index` of the array tells.
+    /// Returns the path of the event file of job `index`.
     pub(super) fn events(&self, index: usize) -> PathBuf {
         self.path.join(format!("{index}.jsonl"))
     }
@@ -115,7 +115,7 @@ impl Submission {
         self.path.join(format!("{index}.log"))
     }
 
-    /// Deletes what Slurm refused.
+    /// Deletes the files of a submission that Slurm refused.
     pub(super) fn forget(&self) -> files::Result<()> {
         files::delete(&self.path)
     }
@@ -143,7 +143,7 @@ mod tests {
         let plan = Plan::parse("test", plan.into()).unwrap();
         let script = |_: &Path| Ok("#!/bin/sh\n".to_owned());
         let mut first = create(&folder, &plan, jobs(&[&["a", "b"], &["c"]]), &script).unwrap();
-        // Broken off before it was complete: its number is not used again.
+        // The preparation of this submission was interrupted. Its number is not used again.
         fs::create_dir(super::directory(&folder).join("2")).unwrap();
         let third = create(&folder, &plan, jobs(&[&["d"]]), &script).unwrap();
         assert_eq!(third.number, 3);

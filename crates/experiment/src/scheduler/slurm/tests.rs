@@ -1,4 +1,4 @@
-//! The state machine over jobs, with a clock of its own and commands that only look like Slurm's. A real Slurm is in
+//! The state machine over jobs, with a simulated clock and fake Slurm commands. Tests with a real Slurm are in
 //! `cli/tests/cli/slurm`.
 
 use std::cell::Cell;
@@ -22,7 +22,7 @@ use crate::plan::Plan;
 const PLAN: &str = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 2
     [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
 
-/// As many of one kind.
+/// Returns a plan with four cells of one kind.
 fn of_one_kind() -> Plan {
     Plan::parse("test", PLAN.replace(", 'Hopper'", "").replace("runs = 2", "runs = 4")).unwrap()
 }
@@ -72,12 +72,12 @@ struct Fake {
     options: SlurmOptions,
     limit: Duration,
     retry_failed: bool,
-    /// How often costs were asked for.
+    /// Number of calls of the estimate of costs.
     costs: Cell<u32>,
 }
 
-/// Writes a program, by another process: a file that this one has open for writing cannot be run, and a child that another
-/// test starts just then would keep it open.
+/// Writes a program with a child process. This process must not have it open for writing, because a child that another test
+/// starts at that moment would keep it open, and such a file cannot be executed.
 pub(super) fn install(path: &Path, text: &str) {
     let mut shell = Command::new("sh")
         .args(["-c", "cat >\"$0.new\" && chmod +x \"$0.new\" && mv \"$0.new\" \"$0\""])
@@ -124,7 +124,7 @@ impl Fake {
         Slurm::in_directory(self.bin(), self.limit)
     }
 
-    /// Runs, a second at each step; `watch` hears every sentence.
+    /// Runs with steps of a second. Calls `watch` for every progress event.
     fn run_with(&self, stop: &StopFlag, watch: &mut dyn FnMut(ProgressEvent<'_>)) -> Result<RunEnd, RunError> {
         let costs = || {
             self.costs.set(self.costs.get() + 1);
@@ -150,7 +150,7 @@ impl Fake {
         self.run_with(&StopFlag::default(), &mut |_| {})
     }
 
-    /// Runs until a sentence with these words is said.
+    /// Runs until a note has these words.
     fn run_until(&self, words: &str) -> Result<RunEnd, RunError> {
         let stop = StopFlag::default();
         let raised = stop.clone();
@@ -218,7 +218,8 @@ fn what_slurm_lost_is_submitted_again() {
     let mut fake = Fake::new();
     (fake.options.cells_per_job, fake.plan) = (None, of_one_kind());
     let ids = fake.ids();
-    // Each cell may take 100 s: three make a job. Its first one is done, then the node is lost; the other job vanishes.
+    // Each cell may take 100 s, so a job has three cells. The first job loses its node after one cell, and the other job
+    // vanishes.
     fake.hook(&format!(
         "if [ $number = 1 ]; then done_ {0}; says 0 {0} done; echo \"1|0|NODE_FAIL|NodeDown|n1|$name\" >queue
          else for cells in $(cat \"$submission/cells.txt\"); do done_ $cells; done; fi",
@@ -289,7 +290,7 @@ fn cell_without_progress_is_given_up() {
         "{message}"
     );
     assert_eq!(fake.submissions().len(), 3);
-    // Called again, it tries again.
+    // Another call tries again.
     fake.hook(&format!("rm queue; done_ {}", ids[1]));
     assert_eq!(fake.run().unwrap(), finished());
     assert_eq!(fake.submissions().len(), 4);
@@ -300,7 +301,7 @@ fn a_training_that_gets_further_each_time_is_not_given_up() {
     let fake = Fake::new();
     let ids = fake.ids();
     ids[1..].iter().for_each(|id| fake.finish(id));
-    // A time limit ends it five times.
+    // A time limit ends the job five times.
     fake.hook(&format!(
         "echo \"$number|0|TIMEOUT|TimeLimit|n1|$name\" >queue
          says 0 {0} training ',\"episodes\":1,\"timesteps\":1,\"saved\":'$number
@@ -319,7 +320,7 @@ fn slurms_refusal_is_shown_and_leaves_nothing_behind() {
     assert_eq!(message, "sbatch refused: sbatch: error: invalid partition specified: x");
     assert!(fake.submissions().is_empty());
 
-    // While jobs are in the queue, it may be a limit on their number.
+    // While jobs are in the queue, the cause of a refusal may be a limit on their number.
     fs::remove_file(fake.bin().join("refusal")).unwrap();
     assert_eq!(fake.run_until("submitted 4 cells").unwrap(), stopped(&["1"]));
     fake.plan = Plan::parse("test", PLAN.replace("runs = 2", "runs = 3")).unwrap();
@@ -348,7 +349,7 @@ fn a_silent_slurm_is_no_reason_to_submit_again() {
     let message = fake.run().unwrap_err().to_string();
     assert!(message.contains("squeue did not answer within 2 s; is Slurm's controller up?"), "{message}");
 
-    // It falls silent while it is watched: results are found all the same.
+    // Slurm stops answering during the run. Results are found all the same.
     fake.command("squeue", "cat queue");
     let end = fake.run_with(&StopFlag::default(), &mut |report| match report {
         ProgressEvent::Note(sentence) if sentence.contains("is in the queue") => fake.command("squeue", silent),
@@ -382,7 +383,7 @@ fn a_submission_whose_number_nobody_heard_is_found_by_its_name() {
     fake.write("queue", &(0..4).map(line).collect::<String>());
     assert_eq!(fake.run_until("Slurm job 7 is in the queue").unwrap(), stopped(&["7"]));
     assert_eq!(fake.submissions()[0].names.job.as_deref(), Some("7"));
-    // An array of the same name with another number is of a folder that is gone.
+    // An array with the same name and another number belongs to a deleted folder.
     fake.write("queue", &(0..4).map(line).collect::<String>().replace("7|", "8|"));
     assert_eq!(fake.run_until("submitted 4 cells").unwrap(), stopped(&["1"]));
 }
