@@ -1,13 +1,14 @@
-"""Steps per second beside EnvPool: perturb's through its private server, EnvPool's in this process, both as they come.
+"""Steps per second of perturb's embedded and private servers, beside Gymnasium's environments and EnvPool's.
 
 All in one run, in turns, so that whatever else the machine does falls on all of them. Printed are medians of the
-rounds; `target` is what perturb should at least reach, as a multiple of EnvPool. Everybody takes the same random
-actions. In the column `send, recv` two batches of half the size take turns. Where EnvPool is not installed,
-its column is empty.
+rounds; a ratio stands beside what it should at least be. Everybody takes the same random actions. One environment by
+itself is made by `gymnasium.make`, and reset when its episode ends; a batch by `make_vec`. In the column `send, recv`
+two batches of half the size take turns. The column of a package that is not installed is empty.
 Run: python throughput.py [--rounds 5] [--seconds 0.5] [--server unix:/path] [CartPole …]
 """
 
 import argparse
+import contextlib
 import statistics
 import time
 from collections.abc import Callable
@@ -25,92 +26,135 @@ try:
 except ImportError:
     envpool = None
 
-# A contender's step, which gives back its flags.
-Step = Callable[[Any], Any]
+# A contender's step, which gives back how many episodes ended.
+Step = Callable[[Any], int]
+
+
+@dataclass(frozen=True)
+class Contender:
+    """How a contender steps, how it ends, and the type of its actions."""
+
+    step: Step
+    close: Callable[[], None]
+    kind: Any
 
 
 @dataclass(frozen=True)
 class Case:
-    """A case: the environment, EnvPool's name for it, the batch size, and the target ratio."""
+    """A case: the environment, Gymnasium's and EnvPool's names for it, the batch size, and target ratios."""
 
     name: str
-    peer: str
+    gymnasium: str
+    envpool: str
     num_envs: int
-    target: float
+    # What the private server should reach of EnvPool.
+    private: float
+    # What the embedded server should reach of Gymnasium.
+    embedded: float | None = None
     # Whether random actions end episodes within a round.
     ends: bool = True
 
 
 CASES = [
-    Case("CartPole", "CartPole-v1", 1, 1.0),
-    Case("CartPole", "CartPole-v1", 16, 1.5),
-    Case("CartPole", "CartPole-v1", 256, 4.0),
-    Case("CartPole", "CartPole-v1", 1024, 6.0),
-    Case("Acrobot", "Acrobot-v1", 256, 4.0),
-    Case("MountainCar", "MountainCar-v0", 256, 4.0),
-    Case("Pendulum", "Pendulum-v1", 256, 4.0),
-    Case("Hopper", "Hopper-v4", 64, 3.0),
-    Case("HalfCheetah", "HalfCheetah-v4", 256, 1.3, ends=False),
+    Case("CartPole", "CartPole-v1", "CartPole-v1", 1, 1.0, embedded=4.0),
+    Case("CartPole", "CartPole-v1", "CartPole-v1", 16, 1.5),
+    Case("CartPole", "CartPole-v1", "CartPole-v1", 256, 4.0),
+    Case("CartPole", "CartPole-v1", "CartPole-v1", 1024, 6.0),
+    Case("Acrobot", "Acrobot-v1", "Acrobot-v1", 256, 4.0),
+    Case("MountainCar", "MountainCar-v0", "MountainCar-v0", 256, 4.0),
+    Case("Pendulum", "Pendulum-v1", "Pendulum-v1", 256, 4.0),
+    Case("Hopper", "Hopper-v5", "Hopper-v4", 1, 1.0, embedded=1.5),
+    Case("Hopper", "Hopper-v5", "Hopper-v4", 64, 3.0),
+    Case("HalfCheetah", "HalfCheetah-v5", "HalfCheetah-v4", 256, 1.3, ends=False),
 ]
 
 
-def ours(case: Case, server: str | None, **settings: Any) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
-    """A batch of perturb's, at its first observations."""
-    envs = gymnasium.make_vec(
-        f"perturb/{case.name}-v{CATALOGUE[case.name].revision}", num_envs=case.num_envs, server=server, **settings
-    )
+def batch(envs: Any, kind: Any) -> Contender:
+    """A batch, at its first observations."""
+
+    def step(actions: Any) -> int:
+        _, _, terminated, truncated, _ = envs.step(actions)
+        return int(np.count_nonzero(terminated | truncated))
+
+    return Contender(step, envs.close, kind)
+
+
+def single(env: Any, kind: Any) -> Contender:
+    """One environment by itself, at its first observation."""
+
+    def step(actions: Any) -> int:
+        _, _, terminated, truncated, _ = env.step(actions[0])
+        if terminated or truncated:
+            env.reset()
+            return 1
+        return 0
+
+    return Contender(step, env.close, kind)
+
+
+def made(name: str, case: Case, **settings: Any) -> Contender:
+    """What Gymnasium makes of a name."""
+    kind = np.int64 if CATALOGUE[case.name].discrete else np.float32
+    if case.num_envs == 1:
+        env = gymnasium.make(name, **settings)
+        env.reset(seed=1)
+        return single(env, kind)
+    envs = gymnasium.make_vec(name, num_envs=case.num_envs, **settings)
     envs.reset(seed=1)
-    return envs
+    return batch(envs, kind)
 
 
-def in_halves(case: Case, server: str | None) -> tuple[Step, Callable[[], None]]:
+def in_halves(case: Case, server: str | None, kind: Any) -> Contender:
     """Two batches of half the size that take turns."""
     halves = [perturb.PerturbVectorEnv(case.name, case.num_envs // 2, server=server) for _ in range(2)]
     for i, half in enumerate(halves):
         half.reset(seed=1 + i * case.num_envs // 2)
         half.send(np.zeros(half.action_space.shape or (), half.action_space.dtype))
 
-    def step(actions: Any) -> Any:
-        got = []
+    def step(actions: Any) -> int:
+        ended = 0
         for half, part in zip(halves, np.split(actions, 2), strict=True):
-            got.append(half.recv())
+            _, _, terminated, truncated, _ = half.recv()
             half.send(part)
-        return None, None, *(np.concatenate([one[i] for one in got]) for i in (2, 3)), {}
+            ended += int(np.count_nonzero(terminated | truncated))
+        return ended
 
     def close() -> None:
         for half in halves:
             half.close()
 
-    return step, close
+    return Contender(step, close, kind)
 
 
-def contenders(case: Case, server: str | None) -> dict[str, tuple[Step, Callable[[], None], Any]]:
-    """By name: how it steps, how it ends, and the type of its actions."""
-    found: dict[str, tuple[Step, Callable[[], None], Any]] = {}
-    for name, settings in {"perturb": {}, "receipts=False": {"receipts": False}}.items():
-        envs = ours(case, server, **settings)
-        kind = np.int64 if CATALOGUE[case.name].discrete else np.float32
-        found[name] = (envs.step, envs.close, kind)
+def contenders(case: Case, server: str | None) -> dict[str, Contender]:
+    """All that are installed, by name."""
+    own = f"perturb/{case.name}-v{CATALOGUE[case.name].revision}"
+    found = {
+        "embedded": made(own, case, server="embedded"),
+        "private": made(own, case, server=server),
+        "receipts=False": made(own, case, server=server, receipts=False),
+    }
     if case.num_envs > 1:
-        step, close = in_halves(case, server)
-        found["send, recv"] = (step, close, kind)
+        found["send, recv"] = in_halves(case, server, found["private"].kind)
+    with contextlib.suppress(gymnasium.error.DependencyNotInstalled):
+        found["Gymnasium"] = made(case.gymnasium, case)
     if envpool is not None:
-        peer = envpool.make(case.peer, env_type="gymnasium", num_envs=case.num_envs, seed=1)
+        peer = envpool.make(case.envpool, env_type="gymnasium", num_envs=case.num_envs, seed=1)
         peer.reset()
-        found["EnvPool"] = (peer.step, peer.close, peer.action_space.dtype)
+        found["EnvPool"] = batch(peer, peer.action_space.dtype)
     return found
 
 
-def rate(step: Step, actions: list[Any], seconds: float) -> tuple[float, int]:
+def rate(contender: Contender, actions: Any, seconds: float) -> tuple[float, int]:
     """Steps of single environments a second, and how many episodes ended."""
     steps = ended = 0
+    rows = list(actions.astype(contender.kind))
     start = time.perf_counter()
     while (elapsed := time.perf_counter() - start) < seconds:
-        for _ in range(8):
-            _, _, terminated, truncated, _ = step(actions[steps % len(actions)])
-            ended += int(np.count_nonzero(terminated | truncated))
-            steps += 1
-    return steps * len(actions[0]) / elapsed, ended
+        for row in rows:
+            ended += contender.step(row)
+        steps += len(rows)
+    return steps * len(rows[0]) / elapsed, ended
 
 
 def measure(case: Case, server: str | None, rounds: int, seconds: float) -> dict[str, float]:
@@ -123,20 +167,27 @@ def measure(case: Case, server: str | None, rounds: int, seconds: float) -> dict
         low, high = np.array(description.actions).T
         drawn = rng.uniform(low, high, size=(64, case.num_envs, len(low)))
     rates: dict[str, list[float]] = {}
-    batches = contenders(case, server)
-    endings = dict.fromkeys(batches, 0)
-    for step, _, kind in batches.values():
-        rate(step, list(drawn.astype(kind)), seconds / 4)
+    found = contenders(case, server)
+    endings = dict.fromkeys(found, 0)
+    for contender in found.values():
+        rate(contender, drawn, seconds / 4)
     for _ in range(rounds):
-        for name, (step, _, kind) in batches.items():
-            measured, ended = rate(step, list(drawn.astype(kind)), seconds)
+        for name, contender in found.items():
+            measured, ended = rate(contender, drawn, seconds)
             rates.setdefault(name, []).append(measured)
             endings[name] += ended
-    for _, close, _ in batches.values():
-        close()
+    for contender in found.values():
+        contender.close()
     for name, ended in endings.items():
         assert ended > 0 or not case.ends, f"{name} ended no episode of {case.name}"
     return {name: statistics.median(results) for name, results in rates.items()}
+
+
+def compared(medians: dict[str, float], own: str, other: str, target: float | None) -> str:
+    """A ratio beside its target."""
+    if target is None or other not in medians:
+        return f"{'':15}"
+    return f"{medians[own] / medians[other]:9.2f} ({target:g})"
 
 
 def main() -> None:
@@ -149,15 +200,17 @@ def main() -> None:
     arguments = parser.parse_args()
 
     print("EnvPool is not installed: pip install envpool" if envpool is None else f"EnvPool {envpool.__version__}")
-    columns = ["EnvPool", "perturb", "receipts=False", "send, recv"]
-    print(f"{'steps/s':18} {''.join(f'{column:>15}' for column in columns)} {'perturb/EnvPool':>16} {'target':>7}")
+    columns = ["Gymnasium", "EnvPool", "embedded", "private", "receipts=False", "send, recv"]
+    ratios = f"{'embedded/Gymnasium':>20}{'private/EnvPool':>17}"
+    print(f"{'steps/s':18} {''.join(f'{column:>15}' for column in columns)}{ratios}")
     for case in CASES:
         if arguments.names and case.name not in arguments.names:
             continue
         medians = measure(case, arguments.server, arguments.rounds, arguments.seconds)
         numbers = "".join(f"{medians[column]:15,.0f}" if column in medians else f"{'':15}" for column in columns)
-        ratio = f"{medians['perturb'] / medians['EnvPool']:16.2f}" if "EnvPool" in medians else f"{'':16}"
-        print(f"{case.name:12}{case.num_envs:6} {numbers} {ratio} {case.target:7.1f}", flush=True)
+        beside_gymnasium = compared(medians, "embedded", "Gymnasium", case.embedded)
+        beside_envpool = compared(medians, "private", "EnvPool", case.private)
+        print(f"{case.name:12}{case.num_envs:6} {numbers}{beside_gymnasium:>20}{beside_envpool:>17}", flush=True)
 
 
 if __name__ == "__main__":

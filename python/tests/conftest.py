@@ -58,11 +58,25 @@ def _program() -> None:
 
 
 @pytest.fixture(scope="session")
-def server(_program: None) -> Iterator[str]:
-    """Give the address of a server that all tests share."""
+def server(request: pytest.FixtureRequest, _program: None) -> Iterator[str]:
+    """Give the address of a server that all tests share, or name the embedded server."""
+    if getattr(request, "param", None) == "embedded":
+        yield "embedded"
+        return
     running = Server()
     yield running.address
     running.end()
+
+
+# Tests of what a session does, which must not depend on the way to its server.
+BOTH_WAYS = {"bad_input", "changes", "disturbances", "faults", "halves", "infos", "observing", "options", "render"}
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run tests of sessions with a server on a socket and with the embedded one."""
+    of_a_session = metafunc.module.__name__.rpartition("test_")[2] in BOTH_WAYS
+    if "server" in metafunc.fixturenames and of_a_session and not metafunc.definition.get_closest_marker("socket"):
+        metafunc.parametrize("server", ["socket", "embedded"], indirect=True, scope="session")
 
 
 @pytest.fixture

@@ -179,6 +179,7 @@ def test_seeds_may_have_holes_as_in_gymnasiums_own(server: str) -> None:
     assert infos["_parameters"].all()
 
 
+@pytest.mark.socket
 def test_a_batch_beyond_the_servers_size_is_refused_at_once(server: str) -> None:
     for num_envs in (10**7, 10**9, 2**32 - 1):
         with pytest.raises(perturb.PerturbError, match=r"environments|num_envs|batch") as caught:

@@ -37,6 +37,7 @@ def test_the_package_has_the_version_of_the_server() -> None:
     assert perturb.__version__ == version[1]
 
 
+@pytest.mark.socket
 def test_the_catalogue_is_the_servers(server: str) -> None:
     served = json.loads(_native.catalogue(server, 10.0))["environments"]
     assert [environment["name"] for environment in served] == list(CATALOGUE)

@@ -19,6 +19,8 @@ pub(super) const INLINE_MAX_US: f64 = 20.0;
 /// This limit applies instead if no other session has stepped since this one did. No other session waits then, and up
 /// to this cost a second worker saves less than a hand-over costs.
 pub(super) const INLINE_MAX_US_UNCONTENDED: f64 = 80.0;
+/// Batches whose steps are at most this expensive are reset on the session's thread, too, µs. A reset costs a few steps.
+pub(super) const INLINE_RESET_MAX_US: f64 = 4.0;
 /// The maximum cost of a job for whose end the session polls before it sleeps, µs.
 const POLL_MAX_US: f64 = 50.0;
 /// The number of polls, which take about twice [`POLL_MAX_US`].

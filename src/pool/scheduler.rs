@@ -3,7 +3,7 @@
 use super::{
     Error,
     capacity::Capacity,
-    job::{Continuation, INLINE_MAX_US, INLINE_MAX_US_UNCONTENDED, Job},
+    job::{Continuation, INLINE_MAX_US, INLINE_MAX_US_UNCONTENDED, INLINE_RESET_MAX_US, Job},
     reaper::Reaper,
     rollout::task::RolloutTask,
     sync::lock,
@@ -155,12 +155,12 @@ impl StepScheduler {
     /// Runs a step of all shards on this thread if the job is cheap. Returns whether it did.
     pub(super) fn step_inline(&self, job: &Job) -> bool {
         let tiny = if self.mark_last_stepped(job) { INLINE_MAX_US_UNCONTENDED } else { INLINE_MAX_US };
-        if job.cost > tiny {
-            return false;
-        }
-        job.prepare();
-        (0..job.shards.len()).for_each(|shard| _ = job.run(shard));
-        true
+        run_inline(job, tiny)
+    }
+
+    /// Runs the resets of all shards on this thread if they are cheap. Returns whether it did.
+    pub(super) fn reset_inline(&self, job: &Job) -> bool {
+        run_inline(job, INLINE_RESET_MAX_US)
     }
 
     /// Queues a step of all shards for the workers. A pipelined step may follow.
@@ -298,4 +298,14 @@ impl StepScheduler {
             job.run(0);
         }
     }
+}
+
+/// Runs all shards on this thread if the job costs at most `max_us` µs. Returns whether it did.
+fn run_inline(job: &Job, max_us: f64) -> bool {
+    if job.cost > max_us {
+        return false;
+    }
+    job.prepare();
+    (0..job.shards.len()).for_each(|shard| _ = job.run(shard));
+    true
 }

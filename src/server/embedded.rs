@@ -101,7 +101,7 @@ impl EmbeddedSession {
         let request = match request.request {
             // A step has nothing but its actions, which the handler checks.
             Some(Request::Step(_)) => Ok(request),
-            _ => self.checked(request).await?,
+            _ => Box::pin(self.checked(request)).await?,
         };
         let answer = match request {
             Ok(request) => self.handler.answer(request).await,

@@ -3,10 +3,14 @@
 //! Numbers are copied once, out of the received message into memory of the array's own: within the message they lie at
 //! any address, where NumPy would be slow and PyTorch refuse them.
 
+use numpy::ndarray::Array2;
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
 use pyo3::prelude::*;
 
 use crate::failure::{MALFORMED, failure};
+
+/// Length of rows that are short.
+const MAX_SHORT_ROW: usize = 64;
 
 /// float32 `[n]`, to change.
 ///
@@ -21,7 +25,21 @@ pub fn floats<'py>(py: Python<'py>, data: &[u8], n: usize) -> PyResult<Bound<'py
 /// # Errors
 /// If there are more or fewer.
 pub fn rows<'py>(py: Python<'py>, data: &[u8], rows: usize, columns: usize) -> PyResult<Bound<'py, PyArray2<f32>>> {
-    PyArray1::from_vec(py, numbers(data, &[rows, columns])?).reshape([rows, columns])
+    let numbers = Array2::from_shape_vec([rows, columns], numbers(data, &[rows, columns])?);
+    Ok(PyArray2::from_owned_array(py, numbers.map_err(|error| failure(MALFORMED, 0, error.to_string()))?))
+}
+
+/// float32 `[n]` of few numbers, to change: memory of NumPy's costs less than a vector that it has to free.
+///
+/// # Errors
+/// If there are more or fewer.
+pub fn row<'py>(py: Python<'py>, data: &[u8], n: usize) -> PyResult<Bound<'py, PyArray1<f32>>> {
+    let (mut row, (words, rest)) = ([0.0; MAX_SHORT_ROW], data.as_chunks::<4>());
+    if words.len() != n || !rest.is_empty() || n > MAX_SHORT_ROW {
+        return floats(py, data, n);
+    }
+    row.iter_mut().zip(words).for_each(|(number, word)| *number = f32::from_le_bytes(*word));
+    Ok(PyArray1::from_slice(py, &row[..n]))
 }
 
 /// bool `[n]`, to change.

@@ -1,19 +1,50 @@
 //! The embedded server: the same pool and the same handler of sessions as in `perturb-server`, in this process.
 
 use std::collections::VecDeque;
-use std::future::Future;
-use std::pin::Pin;
+use std::future::{Future, poll_fn};
+use std::path::PathBuf;
+use std::pin::{Pin, pin};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::task::{Context, Poll, Waker};
 
+use perturb::env::Catalogue;
 use perturb::server::embedded as server;
 use perturb::tasks;
+#[cfg(feature = "mujoco")]
+use perturb::tasks::folder::{self, LoadError};
 use perturb_protocol::proto::{self, SessionRequest, SessionResponse, session_response::Response};
-use perturb_protocol::{TypedRequest, escape_lines};
+use perturb_protocol::{AdaptiveSpin, TypedRequest, escape_lines};
 use pyo3::prelude::*;
 use tonic::Status;
 
-use crate::failure::{LOST, MISMATCH, REFUSED, RequestFailure, UNREACHABLE, failure};
+use crate::failure::{INVALID, LOST, MISMATCH, REFUSED, RequestFailure, UNREACHABLE, failure};
+
+/// A task's folder, as Python names it: the program that loads it first, its path, and the digest of its files.
+type TaskFolder = (PathBuf, PathBuf, String);
+
+/// Catalogues with the task of a folder, by its path and digest. What a folder holds stays in memory until the process
+/// ends, so each is loaded once.
+#[cfg(feature = "mujoco")]
+static LOADED: Mutex<Vec<((PathBuf, String), Catalogue)>> = Mutex::new(Vec::new());
+
+#[cfg(feature = "mujoco")]
+fn catalogue_with((program, path, digest): TaskFolder) -> PyResult<Catalogue> {
+    let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
+    let key = (path, digest);
+    if let Some((_, catalogue)) = loaded.iter().find(|(other, _)| *other == key) {
+        return Ok(catalogue.clone());
+    }
+    let refused = |error: LoadError| failure(INVALID, 0, error.to_string());
+    folder::child::check(&program, &key.0, false).map_err(refused)?;
+    let catalogue = tasks::catalogue_with(std::slice::from_ref(&key.0)).map_err(refused)?;
+    loaded.push((key, catalogue.clone()));
+    Ok(catalogue)
+}
+
+#[cfg(not(feature = "mujoco"))]
+fn catalogue_with(_: TaskFolder) -> PyResult<Catalogue> {
+    Err(failure(INVALID, 0, "this package was built without MuJoCo, which task= needs here: leave server= out"))
+}
 
 /// A server of this process. Sessions end with it.
 #[pyclass(frozen, module = "perturb._native")]
@@ -26,11 +57,15 @@ pub struct NativeServer {
 
 #[pymethods]
 impl NativeServer {
-    /// Starts the server's threads.
+    /// Starts the server's threads. It also serves the task of a folder, which `program`, a perturb-server, loads first,
+    /// since a model may end the process that loads it.
     #[new]
-    fn new(py: Python<'_>) -> PyResult<Self> {
-        let started = py.detach(|| server::EmbeddedServer::start(tasks::catalogue()));
-        let server = started.map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
+    #[pyo3(signature = (task = None))]
+    fn new(py: Python<'_>, task: Option<TaskFolder>) -> PyResult<Self> {
+        let server = py.detach(|| {
+            let catalogue = task.map_or_else(|| Ok(tasks::catalogue()), catalogue_with)?;
+            server::EmbeddedServer::start(catalogue).map_err(|error| failure(UNREACHABLE, 0, error.to_string()))
+        })?;
         Ok(Self { server: Mutex::new(Some(Arc::new(server))), owner: std::process::id() })
     }
 
@@ -75,6 +110,8 @@ pub struct EmbeddedStream {
     waiting: VecDeque<SessionRequest>,
     /// Answers that nobody has taken.
     answers: VecDeque<Answer>,
+    /// Waiting for the workers.
+    spin: AdaptiveSpin,
 }
 
 impl EmbeddedStream {
@@ -85,7 +122,14 @@ impl EmbeddedStream {
     pub fn new(server: &Weak<server::EmbeddedServer>) -> PyResult<Self> {
         let server = server.upgrade().ok_or_else(|| failure(UNREACHABLE, 0, "the embedded server was closed"))?;
         let session = Some(server.session());
-        Ok(Self { session, running: None, offer: None, waiting: VecDeque::new(), answers: VecDeque::new() })
+        Ok(Self {
+            session,
+            running: None,
+            offer: None,
+            waiting: VecDeque::new(),
+            answers: VecDeque::new(),
+            spin: AdaptiveSpin::default(),
+        })
     }
 
     /// Makes a request and takes its reply. No step may be under way.
@@ -94,7 +138,12 @@ impl EmbeddedStream {
     /// [`RequestFailure`].
     pub async fn ask<A: TypedRequest>(&mut self, request: A) -> Result<A::Reply, RequestFailure> {
         let session = self.session.as_mut().ok_or_else(defect)?;
-        reply::<A>(session.answer(SessionRequest { request: Some(request.into()) }).await)
+        let mut answer = pin!(session.answer(SessionRequest { request: Some(request.into()) }));
+        let now = poll_fn(|context| Poll::Ready(answer.as_mut().poll(context))).await;
+        reply::<A>(match now {
+            Poll::Ready(answer) => answer,
+            Poll::Pending => self.spin.until(answer).await,
+        })
     }
 
     /// Begins a step, or has it wait for those before it. Needs the context of a runtime.
@@ -113,7 +162,8 @@ impl EmbeddedStream {
         if let Some(answer) = self.answers.pop_front() {
             return reply::<A>(answer);
         }
-        let (session, answer) = self.running.as_mut().ok_or_else(defect)?.await;
+        let running = self.running.as_mut().ok_or_else(defect)?;
+        let (session, answer) = self.spin.until(running).await;
         (self.session, self.running, self.offer) = (Some(session), None, None);
         self.advance();
         reply::<A>(answer)

@@ -190,7 +190,7 @@ impl Events {
 #[pymethods]
 impl Events {
     /// Infos of one environment by itself.
-    fn single<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+    pub fn single<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let (info, known) = (PyDict::new(py), &self.labels.known);
         if !self.reward_terms.is_empty() {
             let named = PyDict::new(py);

@@ -1,6 +1,7 @@
 """Types of the native module, python/native."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -38,7 +39,7 @@ Stepped: TypeAlias = tuple[
 class NativeServer:
     """A server of this process. Sessions end with it."""
 
-    def __init__(self) -> None: ...
+    def __init__(self, task: tuple[Path, str, str] | None = None) -> None: ...
     def close(self) -> None: ...
 
 class Session:
@@ -77,6 +78,9 @@ class Session:
         observe_parameters: bool,
     ) -> Opened: ...
     def step(self, actions: Any, encode: Callable[[Any], bytes]) -> Stepped: ...
+    def step_single(
+        self, action: Any, encode: Callable[[Any], bytes]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]: ...
     def send(self, actions: Any, encode: Callable[[Any], bytes]) -> None: ...
     def recv(self) -> Stepped: ...
     def reset(

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from . import _native
 from .address import EMBEDDED
-from .errors import ServerStartError
+from .errors import InvalidArgumentError, ServerStartError
+from .local_server import find_program
 
 if TYPE_CHECKING:
     from .local_server import TaskFolder
@@ -28,9 +29,13 @@ class EmbeddedServer:
         self.users = 0
         try:
             with loading:
-                self.native = _native.NativeServer()
+                # A model may end the process that loads it, so that the program does it first.
+                self.native = _native.NativeServer(None if task is None else (find_program(), task.path, task.files))
         except _native.Failure as error:
-            raise ServerStartError(f"the embedded server did not start: {error.args[2]}") from None
+            kind, _, words = error.args
+            if kind == "invalid":
+                raise InvalidArgumentError(words) from None
+            raise ServerStartError(f"the embedded server did not start: {words}") from None
 
     def end(self) -> None:
         """End the server's threads. Its sessions should be closed."""

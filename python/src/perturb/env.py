@@ -32,7 +32,7 @@ class PerturbEnv(CheckedAttributes, gymnasium.Env[NDArray[np.float32], Any]):
         environment: a name of docs/environments.md, such as `CartPole`; with `task` its name, or None.
         version: where parameters come from: `D` their defaults, `R` random, `E` extreme, `R+E` one of
             both, each in half of the trials.
-        server: `unix:/path` or `host:port`; None starts a server of this process's own.
+        server: `unix:/path`, `host:port`, or `embedded` for one in this process; None starts a private server.
         task: the folder of a task, which the server of this process's own then serves; see docs/tasks.md. The
             environment is that of the folder.
         parameters: replaces the version's set of the named parameters: a value, an interval `(low, high)`, or several
@@ -166,9 +166,8 @@ class PerturbEnv(CheckedAttributes, gymnasium.Env[NDArray[np.float32], Any]):
             OutOfOrderError: before the first reset, and after the end of an episode.
             ServerConnectionError, ServerTimeoutError: and the environment is gone.
         """
-        observations, rewards, terminated, truncated, events = self._client.session.step(action, self._encode)
-        info = {} if events is None else events.single()
-        return observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
+        client = self._client
+        return (client._session or client.session).step_single(action, self._encode)
 
     def snapshot(self) -> bytes:
         """Save the environment whole: physics, parameters, counters, random streams."""

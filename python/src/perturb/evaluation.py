@@ -90,7 +90,7 @@ def evaluate(
             it, and is refused if it was trained under one. With a mapping of policies, a mapping, too.
         name: the policy's name in records and reports. By default records have its id, its kind with a checksum of its
             weights, or its function, and reports have its kind.
-        server: `unix:/path` or `host:port`; None starts a server of this process's own.
+        server: `unix:/path`, `host:port`, or `embedded` for one in this process; None starts a private server.
         task: the folder of a task, which the server of this process's own then serves; see docs/tasks.md.
         timeout: how long a reply may take, s.
         progress: whether to show on standard error how many episodes were played; by default on a terminal only.

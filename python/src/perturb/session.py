@@ -150,6 +150,15 @@ class Session:
         """Advance every environment."""
         return self._call("step", self._native.step, actions, encode)
 
+    def step_single(
+        self, action: Any, encode: Callable[[Any], bytes]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Advance an environment by itself: observation [O], reward, both flags, and the info."""
+        try:  # not by _call, which takes long beside a step without a connection
+            return self._native.step_single(action, encode)
+        except BaseException as error:  # noqa: BLE001
+            raise self._failed("step", error) from None
+
     def send(self, actions: Any, encode: Callable[[Any], bytes]) -> None:
         """Ask for a step, whose outcome `recv` gives."""
         self._call("step", self._native.send, actions, encode)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from . import requests
+from .address import EMBEDDED
 from .errors import InvalidArgumentError, PerturbError, ServerStartError
 from .local_server import find_program as find_server
 from .policy import Policy, load_policy
@@ -85,6 +86,11 @@ def train(
         ServerStartError: if the program is not there.
         PerturbError: if the training fails, with the program's words.
     """
+    if server is not None and str(server) == EMBEDDED.target:
+        raise InvalidArgumentError(
+            f"server={server!r} is for environments and tests in this process, and another program trains: leave "
+            "server= out, which starts a private server"
+        )
     program = _find_program()
     command = [program, "--quiet", "train", "--env", str(environment), "--version", requests.version(version)]
     command += ["--algorithm", str(algorithm), "--seed", str(requests.seed(seed))]

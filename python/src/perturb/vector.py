@@ -37,8 +37,8 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         num_envs: N.
         version: where parameters come from: `D` their defaults, `R` random, `E` extreme, `R+E` one of
             both, each in half of the trials.
-        server: `unix:/path` or `host:port`; None starts a server of this process's own.
-        task: the folder of a task, which the server of this process's own then serves; see docs/tasks.md. The
+        server: `unix:/path`, `host:port`, or `embedded` for one in this process; None starts a private server.
+        task: the folder of a task, which the private or the embedded server then serves; see docs/tasks.md. The
             environment is that of the folder.
         parameters: replaces the version's set of the named parameters: a value, an interval `(low, high)`, or several
             `[(low, high), …]`.

@@ -19,7 +19,7 @@ use numpy::{PyArray1, PyArray2, PyArray3};
 use perturb_protocol::proto;
 use perturb_protocol::{Address, ClientError, Timeouts, check_observations, check_step, connect};
 use pyo3::prelude::*;
-use pyo3::types::PyBytes;
+use pyo3::types::{PyBytes, PyDict};
 
 use crate::arrays;
 use crate::embedded::poll_once;
@@ -43,6 +43,9 @@ type StepArrays<'py> = (
     Bound<'py, PyArray1<bool>>,
     Option<Events>,
 );
+
+/// The outcome of a step of an environment by itself: observation, reward, both flags, and the info.
+type SingleStep<'py> = (Bound<'py, PyArray1<f32>>, f64, bool, bool, Bound<'py, PyDict>);
 
 /// A session of a server, which owns a batch of environments.
 #[pyclass(frozen, module = "perturb._native")]
@@ -221,6 +224,28 @@ impl Session {
         self.stepped(py, &labels, stepped)
     }
 
+    /// Advances an environment by itself: observation `[O]`, reward, both flags, and the info.
+    fn step_single<'py>(
+        &self,
+        py: Python<'py>,
+        action: &Bound<'py, PyAny>,
+        encode: &Bound<'py, PyAny>,
+    ) -> PyResult<SingleStep<'py>> {
+        let request = proto::Step { actions: self.actions.encode(action, encode)? };
+        let open = self.take(0)?;
+        let (labels, stepped) = self.ask(py, open, request)?;
+        self.note(&stepped)?;
+        let observation = arrays::row(py, &stepped.observations, self.observation_size)?;
+        let reward = stepped.rewards.as_chunks::<4>().0.first().map_or(f32::NAN, |word| f32::from_le_bytes(*word));
+        let flag = |flags: &Bytes| flags.first().is_some_and(|&flag| flag != 0);
+        let (terminated, truncated) = (flag(&stepped.terminated), flag(&stepped.truncated));
+        let info = match Events::stepped(&labels, stepped, self.observation_size)? {
+            Some(events) => events.single(py)?,
+            None => PyDict::new(py),
+        };
+        Ok((observation, reward.into(), terminated, truncated, info))
+    }
+
     /// The first half of a step: sends the actions, and waits for nothing.
     fn send(&self, py: Python<'_>, actions: &Bound<'_, PyAny>, encode: &Bound<'_, PyAny>) -> PyResult<()> {
         let request = proto::Step { actions: self.actions.encode(actions, encode)? };
@@ -381,6 +406,17 @@ impl Session {
         arrays::rows(py, &last.observations, self.actions.num_envs, self.observation_size)
     }
 
+    /// Checks the reply to a step, and keeps what later replies are merged with.
+    fn note(&self, stepped: &proto::Stepped) -> PyResult<()> {
+        check_step(stepped, self.actions.num_envs, self.observation_size).map_err(|error| malformed(&error))?;
+        *unpoisoned(&self.last) = LastStep {
+            observations: stepped.observations.clone(),
+            terminated: stepped.terminated.clone(),
+            truncated: stepped.truncated.clone(),
+        };
+        Ok(())
+    }
+
     fn stepped<'py>(
         &self,
         py: Python<'py>,
@@ -388,12 +424,7 @@ impl Session {
         stepped: proto::Stepped,
     ) -> PyResult<StepArrays<'py>> {
         let n = self.actions.num_envs;
-        check_step(&stepped, n, self.observation_size).map_err(|error| malformed(&error))?;
-        *unpoisoned(&self.last) = LastStep {
-            observations: stepped.observations.clone(),
-            terminated: stepped.terminated.clone(),
-            truncated: stepped.truncated.clone(),
-        };
+        self.note(&stepped)?;
         Ok((
             arrays::rows(py, &stepped.observations, n, self.observation_size)?,
             arrays::floats(py, &stepped.rewards, n)?,

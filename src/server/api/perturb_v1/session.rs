@@ -308,17 +308,18 @@ impl SessionHandler for Session {
     }
 
     async fn answer(&mut self, request: Self::Request) -> Result<SessionReply, Error> {
+        // A future is as large as the largest within it, and is moved: a step pays for no other request.
         match request.request {
-            Some(Request::Open(open)) => self.open(open).await,
+            Some(Request::Open(open)) => Box::pin(self.open(open)).await,
             Some(Request::Step(step)) => self.step(step).await,
-            Some(Request::Reset(reset)) => self.reset(reset).await,
-            Some(Request::Snapshot(snapshot)) => self.snapshot(snapshot).await,
-            Some(Request::Restore(restore)) => self.restore(restore).await,
-            Some(Request::Render(render)) => self.render(render).await,
-            Some(Request::Release(release)) => self.release(release).await,
-            Some(Request::Act(act)) => self.act(act).await,
+            Some(Request::Reset(reset)) => Box::pin(self.reset(reset)).await,
+            Some(Request::Snapshot(snapshot)) => Box::pin(self.snapshot(snapshot)).await,
+            Some(Request::Restore(restore)) => Box::pin(self.restore(restore)).await,
+            Some(Request::Render(render)) => Box::pin(self.render(render)).await,
+            Some(Request::Release(release)) => Box::pin(self.release(release)).await,
+            Some(Request::Act(act)) => Box::pin(self.act(act)).await,
             Some(Request::SavePlayer(_)) => self.save_player(),
-            Some(Request::Resume(resume)) => self.resume(resume).await,
+            Some(Request::Resume(resume)) => Box::pin(self.resume(resume)).await,
             None => Err(Error::value("request", "empty or of a kind this server does not know", "open, step, …")),
         }
     }
