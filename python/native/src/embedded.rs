@@ -132,6 +132,17 @@ impl EmbeddedStream {
         })
     }
 
+    /// Makes a request, or none if it was sent before, and takes the reply.
+    ///
+    /// # Errors
+    /// [`RequestFailure`].
+    pub async fn exchange<A: TypedRequest>(&mut self, request: Option<A>) -> Result<A::Reply, RequestFailure> {
+        match request {
+            Some(request) => self.ask(request).await,
+            None => self.receive::<A>().await,
+        }
+    }
+
     /// Makes a request and takes its reply. No step may be under way.
     ///
     /// # Errors
@@ -158,7 +169,7 @@ impl EmbeddedStream {
     ///
     /// # Errors
     /// [`RequestFailure`].
-    pub async fn receive<A: TypedRequest>(&mut self) -> Result<A::Reply, RequestFailure> {
+    async fn receive<A: TypedRequest>(&mut self) -> Result<A::Reply, RequestFailure> {
         if let Some(answer) = self.answers.pop_front() {
             return reply::<A>(answer);
         }

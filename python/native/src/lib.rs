@@ -48,7 +48,7 @@ mod _native {
     #[pymodule_export]
     use super::records::{Records, metrics, published, read_results, wilson};
     #[pymodule_export]
-    use super::session::{Session, catalogue};
+    use super::session::{Session, catalogue, note_fork};
     #[pymodule_export]
     use super::sets::{heatmap_contexts, make_set, read_csv_set, read_sets};
     #[pymodule_export]

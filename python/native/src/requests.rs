@@ -6,7 +6,8 @@ use bytes::Bytes;
 use numpy::{Element, PyArrayDyn, PyArrayMethods, PyUntypedArrayMethods};
 use perturb_protocol::{Version, proto};
 use pyo3::prelude::*;
-use pyo3::types::{PyBool, PyBytes, PyInt};
+use pyo3::sync::PyOnceLock;
+use pyo3::types::{PyBytes, PyInt, PyType};
 
 use crate::failure::{INVALID, failure};
 
@@ -75,7 +76,7 @@ impl Actions {
     }
 
     fn choices(&self, actions: &Bound<'_, PyAny>) -> Option<Bytes> {
-        if self.single && actions.is_exact_instance_of::<PyInt>() && !actions.is_instance_of::<PyBool>() {
+        if self.single && is_integer(actions) {
             return Some(Bytes::copy_from_slice(&actions.extract::<i32>().ok()?.to_le_bytes()));
         }
         self.read(actions, |choice: i64| i32::try_from(choice).ok().map(i32::to_le_bytes))
@@ -101,4 +102,13 @@ impl Actions {
         }
         Some(bytes.into())
     }
+}
+
+/// Whether this is one of Python's or NumPy's integers, which policies mostly give; a truth value is none.
+fn is_integer(action: &Bound<'_, PyAny>) -> bool {
+    static NUMPY_INTEGER: PyOnceLock<Py<PyType>> = PyOnceLock::new();
+    action.is_exact_instance_of::<PyInt>()
+        || NUMPY_INTEGER
+            .import(action.py(), "numpy", "integer")
+            .is_ok_and(|integer| action.is_instance(integer).unwrap_or(false))
 }

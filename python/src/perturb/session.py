@@ -403,5 +403,6 @@ def _at_exit() -> None:
     _close_unclosed()
 
 
+os.register_at_fork(after_in_child=_native.note_fork)
 os.register_at_fork(after_in_child=_after_fork_in_child)
 atexit.register(_at_exit)  # runs before the private server is ended, which was registered before

@@ -1,6 +1,7 @@
 //! Exchange of requests and replies by one thread of the process that opened the stream.
 
 use std::pin::pin;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -8,11 +9,20 @@ use perturb_protocol::TypedRequest;
 use pyo3::prelude::*;
 
 use super::Session;
-use super::transport::Transport;
+use super::transport::{SessionServer, Transport};
 use crate::embedded::poll_once;
 use crate::failure::{RequestFailure, TIMED_OUT, UNUSABLE, failure};
 use crate::infos::InfoKeys;
 use crate::session_runtime::{SessionRuntime, WaitError};
+
+/// Number of forks between this process and the one that loaded the module.
+pub(super) static FORKS: AtomicU32 = AtomicU32::new(0);
+
+/// Notes that this process was forked.
+#[pyfunction]
+pub fn note_fork() {
+    FORKS.fetch_add(1, Ordering::Relaxed);
+}
 
 /// SessionState of a session.
 pub(super) enum SessionState {
@@ -49,7 +59,12 @@ impl Session {
 
     /// A forked process leaves the parent's session alone, and its locks, which may be locked for ever.
     pub(super) fn require_own(&self) -> PyResult<()> {
-        if std::process::id() == self.owner {
+        let is_own = match self.server {
+            SessionServer::Address(..) => std::process::id() == self.owner,
+            // To ask the system takes a tenth of a small step.
+            SessionServer::Embedded(_) => self.forks == FORKS.load(Ordering::Relaxed),
+        };
+        if is_own {
             return Ok(());
         }
         Err(failure(UNUSABLE, 0, "another process opened the session"))
@@ -127,14 +142,19 @@ impl Session {
         A::Reply: Send,
     {
         let OpenSession { transport, runtime, labels, .. } = &mut *open;
-        let (labels, is_embedded) = (Arc::clone(labels), transport.is_embedded());
-        let come = {
-            let mut pending = pin!(transport.exchange(request));
-            // An embedded server is mostly done at once.
-            let come = if is_embedded { runtime.now(py, || poll_once(pending.as_mut())) } else { None };
-            match come {
-                Some(come) => Ok(come),
-                None => runtime.wait(py, pending, self.deadline(), &self.closing),
+        let labels = Arc::clone(labels);
+        // A future for both would be as large as the larger one, and is moved.
+        let come = match transport {
+            Transport::Stream { stream, .. } => {
+                let pending = pin!(Transport::exchange(stream, request));
+                runtime.wait(py, pending, self.deadline(), &self.closing)
+            }
+            Transport::Embedded(stream) => {
+                let mut pending = pin!(stream.exchange(request));
+                match runtime.now(py, || poll_once(pending.as_mut())) {
+                    Some(come) => Ok(come),
+                    None => runtime.wait(py, pending, self.deadline(), &self.closing),
+                }
             }
         };
         match come {

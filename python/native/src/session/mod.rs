@@ -11,6 +11,7 @@ mod transport;
 
 use std::pin::pin;
 use std::str::FromStr;
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -27,9 +28,10 @@ use crate::failure::{self, INVALID, MALFORMED, RequestFailure, UNREACHABLE, UNUS
 use crate::infos::{Events, InfoKeys};
 use crate::requests::{self, Actions, IntervalsByName};
 use crate::session_runtime::{CloseSignal, SessionRuntime};
-use exchange::{OpenSession, OpeningGuard, SessionState, duration, explain, unpoisoned};
+use exchange::{FORKS, OpenSession, OpeningGuard, SessionState, duration, explain, unpoisoned};
 use transport::SessionServer;
 
+pub use exchange::note_fork;
 pub use opened::Opened;
 pub use transport::NamedServer;
 
@@ -56,8 +58,9 @@ pub struct Session {
     actions: Actions,
     /// O.
     observation_size: usize,
-    /// The process that made it.
+    /// The process that made it, and the forks before that.
     owner: u32,
+    forks: u32,
     closing: Arc<CloseSignal>,
     state: Mutex<SessionState>,
     last: Mutex<LastStep>,
@@ -100,6 +103,7 @@ impl Session {
             actions: Actions { num_envs, size: action_size, single },
             observation_size,
             owner: std::process::id(),
+            forks: FORKS.load(Ordering::Relaxed),
             closing: Arc::default(),
             state: Mutex::new(SessionState::New),
             last: Mutex::default(),

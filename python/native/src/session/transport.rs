@@ -74,12 +74,13 @@ impl Transport {
     }
 
     /// Sends a request, or none if it was sent before, and takes the reply.
-    pub(super) async fn exchange<A: TypedRequest>(&mut self, request: Option<A>) -> Result<A::Reply, RequestFailure> {
-        match (self, request) {
-            (Self::Stream { stream, .. }, Some(request)) => stream.ask(request).await.map_err(failed),
-            (Self::Stream { stream, .. }, None) => stream.receive::<A>().await.map_err(failed),
-            (Self::Embedded(stream), Some(request)) => stream.ask(request).await,
-            (Self::Embedded(stream), None) => stream.receive::<A>().await,
+    pub(super) async fn exchange<A: TypedRequest>(
+        stream: &mut Stream,
+        request: Option<A>,
+    ) -> Result<A::Reply, RequestFailure> {
+        match request {
+            Some(request) => stream.ask(request).await.map_err(failed),
+            None => stream.receive::<A>().await.map_err(failed),
         }
     }
 
