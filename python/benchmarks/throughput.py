@@ -1,9 +1,9 @@
 """Steps per second of perturb's embedded and private servers, beside Gymnasium's environments and EnvPool's.
 
-All in one run, in turns, so that whatever else the machine does falls on all of them. Printed are medians of the
-rounds; a ratio stands beside what it should at least be. Everybody takes the same random actions. One environment by
-itself is made by `gymnasium.make`, and reset when its episode ends; a batch by `make_vec`. In the column `send, recv`
-two batches of half the size take turns. The column of a package that is not installed is empty.
+The contenders take turns in one run, so that other load on the machine falls on all of them. The table has medians of
+the rounds, and each ratio beside its least permitted value. All contenders take the same random actions. A single
+environment is made by `gymnasium.make`, and reset when its episode ends; a batch by `make_vec`. In the column
+`send, recv` two batches of half the size take turns. The column of a package that is not installed is empty.
 Run: python throughput.py [--rounds 5] [--seconds 0.5] [--server unix:/path] [CartPole …]
 """
 

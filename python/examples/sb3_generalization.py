@@ -1,4 +1,4 @@
-"""Train on one version, test on all three: how far does a policy carry? With stable-baselines3.
+"""Train with stable-baselines3 on one version, and test on all three: does the policy generalise?
 
 Run: python sb3_generalization.py [--environment Pendulum] [--train D] [--steps 50000]
 """

@@ -1,6 +1,6 @@
-"""A simple policy on poles of many lengths: one batch, in which each environment has another pole. Needs nothing more.
+"""A simple policy on poles of many lengths: one batch, with another length in each environment. Needs only the package.
 
-Every environment of a batch may have parameters of its own: reset it by a mask. All begin in the same state.
+Each environment of a batch may have its own parameters: select it by a mask at a reset. All begin in the same state.
 Run: python sweep.py [--server unix:/path]
 """
 

@@ -2,9 +2,9 @@
 
     python -m tests.interrupted ADDRESS PID TIMES
 
-with a server's address and process, which is stopped and continued. After each interrupt the environments go on where
-they were, or say that they are gone and begin anew. Anything else ends the program with an error, as does a round that
-takes too long. Prints, as JSON, how often they did either, and the longest time in which an interrupt had not come, s.
+The arguments are a server's address and its process, which is stopped and continued. After each interrupt the
+environments either continue or say that they are gone and begin anew. Anything else, or a round that takes too long,
+ends the program with an error. Prints, as JSON, how often either happened, and the longest delay of an interrupt, s.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Stepping:
         self._begin()
 
     def go(self) -> None:
-        """Step, for ever."""
+        """Step without end."""
         while True:
             if self.place >= STEPS:
                 self._begin()

@@ -55,7 +55,7 @@ def python(*arguments: str) -> subprocess.Popen[str]:
 
 
 def output_of(*arguments: str, seconds: float = 60) -> tuple[str, str]:
-    """What another Python writes to its output and as errors, if it ends in time."""
+    """Return the output and the errors of another Python, if it ends in time."""
     process = python(*arguments)
     try:
         return process.communicate(timeout=seconds)
@@ -66,7 +66,7 @@ def output_of(*arguments: str, seconds: float = 60) -> tuple[str, str]:
 
 
 def freeze(pid: int) -> None:
-    """Stop every thread of the process, until which it may still answer; SIGCONT lets it go on."""
+    """Stop the process and wait until every thread stands. SIGCONT continues it."""
     os.kill(pid, signal.SIGSTOP)
     threads = [thread / "stat" for thread in Path(f"/proc/{pid}/task").iterdir()]
     wait_until(lambda: all(thread.read_text().rpartition(")")[2].split()[0] == "T" for thread in threads))

@@ -1,4 +1,6 @@
-"""stable-baselines3 takes the environments as they are. Minutes, and gigabytes of PyTorch: `make python-acceptance`."""
+"""stable-baselines3 trains on the environments without wrappers.
+
+`make python-acceptance` runs these tests; they take minutes and download gigabytes of PyTorch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Policies of all kinds in the tests of `perturb evaluate`, and what is said of them."""
+"""Policies of all kinds in the tests of `perturb evaluate`, and their figures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is wrong is refused with what came and what was expected, and changes nothing."""
+"""Bad input is refused and changes nothing. The message says what came and what was expected."""
 
 from __future__ import annotations
 

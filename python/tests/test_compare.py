@@ -1,4 +1,4 @@
-"""Conditions compared: the numbers are those of a script with pandas over the recorded episodes."""
+"""Comparisons of conditions have the numbers that a script with pandas computes from the recorded episodes."""
 
 from __future__ import annotations
 

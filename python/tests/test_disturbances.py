@@ -40,7 +40,7 @@ def test_delays_agree_with_gymnasiums_wrapper(server: str) -> None:
 
 
 class RecordedSticky(StickyAction[np.ndarray, np.ndarray]):
-    """Gymnasium's wrapper with the decisions of an episode's stream, by docs/disturbances.md, instead of its own."""
+    """Gymnasium's wrapper, with decisions of an episode's stream (docs/disturbances.md) instead of its draws."""
 
     def __init__(self, environment: gym.Env[np.ndarray, np.ndarray], probability: float, seed: int) -> None:
         super().__init__(environment, probability)

@@ -94,7 +94,7 @@ def test_a_copied_batch_plays_the_same_episodes_after_a_reset(server: str) -> No
     assert infos["parameters"]["mass"][0] == 1.2
     third.close()
     batch.restore(batch.snapshot())
-    with pytest.raises(perturb.OutOfOrderError, match="a snapshot was restored"):
+    with pytest.raises(perturb.OutOfOrderError, match="after a snapshot was restored"):
         pickle.dumps(batch)
     batch.close()
     other.close()

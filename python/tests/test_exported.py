@@ -82,7 +82,7 @@ def recurrent(environment: str, folder: Path, server: str) -> perturb.Policy:
 
 @pytest.mark.parametrize("environment", ["CartPole", "Pendulum"])
 def test_recurrent_exports_remember_as_the_policy(environment: str, tmp_path: Path, server: str) -> None:
-    """A thousand steps in ten episodes: the random numbers of a step are those of another actor's."""
+    """A thousand steps in ten episodes. Another actor with the same seed gives the random numbers of each step."""
     torch = pytest.importorskip("torch")
     pytest.importorskip("onnx")
     policy = recurrent(environment, tmp_path / "run", server)

@@ -133,7 +133,7 @@ def test_parameters_of_a_snapshot_are_not_forgotten_silently(start_server: Calla
         start_server(listen=listen)
         with pytest.raises(perturb.ServerConnectionError):
             envs.step(np.zeros(2, dtype=np.int64))
-        with pytest.raises(perturb.OutOfOrderError, match="make the environments anew"):
+        with pytest.raises(perturb.OutOfOrderError, match="make the environments again"):
             envs.reset(seed=1)
 
 
@@ -156,7 +156,7 @@ def test_a_restore_that_is_refused_changes_nothing(how: str, start_server: Calla
         if how == "refused":
             assert env.reset(seed=1)[0].tobytes() == expected.tobytes()
         else:
-            with pytest.raises(perturb.OutOfOrderError, match="make the environments anew"):
+            with pytest.raises(perturb.OutOfOrderError, match="make the environments again"):
                 env.reset(seed=1)
 
 

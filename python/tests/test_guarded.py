@@ -1,4 +1,4 @@
-"""Servers that ask who comes: who has what they ask for plays as at an open socket, others are told what is missing."""
+"""Servers that require tokens or certificates: a client without them learns what is missing, others play as usual."""
 
 from __future__ import annotations
 
@@ -84,13 +84,13 @@ def flags(asks: Files, folder: Path) -> list[str]:
 
 @pytest.fixture
 def start(folder: Path, start_server: Callable[..., Server]) -> Callable[[Files], str]:
-    """Start servers that ask for something; gives their addresses."""
+    """Start servers that require tokens or certificates; gives their addresses."""
     return lambda asks: start_server(*flags(asks, folder), listen="tcp://127.0.0.1:0").address
 
 
 @pytest.fixture(scope="module")
 def guarded(folder: Path, _program: None) -> Iterator[str]:
-    """Give the address of a server that asks for everything."""
+    """Give the address of a server that requires a token and a client's certificate."""
     running = Server(*flags(MUTUAL_TLS | TOKENS, folder), listen="tcp://127.0.0.1:0")
     yield running.address
     running.end()
@@ -98,7 +98,7 @@ def guarded(folder: Path, _program: None) -> Iterator[str]:
 
 @pytest.fixture(autouse=True)
 def have(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Files], None]:
-    """Let this process have these files, and no others; at first none."""
+    """Give this process these files and no others; at first none."""
 
     def have(files: Files) -> None:
         for variable in (*ALL, "PERTURB_INSECURE"):
@@ -173,13 +173,13 @@ def test_who_has_what_is_asked_for_plays_as_at_an_open_socket(
         ),
         pytest.param(
             IDENTITY,
-            "the server at {address} does not let this process in: this server asks for a token, and none came; ask "
+            "the server at {address} refuses this process: this server asks for a token, and none came; ask "
             "who runs it for one, and name the file that has it in PERTURB_TOKEN_FILE",
             id="no-token",
         ),
         pytest.param(
             ALL | {"PERTURB_TOKEN_FILE": "another"},
-            "the server at {address} does not let this process in: this server does not know the token that came; ask "
+            "the server at {address} refuses this process: this server does not know the token that came; ask "
             "who runs it for one that is good",
             id="wrong-token",
         ),
@@ -293,7 +293,7 @@ def test_a_token_that_is_taken_out_ends_its_sessions(
     tokens.write_text(TOKENS_TOML.replace("correct-horse", "another-horse"))
     with (
         within(SECONDS),
-        pytest.raises(perturb.ServerConnectionError, match='does not let this process in: the token "ann" was revoked'),
+        pytest.raises(perturb.ServerConnectionError, match='refuses this process: the token "ann" was revoked'),
     ):
         step_until_told(envs)
     with pytest.raises(perturb.OutOfOrderError, match=r"call reset\(\) to begin anew.* was revoked"):

@@ -1,4 +1,4 @@
-"""What Gymnasium expects of environments, and users of Gymnasium."""
+"""Rules of Gymnasium for environments, and habits of its users."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_the_papers_ids_are_the_versions(name: str, server: str) -> None:
 
 
 def run(envs: gymnasium.vector.VectorEnv[Any, Any, Any], steps: int) -> list[Any]:
-    """Reset, act, and reset what has ended where nobody else does."""
+    """Reset, act, and reset ended environments if their mode does not."""
     envs.action_space.seed(1)
     results: list[Any] = [envs.reset(seed=100)]
     for _ in range(steps):

@@ -1,4 +1,4 @@
-"""Heatmaps of whoever was tested over two parameters."""
+"""Heatmaps of policies that were tested over two parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Infos of a batch are plain dictionaries, whoever reads or rebuilds them."""
+"""Infos of a batch are plain dictionaries, and stay so when libraries read or rebuild them."""
 
 from __future__ import annotations
 

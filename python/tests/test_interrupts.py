@@ -1,4 +1,4 @@
-"""Ctrl-C in the middle of a step: it comes at once, and no reply is taken for another's."""
+"""Ctrl-C in the middle of a step takes effect at once, and no reply is taken for the reply to another request."""
 
 from __future__ import annotations
 

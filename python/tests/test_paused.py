@@ -1,4 +1,4 @@
-"""A process that stands still loses its session, and says why."""
+"""A process that was paused loses its session, and the error says why."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def paused(address: str, seconds: float) -> list[str]:
     [
         (
             "--keepalive-seconds",
-            "This process stood still for 5 s .* start the server with a longer --keepalive-seconds",
+            "This process did not run for 5 s .* start the server with a longer --keepalive-seconds",
         ),
         ("--idle-seconds", "the session was idle for 1 s"),
     ],
@@ -66,7 +66,7 @@ def test_lost_session_of_a_paused_process_says_why(flag: str, says: str, start_s
     assert lost.startswith("ServerConnectionError lost the server at")
     assert re.search(says, lost), lost
     assert again == "again"
-    assert ("stood still" in lost) == (flag == "--keepalive-seconds")
+    assert ("did not run" in lost) == (flag == "--keepalive-seconds")
 
 
 def test_short_pause_costs_nothing(start_server: Callable[..., Any]) -> None:

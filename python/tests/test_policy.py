@@ -1,4 +1,4 @@
-"""Checkpoints in Python: they act as they did where they were trained. Those of a shipped experiment are here."""
+"""Checkpoints in Python act as in the program that trained them. The checkpoints are those of a shipped experiment."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PENDULUM = POLICIES / "Pendulum-ppo-ff-R-9bd6546b-s8.safetensors"
 
 @pytest.fixture
 def copied(tmp_path: Path) -> Path:
-    """Give a checkpoint to spoil."""
+    """Return a copy of a checkpoint, which the test may damage."""
     perturb.load_policy(CART_POLE)._native.save(str(tmp_path / "checkpoint"))
     return tmp_path / "checkpoint"
 

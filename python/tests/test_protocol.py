@@ -1,4 +1,4 @@
-"""Servers that do not keep to the protocol, or are of another version: nothing of theirs is taken for a reply."""
+"""Servers that break the protocol, or are of another version: the client accepts none of their replies."""
 
 from __future__ import annotations
 

@@ -262,7 +262,7 @@ def test_model_without_evidence_of_vec_normalize_is_refused(server: str, tmp_pat
     off_policy("SAC", False, server, 1).save(tmp_path / "model")
     loaded = stable_baselines3.SAC.load(tmp_path / "model", device="cpu")
     settings: dict[str, Any] = {"versions": ("D",), "episodes": 5, "server": server}
-    with pytest.raises(perturb.PolicyError, match="does not tell whether it was trained under a VecNormalize"):
+    with pytest.raises(perturb.PolicyError, match="it is not known whether it was trained under a VecNormalize"):
         perturb.evaluate(loaded, "Pendulum", **settings)
     assert perturb.evaluate(loaded, "Pendulum", normalizer=False, **settings)["D"].episodes == 5
 

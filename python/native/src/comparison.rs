@@ -6,10 +6,10 @@ use pyo3::prelude::*;
 use crate::failure::{INVALID, failure};
 use crate::records::Records;
 
-/// A condition: its name, and its policies by the key that pairs them.
+/// A condition: its name, and its policies by key. Policies of two conditions with the same key are a pair.
 type NamedCondition<'py> = (String, Vec<(String, PyRef<'py, Records>)>);
 
-/// Compares conditions in the tests on these sets by `success`, `return` or `length`, as JSON.
+/// Compares conditions in the tests on the given sets by `success`, `return` or `length`. Returns JSON.
 #[pyfunction]
 #[pyo3(signature = (conditions, sets, score, baseline))]
 pub fn compare(

@@ -49,9 +49,9 @@ fn catalogue_with(_: TaskFolder) -> PyResult<Catalogue> {
 /// A server of this process. Sessions end with it.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct NativeServer {
-    /// None after its end.
+    /// `None` after [`end`](Self::end).
     server: Mutex<Option<Arc<server::EmbeddedServer>>>,
-    /// The process that made it.
+    /// The process that started the server.
     owner: u32,
 }
 
@@ -79,7 +79,7 @@ impl NativeServer {
 }
 
 impl NativeServer {
-    /// A way to the server that does not keep it alive.
+    /// Returns a reference to the server that does not keep it alive.
     pub fn handle(&self) -> Weak<server::EmbeddedServer> {
         self.server.lock().unwrap_or_else(PoisonError::into_inner).as_ref().map(Arc::downgrade).unwrap_or_default()
     }
@@ -88,7 +88,7 @@ impl NativeServer {
 impl Drop for NativeServer {
     fn drop(&mut self) {
         if std::process::id() != self.owner {
-            // A forked process has none of the threads that would be waited for.
+            // A forked process does not have the server's threads, so it cannot wait for them.
             std::mem::forget(self.server.get_mut().unwrap_or_else(PoisonError::into_inner).take());
         }
     }
@@ -104,11 +104,11 @@ pub struct EmbeddedStream {
     /// None while a step that was sent ahead is under way.
     session: Option<server::EmbeddedSession>,
     running: Option<StepUnderWay>,
-    /// Takes the step after the running one, unless that has come.
+    /// Hands the step after the running one to the pool. `None` once that step was handed over.
     offer: Option<Box<dyn FnOnce(SessionRequest) + Send>>,
     /// Steps that wait for the running one.
     waiting: VecDeque<SessionRequest>,
-    /// Answers that nobody has taken.
+    /// Answers that were not received yet.
     answers: VecDeque<Answer>,
     /// Waiting for the workers.
     spin: AdaptiveSpin,
@@ -157,7 +157,7 @@ impl EmbeddedStream {
         })
     }
 
-    /// Begins a step, or has it wait for those before it. Needs the context of a runtime.
+    /// Begins a step, or queues it behind the steps that were sent before. Must be called in the context of a tokio runtime.
     pub fn send(&mut self, step: proto::Step) {
         let request = SessionRequest { request: Some(step.into()) };
         self.waiting.push_back(request);
@@ -180,7 +180,7 @@ impl EmbeddedStream {
         reply::<A>(answer)
     }
 
-    /// Begins steps that wait, as long as each is done at once.
+    /// Begins waiting steps one after another, until one does not finish within its first poll.
     fn advance(&mut self) {
         while self.running.is_none() {
             let Some(request) = self.waiting.pop_front() else { return };
@@ -229,7 +229,7 @@ fn defect() -> RequestFailure {
     RequestFailure::Ended(failure(MISMATCH, 0, "no session: a defect of the native module"))
 }
 
-/// Polls a future once. A result that is there at once costs no more.
+/// Polls a future once. A future that is ready at once needs neither a runtime nor a wake-up.
 pub fn poll_once<T>(future: Pin<&mut (dyn Future<Output = T> + Send + '_)>) -> Option<T> {
     match future.poll(&mut Context::from_waker(Waker::noop())) {
         Poll::Ready(come) => Some(come),

@@ -12,14 +12,14 @@ pub struct EpisodeTable {
     pub episodes: Vec<[u64; 5]>,
     /// `[m, P + Q]`: what was requested, then what was applied.
     values: Vec<f64>,
-    /// P.
+    /// Number of requested values P.
     requested: usize,
-    /// P + Q.
+    /// Number of requested and applied values P + Q.
     width: usize,
 }
 
 impl EpisodeTable {
-    /// Makes an empty table for receipts with so many requested and applied values.
+    /// Makes an empty table for receipts with the given numbers of requested and applied values.
     pub fn new(requested: usize, applied: usize) -> Self {
         Self { requested, width: requested + applied, ..Self::default() }
     }
@@ -45,7 +45,7 @@ impl EpisodeTable {
     /// Reads arrays into two tables; the first has the first `ended` episodes.
     ///
     /// # Errors
-    /// If they do not fit each other.
+    /// If the lengths of the arrays do not match.
     pub fn split(&self, episodes: &[u8], values: &[u8], ended: usize) -> PyResult<[Self; 2]> {
         let (words, numbers) = (episodes.as_chunks::<8>().0, values.as_chunks::<8>().0);
         let m = words.len() / 5;
@@ -65,7 +65,7 @@ impl EpisodeTable {
         self.episodes.iter().copied().zip(self.values.chunks(self.width.max(1)))
     }
 
-    /// The receipt of the `index`th; the model's hash is known elsewhere.
+    /// Returns the receipt of the `index`th episode, without the model's hash, which the session knows.
     pub fn receipt(&self, index: usize, model_hash: &str) -> Option<proto::Receipt> {
         let (_, values) = self.rows().nth(index)?;
         let (requested, applied) = values.split_at(self.requested);

@@ -12,29 +12,29 @@ create_exception!(
     "Arguments: the kind of failure, a gRPC code or 0, and the other side's or the transport's words."
 );
 
-/// The server's sentence; the session lives on.
+/// Kind of failure: the server refused a request and says why. The session goes on.
 pub const REFUSED: &str = "refused";
-/// No connection could be made.
+/// Kind of failure: no connection could be made.
 pub const UNREACHABLE: &str = "unreachable";
-/// The connection or the stream ended.
+/// Kind of failure: the connection or the stream ended.
 pub const LOST: &str = "lost";
-/// A reply did not come in time.
+/// Kind of failure: a reply did not come in time.
 pub const TIMED_OUT: &str = "timed out";
-/// A reply of another kind.
+/// Kind of failure: the reply belongs to another kind of request.
 pub const MISMATCH: &str = "mismatch";
-/// A reply whose arrays have another length.
+/// Kind of failure: the arrays of a reply have a wrong length.
 pub const MALFORMED: &str = "malformed";
-/// A value that cannot be sent.
+/// Kind of failure: a value cannot be sent.
 pub const INVALID: &str = "invalid";
-/// The session has ended, is another process's, or another thread waits in it.
+/// Kind of failure: the session has ended, belongs to another process, or is in use by another thread.
 pub const UNUSABLE: &str = "unusable";
 
-/// A policy that cannot be loaded, does not fit, or cannot act.
+/// Kind of failure: a policy cannot be loaded, does not fit the environment, or cannot act.
 pub const POLICY: &str = "policy";
 
 /// Why a request has no reply.
 pub enum RequestFailure {
-    /// The server's sentence; the session lives on.
+    /// The server refused the request and says why. The session goes on.
     Refused(PyErr),
     /// The session has ended.
     Ended(PyErr),
@@ -49,7 +49,7 @@ impl RequestFailure {
     }
 }
 
-/// gRPC's code of a server that is not trusted, or does not trust.
+/// gRPC's code for a failed authentication: the client does not trust the server, or the server refuses the client.
 const UNAUTHENTICATED: i32 = 16;
 
 /// A failure for Python.

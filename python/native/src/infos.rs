@@ -1,5 +1,5 @@
-//! The dictionaries `info` and `infos`. They are filled here, column by column: made of Python's objects they took longer
-//! than the steps of the environments.
+//! The dictionaries `info` and `infos`. They are filled in Rust, column by column. Filling them in Python took longer than
+//! the steps of the environments.
 //!
 //! A reset's info has, if receipts were asked for:
 //!
@@ -37,7 +37,7 @@ fn hash_bytes(text: &str) -> [u8; HASH_BYTES] {
     bytes.and_then(|bytes: Vec<u8>| bytes.try_into().ok()).unwrap_or_default()
 }
 
-/// A key, and that of the mask of the environments that have it.
+/// A key of infos, and the key of its mask, which says which environments have a value.
 struct Label {
     key: Py<PyString>,
     mask: Py<PyString>,
@@ -49,9 +49,9 @@ impl Label {
     }
 }
 
-/// Keys of a session's infos, made once.
+/// Keys of a session's infos, as Python strings that are made once.
 pub struct InfoKeys {
-    /// N.
+    /// Number of environments N.
     num_envs: usize,
     parameters: Vec<Label>,
     applied: Vec<Label>,
@@ -59,7 +59,7 @@ pub struct InfoKeys {
     known: FixedLabels,
     /// SHA-256 of the model, as text; empty without a model.
     model_hash: String,
-    /// The bytes of the hash; zeros without a model.
+    /// The 32 bytes of the hash; zeros without a model.
     model_hash_bytes: [u8; HASH_BYTES],
 }
 
@@ -95,7 +95,7 @@ impl InfoKeys {
         }
     }
 
-    /// No episodes yet.
+    /// Returns an empty table for this environment's receipts.
     fn episode_table(&self) -> EpisodeTable {
         EpisodeTable::new(self.parameters.len(), self.applied.len())
     }
@@ -106,11 +106,11 @@ impl InfoKeys {
 pub struct Events {
     labels: Arc<InfoKeys>,
     ended: Vec<proto::EpisodeEnd>,
-    /// Their receipts, and those of the episodes that began; none if they were not asked for.
+    /// Receipts of the ended episodes; empty if the session has no receipts. `started_episodes` has those of begun episodes.
     ended_episodes: EpisodeTable,
     started_episodes: EpisodeTable,
     final_observations: Vec<f32>,
-    /// O.
+    /// Size O of an observation.
     observation_size: usize,
     reward_terms: Vec<f32>,
 }

@@ -2,15 +2,15 @@
 //!
 //! - [`session`]: a session that waits for its replies without Python's lock, hears of signals, and survives forks.
 //! - [`embedded`]: the server in this process, and its side of a session.
-//! - [`session_runtime`]: the connection under it, which is driven by the thread that waits.
-//! - [`requests`]: requests, made of what Python gives.
+//! - [`session_runtime`]: the runtime of a session's connection, driven by the thread that waits.
+//! - [`requests`]: conversion of Python's values to requests.
 //! - [`arrays`], [`infos`]: replies, as arrays and dictionaries; [`episode_table`]: the episodes that these are made of.
 //! - [`policy`]: trained policies that act here, by the learner's arithmetic.
-//! - [`sets`], [`testing`], [`records`]: tests of whatever acts in Python, recorded as the program `perturb` records its own.
-//! - [`assessed`]: such tests as folders, and in reports; [`comparison`]: such tests compared.
-//! - [`failure`]: what went wrong, for the package to say it as one of its errors.
+//! - [`sets`], [`testing`], [`records`]: tests of policies that act in Python, recorded as `perturb` records its own tests.
+//! - [`assessed`]: folders and reports of such tests; [`comparison`]: comparisons of them.
+//! - [`failure`]: failures as data, which the Python package turns into its errors.
 #![forbid(unsafe_code)]
-// The map above is for who reads this crate: all that it has is Python's, and private.
+// The map above is for readers of this crate. All items are private, because only Python uses them.
 #![allow(rustdoc::private_intra_doc_links)]
 
 use pyo3::prelude::*;
@@ -53,7 +53,7 @@ mod _native {
     use super::sets::{heatmap_contexts, make_set, read_csv_set, read_sets};
     #[pymodule_export]
     use super::testing::Tests;
-    /// Name of a heatmap's set.
+    /// Name of the set that `perturb.sets.heatmap` makes. Reports draw a heatmap of the tests on it.
     #[pymodule_export]
     const HEATMAP_SET: &str = perturb_records::Heatmap::SET;
     /// Maximum number of points along a heatmap's axis.

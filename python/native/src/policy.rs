@@ -34,7 +34,7 @@ impl Policy {
         self.checkpoint.save(&path, None).map_err(|error| refused(&error))
     }
 
-    /// In what it was trained.
+    /// The environment that the policy was trained in.
     #[getter]
     fn environment(&self) -> &str {
         &self.checkpoint.state.config.common.environment
@@ -58,19 +58,19 @@ impl Policy {
         self.checkpoint.state.config.method().to_string()
     }
 
-    /// Episodes in a trial, over which it remembers.
+    /// Number of episodes in a trial. The policy remembers over the episodes of a trial.
     #[getter]
     fn episodes_per_trial(&self) -> u32 {
         self.checkpoint.state.config.settings.episodes_per_trial()
     }
 
-    /// Whether it sees rewards and ends of episodes, too.
+    /// Whether the policy also sees rewards and ends of episodes (RL²).
     #[getter]
     fn sees_rewards(&self) -> bool {
         self.checkpoint.state.config.settings.has_trials()
     }
 
-    /// Whether it remembers.
+    /// Whether the policy is recurrent.
     #[getter]
     fn has_memory(&self) -> bool {
         self.checkpoint.policy.memory_size() > 0
@@ -94,7 +94,7 @@ impl Policy {
         self.checkpoint.state.counters.timesteps
     }
 
-    /// O.
+    /// Size O of an observation.
     #[getter]
     fn observation_size(&self) -> usize {
         self.checkpoint.state.environment_spec.observation.len()
@@ -117,16 +117,16 @@ impl Policy {
 }
 
 impl Policy {
-    /// Whether `served` is the environment that it was trained in.
+    /// Checks that `served` is the environment that the policy was trained in.
     ///
     /// # Errors
-    /// With what differs.
+    /// [`POLICY`], with the difference, if it is another one.
     pub(crate) fn check_unchanged(&self, served: &perturb_protocol::proto::Environment) -> PyResult<()> {
         self.checkpoint.state.check_unchanged(served).map_err(|error| refused(&error))
     }
 }
 
-/// Acts in N environments, and remembers. It is for one thread at a time.
+/// A policy that acts in N environments, with its memory of each. Only one thread at a time may use it.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Player(Mutex<Playing>);
 
@@ -134,10 +134,10 @@ struct Playing {
     player: perturb_policy::Player,
     action: ActionKind,
     seed: u64,
-    /// `[N]` the present trial, and the episode in it.
+    /// `[N]` index of the present trial, and number of the present episode in the trial.
     trials: Vec<(u64, u32)>,
     ended: Vec<SlotEnd>,
-    /// Final observations, which acting has no use for.
+    /// `[ended, O]` zeros in place of final observations, which a player takes but acting does not use.
     finals: Vec<f32>,
 }
 
@@ -153,8 +153,8 @@ impl Player {
         self.own()?.act(py)
     }
 
-    /// Takes what came of the last actions: observations `[N, O]`, rewards `[N]`, and `starts` `[N]`, where an episode
-    /// ended and the observation is the first of the next.
+    /// Takes the outcome of the last actions: observations `[N, O]`, rewards `[N]`, and `starts` `[N]`. `starts` is true
+    /// where an episode ended and the observation is the first one of the next episode.
     fn observe(
         &self,
         observations: PyReadonlyArray2<'_, f32>,
@@ -182,7 +182,7 @@ impl Playing {
         let observations = self.rows(observations)?;
         self.trials.fill((0, 0));
         self.player.begin(&observations, None).map_err(|error| refused(&error))?;
-        // The streams may be those of later trials.
+        // The random streams may be at later trials; they return to the first.
         (0..self.trials.len()).for_each(|slot| self.player.begin_trial(slot, self.seed, 0));
         Ok(())
     }
@@ -229,7 +229,7 @@ impl Playing {
         self.player.observe(&outcome, None).map_err(|error| refused(&error))
     }
 
-    /// Observations `[N, O]` in a row.
+    /// Returns observations `[N, O]` as contiguous numbers.
     fn rows(&self, observations: &PyReadonlyArray2<'_, f32>) -> PyResult<Vec<f32>> {
         let expected = [self.trials.len(), self.player.observation_size()];
         if observations.shape() != expected {

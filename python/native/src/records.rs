@@ -51,7 +51,7 @@ impl Records {
         self.0.write(&path).map_err(|error| failure(INVALID, 0, error.to_string()))
     }
 
-    /// In what was tested.
+    /// The environment that the policy was tested in.
     #[getter]
     fn environment(&self) -> &str {
         &self.0.about.environment
@@ -88,15 +88,15 @@ impl Records {
         Ok(columns)
     }
 
-    /// The same episodes, judged by a rule as it is typed.
+    /// Returns the same episodes, judged by a rule in the spelling of `--success`.
     fn judged_by(&self, rule: &str) -> PyResult<Self> {
         let invalid = |error: perturb_settings::ValueError| failure(INVALID, 0, error.to_string());
         let rule: Rule = rule.parse().map_err(invalid)?;
         self.0.clone().judged_by(&rule).map(Self).map_err(invalid)
     }
 
-    /// The same episodes, judged by a threshold of a quantity of which `values` `[n]` has that of each episode; NaN is no
-    /// success.
+    /// Returns the same episodes, judged by a threshold of a quantity. `values` `[n]` has the quantity of each episode; NaN
+    /// is no success.
     fn judged(
         &self,
         quantity: String,
@@ -115,7 +115,7 @@ impl Records {
         self.0.about.tests.iter().map(|test| to_python(&test.set)).collect()
     }
 
-    /// The rule of success, as it is typed; `None` if the server decided.
+    /// The rule of success in the spelling of `--success`; `None` if the server decided.
     #[getter]
     fn rule(&self) -> Option<String> {
         let success = self.0.about.success.as_ref();
@@ -152,7 +152,7 @@ impl Records {
         })
     }
 
-    /// `[n]` the part of the parameter space, from 0, that each episode of the test on a set lies in.
+    /// Returns `[n]`, for each episode of the test on a set, the part of the parameter space that it lies in, from 0.
     fn parts(&self, name: &str) -> Vec<usize> {
         Outcomes::new(&self.0, name).parts()
     }

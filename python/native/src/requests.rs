@@ -1,4 +1,4 @@
-//! Requests, made of what Python gives. The package has checked kinds and shapes; values are for the server to judge.
+//! Conversion of Python's values to requests. The Python package has checked types and shapes; the server checks values.
 
 use std::collections::HashMap;
 
@@ -47,17 +47,17 @@ pub fn autoreset_mode(name: &str) -> PyResult<proto::AutoresetMode> {
 
 /// Shape and kind of a session's actions.
 pub struct Actions {
-    /// N.
+    /// Number of environments N.
     pub num_envs: usize,
-    /// A; `None` for choices.
+    /// Numbers in an action, A; `None` for discrete actions.
     pub size: Option<usize>,
-    /// Whether there is no first axis: one environment by itself.
+    /// Whether actions have no first axis, as those of a single environment.
     pub single: bool,
 }
 
 impl Actions {
-    /// Encodes actions for the protocol: int32 `[N]`, or float32 `[N, A]`. The usual kinds of arrays of the right shape are
-    /// read here; everything else, wrong actions too, is for `fallback`, which returns bytes.
+    /// Encodes actions for the protocol: int32 `[N]`, or float32 `[N, A]`. Arrays of the usual types and the right shape are
+    /// read directly. `fallback` converts everything else to bytes, or refuses it.
     ///
     /// # Errors
     /// The errors of `fallback`.

@@ -1,5 +1,5 @@
-//! The connection under a session. No thread of its own drives it, but whoever waits for a reply: to hand one over to
-//! another thread and back costs more than a step.
+//! The connection under a session. The thread that waits for a reply drives it. A thread of the connection's own would
+//! have to hand each reply over, which costs more than a step.
 
 use std::future::Future;
 use std::io;
@@ -13,22 +13,22 @@ use tokio::runtime::{Builder, Runtime};
 use tokio::sync::Notify;
 use tokio::task::yield_now;
 
-/// Interval at which a waiting thread checks for signals, which Python answers between two of its instructions.
+/// Interval at which a waiting thread checks for signals. Python runs signal handlers only between two of its instructions.
 const SIGNAL_CHECK_INTERVAL: Duration = Duration::from_millis(20);
-/// Number of turns that the connection gets to write a request, or the end of a session: one task takes it up, and another
-/// one sends it.
+/// Number of times that a thread yields to the connection's tasks, so that they write a request or the end of a session.
+/// One task takes the message up, and another one sends it.
 const POLL_YIELDS: usize = 4;
 
 /// Maximum number of runtimes. Each session has its own, so that threads with a session each do not wait for each other.
 /// Further sessions share them, because each runtime takes four file descriptors.
 const MAX_RUNTIMES: usize = 16;
 
-/// Something to wait for.
+/// A future that a thread waits for.
 pub type Pending<'a, T> = Pin<&'a mut (dyn Future<Output = T> + Send + 'a)>;
 
-/// Why a wait ended without what it was for.
+/// The reason why a wait ended before its future was ready.
 pub enum WaitError {
-    /// A signal's handler raised an error, as for Ctrl-C.
+    /// A signal's handler raised an error, for example `KeyboardInterrupt` after Ctrl-C.
     Interrupted(PyErr),
     /// The deadline passed.
     TimedOut,
@@ -36,7 +36,7 @@ pub enum WaitError {
     Closed,
 }
 
-/// A session's end, which another thread may bring about.
+/// A flag by which another thread ends a session that waits for a reply.
 #[derive(Default)]
 pub struct CloseSignal {
     closed: AtomicBool,
@@ -44,14 +44,14 @@ pub struct CloseSignal {
 }
 
 impl CloseSignal {
-    /// Ends the wait that there is, or the next.
+    /// Ends the present wait, or the next one if no thread waits.
     pub fn close(&self) {
         self.closed.store(true, Ordering::Release);
         self.notify.notify_waiters();
         self.notify.notify_one();
     }
 
-    /// Whether it has come.
+    /// Whether the session was closed.
     pub fn is_closed(&self) -> bool {
         self.closed.load(Ordering::Acquire)
     }
@@ -59,9 +59,9 @@ impl CloseSignal {
 
 /// A runtime that drives connections' tasks while a thread waits.
 struct Reactor {
-    /// Empty once this is dropped.
+    /// `None` only while the reactor is dropped.
     runtime: Option<Runtime>,
-    /// The process that made it.
+    /// The process that made the runtime.
     owner: u32,
 }
 
@@ -74,9 +74,9 @@ impl Reactor {
         Ok(Arc::new(Self { runtime: Some(runtime), owner: std::process::id() }))
     }
 
-    /// Returns a runtime for another session.
+    /// Returns a new runtime, or the one with the fewest sessions if there are [`MAX_RUNTIMES`].
     fn find() -> io::Result<Arc<Self>> {
-        // In a forked process it may be locked for ever.
+        // In a forked process the lock may be held for ever by a thread that was not copied.
         let Ok(mut reactors) = REACTORS.try_lock() else { return Self::new() };
         let own = std::process::id();
         let used: Vec<_> = reactors.iter().filter_map(Weak::upgrade).filter(|reactor| reactor.owner == own).collect();
@@ -95,9 +95,9 @@ impl Drop for Reactor {
     fn drop(&mut self) {
         let Some(runtime) = self.runtime.take() else { return };
         if std::process::id() == self.owner {
-            runtime.shutdown_background(); // a name that is still being looked up is not waited for
+            runtime.shutdown_background(); // does not wait for a running DNS lookup
         } else {
-            // A forked process shares the parent's poll: to leave it would take the parent's connection out of it.
+            // A forked process shares the parent's epoll. Dropping the runtime would remove the parent's connection from it.
             std::mem::forget(runtime);
         }
     }
@@ -117,10 +117,10 @@ impl SessionRuntime {
         Ok(Self { reactor: Reactor::find()? })
     }
 
-    /// Waits, at most until the deadline, without Python's lock but for a look for signals now and then.
+    /// Waits, at most until the deadline. Python's lock is released, and taken only for the checks for signals.
     ///
     /// # Errors
-    /// [`WaitError`]; what was waited for is gone then.
+    /// [`WaitError`]; the future was dropped then.
     pub fn wait<T: Send>(
         &self,
         py: Python<'_>,
@@ -155,7 +155,8 @@ impl SessionRuntime {
         }
     }
 
-    /// Does on this thread, without Python's lock, what can be done at once and may begin tasks of the runtime.
+    /// Calls a function that does not block, without Python's lock. It runs on this thread, in the context of the runtime,
+    /// so it may spawn tasks.
     pub fn now<T: Send>(&self, py: Python<'_>, work: impl FnOnce() -> T + Send) -> T {
         py.detach(|| {
             let _context = self.reactor.runtime.as_ref().map(Runtime::enter);
@@ -163,8 +164,8 @@ impl SessionRuntime {
         })
     }
 
-    /// Lets the connection write what it has, and answer the server's questions whether this side lives. Not for who
-    /// has Python's lock.
+    /// Lets the connection write pending bytes and answer the server's keepalive pings. The caller must not hold Python's
+    /// lock.
     pub fn poll_io(&self) {
         if let Some(runtime) = &self.reactor.runtime {
             runtime.block_on(async {

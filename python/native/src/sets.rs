@@ -14,10 +14,10 @@ use pyo3::prelude::*;
 use crate::failure::{INVALID, failure};
 use crate::requests::IntervalsByName;
 
-/// A set: its name, its version, what is drawn in place of the version's, and the contexts if they are listed.
+/// A set: its name, its version, the intervals that replace the version's, and the contexts if they are listed.
 pub type Set = (String, String, IntervalsByName, Option<Vec<BTreeMap<String, f64>>>);
 
-/// The set that values of parameters make, each as experiment files write them: drawn, or a grid.
+/// Makes a set, drawn or a grid, from values of parameters in the spelling of experiment files.
 #[pyfunction]
 pub fn make_set(name: &str, version: &str, values: Vec<(String, String)>) -> PyResult<Set> {
     let assignments = values.into_iter().map(|(parameter, values)| format!("{parameter}={values}").parse());
@@ -25,21 +25,21 @@ pub fn make_set(name: &str, version: &str, values: Vec<(String, String)>) -> PyR
     set_of(name, parse(version)?, assignments).map(|set| to_python(&set)).map_err(|error| invalid(&error))
 }
 
-/// The set of the rows of a CSV file.
+/// Reads a set of contexts from a CSV file, one context a row.
 #[pyfunction]
 pub fn read_csv_set(name: &str, version: &str, path: PathBuf) -> PyResult<Set> {
     let text = files::read(&path).map_err(|error| PyOSError::new_err(error.to_string()))?;
     set_of_csv(name, parse(version)?, &text).map(|set| to_python(&set)).map_err(|error| invalid(&error))
 }
 
-/// The sets of an experiment file.
+/// Reads the sets of an experiment file.
 #[pyfunction]
 pub fn read_sets(path: PathBuf) -> PyResult<Vec<Set>> {
     let sets = Plan::own_sets(&path).map_err(|error| invalid(&error))?;
     Ok(sets.iter().map(to_python).collect())
 }
 
-/// The contexts of a heatmap over two parameters, each with its range, of so many points along each.
+/// Returns the contexts of a heatmap over two parameters, each with its range and `points` points along it.
 #[pyfunction]
 pub fn heatmap_contexts(
     axes: [(String, f64, f64); 2],

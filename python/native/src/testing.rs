@@ -65,8 +65,8 @@ impl Tests {
         Ok(plan)
     }
 
-    /// The session of the test was opened. The first one's environment is compared with all sets, and with the one that a
-    /// loaded policy was trained in.
+    /// Takes the environment of a test's session after it was opened. Checks the first one against all sets, and against the
+    /// environment that a loaded policy was trained in.
     #[pyo3(signature = (opened, policy))]
     fn opened(&mut self, opened: &Opened, policy: Option<&Policy>) -> PyResult<()> {
         let served = opened.served();
@@ -86,7 +86,7 @@ impl Tests {
         Ok(())
     }
 
-    /// Takes the episodes that ended in a step: how many were counted, and how many there are to be.
+    /// Takes the episodes that ended in a step. Returns the number of episodes counted so far, and the number wanted.
     fn take(&mut self, events: Option<&Events>, terminated: PyReadonlyArray1<'_, bool>) -> PyResult<(u64, u64)> {
         let Some(counting) = &mut self.counting else { return Err(failure(UNUSABLE, 0, "no test has begun")) };
         if let Some(events) = events {

@@ -74,7 +74,7 @@ class Assessment:
 
     @property
     def metrics(self) -> dict[str, float | None]:
-        """The paper's three numbers, %: None where a scenario that one needs is not there.
+        """The paper's three numbers, %. A number is None if a scenario that it needs was not tested.
 
         Default is the success rate of DD, Interpolation of RR, Extrapolation the geometric mean of DR, DE and RE
         (Packer et al., 2018, arXiv:1810.12282).
@@ -92,8 +92,8 @@ class Assessment:
     def success_by_parameter(self, scenario: str, parameter: str) -> tuple[Bin, ...]:
         """Success over a parameter in a test: in tenths of the range of its values, in the parameter's unit.
 
-        Where a tenth of the range has no values, as between E's two intervals, a part ends and another begins. Nothing
-        if the parameter does not vary.
+        Parts have gaps where a tenth of the range has no values, as between E's two intervals. The result is empty if
+        the parameter does not vary.
 
         Raises:
             UnknownNameError: for a scenario that was not tested.
@@ -132,9 +132,9 @@ class Assessment:
     def worst_contexts(self, scenario: str, count: int = 10) -> tuple[Context, ...]:
         """Give the contexts of a test with the lowest success rates, the worst first; of equal ones the lowest return.
 
-        Contexts of a list are themselves; where parameters are drawn, they are parts of the parameter space of some 40
-        episodes each. These are chosen by the same episodes that then say how bad they are, so that the worst look
-        worse than they are; a result's `worst_contexts_percent` does not.
+        For a list, contexts are its own. If parameters are drawn, contexts are parts of the parameter space with some
+        40 episodes each. The same episodes choose the worst parts and say how bad they are, so these parts look worse
+        than they are. A result's `worst_contexts_percent` does not have this bias.
 
         Raises:
             UnknownNameError: for a scenario that was not tested.
@@ -182,7 +182,7 @@ class Assessment:
             success: as in `evaluate`; a threshold must be of a quantity that was recorded.
 
         Raises:
-            InvalidArgumentError: for a rule that these episodes cannot be judged by.
+            InvalidArgumentError: if the rule is malformed, or needs a quantity that was not recorded.
         """
         text, own = success_rules.parse(success)
 
@@ -238,8 +238,8 @@ class Assessment:
     def columns(self) -> dict[str, Any]:
         """Every episode, as arrays [episodes] by name: those of `perturb evaluate --records`, after `trained_on`.
 
-        `trained_on`, `set`, `model_hash` and `ending` are arrays of text; where an episode achieved nothing, `achieved`
-        is NaN.
+        `trained_on`, `set`, `model_hash` and `ending` are arrays of text. `achieved` is NaN where an episode achieved
+        nothing.
         """
         tables = [(one.trained_on, one.records.columns()) for one in self._assessed]
         names = list(tables[0][1])

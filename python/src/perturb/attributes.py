@@ -11,10 +11,10 @@ if TYPE_CHECKING:
 
 
 def refuse_assignment(name: str, description: Description) -> AssignmentError:
-    """Return the error for `env.length = 1.0`, with how to change a parameter."""
+    """Return the error for an assignment such as `env.length = 1.0`. Its message says how to change a parameter."""
     parameters = list(description.parameters)
     if name in parameters:
-        example, what = name, f"the server has {description.name}'s physics, of which it is a parameter"
+        example, what = name, f"it is a parameter of {description.name}'s physics, which the server holds"
     else:
         example = (parameters or ["length"])[0]
         what = (

@@ -1,7 +1,7 @@
-"""The environments and limits, so that one can be made without a server, and before a fork.
+"""Descriptions of the environments, so that an environment can be made without a server, and before a fork.
 
-The build asked a server for them: catalogue.json. They are compared with those of the server in use whenever a session
-opens; a difference is an error.
+The build of the package asked a server for them and wrote catalogue.json. Whenever a session opens, they are compared
+with those of the server in use; a difference is an error.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Description:
 
     @classmethod
     def read(cls, entry: Mapping[str, Any]) -> Description:
-        """Understand an environment of catalogue.json, or of a server, where an open end of a range is null."""
+        """Parse an environment of catalogue.json, or of a server. An open end of a range is null."""
 
         def ranges(channels: Iterable[Mapping[str, float | None]]) -> tuple[Range, ...]:
             ends = ((channel["low"], channel["high"]) for channel in channels)

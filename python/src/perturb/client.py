@@ -108,10 +108,11 @@ class Client:
         self._closed = False
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the session: a copy, here or in another process, has to be reset."""
+        """Return everything but the session. A copy, in this process or another, must be reset first."""
         if self._was_restored:
             raise OutOfOrderError(
-                "a snapshot was restored, whose parameters a copy would not know: copy environments before that"
+                "environments cannot be copied after a snapshot was restored, because a copy would not know its "
+                "parameters: copy them before the restore"
             )
         return {**self.__dict__, "_session": None}
 
@@ -128,12 +129,12 @@ class Client:
         return self._session
 
     def open(self, seeds: Sequence[int], generator: np.random.Generator) -> OpenedSession | None:
-        """Open a session, unless one is open. Without seeds, which a reset is to give, the generator draws one.
+        """Open a session, unless one is open. If the reset gives no seeds, the generator draws one.
 
-        Each environment then has the parameters that resets and contexts gave to it.
+        Each environment gets the parameters that earlier resets and contexts gave to it.
 
         Raises:
-            OutOfOrderError: if a session is gone in which a snapshot was restored.
+            OutOfOrderError: if the last session is gone and a snapshot was restored in it.
         """
         self._require_not_closed()
         if self._session is not None:
@@ -141,8 +142,8 @@ class Client:
                 return None
             if self._was_restored:
                 raise OutOfOrderError(
-                    "the session is gone, and a snapshot was restored in it, whose parameters are not known here: "
-                    "make the environments anew, and restore the snapshot again"
+                    "the session is gone, and the parameters of the snapshot that was restored in it are not known: "
+                    "make the environments again, and restore the snapshot again"
                 )
             self._session.close()
             self._session = None
@@ -155,7 +156,7 @@ class Client:
             if opened.observes_parameters != self._request["observe_parameters"]:
                 raise ProtocolError(
                     "the server does not know observe='parameters': it is older than this package; "
-                    "run the perturb-server of the package's version, or leave it out"
+                    "run the perturb-server of the package's version, or leave observe= out"
                 )
             served = catalogue.Description.read(json.loads(opened.environment))
             self.description.require_equal(served)

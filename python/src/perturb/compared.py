@@ -66,7 +66,7 @@ class Comparison:
         """Give the mean of a condition in a test.
 
         Raises:
-            UnknownNameError: with the conditions and tests that there are.
+            UnknownNameError: if there is no such condition or test. The message lists the known ones.
         """
         for it in self.means:
             if (it.condition, it.tested_on) == (condition, tested_on):
@@ -77,7 +77,7 @@ class Comparison:
     def rows(self, table: Table = "means") -> list[dict[str, Any]]:
         """Give a table as rows by column: `means`, `differences`, or `episodes`, every episode of every policy.
 
-        Where there is no number, None.
+        A missing number is None.
         """
         if table == "means":
             return [

@@ -1,4 +1,4 @@
-"""The embedded server: what perturb-server does, in this process, without a connection."""
+"""The embedded server: environments in this process, as perturb-server serves them, without a connection."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class EmbeddedServer:
         self.native.close()
 
     def exit_status(self) -> int | None:
-        """Return None: it runs as long as this process does."""
+        """Return None, because the server runs as long as this process."""
         return None
 
 

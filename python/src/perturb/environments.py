@@ -1,4 +1,4 @@
-"""The environments that there are, and what of their physics can be changed."""
+"""The catalogue of environments, and the parameters of their physics that can be changed."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def environments(*, task: str | os.PathLike[str] | None = None) -> dict[str, Env
         task: the folder of a task, whose environment is then the last one; see docs/tasks.md.
 
     Raises:
-        InvalidArgumentError: for what is no such folder, with the reason.
+        InvalidArgumentError: if it is not a folder of a task. The message has the reason.
     """
     folder = find_folder(task)
     entries = CATALOGUE_ENTRIES if folder is None else (*CATALOGUE_ENTRIES, entry(folder))

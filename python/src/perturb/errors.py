@@ -12,7 +12,7 @@ class InvalidArgumentError(PerturbError, ValueError):
 
 
 class AssignmentError(PerturbError, AttributeError):
-    """An attribute cannot be assigned, because the assignment would change nothing; the message says what does."""
+    """An attribute cannot be assigned, because that would change nothing. The message says which call would."""
 
 
 class UnknownNameError(PerturbError, KeyError):
@@ -22,11 +22,11 @@ class UnknownNameError(PerturbError, KeyError):
 
 
 class PolicyError(PerturbError, ValueError):
-    """A policy cannot be loaded, does not fit the environment, or gives what is no action."""
+    """A policy cannot be loaded, does not fit the environment, or returns values that are not actions."""
 
 
 class NotAllowedError(PerturbError, PermissionError):
-    """The token's role does not allow what was to be drawn."""
+    """The token's role does not allow the parameters that would be drawn."""
 
 
 class ServerFullError(PerturbError, RuntimeError):
@@ -34,7 +34,7 @@ class ServerFullError(PerturbError, RuntimeError):
 
 
 class ServerUnavailableError(PerturbError, RuntimeError):
-    """The server cannot do it now, and may later: it cannot write down what would be drawn. Nothing has changed."""
+    """The server cannot do it now, but may later; for example, it cannot write its ledger. Nothing has changed."""
 
 
 class RenderError(PerturbError, RuntimeError):

@@ -1,4 +1,4 @@
-"""Trained policies that the package brings, to have something to test before a policy of one's own is trained."""
+"""Trained policies in the package, so that users can test a policy before they have trained one."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ _OPSET, _IR_VERSION = 17, 8
 
 @dataclass(frozen=True)
 class Network:
-    """The arrays of a policy in the order of use: normalisation, layers with tanh, an LSTM or none, a linear head."""
+    """The arrays of a policy in order of use: normalisation, layers with tanh, an optional LSTM, a linear head."""
 
     # Float64 [O]: x becomes clip((x - mean) / deviation, -bound, bound).
     mean: NDArray[np.float64]
@@ -86,7 +86,7 @@ def _safetensors(data: bytes) -> dict[str, NDArray[np.float32]]:
 
 
 def _moments(normalizer: Mapping[str, Any] | None, size: int) -> tuple[NDArray[np.float64], ...]:
-    """Return the means, deviations and bounds [size] of observations; the rest of them stays as it is."""
+    """Return means, deviations and bounds [size] of observations. Entries that are not normalised stay unchanged."""
     mean, deviation, bound = np.zeros(size), np.ones(size), np.full(size, np.finfo(np.float64).max)
     if normalizer is not None:
         moments = normalizer["moments"]

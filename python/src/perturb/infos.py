@@ -1,4 +1,4 @@
-"""Infos of a batch, as Gymnasium's vector environments have them: arrays [N], and beside each a mask of who has it."""
+"""Infos of a batch as in Gymnasium's vector environments: arrays [N], each with a mask of environments with a value."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 
 def merge(infos: dict[str, Any], later: dict[str, Any]) -> None:
-    """Add what later infos tell; where both tell something of an environment, the later infos count."""
+    """Add later infos to infos. If both have a value for an environment, the later one replaces the earlier."""
     for key, values in later.items():
         if key.startswith("_"):
             continue

@@ -1,8 +1,9 @@
 """A perturb-server of this process's own, on a private Unix socket, and how environments share it.
 
-All environments that were made without `server=` share it, those of each `task=` another one. It starts with the first
-and ends with the last. It also ends with this process, however that ends, for this process holds the other end of the
-server's standard input. Environments with `server="embedded"` share embedded servers in the same way.
+All environments that were made without `server=` share one server; those of each `task=` share another one. A server
+starts with its first environment and ends with its last. It also ends with this process, however that ends, because
+this process holds the other end of its standard input. Environments with `server="embedded"` share embedded servers in
+the same way.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ def find_program() -> Path:
 
 @dataclass(frozen=True)
 class TaskFolder:
-    """A folder with a task.toml, as its files are at a moment. Equal ones can share a server."""
+    """A folder with a task.toml, and the state of its files. Environments of equal task folders share a server."""
 
     # Absolute path.
     path: str
@@ -140,7 +141,7 @@ class LocalServer:
                     return
                 if line is not None:
                     continue
-                reason = f"it ended with status {self.process.wait()} before it listened; its words are above"
+                reason = f"it ended with status {self.process.wait()} before it listened; its messages are above"
             self.end()
             raise ServerStartError(f"the private server {program} did not start: {reason}")
 

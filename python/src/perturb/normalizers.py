@@ -1,4 +1,4 @@
-"""The VecNormalize under which a stable-baselines3 model was trained, without which it acts on other observations."""
+"""The VecNormalize of a stable-baselines3 model. Without it a model sees observations that it was not trained on."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def _read(path: Path) -> Any:
 
 
 def _require_untouched(model: Any) -> None:
-    """Refuse a model that was trained under a VecNormalize, which a model that was loaded no longer has.
+    """Refuse a model that was trained under a VecNormalize and was loaded without it.
 
     stable-baselines3 keeps the last original observations of such a model in `_last_original_obs`. Off-policy
     algorithms keep them of every model. The last observations of one that was trained under VecNormalize are then the
@@ -80,14 +80,14 @@ def _require_untouched(model: Any) -> None:
         "give normalizer=, the VecNormalize or the path that VecNormalize.save() wrote; or normalizer=False if the "
         "model takes observations as they are"
     )
-    was_trained = f"this {type(model).__name__} model was trained under a VecNormalize, which it was loaded without"
+    was_trained = f"this {type(model).__name__} model was trained under a VecNormalize, but was loaded without it"
     if not hasattr(model, "replay_buffer"):  # an on-policy model
         raise PolicyError(f"{was_trained}, so it would act on observations that it does not know: {how}")
     if model.get_env() is not None:
         return  # its environment, which was trained in or given to load(), has no VecNormalize
     if last is None or np.shape(last) != np.shape(original) or len(original) < 3:
         raise PolicyError(
-            f"this {type(model).__name__} model was loaded without its environment, and does not tell whether it was "
+            f"this {type(model).__name__} model was loaded without its environment, so it is not known whether it was "
             f"trained under a VecNormalize: {how}"
         )
     if not np.array_equal(last, original) and _is_affine(np.asarray(original, float), np.asarray(last, float)):

@@ -1,6 +1,6 @@
 """Adapters through which `evaluate` plays perturb's policies, functions, stable-baselines3's and torch's models.
 
-None of those packages is imported: an object can only be theirs once somebody else has done so.
+None of those packages is imported here: an object can be an instance of their classes only if its owner imported them.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def prepare(
         # The mode is the default of stable-baselines3's evaluate_policy.
         return _stable_baselines(policy, description, deterministic is not False, normalizer, name)
     if deterministic:
-        raise PolicyError("deterministic=True is for stable-baselines3's models: let the policy itself choose so")
+        raise PolicyError("deterministic=True is for stable-baselines3's models: make the policy itself deterministic")
     if normalizer not in (None, False):
         raise PolicyError("normalizer= is for stable-baselines3's models: let the policy itself normalise")
     if _is(policy, "torch.nn", "Module"):
@@ -183,7 +183,10 @@ def _stable_baselines(
 
 
 class _Module:
-    """A torch module: of choices the greatest of its outputs [N, n], or integers [N]; or numbers [N, A]."""
+    """A torch module. For discrete actions the greatest of its outputs [N, n] counts, or it gives integers [N].
+
+    For continuous actions it gives numbers [N, A].
+    """
 
     def __init__(self, module: Any, description: Description) -> None:
         self._module = module
@@ -242,7 +245,7 @@ def _statistics(normalizer: Any) -> Iterator[bytes]:
 
 
 def _digest(parts: Iterator[bytes]) -> str:
-    """Equal weights have equal names."""
+    """Return a checksum of a module's weights as a name, so that equal weights have equal names."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(part)

@@ -93,9 +93,9 @@ def pooled(policies: Sequence[Sequence[Bin]]) -> list[Bin]:
     """The success of several policies in the parts of a parameter: their episodes counted together."""
     counted: dict[tuple[float, float], list[int]] = {}
     for part in (part for parts in policies for part in parts):
-        both = counted.setdefault((part.low, part.high), [0, 0])
-        both[0] += part.successes
-        both[1] += part.episodes
+        counts = counted.setdefault((part.low, part.high), [0, 0])
+        counts[0] += part.successes
+        counts[1] += part.episodes
     parts = []
     for (low, high), (successes, episodes) in sorted(counted.items()):
         ends = _native.wilson(successes, episodes) if episodes else None
@@ -119,7 +119,7 @@ def pooled_2d(policies: Sequence[Sequence[Bin2D]]) -> list[Bin2D]:
 
 
 def _draw_cells(cells: Sequence[Bin2D], x: str, y: str, units: Mapping[str, str], axes: Any) -> Any:
-    """Draw the parts on axes, and return the scale of colours, which is the same for all."""
+    """Draw the parts on axes, and return the scale of colours, which all panels share."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.patches import Rectangle
@@ -138,7 +138,7 @@ def _draw_cells(cells: Sequence[Bin2D], x: str, y: str, units: Mapping[str, str]
 
 
 def _widened(parts: set[tuple[float, float]]) -> dict[tuple[float, float], tuple[float, float]]:
-    """The points of a grid have no width: each is drawn halfway to its neighbours."""
+    """Return points of a grid as intervals: a point has no width, so it is drawn halfway to its neighbours."""
     ordered = sorted(parts)
     if any(low != high for low, high in ordered):
         return {part: part for part in ordered}

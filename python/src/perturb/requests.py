@@ -44,7 +44,7 @@ _INT32 = np.iinfo(np.int32)
 
 
 def version(name: Any, what: str = "version") -> Version:
-    """D, R, E or R+E, in large letters or small ones."""
+    """Return D, R, E or R+E for a version's name in upper or lower case."""
     for known in VERSIONS:
         if isinstance(name, str) and name.upper() == known:
             return known
@@ -62,7 +62,7 @@ def observes_parameters(observe: Any) -> bool:
 
 
 def autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    """Gymnasium's mode, given as such or as its value."""
+    """Return Gymnasium's mode of autoreset, given as the mode or as its value."""
     try:
         return AutoresetMode(mode)
     except ValueError as error:
@@ -71,7 +71,7 @@ def autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
 
 
 def distributions(parameters: Parameters | None) -> Intervals:
-    """The sets that replace those of the version."""
+    """Return intervals by parameter's name; they replace the intervals of the version."""
     if parameters is None:
         return {}
     if not isinstance(parameters, Mapping):
@@ -82,12 +82,12 @@ def distributions(parameters: Parameters | None) -> Intervals:
 
 
 def frozen(intervals: Intervals) -> tuple[Any, ...]:
-    """Return what equal intervals have in common, as a key of dictionaries."""
+    """Return intervals as a key of dictionaries; equal intervals have equal keys."""
     return tuple(sorted((name, tuple(values)) for name, values in intervals.items()))
 
 
 def contexts(listed: Any) -> list[dict[str, float]]:
-    """Values of parameters by name, in each context those that it has: at least one context."""
+    """Return a list of at least one context: values of parameters by name."""
     if isinstance(listed, str | Mapping) or not isinstance(listed, Sequence):
         raise InvalidArgumentError(
             f"contexts is {listed!r}; expected a list such as [{{'length': 0.3}}, {{'length': 0.5}}]"
@@ -100,7 +100,7 @@ def contexts(listed: Any) -> list[dict[str, float]]:
 def _context(context: Any) -> dict[str, float]:
     values = distributions(context)
     if not all(math.isfinite(end) for intervals in values.values() for interval in intervals for end in interval):
-        raise InvalidArgumentError(f"the context {context!r} has values that are no finite numbers")
+        raise InvalidArgumentError(f"the context {context!r} has values that are not finite numbers")
     if any(len(intervals) != 1 or intervals[0][0] != intervals[0][1] for intervals in values.values()):
         raise InvalidArgumentError(f"the context {context!r} has intervals; expected a value of each parameter")
     return {name: intervals[0][0] for name, intervals in values.items()}
@@ -154,7 +154,7 @@ def _distribution(name: str, value: ParameterSet) -> list[tuple[float, float]]:
 
 
 def _numbers(value: Any, wrong: InvalidArgumentError) -> NDArray[np.float64]:
-    """Convert to float64, but not from text."""
+    """Convert numbers to float64; refuse text."""
     try:
         array = np.asarray(value)
         if array.dtype.kind not in "iuf":
@@ -165,7 +165,7 @@ def _numbers(value: Any, wrong: InvalidArgumentError) -> NDArray[np.float64]:
 
 
 def seed(value: Any, name: str = "seed") -> int:
-    """A number that the protocol can carry."""
+    """Return a seed, an integer from 0 to 2^64 - 1, which the protocol can carry."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -176,7 +176,7 @@ def seed(value: Any, name: str = "seed") -> int:
 
 
 def seeds(value: Any, num_envs: int) -> list[int | None]:
-    """Seeds of N environments: of one seed s the seeds s + i; of a list its own, None where an environment goes on."""
+    """Return the seeds of N environments: s + i for one seed s, or the list's own. None keeps an environment's seed."""
     if value is None:
         return [None] * num_envs
     if not isinstance(value, Sequence | np.ndarray) or getattr(value, "ndim", 1) == 0:
@@ -188,7 +188,7 @@ def seeds(value: Any, num_envs: int) -> list[int | None]:
 
 
 def step_limit(value: Any, description: Description) -> None:
-    """Refuse another step limit than the server's, which Gymnasium's `make_vec` passes on."""
+    """Refuse a step limit that differs from the server's. Gymnasium's `make_vec` passes on the limit of the id."""
     if value not in (None, -1, description.step_limit):
         raise InvalidArgumentError(
             f"max_episode_steps={value!r}: a batch has the step limit of the server, {description.step_limit}; leave "
@@ -206,7 +206,7 @@ def with_step_limit(spec: EnvSpec | None, description: Description) -> EnvSpec |
 
 
 def settings(initialiser: Callable[..., None]) -> list[str]:
-    """Return the names of what an environment can be made with."""
+    """Return the names of the settings with which an environment can be made."""
     parameters = inspect.signature(initialiser).parameters.values()
     return [it.name for it in parameters if it.name != "self" and it.kind is not it.VAR_KEYWORD]
 
@@ -221,11 +221,11 @@ def no_unknown(unknown: Mapping[str, Any], known: Sequence[str]) -> None:
 
 
 def parameter_values(parameters: Parameters, description: Description) -> Intervals:
-    """Sets that replace the version's, whose names and bounds are checked: they act only later.
+    """Return intervals that replace the version's. Names and bounds are checked, because the server sees them later.
 
     Raises:
-        UnknownNameError: for a name that the environment's parameters do not have.
-        InvalidArgumentError: for what is no set of values, and for values out of bounds.
+        UnknownNameError: if the environment has no parameter of a name.
+        InvalidArgumentError: for values that are malformed or out of bounds.
     """
     values = distributions(parameters)
     for name, intervals in values.items():
@@ -247,7 +247,7 @@ def parameter_values(parameters: Parameters, description: Description) -> Interv
 
 
 def count(value: Any, name: str, least: int) -> int:
-    """An integer that fits into the protocol's uint32."""
+    """Return an integer that fits into the protocol's uint32."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -258,7 +258,7 @@ def count(value: Any, name: str, least: int) -> int:
 
 
 def pixels(value: Any, name: str) -> int:
-    """The width or height of a picture that a server draws."""
+    """Return the width or height of a picture, in pixels, within the limits of servers."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -269,7 +269,7 @@ def pixels(value: Any, name: str) -> int:
 
 
 def render_mode(value: Any) -> None:
-    """The one way in which environments are drawn, or none."""
+    """Return `rgb_array`, the only mode of rendering, or None."""
     if value == "human":
         raise InvalidArgumentError(
             "render_mode='human' needs a window, which gymnasium.wrappers.HumanRendering opens: give it an environment "
@@ -280,7 +280,7 @@ def render_mode(value: Any) -> None:
 
 
 def seconds(value: Any, name: str) -> float:
-    """A span of time, more than nothing; infinity is one."""
+    """Return a positive number of seconds; it may be infinite."""
     try:
         number = float(value) if isinstance(value, numbers.Real) and not isinstance(value, bool) else 0.0
     except OverflowError:
@@ -291,7 +291,7 @@ def seconds(value: Any, name: str) -> float:
 
 
 def actions(values: Any, description: Description, shape: tuple[int, ...]) -> bytes:
-    """The actions of all environments: int32 [N] or float32 [N, A], in the shape that the user knows."""
+    """Return the bytes of all environments' actions: int32 [N] or float32 [N, A]. Errors name the user's own shape."""
     array = np.asarray(values)
     if array.shape != shape:
         raise InvalidArgumentError(f"the action has the shape {array.shape}; expected {shape}")
@@ -308,7 +308,7 @@ def actions(values: Any, description: Description, shape: tuple[int, ...]) -> by
 
 
 def states(values: Any, num_envs: int, *, batched: bool) -> bytes:
-    """Exact initial states, float64: [S] of a single environment, [M, S] of M selected ones."""
+    """Return exact initial states, float64: [S] of a single environment, [M, S] of M selected ones."""
     expected = f"{num_envs} rows of numbers, one for each reset environment" if batched else "a row of numbers"
     wrong = InvalidArgumentError(f"options['state'] is {values!r}; expected {expected}")
     array = _numbers(values, wrong)
@@ -318,7 +318,7 @@ def states(values: Any, num_envs: int, *, batched: bool) -> bytes:
 
 
 def mask(value: Any, num_envs: int, name: str) -> NDArray[np.bool_]:
-    """A boolean array [N] that selects at least one environment, as Gymnasium's `reset_mask`."""
+    """Return a boolean array [N] that selects at least one environment, as Gymnasium's `reset_mask`."""
     is_mask = isinstance(value, np.ndarray) and value.dtype == np.bool_ and value.shape == (num_envs,)
     if not is_mask or not value.any():
         raise InvalidArgumentError(
@@ -329,7 +329,7 @@ def mask(value: Any, num_envs: int, name: str) -> NDArray[np.bool_]:
 
 
 def options(given: Mapping[str, Any] | None, known: Sequence[str]) -> Mapping[str, Any]:
-    """The options of a reset, none of which is ignored."""
+    """Return the options of a reset; refuse unknown ones."""
     if given is None:
         return {}
     if not isinstance(given, Mapping):

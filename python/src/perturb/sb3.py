@@ -57,7 +57,7 @@ def make_vec_env(
     """
     for name in _FIXED:
         if name in settings:
-            raise InvalidArgumentError(f"{name}= is what stable-baselines3 needs it to be; leave it out")
+            raise InvalidArgumentError(f"{name}= is fixed, because stable-baselines3 needs its value; leave it out")
     settings.setdefault("receipts", False)
     batch = PerturbVectorEnv(environment, num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
     return PerturbVecEnv(batch, seed)
@@ -174,7 +174,7 @@ class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-
         slots = list(self._get_indices(indices))
         if method_name not in _METHODS or method_kwargs or len(method_args) != _METHODS[method_name]:
             raise AttributeError(
-                f"{method_name!r} cannot be called so; there are snapshot(), restore(snapshot), render(), "
+                f"{method_name!r} cannot be called like this; there are snapshot(), restore(snapshot), render(), "
                 "set_parameters(parameters)"
             )
         if method_name == "render":
@@ -236,7 +236,7 @@ class CurriculumCallback(BaseCallback):  # type: ignore[misc]  # stable-baseline
         return True
 
     def _update(self) -> None:
-        """Give the environments what the schedule says, if it says something else than before."""
+        """Set the parameters of the schedule's present stage, if they changed."""
         if callable(self._schedule):
             parameters = self._schedule(self.num_timesteps)
         else:

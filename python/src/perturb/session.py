@@ -1,8 +1,8 @@
 """A session: one stream to a server, which owns a batch of environments. Requests go out, replies come back in order.
 
-The native module has the stream; here are its errors' sentences and the private server. A session belongs to the
-process that opened it, and is opened when it is first needed, not when an environment is made: a process that is forked
-in between opens its own.
+The native module has the stream. This module starts the private server and writes the messages of the stream's errors.
+A session belongs to the process that opened it. It is opened when it is first needed, not when an environment is made,
+so a process that is forked before that opens its own.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 Reply = TypeVar("Reply")
 
 # Interval of keepalive pings to a silent server, and the limit for its answer, s. The limit is long because a busy
-# machine # is no reason to lose environments. The sockets of a server that ended are closed by its system at once.
+# machine is no reason to lose environments. When a server ends, its system closes its sockets at once.
 KEEPALIVE_INTERVAL, KEEPALIVE_LIMIT = 10.0, 20.0
 # Interval at which idle sessions answer the server's keepalive pings, s.
 POLL_INTERVAL = 0.25
@@ -59,9 +59,9 @@ DEADLINE_EXCEEDED, RESOURCE_EXHAUSTED, OUT_OF_RANGE, UNIMPLEMENTED, UNAUTHENTICA
 
 
 class Session:
-    """The stream. `server` is an address, or None for this process's own server.
+    """A session with a server: an address, or None for this process's own server.
 
-    That server, or the embedded one, serves `task`, too.
+    `task` is a folder that this process's own server, or the embedded one, serves.
 
     A session that is lost (the server died, a reply took too long, the wait for it was interrupted) stays lost.
     """
@@ -117,14 +117,14 @@ class Session:
         self._limit = self._native.timeout = seconds
 
     def usable(self) -> bool:
-        """Whether requests can be sent: it is neither lost nor another process's."""
+        """Whether requests can be sent: the session is neither lost nor opened by another process."""
         return os.getpid() == self._owner and self._gone() is None
 
     def require_usable(self) -> None:
-        """Raise, unless requests can be sent.
+        """Check that requests can be sent.
 
         Raises:
-            OutOfOrderError: with what happened, and that a reset begins anew.
+            OutOfOrderError: if they cannot. The message says why, and that `reset()` opens a new session.
         """
         if os.getpid() != self._owner:
             raise OutOfOrderError(
@@ -133,10 +133,10 @@ class Session:
             )
         gone = self._gone()
         if gone is not None:
-            raise OutOfOrderError(f"call reset() to begin anew, this environment is gone: {gone}")
+            raise OutOfOrderError(f"this environment is gone, call reset() to begin anew: {gone}")
 
     def _gone(self) -> str | None:
-        """Why it is of no more use, if so. A second Ctrl-C may have come before the first was noted."""
+        """Return why the session has ended, or None. A second Ctrl-C may have come before the first was noted."""
         return self._lost or ("it was interrupted, or its connection ended" if self._native.ended else None)
 
     def open(self, **request: Any) -> _native.Opened:
@@ -272,7 +272,7 @@ class Session:
         if code == UNAUTHENTICATED and what == "unreachable":  # certificates, or the files that variables name
             return ServerConnectionError(f"no safe connection to {where}: {words}")
         if code == UNAUTHENTICATED:
-            return ServerConnectionError(f"{where} does not let this process in: {words}")
+            return ServerConnectionError(f"{where} refuses this process: {words}")
         if code == UNIMPLEMENTED:
             return ProtocolError(f"what answers at {self.address} is no perturb-server: {words}")
         if isinstance(self._local, LocalServer):
@@ -291,7 +291,7 @@ class Session:
         pause = _keepalive.longest_pause()
         if pause >= PAUSE_LIMIT and code != DEADLINE_EXCEEDED:  # an idle session has the server's own reason
             return ServerConnectionError(
-                f"{lost}: {words}. This process stood still for {pause:.0f} s (Ctrl-Z, a debugger, a suspended "
+                f"{lost}: {words}. This process did not run for {pause:.0f} s (Ctrl-Z, a debugger, a suspended "
                 "computer, or code that holds Python's lock), and did not answer the server's keepalive pings "
                 "meanwhile; start the server with a longer --keepalive-seconds; reset() begins anew"
             )
@@ -299,7 +299,7 @@ class Session:
 
 
 def _listen(address: Address) -> str:
-    """Return the flags that start a server there."""
+    """Return the `--listen` value, and the flags with it, that start a server at an address."""
     text = str(address)
     if text.startswith("unix:"):
         return text

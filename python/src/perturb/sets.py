@@ -103,11 +103,11 @@ def sampled(
 ) -> Set:
     """Make a list of contexts drawn from R or E once: for training on a chosen number of them, or for testing.
 
-    Each parameter is uniform over its intervals. The same seed gives the same contexts, of which those of a smaller
-    count are the first. `task` is the folder of the environment's task, if it has one.
+    Each parameter is uniform over its intervals. The same seed gives the same contexts, and a smaller count gives the
+    first ones of a larger count. `task` is the folder of the environment's task, if it has one.
 
     Raises:
-        InvalidArgumentError: for an environment that there is not, another version than R and E, or a count below 1.
+        InvalidArgumentError: for an unknown environment, a version other than R and E, or a count below 1.
     """
     parameters = _environment(environment, task).parameters
     version = requests.version(version)
@@ -139,10 +139,10 @@ def heatmap(
     fixed: Mapping[str, float] | None = None,
     task: str | os.PathLike[str] | None = None,
 ) -> Set:
-    """Make the set of a heatmap over two parameters, which reports draw of whoever was tested on it.
+    """Make the set of a heatmap over two parameters. Reports draw a heatmap for each policy that was tested on it.
 
-    Its name is `heatmap`, and its tests are those of `perturb heatmap`. Points stand in the middle of equal parts of
-    the range that R and E have together.
+    The set's name is `heatmap`, and its tests are those of `perturb heatmap`. The range that R and E have together is
+    divided into equal parts along each axis, and the points stand in their middles.
 
     Args:
         environment: its name.
@@ -154,8 +154,9 @@ def heatmap(
         task: the folder of the environment's task, if it has one.
 
     Raises:
-        UnknownNameError: for an environment or a parameter that there is not.
-        InvalidArgumentError: for other numbers of points, one parameter twice, or where it is not known what to show.
+        UnknownNameError: for an unknown environment or parameter.
+        InvalidArgumentError: for other numbers of points, for one parameter twice, or if x and y are left out and the
+            environment has no usual heatmap.
     """
     known = _environment(environment, task)
     usual = known.heatmap_axes or (None, None)
@@ -202,13 +203,14 @@ def contexts_of(
     """Give the contexts of a grid or a list, for environments with this version and these parameters."""
     if chosen.contexts is None:
         raise InvalidArgumentError(
-            f"the set {chosen.name!r} is drawn from, and has no contexts: give parameters={dict(chosen.parameters)}"
+            f"the set {chosen.name!r} is drawn for each episode and has no contexts: give "
+            f"parameters={dict(chosen.parameters)}"
         )
     version = requests.version(version)
     if requests.version(chosen.base, "base") != version or parameters is not None:
         raise InvalidArgumentError(
-            f"the set {chosen.name!r} has parameters that it does not name from {chosen.base!r}, the environments from "
-            f"version={version!r} and parameters={parameters!r}: give the same version, and no parameters"
+            f"the set {chosen.name!r} takes parameters that it does not name from {chosen.base!r}, the environments "
+            f"take them from version={version!r} and parameters={parameters!r}: give the same version, no parameters"
         )
     return chosen.contexts
 

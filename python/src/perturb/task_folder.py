@@ -54,7 +54,7 @@ def find_folder(task: str | os.PathLike[str] | None, server: object = None) -> T
 
 @functools.lru_cache(maxsize=64)
 def entry(task: TaskFolder) -> Mapping[str, Any]:
-    """What a server that serves the folder tells of the task, as in catalogue.json.
+    """Return the description of the task, as in catalogue.json, by a server that serves the folder.
 
     Raises:
         InvalidArgumentError: if the server refuses the folder, with its sentence.
@@ -95,14 +95,14 @@ def describe(
     """Describe an environment: that of a task's folder, a built-in one, or one that the server has.
 
     Raises:
-        InvalidArgumentError: for a name that there is not.
+        InvalidArgumentError: for an unknown name.
     """
     if task is not None:
         known = Description.read(entry(task))
         if environment is not None and not catalogue.is_spelled(environment, known):
             raise InvalidArgumentError(
                 f"environment={environment!r} is not the task in {task.path}, which is {known.name!r}: leave one "
-                "of both out"
+                "of the two out"
             )
         return known
     if environment is None:
@@ -120,7 +120,7 @@ def describe(
 
 
 def _served(server: Address, timeout: float) -> list[Description]:
-    """The environments of a server; none if it does not answer, which the next request to it tells."""
+    """Return the environments of a server; none if it does not answer. The next request then raises the error."""
     try:
         told = _native.catalogue(str(server), timeout)
     except _native.Failure:

@@ -178,7 +178,7 @@ def _of_loaded(policy: Policy, environment: str, trained: str | None, observe: s
     """Return what a loaded policy observes.
 
     Raises:
-        PolicyError: if it was trained in another environment, or does not fit the other settings.
+        PolicyError: if the policy was trained in another environment, or does not fit the other settings.
     """
     if policy.environment != environment:
         raise PolicyError(f"the policy {policy.id} was trained in {policy.environment}, not in {environment}")
@@ -198,7 +198,7 @@ def _test(
     episodes_per_trial: int,
     show: Callable[[int, int], None],
 ) -> None:
-    """Play one set's episodes."""
+    """Play the episodes of one set."""
     _, version, drawn, contexts = one_set
     seed, num_envs = native(tests.plan, place)
     client = Client(

@@ -339,7 +339,7 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
     def _change_parameters(
         self, begun: NDArray[np.bool_], observations: NDArray[np.float32], infos: dict[str, Any]
     ) -> NDArray[np.float32]:
-        """Reset those of the environments whose episodes began that are to have other parameters."""
+        """Reset environments whose episodes just began and whose parameters `set_parameters` changed."""
         slots = [slot for slot in np.flatnonzero(begun).tolist() if slot in self._next_parameters]
         if not slots or self._client.session.under_way:
             return observations

@@ -24,11 +24,11 @@ pub fn note_fork() {
     FORKS.fetch_add(1, Ordering::Relaxed);
 }
 
-/// SessionState of a session.
+/// The phase of a session.
 pub(super) enum SessionState {
     New,
     Idle(Box<OpenSession>),
-    /// A thread waits, and has it.
+    /// A thread waits for a reply and owns the open session meanwhile.
     Busy,
     Ended,
 }
@@ -52,16 +52,16 @@ impl Session {
         timeout.and_then(|timeout| Instant::now().checked_add(timeout))
     }
 
-    /// M.
+    /// Returns M, the number of environments that the mask selects.
     pub(super) fn selected(&self, mask: &[u8]) -> usize {
         if mask.is_empty() { self.actions.num_envs } else { mask.iter().filter(|&&selected| selected != 0).count() }
     }
 
-    /// A forked process leaves the parent's session alone, and its locks, which may be locked for ever.
+    /// Refuses a session of the parent process. A forked process must not touch it: its locks may be held for ever.
     pub(super) fn require_own(&self) -> PyResult<()> {
         let is_own = match self.server {
             SessionServer::Address(..) => std::process::id() == self.owner,
-            // To ask the system takes a tenth of a small step.
+            // A system call for the process would take a tenth of a small step.
             SessionServer::Embedded(_) => self.forks == FORKS.load(Ordering::Relaxed),
         };
         if is_own {
@@ -70,7 +70,7 @@ impl Session {
         Err(failure(UNUSABLE, 0, "another process opened the session"))
     }
 
-    /// The session, with at most so many steps under way, for this thread alone.
+    /// Takes the session for this thread alone, if at most `max_under_way` steps are under way.
     pub(super) fn take(&self, max_under_way: usize) -> PyResult<Box<OpenSession>> {
         self.require_own()?;
         let mut state = self.state();
@@ -130,7 +130,8 @@ impl Session {
         self.exchange::<A>(py, open, None)
     }
 
-    /// Sends a request, or none if it was sent before, and takes the reply. After a refusal the session lives on.
+    /// Sends a request and receives its reply. `None` sends nothing and receives the reply of the oldest step that was sent
+    /// ahead. After a refusal the session goes on; other errors end it.
     fn exchange<A>(
         &self,
         py: Python<'_>,
@@ -171,7 +172,7 @@ impl Session {
                 Err(error)
             }
             Err(broken) => {
-                // The reply to come would be taken for that to the next request.
+                // The late reply would be taken for the reply to the next request.
                 open.close(py);
                 self.end();
                 Err(explain(broken))
@@ -183,7 +184,7 @@ impl Session {
 impl Drop for Session {
     fn drop(&mut self) {
         if std::process::id() != self.owner {
-            // A copy of the parent's: its locks may be locked for ever, and its connection is the parent's.
+            // The session is a copy of the parent's. Its locks may be held for ever, and its connection is the parent's.
             let state = self.state.get_mut().unwrap_or_else(PoisonError::into_inner);
             std::mem::forget(std::mem::replace(state, SessionState::Ended));
         }
@@ -191,7 +192,7 @@ impl Drop for Session {
 }
 
 impl OpenSession {
-    /// Tells the server, so that it frees the environments even where another process has the socket, too.
+    /// Ends the stream by a message, so that the server frees the environments even if a forked process holds the socket.
     pub(super) fn close(self, py: Python<'_>) {
         let Self { transport, runtime, .. } = self;
         let is_embedded = transport.is_embedded();
@@ -204,7 +205,7 @@ impl OpenSession {
     }
 }
 
-/// A session whose opening has not gone well yet: it ends with this.
+/// Ends a session when dropped, unless its opening succeeded and forgot the guard.
 pub(super) struct OpeningGuard<'a>(pub(super) &'a Session);
 
 impl Drop for OpeningGuard<'_> {
@@ -221,7 +222,7 @@ pub(super) fn explain(broken: WaitError) -> PyErr {
     }
 }
 
-/// `None` for ever.
+/// Converts seconds to a duration. Returns `None`, no limit, for infinity and for more than a `Duration` holds.
 pub(super) fn duration(seconds: f64) -> Option<Duration> {
     Duration::try_from_secs_f64(seconds).ok()
 }

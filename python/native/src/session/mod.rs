@@ -1,9 +1,9 @@
-//! A session as Python has it. Whatever it raises is a [`Failure`](crate::failure::Failure), or what a signal's handler
-//! raised.
+//! The Python class of a session. Its methods raise a [`Failure`](crate::failure::Failure), or the error of a signal's
+//! handler.
 //!
-//! - [`exchange`]: who has the session, requests and replies.
+//! - [`exchange`]: ownership of the session by one thread, requests and replies.
 //! - [`transport`]: the gRPC stream, or the embedded server.
-//! - [`opened`]: what opening it gave.
+//! - [`opened`]: the reply that opened it.
 
 mod exchange;
 mod opened;
@@ -35,7 +35,7 @@ pub use exchange::note_fork;
 pub use opened::Opened;
 pub use transport::NamedServer;
 
-/// Maximum number of steps under way, whose replies are kept until they are received.
+/// Maximum number of steps under way. Their replies are kept until they are received.
 const MAX_STEPS_UNDER_WAY: usize = 64;
 /// The outcome of a step: observations, rewards, both flags, and the episodes that began or ended.
 type StepArrays<'py> = (
@@ -122,7 +122,7 @@ impl Session {
         matches!(*self.state(), SessionState::Busy)
     }
 
-    /// Whether it is of no more use.
+    /// Whether the session has ended.
     #[getter]
     fn ended(&self) -> bool {
         self.require_own().is_err() || matches!(*self.state(), SessionState::Ended)
@@ -178,7 +178,7 @@ impl Session {
             receipts,
             reward_terms,
             observe_parameters,
-            // Of one environment by itself a message is as good.
+            // For a single environment messages cost no more than arrays.
             receipt_arrays: receipts && !self.actions.single,
             groups: Vec::new(),
             lease: 0, // a batch that loses its connection is lost
@@ -215,7 +215,7 @@ impl Session {
         })
     }
 
-    /// Advances every environment. What cannot be sent as it is, `encode` makes bytes of, or refuses.
+    /// Advances every environment. `encode` converts actions of unusual types to bytes, or refuses them.
     fn step<'py>(
         &self,
         py: Python<'py>,
@@ -294,7 +294,7 @@ impl Session {
         self.stepped(py, &labels, stepped)
     }
 
-    /// Begins new episodes: observations `[N, O]`, of which those of other environments are the last ones, and the episodes.
+    /// Begins new episodes. Returns observations `[N, O]`, with the last ones of other environments, and the episodes.
     fn reset<'py>(
         &self,
         py: Python<'py>,
@@ -328,7 +328,7 @@ impl Session {
         Ok(saved.snapshots.iter().map(|snapshot| PyBytes::new(py, snapshot)).collect())
     }
 
-    /// Brings saved environments back: observations `[N, O]`, of which those of other environments are the last ones.
+    /// Restores saved environments. Returns observations `[N, O]`, with the last ones of other environments.
     fn restore<'py>(
         &self,
         py: Python<'py>,
@@ -338,7 +338,7 @@ impl Session {
         let snapshots = snapshots.into_iter().map(Bytes::from).collect();
         let open = self.take(0)?;
         let (_, restored) = self.ask(py, open, proto::Restore { mask: Bytes::copy_from_slice(mask), snapshots })?;
-        // Of an environment whose physics diverged, they may be any numbers.
+        // Observations of an environment whose physics diverged may be any numbers.
         arrays::numbers(&restored.observations, &[self.selected(mask), self.observation_size])?;
         self.merged(py, mask, &restored.observations)
     }
@@ -357,12 +357,12 @@ impl Session {
         arrays::picture(py, &rendered.pixels, size)
     }
 
-    /// Answers the server's questions whether this side lives, while nobody waits.
+    /// Answers the server's keepalive pings while no thread waits for a reply.
     fn poll_io(&self, py: Python<'_>) {
         if std::process::id() != self.owner {
             return;
         }
-        // Locked and unlocked without Python's lock: who has that one may wait for this one.
+        // The state is locked without Python's lock, because a thread that has Python's lock may wait for the state.
         py.detach(|| {
             if let Ok(SessionState::Idle(open)) = self.state.try_lock().as_deref()
                 && !open.transport.is_embedded()
@@ -372,7 +372,7 @@ impl Session {
         });
     }
 
-    /// Ends the session; the server frees its environments. A thread that waits for a reply does so no longer.
+    /// Ends the session; the server frees its environments. A thread that waits for a reply gets an error.
     fn close(&self, py: Python<'_>) {
         if std::process::id() != self.owner {
             return;
@@ -380,7 +380,7 @@ impl Session {
         self.closing.close();
         let mut state = self.state();
         if matches!(*state, SessionState::Busy) {
-            return; // whoever waits ends it
+            return; // the thread that waits ends the session
         }
         if let SessionState::Idle(open) = std::mem::replace(&mut *state, SessionState::Ended) {
             drop(state);
@@ -390,8 +390,8 @@ impl Session {
 }
 
 impl Session {
-    /// The observations `[N, O]` after those of the environments that the mask selects, at first all, have become `rows`
-    /// `[M, O]`, whose length was checked.
+    /// Replaces the observations of the environments that the mask selects by `rows` `[M, O]`, whose length was checked.
+    /// An empty mask selects all. Returns the observations `[N, O]` of all environments.
     fn merged<'py>(&self, py: Python<'py>, mask: &[u8], rows: &Bytes) -> PyResult<Bound<'py, PyArray2<f32>>> {
         let mut last = unpoisoned(&self.last);
         let width = 4 * self.observation_size;

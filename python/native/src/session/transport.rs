@@ -1,4 +1,4 @@
-//! The two ways of a session to its server: a gRPC stream, or the embedded server.
+//! The two transports of a session: a gRPC stream to a server, or calls of the embedded server.
 
 use std::str::FromStr;
 use std::sync::Weak;
@@ -23,12 +23,12 @@ pub enum NamedServer<'py> {
 #[derive(Clone)]
 pub(super) enum SessionServer {
     Address(Address, Timeouts),
-    /// The session does not keep it alive until it is open.
+    /// The embedded server, which the session does not keep alive until it is open.
     Embedded(Weak<embedded::EmbeddedServer>),
 }
 
 impl SessionServer {
-    /// Understands what Python gave.
+    /// Parses the address, or takes the embedded server, that Python gave.
     pub(super) fn new(named: &NamedServer<'_>, timeouts: Timeouts) -> PyResult<Self> {
         match named {
             NamedServer::Address(address) => {
@@ -57,7 +57,7 @@ impl SessionServer {
     }
 }
 
-/// The way of an open session's requests and replies. A stream is dropped before its connection.
+/// The transport of an open session's requests and replies. A stream is dropped before its connection.
 pub(super) enum Transport {
     Stream {
         stream: Stream,
@@ -68,12 +68,13 @@ pub(super) enum Transport {
 }
 
 impl Transport {
-    /// Whether nothing has to be written to or read from a connection.
+    /// Whether the server is in this process, so that there is no connection to write to or read from.
     pub(super) fn is_embedded(&self) -> bool {
         matches!(self, Self::Embedded(_))
     }
 
-    /// Sends a request, or none if it was sent before, and takes the reply.
+    /// Sends a request and receives its reply. `None` sends nothing and receives the reply of the oldest step that was sent
+    /// ahead by [`send`](Self::send).
     pub(super) async fn exchange<A: TypedRequest>(
         stream: &mut Stream,
         request: Option<A>,
@@ -84,7 +85,7 @@ impl Transport {
         }
     }
 
-    /// Sends a step whose reply is taken later.
+    /// Sends a step ahead. A later [`exchange`](Self::exchange) of `None` receives its reply.
     pub(super) async fn send(&mut self, step: proto::Step) -> Result<(), RequestFailure> {
         match self {
             Self::Stream { stream, .. } => stream.send_ahead(step).await.map_err(failed),
