@@ -213,11 +213,6 @@ impl<'a> MethodResults<'a> {
         Summary::from_values(&self.metric(metric).into_values().collect::<Vec<_>>())
     }
 
-    /// Returns a scenario's success rate over runs, %.
-    pub fn scenario(&self, Scenario { train, test }: Scenario) -> Option<Summary> {
-        self.test(TrainedOn::Version(train), &test.to_string(), |test| test.success_percent)
-    }
-
     /// Returns a figure of the tests on a set or version over runs. In each run it is the mean over tied configurations.
     pub fn test(&self, trained_on: TrainedOn<'_>, tested_on: &str, figure: fn(&TestResult) -> f64) -> Option<Summary> {
         let of_run = |run: &SelectedRun<'_>| run.mean_over_ties(trained_on, tested_on, figure);

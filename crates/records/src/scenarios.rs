@@ -60,12 +60,7 @@ pub struct Scenario {
 impl Scenario {
     /// The nine pairs: DD, DR, DE, RD, … EE.
     pub fn all() -> impl Iterator<Item = Scenario> {
-        Self::pairs(&Version::ALL, &Version::ALL)
-    }
-
-    /// All pairs of the versions that were trained on and tested on.
-    pub fn pairs(trained: &[Version], tested: &[Version]) -> impl Iterator<Item = Scenario> {
-        trained.iter().flat_map(|&train| tested.iter().map(move |&test| Scenario { train, test }))
+        Version::ALL.into_iter().flat_map(|train| Version::ALL.map(|test| Scenario { train, test }))
     }
 }
 

@@ -59,10 +59,16 @@ fn table(columns: &[(String, usize, Heatmap)]) -> Table {
         mean.points.iter().map(|point| (caption.clone(), *policies, *point)).collect::<Vec<_>>()
     };
     let lines: Vec<(String, usize, HeatmapPoint)> = columns.iter().flat_map(of).collect();
-    let [x, y] = columns.first().map(|(.., mean)| mean.axes.clone().map(|axis| axis.name)).unwrap_or_default();
-    Table::builder("", &lines)
-        .text("trained", |(caption, ..)| caption)
-        .number("policies", |(_, policies, _)| policies)
+    let axes = columns.first().map(|(.., mean)| mean.axes.clone().map(|axis| axis.name)).unwrap_or_default();
+    points_table(["trained", "policies"], axes, &lines)
+}
+
+/// A line for each point of several heatmaps: which it is of, the number of policies, and its figures. `names` are those
+/// of the first two columns.
+pub(crate) fn points_table(names: [&str; 2], [x, y]: [String; 2], lines: &[(String, usize, HeatmapPoint)]) -> Table {
+    Table::builder("", lines)
+        .text(names[0], |(which, ..)| which)
+        .number(names[1], |(_, policies, _)| policies)
         .number(x, |(.., point)| point.x)
         .number(y, |(.., point)| point.y)
         .number("mean_return", |(.., point)| point.mean_return)

@@ -1,6 +1,7 @@
 use perturb_experiment::Plan;
 use perturb_protocol::Version;
-use perturb_records::ExternalEvaluation;
+use perturb_records::{ExternalEvaluation, RecordedTest};
+use perturb_settings::sets::TestSet;
 
 use super::*;
 use crate::fixture;
@@ -115,6 +116,23 @@ fn several_agents_have_a_section_that_compares_them() {
         .read(|whole| whole.page().map_err(ReportError::from))
         .unwrap();
     assert!(page.contains("id=\"comparison\"") && page.contains("SAC − PPO"), "{page}");
+}
+
+#[test]
+fn own_sets_of_agents_alone_come_first() {
+    let tested = fixture::assessed("PPO", "CartPole", &[Some(Version::D)], [200, 190, 100]);
+    let ExternalPolicy { known, records, .. } = &tested.policies()[0];
+    let mut records = records.clone();
+    let set = TestSet { name: "mine".into(), ..Version::D.into() };
+    let episodes = (0..4).map(|index| fixture::episode("mine", index, 0.5, 200, true)).collect();
+    records.add(RecordedTest { set, seed: 1, axes: None }, episodes);
+    let policies = vec![ExternalPolicy::new(known.clone(), records)];
+    let assessed = ExternalEvaluation::new(String::new(), "PPO".into(), policies).unwrap();
+    let page = ReportInputs { assessed: vec![assessed], ..ReportInputs::default() }
+        .read(|whole| whole.page().map_err(ReportError::from))
+        .unwrap();
+    let place = |text: &str| page.find(text).unwrap_or_else(|| panic!("{text}: {page}"));
+    assert!(place(">on mine<") < place(">on D<") && place(">on D<") < place(">on E<"));
 }
 
 #[test]

@@ -16,6 +16,7 @@ use perturb_settings::Method;
 use perturb_text::{Table, count};
 
 use super::pictures::{Picture, PictureDrawing, file_name};
+use crate::heatmap_policies::points_table;
 use crate::plot::{HeatmapColumn, HeatmapPanels, PlotError, common_returns};
 
 /// Heatmaps as pictures: one for each environment, pair of parameters and method, with a column for each training
@@ -217,15 +218,7 @@ impl<'a> Draft<'a> {
             points.map(move |point| (trained_on.clone(), runs, point)).collect::<Vec<_>>()
         };
         let lines: Vec<(String, usize, HeatmapPoint)> = self.columns.iter().flat_map(of_column).collect();
-        let [x, y] = kind.parameters.clone();
-        Table::builder(self.environment, &lines)
-            .text("train", |(trained_on, ..)| trained_on)
-            .number("runs", |(_, runs, _)| runs)
-            .number(x, |(.., point)| point.x)
-            .number(y, |(.., point)| point.y)
-            .number("mean_return", |(.., point)| point.mean_return)
-            .number("success_percent", |(.., point)| point.success_percent)
-            .build()
+        points_table(["train", "runs"], kind.parameters.clone(), &lines)
     }
 }
 

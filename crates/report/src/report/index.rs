@@ -29,8 +29,8 @@ impl<'a> ReportIndex<'a> {
         let of_others = assessed.iter().flat_map(|(_, policy, _)| &policy.records.about.tests).map(|test| &test.set);
         let mut tested_on = distinct(of_plan.chain(of_others).map(|set| set.name.as_str()));
         // Of agents alone, their own sets come first.
-        let set = if plan.cells.is_empty() { -1 } else { Version::KNOWN.len() as i32 };
-        tested_on.sort_by_key(|name| version(name).map_or(set, |version| version as i32));
+        let own_set = if plan.cells.is_empty() { -1 } else { Version::KNOWN.len() as i32 };
+        tested_on.sort_by_key(|name| version(name).map_or(own_set, |version| version as i32));
         Self { averaged, environments, methods: distinct(selections.iter().map(|row| row.method.clone())), tested_on }
     }
 }

@@ -51,9 +51,9 @@ impl Report<'_> {
 
     /// The interquartile mean of each metric, with both of its intervals, and the optimality gap.
     pub(super) fn iqm_table(&self) -> Option<Table> {
-        let title = "Over all environments and the runs that all of them have: interquartile mean with its 95 % stratified \
-                     bootstrap interval, that interval with every selection made anew in each resample, and optimality \
-                     gap, which is how far success rates stay below 100 % on average";
+        let title = "Interquartile means and optimality gaps: over all environments and the runs that all of them have, with \
+                     95 % stratified bootstrap intervals; where something was selected, also the interval with every \
+                     selection made anew in each resample. The gap is how far success rates stay below 100 % on average";
         let mut table = Table::builder(title, &self.averages).text("method", |row| &row.method);
         for metric in Metric::ALL {
             let column = |name: &str| Column { name: name.into(), group: Some(metric.to_string()), is_number: true };
@@ -61,10 +61,11 @@ impl Report<'_> {
                 let [low, high] = row.reselected.get(&metric)?[0].interval_95?;
                 Some(format!("[{:.1}, {:.1}]", low + 0.0, high + 0.0)) // no negative zero
             };
-            table = table
-                .column(column("IQM"), move |row| or(MISSING, row.iqms.get(&metric)))
-                .column(column("selection anew"), move |row| or(NOT_GIVEN, anew(row)))
-                .column(column("gap"), move |row| or(MISSING, row.gaps.get(&metric)));
+            table = table.column(column("IQM"), move |row| or(MISSING, row.iqms.get(&metric)));
+            if self.averages.iter().any(|row| !row.reselected.is_empty()) {
+                table = table.column(column("selection anew"), move |row| or(NOT_GIVEN, anew(row)));
+            }
+            table = table.column(column("gap"), move |row| or(MISSING, row.gaps.get(&metric)));
         }
         let table = table.number("runs", |row| self.runs(&row.method, row.iqm_runs())).build();
         (!table.rows.is_empty()).then_some(table)
