@@ -133,7 +133,7 @@ def results(studies):
     selected = len(studies.finished("classic-ff", seed=2))
     return [
         *texts,
-        f"Stored are the {of['beyond/confirm-2']} of beyond/confirm-2",
+        f"This folder has the {of['beyond/confirm-2']} policies of beyond/confirm-2",
         f"{of['classic-ff']} of the {selected} selected configurations of classic-ff",
         f"classic-rc: {missing['classic-rc']} cells",
         f"locomotion: {missing['locomotion']} cells",
