@@ -197,7 +197,7 @@ def test_sets_with_contexts_can_be_trained_on(server: str) -> None:
     batch.close()
     perturb.PerturbVectorEnv("CartPole", 4, contexts=grid, version="r", server=server).close()  # type: ignore[arg-type]
     wrong: list[tuple[dict[str, Any], str]] = [
-        ({"contexts": grid}, "the environments from version='D'"),
+        ({"contexts": grid}, "the environments take them from version='D'"),
         ({"contexts": grid, "version": "R", "parameters": {"mass": 0.1}}, "no parameters"),
         ({"contexts": perturb.sets.drawn("narrow", {"length": (0.3, 0.4)})}, "has no contexts"),
         ({"contexts": LENGTHS, "num_envs": 2}, "there are 3 contexts for num_envs=2"),
