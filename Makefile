@@ -93,7 +93,7 @@ endef
 
 .DEFAULT_GOAL := help
 .PHONY: help deps all-deps opengl toolchain build generate recurrent build-all install install-recurrent demo all-pairs results-check report-check serve-test test slurm-test kill-test \
-	load-test bounds-test attack-test faults-test asan-test qemu-test simulation-test slurm-acceptance lint proto-lint proto-baseline bench fuzz fuzz-keep \
+	load-test threads-test bounds-test attack-test faults-test asan-test qemu-test simulation-test slurm-acceptance lint proto-lint proto-baseline bench fuzz fuzz-keep \
 	bench-peers audit cargo-deny metrics-test kubernetes-check otel-test python-test interrupts-test wheel wheel-test python-acceptance \
 	bench-python python-venv languages-test docs docs-test docker docker-base docker-test
 
@@ -182,6 +182,11 @@ slurm-test: build-all ## do a plan on a real Slurm of two nodes, started for it,
 
 load-test: build-all ## a server full of Hoppers for five minutes: 1024 sessions of 16, and one more that is refused
 	PERTURB_TEST_FULL_SERVER_SECONDS=$(LOAD_SECONDS) cargo test $(ALL) --test server -- --nocapture every_place_can_be_taken
+
+# The tests of what threads share, once more with two transport threads in servers that do not say how many they have.
+threads-test: build-all opengl ## sessions, leases, limits, tokens and shutdowns with two transport threads; minutes
+	PERTURB_TEST_TRANSPORT_THREADS=2 cargo test $(ALL) --package perturb --test server -- \
+		bounds:: conformance:: determinism:: dm_env_rpc:: faults:: guarded:: leases:: lifecycle:: metrics:: streams::
 
 bounds-test: build-all opengl ## attack a server beside a neighbour, who waits 50 ms at most (p99); on an idle machine
 	PERTURB_TEST_NEIGHBOUR_P99_MS=50 cargo test $(ALL) --package perturb --test server -- --nocapture \

@@ -17,12 +17,17 @@ const ENV_PREFIX: &str = "PERTURB_SERVER";
 const MAX_SECONDS: u64 = 86_400;
 /// Lower limit of the memory for bytes in flight. Pictures need more.
 const MIN_MEMORY: usize = 1 << 20;
+/// The number of cores for which there is a transport thread by default: physics needs most of them.
+const CORES_PER_TRANSPORT_THREAD: usize = 8;
+/// Upper limit of the transport threads. More would not have enough to do on any machine.
+const MAX_TRANSPORT_THREADS: usize = 128;
 /// The maximum length of the file of settings.
 const MAX_CONFIG_BYTES: u64 = 1 << 20;
 /// The settings of `--private`. Limits protect shared servers only. The program may compute for long between two steps;
 /// its death closes the socket and the pipe anyway.
 const PRIVATE: &str = "
     exit_with_stdin = true
+    transport_threads = 1
     grace_seconds = 1
     keepalive_seconds = 3600
     max_envs = 16777216
@@ -53,6 +58,11 @@ pub struct Arguments {
     #[arg(long, value_name = "N")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub workers: Option<usize>,
+    /// Number of threads that talk to clients. A connection stays on one of them. [default: one for each eight cores, at
+    /// least one]
+    #[arg(long, value_name = "N")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub transport_threads: Option<usize>,
     /// Maximum number of environments, over all sessions. [default: 16384]
     #[arg(long, value_name = "N")]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -213,6 +223,8 @@ pub struct Config {
     pub listen: Vec<ListenAddress>,
     /// The number of physics threads, 1 … 1024.
     pub workers: usize,
+    /// The number of threads that talk to clients, 1 … 128.
+    pub transport_threads: usize,
     /// Maximum number of environments, over all sessions, 1 … 2^24.
     pub max_envs: usize,
     /// Maximum number of sessions at a time, at least 1.
@@ -263,7 +275,8 @@ impl Default for Config {
     fn default() -> Self {
         Self {
             listen: vec![ListenAddress::Tcp(SocketAddr::from(([127, 0, 0, 1], DEFAULT_PORT)))],
-            workers: std::thread::available_parallelism().map_or(1, usize::from),
+            workers: cores(),
+            transport_threads: (cores() / CORES_PER_TRANSPORT_THREAD).clamp(1, MAX_TRANSPORT_THREADS),
             max_envs: DEFAULT_MAX_ENVS,
             max_sessions: 1024,
             max_message_bytes: DEFAULT_MAX_MESSAGE_BYTES,
@@ -288,6 +301,10 @@ impl Default for Config {
             tasks: Vec::new(),
         }
     }
+}
+
+fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
 }
 
 /// Returns a quarter of the machine's memory, or of the limit of this process's container or service, in bytes.
@@ -499,6 +516,9 @@ impl Config {
         }
         if !(1..=1024).contains(&self.workers) {
             return refuse("workers", &self.workers, "1 … 1024");
+        }
+        if !(1..=MAX_TRANSPORT_THREADS).contains(&self.transport_threads) {
+            return refuse("transport_threads", &self.transport_threads, "1 … 128: about one for each eight cores");
         }
         if !(1..=1 << 24).contains(&self.max_envs) {
             return refuse("max_envs", &self.max_envs, "1 … 16777216");

@@ -254,7 +254,7 @@ fn task_schema() -> Vec<u8> {
 
 fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
     raise_descriptors();
-    // I/O has one thread: physics has threads of its own, and a hand-over between runtime threads doubles latency.
+    // The first transport thread. Each has a runtime of its own: a hand-over between threads doubles latency.
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let guards = Security::load(config, &environments.catalogue).map_err(Failure::setting)?;
     let result = runtime.block_on(async {

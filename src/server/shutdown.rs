@@ -24,7 +24,8 @@ pub struct Drain {
 
 /// Drives the shutdown.
 pub struct Controller {
-    phase: watch::Sender<ShutdownPhase>,
+    /// The phase as each view sees it.
+    phases: Vec<watch::Sender<ShutdownPhase>>,
     sessions: watch::Sender<()>,
 }
 
@@ -33,12 +34,19 @@ impl Controller {
     pub fn new() -> (Self, Drain) {
         let (phase, view) = watch::channel(ShutdownPhase::Running);
         let sessions = watch::Sender::new(());
-        (Self { phase, sessions: sessions.clone() }, Drain { phase: view, _session: None, sessions })
+        (Self { phases: vec![phase], sessions: sessions.clone() }, Drain { phase: view, _session: None, sessions })
+    }
+
+    /// Another view, for another thread: sessions look at the phase with each request, and two views share no lock.
+    pub fn view(&mut self) -> Drain {
+        let (phase, view) = watch::channel(ShutdownPhase::Running);
+        self.phases.push(phase);
+        Drain { phase: view, _session: None, sessions: self.sessions.clone() }
     }
 
     /// Moves on to a phase.
     pub fn set(&self, phase: ShutdownPhase) {
-        self.phase.send_replace(phase);
+        self.phases.iter().for_each(|view| _ = view.send_replace(phase));
     }
 
     /// Waits until no session runs.

@@ -11,13 +11,15 @@ use super::{
     },
     auth::{AuthLayer, Tokens},
     error::ErrorCounters,
-    metrics::{self, MetricsSources, RequestCounts},
+    metrics::{self, MetricsSources, RequestCounts, TransportMeter},
     net::{
         access_log::AccessLog,
         capacity_health,
-        listener::{self, AcceptLimits, Listener},
+        handshake::{self, Handshakes},
+        listener::Listener,
+        load::{Balance, ThreadLoad},
         peer_limiter::PeerLimiter,
-        tls::Tls,
+        transport_threads::{self, TransportThreads},
     },
     security::Security,
     session::{
@@ -36,7 +38,10 @@ use crate::{
     render::Renderer,
 };
 use std::{future::Future, io, sync::Arc, time::Duration};
-use tokio::{task::JoinSet, time::timeout};
+use tokio::{
+    task::JoinSet,
+    time::{Instant, timeout},
+};
 use tonic::{
     codec::CompressionEncoding,
     server::NamedService,
@@ -86,7 +91,8 @@ pub enum Error {
 
 /// Serves these environments on the listeners, and metrics on another, if there is one, until `shutdown` resolves. Then
 /// it drains: new sessions are refused, running ones may continue for the grace period, and connections are closed.
-/// Must run on a tokio runtime; a current-thread one is fastest.
+/// Must run on a tokio runtime; a current-thread one is fastest. It is the first of the transport threads; it also accepts
+/// connections. The others have runtimes of their own.
 ///
 /// # Errors
 /// [`Error`], before anything is served, or when a listener fails.
@@ -99,25 +105,50 @@ pub async fn run(
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
     let listing = listing(&catalogue, config)?;
-    let (controller, drain) = Controller::new();
+    let (mut controller, drain) = Controller::new();
     let state = ServerParts::new(config, catalogue, drain.clone())?;
     let renderer = Renderer::new();
     let pictures = renderer.times();
     let worlds = state.worlds(guards);
     let service = state.service(listing, renderer, guards);
     let requests = [("perturb.v1", service.counts()), ("dm_env_rpc.v1", worlds.counts())];
-    let sources = Arc::new(state.sources(requests, guards, pictures));
+    let balance = Balance::new(config.transport_threads, Instant::now());
+    let sources = Arc::new(state.sources(requests, guards, pictures, balance.loads()));
     let (health, health_service) = tonic_health::server::health_reporter();
     set_health(&health, ServingStatus::Serving).await;
-    let router = router(config, &state, guards.tokens.clone(), service, worlds, health_service)?;
 
-    let _watching = metrics.map(|listener| watch(listener, &sources)); // ends with this function
-    let mut servers = serve(listeners, &router, &state.admission, guards.tls.as_ref(), &drain);
+    let handshakes = Handshakes { limit: state.handshake, tls: guards.tls.clone() };
+    let is_watched = metrics.is_some();
+    let _scraped = metrics.map(|listener| answer_scrapers(listener, &sources)); // ends with this function
+    let mut servers = JoinSet::new();
+    let (threads, accepted) = TransportThreads::new(balance);
+    for (place, accepted) in accepted.into_iter().enumerate() {
+        let view = controller.view();
+        let (service, worlds) = (service.with_drain(view.clone()), worlds.with_drain(view.clone()));
+        let router = router(config, &state, guards.tokens.clone(), service, worlds, health_service.clone())?;
+        let connections = handshake::connections(accepted, handshakes.clone());
+        let watching = is_watched.then(|| Arc::clone(&sources));
+        let served = async move {
+            tokio::select! {
+                served = router.serve_with_incoming_shutdown(connections, closed(view)) => served.map_err(Error::from),
+                () = watch_lag(watching, place) => Ok(()),
+            }
+        };
+        if place == 0 {
+            servers.spawn(served);
+        } else {
+            let thread = transport_threads::spawn(format!("transport-{place}"), served)?;
+            servers.spawn(async { thread.await? });
+        }
+    }
+    for listener in listeners {
+        servers.spawn(accept(listener, state.connections.clone(), threads.clone(), drain.clone()));
+    }
     tokio::select! {
         () = shutdown => {}
         () = capacity_health::report_capacity(&health, &state.limiter, &state.pool) => {}
-        // A listener ends by itself only if it fails.
-        Some(ended) = servers.join_next() => return Ok(ended.map_err(io::Error::other)??),
+        // None of them ends by itself unless it fails.
+        Some(ended) = servers.join_next() => return ended.map_err(io::Error::other)?,
     }
     shut_down(config, &controller, &health, &sources.requests, servers).await;
     if let Some(ledger) = &guards.ledger {
@@ -165,7 +196,8 @@ struct ServerParts {
     pool: Arc<Pool>,
     catalogue: Arc<Catalogue>,
     limiter: PeerLimiter,
-    admission: AcceptLimits,
+    connections: PeerLimiter,
+    handshake: Duration,
     transit: StreamLimits,
     sessions: Sessions,
     leases: Leases<proto::SessionResponse>,
@@ -192,7 +224,8 @@ impl ServerParts {
             pool,
             catalogue: Arc::new(catalogue),
             limiter,
-            admission: AcceptLimits { limiter: connections, handshake },
+            connections,
+            handshake,
             transit: StreamLimits {
                 budget: Budget::new(config.max_memory),
                 limit: seconds(config.stall_seconds),
@@ -231,13 +264,19 @@ impl ServerParts {
     }
 
     /// The counters that the metrics read.
-    fn sources(&self, requests: [RequestCounts; 2], guards: &Security, pictures: Arc<Histogram>) -> MetricsSources {
+    fn sources(
+        &self,
+        requests: [RequestCounts; 2],
+        guards: &Security,
+        pictures: Arc<Histogram>,
+        loads: Vec<Arc<ThreadLoad>>,
+    ) -> MetricsSources {
         requests.iter().for_each(|(protocol, _)| self.access.register_protocol(protocol));
         MetricsSources {
             pool: Arc::clone(&self.pool),
             sessions: self.limiter.clone(),
             leases: self.leased.clone(),
-            connections: self.admission.limiter.clone(),
+            connections: self.connections.clone(),
             budget: self.transit.budget.clone(),
             requests,
             errors: self.errors.clone(),
@@ -245,7 +284,7 @@ impl ServerParts {
             tokens: guards.tokens.clone(),
             ledger: guards.ledger.clone(),
             pictures,
-            lag: Histogram::default(),
+            threads: loads.into_iter().map(TransportMeter::new).collect(),
         }
     }
 }
@@ -303,43 +342,36 @@ fn reflection() -> tonic_reflection::server::Builder<'static> {
 }
 
 /// Serves metrics, until the set of tasks is dropped.
-fn watch(listener: Listener, sources: &Arc<MetricsSources>) -> JoinSet<()> {
+fn answer_scrapers(listener: Listener, sources: &Arc<MetricsSources>) -> JoinSet<()> {
     let mut tasks = JoinSet::new();
-    let watched = Arc::clone(sources);
-    tasks.spawn(async move { watched.watch_lag().await });
     tasks.spawn(metrics::endpoint::serve(listener, Arc::clone(sources)));
     tasks
 }
 
-/// Serves on each listener, in a task of its own, until the drain is closed.
-fn serve(
-    listeners: Vec<Listener>,
-    router: &Router,
-    admission: &AcceptLimits,
-    tls: Option<&Tls>,
-    drain: &Drain,
-) -> JoinSet<Result<(), tonic::transport::Error>> {
-    let mut servers = JoinSet::new();
-    for listener in listeners {
-        let (router, mut closed, admission) = (router.clone(), drain.clone(), admission.clone());
-        let tls = tls.cloned();
-        servers.spawn(async move {
-            let end = async move { closed.closed().await };
-            match (listener, tls) {
-                (Listener::Tcp(listener), Some(tls)) => {
-                    router.serve_with_incoming_shutdown(listener::tls_connections(listener, admission, tls), end).await
-                }
-                (Listener::Tcp(listener), None) => {
-                    router.serve_with_incoming_shutdown(listener::tcp_connections(listener, admission), end).await
-                }
-                (Listener::Unix(listener, file), _) => {
-                    let connections = listener::unix_connections(listener, file, admission);
-                    router.serve_with_incoming_shutdown(connections, end).await
-                }
-            }
-        });
+/// Watches how late this thread, the one at `place`, wakes, if somebody may ask for it; for ever.
+async fn watch_lag(sources: Option<Arc<MetricsSources>>, place: usize) {
+    match sources {
+        Some(sources) => sources.threads[place].watch_lag().await,
+        None => std::future::pending().await,
     }
-    servers
+}
+
+/// Accepts connections until the end of the shutdown.
+async fn accept(
+    listener: Listener,
+    limiter: PeerLimiter,
+    threads: TransportThreads,
+    drain: Drain,
+) -> Result<(), Error> {
+    tokio::select! {
+        never = transport_threads::accept(listener, limiter, threads) => match never {},
+        () = closed(drain) => Ok(()),
+    }
+}
+
+/// Waits for the end of the shutdown.
+async fn closed(mut drain: Drain) {
+    drain.closed().await;
 }
 
 /// Refuses new sessions, lets running ones continue for the grace period, and closes connections.
@@ -348,7 +380,7 @@ async fn shut_down(
     controller: &Controller,
     health: &HealthReporter,
     requests: &[RequestCounts],
-    mut servers: JoinSet<Result<(), tonic::transport::Error>>,
+    mut servers: JoinSet<Result<(), Error>>,
 ) {
     tracing::info!(grace_seconds = config.grace_seconds, "shutting down: no new sessions");
     controller.set(ShutdownPhase::Draining);

@@ -1,4 +1,4 @@
-//! The same session gives the same bytes, whatever the number of workers, the transport, or the split of the batch.
+//! The same session gives the same bytes, whatever the number of threads, the transport, or the split of the batch.
 
 use crate::common::server::{Actor, Server, Session, catalogue, open, stepped};
 use perturb::proto::{EpisodeEnd, EpisodeStart, Open, Reset, SessionResponse, Stepped, session_response::Response};
@@ -30,8 +30,9 @@ fn hash(responses: &[SessionResponse]) -> String {
 }
 
 #[tokio::test]
-async fn bytes_depend_neither_on_the_workers_nor_on_the_transport() {
-    let (one, four) = (Server::with_folders(&["--workers", "1"]), Server::with_folders(&["--workers", "4"]));
+async fn bytes_depend_neither_on_threads_nor_on_the_transport() {
+    let one = Server::with_folders(&["--workers", "1"]);
+    let four = Server::with_folders(&["--workers", "4", "--transport-threads", "2"]);
     let places = [
         ("1 worker, TCP", one.tcp()),
         ("1 worker, Unix socket", one.unix()),
@@ -71,7 +72,7 @@ async fn bytes_do_not_depend_on_how_many_shards_a_batch_has() {
 
 #[tokio::test]
 async fn other_sessions_on_the_same_server_change_nothing() {
-    let server = Server::with_folders(&["--workers", "2"]);
+    let server = Server::with_folders(&["--workers", "2", "--transport-threads", "2"]);
     for environment in &catalogue(server.tcp()).await {
         let actor = Actor::new(environment, BATCH as usize);
         let run = || transcript(server.unix(), open(&environment.name, BATCH, 3), actor, 300);

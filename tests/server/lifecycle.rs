@@ -363,6 +363,8 @@ fn a_bad_flag_is_refused_before_any_port_is_bound() {
     let wrong: &[&[&str]] = &[
         &["--workers", "0"],
         &["--workers", "1025"],
+        &["--transport-threads", "0"],
+        &["--transport-threads", "129"],
         &["--workers", "-1"],
         &["--workers", "two"],
         &["--max-envs", "0"],

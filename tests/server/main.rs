@@ -39,4 +39,5 @@ mod success;
 mod toy;
 #[cfg(feature = "otel")]
 mod traces;
+mod transport_threads;
 mod unheard;

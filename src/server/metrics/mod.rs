@@ -14,7 +14,7 @@ use super::{
     audit::ledger::Ledger,
     auth::Tokens,
     error::ErrorCounters,
-    net::{access_log::AccessLog, peer_limiter::PeerLimiter},
+    net::{access_log::AccessLog, load::ThreadLoad, peer_limiter::PeerLimiter},
     session::{instrumented::RequestCounters, lease::LeaseCounters},
     transport::budget::Budget,
 };
@@ -22,7 +22,7 @@ use crate::{meters::Histogram, pool::Pool};
 use std::{sync::Arc, time::Duration};
 use tokio::time::{Instant, sleep_until};
 
-/// The interval at which the wake-up delay of the transport's thread is measured.
+/// The interval at which the wake-up delay of a transport thread is measured.
 const LAG_CHECK_INTERVAL: Duration = Duration::from_millis(100);
 
 /// A protocol, and its requests by kind.
@@ -52,11 +52,24 @@ pub struct MetricsSources {
     pub ledger: Option<Ledger>,
     /// The drawing times of pictures.
     pub pictures: Arc<Histogram>,
-    /// The wake-up delays of the transport's thread.
+    /// The transport threads.
+    pub threads: Vec<TransportMeter>,
+}
+
+/// What is measured of a transport thread.
+pub struct TransportMeter {
+    /// The connections of the thread.
+    pub load: Arc<ThreadLoad>,
+    /// The wake-up delays of the thread.
     pub lag: Histogram,
 }
 
-impl MetricsSources {
+impl TransportMeter {
+    /// Nothing is measured yet.
+    pub fn new(load: Arc<ThreadLoad>) -> Self {
+        Self { load, lag: Histogram::default() }
+    }
+
     /// Measures, for ever, how late the thread that runs this wakes up.
     pub async fn watch_lag(&self) {
         loop {

@@ -48,6 +48,7 @@ impl Collector for MetricsCollector {
         self.capacity(&mut page)?;
         self.requests(&mut page)?;
         self.environments(&mut page)?;
+        self.transport(&mut page)?;
         self.tokens(&mut page)?;
         resources(&mut page)
     }
@@ -110,12 +111,19 @@ impl MetricsCollector {
         });
         let help = "How long a step request takes from its check to its reply, by the size of the batch";
         page.histograms("perturb_step_seconds", help, each)?;
-        let MetricsSources { pool, pictures, lag, .. } = &*self.0;
+        let MetricsSources { pool, pictures, .. } = &*self.0;
         let help = "How long a batch waits until a worker takes a part of it, each time";
         page.histograms("perturb_queue_wait_seconds", help, [(NO_LABELS, pool.waits())])?;
-        let help = "How late the thread wakes that talks to clients; 1 ms or 2 are the timer's own";
-        page.histograms("perturb_transport_lag_seconds", help, [(NO_LABELS, lag)])?;
         page.histograms("perturb_picture_seconds", "How long a picture is drawn", [(NO_LABELS, &**pictures)])
+    }
+
+    fn transport(&self, page: &mut Page<'_>) -> EncodeResult {
+        let names: Vec<String> = (0..self.0.threads.len()).map(|place| place.to_string()).collect();
+        let threads = || names.iter().zip(&self.0.threads).map(|(name, thread)| ([("thread", name.as_str())], thread));
+        let each = threads().map(|(name, thread)| (name, thread.load.connections() as f64));
+        page.gauges("perturb_transport_connections", "Connections now of a thread that talks to clients", each)?;
+        let help = "How late a thread wakes that talks to clients; 1 ms or 2 are the timer's own";
+        page.histograms("perturb_transport_lag_seconds", help, threads().map(|(name, thread)| (name, &thread.lag)))
     }
 
     fn tokens(&self, page: &mut Page<'_>) -> EncodeResult {

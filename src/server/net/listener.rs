@@ -1,28 +1,15 @@
 //! Binding addresses: TCP ports and Unix sockets.
 
-use super::{
-    managed_io::ManagedIo,
-    peer_limiter::{Peer, PeerLimiter, PeerPermit},
-    tls::Tls,
-};
+use super::{handshake::AcceptedSocket, peer_limiter::Peer};
 use crate::config::{ListenAddress, SocketMode};
-use futures_util::{Stream, stream};
-use std::time::Duration;
 use std::{
     fs::Permissions,
     io::{self, ErrorKind},
     os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt},
     path::{Path, PathBuf},
 };
-use tokio::{
-    net::{TcpListener, TcpStream, UnixListener, UnixSocket, UnixStream},
-    task::JoinSet,
-    time::timeout,
-};
-use tokio_rustls::server::TlsStream;
+use tokio::net::{TcpListener, UnixListener, UnixSocket, UnixStream};
 
-/// The pause after the system refuses to accept a connection.
-const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(200);
 /// The length of the system's queue of connections that are not accepted yet.
 const MAX_PENDING_CONNECTIONS: u32 = 1024;
 
@@ -34,118 +21,7 @@ pub enum Listener {
     Unix(UnixListener, SocketFile),
 }
 
-/// The limits for connections.
-#[derive(Clone)]
-pub struct AcceptLimits {
-    /// The limiter of connections.
-    pub limiter: PeerLimiter,
-    /// The time in which a client must finish its handshake or send its preface.
-    pub handshake: Duration,
-}
-
-impl AcceptLimits {
-    /// The connection, if there is a permit for it.
-    fn admit<S>(&self, stream: S, peer: Peer) -> Option<ManagedIo<S>> {
-        self.acquire(peer).map(|permit| ManagedIo::new(stream, peer, permit, self.handshake))
-    }
-
-    fn acquire(&self, peer: Peer) -> Option<PeerPermit> {
-        let full = |full| tracing::debug!(?peer, ?full, "closed a connection for which there is no place");
-        self.limiter.acquire(Some(peer)).map_err(full).ok()
-    }
-
-    /// The connection, if its client finishes the handshake in time.
-    async fn handshake(
-        self,
-        stream: TcpStream,
-        peer: Peer,
-        permit: PeerPermit,
-        tls: Tls,
-    ) -> Option<ManagedIo<TlsStream<TcpStream>>> {
-        let refused = |reason: &dyn ToString| {
-            tracing::debug!(?peer, reason = reason.to_string(), "closed a connection in its handshake");
-        };
-        match timeout(self.handshake, tls.accept(stream)).await {
-            Ok(Ok(stream)) => return Some(ManagedIo::new(stream, peer, permit, self.handshake)),
-            Ok(Err(error)) => refused(&error),
-            Err(late) => refused(&late),
-        }
-        None
-    }
-}
-
-/// Accepts connections. Nagle's delay is switched off, because a step is one small message each way.
-pub fn tcp_connections(
-    listener: TcpListener,
-    limits: AcceptLimits,
-) -> impl Stream<Item = io::Result<ManagedIo<TcpStream>>> {
-    stream::unfold((listener, limits), |(listener, limits)| async {
-        let connection = loop {
-            match listener.accept().await {
-                Ok((connection, address)) => {
-                    // It fails only for connections that are already closed.
-                    let _ = connection.set_nodelay(true);
-                    if let Some(connection) = limits.admit(connection, Peer::at(address.ip())) {
-                        break connection;
-                    }
-                }
-                Err(error) => pause(&error).await,
-            }
-        };
-        Some((Ok(connection), (listener, limits)))
-    })
-}
-
-/// Accepts connections and returns them after their TLS handshakes, in the order in which these finish. A slow
-/// handshake does not delay the others.
-pub fn tls_connections(
-    listener: TcpListener,
-    limits: AcceptLimits,
-    tls: Tls,
-) -> impl Stream<Item = io::Result<ManagedIo<TlsStream<TcpStream>>>> {
-    stream::unfold((listener, limits, tls, JoinSet::new()), |(listener, limits, tls, mut handshakes)| async {
-        let connection = loop {
-            tokio::select! {
-                accepted = listener.accept() => match accepted {
-                    Ok((connection, address)) => {
-                        let _ = connection.set_nodelay(true);
-                        let peer = Peer::at(address.ip());
-                        if let Some(permit) = limits.acquire(peer) {
-                            handshakes.spawn(limits.clone().handshake(connection, peer, permit, tls.clone()));
-                        }
-                    }
-                    Err(error) => pause(&error).await,
-                },
-                Some(done) = handshakes.join_next() => if let Ok(Some(connection)) = done { break connection },
-            }
-        };
-        Some((Ok(connection), (listener, limits, tls, handshakes)))
-    })
-}
-
-/// Accepts connections. The socket's file is removed when the stream is dropped.
-pub fn unix_connections(
-    listener: UnixListener,
-    file: SocketFile,
-    limits: AcceptLimits,
-) -> impl Stream<Item = io::Result<ManagedIo<UnixStream>>> {
-    stream::unfold((listener, file, limits), |(listener, file, limits)| async {
-        let connection = loop {
-            match listener.accept().await {
-                Ok((connection, _)) => {
-                    let user = connection.peer_cred().ok().map(|credentials| credentials.uid());
-                    if let Some(connection) = limits.admit(connection, Peer::User(user)) {
-                        break connection;
-                    }
-                }
-                Err(error) => pause(&error).await,
-            }
-        };
-        Some((Ok(connection), (listener, file, limits)))
-    })
-}
-
-/// Returns why an address cannot be bound, and how to change the flag that names it.
+/// Why an address cannot be had, and what to do about the flag that gives it.
 fn explain(address: &ListenAddress, flag: &str, error: &io::Error) -> String {
     let text = address.written();
     match (address, error.kind()) {
@@ -164,13 +40,6 @@ fn explain(address: &ListenAddress, flag: &str, error: &io::Error) -> String {
         }
         _ => format!("cannot listen at {text}: {error}; correct {flag}"),
     }
-}
-
-/// Logs that the system refuses connections, and waits. The process most likely has no file descriptors left, and
-/// retrying at once would keep the thread from its open connections.
-async fn pause(error: &io::Error) {
-    tracing::warn!(%error, "cannot accept a connection");
-    tokio::time::sleep(ACCEPT_RETRY_DELAY).await;
 }
 
 /// Removes a socket's file when it is dropped, unless another server's has taken its place.
@@ -236,6 +105,24 @@ impl Listener {
         match self {
             Self::Tcp(listener) => listener.local_addr().map(ListenAddress::Tcp),
             Self::Unix(_, file) => Ok(ListenAddress::Unix(file.path.clone())),
+        }
+    }
+    /// Waits for the next connection. A TCP connection has no Nagle's delay: a step is one small message each way.
+    ///
+    /// # Errors
+    /// If the operating system refuses, mostly because it is out of file descriptors.
+    pub async fn accept(&self) -> io::Result<(AcceptedSocket, Peer)> {
+        match self {
+            Self::Tcp(listener) => {
+                let (socket, address) = listener.accept().await?;
+                let _ = socket.set_nodelay(true); // it fails for connections that are gone already
+                Ok((AcceptedSocket::Tcp(socket.into_std()?), Peer::at(address.ip())))
+            }
+            Self::Unix(listener, _) => {
+                let (socket, _) = listener.accept().await?;
+                let user = socket.peer_cred().ok().map(|credentials| credentials.uid());
+                Ok((AcceptedSocket::Unix(socket.into_std()?), Peer::User(user)))
+            }
         }
     }
 }

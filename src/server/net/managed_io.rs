@@ -1,6 +1,9 @@
 //! The I/O of a connection, with a timeout for its first bytes and a switch that ends it.
 
-use super::peer_limiter::{Peer, PeerPermit};
+use super::{
+    load::ConnectionLoad,
+    peer_limiter::{Peer, PeerPermit},
+};
 use futures_util::task::AtomicWaker;
 use std::{
     future::Future,
@@ -51,13 +54,33 @@ pub struct ManagedIo<S> {
     /// The number of bytes of the preface that have not arrived, and the deadline for them.
     preface: Option<(usize, Pin<Box<Sleep>>)>,
     _permit: PeerPermit,
+    load: Option<ConnectionLoad>,
 }
 
 impl<S> ManagedIo<S> {
     /// Wraps a connection whose client must send its preface within `limit`.
     pub fn new(stream: S, peer: Peer, permit: PeerPermit, limit: Duration) -> Self {
         let preface = Some((PREFACE_BYTES, Box::pin(sleep(limit))));
-        Self { stream, connection: Connection { peer, kill_switch: Arc::default() }, preface, _permit: permit }
+        Self {
+            stream,
+            connection: Connection { peer, kill_switch: Arc::default() },
+            preface,
+            _permit: permit,
+            load: None,
+        }
+    }
+
+    /// Counts its reads and writes as work of its thread.
+    pub fn counted(mut self, load: ConnectionLoad) -> Self {
+        self.load = Some(load);
+        self
+    }
+
+    /// Counts a read or a write that moved bytes.
+    fn count(&self, bytes: usize) {
+        if let Some(load) = self.load.as_ref().filter(|_| bytes > 0) {
+            load.count(bytes);
+        }
     }
 
     fn check(&self, context: &Context<'_>) -> io::Result<()> {
@@ -91,8 +114,10 @@ impl<S: AsyncRead + Unpin> AsyncRead for ManagedIo<S> {
         self.check(context)?;
         let before = buffer.filled().len();
         let polled = Pin::new(&mut self.stream).poll_read(context, buffer);
+        let bytes = buffer.filled().len() - before;
+        self.count(bytes);
         if let Some((left, limit)) = &mut self.preface {
-            *left = left.saturating_sub(buffer.filled().len() - before);
+            *left = left.saturating_sub(bytes);
             if *left == 0 {
                 self.preface = None;
             } else if limit.as_mut().poll(context).is_ready() {
@@ -106,7 +131,10 @@ impl<S: AsyncRead + Unpin> AsyncRead for ManagedIo<S> {
 impl<S: AsyncWrite + Unpin> AsyncWrite for ManagedIo<S> {
     fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         self.check(context)?;
-        Pin::new(&mut self.stream).poll_write(context, bytes)
+        Pin::new(&mut self.stream).poll_write(context, bytes).map_ok(|written| {
+            self.count(written);
+            written
+        })
     }
 
     fn poll_write_vectored(
@@ -115,7 +143,10 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for ManagedIo<S> {
         parts: &[IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
         self.check(context)?;
-        Pin::new(&mut self.stream).poll_write_vectored(context, parts)
+        Pin::new(&mut self.stream).poll_write_vectored(context, parts).map_ok(|written| {
+            self.count(written);
+            written
+        })
     }
 
     fn is_write_vectored(&self) -> bool {

@@ -52,6 +52,11 @@ impl Sessions {
         Self { limiter, limits, decoder: Decoder::default(), drain, counters, access, leases }
     }
 
+    /// The same sessions, with another view of the shutdown.
+    pub fn with_drain(&self, drain: Drain) -> Self {
+        Self { drain, ..self.clone() }
+    }
+
     /// The phase of the shutdown.
     pub fn phase(&self) -> ShutdownPhase {
         self.drain.phase()

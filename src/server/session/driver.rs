@@ -27,6 +27,7 @@ use std::{
     sync::Arc,
 };
 use tokio::{
+    runtime::Handle,
     sync::{
         mpsc::{self, error::TrySendError},
         oneshot,
@@ -62,7 +63,7 @@ impl Sessions {
         let (responses, mut received) = mpsc::channel::<Result<OutgoingResponse<H::Response>, Status>>(1);
         let outbox = requests.outbox.clone();
         let exchange = Exchange::new(requests, handler, Arc::clone(counts), self.enter(), admission);
-        tokio::spawn(SessionDriver { exchange, lease: None }.run(responses));
+        SessionDriver { exchange, lease: None }.spawn(&Handle::current(), responses);
         let stream = stream::poll_fn(move |context| {
             received.poll_recv(context).map(|response| {
                 Some(response?.map(|OutgoingResponse { response, memory }| {
@@ -102,6 +103,8 @@ enum Attachment<R> {
     Attached(ResponseSender<R>),
     /// The session has no stream, but a stream that was accepted may be about to attach.
     Detached(Option<Resuming<R>>),
+    /// The session is resumed by the stream that takes these responses, on the runtime of that stream's thread.
+    Resumed(Handle, ResponseSender<R>),
     /// The session has ended.
     Ended,
 }
@@ -109,6 +112,11 @@ enum Attachment<R> {
 type Resuming<R> = oneshot::Receiver<ResumingStream<R>>;
 
 impl<H: SessionHandler> SessionDriver<H> {
+    /// Runs the session on this runtime, where its stream is.
+    fn spawn(self, runtime: &Handle, responses: ResponseSender<H::Response>) {
+        runtime.spawn(self.run(responses));
+    }
+
     async fn run(mut self, responses: ResponseSender<H::Response>) {
         let mut attachment = Attachment::Attached(responses);
         loop {
@@ -118,6 +126,7 @@ impl<H: SessionHandler> SessionDriver<H> {
                     next => next,
                 },
                 Attachment::Detached(resuming) => self.detached(resuming).await,
+                Attachment::Resumed(runtime, responses) => return self.spawn(&runtime, responses),
                 Attachment::Ended => return,
             };
         }
@@ -221,9 +230,12 @@ impl<H: SessionHandler> SessionDriver<H> {
         let Some(ticket) = resumed else { return Ok(()) };
         self.exchange.ending = MOVED;
         // If the session has ended by now, the stream ends at once.
-        let _ = ticket
-            .stream
-            .send(ResumingStream { requests: self.exchange.requests.detach(), responses: responses.clone() });
+        let _ = ticket.stream.send(ResumingStream {
+            requests: self.exchange.requests.detach(),
+            responses: responses.clone(),
+            drain: self.exchange.sessions.drain.clone(),
+            runtime: Handle::current(),
+        });
         Err(Attachment::Ended)
     }
 
@@ -264,12 +276,13 @@ impl<H: SessionHandler> SessionDriver<H> {
                 arrived = arrival(&mut resuming) => {
                     resuming = None;
                     match arrived {
-                        Ok(ResumingStream { requests, responses }) => {
+                        Ok(ResumingStream { requests, responses, drain, runtime }) => {
                             exchange.requests = requests;
+                            exchange.sessions.drain = drain;
                             exchange.resumed += 1;
                             exchange.ending = GONE;
                             lease.grant.counters().add_resumed();
-                            return Attachment::Attached(responses);
+                            return Attachment::Resumed(runtime, responses);
                         }
                         Err(_) => continue, // that stream was lost, too
                     }

@@ -8,6 +8,7 @@ use crate::server::{
     auth::Bearer,
     error::{ErrorKind, RequestError},
     id::{Id, NoRandomness, random},
+    shutdown::Drain,
     transport::{budget::MemoryReservation, message_reader::MessageReader},
 };
 use std::{
@@ -18,7 +19,10 @@ use std::{
     time::Duration,
 };
 use subtle::ConstantTimeEq;
-use tokio::sync::{mpsc, oneshot};
+use tokio::{
+    runtime::Handle,
+    sync::{mpsc, oneshot},
+};
 use tonic::Status;
 
 /// The maximum number of stored replies of a session with a lease. It also limits the unanswered requests.
@@ -182,6 +186,10 @@ pub struct ResumingStream<R> {
     pub requests: MessageReader,
     /// The sender of its responses.
     pub responses: ResponseSender<R>,
+    /// The view of the shutdown of the stream's thread.
+    pub drain: Drain,
+    /// The runtime of the stream's thread, on which the session goes on.
+    pub runtime: Handle,
 }
 
 /// A session's lease, until it is dropped.

@@ -148,11 +148,17 @@ impl Drop for Server {
     }
 }
 
+/// How many transport threads the servers of all tests have that do not say so themselves: `make threads-test`.
+const TRANSPORT_THREADS: &str = "PERTURB_TEST_TRANSPORT_THREADS";
+
 /// The server program, not started yet.
 pub fn command() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_perturb-server"));
     for (name, _) in std::env::vars_os().filter(|(name, _)| name.to_string_lossy().starts_with("PERTURB_SERVER_")) {
         command.env_remove(name);
+    }
+    if let Some(threads) = std::env::var_os(TRANSPORT_THREADS) {
+        command.env("PERTURB_SERVER_TRANSPORT_THREADS", threads);
     }
     command
 }

@@ -30,7 +30,7 @@ async fn lag_of_a_busy_transport_is_measured() {
     let start = Instant::now();
     let watched = Watched::start(&[]);
     let [count, sum, soon] =
-        ["_count", "_sum", &format!("_bucket{{le=\"{BOUND}\"}}")].map(|part| format!("{LAG}{part}"));
+        ["_count{", "_sum{", &format!("_bucket{{le=\"{BOUND}\",")].map(|part| format!("{LAG}{part}thread=\"0\"}}"));
     let late = |page: &Page| page.number(&count) - page.number(&soon);
     until("some looks are counted", async || watched.page().number(&count) > 2.0).await;
     let before = watched.page();

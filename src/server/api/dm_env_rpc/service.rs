@@ -8,6 +8,7 @@ use crate::{
     server::{
         audit::ledger::Ledger,
         session::{admission::Sessions, driver::Responses, instrumented::RequestCounters},
+        shutdown::Drain,
         transport::raw_body,
     },
 };
@@ -33,6 +34,11 @@ impl DmEnvRpcService {
             sessions,
             counts: RequestCounters::new::<Agent>(),
         }
+    }
+
+    /// The same service with another view of the shutdown.
+    pub fn with_drain(&self, drain: Drain) -> Self {
+        Self { sessions: self.sessions.with_drain(drain), ..self.clone() }
     }
 
     /// The requests so far.

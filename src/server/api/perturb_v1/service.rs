@@ -7,6 +7,7 @@ use crate::{
         auth::Bearer,
         error::status,
         session::{admission::Sessions, driver::Responses, instrumented::RequestCounters},
+        shutdown::Drain,
         transport::raw_body,
     },
 };
@@ -33,6 +34,11 @@ impl PerturbService {
     /// Makes a service whose sessions share `shared`.
     pub fn new(shared: ServerContext, sessions: Sessions) -> Self {
         Self { shared: Arc::new(shared), sessions, counts: RequestCounters::new::<Session>() }
+    }
+
+    /// The same service with another view of the shutdown.
+    pub fn with_drain(&self, drain: Drain) -> Self {
+        Self { sessions: self.sessions.with_drain(drain), ..self.clone() }
     }
 
     /// The requests so far.
