@@ -192,9 +192,9 @@ impl ServerProcess {
     }
 
     /// Starts a server with a TCP port in place of a socket.
-    pub(crate) fn tcp(flags: &[(&str, &Path)]) -> Result<Self, Failure> {
+    pub(crate) fn tcp(workers: usize, flags: &[(&str, &Path)]) -> Result<Self, Failure> {
         let mut command = Command::new(env!("CARGO_BIN_EXE_perturb-server"));
-        command.args(["--log", "warn", "--workers", "1"]);
+        command.args(["--log", "warn", "--workers", &workers.to_string()]);
         for (flag, value) in flags {
             command.arg(flag).arg(value);
         }

@@ -7,16 +7,16 @@ use super::{
 };
 use perturb_faults::certificates::{Authority, CertificateFiles};
 use perturb_protocol::{Address, Connection, Timeouts, credentials::Credentials};
+use std::path::Path;
 
 /// Measures CartPole in batches of `batch`.
 pub(crate) async fn measure(batch: usize) -> Result<(), Failure> {
     /// Number of steps of a round.
     const TRIPS: usize = 400;
     let directory = tempfile::tempdir()?;
-    let CertificateFiles { cert, key } =
-        Authority::new("bench").issue(directory.path(), "server", &["127.0.0.1"], 2200);
+    let CertificateFiles { cert, key } = certificates(directory.path());
     let (plain, encrypted) =
-        (ServerProcess::tcp(&[])?, ServerProcess::tcp(&[("--tls-cert", &cert), ("--tls-key", &key)])?);
+        (ServerProcess::tcp(1, &[])?, ServerProcess::tcp(1, &[("--tls-cert", &cert), ("--tls-key", &key)])?);
     let mut plain_client =
         Client::on(&connect(&plain.address, Credentials::default()).await?, "CartPole", batch).await?;
     let credentials = Credentials::pinned(&cert)?;
@@ -35,7 +35,12 @@ pub(crate) async fn measure(batch: usize) -> Result<(), Failure> {
     Ok(())
 }
 
-async fn connect(address: &str, credentials: Credentials) -> Result<Connection, Failure> {
+/// Makes the certificate of a server on this machine.
+pub(crate) fn certificates(directory: &Path) -> CertificateFiles {
+    Authority::new("bench").issue(directory, "server", &["127.0.0.1"], 2200)
+}
+
+pub(crate) async fn connect(address: &str, credentials: Credentials) -> Result<Connection, Failure> {
     let address: Address = address.parse()?;
     Ok(Connection::open_as(&address, Timeouts::default(), credentials).await?)
 }

@@ -4,6 +4,7 @@
 //! - Hopper and HalfCheetah, batches of 64, 256 and 1024, two workers, against MuJoCo's timesteps alone ([`robots`]);
 //! - tasks that are folders, against the built-in Hopper and against MuJoCo's functions alone ([`folder`]);
 //! - CartPole over TCP with TLS, against without ([`encrypted`]);
+//! - many sessions at a time, with several transport threads, if asked for by name ([`sessions`]);
 //! - the round trip of one environment, and the memory of one Hopper;
 //! - CartPole, 8 environments in which the server acts with a policy, against computing the actions alone ([`acting`]);
 //! - each environment, a batch of 64, with late and noisy actions and observations, against without ([`disturbed`]);
@@ -22,6 +23,7 @@ mod encrypted;
 mod folder;
 #[cfg(feature = "mujoco")]
 mod robots;
+mod sessions;
 
 use client::{Client, ServerProcess};
 use perturb::tasks;
@@ -48,6 +50,9 @@ fn main() -> Result<(), Failure> {
     // Cargo adds --bench; any other argument selects figures by a part of their name.
     let filter = arguments.iter().skip(1).find(|argument| !argument.starts_with('-'));
     let wanted = |id: &str| filter.is_none_or(|filter| id.contains(filter.as_str()));
+    if filter.is_some() {
+        sessions::measure(wanted)?;
+    }
     runtime.block_on(async {
         if wanted("step/CartPole/256") {
             classic().await?;
