@@ -62,7 +62,7 @@ refused() {
 refused "it accepts no client with the certificate" R PERTURB_CERT=/keys/stranger.pem PERTURB_KEY=/keys/stranger.key
 refused "the certificate of PERTURB_CERT has expired" R PERTURB_CERT=/keys/expired.pem PERTURB_KEY=/keys/expired.key
 refused "asks for a client's certificate" R PERTURB_CERT= PERTURB_KEY=
-refused "nobody who is trusted here" R PERTURB_CA=/keys/stranger_ca.pem
+refused "no trusted authority" R PERTURB_CA=/keys/stranger_ca.pem
 refused "does not know the token" R PERTURB_TOKEN_FILE=/keys/another
 refused "asks for a token" R PERTURB_TOKEN_FILE=
 refused 'a token of the role "train" may not draw from' E

@@ -53,7 +53,7 @@ pub enum MeasureError {
     #[error(transparent)]
     Test(#[from] TestError),
     /// The program was asked to end.
-    #[error("stopped by signal {signal} while measuring; nothing is kept of it")]
+    #[error("stopped by signal {signal} while measuring; the measurement is discarded")]
     Stopped {
         /// The signal.
         signal: i32,

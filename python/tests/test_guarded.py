@@ -147,13 +147,13 @@ def test_who_has_what_is_asked_for_plays_as_at_an_open_socket(
     [
         pytest.param(
             ALL | {"PERTURB_CA": "strangers.pem"},
-            "no safe connection to the server at {address}: nobody who is trusted here has signed its certificate; "
-            "set PERTURB_CA to the file of its authority's",
+            "no safe connection to the server at {address}: no trusted authority has signed its certificate; "
+            "set PERTURB_CA to the authority's certificate",
             id="another-authority",
         ),
         pytest.param(
             TRUST | TOKEN,
-            "{address}: it asks for a client's certificate; set PERTURB_CERT and PERTURB_KEY to the files of yours",
+            "{address}: it asks for a client's certificate; set PERTURB_CERT and PERTURB_KEY to your files",
             id="no-certificate",
         ),
         pytest.param(
@@ -163,7 +163,7 @@ def test_who_has_what_is_asked_for_plays_as_at_an_open_socket(
         ),
         pytest.param(
             ALL | {"PERTURB_CERT": "expired.pem", "PERTURB_KEY": "expired.key"},
-            "{address}: the certificate of PERTURB_CERT has expired; have it renewed by who signed it",
+            "{address}: the certificate of PERTURB_CERT has expired; have it renewed by its authority",
             id="expired-certificate",
         ),
         pytest.param(

@@ -57,7 +57,7 @@ pub enum Error {
     },
     /// A disturbance was requested in a session that was opened without disturbances.
     #[error(
-        "{environment} was opened without disturbances, so that {name:?} cannot change; open it anew and name a \
+        "{environment} was opened without disturbances, so that {name:?} cannot change; open it again with a \
          disturbance, such as {name:?} at its default"
     )]
     NotDisturbed {

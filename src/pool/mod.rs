@@ -70,6 +70,8 @@ pub enum Error {
     #[error("the policy's play has ended: {0}; hand over another policy")]
     Policy(#[from] perturb_policy::Error),
     /// A worker panicked: a defect of the server. The batch is lost.
-    #[error("the simulation failed from a defect of the server; open a new session, and report what its log says")]
+    #[error(
+        "the simulation failed because of a server bug; open a new session, and report the bug with the server's log"
+    )]
     Defect,
 }

@@ -132,7 +132,7 @@ fn policy_at(path: &Path) -> Result<ComparedPolicy> {
         let [policy] = evaluation.policies() else {
             let count = evaluation.policies().len();
             let message =
-                format!("{} holds tests of {count} policies; save those of each policy by themselves", path.display());
+                format!("{} holds tests of {count} policies; save the tests of each policy separately", path.display());
             return Err(CommandError::Usage(message));
         };
         return Ok(ComparedPolicy::Recorded(Box::new(policy.records.clone())));

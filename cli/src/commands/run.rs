@@ -79,7 +79,7 @@ fn run_worker(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<ExitCo
     let mut text = String::new();
     std::io::stdin().lock().read_line(&mut text).map_err(system("read the order"))?;
     let order: WorkerJob = serde_json::from_str(&text)
-        .map_err(|error| CommandError::Usage(format!("the order on standard input is not valid: {error}")))?;
+        .map_err(|error| CommandError::Usage(format!("the job on standard input is not valid: {error}")))?;
     stop_at_end_of_input(stop)?;
     let mut writer = EventLineWriter::new(order.cells.len(), std::io::stdout());
     let plan = Plan::load(&args.plan);

@@ -120,7 +120,7 @@ pub fn weights(run: &Path) -> (String, Vec<u8>) {
 }
 
 #[rstest]
-#[case::another_servers_authority(Has { ca: "strangers.pem", ..ALL }, "R", "nobody who is trusted here")]
+#[case::another_servers_authority(Has { ca: "strangers.pem", ..ALL }, "R", "no trusted authority")]
 #[case::no_certificate(Has { cert: None, ..ALL }, "R", "asks for a client's certificate; set PERTURB_CERT")]
 #[case::wrong_certificate(Has { cert: Some("stranger"), ..ALL }, "R", "accepts no client with the certificate")]
 #[case::expired_certificate(Has { cert: Some("old"), ..ALL }, "R", "the certificate of PERTURB_CERT has expired")]

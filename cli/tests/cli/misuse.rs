@@ -207,7 +207,7 @@ fn each_misuse_is_refused_with_a_remedy_and_leaves_nothing() {
 #[case::plan(
     "perturb plan plan.toml --measure 60",
     "tmp",
-    "perturb: stopped by signal N while measuring; nothing is kept of it",
+    "perturb: stopped by signal N while measuring; the measurement is discarded",
     ""
 )]
 #[case::evaluate(

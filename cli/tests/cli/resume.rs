@@ -268,7 +268,7 @@ fn old_formats_load_and_other_revisions_are_refused() {
 
     let options = TestOptions { episodes: 3, seed: 1, selects: false, success: None };
     let error = Tester::new(&servers, &checkpoint, options.clone()).err().expect("another revision").to_string();
-    let revisions = "trained in CartPole with revision 0, the server's has 1";
+    let revisions = "trained in CartPole with revision 0, but the server has 1";
     let advice = "test with the version of perturb that trained it, or train again";
     assert_eq!(error, format!("the checkpoint was {revisions}: {advice}"));
     let error = go_on(&servers, out.path()).expect_err("another revision");

@@ -115,7 +115,7 @@ fn a_changed_folder_is_refused_for_a_trained_policy() {
         let output = place.run(words);
         let said = stderr(&output);
         assert!(!output.status.success() && said.contains("trained in ReachingArm with model \""), "{words:?}: {said}");
-        assert!(said.contains("for a task of a folder serve its files as they were"), "{words:?}: {said}");
+        assert!(said.contains("if the task is a folder, serve its original files"), "{words:?}: {said}");
     }
 }
 

@@ -34,13 +34,13 @@ const MODEL: &str = "model";
 /// Returns how to mend a difference in the property `what`, as the beginning of a sentence's last part; empty unless the files
 /// of a task's folder may have changed.
 pub fn task_remedy(what: &str) -> &'static str {
-    if what == MODEL { "for a task of a folder serve its files as they were; otherwise " } else { "" }
+    if what == MODEL { "if the task is a folder, serve its original files; otherwise " } else { "" }
 }
 
 /// An environment is no longer what a policy was trained in.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "the checkpoint was trained in {environment} with {what} {trained}, the server's has {served}: {}test with the version \
+    "the checkpoint was trained in {environment} with {what} {trained}, but the server has {served}: {}test with the version \
      of perturb that trained it, or train again",
     task_remedy(what)
 )]

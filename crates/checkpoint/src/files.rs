@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use perturb_files::{self as files, TEMPORARY_PREFIX, write_atomically};
+use perturb_files::{self as files, TEMPORARY_PREFIX, checksum, write_atomically};
 use serde::{Deserialize, Serialize};
 
 use super::{CheckpointError, Result};
@@ -55,7 +55,7 @@ impl ArraysFile {
     /// Reads the file and checks its length, before anything is read, and its checksum.
     ///
     /// # Errors
-    /// [`CheckpointError`], also if it is not what was written.
+    /// [`CheckpointError`], also if the checksum does not match.
     pub fn read(&self, directory: &Path) -> Result<Vec<u8>> {
         let path = self.path(directory);
         let mut content = Vec::new();
@@ -84,7 +84,9 @@ impl ArraysFile {
         if content.len() as u64 == self.bytes && crc32c::crc32c(content) == self.crc32c {
             return Ok(());
         }
-        Err(format!("it has {} bytes, expected {} with another checksum", content.len(), self.bytes))
+        let has_length = content.len() as u64 == self.bytes;
+        let damaged = || format!("it has {} bytes, expected {}", content.len(), self.bytes);
+        Err(if has_length { checksum::CHECKSUM_MISMATCH.into() } else { damaged() })
     }
 }
 

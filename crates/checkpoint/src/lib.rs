@@ -136,7 +136,7 @@ pub enum CheckpointError {
     /// The file has an unknown format, probably that of a newer program, which can read it.
     #[error(
         "{} has format {format}, and this program reads 1 to {FORMAT_VERSION}: use the version of perturb that wrote it, or \
-         a copy that is whole",
+         an undamaged copy",
         path.display()
     )]
     Newer {
@@ -403,7 +403,7 @@ impl CheckpointDocument {
         }
         let document: Self = serde_json::from_value(value).map_err(not_understood)?;
         if sealed.is_err() || (document.format_version >= SEALED && sealed == Ok(false)) {
-            return Err(damaged(path, format!("{}; give a copy that is whole", checksum::CHECKSUM_MISMATCH)));
+            return Err(damaged(path, format!("{}; use an undamaged copy", checksum::CHECKSUM_MISMATCH)));
         }
         Ok(document)
     }

@@ -85,7 +85,7 @@ fn a_policy_file_is_whole_or_refused() {
     let mut other = whole.clone();
     *other.last_mut().unwrap() ^= 1;
     fs::write(&path, other).unwrap();
-    assert!(Checkpoint::load(&path).unwrap_err().to_string().contains("another checksum"));
+    assert!(Checkpoint::load(&path).unwrap_err().to_string().contains("the checksum does not match"));
     fs::write(&path, encode_weights(&saved.weights).unwrap()).unwrap();
     let message = Checkpoint::load(&path).unwrap_err().to_string();
     assert!(message.contains("its metadata have no `perturb`"), "{message}");
@@ -153,7 +153,7 @@ fn damage_is_named() {
         *bytes.last_mut().unwrap() ^= 1;
         bytes
     };
-    assert!(spoil("weights", &flip).contains("another checksum"));
+    assert!(spoil("weights", &flip).contains("the checksum does not match"));
     assert!(spoil("checkpoint", &|_, bytes| bytes[..bytes.len() / 2].to_vec()).contains("not understood"));
     let later = replaced("\"format_version\": 3", "\"format_version\": 9");
     assert!(spoil("checkpoint", &later).contains("has format 9, and this program reads 1 to 3"));
@@ -190,13 +190,13 @@ fn no_byte_of_the_json_changes_a_checkpoint_unnoticed() {
     let mut document: serde_json::Value = serde_json::from_slice(&text).unwrap();
     document["format_version"] = 2.into();
     fs::write(&path, document.to_string()).unwrap();
-    assert!(Checkpoint::load(directory.path()).unwrap_err().to_string().contains("its checksum is another"));
+    assert!(Checkpoint::load(directory.path()).unwrap_err().to_string().contains("the checksum does not match"));
     document.as_object_mut().unwrap().remove("crc32c");
     fs::write(&path, document.to_string()).unwrap();
     assert_eq!(Checkpoint::load(directory.path()).unwrap(), saved, "earlier programs wrote none");
     document["format_version"] = 3.into();
     fs::write(&path, document.to_string()).unwrap();
-    assert!(Checkpoint::load(directory.path()).unwrap_err().to_string().contains("its checksum is another"));
+    assert!(Checkpoint::load(directory.path()).unwrap_err().to_string().contains("the checksum does not match"));
 }
 
 #[test]

@@ -178,7 +178,7 @@ pub enum FolderError {
     #[error(transparent)]
     File(#[from] FileError),
     /// A file is damaged, or a program with another format wrote it.
-    #[error("{} is not understood: {reason}; delete it to have the cell done again", path.display())]
+    #[error("{} is not understood: {reason}; delete it to run the cell again", path.display())]
     Damaged {
         path: PathBuf,
         /// The fault.
@@ -186,14 +186,14 @@ pub enum FolderError {
     },
     /// The model of a result differs from that of the servers.
     #[error(
-        "cell {cell} was trained in {environment} with the model {trained}, the server's has {served}: serve the task's \
-         files as they were, or give another --out"
+        "cell {cell} was trained in {environment} with the model {trained}, but the server has {served}: serve the \
+         task's original files, or give another --out"
     )]
     OtherModel { cell: String, environment: String, trained: String, served: String },
     /// Results of one environment are of different models.
     #[error(
         "cells {cells:?} were trained in {environment} with different models, {hashes:?}, so their results cannot be \
-         compared: delete those of one model, and have them done again"
+         compared: delete the results of one model, and run these cells again"
     )]
     Models { environment: String, cells: Box<[String; 2]>, hashes: Box<[String; 2]> },
     /// The rows of a cell in a results table are invalid.
@@ -572,8 +572,8 @@ mod tests {
         let text = fs::read_to_string(&path).unwrap();
         fs::write(&path, text.replace("33.3", "93.3")).unwrap();
         let message = cell.state().unwrap_err().to_string();
-        assert!(message.contains("result.json is not understood: it is not what was written"), "{message}");
-        assert!(message.ends_with("delete it to have the cell done again"), "{message}");
+        assert!(message.contains("result.json is not understood: the checksum does not match"), "{message}");
+        assert!(message.ends_with("delete it to run the cell again"), "{message}");
         files::write_json(&path, &result()).unwrap();
         assert_eq!(cell.state().unwrap(), CellState::Done(Box::new(result())));
     }

@@ -18,7 +18,7 @@ pub enum VerifyError {
     /// A test's figures differ from those of its recorded episodes.
     #[error(
         "the result of cell {cell} does not follow from its recorded episodes: its test on {test} has {kept} in \
-         result.json, but {recorded} in {file}; delete result.json to have the tests done again",
+         result.json, but {recorded} in {file}; delete result.json to run the tests again",
         file = perturb_records::FILE
     )]
     Test {
@@ -31,8 +31,8 @@ pub enum VerifyError {
     },
     /// The comparison of requested and applied parameters in the result differs from that of the recorded episodes.
     #[error(
-        "the result of cell {cell} does not follow from its recorded episodes: requested and applied parameters differ \
-         otherwise; delete result.json to have the tests done again"
+        "the result of cell {cell} does not follow from its recorded episodes: its check of requested and applied \
+         parameters has another outcome; delete result.json to run the tests again"
     )]
     ParameterCheck { cell: String },
 }
@@ -113,7 +113,7 @@ mod tests {
     #[rstest]
     #[case(|_: &mut CellResult| (), None)]
     #[case(|result: &mut CellResult| result.results.get_mut("D").unwrap().mean_return += 1e-9, Some("its test on D has 3 episodes"))]
-    #[case(|result: &mut CellResult| result.agreement.as_mut().unwrap().episodes = 2, Some("parameters differ otherwise"))]
+    #[case(|result: &mut CellResult| result.agreement.as_mut().unwrap().episodes = 2, Some("parameters has another outcome"))]
     fn a_result_is_that_of_its_recorded_episodes(#[case] change: fn(&mut CellResult), #[case] refused: Option<&str>) {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let directory = tempfile::tempdir().unwrap();

@@ -14,7 +14,7 @@ const MARK: &[u8] = b"perturb.crc32c=";
 /// Digits of a file's checksum.
 const DIGITS: usize = 8;
 /// The error for a document with a wrong checksum.
-pub const CHECKSUM_MISMATCH: &str = "it is not what was written: its checksum is another";
+pub const CHECKSUM_MISMATCH: &str = "the checksum does not match, because the file was changed or damaged";
 
 /// A document and its checksum, in one object.
 #[derive(Serialize)]
@@ -37,7 +37,7 @@ impl<'a, T: Serialize> WithChecksum<'a, T> {
 /// Takes the checksum out of a document that was read; says whether it had one.
 ///
 /// # Errors
-/// [`CHECKSUM_MISMATCH`] if it is another.
+/// [`CHECKSUM_MISMATCH`] if it does not match.
 pub fn open(document: &mut Value) -> Result<bool, &'static str> {
     match document.as_object_mut().and_then(|entries| entries.remove(ENTRY)) {
         None => Ok(false),

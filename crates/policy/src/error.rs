@@ -48,8 +48,8 @@ pub enum Error {
         /// The environment, 0 … N-1.
         environment: usize,
     },
-    /// A policy was to act whose networks were given away.
-    #[error("the policy's networks were given away; load weights before it acts again")]
+    /// The policy cannot act, because its networks were moved out of it.
+    #[error("the policy's networks were moved out of it; load weights before it acts again")]
     NoWeights,
     /// A gradient of no samples was asked for.
     #[error("a minibatch is empty, but must have at least 1 sample")]
@@ -74,7 +74,7 @@ pub enum Error {
         reason: String,
     },
     /// Impossible statistics.
-    #[error("the statistics of {name} cannot be right: {reason}")]
+    #[error("the statistics of {name} are invalid: {reason}")]
     Statistics {
         /// The normalised quantity: observations or rewards.
         name: &'static str,

@@ -90,7 +90,11 @@ impl Credentials {
             Some(path) => certificates(CA, &path)?,
             None => match SYSTEM_CA.iter().map(Path::new).find(|path| path.exists()) {
                 Some(path) => certificates("the system's authorities", path)?,
-                None => return Err(format!("this system names no authorities; set {CA} to the file of the server's")),
+                None => {
+                    return Err(format!(
+                        "this system trusts no authority; set {CA} to the certificate of the server's authority"
+                    ));
+                }
             },
         });
         Ok(Self { token, identity: identity(variable)?, trust })

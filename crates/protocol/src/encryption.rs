@@ -132,12 +132,14 @@ fn words(error: &io::Error, host: &str) -> Option<String> {
             "its certificate is not valid yet: are the clocks right?".into()
         }
         Error::InvalidCertificate(Bad::UnknownIssuer | Bad::BadSignature) => {
-            format!("nobody who is trusted here has signed its certificate; set {CA} to the file of its authority's")
+            format!("no trusted authority has signed its certificate; set {CA} to the authority's certificate")
         }
         Error::InvalidCertificate(Bad::NotValidForName | Bad::NotValidForNameContext { .. }) => {
             format!("its certificate is not for this name: {error}")
         }
-        Error::InvalidCertificate(Bad::ApplicationVerificationFailure) => "its certificate is another one".into(),
+        Error::InvalidCertificate(Bad::ApplicationVerificationFailure) => {
+            "its certificate is not the expected one".into()
+        }
         Error::InvalidCertificate(other) => format!("its certificate is not good: {other}"),
         Error::InvalidMessage(InvalidMessage::InvalidContentType) => {
             format!("it speaks no TLS; write tcp:// for https://, or see who listens at {host}")
@@ -178,10 +180,10 @@ impl AlertRecordingStream {
         };
         let reason = match self.shows_certificate {
             true if *alert == Alert::CertificateExpired => {
-                format!("the certificate of {CERT} has expired; have it renewed by who signed it")
+                format!("the certificate of {CERT} has expired; have it renewed by its authority")
             }
             true => format!("it accepts no client with the certificate of {CERT}: another authority must sign it"),
-            false => format!("it asks for a client's certificate; set {CERT} and {KEY} to the files of yours"),
+            false => format!("it asks for a client's certificate; set {CERT} and {KEY} to your files"),
         };
         *self.failure.lock().unwrap_or_else(PoisonError::into_inner) = Some(reason);
     }

@@ -101,7 +101,7 @@ pub enum ExternalEvaluationError {
     #[error(transparent)]
     Records(#[from] RecordsError),
     /// There is no assessment.
-    #[error("{} holds no assessment: {ASSESSMENT} is not there; give the folder of Assessment.save", path.display())]
+    #[error("{} holds no assessment: it has no {ASSESSMENT}; give a folder of Assessment.save", path.display())]
     Missing { path: PathBuf },
     /// The document is damaged, or was written by an incompatible program.
     #[error("{} is damaged: {reason}", path.display())]
@@ -114,7 +114,7 @@ pub enum ExternalEvaluationError {
     #[error("{} has format {got}; this program reads {FORMAT_VERSION}", path.display())]
     Format { path: PathBuf, got: u64 },
     /// Policies that are not those of one agent in one environment.
-    #[error("an assessment is of policies in one environment, each trained on something else: {got}")]
+    #[error("policies of an assessment have one environment and different training distributions, but {got}")]
     Mixed {
         /// The violated condition.
         got: String,
@@ -175,7 +175,7 @@ impl ExternalEvaluation {
             return Err(ExternalEvaluationError::Mixed { got });
         }
         if trained.len() != policies.len() {
-            return Err(ExternalEvaluationError::Mixed { got: "two were trained on the same".into() });
+            return Err(ExternalEvaluationError::Mixed { got: "two were trained on the same one".into() });
         }
         Ok(Self { name, agent, policies })
     }

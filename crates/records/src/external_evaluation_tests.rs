@@ -54,7 +54,7 @@ fn what_was_changed_is_refused_and_can_be_overwritten() {
     let written = fs::read_to_string(&json).unwrap();
     fs::write(&json, written.replace("\"PPO\"", "\"A2C\"")).unwrap();
     let refused = ExternalEvaluation::read(directory.path()).unwrap_err().to_string();
-    assert!(refused.contains("its checksum is another"), "{refused}");
+    assert!(refused.contains("the checksum does not match"), "{refused}");
     let less = fixture::assessed("PPO", "CartPole", &[Some(D)], [200; 3]);
     less.write(directory.path(), true).unwrap();
     assert_eq!(files::list(directory.path()).unwrap().len(), 2, "the former's records are gone");

@@ -156,7 +156,9 @@ impl Ledgers {
             });
         }
         match missing.first() {
-            Some(digest) => Err(format!("no line has the digest {digest}: the ledger is another, or was written anew")),
+            Some(digest) => {
+                Err(format!("no line has the digest {digest}: this is another ledger, or it was rewritten"))
+            }
             None => Ok(ledgers),
         }
     }

@@ -200,7 +200,7 @@ impl ParquetFile {
     /// Opens a file after its checksum was compared.
     pub(crate) fn open(content: Vec<u8>) -> Result<Self, AnyError> {
         // This is checked first: the decoder believes what a damaged file says, and may panic.
-        checksum::check(&content).map_err(|broken| format!("{broken}; give a copy that is whole, or test again"))?;
+        checksum::check(&content).map_err(|broken| format!("{broken}; use an undamaged copy, or test again"))?;
         let reader = SerializedFileReader::new(Bytes::from(content))?;
         let metadata = reader.metadata().file_metadata().key_value_metadata();
         let about = metadata.and_then(|pairs| pairs.iter().find(|pair| pair.key == KEY));

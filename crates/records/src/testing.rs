@@ -18,11 +18,12 @@ const MAX_ENVS: usize = 100;
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum NotRecorded {
     /// Episodes did not run with the requested parameters.
-    #[error("testing on {set}: {difference}; its results would be of another environment: mend the server")]
+    #[error("testing on {set}: {difference}, so results would be wrong; this is a server bug, please report it")]
     NotApplied { set: String, difference: Difference },
     /// The server requested other parameters of its physics than the client had asked for.
     #[error(
-        "testing on {set}: the server was asked for {parameter} in {asked}, but its receipt says {got}; mend the server"
+        "testing on {set}: the server was asked for {parameter} in {asked}, but its receipt says {got}; this is a server \
+         bug, please report it"
     )]
     NotRequested { set: String, parameter: String, asked: String, got: f64 },
 }

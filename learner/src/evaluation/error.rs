@@ -21,7 +21,7 @@ pub enum TestError {
     #[error(transparent)]
     Value(#[from] ValueError),
     /// The checkpoint cannot be named.
-    #[error("the checkpoint cannot be named: {0}")]
+    #[error("the checkpoint's id cannot be computed: {0}")]
     Unnamed(String),
     /// The server played other episodes than it was asked for.
     #[error(transparent)]

@@ -30,7 +30,9 @@ pub enum TrainError {
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
     /// An action's interval is empty or infinite.
-    #[error("a random policy draws actions from their bounds, but `{name}` is in [{low}, {high}]: train another")]
+    #[error(
+        "a random policy draws actions from their bounds, but `{name}` is in [{low}, {high}]; train another algorithm"
+    )]
     Unbounded {
         /// The action's entry.
         name: String,
@@ -63,7 +65,7 @@ pub enum TrainError {
     },
     /// The environment has changed since the run began.
     #[error(
-        "the run was trained in {environment} with {what} {trained}, the server's has {served}; {}resume with the \
+        "the run was trained in {environment} with {what} {trained}, but the server has {served}; {}resume with the \
          version of perturb-server that it began with, or train again",
         task_remedy(what)
     )]
@@ -94,7 +96,7 @@ pub enum TrainError {
         source: Box<TrainError>,
     },
     /// The program was asked to end during a long update.
-    #[error("stopped by signal {signal} during an update, which was broken off")]
+    #[error("stopped by signal {signal} during an update, which was interrupted")]
     UpdateStopped {
         /// The signal.
         signal: i32,

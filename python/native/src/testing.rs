@@ -96,7 +96,8 @@ impl Tests {
                 EndedEpisode::from_proto(end, slot, terminated.get(slot).copied().unwrap_or_default())
             };
             let ended: Option<Vec<EndedEpisode>> = events.ended().map(ended).collect();
-            let unnamed = "the server sent the end of an episode without its address or its receipt: mend the server";
+            let unnamed = "the server sent the end of an episode without its address or its receipt; this is a server bug, \
+                           please report it";
             counting.take(ended.ok_or_else(|| failure(MALFORMED, 0, unnamed))?);
         }
         Ok(counting.progress())

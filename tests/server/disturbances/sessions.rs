@@ -122,8 +122,8 @@ async fn a_session_without_disturbances_refuses_them_later() {
     let late = Reset { parameters: parameters(&[("action_delay", &[(2.0, 2.0)])]), ..Reset::default() };
     assert_eq!(
         refusal(session.refused(late.clone()).await),
-        "FailedPrecondition: Pendulum was opened without disturbances, so that \"action_delay\" cannot change; open it anew \
-         and name a disturbance, such as \"action_delay\" at its default\n"
+        "FailedPrecondition: Pendulum was opened without disturbances, so that \"action_delay\" cannot change; open it again \
+         with a disturbance, such as \"action_delay\" at its default\n"
     );
     let named = Open { parameters: parameters(&[("sensor_noise", &[(0.0, 0.0)])]), ..open("Pendulum", 1, 1) };
     let (mut named, _) = Session::open(server.unix(), named).await;

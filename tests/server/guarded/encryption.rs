@@ -64,7 +64,7 @@ async fn who_trusts_the_authority_plays_and_the_socket_stays_plain() {
 }
 
 #[rstest]
-#[case::unknown(&["127.0.0.1"], 2040, false, "nobody who is trusted here")]
+#[case::unknown(&["127.0.0.1"], 2040, false, "no trusted authority")]
 #[case::expired(&["127.0.0.1"], 2021, true, "has expired")]
 #[case::another_name(&["example.org"], 2040, true, "not for this name")]
 #[tokio::test]

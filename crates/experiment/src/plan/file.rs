@@ -263,7 +263,7 @@ impl File {
             [("tuning_runs", self.tuning_runs.map(u64::from)), ("selection_episodes", self.selection_episodes)]
         {
             let Some(given) = given else { continue };
-            let expected = "left out, or beside selection = \"clean\"";
+            let expected = "left out, or given with selection = \"clean\"";
             require(self.selection == Selection::Clean, key, given, expected)?;
             require(given > 0, key, given, "at least 1")?;
         }

@@ -346,7 +346,7 @@ mod tests {
         let script = format!("test $id = {} || kill -9 $$; echo no memory >&2; exit 3", ids[0]);
         let ran = run_script(&folder, &script, &StopFlag::default(), &|| None);
         assert_eq!(ran.end.unwrap(), RunEnd::Finished { failed: ids.to_vec() });
-        let recorded = "3 attempts in a row have not brought it any further";
+        let recorded = "3 attempts in a row made no progress";
         for (id, how) in ids.iter().zip(["exit status: 3: no memory", "signal: 9 (SIGKILL)"]) {
             let failure = std::fs::read_to_string(folder.cell(id).path().join("failure.json")).unwrap();
             assert!(failure.contains(&format!("its process ended with {how}; {recorded}")), "{failure}");

@@ -164,18 +164,18 @@ pub enum RunError {
     #[error(transparent)]
     File(#[from] FileError),
     /// A worker does not know the plan's cells.
-    #[error("a worker refused its order: {0}; did another run replace the folder's plan.toml meanwhile?")]
+    #[error("a worker refused its job: {0}; did another run replace the folder's plan.toml meanwhile?")]
     Refused(String),
     /// The servers are gone.
-    #[error("the run cannot go on without a server: {0}; what is done is kept")]
+    #[error("the run cannot go on without a server: {0}; finished work is kept")]
     NoServer(String),
     /// Files of a cell cannot be read or written.
-    #[error("the run cannot go on: {0}; when that is mended, the same command goes on from what was trained")]
+    #[error("the run cannot go on: {0}; correct this, and resume with the same command")]
     FileFault(String),
     /// Several attempts at a cell ended without progress.
     #[error(
-        "{} without a result after {MAX_ATTEMPTS} attempts, the first is {}: {words}; when that is mended, the same \
-         command tries again",
+        "{} without a result after {MAX_ATTEMPTS} attempts, the first is {}: {words}; when this is \
+         corrected, the same command tries again",
         count(ids.len(), "cell"),
         ids[0]
     )]
@@ -402,12 +402,12 @@ impl<'a> Scheduler<'a> {
                 if tracked.attempts < MAX_ATTEMPTS {
                     self.wait(cell);
                 } else if self.backend.records_crashes_as_failures() {
-                    let times = format!("{MAX_ATTEMPTS} attempts in a row have not brought it any further");
+                    let times = format!("{MAX_ATTEMPTS} attempts in a row made no progress");
                     self.record_failure(cell, format!("{end}; {times}"))?;
                 } else {
                     tracked.phase = CellPhase::GivenUp;
                     let id = self.id(cell);
-                    let note = format!("{id} is given up: {MAX_ATTEMPTS} attempts have not brought it any further");
+                    let note = format!("{id} is given up: {MAX_ATTEMPTS} attempts made no progress");
                     (self.report)(ProgressEvent::Note(&note));
                 }
             }

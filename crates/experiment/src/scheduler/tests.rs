@@ -251,7 +251,7 @@ fn every_cell_is_done_once_and_a_second_run_does_nothing() {
 }
 
 #[rstest]
-#[case::killed(vec![killed()], 3, "signal 9; 3 attempts in a row have not brought it any further")]
+#[case::killed(vec![killed()], 3, "signal 9; 3 attempts in a row made no progress")]
 #[case::stopped_alone(vec![ends(CellEvent::Stopped { signal: 15 })], 3, "signal 15 ended its process; 3 attempts")]
 #[case::failed_unrecorded(vec![ends(CellEvent::Failed { reason: "disk full".into() })], 1, "disk full")]
 #[case::failed(vec![Fails, ends(CellEvent::Failed { reason: "NaN".into() })], 1, "NaN")]
@@ -293,7 +293,7 @@ fn a_killed_cell_waits_until_the_others_had_their_turn() {
 fn server_waits_double_and_end() {
     let place = Place::new();
     let ran = place.run(&|_, _| vec![lost()]);
-    let message = format!("the run cannot go on without a server: {}: gone; what is done is kept", place.id(0));
+    let message = format!("the run cannot go on without a server: {}: gone; finished work is kept", place.id(0));
     assert!(ran.end.as_ref().is_err_and(|error| error.starts_with(&message)), "{:?}", ran.end);
     // Each loss is reported a second after the start. The pauses are 1, 2, 4 and 8 s.
     assert_eq!(ran.times(), [0, 2, 5, 10, 19], "at the front of the queue");
@@ -310,7 +310,7 @@ fn full_disk_ends_the_run_without_a_failed_cell() {
     assert_eq!((ran.end.clone(), ran.attempts()), (place.finished(&[]), vec![5, 1, 1, 1]), "there is room again");
     let place = Place::new();
     let ran = place.run(&|_, _| vec![server(), Wait(90), full()]);
-    let message = format!("the run cannot go on: {}: no space left; when that is mended", place.id(0));
+    let message = format!("the run cannot go on: {}: no space left; correct this, and resume", place.id(0));
     assert!(ran.end.as_ref().is_err_and(|error| error.starts_with(&message)), "{:?}", ran.end);
     assert!((0..4).all(|cell| !place.folder.cell(place.id(cell)).is_settled(true)), "no cell is blamed");
     // A disk failure after losses of servers counts as the first in its row.
@@ -426,7 +426,7 @@ fn a_run_whose_jobs_do_not_tell_their_ends_sees_the_results() {
 fn an_order_that_is_refused_ends_the_run() {
     let place = Place::new();
     let ran = place.run(&|_, _| vec![ends(CellEvent::Refused { reason: "no such cell".into() })]);
-    assert!(ran.end.is_err_and(|error| error.starts_with("a worker refused its order: no such cell; did another run")));
+    assert!(ran.end.is_err_and(|error| error.starts_with("a worker refused its job: no such cell; did another run")));
 }
 
 #[test]
@@ -437,7 +437,7 @@ fn cell_is_given_up_if_machines_may_be_faulty() {
     assert!(ran.end.as_ref().is_err_and(|error| error.starts_with(&message)), "{:?}", ran.end);
     assert_eq!(ran.attempts(), [1, 3, 1, 1]);
     assert_eq!(place.failure(1), "", "nothing is recorded");
-    let note = format!("{} is given up: 3 attempts have not brought it any further", place.id(1));
+    let note = format!("{} is given up: 3 attempts made no progress", place.id(1));
     assert_eq!(ran.notes, [note]);
 }
 

@@ -23,7 +23,7 @@ pub enum SlurmError {
     #[error("{program} refused: {words}")]
     Refused { program: &'static str, words: String },
     /// A command did not answer in time.
-    #[error("{program} did not answer within {} s; is Slurm's controller up? The same command goes on", limit.as_secs())]
+    #[error("{program} did not answer within {} s; is Slurm's controller up? The same command resumes", limit.as_secs())]
     Silent {
         program: &'static str,
         /// The time limit of the answer.
@@ -45,11 +45,11 @@ pub enum SlurmError {
     #[error(transparent)]
     File(#[from] FileError),
     /// The cost of cells cannot be estimated.
-    #[error("cannot estimate what cells cost, which says how many a job does: {0}; give --cells-per-job instead")]
+    #[error("cannot estimate the durations of cells, from which jobs get their size: {0}; give --cells-per-job")]
     Cost(AnyError),
     /// All jobs of the run were cancelled.
     #[error(
-        "Slurm job {} was cancelled; the same command submits what has no result again: {}",
+        "Slurm job {} was cancelled; the same command submits the unfinished cells again: {}",
         arrays.join(", "),
         count(*missing, "cell")
     )]

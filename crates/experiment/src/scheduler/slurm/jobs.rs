@@ -139,7 +139,7 @@ impl<'a> Jobs<'a> {
     fn put_up_with(&mut self, error: &RunError) {
         let words = error.to_string();
         if self.trouble.as_ref() != Some(&words) {
-            self.news.push(BackendEvent::Note(format!("{words}; results are still looked for, and it is tried again")));
+            self.news.push(BackendEvent::Note(format!("{words}; results are still read, and Slurm is asked again")));
             self.trouble = Some(words);
         }
     }

@@ -325,7 +325,7 @@ fn slurms_refusal_is_shown_and_leaves_nothing_behind() {
     assert_eq!(fake.run_until("submitted 4 cells").unwrap(), stopped(&["1"]));
     fake.plan = Plan::parse("test", PLAN.replace("runs = 2", "runs = 3")).unwrap();
     fake.write("refusal", "sbatch: error: QOSMaxSubmitJobPerUserLimit");
-    assert_eq!(fake.run_until("QOSMaxSubmitJobPerUserLimit; results are still looked for").unwrap(), stopped(&["1"]));
+    assert_eq!(fake.run_until("QOSMaxSubmitJobPerUserLimit; results are still read").unwrap(), stopped(&["1"]));
     let (stop, refusal) = (StopFlag::default(), fake.bin().join("refusal"));
     let raised = stop.clone();
     let end = fake.run_with(&stop, &mut |report| match report {
@@ -367,7 +367,7 @@ fn cancelled_job_is_resubmitted_by_the_next_call_only() {
     let fake = Fake::new();
     fake.hook("sed -i s/PENDING/CANCELLED/ queue");
     let message = fake.run().unwrap_err().to_string();
-    assert_eq!(message, "Slurm job 1 was cancelled; the same command submits what has no result again: 4 cells");
+    assert_eq!(message, "Slurm job 1 was cancelled; the same command submits the unfinished cells again: 4 cells");
     assert_eq!(fake.submissions().len(), 1);
     fake.hook("for cells in $(cat \"$submission/cells.txt\"); do done_ $cells; done");
     assert_eq!(fake.run().unwrap(), finished());
