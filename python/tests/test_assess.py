@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import os
 import shutil
@@ -45,6 +46,18 @@ def saved(assessment: perturb.Assessment, folder: Path) -> bytes:
     files = list(folder.glob("episodes*.parquet"))
     assert len(files) == 1
     return files[0].read_bytes()
+
+
+def test_saved_assessments_are_listed(server: str, tmp_path: Path) -> None:
+    def push_left(observations: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        return np.zeros(len(observations), np.int64)
+
+    assessment = perturb.evaluate(push_left, "CartPole", episodes=10, seed=1, name="left", server=server)
+    assessment.save(tmp_path / "study" / "saved")
+    (listed,) = json.loads(run("ls", "--json", "-", str(tmp_path)))
+    assert listed["path"].endswith("study/saved")
+    assert (listed["what"], listed["done"], listed["unit"]) == ("CartPole left", 30, "episodes")
+    assert (listed["success_percent"], listed["state"]) == (0.0, "assessed")
 
 
 @pytest.mark.parametrize("cell", ["CartPole-ppo-ff-D-9bd6546b-s7", "Pendulum-ppo-ff-R-9bd6546b-s8"])

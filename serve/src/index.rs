@@ -3,6 +3,7 @@
 use perturb_experiment::runs::{RunFolder, RunKind, RunSummary, places};
 use perturb_files::FileError;
 
+use crate::assessment::LiveAssessment;
 use crate::experiment::LiveExperiment;
 use crate::paths::{RelativePath, Root};
 use crate::pictures::{Pictures, scan_folder};
@@ -90,6 +91,14 @@ impl Row {
                 |experiment| {
                     experiment.refresh();
                     (experiment.summary(), experiment.changed(), None)
+                },
+            ),
+            RunKind::Assessment => runs.assessments.with(
+                path,
+                || LiveAssessment::new(root.path(), path),
+                |assessment| {
+                    assessment.refresh();
+                    (assessment.summary(), assessment.changed(), None)
                 },
             ),
         };

@@ -10,6 +10,7 @@
 //! - `pages` makes HTML of all this.
 #![forbid(unsafe_code)]
 
+mod assessment;
 mod cached_loader;
 mod connections;
 mod curve;

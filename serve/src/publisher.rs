@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use perturb_experiment::runs::RunKind;
 use tokio::sync::{Notify, Semaphore, watch};
 
+use crate::assessment::LiveAssessment;
 use crate::cached_loader::{CachedLoader, pause_after};
 use crate::error::ViewError;
 use crate::experiment::LiveExperiment;
@@ -138,6 +139,14 @@ impl Publisher {
                     experiment.refresh_details();
                     let report = self.reports.fingerprint(&path, experiment.report_fingerprint());
                     pages::experiment::update(root, relative, &path, experiment, report)
+                },
+            ),
+            RunKind::Assessment => self.runs.assessments.with(
+                &path,
+                || LiveAssessment::new(root.path(), &path),
+                |assessment| {
+                    assessment.refresh();
+                    pages::assessment::update(root, relative, assessment)
                 },
             ),
         })

@@ -3,6 +3,7 @@
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 
+use crate::assessment::LiveAssessment;
 use crate::experiment::LiveExperiment;
 use crate::keyed_cache::KeyedCache;
 use crate::training::LiveTraining;
@@ -12,6 +13,7 @@ use crate::training::LiveTraining;
 pub(crate) struct Runs {
     pub(crate) trainings: RunCache<LiveTraining>,
     pub(crate) experiments: RunCache<LiveExperiment>,
+    pub(crate) assessments: RunCache<LiveAssessment>,
 }
 
 /// Runs of one kind by their folders. Each has a lock of its own, so that a slow run delays no other one.
@@ -23,6 +25,7 @@ impl Runs {
     pub(crate) fn remove_idle(&self) {
         self.trainings.0.remove_idle(|_| false);
         self.experiments.0.remove_idle(|_| false);
+        self.assessments.0.remove_idle(|_| false);
     }
 }
 

@@ -23,8 +23,8 @@ const MIN_ELAPSED: Duration = Duration::from_secs(1);
 
 /// Whether only warnings and errors are printed.
 static QUIET: AtomicBool = AtomicBool::new(false);
-/// The bar on the terminal, if there is one.
-static CURRENT_BAR: Mutex<Option<MultiProgress>> = Mutex::new(None);
+/// The bars on the terminal, and their number, if there are any.
+static CURRENT_BARS: Mutex<Option<(MultiProgress, usize)>> = Mutex::new(None);
 
 /// Suppresses [`note`] and progress from now on.
 pub(super) fn be_quiet() {
@@ -82,9 +82,9 @@ impl Write for AboveBar {
     }
 
     fn write_all(&mut self, bytes: &[u8]) -> std::io::Result<()> {
-        match &*current_bar() {
+        match &*current_bars() {
             // `suspend` would panic if the terminal is gone.
-            Some(bar) => bar.println(String::from_utf8_lossy(bytes).trim_end_matches('\n')),
+            Some((bars, _)) => bars.println(String::from_utf8_lossy(bytes).trim_end_matches('\n')),
             None => std::io::stderr().write_all(bytes),
         }
     }
@@ -99,8 +99,8 @@ impl Write for AboveBar {
     }
 }
 
-fn current_bar() -> MutexGuard<'static, Option<MultiProgress>> {
-    CURRENT_BAR.lock().unwrap_or_else(PoisonError::into_inner)
+fn current_bars() -> MutexGuard<'static, Option<(MultiProgress, usize)>> {
+    CURRENT_BARS.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Returns the width of the terminal on standard output, in columns; `None` if it is no terminal.
@@ -237,17 +237,19 @@ fn first_lines(mut lines: Vec<String>) -> Vec<String> {
 
 impl Bar {
     fn new(what: &str, total: u64) -> Self {
-        let all = MultiProgress::new();
+        let mut bars = current_bars();
+        let (all, number) = bars.get_or_insert_with(|| (MultiProgress::new(), 0));
+        *number += 1;
         let bar = ProgressBar::new(total).with_style(style("{prefix}{wide_bar} {percent:>3} %"));
         // Setting the prefix later would draw the bar once more, and that copy would stay.
         let bar = all.add(bar.with_prefix(what.to_owned()));
-        *current_bar() = Some(all.clone());
-        Self { all, bar, lines: Vec::new() }
+        Self { all: all.clone(), bar, lines: Vec::new() }
     }
 
     fn show(&mut self, position: u64, lines: Vec<String>) {
         while self.lines.len() < lines.len() {
-            self.lines.push(self.all.add(ProgressBar::no_length().with_style(style("{wide_msg}"))));
+            let line = ProgressBar::no_length().with_style(style("{wide_msg}"));
+            self.lines.push(self.all.insert_after(self.lines.last().unwrap_or(&self.bar), line));
         }
         for unused in self.lines.drain(lines.len()..) {
             unused.finish_and_clear();
@@ -266,11 +268,19 @@ fn style(template: &str) -> ProgressStyle {
 impl Drop for Display {
     fn drop(&mut self) {
         if let Some(Bar { all, bar, lines }) = &self.bar {
-            lines.iter().for_each(ProgressBar::finish_and_clear);
-            bar.finish_and_clear();
-            // Clearing fails if the terminal is gone.
-            let _ = all.clear();
-            *current_bar() = None;
+            lines.iter().chain([bar]).for_each(|line| {
+                line.finish_and_clear();
+                all.remove(line);
+            });
+            let mut bars = current_bars();
+            if let Some((_, number)) = &mut *bars {
+                *number -= 1;
+                if *number == 0 {
+                    // Clearing fails if the terminal is gone.
+                    let _ = all.clear();
+                    *bars = None;
+                }
+            }
         }
     }
 }

@@ -10,7 +10,7 @@ use super::display::{note, output, terminal_width};
 use super::error::{CommandError, Result};
 
 /// Explanation of the column `success`, printed below the list.
-const SUCCESS_NOTE: &str = "\nsuccess: a training's last 100 episodes, or all tests of finished cells";
+const SUCCESS_NOTE: &str = "\nsuccess: a training's last 100 episodes, or all tests of cells or assessments";
 
 pub(super) fn run(args: &LsArgs) -> Result<()> {
     args.json.check()?;
@@ -28,7 +28,7 @@ pub(super) fn run(args: &LsArgs) -> Result<()> {
     }
     let mut out = output();
     if found.is_empty() {
-        return Ok(writeln!(out, "{} has no trainings and no experiments", args.dir.display())?);
+        return Ok(writeln!(out, "{} has no trainings, experiments or assessments", args.dir.display())?);
     }
     let done = |found: &RunSummary| {
         if found.unit.is_empty() {

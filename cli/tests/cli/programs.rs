@@ -233,7 +233,8 @@ fn the_demo_compares_with_the_paper() {
         assert!(text.contains(part), "{part}: {text}");
     }
     assert!(text.lines().all(|line| line.chars().count() <= 80), "{text}");
-    assert!(read(folder.path(), "demo/trained-on-R/config.toml").contains("version = \"R\""));
+    let config = read(folder.path(), "demo/trained-on-R/config.toml");
+    assert!(config.contains("version = \"R\"") && config.contains("learning_rate = 0.003"), "{config}");
     let picture = std::fs::read(folder.path().join("demo/heatmap.png")).expect("a picture");
     assert!(picture.starts_with(b"\x89PNG"));
     // No policy balances the pole after twenty episodes.

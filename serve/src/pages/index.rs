@@ -89,7 +89,11 @@ fn run(root: &Root, Row { relative, kind, summary, changed, remaining_seconds }:
         tr role="row" {
             th scope="row" role="rowheader" { a href=(run_link(relative)) { (name) } }
             td.what role="cell" {
-                (match kind { RunKind::Training => "training", RunKind::Experiment => "experiment" })
+                (match kind {
+                    RunKind::Training => "training",
+                    RunKind::Experiment => "experiment",
+                    RunKind::Assessment => "assessment",
+                })
                 @if !summary.what.is_empty() { ": " (summary.what) }
             }
             td.amount role="cell" {

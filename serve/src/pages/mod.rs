@@ -3,6 +3,7 @@
 //! A page consists of named parts. When something changes, an event has all parts as they would be in a new page, and
 //! the script replaces them. Curves are sent as numbers.
 
+pub(crate) mod assessment;
 pub(crate) mod experiment;
 pub(crate) mod index;
 pub(crate) mod pictures;
@@ -110,6 +111,7 @@ fn describe(error: &ViewError) -> (StatusCode, String) {
 pub(crate) fn run_page(root: &Root, relative: &RelativePath, update: &Update) -> String {
     match update.kind {
         Some(RunKind::Experiment) => experiment::page(root, relative, update),
+        Some(RunKind::Assessment) => assessment::page(root, relative, update),
         _ => training::page(root, relative, update),
     }
 }

@@ -1,5 +1,6 @@
-//! The trainings and experiments below a folder, with their kind, progress and success.
+//! The trainings, experiments and saved assessments below a folder, with their kind, progress and success.
 
+mod assessment;
 mod experiment;
 mod progress;
 mod training;
@@ -10,10 +11,12 @@ use std::path::{Path, PathBuf};
 
 use serde::{Serialize, Serializer};
 
+pub use self::assessment::{AssessedTest, AssessmentStatus};
 pub use self::experiment::{CellStatus, ExperimentStatus, LEADS_OUT};
 pub use self::progress::{LastProgress, last_progress};
 pub use self::training::TrainingStatus;
 use perturb_files::{self as files, AnyError, leads_out};
+use perturb_records::ExternalEvaluation;
 
 /// Maximum number of folders that are searched behind symbolic links, since a link may lead to a whole disk.
 const MAX_FOLDERS_BEHIND_LINKS: usize = 10_000;
@@ -34,6 +37,8 @@ pub enum RunKind {
     Training,
     /// An experiment, as `perturb run --out` writes it.
     Experiment,
+    /// An assessment, as `Assessment.save` of the Python package writes it.
+    Assessment,
 }
 
 impl RunKind {
@@ -41,8 +46,10 @@ impl RunKind {
     pub fn detect(path: &Path) -> Option<Self> {
         if path.join("plan.toml").is_file() {
             Some(RunKind::Experiment)
+        } else if path.join("config.toml").is_file() {
+            Some(RunKind::Training)
         } else {
-            path.join("config.toml").is_file().then_some(RunKind::Training)
+            ExternalEvaluation::is_in(path).then_some(RunKind::Assessment)
         }
     }
 }
@@ -137,21 +144,21 @@ impl FolderSearch {
     }
 }
 
-/// A training or an experiment in a few figures.
+/// A training, an experiment or an assessment in a few figures.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RunSummary {
     /// The path of the folder. JSON has U+FFFD where it is not UTF-8.
     #[serde(serialize_with = "as_text")]
     pub path: PathBuf,
-    /// The trained method, or the environments of an experiment.
+    /// The trained method, the environments of an experiment, or what an assessment tested.
     pub what: String,
-    /// Number of finished episodes of a training, or finished cells of an experiment.
+    /// Number of finished episodes of a training or an assessment, or finished cells of an experiment.
     pub done: u64,
     /// Total number of these episodes or cells.
     pub budget: u64,
     /// "episodes" or "cells".
     pub unit: &'static str,
-    /// Success: of the last 100 episodes of a training, or over the tests of the cells that are done.
+    /// Success: of the last 100 episodes of a training, or over the tests of an assessment or of the cells that are done.
     pub success_percent: Option<f64>,
     /// "in work", "finished", "broken off", …
     pub state: &'static str,
@@ -169,6 +176,7 @@ impl RunSummary {
             Ok(match place.kind {
                 RunKind::Training => TrainingStatus::read(&place.path)?.summary(),
                 RunKind::Experiment => ExperimentStatus::read(&place.path)?.summary(),
+                RunKind::Assessment => AssessmentStatus::read(&place.path)?.summary(),
             })
         };
         read().unwrap_or_else(|_| Self::not_understood(&place.path))

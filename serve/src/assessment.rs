@@ -1,0 +1,56 @@
+//! The state of a saved assessment, read again when its files change.
+
+use std::path::{Path, PathBuf};
+
+use perturb_experiment::runs::{AssessmentStatus, LEADS_OUT, RunSummary};
+use perturb_files::{Stamp, leads_out, list};
+use perturb_text::shortened;
+
+/// The state of an assessment at the last refresh.
+#[derive(Debug)]
+pub(crate) struct LiveAssessment {
+    /// The served folder. Links must not lead out of it.
+    root: PathBuf,
+    path: PathBuf,
+    /// The stamps of all files in the folder.
+    stamps: Vec<Option<Stamp>>,
+    status: Result<AssessmentStatus, String>,
+}
+
+impl LiveAssessment {
+    /// Makes the state of the assessment in `path`, before its first refresh. Files outside of `root` are not read.
+    pub(crate) fn new(root: &Path, path: &Path) -> Self {
+        let status = Err("it was not read yet".into());
+        Self { root: root.to_owned(), path: path.to_owned(), stamps: Vec::new(), status }
+    }
+
+    /// Reads the assessment again if a file in its folder has changed.
+    pub(crate) fn refresh(&mut self) {
+        let files = list(&self.path).unwrap_or_default();
+        let names = files.iter().filter_map(|path| path.file_name());
+        if let Some(name) = names.into_iter().find(|name| leads_out(&self.root, &self.path, name)) {
+            let status = Err(format!("{} is {LEADS_OUT}", Path::new(name).display()));
+            *self = Self { status, ..Self::new(&self.root, &self.path) };
+            return;
+        }
+        let stamps: Vec<_> = files.iter().map(|path| Stamp::read(path)).collect();
+        if stamps != self.stamps {
+            self.status = AssessmentStatus::read(&self.path).map_err(|error| shortened(error.to_string()));
+            self.stamps = stamps;
+        }
+    }
+
+    /// Returns the status, or the reason why it is not known.
+    pub(crate) fn status(&self) -> Result<&AssessmentStatus, &str> {
+        self.status.as_ref().map_err(String::as_str)
+    }
+
+    pub(crate) fn summary(&self) -> RunSummary {
+        self.status.as_ref().map_or_else(|_| RunSummary::not_understood(&self.path), AssessmentStatus::summary)
+    }
+
+    /// Returns the time of the last change, in seconds since 1970.
+    pub(crate) fn changed(&self) -> i64 {
+        self.stamps.iter().flatten().map(Stamp::seconds).max().unwrap_or_default()
+    }
+}
