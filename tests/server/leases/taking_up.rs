@@ -92,7 +92,7 @@ async fn a_newer_stream_takes_over_from_one_that_looks_alive() {
     old.play(actor, 0, 3).await;
     let (mut new, _) = resume(server.tcp(), &opened.lease, 3).await;
     let status = old.end().await;
-    assert!(status.code() == Code::Aborted && status.message().contains("another stream has taken up"), "{status:?}");
+    assert!(status.code() == Code::Aborted && status.message().contains("another stream has resumed"), "{status:?}");
     new.play(actor, 3, 6).await;
 }
 
