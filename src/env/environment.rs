@@ -41,7 +41,7 @@ pub struct EnvironmentSpec {
     pub action: ActionSpace,
     /// The entries of an exact initial state, `[S]`.
     pub state: &'static [Channel],
-    /// The terms of the reward, which is their sum, in order.
+    /// The terms of the reward, in order. The reward is their sum.
     pub reward_terms: &'static [RewardTerm],
     /// The quantities that receipts read back from the physics.
     pub applied: &'static [Quantity],
@@ -51,7 +51,7 @@ pub struct EnvironmentSpec {
     pub control_timestep: f64,
     /// The approximate time of a step on one core, µs. The pool cuts batches by it; results do not depend on it.
     pub step_cost: f64,
-    /// How it can be pushed; `None` if it cannot.
+    /// The pushes that the environment can take; `None` if it cannot be pushed.
     pub push: Option<PushSpec>,
     /// The success rule of the paper's text.
     pub success: Success,

@@ -89,7 +89,7 @@ pub enum Error {
     NameTaken {
         /// The name of the new environment.
         name: &'static str,
-        /// The name of the environment that is there.
+        /// The name of the existing environment.
         taken: &'static str,
     },
     /// The environment could not be built.

@@ -11,7 +11,8 @@ const AREA: f64 = 0.004_928_673_233_974_655;
 /// The number of fractions that a layer is divided into.
 const N_FRACTIONS: f64 = (1u64 << 52) as f64;
 
-/// A layer, from the top of the curve, 1, to its edge, 255. Layer 0 is the lowest rectangle with the tail.
+/// A layer of the ziggurat. Layer 1 is at the top of the curve, and layer 255 ends at [`EDGE`]. Layer 0 is the lowest
+/// rectangle together with the tail.
 #[derive(Debug, Clone, Copy)]
 struct ZigguratLayer {
     /// Fractions below this are under the curve at every height of the layer.

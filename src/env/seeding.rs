@@ -103,8 +103,9 @@ impl Stream {
         (self.next_u64() >> 11) as f64 * (1.0 / (1u64 << 53) as f64)
     }
 
-    /// A random direction along `n` axes: ±1 for one; uniform on the circle for two, by its angle; uniform on the sphere for
-    /// three, by its last coordinate and its angle about that axis. The other entries are 0.
+    /// Returns a random unit vector along the first `n` axes; its other entries are 0. For one axis it is ±1. For two
+    /// it is uniform on the circle: the angle is drawn. For three it is uniform on the sphere: the last coordinate is
+    /// drawn, then the angle about the last axis.
     pub fn direction(&mut self, n: usize) -> [f64; 3] {
         let last = match n {
             1 => return [if self.unit() < 0.5 { -1.0 } else { 1.0 }, 0.0, 0.0],

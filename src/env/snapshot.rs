@@ -121,7 +121,7 @@ impl Episodes {
     }
 }
 
-/// Returns the bytes of distributions in a snapshot, without the number of distributions.
+/// Returns how many bytes distributions take in a snapshot. The count of distributions before them is not included.
 pub(crate) fn distributions_bytes(distributions: &[Distribution]) -> usize {
     // A distribution has at most 64 intervals, whose number has one byte.
     distributions.iter().map(|distribution| 1 + size_of::<(f64, f64)>() * distribution.intervals().len()).sum()

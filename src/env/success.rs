@@ -34,9 +34,9 @@ pub enum Achievement {
 /// The comparison of the achieved value with the threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Comparison {
-    /// A success achieved the threshold or more.
+    /// An episode succeeds if the achieved value is the threshold or more.
     AtLeast,
-    /// A success achieved the threshold or less.
+    /// An episode succeeds if the achieved value is the threshold or less.
     AtMost,
 }
 

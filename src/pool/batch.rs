@@ -76,7 +76,7 @@ pub struct Batch {
     freed: Option<oneshot::Sender<()>>,
 }
 
-/// A hook that gets the draws of all environments when they are freed.
+/// A hook that runs when the environments are freed. It gets their draws, in order of slots.
 pub type DropHook = Box<dyn FnOnce(Vec<Draw>) + Send + Sync>;
 
 impl Batch {
@@ -319,7 +319,7 @@ impl Batch {
         lock(&self.job.shards[slot / self.shard_size]).draw(slot)
     }
 
-    /// Sets the hook that gets the draws of all environments, in order of slots, when they are freed.
+    /// Sets the hook that runs when the environments are freed. It gets their draws, in order of slots.
     pub fn when_freed(&mut self, hook: DropHook) {
         self.drop_hook = Some(hook);
     }
@@ -473,7 +473,7 @@ impl Drop for Batch {
     }
 }
 
-/// The draws of all environments of a job.
+/// Returns the draws of all environments of a job, in order of slots.
 fn draws(job: &Job) -> Vec<Draw> {
     job.shards.iter().flat_map(|shard| lock(shard).draws().collect::<Vec<_>>()).collect()
 }

@@ -12,7 +12,7 @@ use tokio::time::Instant;
 /// The pipelined step of a job.
 #[derive(Default)]
 pub(super) struct PipelinedStep {
-    /// Whether a step runs whose last worker will check for a pipelined one.
+    /// Whether a step is running that a pipelined step may follow. The last worker of the running step checks for one.
     is_under_way: bool,
     /// The next step's actions.
     actions: Option<Bytes>,

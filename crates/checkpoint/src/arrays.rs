@@ -62,7 +62,7 @@ pub struct Arrays<'a>(SafeTensors<'a>);
 
 impl<'a> Arrays<'a> {
     /// # Errors
-    /// What is wrong with the file.
+    /// A description of what is wrong with the file.
     pub fn decode(bytes: &'a [u8]) -> Result<Self, String> {
         SafeTensors::deserialize(bytes).map(Self).map_err(|error| error.to_string())
     }

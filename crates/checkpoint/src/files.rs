@@ -79,7 +79,7 @@ impl ArraysFile {
     /// Checks length and checksum of `content`.
     ///
     /// # Errors
-    /// What differs.
+    /// A description of the difference.
     pub(super) fn require_content(&self, content: &[u8]) -> std::result::Result<(), String> {
         if content.len() as u64 == self.bytes && crc32c::crc32c(content) == self.crc32c {
             return Ok(());

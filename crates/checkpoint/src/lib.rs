@@ -230,7 +230,7 @@ impl Checkpoint {
     /// the same name.
     ///
     /// # Errors
-    /// What is wrong with the weights.
+    /// A description of what is wrong with the weights.
     pub fn id(&self) -> std::result::Result<String, String> {
         let weights = encode_weights(&self.weights)?;
         Ok(format!("{:08}-{:08x}", self.state.counters.iterations, crc32c::crc32c(&weights)))

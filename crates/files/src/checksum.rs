@@ -28,7 +28,7 @@ impl<'a, T: Serialize> WithChecksum<'a, T> {
     /// `document`, which must be an object.
     ///
     /// # Errors
-    /// One that cannot be written as JSON.
+    /// The serializer's error, if `document` cannot be written as JSON.
     pub fn new(document: &'a T) -> serde_json::Result<Self> {
         Ok(Self { document, crc32c: checksum(&serde_json::to_value(document)?) })
     }

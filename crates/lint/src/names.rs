@@ -28,7 +28,7 @@ pub struct Definition {
 pub struct NameDefinitions {
     /// Structs, enums, traits, classes and type aliases of modules, without tests, benchmarks and examples.
     pub types: Vec<Definition>,
-    /// Those of `types` in Rust that are `pub` without a restriction.
+    /// The Rust types among `types` that are `pub` without a restriction.
     pub public_types: Vec<Definition>,
     /// Constants and statics whose first word is one of [`SUPERLATIVES`], without tests.
     pub superlatives: Vec<Definition>,

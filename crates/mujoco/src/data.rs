@@ -120,7 +120,7 @@ impl Simulation {
         }
     }
 
-    /// A field of the model, to be edited. Follow edits of masses, inertias, armatures and gears by
+    /// Returns a field of the model for editing. Follow edits of masses, inertias, armatures and gears by
     /// [`set_const`](Self::set_const).
     pub fn field_mut(&mut self, field: Field) -> &mut [f64] {
         let (start, length) = self.model.place(field);

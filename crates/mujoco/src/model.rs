@@ -75,7 +75,7 @@ impl Kind {
     }
 }
 
-/// A compiled model, immutable. A [`Simulation`](crate::Simulation) owns and edits one.
+/// A compiled model. It is immutable, except through the [`Simulation`](crate::Simulation) that owns it.
 #[derive(Debug)]
 pub struct Model {
     // Made by mj_loadXML or mj_copyModel, owned, freed in drop. Its sizes and index arrays never change.

@@ -87,7 +87,7 @@ impl Renderer {
         Ok(renderer)
     }
 
-    /// The model that is drawn and its positions, to be edited.
+    /// Returns the simulation that is drawn. Edit it to change the model or its positions.
     pub fn simulation(&mut self) -> &mut Simulation {
         &mut self.simulation
     }

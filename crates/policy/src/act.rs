@@ -16,8 +16,8 @@ use crate::weights::Weights;
 /// Computes actions, log-probabilities and values. Acting allocates nothing after its creation for batches of at most
 /// `max_batch`, except where the caller's outputs grow.
 ///
-/// A recurrent policy's actor keeps the memory of every environment: [`Actor::act`] moves it on, [`Actor::forget`]
-/// empties it at an episode's end (RL²: a trial's), values leave it alone.
+/// A recurrent policy's actor keeps a memory for every environment. [`Actor::act`] advances it. [`Actor::forget`]
+/// clears it at the end of an episode (RL²: of a trial). Computing values alone does not change it.
 #[derive(Clone, Debug)]
 pub struct Actor {
     spec: PolicySpec,

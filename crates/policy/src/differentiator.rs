@@ -136,8 +136,8 @@ impl Differentiator {
             })
     }
 
-    /// Writes the derivatives of the total loss of the samples at `indices` by `weights` `[P]`, which must be those that were
-    /// loaded, to `gradient` `[P]`. Returns the losses.
+    /// Writes the derivatives of the total loss of the samples at `indices` with respect to `weights` `[P]` to
+    /// `gradient` `[P]`. `weights` must be those that were loaded. Returns the losses.
     ///
     /// # Errors
     /// Lengths that do not fit, or no indices.

@@ -86,7 +86,7 @@ pub enum Error {
     Input {
         /// The array, with its axes.
         name: &'static str,
-        /// The first such element.
+        /// The first element that is not finite.
         value: f32,
     },
 }

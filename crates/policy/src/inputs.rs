@@ -48,8 +48,8 @@ impl Inputs {
         self.rows(observations, 0..n_envs, false)
     }
 
-    /// The inputs `[K, I]` of final observations `[K, O]` of `environments` `[K]`, after the step that was remembered last, as
-    /// if no episode had ended.
+    /// Returns the inputs `[K, I]` of final observations `[K, O]` of `environments` `[K]`. Their previous step is the
+    /// one that was remembered last, with a done flag of 0, as if no episode had ended.
     pub fn from_final_observations<'a>(&'a mut self, observations: &'a [f32], environments: &[usize]) -> &'a [f32] {
         self.rows(observations, environments.iter().copied(), true)
     }

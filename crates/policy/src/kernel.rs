@@ -122,7 +122,8 @@ impl Rows {
         }
     }
 
-    /// Multiplies the first `n` rows, derivatives by a tanh, by 1 - tanh². `tanhs` are the results of the tanh.
+    /// Multiplies the first `n` rows, derivatives with respect to a tanh, by 1 - tanh². `tanhs` are the results of the
+    /// tanh.
     #[inline(always)]
     pub(crate) fn differentiate_tanh(&mut self, tanhs: &Rows, n: usize) {
         for (lane, tanhs) in self.lanes_mut(n).iter_mut().zip(tanhs.lanes(n)) {

@@ -1,4 +1,4 @@
-//! The loss that an update minimises, and its derivatives by a policy's outputs.
+//! The loss that an update minimises, and its derivatives with respect to a policy's outputs.
 
 use crate::losses::Losses;
 use crate::math::{exp, ln};
@@ -83,17 +83,17 @@ impl Gaussian {
     }
 }
 
-/// The policy's outputs at one sample, and the buffers for the derivatives of the loss by them.
+/// The policy's outputs at one sample, and buffers for the derivatives of the loss with respect to these outputs.
 pub(crate) struct Outputs<'a> {
     /// `[n]` logits, or `[A]` means.
     pub(crate) head: &'a [f32],
     pub(crate) gaussian: &'a Gaussian,
     pub(crate) value: f32,
-    /// Derivatives by `head`; replaced.
+    /// Derivatives with respect to `head`; overwritten.
     pub(crate) by_head: &'a mut [f32],
-    /// `[A]` derivatives by log σ; added to.
+    /// `[A]` derivatives with respect to log σ; the sample's are added.
     pub(crate) by_log_std: &'a mut [f32],
-    /// The derivative by the value; replaced.
+    /// The derivative with respect to the value; overwritten.
     pub(crate) by_value: &'a mut f32,
 }
 
@@ -115,8 +115,8 @@ impl Objective {
         means
     }
 
-    /// Computes the losses of one of `n` samples, and the derivatives by the policy's outputs. The derivatives are divided by
-    /// `n`, the losses are not.
+    /// Computes the losses of one of `n` samples, and their derivatives with respect to the policy's outputs. The
+    /// derivatives are divided by `n`, the losses are not.
     #[inline(always)]
     pub(crate) fn differentiate(
         &self,
@@ -193,7 +193,7 @@ impl Objective {
         losses
     }
 
-    /// The value loss of a sample, and its derivative by the value.
+    /// The value loss of a sample, and its derivative with respect to the value.
     #[inline(always)]
     fn value_loss(&self, value: f32, sample: &Sample<'_>) -> (f32, f32) {
         let error = value - sample.return_;
@@ -206,7 +206,8 @@ impl Objective {
         if free.0 >= clipped || moved.abs() <= range as f32 { free } else { (clipped, 0.0) }
     }
 
-    /// The derivative of a sample's surrogate by its log-probability. Stores the surrogate's figures in `losses`.
+    /// The derivative of a sample's surrogate with respect to its log-probability. Stores the surrogate's figures in
+    /// `losses`.
     #[inline(always)]
     fn policy_loss(&self, log_prob: f32, sample: &Sample<'_>, losses: &mut Losses) -> f32 {
         let Surrogate::Clipped { range } = self.surrogate else {

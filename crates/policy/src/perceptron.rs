@@ -119,7 +119,7 @@ pub(crate) struct Backward {
 struct LayerBackward {
     inputs: usize,
     outputs: usize,
-    /// Derivatives by this layer's outputs before their tanh, for a batch.
+    /// Derivatives with respect to this layer's outputs before their tanh, for a batch.
     deltas: Rows,
 }
 
@@ -140,14 +140,14 @@ impl Backward {
         self.n_weights
     }
 
-    /// The buffer for the derivatives by the perceptron's outputs, to be filled before [`Backward::sum`].
+    /// The buffer for the derivatives with respect to the perceptron's outputs. Fill it before [`Backward::sum`].
     pub(crate) fn by_outputs(&mut self) -> &mut Rows {
         let last = self.layers.len() - 1;
         &mut self.layers[last].deltas
     }
 
-    /// Writes the derivatives of a sum over the first `n` rows by `weights` `[P]` to `sums` `[P]`, or adds them with `ADD`.
-    /// `outputs` are those of [`Perceptron::forward`] for `inputs`.
+    /// Writes the derivatives of a sum over the first `n` rows with respect to `weights` `[P]` to `sums` `[P]`. With
+    /// `ADD` it adds them instead. `outputs` are those of [`Perceptron::forward`] for `inputs`.
     #[inline(always)]
     pub(crate) fn sum<S: Simd, const ADD: bool>(
         &mut self,

@@ -75,7 +75,8 @@ impl Environment {
     }
 }
 
-/// How a disturbance is observed: from the least to the greatest value that it has in R and E, which most have one of.
+/// Returns how a disturbance is observed: its least value in R and E becomes -1, its greatest 1. Most disturbances have
+/// only one of R and E.
 fn observation(disturbance: &Parameter) -> ParameterObservation {
     let sets = [&disturbance.random, &disturbance.extreme].into_iter().flatten();
     let intervals = sets.flat_map(|set| &set.intervals).map(|interval| (interval.low, interval.high));

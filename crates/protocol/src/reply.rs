@@ -7,9 +7,9 @@ use crate::proto;
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{got}; expected {expected}")]
 pub struct Malformed {
-    /// What came.
+    /// The description of the received reply.
     pub got: String,
-    /// What the protocol demands.
+    /// The description of the reply that the protocol demands.
     pub expected: String,
 }
 

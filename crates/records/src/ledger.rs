@@ -321,7 +321,8 @@ impl Ledgers {
     }
 }
 
-/// Returns the regions that a test draws from and the training does not, by context.
+/// Returns one region for each context of a test: the parameters that the test draws from. Regions inside `claimed`,
+/// the region of the training, are left out.
 fn tested(environment: &proto::Environment, test: &RecordedTest, claimed: &Region) -> Vec<Region> {
     let of = |context| Region::from_version(environment, test.set.version, &test.set.parameters(context));
     test.set.listed().iter().map(of).filter(|region| !region.is_within([claimed])).collect()

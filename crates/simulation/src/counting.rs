@@ -106,7 +106,7 @@ impl SessionHandler for CountingSession {
         }
     }
 
-    /// No pool runs the steps.
+    /// Returns `None`: steps run without a pool, so none is pipelined.
     fn pipeline(&self, _request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<>> {
         None::<fn(Self::Request)>
     }

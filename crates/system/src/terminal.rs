@@ -1,4 +1,4 @@
-//! Text that another party wrote, on its way to a terminal or a log.
+//! Escapes text that another party wrote, before it goes to a terminal or a log.
 
 use std::borrow::Cow;
 

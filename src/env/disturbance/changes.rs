@@ -87,7 +87,7 @@ impl ChangingPhysics {
         out.push(f64::from(u8::from(self.is_changed)));
     }
 
-    /// Takes back what was saved.
+    /// Restores the state that [`save`](Self::save) wrote.
     ///
     /// # Errors
     /// [`Error::Snapshot`]; the state is undefined then.

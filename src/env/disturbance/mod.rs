@@ -122,7 +122,8 @@ fn with_set(spec: &'static EnvironmentSpec, set: DisturbanceSet) -> &'static Env
     let mut disturbed = *spec;
     disturbed.parameters = Vec::leak(spec.parameters.iter().copied().chain(set.parameters()).collect());
     disturbed.applied = Vec::leak(spec.applied.iter().copied().chain(quantities).collect());
-    // An environment knows its spec, which has the closure that makes it.
+    // Each environment refers to its spec, and the spec holds the closure that makes environments. The cell closes this
+    // circle: the closure reads the spec's address from it.
     let address: &'static OnceLock<&'static EnvironmentSpec> = Box::leak(Box::default());
     disturbed.make = Box::leak(Box::new(move || {
         let disturbed = address.get().expect("nobody has the closure before the address is set");

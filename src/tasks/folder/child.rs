@@ -22,7 +22,8 @@ const POLL_INTERVAL: Duration = Duration::from_millis(2);
 /// Limit of the process's output that is kept, in bytes.
 const MAX_OUTPUT_BYTES: u64 = 1 << 20;
 
-/// Limits this process before it loads a folder that was never loaded before.
+/// Limits the memory and the CPU time of this process, and forbids core files. Call it before the process loads a
+/// folder that was never loaded before.
 ///
 /// # Errors
 /// [`io::Error`] if the system refuses.

@@ -163,7 +163,8 @@ impl FolderEnvironment {
         let task = self.task;
         let started = shared::with(&task.template, |shared| {
             let (simulation, numbers) = shared.at(&self.edit, &self.state)?;
-            // Forces that another environment left must not be read. Sensors may compute them again.
+            // The simulation is shared: no reading may see the external forces of another environment. `forward`
+            // computes the forces again if a sensor needs them.
             simulation.clear_external_forces();
             simulation.forward()?;
             simulation.state(&mut self.state);

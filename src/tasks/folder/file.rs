@@ -384,7 +384,8 @@ fn action_channels(model: &Model, elements: &Elements, controls: &[(f64, f64)], 
     leaked_list(names.iter().zip(controls).map(channel))
 }
 
-/// Positions, then velocities. The bounds are far beyond any episode and keep absurd numbers out.
+/// Returns the entries of a state: positions, then velocities. Their bounds are far beyond the values of any episode
+/// and exclude absurd numbers.
 fn state_channels(model: &Model, elements: &Elements) -> &'static [Channel] {
     let mut channels = Vec::new();
     for is_velocity in [false, true] {

@@ -112,7 +112,7 @@ impl EditedText {
     /// Prepares a text. `leaves_out` says whether the model lacks the geoms that only pictures show. `refuse` makes the error of a slot.
     ///
     /// # Errors
-    /// Those of `refuse`: what has no such length, or could not follow.
+    /// The error that `refuse` makes, if an element has no such length or cannot follow the edit.
     pub(super) fn new(
         text: &Text,
         model: &Model,
@@ -368,7 +368,7 @@ impl<'a, 'input> Editor<'a, 'input> {
         }
     }
 
-    /// Scales the numbers of an attribute by the slots of each, and all others by `rest`.
+    /// Scales each number of an attribute by its slot in `first`, and the numbers after these by `rest`.
     fn scale(
         &mut self,
         node: Node<'a, 'input>,
@@ -386,7 +386,7 @@ impl<'a, 'input> Editor<'a, 'input> {
         Ok(())
     }
 
-    /// The numbers of an attribute, as the element or its defaults have it.
+    /// Returns the numbers of an attribute, which the element or its defaults set; `absent` if neither does.
     fn numbers(&self, node: Node<'a, 'input>, key: &str, absent: &[f64]) -> Result<Vec<f64>> {
         let Some(text) = self.attributes.get(node, key) else { return Ok(absent.to_vec()) };
         let numbers = text.split_whitespace().map(|number| number.parse().ok()).collect::<Option<Vec<f64>>>();

@@ -31,7 +31,7 @@ pub(super) struct EditedParameter {
 }
 
 impl EditedParameter {
-    /// Reads the table of a parameter.
+    /// Makes a parameter from its TOML table.
     pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements) -> Result<Self> {
         let name = table.require("name", "\"torso_mass\"")?;
         let name = identifier(&name, name.text()?)?;
@@ -257,7 +257,7 @@ pub(super) struct AppliedQuantity {
 }
 
 impl AppliedQuantity {
-    /// Reads the table of a quantity.
+    /// Makes an applied quantity from its TOML table.
     pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements) -> Result<Self> {
         table.only(&[&KEYS[..], &APPLIED].concat())?;
         let name = table.require("name", "\"torso_mass\"")?;

@@ -8,7 +8,7 @@ const PICTURE: &[&str] = &["camera", "look_at", "distance", "azimuth", "elevatio
 const AZIMUTH: f64 = 90.0;
 const ELEVATION: f64 = -15.0;
 
-/// Reads the table of the picture. Without a table the picture shows the whole model from the side.
+/// Makes the view from the TOML table `picture`. Without a table the picture shows the whole model from the side.
 pub(super) fn view(table: Option<&Table<'_>>, model: &Model, elements: &Elements) -> Result<ModelView> {
     // The statistics hold the extent and the centre of the model at the places 3 and 4 to 6.
     let statistic = model.field(Field::Statistic);

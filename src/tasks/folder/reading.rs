@@ -37,7 +37,7 @@ pub(super) struct Reading {
 }
 
 impl Reading {
-    /// Reads the table of a reading.
+    /// Makes a reading from its TOML table.
     pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements) -> Result<Self> {
         table.only(&[&SUBJECTS[..], &OPTIONS].concat())?;
         let (subject, value) = table.one_of(&SUBJECTS).map_err(|_| {

@@ -1,4 +1,4 @@
-//! Resolves a reading of the file to numbers of the simulation.
+//! Resolves the description of a reading in a task's file to numbers of the simulation.
 
 use super::{
     elements::{Elements, actuator_name},
@@ -28,7 +28,7 @@ const OF_A_GEOM: &[&str] = &["position", "touching"];
 const OF_AN_ACTUATOR: &[&str] = &["control", "force", "activation"];
 const OF_TWO_POINTS: &[&str] = &["vector", "distance"];
 
-/// The table of a reading, with the model and its elements, to which the table refers.
+/// The TOML table of a reading, with the model and the elements to which the table refers.
 pub(super) struct Source<'a> {
     pub(super) table: &'a Table<'a>,
     pub(super) model: &'a Model,

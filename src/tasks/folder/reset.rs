@@ -28,16 +28,16 @@ enum Noise {
     Normal(f64),
 }
 
-/// Rule by which the numbers of some joints are drawn.
+/// Rule by which the positions or velocities of some joints are drawn.
 #[derive(Debug, Clone, PartialEq)]
 enum Placement {
-    /// The initial numbers with noise.
+    /// The initial values with noise.
     Noise(Noise),
-    /// This number.
+    /// Every value is this number.
     Fixed(f64),
-    /// Each number is uniform in this interval.
+    /// Every value is uniform in this interval.
     Interval(f64, f64),
-    /// Two numbers, uniform in a disc of this radius about 0.
+    /// A pair, uniform in a disc of this radius about 0.
     Disc(f64),
     /// Each number is uniform in its interval, and the distance of their vector from 0 is larger than this.
     Box(Vec<(f64, f64)>, f64),
@@ -55,7 +55,7 @@ pub(super) struct Reset {
 }
 
 impl Reset {
-    /// Reads the table of the reset, if there is one.
+    /// Makes the distribution from the TOML table `reset`, if there is one.
     pub(super) fn new(table: Option<&Table<'_>>, model: &Model, elements: &Elements) -> Result<Self> {
         let (n_q, n_v) = (model.n_q(), model.n_v());
         let mut base = [model.field(Field::InitialPositions), &vec![0.0; n_v]].concat();

@@ -96,7 +96,7 @@ pub(super) struct Step<'a> {
 }
 
 impl Term {
-    /// Reads the table of a term. `n_remembered` is how many numbers the terms before it remember.
+    /// Makes a term from its TOML table. `n_remembered` counts the numbers that the terms before it remember.
     pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements, n_remembered: usize) -> Result<Self> {
         let name = table.require("name", "\"forward\"")?;
         let name = identifier(&name, name.text()?)?;

@@ -38,7 +38,7 @@ pub(super) struct Range {
 }
 
 impl Range {
-    /// Reads the table of a range.
+    /// Makes a range from its TOML table.
     pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements) -> Result<Self> {
         table.only(RANGE)?;
         let of = table.require("of", "{ joint = \"root\", get = \"position\" }")?.table()?;
@@ -107,7 +107,7 @@ pub(super) struct Goal {
 }
 
 impl Goal {
-    /// Reads the table of success, for episodes of at most `step_limit` steps.
+    /// Makes the goal from the TOML table `success`, for episodes of at most `step_limit` steps.
     pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements, step_limit: u32) -> Result<Self> {
         table.only(SUCCESS)?;
         let description = table.require("description", "\"the torso came 10 m far\"")?.text()?;

@@ -101,17 +101,20 @@ impl<'a> Table<'a> {
         Some(Value { text: self.text, value: value.get_ref(), place, span: value.span() })
     }
 
-    /// Whether a key is there.
+    /// Whether a key is present.
     pub(super) fn has(&self, key: &str) -> bool {
         self.entries.contains_key(key)
     }
 
-    /// The value of a key that must be there.
+    /// Returns the value of a required key.
     pub(super) fn require(&self, key: &str, example: &str) -> Result<Value<'a>> {
         self.get(key).ok_or_else(|| self.error(format_args!("{key} is missing; give for instance {key} = {example}")))
     }
 
-    /// The only one of several keys that is there.
+    /// Returns the only key of `keys` that is present, with its value.
+    ///
+    /// # Errors
+    /// An error about this table if none or several of them are present.
     pub(super) fn one_of(&self, keys: &[&'static str]) -> Result<(&'static str, Value<'a>)> {
         let mut found = keys.iter().filter_map(|&key| Some((key, self.get(key)?)));
         let (key, value) = found.next().ok_or_else(|| self.error(format_args!("give one of {}", keys.join(", "))))?;
@@ -121,22 +124,22 @@ impl<'a> Table<'a> {
         }
     }
 
-    /// A finite number, if the key is there.
+    /// Returns a finite number, or `None` if the key is absent.
     pub(super) fn number(&self, key: &str) -> Result<Option<f64>> {
         self.get(key).map(|value| value.number()).transpose()
     }
 
-    /// A text, if the key is there.
+    /// Returns a text, or `None` if the key is absent.
     pub(super) fn text(&self, key: &str) -> Result<Option<&'a str>> {
         self.get(key).map(|value| value.text()).transpose()
     }
 
-    /// `true` or `false`, if the key is there.
+    /// Returns `true` or `false`, or `None` if the key is absent.
     pub(super) fn flag(&self, key: &str) -> Result<Option<bool>> {
         self.get(key).map(|value| value.flag()).transpose()
     }
 
-    /// The tables of a list, each at the place `key[i]`; none if the key is absent.
+    /// Returns the tables of a list, each with the place `key[i]`. The result is empty if the key is absent.
     pub(super) fn tables(&self, key: &str) -> Result<Vec<Table<'a>>> {
         self.get(key).map_or(Ok(Vec::new()), |value| value.tables())
     }

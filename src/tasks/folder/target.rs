@@ -66,7 +66,7 @@ pub(super) struct Targets {
     pub(super) subject: &'static str,
     /// The field, or the option.
     pub(super) field: &'static str,
-    /// The numbers of the elements; empty for an option.
+    /// The indices of the elements; empty for an option.
     pub(super) ids: Vec<usize>,
     /// The names of the elements, or the option's.
     pub(super) names: Vec<String>,

@@ -41,7 +41,7 @@ pub(super) struct Joint {
 }
 
 impl Joint {
-    /// The position, with the joint's range scaled to ±1.
+    /// Scales position `q` so that the joint's range becomes -1 … 1.
     pub(super) fn scaled(self, q: f64) -> f64 {
         2.0 * (q - (self.low + self.high) / 2.0) / (self.high - self.low)
     }

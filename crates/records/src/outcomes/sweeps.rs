@@ -109,6 +109,7 @@ fn bin_of(value: f64, bins: &[Bin]) -> usize {
 mod tests {
     use super::*;
 
+    /// Four episodes. The first parameter is always 1, the second one varies; only the episode at 0.95 fails.
     fn outcomes() -> Outcomes {
         Outcomes {
             parameters: vec![vec![1.0; 4], vec![0.15, 0.95, 1.0, 0.0]],
@@ -123,7 +124,7 @@ mod tests {
         let spread = Outcomes { parameters: vec![(0..=100).map(f64::from).collect()], ..Outcomes::default() };
         let even = bins([&spread].into_iter(), 0);
         assert_eq!((even.len(), even[0], even[9]), (10, Bin { low: 0.0, high: 10.0 }, Bin { low: 90.0, high: 100.0 }));
-        // From 0 to 30 and from 80 to 100.
+        // The values lie in two intervals, 0 … 0.3 and 0.8 … 1. Bins of a tenth each cover these and leave the gap out.
         let tenth = |from: u32, to: u32| (from..=to).map(|value| f64::from(value) / 100.0).collect::<Vec<_>>();
         let gap = Outcomes { parameters: vec![Vec::new(), [tenth(0, 30), tenth(80, 100)].concat()], ..outcomes() };
         let bins = bins([&gap].into_iter(), 1);

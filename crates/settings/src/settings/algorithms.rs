@@ -45,9 +45,10 @@ pub struct A2cConfig {
     pub gamma: f64,
     /// Weight of the entropy in nats, not negative (default: `0.01`). Larger keeps actions random for longer.
     pub ent_coef: f64,
-    /// Weight of the value loss, the mean squared error, not negative (default: `0.5`; paper: `0.25`, where it is
-    /// half of the squared error that has the weight 0.5). Feed-forward policy and value networks share no weights, so
-    /// it acts through the clipping of the common gradient only; recurrent ones share all but their heads.
+    /// Weight of the value loss, which is the mean squared error; not negative (default: `0.5`; paper: `0.25`, because
+    /// the authors' code gives half of the squared error the weight 0.5). Feed-forward policy and value networks share
+    /// no weights, so this weight changes the policy only through the clipping of the common gradient. Recurrent
+    /// networks share all weights except those of their heads.
     pub vf_coef: f64,
     /// Global norm that longer gradients are scaled down to, above 0 (default: `0.5`).
     pub max_grad_norm: f64,
@@ -133,9 +134,10 @@ pub struct PpoConfig {
     /// Weight of the KL divergence of the new from the acting policy, in nats, not negative (default: `0`). Larger holds
     /// the policy back where clipping does not. Packer et al. (2018) search it for RL².
     pub kl_coef: f64,
-    /// Weight of the value loss, the mean squared error, not negative (default: `0.5`; paper: `0.25`, where it is
-    /// half of the squared error that has the weight 0.5). Feed-forward policy and value networks share no weights, so
-    /// it acts through the clipping of the common gradient only; recurrent ones share all but their heads.
+    /// Weight of the value loss, which is the mean squared error; not negative (default: `0.5`; paper: `0.25`, because
+    /// the authors' code gives half of the squared error the weight 0.5). Feed-forward policy and value networks share
+    /// no weights, so this weight changes the policy only through the clipping of the common gradient. Recurrent
+    /// networks share all weights except those of their heads.
     pub vf_coef: f64,
     /// Global norm that longer gradients are scaled down to, above 0 (default: `0.5`).
     pub max_grad_norm: f64,

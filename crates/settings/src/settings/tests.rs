@@ -217,7 +217,8 @@ fn the_command_lines_preset_beats_the_files() {
     assert_eq!(loaded(&format!("{file}\npreset = 'perturb'"), "preset = 'paper'"), loaded(&paper, ""));
 }
 
-/// The names of cells depend on these settings, and must still find the results of earlier programs.
+/// The names of cells depend on the settings that are written. A setting that was added later is left out if it has its
+/// old value, so that the names stay the same and results of earlier programs are found.
 #[test]
 fn default_preset_omits_younger_settings_with_old_values() {
     for (algorithm, architecture) in pairs() {
