@@ -34,7 +34,7 @@ pub enum StartError {
     /// An environment cannot be built.
     #[error(transparent)]
     Environment(#[from] env::Error),
-    /// The operating system gives no thread.
+    /// The operating system cannot start a thread.
     #[error(transparent)]
     Io(#[from] io::Error),
     /// The settings of a private server are refused: a defect.

@@ -54,7 +54,7 @@ use tonic_health::{
 };
 use tower::{Layer, ServiceBuilder};
 
-/// The flow-control window of a stream: the actions of ten thousand robots.
+/// The flow-control window of a stream, bytes. It has room for the actions of ten thousand robots.
 const STREAM_WINDOW_BYTES: u32 = 1 << 20;
 /// The flow-control window of a connection, bytes. It has room for 16 sessions whose requests pile up, before they
 /// stall the others.

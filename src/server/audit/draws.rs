@@ -1,4 +1,4 @@
-//! The audit of what a session draws from: its token's role must allow it, and the ledger has it before it happens.
+//! The audit of a session's draws: the token's role must allow each draw, and the ledger records it before it happens.
 
 use super::{
     Error,
@@ -35,7 +35,7 @@ const MAX_LOGGED_REFUSALS: u32 = 100;
 /// The number of bytes of a ledger's line that are charged as one step.
 const LINE_BYTES_PER_STEP: usize = 16;
 
-/// Draws that are in the ledger before they happen. They are withdrawn if they do not.
+/// Draws that were recorded in the ledger before they happen. Those that fail are withdrawn.
 #[derive(Default)]
 pub struct PendingDraws(Vec<DrawStart>);
 
@@ -197,8 +197,8 @@ impl DrawAuditor {
         self.ledger.is_none() && self.bearer.as_ref().is_none_or(|bearer| bearer.role().is_none())
     }
 
-    /// Checks the draws that begin, and records them with the draws that end. Each of `begins` has the number of
-    /// environments that draw alike.
+    /// Checks the draws that are about to begin, and records them in one ledger line with the draws that they end. Each
+    /// of `begins` has the draw of the first of some successive environments, and the number of these environments.
     async fn begin<'a>(
         &self,
         spec: &EnvironmentSpec,
@@ -271,7 +271,7 @@ fn group_begins<'a>(
     (regions, group_begins)
 }
 
-/// Groups neighbouring environments whose draws end alike.
+/// Groups neighbouring environments that end draws of the same seed and episode.
 fn group_ends(draws: impl IntoIterator<Item = Draw>) -> Vec<DrawEnd> {
     let mut group_ends: Vec<DrawEnd> = Vec::new();
     for Draw { seed, environment_index: index, episode_index } in draws {

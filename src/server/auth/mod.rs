@@ -158,7 +158,7 @@ impl Token {
         self.revoked_notify.notify_waiters();
     }
 
-    /// Takes a session out of the quota.
+    /// Takes one session from the quota, until the guard is dropped.
     ///
     /// # Errors
     /// [`Error::QuotaExceeded`].
@@ -166,7 +166,7 @@ impl Token {
         self.take(1, QuotaKind::Sessions)
     }
 
-    /// Takes environments out of the quota.
+    /// Takes environments from the quota, until the guard is dropped.
     ///
     /// # Errors
     /// [`Error::QuotaExceeded`].

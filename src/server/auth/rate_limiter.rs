@@ -17,7 +17,7 @@ const MIN_WAIT: Duration = Duration::from_micros(1);
 /// The interval at which a waiting request checks whether the rate has changed.
 const RECHECK_INTERVAL: Duration = Duration::from_millis(500);
 
-/// A token's rate, and the steps that it has allowed and seen.
+/// A token's rate limit, with the numbers of steps that it has allowed and that were done.
 #[derive(Default)]
 pub(super) struct RateLimiter(Mutex<RateState>);
 
@@ -143,7 +143,7 @@ mod tests {
             self.state.set_rate(Some(rate), self.now);
         }
 
-        /// How long the next turn takes, s.
+        /// The duration of the next turn, s.
         fn turn(&mut self) -> Result<f64, TooFast> {
             let (start, mut ticket) = (self.now, None);
             while let Some(wait) = self.state.wait(&mut ticket, MAX_WAIT, self.now)? {

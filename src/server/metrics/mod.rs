@@ -56,7 +56,7 @@ pub struct MetricsSources {
     pub threads: Vec<TransportMeter>,
 }
 
-/// What is measured of a transport thread.
+/// The measurements of a transport thread.
 pub struct TransportMeter {
     /// The connections of the thread.
     pub load: Arc<ThreadLoad>,
@@ -65,7 +65,7 @@ pub struct TransportMeter {
 }
 
 impl TransportMeter {
-    /// Nothing is measured yet.
+    /// Makes a meter without measurements of the wake-up delay.
     pub fn new(load: Arc<ThreadLoad>) -> Self {
         Self { load, lag: Histogram::default() }
     }

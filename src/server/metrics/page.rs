@@ -1,5 +1,5 @@
-//! The metrics. Labels have names of this program, of its environments and of the file of tokens, but no text that a
-//! client sent.
+//! The metrics. Labels contain only names that this program, its environments or the tokens file define, never text that
+//! a client sent.
 
 use super::{MetricsSources, process};
 use crate::{meters::Histogram, server::audit::ledger::Ledger};

@@ -1,4 +1,4 @@
-//! How connections begin on the thread that serves them.
+//! Begins connections on the thread that serves them.
 
 use super::{
     load::ConnectionLoad,
@@ -44,7 +44,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin + Send> ByteStream for S {}
 /// A connection that is served.
 pub type ServedConnection = ManagedIo<Box<dyn ByteStream>>;
 
-/// How the connections of a transport thread begin.
+/// The settings with which a transport thread begins connections.
 #[derive(Clone)]
 pub struct Handshakes {
     /// The time in which a client must begin.

@@ -76,7 +76,7 @@ impl Listener {
     /// Binds an address that another flag gives.
     ///
     /// # Errors
-    /// As [`Listener::bind`].
+    /// The same as those of [`Listener::bind`].
     pub async fn bind_as(address: &ListenAddress, flag: &str, mode: SocketMode) -> io::Result<Self> {
         let explain = |error: io::Error| io::Error::new(error.kind(), explain(address, flag, &error));
         match address {

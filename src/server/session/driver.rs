@@ -93,7 +93,7 @@ struct StoredReply<R> {
     response: R,
     /// The reservation while the reply is stored. Without one the reply is dropped when it is sent.
     memory: Option<MemoryReservation>,
-    /// The reservation of the handler, which is released when the reply is first sent.
+    /// The reservation that the handler made for the response. It leaves with the response when that is first sent.
     outgoing: Option<MemoryReservation>,
 }
 

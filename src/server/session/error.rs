@@ -15,7 +15,7 @@ pub enum Error {
     /// The token was revoked, is at its quota, or steps too fast.
     #[error(transparent)]
     Auth(#[from] auth::Error),
-    /// A message is refused.
+    /// The transport refuses a message.
     #[error(transparent)]
     Transport(#[from] transport::Error),
     /// A session cannot be resumed, or another stream has resumed it.

@@ -133,9 +133,11 @@ impl Runner {
     /// If the server has a defect.
     pub(super) async fn begin(&mut self, changes: Changes) -> Result<WorldStep, Error> {
         let Changes { version, seed, distributions } = changes;
+        // The first episode of a new world has already begun. Without changes it is shown as it is.
         if self.phase != EpisodePhase::Unseen || seed.is_some() || distributions.is_some() {
             let entries = vec![ResetEntry { slot: 0, seed, distributions, state: None }];
             self.draws.reset(&self.batch, &entries).await?;
+            // The phase is set first: if the reset fails, the next call resets again.
             (self.phase, self.version, self.seed) = (EpisodePhase::Over, version, seed.unwrap_or(self.seed));
             let (first, started) = self.batch.reset(entries).await?;
             (self.first, self.start) = (first, only(started));

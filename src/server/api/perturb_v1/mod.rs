@@ -4,7 +4,7 @@
 //! - [`session`]: the legal order of a session's requests.
 //! - [`convert`]: conversion between the protocol and the domain, with all validation; [`policy`]: the same for
 //!   policies.
-//! - `price`: the price of requests, in steps of a token's rate.
+//! - `price`: the price of each request, in steps that count against the token's rate limit.
 //! - [`sizes`]: upper bounds of the lengths of requests and replies.
 
 pub mod convert;

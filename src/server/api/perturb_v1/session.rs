@@ -308,7 +308,7 @@ impl SessionHandler for Session {
     }
 
     async fn answer(&mut self, request: Self::Request) -> Result<SessionReply, Error> {
-        // A future is as large as the largest within it, and is moved: a step pays for no other request.
+        // This future is moved, and is as large as its largest branch. Boxing the other branches keeps a step cheap.
         match request.request {
             Some(Request::Open(open)) => Box::pin(self.open(open)).await,
             Some(Request::Step(step)) => self.step(step).await,
