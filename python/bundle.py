@@ -67,14 +67,14 @@ def add_licences(files: Path, programs: list[Path]) -> None:
 
 
 def unpack(wheel: Path, directory: Path) -> Path:
-    """Give the folder with a wheel's files, named by package and version."""
+    """Unpack a wheel. Return the folder of its files, whose name is the package and its version."""
     run(sys.executable, "-m", "wheel", "unpack", "--dest", directory, wheel)
     (files,) = directory.iterdir()
     return files
 
 
 def pack(files: Path, directory: Path) -> Path:
-    """Make a wheel of the files, and write its list of files anew."""
+    """Pack files into a wheel, with a new list of the files. Return the path of the wheel."""
     directory.mkdir(parents=True, exist_ok=True)
     words = run(sys.executable, "-m", "wheel", "pack", "--dest-dir", directory, files)
     (name,) = re.findall(r"\S+\.whl", words)

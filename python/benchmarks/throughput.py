@@ -127,7 +127,7 @@ def in_halves(case: Case, server: str | None, kind: Any) -> Contender:
 
 
 def contenders(case: Case, server: str | None) -> dict[str, Contender]:
-    """All that are installed, by name."""
+    """Return the installed contenders by name."""
     own = f"perturb/{case.name}-v{CATALOGUE[case.name].revision}"
     found = {
         "embedded": made(own, case, server="embedded"),
@@ -146,7 +146,7 @@ def contenders(case: Case, server: str | None) -> dict[str, Contender]:
 
 
 def rate(contender: Contender, actions: Any, seconds: float) -> tuple[float, int]:
-    """Steps of single environments a second, and how many episodes ended."""
+    """Return the steps of single environments a second, and the number of ended episodes."""
     steps = ended = 0
     rows = list(actions.astype(contender.kind))
     start = time.perf_counter()
@@ -158,7 +158,7 @@ def rate(contender: Contender, actions: Any, seconds: float) -> tuple[float, int
 
 
 def measure(case: Case, server: str | None, rounds: int, seconds: float) -> dict[str, float]:
-    """Medians by contender."""
+    """Return the median rate of each contender, in steps of single environments a second."""
     description, rng = CATALOGUE[case.name], np.random.default_rng(1)
     drawn: Any
     if isinstance(description.actions, int):
@@ -179,7 +179,7 @@ def measure(case: Case, server: str | None, rounds: int, seconds: float) -> dict
     for contender in found.values():
         contender.close()
     for name, ended in endings.items():
-        # A batch of Gymnasium's may be too slow for that: its Acrobots have 500 steps.
+        # Gymnasium's batch may be too slow to end an episode: its Acrobot has 500 steps.
         assert ended > 0 or not case.ends or name == "Gymnasium", f"{name} ended no episode of {case.name}"
     return {name: statistics.median(results) for name, results in rates.items()}
 

@@ -13,17 +13,17 @@ const ATTRIBUTES: [&str; 3] = ["href=\"", "src=\"", "data-events=\""];
 pub(crate) struct WayUp(String);
 
 impl WayUp {
-    /// From the list of all runs.
+    /// Returns the way from the list of all runs.
     pub(crate) fn from_index() -> Self {
         Self::from_path("/")
     }
 
-    /// From the page of a run, whose address does not end with a slash.
+    /// Returns the way from the page of a run. The address of that page does not end with a slash.
     pub(crate) fn from_run(relative: &RelativePath) -> Self {
         Self("../".repeat(relative.path().iter().count().max(1)))
     }
 
-    /// From the page at the path of an address.
+    /// Returns the way from the page at a path.
     pub(crate) fn from_path(path: &str) -> Self {
         match path.matches('/').count() {
             0 | 1 => Self("./".into()),

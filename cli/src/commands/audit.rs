@@ -39,9 +39,9 @@ struct RecordedPolicy {
 
 /// A policy that is audited.
 enum AuditedPolicy {
-    /// By its recorded episodes.
+    /// A policy whose recorded episodes are replayed.
     Recorded(RecordedPolicy),
-    /// By checksums in a table.
+    /// A policy whose tests are repeated and compared with the checksums in a table.
     Stored(Box<table::ChecksummedPolicy>),
 }
 

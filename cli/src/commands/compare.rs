@@ -26,9 +26,9 @@ const POLICY_EXTENSION: &str = "safetensors";
 
 /// A policy of a condition.
 enum ComparedPolicy {
-    /// Its tests were recorded.
+    /// A policy whose tests were recorded.
     Recorded(Box<Records>),
-    /// It is tested now.
+    /// A policy that this command tests.
     Trained(Box<Checkpoint>),
 }
 

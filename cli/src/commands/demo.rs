@@ -258,11 +258,11 @@ impl Demo<'_> {
     }
 }
 
-/// Returns the training episodes without `--episodes`, and the settings beside the defaults.
+/// Returns the number of training episodes if `--episodes` is not given, and the settings that are not the defaults.
 ///
-/// On CartPole, as in experiments/quick.toml, policies are trained for long at a high learning rate. Otherwise they
-/// succeed everywhere, and there is nothing to repair. With minibatches Hopper needs half of the episodes, and a falling
-/// learning rate keeps its last policies from getting worse.
+/// Policies for CartPole are trained for long at a high learning rate, as in experiments/quick.toml. With the defaults
+/// they would succeed everywhere, and there would be nothing to repair. Minibatches halve the number of episodes that
+/// Hopper needs, and a falling learning rate keeps its last policies from getting worse.
 fn budget(environment: &str) -> (u64, &'static [&'static str]) {
     match environment {
         "CartPole" => (1500, &["learning_rate=3e-3"]),
@@ -271,7 +271,7 @@ fn budget(environment: &str) -> (u64, &'static [&'static str]) {
     }
 }
 
-/// Does two things at the same time. Each alone leaves a core idle: whether a server steps or a learner learns.
+/// Calls two functions at the same time. One alone leaves a core idle, because server and learner work by turns.
 fn side_by_side<A: Send, B: Send>(first: impl FnOnce() -> A + Send, second: impl FnOnce() -> B) -> (A, B) {
     std::thread::scope(|scope| {
         let first = scope.spawn(first);

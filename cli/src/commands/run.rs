@@ -26,7 +26,7 @@ use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
 use super::{check_models, cores, load_plan, recurrent, refuse_file, servers_of_jobs, slurm, with_tasks_of};
 
-/// Time of measurement for each group of trainings.
+/// Time for which each group of trainings runs, so that the duration of its cells can be estimated.
 const MEASURE_TIME: Duration = Duration::from_secs(1);
 
 pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {

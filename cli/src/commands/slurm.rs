@@ -18,7 +18,7 @@ use super::error::{Result, system};
 use super::plan::step_limits;
 use super::{check_models, check_server_args, recurrent, servers_of_jobs, with_tasks_of};
 
-/// Time of measurement for each group of trainings.
+/// Time for which each group of trainings runs, so that the duration of its cells can be estimated.
 const MEASURE_TIME: Duration = Duration::from_secs(2);
 /// Time between two requests to Slurm, whose controller serves other users, too.
 const QUEUE_INTERVAL: Duration = Duration::from_secs(15);

@@ -87,8 +87,8 @@ impl Footage {
 /// after each shown step. The policy of `checkpoint` samples its actions and does not update its statistics. Calls
 /// `report` with the number of finished episodes.
 ///
-/// The film has environment 0 of a test with the same seed, so a film of one episode shows what a test of one episode
-/// plays. For a policy that was trained in trials all episodes of a trial are filmed, and the policy remembers them.
+/// The film shows environment 0 of a test with the same seed, so a film of one episode shows what a test of one episode
+/// plays. A policy that was trained in trials keeps its memory during a trial. All episodes of the trial are filmed.
 ///
 /// # Errors
 /// [`VideoError`]. No file is left then.

@@ -49,7 +49,8 @@ impl GifEncoder {
         };
         let size = (fits(width)?, fits(height)?);
         let seconds = 1.0 / fps;
-        // The delay must fit its field, also when an episode's last frame comes in between.
+        // The delay of a shown frame includes that of the skipped frames after it, and must fit into 16 bits. Half of
+        // the range stays free, because the last frame of an episode may come in between.
         let fits =
             |stride: &u16| *stride == 1 || u32::from(*stride) * u32::from(delay(seconds)) <= u32::from(u16::MAX / 2);
         let films = STRIDES.into_iter().filter(fits).map(|stride| ThinnedFilm::new(stride, delay(seconds))).collect();

@@ -29,13 +29,13 @@ impl Assessment {
         ExternalEvaluation::new(String::new(), agent, policies).map(Self).map_err(refused)
     }
 
-    /// Reads what is in a folder.
+    /// Reads an assessment from the folder that [`write`](Self::write) wrote.
     #[staticmethod]
     fn read(path: PathBuf) -> PyResult<Self> {
         ExternalEvaluation::read(&path).map(Self).map_err(refused)
     }
 
-    /// Writes it into a folder.
+    /// Writes the assessment into a folder. `overwrite` permits replacing the one that is there.
     fn write(&self, path: PathBuf, overwrite: bool) -> PyResult<()> {
         self.0.write(&path, overwrite).map_err(refused)
     }

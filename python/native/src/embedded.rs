@@ -46,7 +46,7 @@ fn catalogue_with(_: TaskFolder) -> PyResult<Catalogue> {
     Err(failure(INVALID, 0, "this package was built without MuJoCo, which task= needs here: leave server= out"))
 }
 
-/// A server of this process. Sessions end with it.
+/// A server in this process. Its sessions end with it.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct NativeServer {
     /// `None` after [`end`](Self::end).
@@ -57,8 +57,8 @@ pub struct NativeServer {
 
 #[pymethods]
 impl NativeServer {
-    /// Starts the server's threads. It also serves the task of a folder, which `program`, a perturb-server, loads first,
-    /// since a model may end the process that loads it.
+    /// Starts the server's threads. The server also serves the task in the folder `task`, if one is given. A
+    /// perturb-server in a process of its own loads the task first, because a model may end the process that loads it.
     #[new]
     #[pyo3(signature = (task = None))]
     fn new(py: Python<'_>, task: Option<TaskFolder>) -> PyResult<Self> {
@@ -69,7 +69,7 @@ impl NativeServer {
         Ok(Self { server: Mutex::new(Some(Arc::new(server))), owner: std::process::id() })
     }
 
-    /// Ends the threads. Sessions should be closed.
+    /// Ends the threads. Close the sessions first.
     fn close(&self, py: Python<'_>) {
         if std::process::id() == self.owner {
             let server = self.server.lock().unwrap_or_else(PoisonError::into_inner).take();
@@ -110,7 +110,7 @@ pub struct EmbeddedStream {
     waiting: VecDeque<SessionRequest>,
     /// Answers that were not received yet.
     answers: VecDeque<Answer>,
-    /// Waiting for the workers.
+    /// Decides whether to spin or to block while the workers run a step.
     spin: AdaptiveSpin,
 }
 
@@ -180,7 +180,7 @@ impl EmbeddedStream {
         reply::<A>(answer)
     }
 
-    /// Begins waiting steps one after another, until one does not finish within its first poll.
+    /// Starts the steps in `waiting` one after another, until one does not finish at its first poll.
     fn advance(&mut self) {
         while self.running.is_none() {
             let Some(request) = self.waiting.pop_front() else { return };

@@ -73,7 +73,7 @@ impl EpisodeTable {
     }
 }
 
-/// A message: its slot, and what it says.
+/// A message about an episode: its slot, and the episode and the receipt if the message has them.
 pub type EpisodeMessage<'a> = (u32, Option<&'a proto::Episode>, Option<&'a proto::Receipt>);
 
 /// The error for episodes that do not fit the batch.

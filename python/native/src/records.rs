@@ -1,4 +1,4 @@
-//! Recorded test episodes and what they say, for Python: the study's own records, files and figures.
+//! Recorded test episodes and their statistics, for Python. Files and statistics are those of studies.
 
 use std::path::PathBuf;
 

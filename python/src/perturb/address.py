@@ -26,10 +26,10 @@ EMBEDDED = Address("embedded")
 
 
 def parse_address(text: str) -> Address:
-    """Understand `unix:/path`, `host:port` (`http://` or `tcp://` before it), `https://host:port`, and `embedded`.
+    """Parse `unix:/path`, `host:port` (`http://` or `tcp://` before it), `https://host:port`, and `embedded`.
 
     Raises:
-        InvalidArgumentError: with what is wrong with it.
+        InvalidArgumentError: if the address is malformed. The message says what is wrong.
     """
 
     def refuse(reason: str) -> InvalidArgumentError:

@@ -268,10 +268,10 @@ class Assessment:
         return pd.DataFrame(self.columns())
 
     def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write everything: `assessment.json`, and of each policy a file such as `perturb evaluate --records` writes.
+        """Write `assessment.json`, and for each policy a file such as `perturb evaluate --records` writes.
 
-        `perturb report` takes such folders beside an experiment's, `to_html` beside others, `perturb audit` replays the
-        tests of perturb's policies.
+        `perturb report` shows such a folder beside an experiment, and `to_html` beside other assessments.
+        `perturb audit` replays the tests of perturb's policies.
 
         Args:
             folder: it must be new or empty, unless an assessment in it may be overwritten.

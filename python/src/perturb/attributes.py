@@ -29,7 +29,7 @@ def refuse_assignment(name: str, description: Description) -> AssignmentError:
 
 
 class CheckedAttributes:
-    """Refuses assignments to attributes that do not exist once the object is made; subclasses may have their own."""
+    """Refuses new attributes after the object is made. Classes outside this package may add attributes."""
 
     _description: Description
     _is_made = False
@@ -47,5 +47,5 @@ class CheckedAttributes:
         super().__setattr__(name, value)
 
     def _allows_new_attributes(self) -> bool:
-        """Whether the object's class is not of this package."""
+        """Whether the object's class is defined outside this package."""
         return not type(self).__module__.startswith(f"{__package__}.")

@@ -97,7 +97,7 @@ class Description:
         )
 
     def with_parameters(self, names: Iterable[str]) -> Description:
-        """The environment of a session that names these parameters: with all disturbances, if one of them is named."""
+        """Return the description for a session with these parameters. One disturbance among them adds all others."""
         added = {name: ends for name, ends in self.disturbances.items() if name not in self.parameters}
         if added.keys().isdisjoint(names):
             return self
@@ -114,12 +114,12 @@ class Description:
         return not self.disturbances.keys().isdisjoint(self.parameters)
 
     def observing_parameters(self) -> Description:
-        """The environment of a session whose observations have the parameters at their end."""
+        """Return the description for a session whose observations end with the parameters."""
         return replace(self, observation=self.observation + self.parameter_observations)
 
     @property
     def discrete(self) -> bool:
-        """Whether actions are choices."""
+        """Whether actions are discrete."""
         return isinstance(self.actions, int)
 
     def metadata(self) -> dict[str, Any]:

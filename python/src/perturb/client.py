@@ -231,7 +231,7 @@ class Client:
         return self.session.snapshot(_bytes(mask))
 
     def restore(self, snapshots: Sequence[bytes], mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
-        """Bring saved environments back: observations [N, O], of other environments the last ones."""
+        """Restore saved environments. Return observations [N, O]; other environments have their last ones."""
         if not all(isinstance(snapshot, bytes) for snapshot in snapshots):
             raise InvalidArgumentError("a snapshot is not of the type bytes; expected what snapshot() returned")
         session = self.session

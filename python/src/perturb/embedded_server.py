@@ -14,13 +14,13 @@ from .local_server import find_program
 if TYPE_CHECKING:
     from .local_server import TaskFolder
 
-# Held while models are loaded or drawn, and by forks. A process that was forked in the middle of it would inherit locks
-# that nobody opens.
+# Held while models are loaded or drawn, and by forks. A process that was forked meanwhile would inherit locks that no
+# thread releases.
 loading = threading.RLock()
 
 
 class EmbeddedServer:
-    """A running server of this process, which ends its threads when it is ended."""
+    """A server that runs in this process until `end`."""
 
     address = EMBEDDED
 
@@ -29,7 +29,7 @@ class EmbeddedServer:
         self.users = 0
         try:
             with loading:
-                # A model may end the process that loads it, so that the program does it first.
+                # A model may end the process that loads it, so perturb-server loads the model first.
                 self.native = _native.NativeServer(None if task is None else (find_program(), task.path, task.files))
         except _native.Failure as error:
             kind, _, words = error.args
@@ -38,7 +38,7 @@ class EmbeddedServer:
             raise ServerStartError(f"the embedded server did not start: {words}") from None
 
     def end(self) -> None:
-        """End the server's threads. Its sessions should be closed."""
+        """End the server's threads. Close its sessions first."""
         self.native.close()
 
     def exit_status(self) -> int | None:

@@ -111,13 +111,13 @@ class LocalServer:
         self._wait_until_ready(program)
 
     def end(self) -> None:
-        """End the server and wait until it has ended. Its sessions should be closed."""
+        """End the server and wait until it has ended. Close its sessions first."""
         # Not by a call of the finalizer: finalizers do nothing any more when _at_exit runs.
         if self._unended.detach() is not None:
             _end(self.process, self._directory, self._owner)
 
     def exit_status(self) -> int | None:
-        """Tell how it ended, as `subprocess` does; None while it runs."""
+        """Return the exit status, as `subprocess` does, or None while the server runs."""
         return self.process.poll()
 
     def forget_in_child(self) -> None:
@@ -155,10 +155,10 @@ class OwnServer(Protocol):
     def __init__(self, task: TaskFolder | None = None) -> None: ...
 
     def end(self) -> None:
-        """End the server. Its sessions should be closed."""
+        """End the server. Close its sessions first."""
 
     def exit_status(self) -> int | None:
-        """Tell how it ended; None while it runs."""
+        """Return the exit status, or None while the server runs."""
 
 
 Server = TypeVar("Server", bound=OwnServer)
@@ -219,7 +219,7 @@ def acquire(kind: type[Server], task: TaskFolder | None = None) -> Server:
 
 
 def release(server: OwnServer) -> None:
-    """Give a share back; the last ends the server."""
+    """Give up a share of a server. The last release ends the server."""
     with _lock:
         key = type(server), server.task
         if server is not _shared.get(key):

@@ -1,6 +1,7 @@
 """Adapters through which `evaluate` plays perturb's policies, functions, stable-baselines3's and torch's models.
 
-None of those packages is imported here: an object can be an instance of their classes only if its owner imported them.
+This module imports neither stable-baselines3 nor torch: an object can be an instance of their classes only if its owner
+imported them.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ class Player(Protocol):
         """Begin an episode everywhere, with observations [N, O]."""
 
     def act(self) -> Any:
-        """The next actions: integers [N] from 0, or numbers [N, A]."""
+        """Return the next actions: integers [N] from 0, or numbers [N, A]."""
 
     def observe(
         self, observations: NDArray[np.float32], rewards: NDArray[np.float32], starts: NDArray[np.bool_]
     ) -> None:
-        """Take observations [N, O], rewards [N], and where [N] the observation is the first of an episode."""
+        """Take observations [N, O], rewards [N], and flags [N] of observations that are the first of an episode."""
 
 
 @dataclass(frozen=True)
@@ -109,10 +110,10 @@ def _is(policy: Any, module: str, name: str) -> bool:
 
 
 def _remembers(function: Callable[..., Any]) -> bool:
-    """Whether a function has memory: by the number of arguments that it must be given."""
+    """Whether a function requires three arguments, which means that it has memory."""
     try:
         parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):  # of some compiled functions nothing is known
+    except (TypeError, ValueError):  # some compiled functions have no signature
         return False
     positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     needed = [it for it in parameters if it.default is it.empty and it.kind in positional]
@@ -139,7 +140,7 @@ class _Function:
         self._observations, self._starts = observations, np.ones(len(observations), np.bool_)
 
     def act(self) -> Any:
-        observations = self._observations.copy()  # its own to change
+        observations = self._observations.copy()  # a copy, which the function may change
         if not self._remembers:
             return self._function(observations)
         came = self._function(observations, self._memory, self._starts)
@@ -183,9 +184,10 @@ def _stable_baselines(
 
 
 class _Module:
-    """A torch module. For discrete actions the greatest of its outputs [N, n] counts, or it gives integers [N].
+    """A player of a torch module.
 
-    For continuous actions it gives numbers [N, A].
+    For discrete actions the module returns a number for each choice, [N, n], and the choice with the greatest number is
+    taken. It may instead return the choices, integers [N]. For continuous actions it returns numbers [N, A].
     """
 
     def __init__(self, module: Any, description: Description) -> None:
@@ -202,7 +204,7 @@ class _Module:
         import torch
 
         training = self._module.training
-        self._module.eval()  # of dropout and batch normalisation
+        self._module.eval()  # ends dropout and updates of batch normalisation
         try:
             with torch.no_grad():
                 seen = torch.from_numpy(self._observations.copy()).to(self._device, self._dtype)
@@ -254,7 +256,7 @@ def _digest(parts: Iterator[bytes]) -> str:
 
 @contextlib.contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Seed NumPy's global random numbers, and torch's if it is loaded; afterwards they are what they were."""
+    """Seed NumPy's global generator within a `with` block, and torch's if it is loaded; then restore both."""
     before = np.random.get_state()
     np.random.seed(seed % 2**32)
     try:

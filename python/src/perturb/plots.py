@@ -1,4 +1,4 @@
-"""Pictures of assessments, by matplotlib where it is installed."""
+"""Pictures of assessments. Drawing them needs matplotlib."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
 
 def curves(lines: Mapping[str, Sequence[Bin]], parameter: str, units: Mapping[str, str], title: str, axes: Any) -> Any:
-    """Success, %, over the middles of a parameter's parts, with bands; a gap where parts do not touch."""
+    """Draw success, %, at the middle of each part of a parameter's range, with a band for its interval.
+
+    A line has a gap where parts do not touch.
+    """
     axes = _axes(axes)
     drawn = {name: parts for name, parts in lines.items() if parts}
     if not drawn:
@@ -44,7 +47,7 @@ def curves(lines: Mapping[str, Sequence[Bin]], parameter: str, units: Mapping[st
 def heatmap(
     cells: Sequence[Bin2D], x: str, y: str, units: Mapping[str, str], title: str, axes: Any, cbar: bool = True
 ) -> Any:
-    """Success, %, in the parts of two parameters, each drawn where it lies; white without episodes."""
+    """Draw success, %, in the parts of two parameters' ranges. Parts without episodes stay white."""
     axes = _axes(axes)
     if not cells:
         raise InvalidArgumentError(f"{x} or {y} does not vary in this test: there is no heatmap over them")
@@ -64,7 +67,7 @@ def heatmaps(
     cbar: bool,
     axes: Any,
 ) -> Any:
-    """A heatmap for each name, side by side, with the same axes and one scale of colours. Returns an array of axes."""
+    """Draw a heatmap for each name, with the same axes and one scale of colours. Returns an array of axes."""
     if axes is None:
         plt = _pyplot()
         size = (3.2 * len(panels) + 0.8, 3.6)
@@ -90,7 +93,7 @@ def heatmaps(
 
 
 def pooled(policies: Sequence[Sequence[Bin]]) -> list[Bin]:
-    """The success of several policies in the parts of a parameter: their episodes counted together."""
+    """Return success in each part of a parameter's range, over the episodes of all policies."""
     counted: dict[tuple[float, float], list[int]] = {}
     for part in (part for parts in policies for part in parts):
         counts = counted.setdefault((part.low, part.high), [0, 0])
@@ -106,7 +109,7 @@ def pooled(policies: Sequence[Sequence[Bin]]) -> list[Bin]:
 
 
 def pooled_2d(policies: Sequence[Sequence[Bin2D]]) -> list[Bin2D]:
-    """The success of several policies in the parts of two parameters: their episodes counted together."""
+    """Return success in each part of two parameters' ranges, over the episodes of all policies."""
     counted: dict[tuple[tuple[float, float], tuple[float, float]], list[int]] = {}
     for cell in (cell for cells in policies for cell in cells):
         both = counted.setdefault((cell.x, cell.y), [0, 0])

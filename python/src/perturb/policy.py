@@ -86,11 +86,12 @@ class Policy:
         return Actor(self, count, requests.seed(seed), first)
 
     def to_torch(self) -> Any:
-        """Give the policy as a torch module, with its normalisation: for deployment, or as a start of other trainings.
+        """Return the policy as a torch module, with its normalisation, for deployment or further training.
 
-        A feed-forward policy's module maps observations [N, O] to logits [N, n] of choices or means [N, A] of numbers.
-        A recurrent one's maps (observations, memory, starts) to (outputs, memory): `memory` is None at first, later
-        what was returned, and where `starts`, bool [N], is true the row is forgotten.
+        The module of a feed-forward policy maps observations [N, O] to logits [N, n] of choices or means [N, A] of
+        numbers. The module of a recurrent policy maps (observations, memory, starts) to (outputs, memory). Pass the
+        memory None first, and then the memory that the last call returned. Rows where `starts`, bool [N], is true begin
+        with an empty memory.
 
         Raises:
             ImportError: if torch is not installed.
@@ -101,8 +102,9 @@ class Policy:
     def to_onnx(self, path: str | os.PathLike[str]) -> None:
         """Write the policy as an ONNX model, with its normalisation.
 
-        Inputs are `observations`, float32 [N, O], and of a recurrent policy its memory, `h` and `c` [N, H], which is 0
-        at the start of an episode. Outputs are `outputs`, logits [N, n] or means [N, A], and `next_h` and `next_c`.
+        The input is `observations`, float32 [N, O]. The output is `outputs`, logits [N, n] or means [N, A]. A recurrent
+        policy also has its memory as inputs `h` and `c` [N, H], which are 0 at the start of an episode, and as outputs
+        `next_h` and `next_c`.
 
         Raises:
             ImportError: if onnx is not installed.
@@ -118,7 +120,7 @@ def _unpickled_policy(files: dict[str, bytes]) -> Policy:
 
 
 class Actor:
-    """A policy that acts in N environments: it samples actions and remembers what it has to.
+    """A policy that acts in N environments. It samples actions and keeps the policy's memory.
 
         actor = policy.actor(num_envs=8, seed=1)
         actions = actor(observations)
@@ -126,8 +128,8 @@ class Actor:
             observations, rewards, terminated, truncated, infos = envs.step(actions)
             actions = actor(observations, starts=terminated | truncated, rewards=rewards)
 
-    with environments that are reset in the step that ends an episode (`autoreset_mode="SameStep"`). Pickles before its
-    first action.
+    The environments must be reset in the step that ends an episode (`autoreset_mode="SameStep"`). An actor can be
+    pickled before its first action.
     """
 
     def __init__(self, policy: Policy, num_envs: int, seed: int, first_environment_index: int) -> None:
@@ -147,7 +149,9 @@ class Actor:
     def __call__(
         self, observations: ArrayLike, starts: ArrayLike | None = None, rewards: ArrayLike | None = None
     ) -> NDArray[Any]:
-        """Choose actions: int64 [N], counted from 0, or float32 [N, A], as sampled, which environments clip.
+        """Sample actions: int64 [N], counted from 0, or float32 [N, A].
+
+        Numbers may lie outside the range of actions; environments clip them.
 
         Args:
             observations: [N, O], not normalised. The first call begins a trial in every environment.
@@ -156,7 +160,7 @@ class Actor:
             rewards: [N], rewards of the last actions, not normalised; for policies that see them (RL²).
 
         Raises:
-            PolicyError: for other shapes, and if the policy gives numbers that are not finite.
+            PolicyError: if a shape is wrong, or if the policy's outputs are not finite.
         """
         rows = _array(observations, np.float32, "observations")
         if not self._begun:
@@ -178,7 +182,7 @@ class Actor:
 
 
 def _array(values: ArrayLike, dtype: type[np.generic], name: str) -> NDArray[Any]:
-    """An array whose kind is not changed by the conversion: no text, and flags for flags."""
+    """Convert values to an array. Refuse text, flags in place of numbers, and numbers in place of flags."""
     array = np.asarray(values)
     kinds = "b" if dtype is np.bool_ else "iuf"
     if array.dtype.kind not in kinds:
@@ -191,7 +195,7 @@ def _array(values: ArrayLike, dtype: type[np.generic], name: str) -> NDArray[Any
 
 
 def native(call: Callable[..., Any], *arguments: Any) -> Any:
-    """Call the native module; what it refuses becomes one of this package's errors."""
+    """Call the native module, and raise its failures as errors of this package."""
     try:
         return call(*arguments)
     except _native.Failure as failure:

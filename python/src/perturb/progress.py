@@ -1,11 +1,11 @@
-"""Progress of tests on standard error, where somebody may look at it."""
+"""Progress of tests and trainings, shown on standard error."""
 
 from __future__ import annotations
 
 import sys
 import time
 
-# Seconds between two lines: on a terminal, where a line replaces the one before it, and elsewhere.
+# Seconds between two lines. On a terminal a line replaces the one before it, so the interval is shorter there.
 _TERMINAL_INTERVAL, _LOG_INTERVAL = 0.2, 5.0
 
 

@@ -13,7 +13,7 @@ _OLD_SUFFIXES = {"D": "", "R": "RandomNormal", "E": "RandomExtreme"}
 def register_all() -> None:
     """Register `perturb/CartPole-v1` and so on and the paper's ids, such as `SunblazeCartPoleRandomNormal-v0`.
 
-    Step limits are the server's: a limit here would go wrong when a snapshot is restored.
+    The ids have no step limit, because the server has it: a limit here would be wrong after a snapshot is restored.
     """
     for name, description in CATALOGUE.items():
         register_id(f"perturb/{name}-v{description.revision}", environment=name)
@@ -22,7 +22,7 @@ def register_all() -> None:
 
 
 def register_id(identifier: str, **settings: str) -> None:
-    """Register an id with the settings that environments are made with, unless it is registered."""
+    """Register an id with the settings of its environments, unless the id is registered already."""
     if identifier not in gymnasium.registry:
         gymnasium.register(
             identifier,

@@ -86,13 +86,15 @@ class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-
             self.seed(seed)
 
     def reset(self) -> NDArray[np.float32]:
-        """Begin the next episodes: observations float32 [N, O].
+        """Begin the next episodes. Return observations float32 [N, O].
 
-        stable-baselines3 calls it once, when a training begins: `env_method("set_parameters", …)` is what acts later.
-        `seed(s)` before it begins with the seeds s + i. `set_options` before it gives the options of
-        `PerturbEnv.reset`, `parameters` and `state`, to each environment: one dictionary for all, or a list of N. If
-        those differ, environments are reset one by one after all of them, and without seeds begin the episode after the
-        next.
+        stable-baselines3 calls `reset` once, when a training begins. Call `env_method("set_parameters", …)` to change
+        the physics later. Call `seed(s)` before `reset` to begin with the seeds s + i. Call `set_options` before it to
+        pass the options of `PerturbEnv.reset`, `parameters` and `state`: one dictionary for all environments, or a list
+        of N.
+
+        If the options differ, all environments are reset together, and then those with options again, one by one.
+        Without seeds, the environments with options skip an episode.
         """
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
         first, *others = self._options
@@ -125,7 +127,10 @@ class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-
         self.batch.send(actions)
 
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], list[dict[str, Any]]]:
-        """Receive a step: observations float32 [N, O], after an end the next episode's first; rewards float32 [N]."""
+        """Receive a step: observations float32 [N, O], rewards float32 [N], flags of ends [N], and infos.
+
+        Where an episode ended, the observation is the first one of the next episode.
+        """
         observations, rewards, terminated, truncated, batched = self.batch.recv()
         dones = terminated | truncated
         self._returns += rewards

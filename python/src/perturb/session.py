@@ -170,7 +170,7 @@ class Session:
     def reset(
         self, mask: bytes, seeds: Sequence[int], parameters: Intervals, states: bytes
     ) -> tuple[NDArray[np.float32], _native.Events]:
-        """Begin new episodes: observations [N, O], of other environments the last ones, and the episodes."""
+        """Begin new episodes. Return observations [N, O] (the last ones of other environments) and the episodes."""
         return self._call("reset", self._native.reset, mask, seeds, parameters, states)
 
     def last_ended(self) -> NDArray[np.bool_]:
@@ -187,7 +187,7 @@ class Session:
         return self._call("snapshot", self._native.snapshot, mask)
 
     def restore(self, mask: bytes, snapshots: Sequence[bytes]) -> NDArray[np.float32]:
-        """Bring saved environments back: observations [N, O], of other environments the last ones."""
+        """Restore saved environments. Return observations [N, O]; other environments have their last ones."""
         return self._call("restore", self._native.restore, mask, snapshots)
 
     def render(self, slot: int, width: int, height: int) -> NDArray[np.uint8]:
@@ -346,7 +346,7 @@ class _KeepaliveThread:
         self._pause = (0.0, 0.0)
 
     def longest_pause(self) -> float:
-        """Return for how long this process did not run, at the most, in the last minute, s."""
+        """Return the longest time for which this process did not run in the last minute, s."""
         self._note_pause()
         length, end = self._pause
         return length if _now() - end < PAUSE_MEMORY else 0.0
@@ -366,13 +366,13 @@ class _KeepaliveThread:
                 self._thread.start()
 
     def end(self) -> None:
-        """End the thread: where Python ends it, it must not be in the native module."""
+        """End the thread, so that it is not in the native module when Python exits."""
         self._ended.set()
         if self._thread is not None:
             self._thread.join()
 
     def sessions(self) -> list[Session]:
-        """All that somebody holds."""
+        """Return the sessions that still exist."""
         with self._lock:
             return list(self._sessions)
 

@@ -30,7 +30,7 @@ class OwnRule:
     quantity: str
     at_least: bool
     threshold: float
-    # The quantity of each episode, of the records' columns.
+    # Computes the quantity of each episode from the records' columns.
     values: Callable[[Mapping[str, Any]], Any]
 
     def judge(self, records: _native.Records) -> _native.Records:
@@ -50,10 +50,12 @@ class OwnRule:
 
 
 def parse(rule: SuccessRule | None) -> tuple[str | None, OwnRule | None]:
-    """Return what the native module judges by while it records, and what judges the records afterwards.
+    """Return the rule that the native module applies while it records, and the rule for the finished records.
+
+    At most one of them is not None. `return=NUMBER` means at least this return.
 
     Raises:
-        InvalidArgumentError: for what is neither a text nor a function.
+        InvalidArgumentError: if the rule is neither a text nor a function, or if a threshold is malformed.
     """
     if rule is None:
         return None, None

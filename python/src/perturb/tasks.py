@@ -46,7 +46,7 @@ def from_gymnasium(id: str, folder: str | Path) -> Path:  # noqa: A002 - Gymnasi
 
     Args:
         id: the id in Gymnasium, such as "Walker2d-v5"; see `GYMNASIUM_TASKS`.
-        folder: where to write; it is made if need be. Files of the same names are overwritten.
+        folder: where to write. It is made if it does not exist, and files of the same names are overwritten.
 
     Returns:
         The folder, for `perturb-server --task`.
@@ -70,7 +70,7 @@ def from_dm_control(task: str, folder: str | os.PathLike[str]) -> Path:
 
     Args:
         task: domain and task, such as "cheetah-run"; see `DM_CONTROL_TASKS`.
-        folder: where to write; it is made if need be. Files of the same names are overwritten.
+        folder: where to write. It is made if it does not exist, and files of the same names are overwritten.
 
     Returns:
         The folder, for `task=` and `perturb-server --task`.
@@ -117,7 +117,7 @@ def register_ids() -> None:
 
 
 def _write(file: str, models: Path, target: Path, package: str, included: list[str], remedy: str) -> Path:
-    """Write a task file, its model with what it includes from a package's folder, and the package's licence."""
+    """Write a task file, its model with the files that the model includes, and the licence of their package."""
     task = (resources.files("perturb") / "task_files" / file).read_text(encoding="utf-8")
     model = _model(task)
     for name in [model, *included]:
@@ -132,7 +132,7 @@ def _write(file: str, models: Path, target: Path, package: str, included: list[s
 
 
 def _model(task: str) -> str:
-    """The file name that a task file has as its model."""
+    """Return the name of the model's file, which a task file states."""
     line = next(line for line in task.splitlines() if line.startswith("model = "))
     return line.split('"')[1]
 

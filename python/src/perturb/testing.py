@@ -111,7 +111,13 @@ def play(
     name: str | None,
     expected: str | None = None,
 ) -> tuple[str, PolicyRecords]:
-    """Test one policy, which records call as expected: what reports call the agent, and its records."""
+    """Test one policy. Return the agent's name in reports, and the records of the test.
+
+    `expected` is the policy's name in the records that this test repeats, or None for a new test.
+
+    Raises:
+        PolicyError: if the policy does not fit, or its name is not the expected one.
+    """
     environment, observe = settings.environment, settings.observe
     names = [name for _, _, drawn, contexts in settings.sets for named in (drawn, *(contexts or ())) for name in named]
     address = None if settings.server is None else parse_address(settings.server)
@@ -155,7 +161,7 @@ def play(
 
 
 def policies(policy: Any, trained_on: str | None, normalizer: Any) -> list[tuple[str | None, Any, Any]]:
-    """Return each policy with the version that it was trained on, before it, and its normaliser after it."""
+    """Return a tuple for each policy: the version that it was trained on, the policy, and its normaliser."""
     if not isinstance(policy, Mapping):
         return [(None if trained_on is None else requests.version(trained_on, "trained_on"), policy, normalizer)]
     if trained_on is not None:

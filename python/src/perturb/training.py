@@ -112,8 +112,8 @@ def train(
 
 
 def _run(command: list[str], folder: Path | None, episodes: int | None, progress: bool | None) -> None:
-    """Run the program to its end, and show what its log says."""
-    # Without a server of its own the program starts the one that this package would start.
+    """Run the program to its end, and show how many episodes its log has."""
+    # If no server is given, the program starts the perturb-server on PATH. It must be the one of this package.
     environment = {**os.environ, "PATH": os.pathsep.join([str(find_server().parent), os.environ.get("PATH", "")])}
     shown = Progress(progress)
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)

@@ -127,7 +127,7 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._encode = partial(requests.actions, description=description, shape=self.action_space.shape or ())
         self._reward_terms = reward_terms
-        # By slot the parameters that act at its next episode.
+        # Parameters that act from the next episode on, by slot.
         self._next_parameters: dict[int, requests.Intervals] = {}
         # In next-step mode: environments whose next step is an autoreset, which has no reward and no reward terms. Kept
         # only if something depends on it.
@@ -258,11 +258,11 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
     def send(self, actions: Any) -> None:
         """Send the actions of a step without waiting for its outcome, which `recv` returns.
 
-        So several batches, each with a session of its own, can be under way together. The same batch can have up to 64
-        steps under way, with actions that do not depend on what they lead to.
+        Several batches can step at the same time in this way, each in a session of its own. One batch can have up to 64
+        steps under way, if the actions do not depend on the outcomes of these steps.
 
         Raises:
-            InvalidArgumentError: for a wrong shape or kind of numbers; wrong values are told by `recv`.
+            InvalidArgumentError: for a wrong shape or kind of numbers; `recv` raises it for wrong values.
             OutOfOrderError: before the first reset, or if 64 steps are under way.
             ServerConnectionError, ServerTimeoutError: and the environments are gone.
         """
@@ -276,7 +276,7 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         Until all are received, nothing but `send` and `recv` may be called.
 
         Raises:
-            InvalidArgumentError: no environment has moved in this step; those that were sent after it count.
+            InvalidArgumentError: if an action is wrong. No environment moves in this step; later steps are still made.
             OutOfOrderError: if no step is under way; with autoreset disabled, if an episode has ended.
             ServerConnectionError, ServerTimeoutError: and the environments are gone.
         """
@@ -287,10 +287,11 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         return self._client.snapshot(None if mask is None else requests.mask(mask, self.num_envs, "mask"))
 
     def restore(self, snapshots: Sequence[bytes], mask: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-        """Bring saved environments back into the M slots that the mask [N] selects, by default all.
+        """Restore saved environments into the M slots that the mask [N] selects, by default all.
 
-        Returns the observations [N, O]: of restored environments those at which they were saved, of others the last.
-        What follows is what followed the snapshot, byte for byte. All are restored, or none.
+        Returns the observations [N, O]. Restored environments have the observations at which they were saved, and the
+        others have their last ones. The same actions then give the same bytes as after the snapshot. If one environment
+        cannot be restored, none is.
         """
         selected = None
         if mask is not None:
@@ -302,7 +303,7 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         return restored
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:
-        """Draw the environments as they are now: of each, red, green and blue, uint8 [height, width, 3].
+        """Draw the present state of each environment, as an RGB picture, uint8 [height, width, 3].
 
         In same-step mode the environment of an ended episode is at the start of the next one already.
 

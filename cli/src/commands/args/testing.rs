@@ -53,8 +53,8 @@ pub struct EvaluateArgs {
     /// these episodes.
     #[arg(long)]
     pub selection_episodes: bool,
-    /// Also print success by the values of this parameter, or with `context` by the contexts of a grid or a list, the
-    /// lowest success rate first. Drawn parameters are told apart by tenths of their range.
+    /// Also print success for each value of this parameter, the lowest success rate first. `context` prints it for each
+    /// context of a grid or a list. The range of a drawn parameter is divided into about ten equal parts.
     #[arg(long, value_name = "PARAMETER|context")]
     pub by: Option<String>,
     #[command(flatten)]
@@ -128,8 +128,8 @@ pub struct RescoreArgs {
     /// test].
     #[arg(long, value_name = "text|code|QUANTITY=NUMBER", num_args = 1.., value_parser = success_rule)]
     pub success: Vec<Rule>,
-    /// Also print success by the values of this parameter, or with `context` by the contexts of a grid or a list, the
-    /// lowest success rate first. Drawn parameters are told apart by tenths of their range.
+    /// Also print success for each value of this parameter, the lowest success rate first. `context` prints it for each
+    /// context of a grid or a list. The range of a drawn parameter is divided into about ten equal parts.
     #[arg(long, value_name = "PARAMETER|context")]
     pub by: Option<String>,
     #[command(flatten)]

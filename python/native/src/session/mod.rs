@@ -56,10 +56,11 @@ pub struct Session {
     /// Limit for a reply; `None` for no limit.
     timeout: Mutex<Option<Duration>>,
     actions: Actions,
-    /// O.
+    /// Number O of values in an observation.
     observation_size: usize,
-    /// The process that made it, and the forks before that.
+    /// Id of the process that made the session.
     owner: u32,
+    /// Number of forks before the session was made.
     forks: u32,
     closing: Arc<CloseSignal>,
     state: Mutex<SessionState>,
@@ -78,8 +79,8 @@ struct LastStep {
 
 #[pymethods]
 impl Session {
-    /// The server is an address, or the embedded server. Times are in seconds, and may be infinite. `action_size` is None for choices; of a `single` environment actions
-    /// have no first axis.
+    /// Makes a session with the server at an address, or with the embedded server. Times are in seconds, and may be
+    /// infinite. `action_size` is None for discrete actions. Actions of a `single` environment have no first axis.
     #[new]
     #[pyo3(signature = (server, timeout, keepalive, num_envs, observation_size, action_size, single))]
     fn new(
