@@ -19,7 +19,7 @@ pub enum Error {
         got: usize,
         /// Steps that fit.
         expected: usize,
-        /// The attempt.
+        /// The operation that failed.
         what: &'static str,
     },
     /// The program was asked to end, and the update would have taken long.

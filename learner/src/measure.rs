@@ -130,8 +130,9 @@ fn measure_one(
     Ok(Speed { training, testing: measure_test(servers, cell, &checkpoint, stop)? })
 }
 
-/// Measures the time from one iteration to another of the leader, the cell that reports first, and counts the steps of all
-/// cells between. Where cells take turns, all others have had an iteration between two of the leader's.
+/// Measures the time between two iterations of the leader, and counts the steps of all cells in this time. The leader
+/// is the cell that reports first. Where cells take turns, every other cell has one iteration between two of the
+/// leader's.
 struct SpeedMeter {
     start: Instant,
     timesteps: HashMap<String, u64>,
@@ -152,7 +153,8 @@ impl SpeedMeter {
         Self { start: Instant::now(), timesteps, heard, leader: None, first: None, last: None, ended: None }
     }
 
-    /// Counts an event. Returns for how long the meter has measured; zero before the leader's second report.
+    /// Counts an event. Returns the time since the meter started, or zero before the leader's second report. If the
+    /// leader stops reporting, the cell of this event takes its place.
     fn on_event(&mut self, id: &str, event: CellEvent) -> Duration {
         let now = self.start.elapsed();
         match event {

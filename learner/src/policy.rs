@@ -72,7 +72,7 @@ impl Policy {
     /// A workspace like the one in which this policy computes gradients; `None` if it is recurrent.
     ///
     /// # Errors
-    /// Those of [`gradient_backend`].
+    /// The errors of [`gradient_backend`].
     pub fn workspace(&self) -> Result<Option<GradientWorkspace>> {
         if self.spec.lstm.is_some() {
             return Ok(None);

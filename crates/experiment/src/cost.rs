@@ -15,9 +15,9 @@ use crate::plan::{Cell, Grouping, Plan, distinct};
 /// Process time for one step of one environment, s. It includes the policy's share of that step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Speed {
-    /// In training, with rollouts and updates.
+    /// The time in training, with rollouts and updates.
     pub training: f64,
-    /// In tests, which have no updates.
+    /// The time in tests, which have no updates.
     pub testing: f64,
 }
 

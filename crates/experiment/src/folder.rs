@@ -41,7 +41,7 @@ const MAX_BYTES: u64 = 64 << 20;
 #[derive(Clone, Debug)]
 pub struct Folder {
     path: PathBuf,
-    /// The folder for new heatmaps, if it is another.
+    /// The folder for new heatmaps; `None` if they go into the experiment's folder.
     new_heatmaps: Option<PathBuf>,
 }
 
@@ -63,11 +63,11 @@ pub struct FailureId {
 /// The state of a cell.
 #[derive(Clone, Debug, PartialEq)]
 pub enum CellState {
-    /// There is a result.
+    /// The cell has a result.
     Done(Box<CellResult>),
     /// The cell failed.
     Failed(Failure),
-    /// There is neither a result nor a failure.
+    /// The cell has neither a result nor a failure.
     Missing,
 }
 
@@ -113,7 +113,7 @@ pub struct IntermediateEvaluation {
 /// A training in a result.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Training {
-    /// By its name in the catalogue.
+    /// The environment's name in the catalogue.
     pub environment: String,
     /// The environment's revision on the server. Changes of dynamics raise it.
     pub environment_revision: u32,

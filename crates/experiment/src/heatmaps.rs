@@ -108,7 +108,7 @@ pub fn heatmap_places<'a>(selections: &'a [MethodResults<'a>]) -> Vec<HeatmapPla
 /// Returns the kinds of heatmaps in `folder` by environment, including heatmaps of results that have been replaced.
 ///
 /// # Errors
-/// The operating system's.
+/// Errors of the operating system.
 pub fn heatmap_kinds<'a>(
     folder: &Folder,
     places: &[HeatmapPlace<'a>],
@@ -203,7 +203,7 @@ fn heatmap_name(cell: &Cell, kind: &HeatmapKind) -> String {
 /// Stores `heatmap`, which shows the policy `checkpoint`, for `cell`.
 ///
 /// # Errors
-/// The operating system's. There is no heatmap then.
+/// Errors of the operating system. There is no heatmap then.
 pub fn store_heatmap(
     folder: &Folder,
     cell: &Cell,

@@ -23,7 +23,7 @@ use crate::selection::{MethodResults, Results, Selected, common_runs};
 
 /// The seed for drawing runs, which is that of the interval without selection.
 const RUNS_SEED: u64 = 1;
-/// The seed for drawing selections. Separate draws leave the drawn runs unchanged.
+/// The seed for drawing selections. It is a separate stream, so the same runs are drawn with and without selection.
 const SELECTION_SEED: u64 = 2;
 
 /// All selections of a plan, with their candidates.

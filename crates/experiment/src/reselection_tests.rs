@@ -37,7 +37,8 @@ fn intervals(results: &Results<'_>, metric: Metric) -> [[f64; 2]; 2] {
     [without, with].map(|number| number.interval_95.unwrap())
 }
 
-/// In each run A has a success rate of 60 % or more. The rate of B is lower by `behind`, and B is bad in all other tests.
+/// Returns [`intervals`] for two configurations. On D and R, A has a success rate of 60 % or more, and the rate of B is
+/// lower by `behind`. On E, A has 50 % and B 0 %.
 fn by_paper(behind: f64, metric: Metric) -> [[f64; 2]; 2] {
     let plan = plan("");
     let results = fixture::results(&plan, |cell| {
@@ -67,8 +68,9 @@ fn doubtful_selection_widens_the_interval() {
 
 const CLEAN: &str = "selection = 'clean'\ntuning_runs = 2\nselection_episodes = 1000\n";
 
-/// `selecting` gives the rates in selection episodes, by configuration and tuning run. In tests the tuning cells of A have
-/// 90 %, those of B 10 %, and the cells that were trained after the selection 80 %.
+/// Returns [`intervals`] with the clean rule. `selecting` gives the success rates in selection episodes, for A or not A
+/// and the tuning run. In reported tests the tuning cells of A have 90 %, those of B 10 %, and cells trained after the
+/// selection 80 %.
 fn by_clean(selecting: fn(bool, u32) -> f64) -> [[f64; 2]; 2] {
     let mut plan = plan(CLEAN);
     let tuning = plan.cells.len();

@@ -36,7 +36,8 @@ pub struct MethodResults<'a> {
     pub environment: &'a str,
     /// The method.
     pub method: Method,
-    /// Number of cells that the plan has or will have for this row, without those that are trained on the plan's own sets.
+    /// Number of cells that the plan has or will have for this row. Cells that are trained on the plan's own sets do
+    /// not count.
     pub cells: usize,
     /// Number of these cells with a result. If some are missing, the selection was among fewer configurations than the
     /// plan has.

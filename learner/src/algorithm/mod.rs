@@ -42,7 +42,7 @@ pub trait BaseAlgorithm: Algorithm {
     /// means over all steps.
     ///
     /// # Errors
-    /// Those of [`Algorithm::update`].
+    /// The errors of [`Algorithm::update`].
     fn update_many(
         &mut self,
         policy: &mut Policy,

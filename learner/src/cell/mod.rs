@@ -209,9 +209,10 @@ impl<'a> RunningCell<'a> {
         Ok(work)
     }
 
-    /// Recovers a training that was interrupted. The policy of a finished training is only tested. An unfinished training
-    /// is resumed from its last checkpoint, to the same bytes as without the break. A training without a usable checkpoint
-    /// begins again.
+    /// Recovers a training that was interrupted. The policy of a finished training is only tested. An unfinished
+    /// training is resumed from its last checkpoint, to the same bytes as without the break. A training begins again if
+    /// it has no usable checkpoint, if the plan's settings changed, or if an intermediate policy that the tests need is
+    /// missing.
     fn recover(&mut self, tell: &mut dyn FnMut(&Cell, CellEvent)) -> Result<(), RunDirectoryError> {
         let Cell { config, tests, .. } = self.job.cell;
         let path = self.job.folder.training();

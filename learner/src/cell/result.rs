@@ -113,8 +113,8 @@ fn parameters(parameters: &Parameters) -> String {
     texts.collect::<Vec<_>>().join(" ")
 }
 
-/// The command that reproduces a cell's numbers without the plan. RUN and TASK stand for the folders of the run and, unless
-/// the environment is built in, of the task.
+/// The command that reproduces a cell's numbers without the plan. RUN stands for the folder of the run. TASK stands for
+/// the folder of the task; a built-in environment needs none.
 fn command(cell: &Cell) -> String {
     let common = &cell.config.common;
     let mut text = format!(

@@ -22,9 +22,10 @@ pub use perturb_checkpoint::{Changed, Checkpoint, CheckpointError, EnvironmentSu
 /// The state of a training between two iterations, without the parts that a [`Checkpoint`] holds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ResumeState {
-    /// Environments, observations, memories, the stream of actions.
+    /// Snapshots of the environments, and the player's state: observations, recurrent memory and the random stream of
+    /// actions.
     pub collector: CollectorState,
-    /// The optimiser, the stream of minibatches.
+    /// The optimiser's averages and the random stream of minibatch orders.
     pub algorithm: AlgorithmState,
     /// The figures of the run so far.
     pub history: History,
@@ -51,7 +52,7 @@ struct ResumeDocument {
     arrays: ArraysFile,
     /// The algorithm's state; the data of its arrays are in the file of arrays.
     algorithm: AlgorithmState,
-    /// The stream of actions.
+    /// The random stream of actions.
     actions: ChaCha8Rng,
     history: History,
 }

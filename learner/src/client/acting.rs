@@ -1,4 +1,4 @@
-//! Policies that servers play, and their rollouts.
+//! Requests by which servers choose the actions of a policy themselves, and the rollouts that they return.
 
 use std::io::ErrorKind;
 use std::ops::Range;
@@ -60,7 +60,7 @@ impl Session<'_> {
     /// Waits for the reply to [`Session::ask_to_play`].
     ///
     /// # Errors
-    /// Those of [`Session::play`].
+    /// The errors of [`Session::play`].
     pub async fn played(&mut self) -> Result<RolloutReply, ClientError> {
         let Self { servers, parts, .. } = self;
         let [part] = parts.as_mut_slice() else { return Err(not_played_together()) };
@@ -76,7 +76,7 @@ impl Session<'_> {
     /// The player's state and statistics at the server; `None` if the batch is not on one server.
     ///
     /// # Errors
-    /// Those of [`Session::play`].
+    /// The errors of [`Session::play`].
     pub fn save_player(&mut self) -> Result<Option<(PlayerState, Normalisers)>, ClientError> {
         let size = self.observation_size();
         let mut states = Vec::new();

@@ -31,9 +31,9 @@ pub struct OpenOptions {
 /// The place where actions of trainings and tests are chosen. It changes no byte.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ActorLocation {
-    /// At the server, if it can: the network's delay is then paid once a rollout, not at each step. Trainings over several
-    /// servers, groups of trainings with [short](perturb_settings::CollectionMode) rollouts, and trainings with observation noise
-    /// choose their actions at the client in any case.
+    /// At the server if it can: the network's delay is then paid once a rollout, not at each step. Trainings over
+    /// several servers, groups of trainings with [short](perturb_settings::CollectionMode) rollouts, and trainings with
+    /// observation noise choose their actions at the client in any case.
     #[default]
     Server,
     /// At the client.

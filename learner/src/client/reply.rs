@@ -27,17 +27,17 @@ pub struct StepReply {
 pub struct StepSlice<'a> {
     /// The first of the slots.
     pub first_slot: usize,
-    /// `[n, O]`
+    /// `[n, O]` observations of the n slots.
     pub observations: &'a [f32],
-    /// `[n]`
+    /// `[n]` rewards.
     pub rewards: &'a [f32],
-    /// `[n]`
+    /// `[n]` whether the task ended the episode.
     pub terminated: &'a [bool],
-    /// `[n]`
+    /// `[n]` whether the step limit ended the episode.
     pub truncated: &'a [bool],
-    /// `[k, O]`
+    /// `[k, O]` last observations of the k episodes that ended, in the order of `ended`.
     pub final_observations: &'a [f32],
-    /// `[k]` the episodes that ended, with slots counted over the whole batch.
+    /// The k episodes that ended. Their slots count over the whole batch.
     pub ended: &'a [EndedEpisode],
 }
 

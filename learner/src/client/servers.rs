@@ -76,7 +76,7 @@ impl Servers {
     /// `tasks`, and connects to it.
     ///
     /// # Errors
-    /// Those of [`PrivateServer::start_unless`] and of [`Servers::connect`].
+    /// The errors of [`PrivateServer::start_unless`] and of [`Servers::connect`].
     pub fn local(workers: Option<usize>, tasks: &[PathBuf], stop: &StopFlag) -> Result<Self, ClientError> {
         let mut server = PrivateServer::start_unless(workers, tasks, &|| stop.signal())?;
         match Self::connect_until(std::slice::from_ref(server.address()), stop) {
@@ -107,7 +107,7 @@ impl Servers {
     /// that gives no sign of life ends within about a second.
     ///
     /// # Errors
-    /// Those of [`Servers::connect`], and [`ClientError::Stopped`].
+    /// The errors of [`Servers::connect`], and [`ClientError::Stopped`].
     pub fn connect_until(addresses: &[Address], stop: &StopFlag) -> Result<Self, ClientError> {
         let runtime = runtime()?;
         let connections = runtime.block_on(unless_stopped(stop, async {
@@ -184,7 +184,7 @@ impl Servers {
     /// Returns the errors of the others.
     ///
     /// # Errors
-    /// Those of [`Servers::connect_to_one`].
+    /// The errors of [`Servers::connect_to_one`].
     pub fn connect_to_some(addresses: &[Address], stop: &StopFlag) -> Result<(Self, Vec<ClientError>), ClientError> {
         let runtime = runtime()?;
         let (connections, errors) = runtime.block_on(unless_stopped(stop, async {
@@ -338,8 +338,8 @@ impl Servers {
     /// parameters.
     ///
     /// # Errors
-    /// Those of [`Servers::environment`]; [`ClientError::NoParameters`] if it sees parameters and the servers cannot
-    /// tell them.
+    /// The errors of [`Servers::environment`]; [`ClientError::NoParameters`] if it sees parameters and the servers
+    /// cannot tell them.
     pub fn environment_seen(&self, common: &Common) -> Result<proto::Environment, ClientError> {
         self.environment_seen_with(common, std::iter::empty())
     }
@@ -348,7 +348,7 @@ impl Servers {
     /// disturbance.
     ///
     /// # Errors
-    /// Those of [`Servers::environment_seen`].
+    /// The errors of [`Servers::environment_seen`].
     pub fn environment_seen_with<'a>(
         &self,
         common: &'a Common,

@@ -45,7 +45,7 @@ impl<'a> Session<'a> {
     /// same observation.
     ///
     /// # Errors
-    /// Those of [`Session::open`].
+    /// The errors of [`Session::open`].
     pub fn open_together(
         servers: &'a Servers,
         options: &[OpenOptions],

@@ -26,14 +26,14 @@ pub struct Audit {
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum AuditError {
-    /// The episodes were recorded of another policy.
+    /// The episodes were recorded from another policy.
     #[error(
         "the episodes were recorded of the policy {recorded}, the checkpoint is {got}: give the checkpoint that was tested"
     )]
     Policy {
         /// The recorded policy.
         recorded: String,
-        /// The checkpoint's.
+        /// The checkpoint's policy.
         got: String,
     },
     /// The episodes cannot be played.

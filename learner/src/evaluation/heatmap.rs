@@ -25,7 +25,7 @@ pub enum HeatmapError {
         /// The environment's parameters.
         parameters: Vec<String>,
     },
-    /// Recorded episodes are of another policy.
+    /// The episodes were recorded from another policy.
     #[error(
         "the episodes were recorded of the policy {recorded}, the checkpoint is {got}: pass the checkpoint these episodes \
          were recorded with"
@@ -33,7 +33,7 @@ pub enum HeatmapError {
     Policy {
         /// The recorded policy.
         recorded: String,
-        /// The checkpoint's.
+        /// The checkpoint's policy.
         got: String,
     },
     /// An axis has a fixed value, too.

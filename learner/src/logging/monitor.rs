@@ -34,7 +34,7 @@ impl Monitor {
     /// Creates the file.
     ///
     /// # Errors
-    /// The operating system's.
+    /// Errors of the operating system.
     pub fn create(path: &Path, environment: &str, spec: &EnvironmentSummary, clock: Clock) -> std::io::Result<Self> {
         let file = File::create(path)?;
         let mut head = Vec::new();
@@ -67,7 +67,7 @@ impl Monitor {
     /// Adds an episode.
     ///
     /// # Errors
-    /// The operating system's.
+    /// Errors of the operating system.
     pub fn write(&mut self, episode: &EndedEpisode) -> std::io::Result<()> {
         let flag = |flag: bool| u8::from(flag).to_string();
         let fixed = [
@@ -94,7 +94,7 @@ impl Monitor {
     /// Passes buffered lines to the operating system.
     ///
     /// # Errors
-    /// The operating system's.
+    /// Errors of the operating system.
     pub fn flush(&mut self) -> std::io::Result<()> {
         self.lines.flush()?;
         let lines = std::mem::replace(&mut self.lines, csv::Writer::from_writer(Vec::new()));

@@ -146,7 +146,7 @@ impl ProgressLog {
     /// Creates `progress.csv` and an events file in `directory`. `t_start` is the time of day in seconds since 1970.
     ///
     /// # Errors
-    /// The operating system's.
+    /// Errors of the operating system.
     pub fn create(directory: &Path, t_start: f64) -> std::io::Result<Self> {
         let mut csv = csv::Writer::from_writer(File::create(directory.join("progress.csv"))?);
         csv.write_record(Progress::default().columns().map(|(name, _)| name))?;
@@ -173,7 +173,7 @@ impl ProgressLog {
     /// Adds a line and an event, and passes them to the operating system. A missing value is an empty cell.
     ///
     /// # Errors
-    /// The operating system's.
+    /// Errors of the operating system.
     pub fn write(&mut self, progress: &Progress) -> std::io::Result<()> {
         let columns = progress.columns();
         self.csv.write_record(columns.map(|(_, value)| value.map_or_else(String::new, |value| value.to_string())))?;

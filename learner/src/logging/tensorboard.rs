@@ -54,7 +54,7 @@ impl EventWriter {
     /// Creates an events file in `directory`. `t_start` is the time of day in seconds since 1970.
     ///
     /// # Errors
-    /// The operating system's.
+    /// Errors of the operating system.
     pub fn create(directory: &Path, t_start: f64) -> std::io::Result<Self> {
         let file_name = format!("events.out.tfevents.{}.perturb", t_start as u64);
         let file = File::create(directory.join(&file_name))?;
@@ -84,7 +84,7 @@ impl EventWriter {
     /// Adds scalars at `step`, `elapsed` seconds after the start, and passes them to the operating system.
     ///
     /// # Errors
-    /// The operating system's.
+    /// Errors of the operating system.
     pub fn write<'a>(
         &mut self,
         step: u64,

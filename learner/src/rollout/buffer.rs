@@ -52,7 +52,7 @@ impl Rollout {
         Self::with_capacity(Some(n_steps), n_steps, n_envs, observation_size, action_width)
     }
 
-    /// An empty rollout for complete episodes, as long as these will be.
+    /// An empty rollout for complete episodes. It grows with every step until [`Rollout::finish`].
     pub fn of_episodes(n_envs: usize, observation_size: usize, action_width: usize) -> Self {
         Self::with_capacity(None, 0, n_envs, observation_size, action_width)
     }
@@ -159,7 +159,7 @@ impl Rollout {
     /// The arrays that advantages are estimated from.
     ///
     /// # Errors
-    /// Before [`Rollout::finish`].
+    /// [`Error::RolloutLength`] before [`Rollout::finish`].
     pub fn trajectories(&self) -> Result<Trajectories<'_>> {
         if !self.finished {
             let what = "it was used before it was finished";
@@ -211,10 +211,12 @@ impl Rollout {
         self.fixed_steps.unwrap_or(self.len)
     }
 
-    /// Adds an episode that ended with the last of `end` steps, and whose `length` steps are all in the rollout.
+    /// Adds an episode of `length` steps that ended before step `end`, counted from 0. All its steps must be in the
+    /// rollout.
     ///
     /// # Errors
-    /// An episode that the rollout does not hold: without steps, longer than the rollout, of an environment beyond N.
+    /// [`Error::Episode`] if the episode has no steps, starts before the rollout, ends after it, or if there is no such
+    /// environment.
     pub fn note_episode(&mut self, environment: usize, end: usize, length: usize, episode_return: f64) -> Result<()> {
         self.check_episode(environment, end, length)?;
         self.episodes.push(EpisodeSlice { environment, start: end - length, length, episode_return });
@@ -246,12 +248,12 @@ impl Rollout {
         self.episodes.iter().map(sum).collect()
     }
 
-    /// A rollout of only the given episodes of this one. T is the length of the longest episode. Shorter ones are put one after
-    /// the other into the same column where they fit. Steps that fill a column up are no samples. Every episode begins with an
-    /// empty memory.
+    /// A rollout of only the given episodes of this one. T is the length of the longest episode. Shorter ones share a
+    /// column, one after another, where they fit. The rest of a column is padding, which is not sampled. Every episode
+    /// begins with an empty memory.
     ///
     /// # Errors
-    /// No episode at all; one that the rollout does not hold.
+    /// There is no episode, or the rollout does not hold one of them.
     pub fn select(&self, episodes: &[EpisodeSlice]) -> Result<Rollout> {
         let longest = episodes.iter().map(|episode| episode.length).max().unwrap_or(0);
         if longest == 0 {

@@ -74,15 +74,15 @@ pub enum TrainError {
         environment: String,
         /// The property that differs.
         what: &'static str,
-        /// In training.
+        /// The property's value in training.
         trained: String,
-        /// On the server.
+        /// The property's value on the server.
         served: String,
     },
     /// A part of a checkpoint does not fit.
     #[error("cannot restore the {what}: {source}")]
     Restore {
-        /// The part.
+        /// The name of the part.
         what: &'static str,
         /// The reason.
         source: Box<TrainError>,

@@ -68,7 +68,8 @@ pub fn train(
 /// Otherwise as [`train`]. `servers` may be others than before. Lines of the logs beyond the checkpoint are deleted.
 ///
 /// # Errors
-/// Those of [`train`]; an environment, a state or a log that does not fit the checkpoint, before anything is changed.
+/// The errors of [`train`]; an environment, a state or a log that does not fit the checkpoint, before anything is
+/// changed.
 pub fn resume(
     servers: &Servers,
     directory: &RunDirectory,

@@ -233,7 +233,7 @@ impl RunDirectory {
     /// Whether the checkpoints of all `marks` exist.
     ///
     /// # Errors
-    /// The operating system's.
+    /// Errors of the operating system.
     pub fn has_kept(&self, marks: impl Iterator<Item = u64>) -> Result<bool> {
         for mark in marks {
             if !files::has_file(&self.mark(mark).join("checkpoint.json"))? {

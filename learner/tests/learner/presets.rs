@@ -15,7 +15,7 @@ use crate::common::{connect, moved, server};
 use rstest::rstest;
 use tempfile::TempDir;
 
-/// Trains on CartPole; gives the run and all its figures.
+/// Trains on CartPole. Returns the run's folder and every reported [`Progress`].
 fn trained(settings: &str) -> (TempDir, Vec<Progress>) {
     let private = [server()];
     let text = format!("environment = 'CartPole'\n{settings}");

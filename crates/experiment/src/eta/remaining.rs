@@ -109,10 +109,11 @@ mod tests {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let [cart_pole, cart_pole_2, hopper, hopper_2] = &plan.cells[..] else { panic!() };
         let times = CellDurations::default();
+        // After 20 s the remaining work is twice the work so far.
         let a_third = Some((20.0, Some(2.0)));
         assert_eq!(seconds(&times, &[(hopper, a_third)], 1), Some(40.0));
         assert_eq!(seconds(&times, &[(hopper, a_third), (hopper_2, None)], 1), Some(100.0));
-        // Two in one process had half of it each.
+        // Two cells in one process had half of its time each, so 10 s, and need 20 s more each.
         assert_eq!(seconds(&times, &[(cart_pole, a_third), (cart_pole_2, a_third)], 1), Some(40.0));
         assert_eq!(seconds(&times, &[(cart_pole, a_third), (cart_pole_2, None), (hopper, None)], 1), None);
     }

@@ -98,16 +98,16 @@ impl Default for SuccessRules {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Block {
-    /// In place of the file's.
+    /// Replaces the file's preset.
     #[serde(default, deserialize_with = "preset")]
     preset: Option<Preset>,
     /// An algorithm, as of `perturb train --algorithm`.
     pub(super) name: String,
     /// "ff", "rc" or both; of RL² "rc" alone.
     pub(super) architectures: Vec<String>,
-    /// In place of the file's.
+    /// Replaces the file's environments.
     environments: Option<Vec<String>>,
-    /// In place of the file's.
+    /// Replaces the file's versions.
     versions: Option<Vec<String>>,
     /// Settings of these trainings, over those of the file.
     #[serde(default)]

@@ -51,8 +51,7 @@ pub struct Plan {
     /// All cells that are known before the run: the tuning cells, if there are any. A cell's index is its position in this
     /// list.
     pub cells: Vec<Cell>,
-    /// Cells that are added when their configuration is selected, with the following indices.
-    /// [`Plan::with_selected_cells`] adds them.
+    /// Cells that are appended to `cells` when their configuration is selected, see [`Plan::with_selected_cells`].
     pub candidates: Vec<Cell>,
 }
 

@@ -54,7 +54,7 @@ impl AssessmentStatus {
         })
     }
 
-    /// In a few figures.
+    /// Summarises the assessment for a list of runs.
     pub fn summary(&self) -> RunSummary {
         let episodes = self.tests.iter().map(|test| test.result.episodes).sum();
         RunSummary {

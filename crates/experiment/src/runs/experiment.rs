@@ -38,7 +38,7 @@ pub struct ExperimentStatus {
 /// The status of a cell.
 #[derive(Clone, Debug, PartialEq)]
 pub enum CellStatus {
-    /// There is a result.
+    /// The cell has a result.
     Done(Box<CellResult>),
     /// The cell failed with this reason.
     Failed(String),

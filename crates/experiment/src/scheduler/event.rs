@@ -54,25 +54,25 @@ pub struct EventLine {
 #[serde(tag = "event", rename_all = "snake_case")]
 #[expect(missing_docs, reason = "the variants say what their fields are")]
 pub enum CellEvent {
-    /// There is a server for it, at this address.
+    /// The cell has a server, at this address.
     Server { address: String },
     /// The training has had so many episodes and steps. `saved` steps are in a checkpoint, from which another attempt
     /// would resume. The first such line of an attempt says where the attempt begins.
     Training { episodes: u64, timesteps: u64, saved: u64 },
     /// The policy is tested on this set and has had so many episodes.
     Testing { set: String, episodes: u64 },
-    /// There is a result, of now or of earlier.
+    /// The cell has a result, which may be from an earlier attempt.
     Done,
     /// The cell failed with this reason, now or earlier.
     Failed { reason: String },
-    /// Somebody else works on it.
+    /// Another process works on the cell.
     Busy,
-    /// There is no server, or no longer, which is not the cell's failure.
+    /// The cell found no server or lost it. This is not the cell's failure.
     LostServer { reason: String },
-    /// A file could not be read or written, which is not the cell's failure: the disk is full, for instance. What was
-    /// trained is kept.
+    /// A file could not be read or written, for example because the disk is full. This is not the cell's failure. The
+    /// training so far is kept.
     FileFault { reason: String },
-    /// This signal asked to end. What was trained is kept.
+    /// A signal asked the worker to end. The training so far is kept.
     Stopped { signal: i32 },
     /// The worker does not know a cell of its job.
     Refused { reason: String },

@@ -11,18 +11,18 @@ use super::{FAMILY, PlotError, WIDTH, drawing, load_font};
 /// The size of all texts, as the library counts it: its SVG divides it by 1.24, which is 13.7 units, and in a column of 85 mm
 /// 9.2 pt.
 const TEXT: u32 = 17;
-/// From one line of text to the next.
+/// Distance from one line of text to the next, units.
 pub(super) const LINE: f64 = 18.0;
-/// Beside everything.
+/// Margin on all sides of a picture, units.
 pub(super) const MARGIN: f64 = 8.0;
 /// Width between the left and the right margin, units.
 pub(super) const INSIDE: f64 = WIDTH as f64 - 2.0 * MARGIN;
-/// See [`LineStyle::dashes`].
+/// The dashes that lines take in turn, see [`LineStyle::dashes`].
 const DASHES: [Option<(u32, u32)>; 3] = [None, Some((8, 4)), Some((2, 3))];
-/// Frames and ticks.
+/// The style of frames and ticks.
 pub(super) const TICK: LineStyle = LineStyle { colour: FRAME, width: 1, dashes: None };
 
-/// A place, from the upper left corner.
+/// A position (x, y), units from the upper left corner.
 pub(super) type CanvasPoint = (f64, f64);
 
 /// The style of a line; widths and lengths are in units.
@@ -30,7 +30,7 @@ pub(super) type CanvasPoint = (f64, f64);
 pub(super) struct LineStyle {
     pub(super) colour: RGBColor,
     pub(super) width: u32,
-    /// Dash and gap; none of a whole line.
+    /// Lengths of a dash and of a gap; `None` for a solid line.
     pub(super) dashes: Option<(u32, u32)>,
 }
 
@@ -55,7 +55,8 @@ pub(super) fn text_width(text: &str) -> f64 {
     known.map_or(0.6 * f64::from(TEXT) * text.chars().count() as f64, |(width, _)| f64::from(width))
 }
 
-/// Lines that are at most so wide, unless a word is wider. A number stays with the word before it, as in "seed 1".
+/// Breaks a text into lines of limited width, unless a word is wider. A number stays with the word before it, as in
+/// "seed 1".
 pub(super) fn wrapped(text: &str, width: f64) -> Vec<String> {
     let mut words: Vec<String> = Vec::new();
     for word in text.split_whitespace() {
@@ -85,19 +86,19 @@ pub(super) struct PlotCanvas<'a, DB: DrawingBackend> {
 }
 
 impl<'a, DB: DrawingBackend> PlotCanvas<'a, DB> {
-    /// An empty one.
+    /// Returns a canvas on `area`, which it fills with the background colour.
     pub(super) fn new(area: &'a DrawingArea<DB, Shift>, scale: u32) -> Result<Self, PlotError> {
         area.fill(&PAPER).map_err(drawing)?;
         Ok(Self { area, scale })
     }
 
-    /// In the backend's steps.
+    /// Converts a position to steps of the backend.
     pub(super) fn at(&self, (x, y): CanvasPoint) -> (i32, i32) {
         let step = |units: f64| (units * f64::from(self.scale)).round() as i32;
         (step(x), step(y))
     }
 
-    /// A text in one line, whose middle is at this height.
+    /// Writes a text in one line, vertically centred at the position.
     pub(super) fn text(&self, text: &str, at: CanvasPoint, side: TextAnchor) -> Result<(), PlotError> {
         let h = [HPos::Left, HPos::Center, HPos::Right][side as usize];
         // The library's middle of a line of text is that of its letters in an SVG, and lies above them in a PNG.

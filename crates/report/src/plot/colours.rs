@@ -1,20 +1,20 @@
-//! Colours. Lines have those of Okabe and Ito, which people with any colour vision tell apart; surfaces have viridis, whose
-//! lightness alone says how much.
+//! Colours. Lines have the palette of Okabe and Ito, which people with any colour vision can tell apart. Surfaces have
+//! viridis, whose lightness rises with the value.
 
 use plotters::style::RGBColor;
 
-/// Background colour, and below it the colour of texts. A dark page exchanges both, see `report/style.css`, as well as
-/// [`GRID`]. All other colours are visible on both.
+/// Background colour. A dark page replaces it, [`INK`] and [`GRID`], see `report/style.css`. All other colours are
+/// visible on both backgrounds.
 pub(super) const PAPER: RGBColor = RGBColor(255, 255, 255);
-/// See [`PAPER`].
+/// Colour of texts.
 pub(super) const INK: RGBColor = RGBColor(34, 34, 34);
-/// Lines behind lines.
+/// Colour of the grid behind a chart's lines.
 pub(super) const GRID: RGBColor = RGBColor(225, 225, 225);
-/// Frames and the ticks at them.
+/// Colour of frames and ticks.
 pub(super) const FRAME: RGBColor = RGBColor(120, 120, 120);
 
-/// The colours of lines, after Okabe and Ito (2008), darkest first; ink for black, which a dark page
-/// exchanges; yellow is left out, since it is not seen on white.
+/// The colours of lines, after Okabe and Ito (2008), darkest first. Ink stands for black, so that a dark page replaces
+/// it. Yellow is left out, since it is invisible on white.
 pub(super) const LINES: [RGBColor; 7] = [
     INK,
     RGBColor(0, 114, 178),
@@ -38,7 +38,8 @@ const VIRIDIS: [(u8, u8, u8); 9] = [
     (253, 231, 37),
 ];
 
-/// Light to dark blue, for numbers that are read in the colour: text on it stays readable, and ink is spared.
+/// Light to dark blue, for the background of a table's numbers. Text on it stays readable, and printing takes little
+/// ink.
 const BLUES: [(u8, u8, u8); 5] = [(247, 251, 255), (198, 219, 239), (107, 174, 214), (33, 113, 181), (8, 48, 107)];
 
 /// The colour for `share`, 0 … 1, from light to dark.
@@ -62,7 +63,7 @@ fn blend(anchors: &[(u8, u8, u8)], share: f64) -> (u8, u8, u8) {
     (mix(low.0, high.0), mix(low.1, high.1), mix(low.2, high.2))
 }
 
-/// Whether white text is read better on a colour than black.
+/// Whether white text has more contrast on a colour than black text.
 pub fn is_dark((r, g, b): (u8, u8, u8)) -> bool {
     luminance((r, g, b)) < 0.179 // there both contrasts are equal
 }
@@ -107,7 +108,8 @@ mod tests {
         }
     }
 
-    /// 3 to 1 is what WCAG asks for of graphics; two of the palette have less on white, and dashes beside their colour.
+    /// WCAG asks for a contrast of 3 to 1 in graphics. Two colours of the palette have less on white, but lines also
+    /// differ in their dashes.
     #[test]
     fn lines_are_seen_on_white_and_on_a_dark_page() {
         let dark = luminance((0x17, 0x1a, 0x1d)); // report/style.css

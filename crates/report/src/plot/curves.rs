@@ -20,7 +20,7 @@ pub enum CurveQuantity {
 }
 
 impl CurveQuantity {
-    /// Both.
+    /// Both quantities.
     pub const ALL: [CurveQuantity; 2] = [CurveQuantity::Return, CurveQuantity::Success];
 
     fn summary(self, point: &CurvePoint) -> Summary {
@@ -81,7 +81,7 @@ fn line(curve: &Curve, quantity: CurveQuantity, by: BudgetAxis, methods: &[Metho
     PanelLine { index: index_of(methods, &curve.method), points: curve.points(by).iter().map(point).collect() }
 }
 
-/// The values that all panels share.
+/// Returns the ranges of the x and y axes, which all panels share.
 fn ranges(curves: &[Curve], quantity: CurveQuantity, by: BudgetAxis) -> (Range<f64>, Range<f64>) {
     let longest = curves.iter().map(|curve| curve.total(by)).fold(0.0, f64::max);
     let x = 0.0..if longest > 0.0 { longest } else { 1.0 };

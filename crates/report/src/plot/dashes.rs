@@ -1,5 +1,6 @@
-//! Dashed lines, cut into their dashes with operations that round alike everywhere. plotters cuts them with the C
-//! library's `hypotf`: as its version rounds, and on Debian 12 one that needs a newer glibc than all the rest.
+//! Dashed lines, cut into their dashes with operations that round alike everywhere. plotters would cut them with the C
+//! library's `hypotf`. Its rounding depends on the library's version, and on Debian 12 it needs a newer glibc than the
+//! rest of the program.
 
 /// The dashes of the line through these points, each a line of its own. It begins with a whole dash, and goes on around
 /// corners. Lengths are in the unit of the points, and above 0.

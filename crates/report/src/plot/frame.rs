@@ -9,15 +9,16 @@ use super::canvas::{CanvasPoint, LINE, LineStyle, PlotCanvas, TICK, TextAnchor, 
 use super::colours::GRID;
 use super::ticks::round_ticks;
 
-/// Between two numbers along an axis, at least.
+/// Least gap between two numbers along an axis, units.
 const BETWEEN: f64 = 6.0;
-/// Between the first and the last, where those between have no number: a space.
+/// Least gap between the first and the last number, where the ticks between have none, units. It is the width of a
+/// space.
 const SPACE: f64 = 4.6;
-/// A number goes so far beyond its frame, which may have a neighbour.
+/// Most that a number may stand out beyond its frame, which may have a neighbour, units.
 const BEYOND: f64 = 2.0;
 /// The most ticks at an axis.
 const MAX_TICKS: usize = 6;
-/// Lines at ticks.
+/// The style of the grid lines behind a chart.
 const BEHIND: LineStyle = LineStyle { colour: GRID, width: 1, dashes: None };
 /// Height of the x axis' numbers with their ticks.
 pub(super) const NUMBERS: f64 = LINE + 5.0;
@@ -56,7 +57,8 @@ impl Frame {
         self.bottom() - self.height * share(&self.y, value)
     }
 
-    /// With their numbers, all or as many as have room: the first and the last, or the last alone.
+    /// Returns the x ticks with their numbers. If not all numbers have room, only the first and the last tick have one,
+    /// or the last alone.
     fn x_ticks(&self) -> Vec<(f64, Option<String>)> {
         let sets: Vec<_> = (2..=MAX_TICKS).rev().map(|most| round_ticks(&self.x, most)).collect();
         // A single number would not say how far it is to the next.
@@ -73,13 +75,13 @@ impl Frame {
         numbered(&ticks, |index| index + 1 == ticks.len())
     }
 
-    /// Between the numbers of two ticks.
+    /// Returns the gap between the numbers of two ticks, units.
     fn gap(&self, left: &(f64, String), right: &(f64, String)) -> f64 {
         let middle = |(value, number): &(f64, String)| self.number(*value, number);
         middle(right) - middle(left) - (text_width(&left.1) + text_width(&right.1)) / 2.0
     }
 
-    /// The middle of the number below a tick.
+    /// Returns the x position of the middle of the number below a tick.
     fn number(&self, value: f64, number: &str) -> f64 {
         let half = text_width(number) / 2.0 - BEYOND;
         self.x(value).clamp(self.left + half, (self.right() - half).max(self.left + half))
@@ -107,7 +109,7 @@ fn share(range: &Range<f64>, value: f64) -> f64 {
 }
 
 impl<DB: DrawingBackend> PlotCanvas<'_, DB> {
-    /// The frame's edges; with lines behind what will be drawn, at the ticks.
+    /// Draws the frame's edges, and grid lines at the ticks if `with_lines` is set.
     pub(super) fn frame(&self, frame: &Frame, with_lines: bool) -> Result<(), PlotError> {
         let Frame { left, top, .. } = *frame;
         let (right, bottom) = (frame.right(), frame.bottom());
@@ -122,7 +124,7 @@ impl<DB: DrawingBackend> PlotCanvas<'_, DB> {
         self.line(&[(left, top), (left, bottom), (right, bottom)], TICK)
     }
 
-    /// Below the frame, with numbers if they are wanted.
+    /// Draws the ticks below the frame, with their numbers if `numbers` is set.
     pub(super) fn x_ticks(&self, frame: &Frame, numbers: bool) -> Result<(), PlotError> {
         let bottom = frame.bottom();
         for (value, number) in frame.x_ticks() {
@@ -135,7 +137,7 @@ impl<DB: DrawingBackend> PlotCanvas<'_, DB> {
         Ok(())
     }
 
-    /// Left of the frame, with numbers if they are wanted.
+    /// Draws the ticks left of the frame, with their numbers if `numbers` is set.
     pub(super) fn y_ticks(&self, frame: &Frame, numbers: bool) -> Result<(), PlotError> {
         for (value, number) in frame.y_ticks() {
             let y = frame.y(value);

@@ -1,5 +1,6 @@
-//! Heatmaps side by side, of policies that were trained on different things: mean return and, below it, success over two
-//! parameters, with the boxes of R and E and the default. All share their axes, and each of the two its colours.
+//! Heatmaps of policies with different training distributions, side by side. The upper row shows mean return over two
+//! parameters, the lower one success. Both show the boxes of R and E and the default. All heatmaps share their axes,
+//! and those of one quantity share its colour scale.
 
 mod scale;
 mod surfaces;
@@ -23,7 +24,7 @@ const FEWER: usize = 3;
 /// Widest, lowest and highest panel.
 const WIDEST: f64 = 210.0;
 const HEIGHTS: Range<f64> = 96.0..150.0;
-/// Between panels, and between what stands below each other.
+/// Gap between panels, and between a panel and the texts below it, units.
 const GAP: f64 = 9.0;
 /// Height of the colour scale.
 const BAR: f64 = 10.0;
@@ -32,7 +33,7 @@ const RANDOM: [LineStyle; 2] = [outline(BLACK, 4), outline(WHITE, 2)];
 const EXTREME: [LineStyle; 2] = [outline(WHITE, 4), outline(RGBColor(200, 30, 30), 2)];
 /// Inset that keeps a box inside the frame.
 const WITHIN: f64 = 2.0;
-/// The legend's samples.
+/// Width and height of a sample in the legend, units.
 const SAMPLE: (f64, f64) = (24.0, 14.0);
 
 const fn outline(colour: RGBColor, width: u32) -> LineStyle {
@@ -42,13 +43,13 @@ const fn outline(colour: RGBColor, width: u32) -> LineStyle {
 /// Heatmaps over the same two parameters.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeatmapPanels {
-    /// Above all: what it is of, and how it was made.
+    /// The lines above all panels: the subject, and how the heatmaps were made.
     pub title: Vec<String>,
-    /// x and y.
+    /// The x and y axes.
     pub axes: [Axis; 2],
     /// The scale of mean returns.
     pub returns: Range<f64>,
-    /// From left to right.
+    /// The columns from left to right.
     pub columns: Vec<HeatmapColumn>,
 }
 
@@ -115,13 +116,13 @@ impl Plot for HeatmapPanels {
         self.key(&canvas, top + LINE)
     }
 
-    /// The surfaces, thousands of rectangles, as a path for each colour.
+    /// Replaces the thousands of rectangles of the surfaces by a path for each colour.
     fn finish(&self, svg: String) -> String {
         surfaces::as_paths(&svg)
     }
 }
 
-/// The most lines that one of several texts has.
+/// Returns the number of lines of the longest text.
 fn most(texts: &[Vec<String>]) -> f64 {
     texts.iter().map(Vec::len).max().unwrap_or(0) as f64
 }
@@ -143,7 +144,7 @@ impl HeatmapPanels {
         self.columns.chunks(self.per_row())
     }
 
-    /// A panel's.
+    /// Returns the width and height of a panel.
     fn size(&self) -> (f64, f64) {
         let [_, y] = &self.axes;
         let left = MARGIN + NAME + y_numbers_width(&(y.low..y.high), HEIGHTS.start);
@@ -233,13 +234,13 @@ impl HeatmapPanels {
 }
 
 impl<DB: DrawingBackend> PlotCanvas<'_, DB> {
-    /// The colours of a heatmap: neighbours of one colour are one rectangle.
+    /// Draws the surface of a heatmap. Neighbours of the same colour form one rectangle.
     fn surface(&self, frame: &Frame, heatmap: &Heatmap, quantity: &HeatmapQuantity) -> Result<(), PlotError> {
         let ((left, top), (right, bottom)) =
             (self.at((frame.left, frame.top)), self.at((frame.right(), frame.bottom())));
         let (width, height, grid) = (right - left, bottom - top, heatmap.grid as i32);
         let edge = |length: i32, index: usize| length * index as i32 / grid;
-        // Behind them what is between: printers that smooth edges let it through.
+        // Renderers that smooth edges let the background through between rectangles, so it gets the mean colour.
         let (low, high) = (quantity.range.start, quantity.range.end);
         let shares =
             heatmap.points.iter().map(|point| (((quantity.value)(point) - low) / (high - low)).clamp(0.0, 1.0));
@@ -277,7 +278,7 @@ impl<DB: DrawingBackend> PlotCanvas<'_, DB> {
         self.lines(&lines, (frame.middle().0, first), TextAnchor::Middle).map(|_| ())
     }
 
-    /// A box, in one line within another.
+    /// Draws a box of two lines, the second on top of the wider first one.
     fn outline(
         &self,
         [(left, top), (right, bottom)]: [CanvasPoint; 2],
@@ -296,7 +297,7 @@ impl<DB: DrawingBackend> PlotCanvas<'_, DB> {
         Ok(())
     }
 
-    /// The default: a ring in black within a white one.
+    /// Marks the default parameters by a black ring on a wider white one.
     fn mark(&self, at: CanvasPoint) -> Result<(), PlotError> {
         [(WHITE, 5), (BLACK, 2)]
             .into_iter()

@@ -1,4 +1,4 @@
-//! Numbers with their intervals, in groups below each other, and others to compare them with.
+//! Numbers with their intervals, in groups below each other. Each may stand beside another number to compare it with.
 
 use std::ops::Range;
 
@@ -12,7 +12,7 @@ use super::{Plot, PlotError, WIDTH};
 
 /// Maximum width of names.
 const NAMES: f64 = 150.0;
-/// Around what belongs to a row, and a group.
+/// Gap around a row and around a group, units.
 const GAP: f64 = 5.0;
 /// Distance of a number from the middle of its row, if a number to compare with is on the other side.
 const APART: f64 = 4.5;
@@ -24,7 +24,7 @@ const CAP: f64 = 3.5;
 /// Rows in groups that share their x axis.
 #[derive(Clone, Debug, PartialEq)]
 pub struct IntervalPlot {
-    /// Above all.
+    /// The title above all groups.
     pub(crate) title: String,
     /// The name of the axis.
     pub(crate) x_name: String,
@@ -32,7 +32,7 @@ pub struct IntervalPlot {
     pub(crate) groups: Vec<Group>,
     /// The legend's texts for a number, its interval, and the number to compare with; the last two may be empty.
     pub(crate) legend: [String; 3],
-    /// Below all.
+    /// The note below all groups.
     pub(crate) note: String,
 }
 
@@ -43,7 +43,7 @@ pub(crate) struct Group {
     pub(crate) rows: Vec<IntervalRow>,
 }
 
-/// A number.
+/// A number with its interval.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct IntervalRow {
     pub(crate) name: String,

@@ -1,8 +1,8 @@
 //! Pictures, as SVG and PNG.
 //!
-//! All are made for a printed column: as wide as one, with texts that are read there, and what does not fit beside each
-//! other below each other, so that they fit a telephone as well. Lines have the colours of Okabe and Ito and dashes, which
-//! print keeps; surfaces have viridis. Ticks are round in all of them.
+//! All pictures fit a printed column: they have its width, and their texts are readable in it. Panels that do not fit
+//! side by side stand below each other, so pictures fit a telephone as well. Lines have the colours of Okabe and Ito,
+//! and dashes for print without colour. Surfaces have viridis. Ticks are at round numbers.
 
 mod canvas;
 mod colours;
@@ -29,7 +29,7 @@ pub use panels::Panels;
 use perturb_experiment::FolderError;
 use perturb_files::{FileError, write_atomically};
 
-/// DejaVu Sans, cut down to the letters that pictures have; its licence is beside it.
+/// DejaVu Sans with only the letters that pictures need. Its licence is in the same folder.
 const FONT: &[u8] = include_bytes!("../../data/fonts/DejaVuSans-subset.ttf");
 /// The font family in an SVG.
 pub const FAMILY: &str = "sans-serif";
@@ -60,10 +60,10 @@ pub trait Plot {
     /// Returns the height, units.
     fn height(&self) -> u32;
 
-    /// Draws it.
+    /// Draws the picture.
     ///
     /// # Errors
-    /// The backend's.
+    /// Errors of the backend.
     fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError>;
 
     /// Post-processes the SVG.
@@ -86,7 +86,7 @@ pub fn svg(plot: &impl Plot) -> Result<String, PlotError> {
         plot.draw(&area, SVG_SCALE)?;
         area.present().map_err(drawing)?;
     }
-    // The library takes steps for pixels; its `viewBox` stays.
+    // The library writes the size in steps. Only `width` and `height` become units; the `viewBox` stays in steps.
     let size = |(width, height): (u32, u32)| format!("width=\"{width}\" height=\"{height}\"");
     Ok(plot.finish(text.replacen(&size(steps), &size((width, height)), 1)))
 }
@@ -114,7 +114,7 @@ pub fn png(plot: &impl Plot) -> Result<Vec<u8>, PlotError> {
     Ok(file)
 }
 
-/// Writes a picture as SVG and as PNG, each in one piece: `path` with these endings.
+/// Writes a picture as SVG and as PNG. Adds `.svg` and `.png` to `path`, and replaces each file atomically.
 ///
 /// # Errors
 /// [`PlotError`].

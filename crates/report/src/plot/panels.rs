@@ -12,7 +12,7 @@ use super::{Plot, PlotError, WIDTH};
 
 /// Height of a panel's frame.
 const HEIGHT: f64 = 128.0;
-/// Between two panels, and around the legend.
+/// Gap between two panels and around the legend, units.
 const GAP: f64 = 8.0;
 /// Length of a line's sample in the legend, and the gap between columns below it.
 const SAMPLE: f64 = 30.0;
@@ -23,12 +23,12 @@ const DOT: f64 = 3.0;
 /// The range of a success rate, %, with room for lines at its ends.
 pub(crate) const RATES: Range<f64> = -2.0..102.0;
 
-/// Panels that share their legend. Where their x axes are the same, the lowest has its numbers.
+/// Panels that share a legend. Of successive panels with the same x axis, only the lowest shows its numbers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Panels {
-    /// Above all.
+    /// The title above all panels.
     pub(crate) title: String,
-    /// From above to below.
+    /// The panels from top to bottom.
     pub(crate) panels: Vec<PlotPanel>,
     /// The names of the lines by index.
     pub(crate) legend: Vec<String>,
@@ -50,7 +50,7 @@ pub(crate) struct PlotPanel {
 /// A line with its band.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct PanelLine {
-    /// In the legend.
+    /// The index of the line's name in the legend.
     pub(crate) index: usize,
     pub(crate) points: Vec<PanelPoint>,
 }
@@ -103,13 +103,13 @@ impl Panels {
         wrapped(&self.note, INSIDE)
     }
 
-    /// Whether the panel below has another.
+    /// Whether the panel has an x axis: the last panel, and a panel whose next one has a different axis.
     fn has_x_axis(&self, index: usize) -> bool {
         let axis = |panel: &PlotPanel| (panel.x_name.clone(), panel.x.clone());
         self.panels.get(index + 1).is_none_or(|next| axis(next) != axis(&self.panels[index]))
     }
 
-    /// All frames are as far from the left.
+    /// Returns the frame of a panel. The left edges of all frames are aligned.
     fn frame(&self, panel: &PlotPanel, top: f64) -> Frame {
         let numbers = self.panels.iter().map(|panel| y_numbers_width(&panel.y, HEIGHT)).fold(0.0, f64::max);
         let left = MARGIN + NAME + numbers;
@@ -146,7 +146,7 @@ impl Panels {
         Ok(top + LINE * lines as f64)
     }
 
-    /// All that is drawn: a line for each point, with the names of the axes in `x_name` and `y_name`.
+    /// Returns the drawn numbers as a table with a row for each point. `x_name` and `y_name` are the names of the axes.
     pub(crate) fn table(&self) -> Table {
         let of_panel = |panel: &'_ PlotPanel| {
             let of_line = |line: &PanelLine| {

@@ -2,8 +2,8 @@
 
 use std::ops::Range;
 
-/// At most `most` multiples of 1, 2 or 5 times a power of ten in `range`, both ends included, with what is written there;
-/// the low end alone of a range that is none.
+/// Returns at most `most` ticks in `range`, with their texts. Ticks are multiples of 1, 2 or 5 times a power of ten. An
+/// empty range has a tick at its low end alone.
 pub(super) fn round_ticks(range: &Range<f64>, most: usize) -> Vec<(f64, String)> {
     let span = range.end - range.start;
     if !span.is_finite() || span <= 0.0 {
@@ -29,13 +29,13 @@ pub(super) fn round_ticks(range: &Range<f64>, most: usize) -> Vec<(f64, String)>
     values.into_iter().map(|value| (value, written(value, power, largest))).collect()
 }
 
-/// From a tick to a tick, so that all of `range` is between; a range that is none stays.
+/// Widens `range` outwards to the next ticks. An empty range stays as it is.
 pub(super) fn rounded(range: &Range<f64>) -> Range<f64> {
     match round_ticks(range, 6)[..] {
         [(first, _), (second, _), ..] => {
             let step = second - first;
             let slack = 1e-9;
-            // Without the noise of binary fractions.
+            // Removes rounding errors of binary fractions.
             let tidy = |number: f64| format!("{number:.9e}").parse().unwrap_or(number);
             tidy((range.start / step + slack).floor() * step)..tidy((range.end / step - slack).ceil() * step)
         }
@@ -43,7 +43,8 @@ pub(super) fn rounded(range: &Range<f64>) -> Range<f64> {
     }
 }
 
-/// With as many digits as multiples of that power of ten need, in the unit that suits the axis's largest value.
+/// Formats a tick with the digits that multiples of ten to the `power` need. `largest`, the axis's largest value,
+/// decides whether numbers are written in thousands (k) or millions (M).
 fn written(value: f64, power: i32, largest: f64) -> String {
     // Adding 0 makes a negative zero positive.
     if power < 0 {
@@ -58,7 +59,7 @@ fn written(value: f64, power: i32, largest: f64) -> String {
     }
 }
 
-/// A number at an axis: short, and without the noise of binary fractions.
+/// Formats a number at an axis: short, and without rounding errors of binary fractions.
 fn tick(number: f64) -> String {
     let digits = match number.abs() {
         1e6.. => return format!("{}M", (number / 1e5).round() / 10.0),

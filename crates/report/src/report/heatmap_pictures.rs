@@ -23,15 +23,15 @@ use crate::plot::{HeatmapColumn, HeatmapPanels, PlotError, common_returns};
 /// distribution. Each column is the mean over runs.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct HeatmapPictures {
-    /// Those of which something is there.
+    /// The pictures that have at least one heatmap.
     pub pictures: Vec<Picture>,
-    /// Number of heatmaps that there could be.
+    /// Number of heatmaps, with the missing ones.
     pub total: usize,
-    /// Reasons why others of these are not there.
+    /// Reasons for the missing heatmaps.
     pub missing: Vec<NoHeatmap>,
 }
 
-/// A picture in the making: its scale is that of all of its environment.
+/// A picture before its colour scale is known, which all pictures of an environment share.
 struct Draft<'a> {
     environment: &'a str,
     method: &'a Method,
@@ -39,7 +39,7 @@ struct Draft<'a> {
     columns: Vec<PictureColumn<'a>>,
 }
 
-/// The policies that were trained on the same.
+/// The policies with the same training distribution.
 struct PictureColumn<'a> {
     trained_on: TrainedOn<'a>,
     /// Number of policies, with and without a heatmap.
@@ -125,7 +125,8 @@ fn shown<'a>(
     Ok(ShownPolicy { trained_on: place.trained_on, run: place.run, content })
 }
 
-/// The heatmaps of an agent that was trained elsewhere, in the order of cells' ones; of a row of cells none.
+/// Returns the heatmaps of an agent that was trained elsewhere, in the same order as those of cells. Empty for other
+/// rows.
 fn shown_elsewhere<'a>(row: &MethodResults<'a>) -> Vec<(HeatmapKind, ShownPolicy<'a>)> {
     let mut all = Vec::new();
     for (&run, of_run) in &row.runs {
@@ -210,7 +211,7 @@ impl<'a> Draft<'a> {
         )
     }
 
-    /// A line for each column and point.
+    /// Returns the numbers as a table with a row for each column and point.
     fn table(&self, kind: &HeatmapKind) -> Table {
         let of_column = |column: &'_ PictureColumn<'a>| {
             let (trained_on, runs) = (column.trained_on.to_string(), column.origins.len());
@@ -261,8 +262,8 @@ impl HeatmapPictures {
     }
 }
 
-/// Writes all pictures into the folder `out`, and deletes those that it has of heatmaps that are gone; the names, without
-/// endings, of what was written.
+/// Writes all pictures into the folder `out`. Deletes earlier heatmap pictures in it that are not among them. Returns
+/// the names of the written files without extensions.
 ///
 /// # Errors
 /// [`PlotError`].
@@ -278,7 +279,7 @@ pub fn save_heatmaps<'a>(all: &'a HeatmapPictures, out: &Path) -> Result<Vec<&'a
     Ok(written)
 }
 
-/// Reasons, each once.
+/// Joins the distinct reasons.
 fn said<'a>(missing: impl Iterator<Item = &'a (u32, NoHeatmap)>) -> String {
     distinct(missing.map(|(_, why)| why.to_string())).join("; ")
 }

@@ -74,7 +74,7 @@ impl ReportBundle<'_> {
         Ok(page(report, &finding, &shown, &missing).into_string())
     }
 
-    /// Tables, of each environment with its figure.
+    /// Returns the tables of the metrics, each environment's with its figure.
     fn metrics(&self) -> Result<Vec<Subsection>, PlotError> {
         let pictures = self.report.environment_pictures();
         let with_figure = |table: Table| {
@@ -314,7 +314,7 @@ fn by_environment(pictures: &[Picture]) -> Result<Vec<Subsection>, PlotError> {
     pictures.chunk_by(|a, b| a.environment == b.environment).map(subsection).collect()
 }
 
-/// Side by side where there is room.
+/// Returns the pictures as figures, side by side where there is room.
 fn figures(pictures: &[Picture]) -> Result<Markup, PlotError> {
     let figures = pictures.iter().map(figure).collect::<Result<Vec<_>, _>>()?;
     Ok(html! { @if !figures.is_empty() { div.figures { @for one in figures { (one) } } } })
@@ -338,7 +338,7 @@ fn figure(Picture { file, name, caption, drawing, data, .. }: &Picture) -> Resul
     })
 }
 
-/// An address that has `content` in it, so that links lead somewhere wherever the page is.
+/// Returns a `data:` address that holds `content`, so that links work wherever the page is.
 fn data_uri(media_type: &str, content: &[u8]) -> String {
     format!("data:{media_type};charset=utf-8,{}", percent_encode(content, ENCODED))
 }
@@ -347,7 +347,7 @@ fn list(notes: &[String]) -> Markup {
     html! { @if !notes.is_empty() { ul.missing { @for note in notes { li { (prose(note)) } } } } }
 }
 
-/// A sentence, in which `names` stand between backticks.
+/// Returns a text in which words between backticks are set as code.
 fn prose(text: &str) -> Markup {
     html! { @for (i, part) in text.split('`').enumerate() { @if i % 2 == 1 { code { (part) } } @else { (part) } } }
 }

@@ -7,16 +7,16 @@ use perturb_protocol::Version;
 use perturb_records::TrainedOn;
 use perturb_settings::Method;
 
-/// Environments, methods and tests of a report, in its order.
+/// Environments, methods and tests of a report, in the order in which it shows them.
 #[derive(Clone, Debug)]
 pub(super) struct ReportIndex<'a> {
-    /// Over which methods are averaged: the plan's; of a report without one all.
+    /// The environments of averages: the plan's, or all if there is no plan.
     pub(super) averaged: Vec<&'a str>,
-    /// All that have rows.
+    /// All environments that have rows.
     pub(super) environments: Vec<&'a str>,
-    /// All that have rows.
+    /// All methods that have rows.
     pub(super) methods: Vec<Method>,
-    /// The names of what was tested on.
+    /// The names of the test sets.
     pub(super) tested_on: Vec<&'a str>,
 }
 
@@ -35,12 +35,12 @@ impl<'a> ReportIndex<'a> {
     }
 }
 
-/// The version of that name.
+/// Returns the version called `name`.
 pub(super) fn version(name: &str) -> Option<Version> {
     Version::KNOWN.into_iter().find(|version| version.to_string() == name)
 }
 
-/// Whether a row has places among the scenarios: nobody knows what some agents were trained on.
+/// Whether a row belongs among the scenarios. Agents whose training distribution is unknown do not.
 pub(super) fn has_scenarios(row: &MethodResults<'_>) -> bool {
     !row.method.external || trained_on(row).iter().any(|one| matches!(one, TrainedOn::Version(_)))
 }

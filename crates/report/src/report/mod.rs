@@ -85,14 +85,14 @@ impl<'a> Report<'a> {
         format!("{}\n{}", self.sentences().join("\n"), shown.collect::<String>())
     }
 
-    /// For GitHub and the like.
+    /// Renders the report as Markdown, for GitHub for example.
     pub fn markdown(&self) -> String {
         let shown = self.tables().map(|table| format!("\n## {}\n\n{}\n", table.title, table.to_markdown()));
         format!("# Results\n\n{}\n{}", self.sentences().join("\n\n"), shown.collect::<String>())
     }
 
-    /// The numbers as pictures, as far as there are some: the finding, that of each environment, performance profiles,
-    /// and success over parameters.
+    /// Returns the pictures that there are numbers for: the main result, each environment, performance profiles, and
+    /// success over parameters.
     pub fn pictures(&self) -> Vec<Picture> {
         let finding = self.finding_pictures().into_iter().chain(self.environment_pictures());
         finding.chain(self.profiles_picture()).chain(self.parameter_pictures()).collect()
@@ -108,7 +108,7 @@ impl<'a> Report<'a> {
         numbers.chain(self.iqm_table()).chain(self.comparisons_table())
     }
 
-    /// All cells that numbers come from.
+    /// Returns all cells that the report's numbers come from.
     fn selected(&self) -> Vec<Selected<'a>> {
         let runs = self.selections.iter().flat_map(|selection| selection.runs.values());
         runs.flat_map(|run| run.selected.values().flatten()).filter_map(Reported::cell).collect()

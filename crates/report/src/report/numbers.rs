@@ -16,12 +16,12 @@ use super::index::{ReportIndex, has_scenarios};
 const RESAMPLES: usize = 50_000;
 /// Number of bootstrap resamples with a selection in each, which costs hundreds of times more.
 const N_BOOTSTRAP_SELECTION: usize = 10_000;
-/// The best success rate, %, from which the optimality gap is.
+/// The best success rate, %. The optimality gap is the distance from it.
 const MAX_SUCCESS: f64 = 100.0;
 /// The name of all environments together, here and in the paper.
 pub(super) const AVERAGE: &str = "Average";
 
-/// A method's metrics in an environment, or over all; a metric that is not known is not there.
+/// A method's metrics in an environment or over all environments. Unknown metrics are left out.
 pub(super) struct MethodMetrics<'a> {
     pub(super) environment: &'a str,
     pub(super) method: Method,
@@ -29,7 +29,7 @@ pub(super) struct MethodMetrics<'a> {
     /// The range of `ours` over the choices among tied configurations.
     pub(super) ties: BTreeMap<Metric, TieRange>,
     pub(super) papers: BTreeMap<Metric, Summary>,
-    /// Whether one can be compared with the other.
+    /// Whether `ours` can be compared with `papers`.
     pub(super) comparable: bool,
     /// The means of `ours` again, with intervals where there are enough runs for one.
     pub(super) means: BTreeMap<Metric, Bootstrapped>,
@@ -39,14 +39,14 @@ pub(super) struct MethodMetrics<'a> {
     pub(super) iqms: BTreeMap<Metric, Bootstrapped>,
     /// Optimality gaps, over all environments only.
     pub(super) gaps: BTreeMap<Metric, Bootstrapped>,
-    /// Both once more, with every selection made anew in each resample.
+    /// Interquartile means and optimality gaps, with every selection repeated in each resample.
     pub(super) reselected: BTreeMap<Metric, [Bootstrapped; 2]>,
     pub(super) done: usize,
     pub(super) cells: usize,
 }
 
 impl MethodMetrics<'_> {
-    /// Ours less the paper's, if that says something.
+    /// Returns our mean minus the paper's. `None` if they cannot be compared, or one is missing.
     pub(super) fn difference(&self, metric: Metric) -> Option<f64> {
         self.comparable.then_some(())?;
         Some(self.ours.get(&metric)?.mean - self.papers.get(&metric)?.mean)
@@ -83,7 +83,7 @@ pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics
     selections.iter().filter(|row| has_scenarios(row)).map(of_selection).collect()
 }
 
-/// Averaged over the plan's environments.
+/// Returns the metrics of each method, averaged over the plan's environments.
 pub(super) fn averages<'a>(
     scope: &ReportIndex<'_>,
     selections: &[MethodResults<'a>],
@@ -134,7 +134,7 @@ pub(super) fn counted(selection: &MethodResults<'_>, trained_on: TrainedOn<'_>, 
     tests.map(of).sum()
 }
 
-/// A field of a file.
+/// Returns a number as a CSV field, which is empty for `None`.
 pub(super) fn or_empty(number: Option<impl ToString>) -> String {
     number.map(|number| number.to_string()).unwrap_or_default()
 }

@@ -13,17 +13,17 @@ use crate::plot::{HeatmapPanels, IntervalPlot, Panels, Plot, PlotError, save};
 /// A picture.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Picture {
-    /// The environment; empty for all together.
+    /// The environment; empty for a picture of all environments.
     pub environment: String,
     /// The names of the files, without extension.
     pub file: String,
-    /// A few words for those who do not see it.
+    /// Alternative text.
     pub name: String,
     /// The caption.
     pub caption: String,
     /// The drawing.
     pub drawing: PictureDrawing,
-    /// The numbers of it.
+    /// The drawn numbers.
     pub data: Table,
 }
 
@@ -64,7 +64,7 @@ impl Plot for PictureDrawing {
 }
 
 impl Picture {
-    /// Writes it into the folder `out` as SVG, PNG and CSV.
+    /// Writes the picture into the folder `out` as SVG, PNG and CSV.
     ///
     /// # Errors
     /// [`PlotError`].

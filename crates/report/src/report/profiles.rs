@@ -64,7 +64,7 @@ impl Report<'_> {
             .build()
     }
 
-    /// `None` without a profile.
+    /// Returns the picture of the profiles; `None` if there are none.
     pub(super) fn profiles_picture(&self) -> Option<Picture> {
         self.profiles.first()?;
         let methods = &self.scope.methods;

@@ -15,7 +15,7 @@ use super::finding::listed;
 /// The paper's budgets.
 const PAPER_EPISODES: u64 = 15_000;
 const PAPER_TEST_EPISODES: u64 = 1000;
-/// Maximum number of failures whose reason is told.
+/// Maximum number of failures that the report explains.
 const MAX_REASONS: usize = 3;
 
 /// Returns the sentences, with `names` between backticks.
@@ -77,7 +77,7 @@ pub(super) fn sentences(
     lines
 }
 
-/// By which rule configurations are selected, and on which seeds.
+/// Describes the rule and the seeds that select configurations.
 fn rule(plan: &Plan) -> String {
     let tuning = seeds(plan.cells.iter().filter(|cell| cell.tuned_as.is_none()));
     match plan.selection {
@@ -105,7 +105,7 @@ fn seeds<'a>(cells: impl Iterator<Item = &'a Cell>) -> String {
     }
 }
 
-/// The number that all cells have, or the least and the most.
+/// Returns the number that all cells have, or the least and the greatest: "5 to 9".
 fn range(cells: &[Cell], of: fn(&Cell) -> u64) -> String {
     let numbers: BTreeSet<u64> = cells.iter().map(of).collect();
     match (numbers.first(), numbers.last()) {

@@ -1,4 +1,4 @@
-//! From what a report is made: an experiment's folder or a study of a results table, assessments of agents that were
+//! The inputs of a report: an experiment's folder or a study of a results table, assessments of agents that were
 //! trained elsewhere, or both.
 
 use std::path::{Path, PathBuf};
@@ -27,9 +27,9 @@ pub struct ReportInputs {
     pub folder: Option<Folder>,
     /// A study of a results table.
     pub study: Option<StudySource>,
-    /// In the place of its plan's.
+    /// The selection rule to use instead of the plan's.
     pub rule: Option<Selection>,
-    /// In the order of their rows.
+    /// The assessments of agents that were trained elsewhere, in the order of their rows.
     pub assessed: Vec<ExternalEvaluation>,
 }
 
@@ -65,13 +65,13 @@ pub enum ReportError {
     Records(#[from] RecordsError),
     #[error(transparent)]
     Table(#[from] TableError),
-    /// A table has no such study, or several of which none was named.
+    /// A table has no study of this name, or has several studies and the path names none.
     #[error(
         "{} has no study `{study}`: give one of them as {}/STUDY: {}",
         table.display(), table.display(), known.join(", ")
     )]
     NoStudy { table: PathBuf, study: String, known: Vec<String> },
-    /// A folder has neither.
+    /// A folder has neither an experiment nor an assessment.
     #[error(
         "{} holds neither an experiment (plan.toml) nor an assessment (assessment.json): give the --out of `perturb run`, \
          the folder of Assessment.save, or the study of a results table, FILE.parquet/STUDY",
@@ -83,13 +83,13 @@ pub enum ReportError {
     Experiments { first: PathBuf, second: PathBuf },
 }
 
-/// A report with what is drawn beside its own numbers.
+/// A report with its training curves, comparisons and heatmaps.
 pub struct ReportBundle<'a> {
     /// The numbers.
     pub report: Report<'a>,
     /// The training curves.
     pub curves: &'a [EnvironmentCurves],
-    /// Agents that were trained elsewhere, compared where there are several.
+    /// Comparisons of agents that were trained elsewhere, for environments with several of them.
     pub comparisons: Vec<EnvironmentComparison>,
     /// The heatmaps.
     pub heatmaps: &'a HeatmapPictures,

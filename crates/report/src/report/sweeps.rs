@@ -151,7 +151,7 @@ impl Report<'_> {
         }
     }
 
-    /// `rows` are those of one parameter.
+    /// Returns the panel of a parameter, whose rows are `rows`.
     fn parameter_panel(&self, rows: &[&SweepPoint<'_>]) -> PlotPanel {
         let RecordedParameter { name, unit, .. } = rows[0].parameter;
         // A line ends where a test ends, and where it draws nothing.

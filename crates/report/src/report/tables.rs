@@ -13,11 +13,11 @@ use super::{MISSING, Report};
 /// The text for a number that the paper does not have.
 const NOT_GIVEN: &str = "–";
 
-/// Results, and what their policies were trained on.
+/// A row of results, and the distribution that its policies were trained on.
 pub(super) type ScenarioRow<'r, 'a> = (&'r MethodResults<'a>, TrainedOn<'a>);
 
 impl Report<'_> {
-    /// The three metrics, averaged where there are several environments, and of each.
+    /// Returns the tables of the three metrics: the average if there are several environments, then each environment.
     pub(super) fn metrics_tables(&self) -> Vec<Table> {
         let environments = &self.scope.averaged;
         let averages = (environments.len() > 1)
@@ -95,13 +95,13 @@ impl Report<'_> {
         self.scenario_rows().chunk_by(|a, b| a.0.environment == b.0.environment).map(table).collect()
     }
 
-    /// Each row of results with each thing that it was trained on.
+    /// Returns each row of results once for each distribution that its policies were trained on.
     pub(super) fn scenario_rows(&self) -> Vec<ScenarioRow<'_, '_>> {
         let of = |row| trained_on(row).into_iter().map(move |train| (row, train));
         self.selections.iter().flat_map(of).collect()
     }
 
-    /// The tests that a row has places for; of agents that were trained elsewhere, those that they have.
+    /// Returns the tests to list for a row. Agents that were trained elsewhere have only the tests that were run.
     pub(super) fn tests_of<'r>(
         &'r self,
         (row, train): ScenarioRow<'r, 'r>,

@@ -1,4 +1,4 @@
-//! The head of a report: its title, and in which paragraphs the plan says what it is.
+//! The head of a report: its title, and the plan's description of itself.
 
 use super::Report;
 use super::finding::listed;
@@ -7,7 +7,7 @@ use super::finding::listed;
 const MAX_NAMED: usize = 3;
 
 impl Report<'_> {
-    /// The plan's, or what it is of.
+    /// Returns the plan's title, or one with the methods and environments.
     pub(super) fn title(&self) -> String {
         if !self.plan.title.is_empty() {
             return self.plan.title.clone();
@@ -20,7 +20,7 @@ impl Report<'_> {
         format!("Generalisation of {methods} on {}", listed(&self.scope.environments))
     }
 
-    /// The paragraphs in which the plan says what it is.
+    /// Returns the plan's description of itself, as paragraphs.
     pub(super) fn abstract_paragraphs(&self) -> Vec<String> {
         opening_comment(&self.plan.text)
     }

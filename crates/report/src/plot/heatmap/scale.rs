@@ -6,8 +6,8 @@ use perturb_records::Heatmap;
 
 use crate::plot::ticks::rounded;
 
-/// The scales of the paper's environments, so that pictures of one can be compared wherever they were made. They end where
-/// little is left to gain: a perfect policy has the last colour, and so has all that is above.
+/// The fixed scales of the paper's environments: (name, low, high). They make pictures from different experiments
+/// comparable. A scale ends where little is left to gain; all higher returns have its last colour.
 const FIXED: [(&str, f64, f64); 6] = [
     // 1 for each of at most 200 steps.
     ("CartPole", 0.0, 200.0),
@@ -22,8 +22,8 @@ const FIXED: [(&str, f64, f64); 6] = [
     ("Hopper", 0.0, 2000.0),
 ];
 
-/// The scale for the mean returns of `heatmaps` in `environment`: fixed for the paper's, of others from the lowest to the
-/// highest of them, rounded outwards.
+/// Returns the colour scale for the mean returns of `heatmaps` in `environment`. The paper's environments have a fixed
+/// scale. Other scales reach from the lowest to the highest return, rounded outwards.
 pub fn common_returns<'a>(environment: &str, heatmaps: impl Iterator<Item = &'a Heatmap>) -> Range<f64> {
     if let Some((_, low, high)) = FIXED.into_iter().find(|(name, ..)| *name == environment) {
         return low..high;

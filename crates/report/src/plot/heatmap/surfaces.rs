@@ -1,10 +1,11 @@
-//! Surfaces in an SVG. The plotting library makes an element of each rectangle: of a picture with six surfaces that is ten
-//! thousand of them, a megabyte, and where the picture is not shown at its own size, thin lines of background between
-//! them. A path for each colour takes a tenth, and its edges are crisp.
+//! Surfaces in an SVG. The plotting library writes an element for each rectangle: ten thousand elements, a megabyte,
+//! for a picture with six surfaces. Scaled pictures also show thin lines of background between the rectangles. A path
+//! for each colour takes a tenth of the bytes, and its edges are crisp.
 
 use std::collections::BTreeMap;
 
-/// `svg` with all filled rectangles that follow each other as paths, by their colours. They must not overlap.
+/// Replaces each run of successive filled rectangles in `svg` by a path for each colour. The rectangles of a run must
+/// not overlap.
 pub(super) fn as_paths(svg: &str) -> String {
     let mut shown = String::new();
     let mut surface: BTreeMap<&str, String> = BTreeMap::new();
@@ -31,7 +32,7 @@ fn flush(surface: &mut BTreeMap<&str, String>, shown: &mut String) {
     }
 }
 
-/// A filled one, as the library writes it.
+/// A filled rectangle, as the library writes it.
 struct Rectangle<'a> {
     colour: &'a str,
     x: &'a str,
