@@ -174,7 +174,7 @@ pub struct Timing {
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum FolderError {
-    /// The operating system refused a file.
+    /// The operating system could not read or write a file.
     #[error(transparent)]
     File(#[from] FileError),
     /// A file is damaged, or a program with another format wrote it.

@@ -33,7 +33,7 @@ pub struct HeatmapPlace<'a> {
     pub method: &'a Method,
     /// The training distribution.
     pub trained_on: TrainedOn<'a>,
-    /// Counted from 1.
+    /// The run, from 1.
     pub run: u32,
     /// The selected policy; `None` if no cell has a result.
     pub selected: Option<Selected<'a>>,
@@ -55,7 +55,7 @@ pub struct HeatmapRecord {
     /// The options of the test.
     #[serde(flatten)]
     pub options: HeatmapOptions,
-    /// x and y.
+    /// The x and y axes.
     pub axes: [Axis; 2],
     /// The program's version and the commit that it was built from.
     pub commit: String,

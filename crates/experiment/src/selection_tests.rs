@@ -30,7 +30,7 @@ fn is_a(cell: &Cell) -> bool {
     cell.config.table()["learning_rate"].as_float() == Some(7e-3)
 }
 
-/// All hand-made; the best on the trained version is marked by *.
+/// Returns made-up rates on D, R and E. A * marks the configuration that is best on its training version.
 fn synthetic(environment: &str, version: Version, name: &str, run: u32) -> Option<([f64; 3], f64)> {
     use Version::{D, E, R};
     let rates = match (environment, version, name, run) {
@@ -167,7 +167,8 @@ fn what_is_missing_is_missing_and_never_zero() {
     assert_eq!(average(&[], Metric::Default), None);
 }
 
-/// Both configurations have 100 % and the same return on what they were trained on; on the other versions they differ.
+/// Returns rates of configurations that tie: equal rates and returns on the training version, different rates
+/// elsewhere.
 fn tied(_: &str, version: Version, name: &str, _: u32) -> Option<([f64; 3], f64)> {
     let rates = match (version, name) {
         (Version::D, "A") => [100.0, 40.0, 10.0],

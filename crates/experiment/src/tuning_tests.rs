@@ -35,7 +35,8 @@ fn is_a(cell: &Cell) -> bool {
 /// the order of A and B is reversed.
 type PolicyMetadata = fn(&str, u64) -> Option<(f64, f64)>;
 
-/// What `known` does not know has failed, if `failed`, or is missing.
+/// Writes the results that `known` returns. Cells for which it returns `None` have failed if `failed` is set, and are
+/// missing otherwise.
 fn done(plan: &Plan, folder: &Folder, known: PolicyMetadata, failed: bool) {
     for cell in &plan.cells {
         let place = folder.cell(&cell.id);

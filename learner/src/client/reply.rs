@@ -5,7 +5,7 @@ use std::ops::Range;
 use perturb_policy::{SlotEnd, StepOutcome};
 use perturb_protocol::EndedEpisode;
 
-/// The reply to a step, in buffers that are used again.
+/// The reply to a step. Its buffers are reused.
 #[derive(Clone, Debug, Default)]
 pub struct StepReply {
     /// `[N, O]` observations; where an episode ended, the first one of the next.

@@ -1,4 +1,4 @@
-//! All logs of a run: created, or cut back to a checkpoint and continued.
+//! The logs of a run. A new run creates them. A resumed run cuts them back to its checkpoint and continues them.
 
 use std::fs::{File, OpenOptions};
 use std::io::ErrorKind;
@@ -41,7 +41,7 @@ pub struct LogLengths {
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum LogError {
-    /// The operating system refused a file.
+    /// The operating system could not read or write a file.
     #[error(transparent)]
     File(#[from] FileError),
     /// A log does not hold what it held when the checkpoint was written.

@@ -44,7 +44,7 @@ pub enum TrainError {
     /// A log cannot be continued.
     #[error(transparent)]
     Log(#[from] LogError),
-    /// The operating system refused a file.
+    /// The operating system could not read or write a file.
     #[error(transparent)]
     File(#[from] FileError),
     /// The served environment has no action space.

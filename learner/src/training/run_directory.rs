@@ -31,7 +31,7 @@ pub enum RunDirectoryError {
         /// The path that was given.
         path: PathBuf,
     },
-    /// Another process trains in it.
+    /// Another process trains in the directory.
     #[error("another process trains in {}; wait until it ends, or choose another directory", path.display())]
     Locked {
         /// The directory.
@@ -82,7 +82,7 @@ pub enum RunDirectoryError {
     /// The checkpoint cannot be read or resumed.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// The operating system refused a file.
+    /// The operating system could not read or write a file.
     #[error(transparent)]
     File(#[from] FileError),
 }

@@ -31,10 +31,10 @@ type PendingReply<'a> =
 /// Collects the rollouts of runs whose policies the server plays.
 pub(super) struct ServerSide<'a> {
     servers: &'a Servers,
-    /// Runs whose server plays nothing: between two rollouts.
+    /// Runs between two rollouts, for which no server plays.
     #[expect(clippy::vec_box, reason = "a lane moves into its pending reply and back, as a pointer")]
     idle: Vec<Box<ServerLane<'a>>>,
-    /// Runs whose server plays.
+    /// Runs for which a server plays a rollout.
     playing: FuturesUnordered<PendingReply<'a>>,
     /// Time in which no run had a rollout to learn from.
     waited: Duration,

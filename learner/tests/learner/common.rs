@@ -54,7 +54,7 @@ pub fn bases(n_steps: usize, n_minibatches: usize, policy: &Policy) -> [Box<dyn 
     ]
 }
 
-/// All that a finished rollout holds; flags are 0 and 1.
+/// Returns all arrays of a finished rollout, with flags as 0 and 1.
 pub fn contents(rollout: &Rollout) -> Vec<Vec<f32>> {
     let flags = |flags: &[bool]| flags.iter().map(|&flag| f32::from(u8::from(flag))).collect::<Vec<_>>();
     let trajectories = rollout.trajectories().expect("a finished rollout");

@@ -328,7 +328,7 @@ fn preset_of_plan_or_table_decides_success_rule() {
     }
 }
 
-/// These are the ids of the program before it had presets.
+/// Cells of the preset "perturb" have the ids that they had before there were presets.
 #[test]
 fn cells_of_the_usual_preset_keep_their_names() {
     let names = |text: &str| -> Vec<String> { parse(text).unwrap().cells.into_iter().map(|cell| cell.id).collect() };

@@ -76,7 +76,8 @@ pub struct RunFolders {
 /// each folder is searched once. With `within`, an absolute path without links, links that lead out of it are not followed.
 ///
 /// # Errors
-/// The operating system's, if `folder` itself cannot be listed. Other folders that cannot be listed are skipped.
+/// Errors of the operating system, if `folder` itself cannot be listed. Other folders that cannot be listed are
+/// skipped.
 pub fn places(folder: &Path, most: usize, within: Option<&Path>) -> files::Result<RunFolders> {
     let mut found = RunFolders::default();
     let mut search = FolderSearch::default();
@@ -156,7 +157,7 @@ pub struct RunSummary {
     pub done: u64,
     /// Total number of these episodes or cells.
     pub budget: u64,
-    /// "episodes" or "cells".
+    /// The unit of `budget`: "episodes" or "cells".
     pub unit: &'static str,
     /// Success: of the last 100 episodes of a training, or over the tests of an assessment or of the cells that are done.
     pub success_percent: Option<f64>,

@@ -28,7 +28,7 @@ pub struct TrainingStatus {
     pub saved: Option<u64>,
     /// The fault of the checkpoint, if it is damaged.
     pub damaged: Option<String>,
-    /// "in work", "finished", "broken off", "without a checkpoint".
+    /// The state: "in work", "finished", "broken off" or "without a checkpoint".
     pub state: &'static str,
     /// Whether the training has ended by its budget or by its success rate. A cell may still be in work then, because
     /// its policy is tested.

@@ -88,7 +88,7 @@ fn attribute<'a>(element: &'a str, name: &str) -> Option<&'a str> {
     element.split_once(&format!(" {name}=\""))?.1.split_once('"').map(|(value, _)| value)
 }
 
-/// 85 mm are 241 pt.
+/// A picture is printed 85 mm wide, which is 241 pt.
 #[test]
 fn texts_have_nine_points_and_stay_inside() {
     for picture in pictures() {
@@ -114,7 +114,7 @@ fn texts_have_nine_points_and_stay_inside() {
     }
 }
 
-/// What style.css exchanges on a dark page is written as it says.
+/// The colours that `style.css` replaces on a dark page are written in the SVG as its selectors expect.
 #[rstest]
 #[case("[fill=\"#FFFFFF\"]", "fill=\"#FFFFFF\"")]
 #[case("[fill=\"#222222\"]", "fill=\"#222222\"")]

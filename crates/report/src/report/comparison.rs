@@ -1,4 +1,4 @@
-//! Conditions compared over seeds and episodes: tables, and a section of pages.
+//! Comparisons of conditions over seeds and episodes, as tables and as a section of a page.
 
 use perturb_experiment::distinct;
 use perturb_records::comparison::{ComparedCondition, ComparedScore, ConditionComparison, compare};
@@ -20,8 +20,8 @@ pub struct EnvironmentComparison {
     pub comparison: ConditionComparison,
 }
 
-/// Compares the success of externally trained agents in the tests that all of them have, in each environment where there
-/// are several. Policies of an agent that were trained on the same are its seeds.
+/// Compares the success of externally trained agents in each environment with several of them, by the tests that all of
+/// them have. An agent's policies with the same training distribution are its seeds.
 pub(super) fn comparisons_of(assessed: &[ExternalEvaluation]) -> Vec<EnvironmentComparison> {
     let environments = distinct(assessed.iter().map(ExternalEvaluation::environment));
     environments.into_iter().filter_map(|environment| comparison_in(environment, assessed)).collect()

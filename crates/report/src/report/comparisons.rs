@@ -1,4 +1,4 @@
-//! Each two methods compared: by runs of the same seed in the same environments.
+//! Comparisons of methods in pairs, by runs with the same seed in the same environments.
 
 use perturb_experiment::{MethodResults, scores};
 use perturb_records::Metric;
@@ -10,14 +10,15 @@ use super::columns::MethodColumns;
 use super::index::ReportIndex;
 use super::{MISSING, Report};
 
-/// Resamples of a bootstrap; there are hundreds of comparisons, of two numbers each.
+/// Number of bootstrap resamples. It is smaller than that of other numbers, because a report may have hundreds of
+/// comparisons.
 const RESAMPLES: usize = 10_000;
 /// Minimum number of runs for a comparison.
 const MIN_RUNS: usize = 2;
 /// The name of all environments together.
 const ALL: &str = "all";
 
-/// Two methods by a metric, over the runs that both have in each of the environments.
+/// A comparison of two methods by a metric, over the runs that both have in each of the environments.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct MethodComparison {
     /// The environment's name, or [`ALL`].
@@ -31,11 +32,11 @@ pub(super) struct MethodComparison {
     improvement: Bootstrapped,
     pairs: usize,
     p: f64,
-    /// Corrected for all comparisons of the same environment.
+    /// The p-value after Holm's correction for all comparisons of the same environment.
     corrected: f64,
 }
 
-/// All comparisons over all environments, then, if there are several, those in each of them.
+/// Returns the comparisons over all environments. If there are several environments, those of each environment follow.
 pub(super) fn comparisons(scope: &ReportIndex<'_>, selections: &[MethodResults<'_>]) -> Vec<MethodComparison> {
     let environments = &scope.averaged;
     if let [environment] = environments[..] {
@@ -45,8 +46,9 @@ pub(super) fn comparisons(scope: &ReportIndex<'_>, selections: &[MethodResults<'
     family(scope, selections, ALL, environments).into_iter().chain(each).collect()
 }
 
-/// The family of comparisons over some environments. Reference lines are not in it: each would cost the others' p-values; nor
-/// are agents that were trained elsewhere, whose runs have no seeds in common with others.
+/// Returns the comparisons over some environments, which are corrected together. Reference lines are left out, because
+/// each would raise the corrected p-values of the others. Agents that were trained elsewhere are left out, because
+/// their runs share no seeds with others.
 fn family(
     scope: &ReportIndex<'_>,
     selections: &[MethodResults<'_>],
@@ -73,7 +75,8 @@ fn family(
     family
 }
 
-/// `scores` are those of x in each environment, then those of y.
+/// Compares x with y. `scores` has x's scores in each environment, then y's. Returns `None` if there are fewer than
+/// [`MIN_RUNS`] runs.
 fn compare(environment: &str, [x, y]: [&Method; 2], metric: Metric, scores: &[Vec<f64>]) -> Option<MethodComparison> {
     let (of_x, of_y) = scores.split_at(scores.len() / 2);
     let difference = |(x, y): (&Vec<f64>, &Vec<f64>)| x.iter().zip(y).map(|(x, y)| x - y).collect();
@@ -101,7 +104,7 @@ fn compare(environment: &str, [x, y]: [&Method; 2], metric: Metric, scores: &[Ve
 }
 
 impl Report<'_> {
-    /// Over all environments; `None` if there is nothing to compare.
+    /// Returns the table of comparisons over all environments; `None` if there is nothing to compare.
     pub(super) fn comparisons_table(&self) -> Option<Table> {
         let first = self.comparisons.first()?;
         let of_all = self.comparisons.chunk_by(|a, b| a.environment == b.environment).next()?;
@@ -146,7 +149,7 @@ impl Report<'_> {
     }
 }
 
-/// A p-value, to three decimals.
+/// Formats a p-value with three decimals.
 pub(super) fn shown(p: f64) -> String {
     if p < 0.0005 {
         "< 0.001".into()

@@ -9,7 +9,7 @@ use super::Report;
 use super::columns::MethodColumns;
 use super::numbers::{MethodMetrics, counted, or_empty};
 
-/// A number of a method by a metric.
+/// Reads a bootstrapped number of a method's metric.
 type BootstrappedOf = fn(&MethodMetrics<'_>, Metric) -> Option<Bootstrapped>;
 
 impl Report<'_> {
@@ -79,7 +79,7 @@ impl Report<'_> {
     }
 }
 
-/// The three metrics of methods, with the t intervals of their means, beside the paper's.
+/// Returns the file of the methods' three metrics, with t intervals of the means and the paper's numbers.
 pub(super) fn metrics_file(name: &str, rows: &[&MethodMetrics<'_>]) -> Table {
     let lines: Vec<_> = rows.iter().flat_map(|row| Metric::ALL.map(|metric| (*row, metric))).collect();
     let end = |(row, metric): &(&MethodMetrics<'_>, Metric), end: usize| {

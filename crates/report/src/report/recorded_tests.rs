@@ -1,4 +1,4 @@
-//! What a report makes of recorded episodes, of several methods with several runs.
+//! Tests of the numbers that a report computes from recorded episodes, with several methods and runs.
 
 use std::collections::BTreeMap;
 
@@ -22,10 +22,10 @@ architectures = ['ff']
 name = 'ppo'
 architectures = ['ff']
 ";
-/// In each test: ten parts of forty, of one parameter.
+/// Episodes of each test: forty in each of ten parts of the parameter's range.
 const EPISODES: u32 = 400;
 
-/// R's lengths are 0.25 … 0.75; E's are on either side.
+/// Returns the pole length of an episode. Lengths of R are 0.25 … 0.75, those of E lie on either side.
 fn length(version: Version, index: u32) -> f64 {
     let place = (f64::from(index) + 0.5) / f64::from(EPISODES);
     match version {
@@ -36,8 +36,8 @@ fn length(version: Version, index: u32) -> f64 {
     }
 }
 
-/// A2C balances a pole of length l for 200 l steps, PPO for 45 more in the first run and 40 less in the second; 100 are a
-/// success.
+/// Returns an episode. A2C balances a pole of length l for 200 l steps. PPO balances it for 45 steps more in the first
+/// run, and 40 fewer in the second. An episode with 100 steps is a success.
 fn episode(cell: &Cell, version: Version, index: u32) -> EpisodeRecord {
     let length = length(version, index);
     let more = match (cell.config.settings.name(), cell.run) {
@@ -71,7 +71,7 @@ fn records(cell: &Cell) -> Records {
     records
 }
 
-/// Rates, %, of the recorded episodes.
+/// Returns results with the success rates of the recorded episodes.
 fn results(plan: &Plan) -> Results<'_> {
     fixture::results(plan, |cell| {
         let records = records(cell);
@@ -103,7 +103,8 @@ fn success_over_parameter_has_a_row_for_each_bin() {
         assert!(of("CartPole,ppo,ff,,D,D").is_empty(), "it does not vary there");
         let on_r = of("CartPole,ppo,ff,,D,R");
         assert_eq!((on_r.len(), of("CartPole,ppo,ff,,D,E").len()), (10, 5), "nothing between E's two intervals");
-        // From 0.55 to 0.6, in the first run 155 to 164 steps, in the second 70 to 79: half of 80 are successes.
+        // Lengths from 0.55 to 0.6 give 155 to 164 steps in the first run and 70 to 79 in the second, so 40 of 80
+        // episodes are successes.
         assert!(
             on_r[6].contains(",2,80,40,50,39.") && on_r[6].starts_with("CartPole,ppo,ff,,D,R,length,m,0.5"),
             "{on_r:?}"

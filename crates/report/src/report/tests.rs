@@ -34,7 +34,8 @@ name = 'ppo'
 architectures = ['ff']
 ";
 
-/// The first run of A2C on D failed; RL²-PPO has nothing on Pendulum, nor a second run.
+/// Returns results in which the first run of A2C on D failed. RL²-PPO has results only on CartPole and in the first
+/// run.
 fn results(plan: &Plan) -> Results<'_> {
     let mut results = fixture::results(plan, |cell| {
         let common = &cell.config.common;
@@ -56,7 +57,7 @@ fn results(plan: &Plan) -> Results<'_> {
     results
 }
 
-/// The name of a snapshot is that of its file, so that files can move with the module.
+/// Snapshots are named after their files alone, so that the files can move with the module.
 #[rstest]
 #[case("text", |report: &Report<'_>| report.text(usize::MAX))]
 #[case("csv", |report: &Report<'_>| {
@@ -98,8 +99,8 @@ fn custom_sets_stand_beside_the_scenarios() {
     assert!(report.provenance.iter().any(|line| line.contains(told)), "{:?}", report.provenance);
 }
 
-/// Two configurations and two tuning seeds. One cell of what is selected failed; what is trained on E waits, and on R nothing
-/// can be selected.
+/// The plan has two configurations and two tuning seeds. On D, a tuning cell of the selected configuration failed. On
+/// R, all tuning cells failed. On E, a tuning cell has no result yet.
 #[test]
 fn clean_report_names_rule_seeds_and_selection() {
     let text = "environments = ['CartPole']\nselection = 'clean'\ntuning_runs = 2\nruns = 2\nselection_episodes = 70
@@ -147,7 +148,7 @@ fn clean_report_names_rule_seeds_and_selection() {
     }
     let table = |title: &str| report.files().into_iter().find(|table| table.title == title).unwrap();
     let metrics = String::from_utf8(table("metrics.csv").to_csv()).unwrap();
-    // 13 and 14 of what was trained anew, not the 90s that were not selected.
+    // The mean of 13 and 14, the results of the selected configuration with seeds 3 and 4.
     assert!(metrics.contains("CartPole,ppo,ff,,Default,2,13.5,0.5"), "{metrics}");
     let selected = String::from_utf8(table("selected.csv").to_csv()).unwrap();
     assert_eq!(selected.matches("\nCartPole,ppo,ff,,D,").count(), 2, "{selected}");
@@ -201,12 +202,13 @@ fn what_is_not_done_is_missing_and_has_no_colour() {
     let entries: Vec<_> =
         with_no_result(&plan, |report| report.tables().flat_map(|table| table.rows.into_iter().flatten()).collect());
     assert!(entries.iter().all(|entry| entry.heat.is_none()));
-    // Metrics of three tables; scenarios of three and two trainings in two environments; IQM and gap.
+    // Three tables of metrics, then the scenarios of three and two training distributions in two environments, then the
+    // interquartile means and optimality gaps.
     let expected = 3 * 2 * 3 + 3 * (3 + 2) * 2 + 2 * 3 * 2;
     assert_eq!(entries.iter().filter(|entry| entry.text == MISSING).count(), expected);
 }
 
-/// What is trained on both is a line to compare with.
+/// Policies that are trained on R+E have a row among the scenarios, but no metrics.
 #[test]
 fn training_on_r_plus_e_is_a_scenario_row_only() {
     let plan = |versions: &str| {
@@ -257,7 +259,7 @@ fn files_tell_two_presets_of_a_method_apart() {
         let selections = results.select();
         let recorded = Recorded::default();
         for file in Report::new(&results, &selections, &recorded, &[]).files() {
-            // Of a pair, one side alone is of another preset.
+            // In a comparison of two methods, only one of them has another preset, so only one has the column.
             let columns = file.columns.iter().filter(|column| column.name.ends_with(name)).count();
             // Reference lines are not compared in pairs.
             let compared = file.columns.iter().any(|column| column.name.starts_with("x_"));
@@ -266,7 +268,7 @@ fn files_tell_two_presets_of_a_method_apart() {
     }
 }
 
-/// What follows a rule that is not closed is read as part of it, and no browser says so.
+/// A browser reads everything after an unclosed rule as part of this rule, without a warning.
 #[test]
 fn every_rule_of_the_style_is_closed() {
     let depths: Vec<i32> = super::html::STYLE

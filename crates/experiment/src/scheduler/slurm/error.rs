@@ -41,7 +41,7 @@ pub enum SlurmError {
     /// The folder cannot be read or written.
     #[error(transparent)]
     Folder(#[from] FolderError),
-    /// The operating system refused a file.
+    /// The operating system could not read or write a file.
     #[error(transparent)]
     File(#[from] FileError),
     /// The cost of cells cannot be estimated.

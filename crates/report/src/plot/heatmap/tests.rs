@@ -9,7 +9,7 @@ fn panels(heatmaps: &[Heatmap]) -> HeatmapPanels {
     HeatmapPanels { title, axes, returns, columns: heatmaps.iter().map(column).collect() }
 }
 
-/// The surfaces' paths: their colour and how they go, of those that are as wide.
+/// Returns the surfaces' paths with rectangles of this width: their colour and the rest of the element.
 fn surfaces(shown: &str, width: i32) -> Vec<(&str, &str)> {
     let lines = shown.lines().filter_map(|line| line.strip_prefix("<path fill=\"")?.split_once('"'));
     lines.filter(|(_, rest)| rest.contains(&format!("h{width}v"))).collect()
@@ -20,7 +20,7 @@ fn perfect_and_worst_policies_have_the_end_colours() {
     for (figures, colour) in [((-120.0, 100.0), "#FDE725"), ((-1700.0, 0.0), "#440154")] {
         let panels = panels(&[fixture::heatmap(5, |_, _| figures)]);
         let shown = svg(&panels).unwrap();
-        // A line of a panel is as wide as the panel: each surface's five are of one colour.
+        // All points have the same colour, so each of a surface's five lines is one rectangle, as wide as the panel.
         let whole_lines = surfaces(&shown, (panels.size().0 * 4.0).round() as i32);
         assert_eq!(whole_lines.len(), 2, "mean return and success");
         for (got, path) in whole_lines {
@@ -31,7 +31,7 @@ fn perfect_and_worst_policies_have_the_end_colours() {
 
 #[test]
 fn a_point_has_the_colour_of_its_share_of_the_scale() {
-    // From -1600 to -200: a quarter, and all of it.
+    // On the scale from -1600 to -200, a return of -1250 is a quarter, and -200 the whole.
     let heatmap = fixture::heatmap(2, |mass, length| {
         (if mass < 1.0 { -1250.0 } else { -200.0 }, if length > 1.0 { 75.0 } else { 0.0 })
     });
@@ -48,10 +48,10 @@ fn a_point_has_the_colour_of_its_share_of_the_scale() {
         let all = surfaces(&shown, width);
         all.into_iter().find(|(got, _)| *got == colour(share)).map(|(_, path)| path.to_owned())
     };
-    // Small masses are left.
+    // Small masses are on the left.
     assert!(path_of(0.25, half).unwrap().contains(&format!("M{left} ")));
     assert!(!path_of(1.0, half).unwrap().contains(&format!("M{left} ")));
-    // Great lengths are above, along the whole panel.
+    // Great lengths are at the top, over the whole width of the panel.
     assert_eq!(path_of(0.75, 2 * half).unwrap().matches('M').count(), 1);
 }
 
@@ -65,7 +65,7 @@ fn d_r_e_share_one_scale_and_whole_boxes() {
     assert!(three.frame(2, 0.0).right() <= f64::from(WIDTH) - MARGIN);
     let shown = svg(&three).unwrap();
     for (name, boxes) in [("#C81E1E", 4), ("#FFFFFF", 1)] {
-        // Of each panel, and the legend's; whole lines in both.
+        // The boxes of six panels and of the legend have four solid sides each.
         let lines =
             shown.lines().filter(|line| line.contains("<polyline") && line.contains(&format!("stroke=\"{name}\"")));
         let core = lines.filter(|line| line.contains("stroke-width=\"8\"")).count();
