@@ -20,6 +20,7 @@ mod resume;
 mod serve;
 mod servers;
 mod sets;
+mod showcases;
 mod signals;
 mod silence;
 mod slurm;
