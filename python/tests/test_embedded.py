@@ -16,8 +16,8 @@ from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
 
 import perturb
-from perturb import local_server
-from perturb.embedded_server import EmbeddedServer
+from perturb import _native, local_server
+from perturb.embedded_server import EmbeddedServer, loading
 
 from .conftest import ROOT
 from .processes import SECONDS, output_of, wait_until, within
@@ -145,6 +145,51 @@ def test_reply_that_takes_too_long_ends_a_session() -> None:
     with pytest.raises(perturb.ServerTimeoutError, match="the embedded server did not answer step within"):
         envs.step(actions)
     envs.close()
+
+
+class BrokenNative:
+    """The native half of a session that is lost during `render`, while another thread starts an embedded server."""
+
+    ended = False
+
+    def __init__(self) -> None:
+        self.started = threading.Event()
+        self.thread = threading.Thread(target=self.start_server, daemon=True)
+
+    def start_server(self) -> None:
+        with local_server._lock:
+            self.started.set()
+            with loading:
+                pass
+
+    def render(self, *_: Any) -> None:
+        self.thread.start()
+        self.started.wait()
+        raise _native.Failure("ended", 0, "as the test wants")
+
+    def poll_io(self) -> None:
+        """Nothing to answer."""
+
+
+def test_a_lost_session_and_a_server_that_starts_do_not_wait_for_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    environment = perturb.PerturbVectorEnv("CartPole", 1, server="embedded")
+    environment.reset()
+    session, broken = environment._client.session, BrokenNative()
+    monkeypatch.setattr(session, "_native", broken)
+    with within(SECONDS):
+        with pytest.raises(perturb.ServerConnectionError, match="as the test wants"):
+            session.render(0, 8, 8)
+        broken.thread.join()
+    environment.close()
+
+
+def test_release_without_wait_leaves_the_share_while_a_server_starts() -> None:
+    server = local_server.acquire(EmbeddedServer)
+    users = server.users
+    with local_server._lock:
+        assert not local_server.release(server, wait=False)
+    assert server.users == users
+    assert local_server.release(server, wait=False)
 
 
 def rewards(seed: int) -> list[float]:

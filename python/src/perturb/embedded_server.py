@@ -14,8 +14,8 @@ from .local_server import find_program
 if TYPE_CHECKING:
     from .local_server import TaskFolder
 
-# Held while models are loaded or drawn, and by forks. A process that was forked meanwhile would inherit locks that no
-# thread releases.
+# Held while models are loaded, compiled or drawn, and by forks. A process that was forked meanwhile would inherit locks
+# that no thread releases. A thread that holds the lock of `local_server` must not wait for this one.
 loading = threading.RLock()
 
 

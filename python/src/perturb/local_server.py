@@ -218,17 +218,26 @@ def acquire(kind: type[Server], task: TaskFolder | None = None) -> Server:
         return server
 
 
-def release(server: OwnServer) -> None:
-    """Give up a share of a server. The last release ends the server."""
-    with _lock:
+def release(server: OwnServer, *, wait: bool = True) -> bool:
+    """Give up a share of a server. The last release ends the server.
+
+    Without `wait`, return False and do nothing if another thread holds the lock, for instance to start a server.
+    """
+    lock = _lock
+    if not lock.acquire(blocking=wait):
+        return False
+    try:
         key = type(server), server.task
         if server is not _shared.get(key):
-            return  # it died and was replaced
+            return True  # it died and was replaced
         server.users -= 1
         if server.users > 0:
-            return
+            return True
         del _shared[key]
+    finally:
+        lock.release()
     server.end()
+    return True
 
 
 def _after_fork_in_child() -> None:

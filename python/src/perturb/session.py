@@ -82,10 +82,14 @@ class Session:
             self._local = local_server.acquire(LocalServer, task)
             server = self._local.address
         elif server == EMBEDDED:
-            self._local = local_server.acquire(EmbeddedServer, task)
+            with embedded_server.loading:  # always taken before the lock of the shared servers
+                self._local = local_server.acquire(EmbeddedServer, task)
         self.address: Address = server
         self._owner = os.getpid()
         self._limit = timeout
+        self._embedded = server == EMBEDDED
+        # Resets and steps of a task from a folder may compile a model with other lengths.
+        self._compiles = self._embedded and task is not None
         self._lost: str | None = None
         self._opened = False
         self._native = _native.Session(
@@ -141,8 +145,7 @@ class Session:
 
     def open(self, **request: Any) -> _native.Opened:
         """Create the environments and begin their first episodes."""
-        with self._loading():
-            opened = self._call("open", self._native.open, **request)
+        opened = self._call("open", self._native.open, **request)
         self._opened = True
         return opened
 
@@ -154,6 +157,8 @@ class Session:
         self, action: Any, encode: Callable[[Any], bytes]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Advance an environment by itself: observation [O], reward, both flags, and the info."""
+        if self._compiles:
+            return self._call("step", self._native.step_single, action, encode)
         try:  # not by _call, which takes long beside a step without a connection
             return self._native.step_single(action, encode)
         except BaseException as error:  # noqa: BLE001
@@ -192,11 +197,7 @@ class Session:
 
     def render(self, slot: int, width: int, height: int) -> NDArray[np.uint8]:
         """Draw an environment: [height, width, 3]."""
-        with self._loading():
-            return self._call("render", self._native.render, slot, width, height)
-
-    def _loading(self) -> contextlib.AbstractContextManager[object]:
-        return embedded_server.loading if self.address == EMBEDDED else contextlib.nullcontext()
+        return self._call("render", self._native.render, slot, width, height)
 
     def poll_io(self) -> None:
         """Answer the server's keepalive pings; the keepalive thread calls it."""
@@ -213,7 +214,12 @@ class Session:
             _close(*self._resources)
 
     def _call(self, kind: str, call: Callable[..., Reply], *arguments: Any, **fields: Any) -> Reply:
+        loads = self._compiles or (self._embedded and kind in ("open", "render"))
         try:
+            if loads:
+                # Released before `_failed` closes the session, which takes the lock of the shared servers.
+                with embedded_server.loading:
+                    return call(*arguments, **fields)
             return call(*arguments, **fields)
         except BaseException as error:  # noqa: BLE001  (Ctrl-C ends a session, too)
             raise self._failed(kind, error) from None
@@ -314,18 +320,24 @@ _Resources: TypeAlias = "tuple[_native.Session, LocalServer | EmbeddedServer | N
 _unclosed: collections.deque[_Resources] = collections.deque()
 
 
-def _close_unclosed() -> None:
+def _close_unclosed(*, wait: bool = True) -> None:
+    """Close the sessions that nobody closed. Without `wait`, leave the rest if a server is being started."""
     with contextlib.suppress(IndexError):  # another thread may be at it, too
         while True:
-            _close(*_unclosed.popleft())
+            resources = _unclosed.popleft()
+            if not _close(*resources, wait=wait):
+                _unclosed.appendleft(resources)
+                return
 
 
-def _close(native: _native.Session, local: LocalServer | EmbeddedServer | None, owner: int) -> None:
+def _close(
+    native: _native.Session, local: LocalServer | EmbeddedServer | None, owner: int, *, wait: bool = True
+) -> bool:
+    """Close a session's resources. Return False if the server was not released: call again."""
     if os.getpid() != owner:
-        return  # what a forked process inherited is the parent's
-    native.close()
-    if local is not None:
-        local_server.release(local)
+        return True  # what a forked process inherited is the parent's
+    native.close()  # a second call does nothing
+    return local is None or local_server.release(local, wait=wait)
 
 
 def _now() -> float:
@@ -381,7 +393,7 @@ class _KeepaliveThread:
             self._note_pause()
             self._last_run = _now()
             self._look()  # in a frame of its own: a sleeping keeper keeps no session alive
-            _close_unclosed()
+            _close_unclosed(wait=False)  # pings must be answered also while a server starts
 
     def _look(self) -> None:
         for session in self.sessions():
