@@ -2,8 +2,8 @@
 //! that links this library, such as the Python package's native module, hands requests over as messages and gets
 //! replies as messages.
 //!
-//! Limits are those of `perturb-server --private`, except that the number of sessions is not limited. Nobody else uses the
-//! server, so there are no tokens, no leases, no ledger and no metrics.
+//! Limits are those of `perturb-server --private`, except that the number of sessions is not limited. Nobody else uses
+//! the server, so there are no tokens, no leases, no ledger and no metrics.
 
 use super::{
     api::perturb_v1::{
