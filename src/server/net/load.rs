@@ -16,8 +16,8 @@ const BYTES_PER_UNIT: usize = 16 << 10;
 /// The work that is expected of a new connection at least: its handshake.
 const HANDSHAKE_WORK: f64 = 16.0;
 
-/// The work of one thread, which alone adds to it. One unit is a read or a write that moved something. Steps that run on
-/// the thread itself, for up to 80 µs each, are not counted. Time would be a wrong measure, as sessions spin while
+/// The work of one thread, which alone adds to it. One unit is a read or a write that moved something. Steps that run
+/// on the thread itself, for up to 80 µs each, are not counted. Time would be a wrong measure, as sessions spin while
 /// they wait.
 #[derive(Default)]
 pub struct ThreadLoad {
