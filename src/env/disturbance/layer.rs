@@ -54,6 +54,7 @@ impl Disturbed {
     /// Begins an episode from the present state of the physics.
     fn begin(&mut self) {
         self.steps = 0;
+        self.physics.environment.push([0.0; 3]); // an episode that diverged may have left a push behind
         self.actions.begin(&self.values);
         self.sensors.begin(&self.values, &self.draw, |out| self.physics.environment.observe(out));
     }
@@ -157,6 +158,7 @@ impl Environment for Disturbed {
         let (own, late) = state.split_at(own);
         let (late_actions, late_observations) = late.split_at(actions);
         self.physics.load(own)?;
+        self.physics.environment.push([0.0; 3]); // of the episode before
         self.actions.load(&self.values, late_actions)?;
         let address = (&self.draw, self.steps);
         self.sensors.load(&self.values, address, late_observations, |out| self.physics.environment.observe(out))

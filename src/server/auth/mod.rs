@@ -316,7 +316,7 @@ mod tests {
     #[case::no_steps(&file(SECRET, "max_steps_per_second = 0"), 1, "leave the token out")]
     #[case::too_many_steps(&file(SECRET, "max_steps_per_second = 5000000000"), 4, "cannot be read")]
     #[case::twice(&(file(SECRET, "") + &file("another-horse-battery", "")), 4, "two tokens called \"ann\"")]
-    #[case::shared(&(file(SECRET, "") + &file(SECRET, "").replace("ann", "bob")), 4, "another one's")]
+    #[case::shared(&(file(SECRET, "") + &file(SECRET, "").replace("ann", "bob")), 4, "of another entry")]
     fn a_wrong_file_is_refused_with_its_line_and_no_token(#[case] text: &str, #[case] line: usize, #[case] part: &str) {
         let wrong = tokens_of(text).err().unwrap();
         assert_eq!(wrong.line, line, "{wrong}");

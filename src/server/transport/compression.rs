@@ -1,11 +1,18 @@
 //! Messages that a client compresses, as gRPC allows.
 
 use flate2::bufread::{GzDecoder, ZlibDecoder};
-use std::{fmt, io::Read};
+use std::{
+    fmt,
+    io::{self, BufRead, ErrorKind, Read},
+};
 use tonic::codegen::http::HeaderMap;
 
 /// The header of a call that names the compression of its messages.
 const ENCODING_HEADER: &str = "grpc-encoding";
+/// The maximum number of compressed bytes that a part reads, so that input without output takes little time too.
+const COMPRESSED_PART_BYTES: usize = 4 << 10;
+/// The maximum number of decompressed bytes of a part.
+const DECOMPRESSED_PART_BYTES: usize = 64 << 10;
 
 /// A compression that the server reads. Its replies are never compressed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,11 +33,12 @@ impl Compression {
         }
     }
 
-    /// Returns a reader of the decompressed message.
-    pub(super) fn reader<'a>(self, compressed: &'a [u8]) -> Box<dyn Read + Send + 'a> {
+    /// Returns a decoder of a compressed message.
+    pub(super) fn decoder(self, compressed: &[u8]) -> Decoder<'_> {
+        let input = PartialInput { bytes: compressed, left: 0 };
         match self {
-            Self::Gzip => Box::new(GzDecoder::new(compressed)),
-            Self::Deflate => Box::new(ZlibDecoder::new(compressed)),
+            Self::Gzip => Decoder::Gzip(GzDecoder::new(input)),
+            Self::Deflate => Decoder::Deflate(ZlibDecoder::new(input)),
         }
     }
 }
@@ -41,5 +49,101 @@ impl fmt::Display for Compression {
             Self::Gzip => "gzip",
             Self::Deflate => "deflate",
         })
+    }
+}
+
+/// Decompresses a message in parts that take little time each.
+pub(super) enum Decoder<'a> {
+    Gzip(GzDecoder<PartialInput<'a>>),
+    Deflate(ZlibDecoder<PartialInput<'a>>),
+}
+
+impl Decoder<'_> {
+    /// Appends the next part to `bytes`. Returns whether there may be more.
+    ///
+    /// # Errors
+    /// The message is not of the compression.
+    pub(super) fn append_part(&mut self, bytes: &mut Vec<u8>) -> io::Result<bool> {
+        let limit = DECOMPRESSED_PART_BYTES as u64;
+        let read = match self {
+            Self::Gzip(decoder) => {
+                decoder.get_mut().left = COMPRESSED_PART_BYTES;
+                decoder.take(limit).read_to_end(bytes)
+            }
+            Self::Deflate(decoder) => {
+                decoder.get_mut().left = COMPRESSED_PART_BYTES;
+                decoder.take(limit).read_to_end(bytes)
+            }
+        };
+        match read {
+            Ok(read) => Ok(read == DECOMPRESSED_PART_BYTES),
+            Err(error) if error.kind() == ErrorKind::WouldBlock => Ok(true),
+            Err(error) => Err(error),
+        }
+    }
+}
+
+/// Bytes of which only the next `left` can be read.
+pub(super) struct PartialInput<'a> {
+    bytes: &'a [u8],
+    left: usize,
+}
+
+impl Read for PartialInput<'_> {
+    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+        let read = self.fill_buf()?.read(out)?;
+        self.consume(read);
+        Ok(read)
+    }
+}
+
+impl BufRead for PartialInput<'_> {
+    fn fill_buf(&mut self) -> io::Result<&[u8]> {
+        if self.left == 0 && !self.bytes.is_empty() {
+            return Err(ErrorKind::WouldBlock.into());
+        }
+        Ok(&self.bytes[..self.left.min(self.bytes.len())])
+    }
+
+    fn consume(&mut self, amount: usize) {
+        self.bytes = &self.bytes[amount..];
+        self.left -= amount;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use flate2::{Compression as Level, write::GzEncoder};
+    use std::io::Write;
+
+    /// Decompresses a message, and returns it with the number of its parts.
+    fn parts(compression: Compression, compressed: &[u8]) -> io::Result<(Vec<u8>, usize)> {
+        let (mut decoder, mut bytes, mut n) = (compression.decoder(compressed), Vec::new(), 1);
+        while decoder.append_part(&mut bytes)? {
+            n += 1;
+        }
+        Ok((bytes, n))
+    }
+
+    #[test]
+    fn parts_together_are_the_message() {
+        let message: Vec<u8> = (0..300_000_u32).flat_map(|i| i.wrapping_mul(2_654_435_761).to_le_bytes()).collect();
+        let mut encoder = GzEncoder::new(Vec::new(), Level::fast());
+        encoder.write_all(&message).unwrap();
+        let (bytes, n) = parts(Compression::Gzip, &encoder.finish().unwrap()).unwrap();
+        assert_eq!(bytes, message);
+        assert!(n > message.len() / DECOMPRESSED_PART_BYTES, "{n}");
+    }
+
+    #[test]
+    fn input_without_output_is_cut_into_parts() {
+        let empty_block = [0, 0, 0, 0xff, 0xff];
+        let compressed = [&[0x78, 0x9c], empty_block.repeat(100_000).as_slice()].concat();
+        let mut decoder = Compression::Deflate.decoder(&compressed);
+        let mut bytes = Vec::new();
+        let n = (0..).take_while(|_| decoder.append_part(&mut bytes).is_ok_and(|more| more)).count();
+        assert!(n >= compressed.len() / COMPRESSED_PART_BYTES, "{n}");
+        assert!(bytes.is_empty());
     }
 }

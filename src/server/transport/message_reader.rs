@@ -14,7 +14,7 @@ use crate::server::{auth::Bearer, limits::RequestLimits, net::managed_io::Connec
 use bytes::{Buf, Bytes, BytesMut};
 use http_body::Body as _;
 use http_body_util::BodyExt;
-use std::{io::Read, time::Duration};
+use std::time::Duration;
 use tokio::{
     task::yield_now,
     time::{Instant, timeout_at},
@@ -29,8 +29,6 @@ const UNBUDGETED_BYTES: usize = 64 << 10;
 /// The minimum average rate of a message, bytes per second. A message may take [`StreamLimits::limit`] longer than at
 /// this rate.
 const MIN_BYTES_PER_SECOND: usize = 64 << 10;
-/// The bytes of a compressed message that are decompressed before other streams have a turn.
-const DECOMPRESSED_PART_BYTES: usize = 64 << 10;
 /// A message of at least this length gets an allocation of its own.
 const OWN_BUFFER_MIN_BYTES: usize = 1 << 20;
 
@@ -247,12 +245,12 @@ impl MessageReader {
     async fn decompress(&mut self, limits: RequestLimits) -> Result<Option<Message>, StreamStop> {
         let Some(PartialMessage::Compressed(length, compression)) = self.message else { return Ok(None) };
         let Some(compressed) = self.buffer.get(..length) else { return Ok(None) };
-        let mut reader = compression.reader(compressed);
+        let mut decoder = compression.decoder(compressed);
         let mut share = self.transit.budget.empty();
         let mut bytes = Vec::new();
         let message = loop {
-            let part = reader.by_ref().take(DECOMPRESSED_PART_BYTES as u64).read_to_end(&mut bytes);
-            let part = part.map_err(|error| Status::internal(format!("a message is not {compression}: {error}")))?;
+            let more = decoder.append_part(&mut bytes);
+            let more = more.map_err(|error| Status::internal(format!("a message is not {compression}: {error}")))?;
             if bytes.len() > limits.bytes {
                 return Err(StreamStop::Refused(Error::DecompressedTooLarge { limit: limits.bytes }));
             }
@@ -260,13 +258,17 @@ impl MessageReader {
             if let Err(refusal) = share.grow(budgeted - share.bytes()) {
                 break Message::Refused(refusal);
             }
-            if part < DECOMPRESSED_PART_BYTES {
+            if !more {
                 break Message::Whole(bytes.into(), share);
             }
             yield_now().await;
         };
-        drop(reader);
-        self.buffer.advance(length);
+        drop(decoder);
+        if length < OWN_BUFFER_MIN_BYTES {
+            self.buffer.advance(length);
+        } else {
+            self.buffer = BytesMut::from(&self.buffer[length..]); // the memory of the message goes with it
+        }
         self.share = self.transit.budget.empty();
         self.message = None;
         Ok(Some(message))
