@@ -218,9 +218,9 @@ fn each_misuse_is_refused_with_a_remedy_and_leaves_nothing() {
 )]
 #[case::demo(
     "perturb demo --env CartPole --episodes 1000000 --out demo",
-    "demo/trained-on-D/progress.csv",
+    "demo/trained-on-R/progress.csv",
     "stopped by signal N; finished parts are kept in demo",
-    "demo, demo/trained-on-D"
+    "demo, demo/trained-on-D, demo/trained-on-R"
 )]
 #[case::heatmap(
     "perturb heatmap --checkpoint short --grid 100 --episodes 1000 --out new",

@@ -18,12 +18,9 @@ const TEST_EPISODES: u64 = 100;
 /// PPO as in experiments/quick.toml, which `perturb demo --env CartPole` repeats, is trained on `version`.
 fn median_success(servers: &Servers, plan: &Plan, version: Version) -> [f64; 3] {
     let is_wanted = |method: &str| method.starts_with("ppo");
-    let cells = plan.cells.iter().map(|cell| &cell.config);
-    let mut config = cells
-        .filter(|config| config.common.version == version && is_wanted(&config.method().to_string()))
-        .cloned()
-        .next()
-        .expect("PPO is in the plan");
+    let mut configs = plan.cells.iter().map(|cell| &cell.config);
+    let config = configs.find(|config| config.common.version == version && is_wanted(&config.method().to_string()));
+    let mut config = config.expect("PPO is in the plan").clone();
     let successes = SEEDS.map(|seed| {
         config.common.seed = seed;
         let (_out, outcome) = run(servers, &config.to_toml());

@@ -194,7 +194,7 @@ fn a_rule_that_a_plan_was_not_made_for_is_refused() {
     assert!(message.contains("selection is clean, but must be \"paper\": the plan has no tuning cells"), "{message}");
     for (from, to, part) in [
         ("'clean'", "'fair'", "unknown variant `fair`, expected `paper` or `clean`"),
-        ("'clean'", "'paper'", "tuning_runs is 2, but must be left out, or beside selection = \"clean\""),
+        ("'clean'", "'paper'", "tuning_runs is 2, but must be left out, or given with selection = \"clean\""),
         ("tuning_runs = 2", "tuning_runs = 0", "tuning_runs is 0, but must be at least 1"),
         ("selection_episodes = 70", "selection_episodes = 0", "selection_episodes is 0"),
         (

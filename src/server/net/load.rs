@@ -112,7 +112,7 @@ impl Balance {
     fn refresh(&mut self, now: Instant) {
         let windows = (now - self.at).as_secs_f64() / WINDOW.as_secs_f64();
         self.at = now;
-        let kept = (-windows).exp();
+        let kept = libm::exp(-windows);
         let counted = if windows > 0.0 { (1.0 - kept) / windows } else { 1.0 };
         for RecentWork { load, seen, recent } in &mut self.threads {
             let work = load.work.load(Ordering::Relaxed);

@@ -33,7 +33,7 @@ impl<'a, 'input> ModelText<'a, 'input> {
         let top = self.document.root_element().children().filter(is_default);
         let of_class = |found: Node<'a, 'input>| {
             let elements = found.children().filter(|child| child.tag_name() == node.tag_name());
-            elements.filter_map(|element| element.attribute(key)).last()
+            elements.filter_map(|element| element.attribute(key)).next_back()
         };
         nested.chain(top).find_map(of_class)
     }

@@ -26,7 +26,7 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
 async fn replies(mut session: Session) -> Vec<SessionResponse> {
     let requests = [Request::from(open("CartPole", BATCH, 7))].into_iter();
     let mut replies = Vec::new();
-    for request in requests.chain((0..20).map(|i| step(vec![i % 2; BATCH as usize * 4]).into())) {
+    for request in requests.chain((0..20).map(|i| step(vec![i % 2; BATCH as usize * 4]))) {
         session.send(request).await;
         replies.push(session.receive().await.unwrap().unwrap());
     }

@@ -4,6 +4,7 @@ mod changes;
 mod echo;
 mod environments;
 mod laws;
+#[cfg(feature = "mujoco")]
 mod pushes;
 mod sessions;
 

@@ -19,7 +19,7 @@ fn a_failing_disk_ends_the_run_and_keeps_results() {
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("the run cannot go on: CartPole-a2c-ff-D-") && said.contains("File too large"), "{said}");
-    assert!(said.contains("the same command goes on from what was trained"), "{said}");
+    assert!(said.contains("resume with the same command"), "{said}");
     assert!(experiment.results("out").is_empty());
     let cells = experiment.out("out").join("cells");
     for cell in std::fs::read_dir(cells).expect("cells") {

@@ -165,7 +165,8 @@ fn policies_trained_on_r_and_e_are_in_the_report() {
     assert!(output.stdout.starts_with(b"384 of 384 episodes of 8 policies"), "{output:?}");
     let output = perturb(&["report"]).arg(experiment.out("out")).output().expect("ended");
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
-    let row = text.lines().find(|line| line.starts_with("a2c ff  R+E ")).unwrap_or_else(|| panic!("{text}"));
+    let row =
+        text.lines().find(|line| line.trim_start().starts_with("a2c ff  R+E ")).unwrap_or_else(|| panic!("{text}"));
     assert!(!row.contains("missing") && text.contains("on R+E"), "{text}");
     let page = experiment.page("out");
     assert!(page.contains("trained on R+E"), "curves and success over parameters");

@@ -58,6 +58,7 @@ impl SessionServer {
 }
 
 /// The transport of an open session's requests and replies. A stream is dropped before its connection.
+#[allow(clippy::large_enum_variant)] // a session has one
 pub(super) enum Transport {
     Stream {
         stream: Stream,
