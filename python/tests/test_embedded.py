@@ -171,7 +171,7 @@ class BrokenNative:
         """Nothing to answer."""
 
 
-def test_a_lost_session_and_a_server_that_starts_do_not_wait_for_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lost_session_waits_for_no_server_that_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     environment = perturb.PerturbVectorEnv("CartPole", 1, server="embedded")
     environment.reset()
     session, broken = environment._client.session, BrokenNative()
@@ -183,7 +183,7 @@ def test_a_lost_session_and_a_server_that_starts_do_not_wait_for_each_other(monk
     environment.close()
 
 
-def test_release_without_wait_leaves_the_share_while_a_server_starts() -> None:
+def test_release_without_wait_leaves_the_share() -> None:
     server = local_server.acquire(EmbeddedServer)
     users = server.users
     with local_server._lock:

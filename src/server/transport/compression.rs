@@ -33,12 +33,12 @@ impl Compression {
         }
     }
 
-    /// Returns a decoder of a compressed message.
-    pub(super) fn decoder(self, compressed: &[u8]) -> Decoder<'_> {
+    /// Returns a decompressor of a compressed message.
+    pub(super) fn decompressor(self, compressed: &[u8]) -> Decompressor<'_> {
         let input = PartialInput { bytes: compressed, left: 0 };
         match self {
-            Self::Gzip => Decoder::Gzip(GzDecoder::new(input)),
-            Self::Deflate => Decoder::Deflate(ZlibDecoder::new(input)),
+            Self::Gzip => Decompressor::Gzip(GzDecoder::new(input)),
+            Self::Deflate => Decompressor::Deflate(ZlibDecoder::new(input)),
         }
     }
 }
@@ -53,12 +53,12 @@ impl fmt::Display for Compression {
 }
 
 /// Decompresses a message in parts that take little time each.
-pub(super) enum Decoder<'a> {
+pub(super) enum Decompressor<'a> {
     Gzip(GzDecoder<PartialInput<'a>>),
     Deflate(ZlibDecoder<PartialInput<'a>>),
 }
 
-impl Decoder<'_> {
+impl Decompressor<'_> {
     /// Appends the next part to `bytes`. Returns whether there may be more.
     ///
     /// # Errors
@@ -119,7 +119,7 @@ mod tests {
 
     /// Decompresses a message, and returns it with the number of its parts.
     fn parts(compression: Compression, compressed: &[u8]) -> io::Result<(Vec<u8>, usize)> {
-        let (mut decoder, mut bytes, mut n) = (compression.decoder(compressed), Vec::new(), 1);
+        let (mut decoder, mut bytes, mut n) = (compression.decompressor(compressed), Vec::new(), 1);
         while decoder.append_part(&mut bytes)? {
             n += 1;
         }
@@ -140,7 +140,7 @@ mod tests {
     fn input_without_output_is_cut_into_parts() {
         let empty_block = [0, 0, 0, 0xff, 0xff];
         let compressed = [&[0x78, 0x9c], empty_block.repeat(100_000).as_slice()].concat();
-        let mut decoder = Compression::Deflate.decoder(&compressed);
+        let mut decoder = Compression::Deflate.decompressor(&compressed);
         let mut bytes = Vec::new();
         let n = (0..).take_while(|_| decoder.append_part(&mut bytes).is_ok_and(|more| more)).count();
         assert!(n >= compressed.len() / COMPRESSED_PART_BYTES, "{n}");

@@ -245,11 +245,11 @@ impl MessageReader {
     async fn decompress(&mut self, limits: RequestLimits) -> Result<Option<Message>, StreamStop> {
         let Some(PartialMessage::Compressed(length, compression)) = self.message else { return Ok(None) };
         let Some(compressed) = self.buffer.get(..length) else { return Ok(None) };
-        let mut decoder = compression.decoder(compressed);
+        let mut decompressor = compression.decompressor(compressed);
         let mut share = self.transit.budget.empty();
         let mut bytes = Vec::new();
         let message = loop {
-            let more = decoder.append_part(&mut bytes);
+            let more = decompressor.append_part(&mut bytes);
             let more = more.map_err(|error| Status::internal(format!("a message is not {compression}: {error}")))?;
             if bytes.len() > limits.bytes {
                 return Err(StreamStop::Refused(Error::DecompressedTooLarge { limit: limits.bytes }));
@@ -263,7 +263,7 @@ impl MessageReader {
             }
             yield_now().await;
         };
-        drop(decoder);
+        drop(decompressor);
         if length < OWN_BUFFER_MIN_BYTES {
             self.buffer.advance(length);
         } else {
