@@ -111,7 +111,7 @@ def test_damage_is_named(copied: Path) -> None:
     weights = copied / json.loads((copied / "checkpoint.json").read_text())["weights"]["file"]
     content = weights.read_bytes()
     weights.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    broken = f"{weights.name} is not a usable checkpoint: .* the checksum does not match"
+    broken = f"{weights.name} is not a usable checkpoint: .*the checksum does not match"
     with pytest.raises(perturb.PolicyError, match=broken):
         perturb.load_policy(copied)
     weights.unlink()
