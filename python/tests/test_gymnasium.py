@@ -165,7 +165,7 @@ def test_two_environments_of_one_seed_match(server: str) -> None:
 
 
 def test_random_numbers_are_those_of_the_documents(server: str) -> None:
-    """docs/environments.md, "Random streams": seed 7, environment 3, trial 2 of CartPole E."""
+    """docs/random-streams.md: seed 7, environment 3, trial 2 of CartPole E."""
     env = gymnasium.make("perturb/CartPole-v1", version="E", environment_index=3, server=server)
     env.reset(seed=7)
     env.reset()
