@@ -1,4 +1,4 @@
-//! Finds MuJoCo 2.2.2 and compiles the shim.
+//! Finds MuJoCo 2.2.2 and compiles the C code of this crate.
 
 use std::{
     env, fs,
@@ -22,13 +22,13 @@ fn main() {
     println!("cargo:rustc-link-search=native={}", library_folder(&prefix).display());
     let mut shim = cc::Build::new();
     shim.files(["src/shim.c", "src/kinematics.c"]).include(&include).std("c11").opt_level(2);
-    // Debian's MuJoCo fuses no products and sums, and kinematics.c must give the same bytes.
+    // kinematics.c must give the same bytes as Debian's MuJoCo, which is built without fused multiply-add.
     shim.flag("-ffp-contract=off").compile("perturb_mujoco_shim");
-    // The shim needs MuJoCo, so this comes after it.
+    // The linker needs a library after the code that uses it, so MuJoCo comes after the shim.
     println!("cargo:rustc-link-lib=dylib=mujoco");
 }
 
-/// Ends the build with one sentence.
+/// Prints a message and ends the build.
 fn fail(sentence: String) -> ! {
     eprintln!("{sentence}");
     process::exit(1)

@@ -1,4 +1,4 @@
-//! A model and the data that MuJoCo computes on it.
+//! Simulations: a model and the data that MuJoCo computes for it.
 
 use crate::{Error, Field, Model, Reading, Warning, model::last_error, sys};
 use std::{
@@ -10,78 +10,82 @@ use std::{
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Status {
     Sound,
-    /// MuJoCo refuses to compute until the next reset.
+    /// MuJoCo raised this warning. Calls that compute are refused until the next reset.
     Diverged(Warning),
-    /// A fatal error interrupted MuJoCo in the middle. The data stay unusable.
+    /// A fatal error interrupted a computation. The data stay unusable for ever.
     Poisoned,
 }
 
-/// A simulation: a model of its own, editable, and its data.
+/// A physics simulation: a model, which may be edited, and its current state with all quantities computed from it.
 ///
-/// After construction and after [`reset`](Self::reset) the state is the model's initial one, after
-/// [`set_state`](Self::set_state) the one that was given, and nothing derived from it (poses, contacts) is computed
-/// before [`step1`](Self::step1), [`motion`](Self::motion) or [`forward`](Self::forward).
+/// A new simulation is in the model's initial state, as after [`reset`](Self::reset). These two and
+/// [`set_state`](Self::set_state) do not compute the quantities that follow from the state, such as poses and contacts.
+/// Call [`step1`](Self::step1), [`motion`](Self::motion) or [`forward`](Self::forward) before reading them.
 ///
-/// One simulation serves any number of states: what follows depends on [`state`](Self::state) and
-/// [`constants`](Self::constants) alone, not on what was simulated before.
+/// One simulation can serve several environments in turn, each with its own [`state`](Self::state) and
+/// [`constants`](Self::constants). Results depend only on these two, not on earlier computations.
 #[derive(Debug)]
 pub struct Simulation {
     model: Model,
-    // Made by mj_makeData for `model`, owned, freed in drop. The model is never replaced by one of other sizes.
+    // Comes from mj_makeData for `model`. `self` owns it, and `drop` frees it. The model is never replaced by one of
+    // other sizes.
     data: NonNull<sys::mjData>,
-    /// The pairs of geoms that can touch, made for `model`, whose arrays they share; owned, freed in drop. `None` if the
-    /// model needs the search for near geoms.
+    /// The pairs of geoms that can touch, for [`Simulation::step_without_search`]. They point to arrays of `model`.
+    /// `self` owns them, and `drop` frees them. `None` if the model needs MuJoCo's search for nearby geoms.
     pairs: Option<NonNull<sys::perturb_mj_pairs>>,
     status: Status,
 }
 
-// SAFETY: mjData and the pairs are plain memory without ties to a thread; `Simulation` owns them alone. The error handler
-// of a call is that of the calling thread, and is removed before the call returns.
+// SAFETY: mjData and the pairs are plain memory without ties to a thread, and only `Simulation` owns them. A call uses
+// the error handler of the calling thread, and removes it before it returns.
 unsafe impl Send for Simulation {}
-// SAFETY: through `&Simulation` nothing is written: the accessors read, and mj_objectVelocity takes all as const.
+// SAFETY: nothing is written through `&Simulation`: the accessors only read, and mj_objectVelocity takes const
+// pointers.
 unsafe impl Sync for Simulation {}
 
 impl Simulation {
-    /// A simulation of `model`.
+    /// Creates a simulation of `model` in its initial state.
     ///
     /// # Errors
-    /// [`Error::Fatal`] without memory.
+    /// [`Error::Fatal`] if there is not enough memory.
     pub fn new(model: Model) -> Result<Self, Error> {
         let data = make_data(&model)?;
-        // SAFETY: a valid model, only read; its memory stays where it is as long as `model` lives, which is as long as the
-        // pairs do; the result is new, or null.
+        // SAFETY: the model is valid and only read. The pairs point into its memory, which does not move, and `model`
+        // lives as long as they do. The result is new, or null.
         let pairs = NonNull::new(unsafe { sys::perturb_mj_make_pairs(model.as_ptr()) });
         Ok(Self { model, data, pairs, status: Status::Sound })
     }
 
-    /// The model as edited.
+    /// The model, with the edits that were made.
     pub fn model(&self) -> &Model {
         &self.model
     }
 
-    /// Replaces the model by a copy of another one of the same sizes, with its edits. What was computed is undefined then;
-    /// the state is not.
+    /// Replaces the model, with its edits, by a copy of `source`, which must have the same sizes. Keeps the state. All
+    /// computed quantities are undefined until they are computed again.
     ///
     /// # Errors
     /// [`Error::Fatal`], [`Error::Poisoned`].
     ///
     /// # Panics
-    /// If a size differs.
+    /// If a size differs, see [`Model::has_sizes_of`].
     pub fn set_model(&mut self, source: &Model) -> Result<(), Error> {
         assert!(self.model.has_sizes_of(source), "the model has other sizes");
         if self.status == Status::Poisoned {
             return Err(Error::Poisoned);
         }
-        // SAFETY: two valid models of the same sizes, of which `&mut self` lends the one that is written to nobody else. Its
-        // arrays stay where they are, so that the pairs' addresses remain valid.
+        // SAFETY: both models are valid and have the same sizes, and `&mut self` excludes other users of the one that
+        // is written. Its arrays do not move, so the pairs' pointers into them remain valid.
         let failed = unsafe { sys::perturb_mj_set_model(self.model.as_ptr(), source.as_ptr()) };
         self.poison_if(failed)
     }
 
     // ---- model edits
 
-    /// Writes the constants that the edits below change, with everything that follows from them: [`Model::n_constants`]
-    /// numbers.
+    /// Copies to `out` the model's masses, inertias and friction coefficients, and all arrays that [`set_const`]
+    /// derives from them: [`Model::n_constants`] numbers.
+    ///
+    /// [`set_const`]: Self::set_const
     pub fn constants(&self, out: &mut [f64]) {
         assert_eq!(out.len(), self.model.n_constants(), "the constants of another model");
         let mut rest = out;
@@ -91,7 +95,8 @@ impl Simulation {
         }
     }
 
-    /// Restores what [`constants`](Self::constants) wrote, for this or another simulation of the same model.
+    /// Restores the arrays that [`constants`](Self::constants) copied from this or another simulation of the same
+    /// model.
     pub fn set_constants(&mut self, constants: &[f64]) {
         assert_eq!(constants.len(), self.model.n_constants(), "the constants of another model");
         let mut rest = constants;
@@ -100,7 +105,7 @@ impl Simulation {
         }
     }
 
-    /// Copies fields of the model, one after the other: [`Model::n_fields`] numbers.
+    /// Copies the values of `fields` to `out`, one field after the other: [`Model::n_fields`] numbers.
     pub fn fields(&self, fields: &[Field], out: &mut [f64]) {
         assert_eq!(out.len(), self.model.n_fields(fields), "the fields of another model");
         let mut rest = out;
@@ -110,7 +115,7 @@ impl Simulation {
         }
     }
 
-    /// Restores what [`fields`](Self::fields) wrote, for this or another simulation of the same model.
+    /// Restores the values that [`fields`](Self::fields) copied from this or another simulation of the same model.
     pub fn set_fields(&mut self, fields: &[Field], values: &[f64]) {
         assert_eq!(values.len(), self.model.n_fields(fields), "the fields of another model");
         let mut rest = values;
@@ -120,39 +125,41 @@ impl Simulation {
         }
     }
 
-    /// Returns a field of the model for editing. Follow edits of masses, inertias, armatures and gears by
+    /// The values of a field of the model, for editing. After editing masses, inertias, armatures or gears call
     /// [`set_const`](Self::set_const).
     pub fn field_mut(&mut self, field: Field) -> &mut [f64] {
         let (start, length) = self.model.place(field);
         self.array_mut(start, length)
     }
 
-    /// Masses in kg, `[B]`. Follow an edit by [`set_const`](Self::set_const).
+    /// The masses of the bodies in kg, `[n_body]`. After editing them call [`set_const`](Self::set_const).
     pub fn body_mass_mut(&mut self) -> &mut [f64] {
         let (start, length) = (self.model.raw().body_mass, self.model.n_body());
         self.array_mut(start, length)
     }
 
-    /// Principal moments of inertia in kg m², `[B, 3]`. Follow an edit by [`set_const`](Self::set_const).
+    /// The principal moments of inertia of the bodies in kg m², `[n_body, 3]`. After editing them call
+    /// [`set_const`](Self::set_const).
     pub fn body_inertia_mut(&mut self) -> &mut [f64] {
         let (start, length) = (self.model.raw().body_inertia, 3 * self.model.n_body());
         self.array_mut(start, length)
     }
 
-    /// Sliding, torsional and rolling friction, `[G, 3]`.
+    /// The sliding, torsional and rolling friction coefficients of the geoms, `[n_geom, 3]`, for editing.
     pub fn geom_friction_mut(&mut self) -> &mut [f64] {
         let (start, length) = (self.model.raw().geom_friction, 3 * self.model.n_geom());
         self.array_mut(start, length)
     }
 
-    /// Colours: red, green, blue and opacity in 0 … 1, `[G, 4]`.
+    /// The colours of the geoms, for editing: red, green, blue and opacity in 0 … 1, `[n_geom, 4]`.
     pub fn geom_rgba_mut(&mut self) -> &mut [f32] {
         let (start, length) = (self.model.raw().geom_rgba, 4 * self.model.n_geom());
         self.array_mut(start, length)
     }
 
-    /// Recomputes what follows from the edited arrays. It overwrites the positions: reset or set the state afterwards.
-    /// It also overwrites [`Field::Statistic`], which a model may have given by an element of its own.
+    /// Recomputes the arrays of the model that follow from edited ones, such as masses of subtrees. Overwrites the
+    /// positions, so reset or set the state afterwards. Also overwrites [`Field::Statistic`], even if the MJCF text
+    /// sets it explicitly.
     ///
     /// # Errors
     /// [`Error::Fatal`], [`Error::Poisoned`].
@@ -167,7 +174,8 @@ impl Simulation {
 
     // ---- computation
 
-    /// Sets the initial state and forgets everything else, divergence included.
+    /// Sets the model's initial state. Clears all else, including warnings and applied forces, so that a diverged
+    /// simulation can be used again.
     ///
     /// # Errors
     /// [`Error::Fatal`], [`Error::Poisoned`].
@@ -182,7 +190,8 @@ impl Simulation {
         Ok(())
     }
 
-    /// Computes what depends on positions and velocities: poses, contacts, passive forces.
+    /// Computes all quantities that depend on positions and velocities, such as poses, contacts and passive forces.
+    /// This is the first half of a timestep, before the controls are applied.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
@@ -190,8 +199,8 @@ impl Simulation {
         self.run(sys::perturb_mj_step1)
     }
 
-    /// Applies the controls and advances positions, velocities and time by one timestep. Poses, contacts and everything
-    /// else that [`step1`](Self::step1) computes keep their earlier values.
+    /// Applies the controls, and advances positions, velocities and time by one timestep. Call [`step1`](Self::step1)
+    /// first. The quantities that it computed, such as poses and contacts, are not updated to the new state.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
@@ -199,8 +208,8 @@ impl Simulation {
         self.run(sys::perturb_mj_step2)
     }
 
-    /// Advances by one timestep: [`step1`](Self::step1), then [`step2`](Self::step2). So contacts are those before the
-    /// timestep.
+    /// Advances by one timestep: [`step1`](Self::step1), then [`step2`](Self::step2). Poses and contacts are afterwards
+    /// those of the state before the timestep.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
@@ -208,25 +217,25 @@ impl Simulation {
         self.run(sys::perturb_mj_step)
     }
 
-    /// Does what [`step`](Self::step) does, to the same bytes, but faster if only the world's geoms can touch others.
-    /// MuJoCo then need not search for geoms that are near each other, for which it compares the bounding boxes of all
-    /// pairs.
+    /// Advances by one timestep with the same bytes as [`step`](Self::step). It is faster if each contact is between a
+    /// geom of the world and a geom of another body. Then it does not search for nearby geoms, for which MuJoCo
+    /// compares the bounding boxes of all pairs.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
     pub fn step_without_search(&mut self) -> Result<(), Error> {
         let Some(pairs) = self.pairs else { return self.step() };
-        // SAFETY: the pairs are those of this model, which `&mut self` lends to nobody else.
+        // SAFETY: the pairs belong to this model, and `&mut self` excludes other users.
         self.run_with(|model, data| unsafe { sys::perturb_mj_step_pairs(model, pairs.as_ptr(), data) })
     }
 
-    /// Tells whether [`step_without_search`](Self::step_without_search) omits the search.
+    /// Whether [`step_without_search`](Self::step_without_search) is faster than [`step`](Self::step) for this model.
     pub fn has_pairs(&self) -> bool {
         self.pairs.is_some()
     }
 
-    /// Checks positions and velocities, and computes the poses and the velocities of bodies. This is a part of
-    /// [`step1`](Self::step1): contacts and forces are not computed, and keep their earlier values.
+    /// Checks that positions and velocities are finite, and computes the poses and velocities of the bodies. This is a
+    /// part of [`step1`](Self::step1). Contacts and forces keep their earlier values.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
@@ -234,13 +243,13 @@ impl Simulation {
         self.run(sys::perturb_mj_motion)
     }
 
-    /// Computes everything at the current state, accelerations included, without advancing.
+    /// Computes all quantities of the current state, including accelerations, without advancing the time.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
     pub fn forward(&mut self) -> Result<(), Error> {
         self.run(sys::perturb_mj_forward)?;
-        // Unlike the steps, MuJoCo's forward looks at no number itself.
+        // Unlike its steps, MuJoCo's forward computation does not check its numbers.
         let finite = |values: &[f64]| values.iter().all(|value| value.is_finite());
         let warning = if !finite(self.qpos()) {
             Warning::BadPosition
@@ -255,7 +264,7 @@ impl Simulation {
         Err(Error::Diverged { warning })
     }
 
-    /// Computes the poses of bodies, geoms and lights at the current positions, and nothing else.
+    /// Computes only the poses of bodies, geoms, cameras and lights at the current positions.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
@@ -263,8 +272,8 @@ impl Simulation {
         self.run(sys::perturb_mj_kinematics)
     }
 
-    /// Computes the external forces on bodies, which neither [`step`](Self::step) nor [`forward`](Self::forward) does
-    /// unless a sensor needs them: [`Reading::BodyExternalForces`].
+    /// Computes [`Reading::BodyExternalForces`]. [`step`](Self::step) and [`forward`](Self::forward) compute them only
+    /// if a sensor of the model needs them.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
@@ -272,28 +281,29 @@ impl Simulation {
         self.run(sys::perturb_mj_rne_post_constraint)
     }
 
-    /// Sets the external forces on bodies to 0, as after [`reset`](Self::reset).
+    /// Sets [`Reading::BodyExternalForces`] to 0, its value after [`reset`](Self::reset).
     pub fn clear_external_forces(&mut self) {
         let (start, length) = Reading::BodyExternalForces.place(self.raw(), self.model.raw());
         self.array_mut(start, length).fill(0.0);
     }
 
-    /// Tells whether a fatal error made the simulation unusable.
+    /// Whether a fatal error made the simulation unusable.
     pub fn is_poisoned(&self) -> bool {
         self.status == Status::Poisoned
     }
 
-    /// Returns the number of times that MuJoCo raised a warning since the last reset.
+    /// The number of times that MuJoCo raised `warning` since the last reset.
     pub fn warnings(&self, warning: Warning) -> usize {
         self.raw().warning[warning as usize].number as usize
     }
 
     fn run(&mut self, call: unsafe extern "C" fn(*const sys::mjModel, *mut sys::mjData) -> c_int) -> Result<(), Error> {
-        // SAFETY: `call` is one of the shim's, which want what `run_with` gives.
+        // SAFETY: `call` is a function of shim.c, which requires a model and its data, as `run_with` passes.
         self.run_with(|model, data| unsafe { call(model, data) })
     }
 
-    /// Calls the shim with the model and data that belong to it and are sound; `&mut self` excludes other users.
+    /// Calls a function of `shim.c` with the model and its data, and returns its error or MuJoCo's warning. Refuses if
+    /// the simulation diverged or is poisoned. `&mut self` excludes other users.
     fn run_with(&mut self, call: impl FnOnce(*const sys::mjModel, *mut sys::mjData) -> c_int) -> Result<(), Error> {
         match self.status {
             Status::Sound => {}
@@ -302,7 +312,7 @@ impl Simulation {
         }
         let failed = call(self.model.as_ptr(), self.data.as_ptr());
         self.poison_if(failed)?;
-        // MuJoCo reports a bad number only by resetting the state and counting a warning.
+        // MuJoCo does not report bad numbers: it resets the state and counts a warning.
         match Warning::ALL.into_iter().find(|&warning| self.warnings(warning) != 0) {
             None => Ok(()),
             Some(warning) => {
@@ -322,9 +332,9 @@ impl Simulation {
 
     // ---- state
 
-    /// Writes the complete state, [`Model::n_state`] numbers: time in s, positions `[Q]`, velocities `[V]`, activations
-    /// `[n_act]`, the constraint solver's starting point `[V]`, controls `[U]`. All later results depend on the state and
-    /// the model alone.
+    /// Copies the complete state to `out`, [`Model::n_state`] numbers: time in s, positions `[n_q]`, velocities
+    /// `[n_v]`, activations `[n_act]`, the constraint solver's starting point `[n_v]`, controls `[n_u]`. All later
+    /// results depend only on this state and the model.
     pub fn state(&self, out: &mut [f64]) {
         assert_eq!(out.len(), self.model.n_state(), "the state of another model");
         out[0] = self.time();
@@ -335,15 +345,15 @@ impl Simulation {
         }
     }
 
-    /// Restores what [`state`](Self::state) wrote, for this or another simulation of the same model. Forgets everything
-    /// else, divergence included.
+    /// Restores a state that [`state`](Self::state) copied from this or another simulation of the same model. A
+    /// diverged simulation is reset first, and can be used again.
     ///
     /// # Errors
     /// [`Error::Fatal`], [`Error::Poisoned`].
     pub fn set_state(&mut self, state: &[f64]) -> Result<(), Error> {
         assert_eq!(state.len(), self.model.n_state(), "the state of another model");
         if self.status != Status::Sound {
-            self.reset()?; // a sound simulation has no warnings to be forgotten, and its steps overwrite all else
+            self.reset()?; // a sound simulation has no warnings to clear, and its steps overwrite all else
         }
         // SAFETY: `data` is valid for the lifetime of `self`, and `&mut self` excludes other users.
         unsafe { (*self.data.as_ptr()).time = state[0] };
@@ -354,7 +364,7 @@ impl Simulation {
         Ok(())
     }
 
-    /// The state's arrays in the data, with their lengths.
+    /// Pointers to the arrays that make up the state, and their lengths.
     fn state_arrays(&self) -> [(*mut f64, usize); 5] {
         let (data, model) = (self.raw(), &self.model);
         [
@@ -366,65 +376,68 @@ impl Simulation {
         ]
     }
 
-    /// Simulated seconds.
+    /// The simulated time since the initial state, in s.
     pub fn time(&self) -> f64 {
         self.raw().time
     }
 
-    /// Positions, `[Q]`.
+    /// The generalised positions, `[n_q]`.
     pub fn qpos(&self) -> &[f64] {
         self.array(self.raw().qpos, self.model.n_q())
     }
 
-    /// Positions, `[Q]`.
+    /// The generalised positions, `[n_q]`, for editing.
     pub fn qpos_mut(&mut self) -> &mut [f64] {
         let (start, length) = (self.raw().qpos, self.model.n_q());
         self.array_mut(start, length)
     }
 
-    /// Velocities, `[V]`.
+    /// The generalised velocities, `[n_v]`.
     pub fn qvel(&self) -> &[f64] {
         self.array(self.raw().qvel, self.model.n_v())
     }
 
-    /// Velocities, `[V]`.
+    /// The generalised velocities, `[n_v]`, for editing.
     pub fn qvel_mut(&mut self) -> &mut [f64] {
         let (start, length) = (self.raw().qvel, self.model.n_v());
         self.array_mut(start, length)
     }
 
-    /// Accelerations of the last [`step2`](Self::step2) or [`forward`](Self::forward), `[V]`.
+    /// The generalised accelerations, `[n_v]`, of the last [`step2`](Self::step2) or [`forward`](Self::forward).
     pub fn qacc(&self) -> &[f64] {
         self.array(self.raw().qacc, self.model.n_v())
     }
 
-    /// Controls, `[U]`.
+    /// The controls of the actuators, `[n_u]`.
     pub fn ctrl(&self) -> &[f64] {
         self.array(self.raw().ctrl, self.model.n_u())
     }
 
-    /// Controls, `[U]`.
+    /// The controls of the actuators, `[n_u]`, for editing.
     pub fn ctrl_mut(&mut self) -> &mut [f64] {
         let (start, length) = (self.raw().ctrl, self.model.n_u());
         self.array_mut(start, length)
     }
 
-    /// Sets the force on the centre of mass of a body in N, in the world's frame, until it is set again. It is no part of
-    /// the [state](Self::state).
+    /// Sets an external force on a body's centre of mass, in N, world frame. It acts until it is set again or the
+    /// simulation is reset. It is not part of the [state](Self::state).
+    ///
+    /// # Panics
+    /// If `body` is not below the number of bodies.
     pub fn set_force(&mut self, body: usize, force: [f64; 3]) {
         let (start, length) = (self.raw().xfrc_applied, 6 * self.model.n_body());
         self.array_mut(start, length)[6 * body..][..3].copy_from_slice(&force);
     }
 
-    // ---- what step1 computed
+    // ---- quantities that step1 computes
 
-    /// An array that MuJoCo computed.
+    /// The values of an array that MuJoCo computed.
     pub fn reading(&self, reading: Reading) -> &[f64] {
         let (start, length) = reading.place(self.raw(), self.model.raw());
         self.array(start, length)
     }
 
-    /// The centre of mass of a body in m, world frame.
+    /// The position of a body's centre of mass in m, world frame.
     ///
     /// # Panics
     /// If `body` is not below the number of bodies.
@@ -433,7 +446,7 @@ impl Simulation {
         [all[3 * body], all[3 * body + 1], all[3 * body + 2]]
     }
 
-    /// The origin of a body's frame in m, world frame.
+    /// The position of the origin of a body's frame in m, world frame.
     ///
     /// # Panics
     /// If `body` is not below the number of bodies.
@@ -442,7 +455,7 @@ impl Simulation {
         [all[3 * body], all[3 * body + 1], all[3 * body + 2]]
     }
 
-    /// The rotation matrix of a body's frame, row-major.
+    /// The rotation matrix from a body's frame to the world frame, `[3, 3]`, row-major.
     ///
     /// # Panics
     /// If `body` is not below the number of bodies.
@@ -450,15 +463,16 @@ impl Simulation {
         &self.array(self.raw().xmat, 9 * self.model.n_body())[9 * body..9 * body + 9]
     }
 
-    /// A body's velocity at its centre of mass, world frame: angular in rad/s, then linear in m/s.
+    /// The velocity of a body at its centre of mass, world frame: angular velocity `[3]` in rad/s, then linear velocity
+    /// `[3]` in m/s.
     ///
     /// # Panics
     /// If `body` is not below the number of bodies.
     pub fn body_velocity(&self, body: usize) -> [f64; 6] {
         assert!(body < self.model.n_body(), "body {body} of {}", self.model.n_body());
         let mut velocity = [0.0; 6];
-        // SAFETY: `data` belongs to `model`, both only read; the body exists; the result has the six numbers' room. The
-        // only fatal error there is an unknown kind of object.
+        // SAFETY: `data` belongs to `model`, both only read; the body exists; the result has space for six numbers. The
+        // only fatal error of this function is an unknown kind of object.
         unsafe {
             sys::mj_objectVelocity(
                 self.model.as_ptr(),
@@ -472,7 +486,7 @@ impl Simulation {
         velocity
     }
 
-    /// The pairs of geoms that touch.
+    /// The indices of the two geoms of each contact.
     pub fn contacts(&self) -> impl ExactSizeIterator<Item = (usize, usize)> {
         self.array(self.raw().contact, self.raw().ncon as usize)
             .iter()
@@ -488,23 +502,24 @@ impl Simulation {
         unsafe { self.data.as_ref() }
     }
 
-    /// `start` must be a field of the data with `length` elements.
+    /// Returns an array of the data or of the model as a slice. `start` must be such an array with `length` elements.
     fn array<T>(&self, start: *mut T, length: usize) -> &[T] {
         if length == 0 {
             return &[]; // the pointer may be null
         }
-        // SAFETY: the caller passes a field of these data with the length that MuJoCo allocated it with (for contacts:
-        // at most); it is initialised by mj_makeData, lives, and is not written as long as `self` is borrowed.
+        // SAFETY: the caller passes an array of these data or of their model, with at most the length that MuJoCo
+        // allocated. It is initialised by mj_makeData or mj_loadXML, and lives unchanged as long as `self` is borrowed.
         unsafe { slice::from_raw_parts(start, length) }
     }
 
-    /// `start` must be a field of the data or of the model with `length` elements.
+    /// Returns an array of the data or of the model as a slice for editing. `start` must be such an array with `length`
+    /// elements.
     fn array_mut<T>(&mut self, start: *mut T, length: usize) -> &mut [T] {
         if length == 0 {
             return &mut []; // the pointer may be null
         }
-        // SAFETY: as in `array`; `&mut self` excludes other users. The callers expose floating-point arrays only, any
-        // value of which is memory-safe: MuJoCo indexes by none of them.
+        // SAFETY: as in `array`; `&mut self` excludes other users. The callers expose only floating-point arrays. Any
+        // value in them is memory-safe, because MuJoCo uses none of them as an index.
         unsafe { slice::from_raw_parts_mut(start, length) }
     }
 }
@@ -512,7 +527,8 @@ impl Simulation {
 impl Drop for Simulation {
     fn drop(&mut self) {
         // SAFETY: the data came from mj_makeData, are owned by `self`, and are freed once; also after a fatal error the
-        // two buffers that this frees are as mj_makeData left them. So do the pairs, of which MuJoCo keeps nothing.
+        // two buffers that this frees are as mj_makeData left them. The pairs are owned by `self`, too, and MuJoCo
+        // keeps no pointer to them.
         unsafe {
             sys::mj_deleteData(self.data.as_ptr());
             sys::perturb_mj_free_pairs(self.pairs.map_or(ptr::null_mut(), NonNull::as_ptr));

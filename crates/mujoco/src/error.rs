@@ -2,50 +2,51 @@
 
 use std::fmt;
 
-/// A failure of MuJoCo or of its use.
+/// A failure of MuJoCo, or a wrong use of it.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The library that was loaded is not the one whose headers were compiled against.
+    /// The loaded MuJoCo library has another version than the headers with which this crate was compiled.
     #[error("the MuJoCo library is version {library}, the headers {header}; install libmujoco-dev and build again")]
     Version {
         /// The headers' version, e.g. 222 for 2.2.2.
         header: i32,
-        /// The library's version.
+        /// The library's version, in the same form.
         library: i32,
     },
     /// The MJCF text cannot be compiled into a model.
     #[error("the model cannot be compiled: {reason}")]
     Compile {
-        /// MuJoCo's message, with the line.
+        /// MuJoCo's message, usually with the line of the text.
         reason: String,
     },
-    /// The model has no element of this name.
+    /// The model has no element with this name.
     #[error("the model has no {kind} named {name:?}")]
     UnknownName {
-        /// The kind of element.
+        /// The kind of element, as MJCF calls it, e.g. "joint".
         kind: &'static str,
         /// The name that was requested.
         name: String,
     },
-    /// MuJoCo raised a fatal error. The data it worked on is unusable from now on.
+    /// MuJoCo raised a fatal error. The simulation on which it worked is unusable from now on.
     #[error("MuJoCo raised a fatal error: {message}")]
     Fatal {
         /// MuJoCo's message.
         message: String,
     },
-    /// An earlier fatal error left the data in an undefined state.
+    /// The simulation is unusable because an earlier fatal error left it in an undefined state.
     #[error("the simulation is unusable after a fatal error; make another")]
     Poisoned,
-    /// There is no OpenGL to draw with.
+    /// OpenGL is not available, so nothing can be drawn.
     #[error("OpenGL without a display is missing: {reason}; install the Debian packages libegl1 and libgl1-mesa-dri")]
     NoOpenGl {
-        /// The call that failed.
+        /// The error of the dynamic loader, or the EGL call that failed.
         reason: String,
-        /// Whether the library is installed, so that another attempt may succeed.
+        /// Whether the EGL library is installed. If so, another attempt may succeed.
         is_installed: bool,
     },
-    /// The state cannot be trusted any more. MuJoCo may have put the initial state in its place.
+    /// MuJoCo raised a warning, so the simulated state is not reliable. MuJoCo may have replaced it with the initial
+    /// state.
     #[error("the simulation diverged: {warning}; reset it")]
     Diverged {
         /// MuJoCo's warning.
@@ -53,16 +54,16 @@ pub enum Error {
     },
 }
 
-/// MuJoCo's warnings, in MuJoCo's order.
+/// A warning of MuJoCo.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Warning {
     /// The inertia matrix is nearly singular.
     Inertia,
-    /// More contacts than the model's `nconmax`; the rest were dropped.
+    /// There are more contacts than the model's `nconmax` allows; the excess was dropped.
     ContactsFull,
-    /// More constraint rows than the model's `njmax`; the rest were dropped.
+    /// There are more constraint rows than the model's `njmax` allows; the excess was dropped.
     ConstraintsFull,
-    /// More visual geoms than there is room for.
+    /// The scene has no space for all visual geoms.
     VisualGeomsFull,
     /// A position is not finite or too large.
     BadPosition,
@@ -75,7 +76,7 @@ pub enum Warning {
 }
 
 impl Warning {
-    /// All warnings, in the order of `mjtWarning`.
+    /// All warnings, in the order of MuJoCo's `mjtWarning`.
     pub const ALL: [Self; 8] = [
         Self::Inertia,
         Self::ContactsFull,

@@ -1,8 +1,8 @@
-//! The arrays of a model and of a simulation, by name.
+//! Names of the arrays of models and simulations, by which their values are read and edited.
 
 use crate::sys;
 
-/// Declares an enum of arrays of the model, each with its MuJoCo name and its number of elements.
+/// Declares an enum of arrays of the model. Each variant has the array's name in MuJoCo and its number of elements.
 macro_rules! model_arrays {
     ($(#[$about:meta])* $name:ident: $type:ty, { $($(#[$doc:meta])* $field:ident = $raw:ident: $length:expr,)* }) => {
         $(#[$about])*
@@ -12,7 +12,7 @@ macro_rules! model_arrays {
         }
 
         impl $name {
-            /// The first element of the array in this model, and the number of elements.
+            /// A pointer to the first element of the array in this model, and the number of elements.
             pub(crate) fn place(self, m: &sys::mjModel) -> (*mut $type, usize) {
                 match self {
                     $(Self::$field => {
@@ -27,27 +27,28 @@ macro_rules! model_arrays {
 
 macro_rules! float_fields {
     ($($(#[$doc:meta])* $field:ident = $raw:ident: $length:expr,)*) => {
-        /// A floating-point array of a model, or numbers of its options.
+        /// A floating-point array of a model, or one of its numeric options.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
         pub enum Field {
             $($(#[$doc])* $field,)*
             /// Gravity in m/s², `[3]`.
             Gravity,
-            /// Wind in m/s, `[3]`.
+            /// Velocity of the wind in m/s, `[3]`.
             Wind,
-            /// Density of the medium in kg/m³, `[1]`.
+            /// Density of the medium around the bodies in kg/m³, `[1]`.
             Density,
-            /// Viscosity of the medium in Pa s, `[1]`.
+            /// Viscosity of the medium around the bodies in Pa s, `[1]`.
             Viscosity,
-            /// Mean inertia, mean mass, mean size, extent, and the centre's x, y and z, `[7]`.
+            /// Statistics of the model, `[7]`: mean inertia, mean mass, mean body size, spatial extent, and the
+            /// centre's x, y and z.
             Statistic,
         }
 
         impl Field {
-            /// The first element of the array in this model, and the number of elements.
+            /// A pointer to the first element of the array in this model, and the number of elements.
             ///
             /// # Safety
-            /// `raw` is a valid model, which nobody writes during the call.
+            /// `raw` must point to a valid model that is not written during the call.
             pub(crate) unsafe fn place(self, raw: *mut sys::mjModel) -> (*mut f64, usize) {
                 // SAFETY: the caller passes a valid model.
                 let m = unsafe { &*raw };
@@ -76,71 +77,73 @@ macro_rules! float_fields {
 }
 
 float_fields! {
-    /// Masses in kg, `[B]`.
+    /// Masses of bodies in kg, `[bodies]`.
     BodyMass = body_mass: |m| m.nbody,
-    /// Principal moments of inertia in kg m², `[B, 3]`.
+    /// Principal moments of inertia of bodies in kg m², `[bodies, 3]`.
     BodyInertia = body_inertia: |m| 3 * m.nbody,
-    /// Masses of subtrees in kg, `[B]`.
+    /// Total mass of each body and all its descendants in kg, `[bodies]`.
     BodySubtreeMass = body_subtreemass: |m| m.nbody,
-    /// Mean inverse inertia of bodies in the initial pose, `[B, 2]`.
+    /// Mean inverse inertia of each body in the initial pose, `[bodies, 2]`: for translation and rotation.
     BodyInvWeight = body_invweight0: |m| 2 * m.nbody,
-    /// Positions of bodies' frames in those of their parents in m, `[B, 3]`.
+    /// Position of each body's frame relative to its parent's frame in m, `[bodies, 3]`.
     BodyPosition = body_pos: |m| 3 * m.nbody,
-    /// Rotations of bodies' frames in those of their parents, as quaternions, `[B, 4]`.
+    /// Rotation of each body's frame relative to its parent's frame, as a quaternion, `[bodies, 4]`.
     BodyRotation = body_quat: |m| 4 * m.nbody,
-    /// Sizes of geoms in m, `[G, 3]`: of a sphere the radius, of a capsule or cylinder the radius and half of the length.
+    /// Sizes of geoms in m, `[geoms, 3]`. A sphere has its radius in the first entry; a capsule or cylinder has its
+    /// radius in the first and half of its length in the second.
     GeomSize = geom_size: |m| 3 * m.ngeom,
-    /// Sliding, torsional and rolling friction of geoms, `[G, 3]`.
+    /// Sliding, torsional and rolling friction coefficients of geoms, `[geoms, 3]`.
     GeomFriction = geom_friction: |m| 3 * m.ngeom,
-    /// Friction of declared pairs: two sliding, one torsional, two rolling, `[P, 5]`.
+    /// Friction coefficients of the pairs of geoms that the model declares, `[pairs, 5]`: two sliding, one torsional,
+    /// two rolling.
     PairFriction = pair_friction: |m| 5 * m.npair,
-    /// Damping of degrees of freedom, `[V]`.
+    /// Damping of degrees of freedom, `[dofs]`.
     DofDamping = dof_damping: |m| m.nv,
-    /// Armature of degrees of freedom, `[V]`.
+    /// Armature of degrees of freedom, `[dofs]`: an inertia that is added to each, e.g. that of a motor's rotor.
     DofArmature = dof_armature: |m| m.nv,
-    /// Friction loss of degrees of freedom, `[V]`.
+    /// Dry friction of degrees of freedom, `[dofs]`.
     DofFrictionLoss = dof_frictionloss: |m| m.nv,
-    /// Inverse inertia of degrees of freedom in the initial pose, `[V]`.
+    /// Inverse inertia of degrees of freedom in the initial pose, `[dofs]`.
     DofInvWeight = dof_invweight0: |m| m.nv,
-    /// Inertia of degrees of freedom in the initial pose, `[V]`.
+    /// Inertia of degrees of freedom in the initial pose, `[dofs]`.
     DofInertia = dof_M0: |m| m.nv,
-    /// Stiffness of joints, `[J]`.
+    /// Spring stiffness of joints, `[joints]`.
     JointStiffness = jnt_stiffness: |m| m.njnt,
-    /// Limits of joints in rad or m, `[J, 2]`.
+    /// Lower and upper limits of joints in rad or m, `[joints, 2]`.
     JointRange = jnt_range: |m| 2 * m.njnt,
-    /// Anchors of joints in the frames of their bodies in m, `[J, 3]`.
+    /// Position of each joint's anchor in its body's frame in m, `[joints, 3]`.
     JointAnchor = jnt_pos: |m| 3 * m.njnt,
-    /// Initial positions, `[Q]`.
+    /// Initial generalised positions, `[n_q]`.
     InitialPositions = qpos0: |m| m.nq,
-    /// Gears of actuators, `[U, 6]`.
+    /// Gear ratios of actuators, `[actuators, 6]`.
     ActuatorGear = actuator_gear: |m| 6 * m.nu,
-    /// Gain parameters of actuators, `[U, 10]`.
+    /// Gain parameters of actuators, `[actuators, 10]`.
     ActuatorGain = actuator_gainprm: |m| sys::mjNGAIN as i32 * m.nu,
-    /// Bias parameters of actuators, `[U, 10]`.
+    /// Bias parameters of actuators, `[actuators, 10]`.
     ActuatorBias = actuator_biasprm: |m| sys::mjNBIAS as i32 * m.nu,
-    /// Limits of controls, `[U, 2]`.
+    /// Lower and upper limits of the actuators' controls, `[actuators, 2]`.
     ActuatorControlRange = actuator_ctrlrange: |m| 2 * m.nu,
-    /// Limits of forces, `[U, 2]`.
+    /// Lower and upper limits of the actuators' forces, `[actuators, 2]`.
     ActuatorForceRange = actuator_forcerange: |m| 2 * m.nu,
-    /// Acceleration from a unit force in the initial pose, `[U]`.
+    /// Acceleration that a unit force of each actuator causes in the initial pose, `[actuators]`.
     ActuatorAcceleration = actuator_acc0: |m| m.nu,
-    /// Lengths of actuators in the initial pose, `[U]`.
+    /// Lengths of actuators in the initial pose, `[actuators]`.
     ActuatorLength = actuator_length0: |m| m.nu,
-    /// Stiffness of tendons, `[T]`.
+    /// Stiffness of tendons, `[tendons]`.
     TendonStiffness = tendon_stiffness: |m| m.ntendon,
-    /// Damping of tendons, `[T]`.
+    /// Damping of tendons, `[tendons]`.
     TendonDamping = tendon_damping: |m| m.ntendon,
-    /// Lengths of tendons in the initial pose, `[T]`.
+    /// Lengths of tendons in the initial pose, `[tendons]`.
     TendonLength = tendon_length0: |m| m.ntendon,
-    /// Inverse weights of tendons in the initial pose, `[T]`.
+    /// Inverse inertia of tendons in the initial pose, `[tendons]`.
     TendonInvWeight = tendon_invweight0: |m| m.ntendon,
-    /// Positions of keyframes, `[K, Q]`.
+    /// Generalised positions of keyframes, `[keyframes, n_q]`.
     KeyPositions = key_qpos: |m| m.nkey * m.nq,
-    /// Velocities of keyframes, `[K, V]`.
+    /// Generalised velocities of keyframes, `[keyframes, n_v]`.
     KeyVelocities = key_qvel: |m| m.nkey * m.nv,
 }
 
-/// The fields that edits of masses, inertias and friction change, or that mj_setConst computes from them.
+/// The fields with masses, inertias and friction, and all fields that mj_setConst derives from masses and inertias.
 pub(crate) const CONSTANTS: [Field; 9] = [
     Field::BodyMass,
     Field::BodyInertia,
@@ -154,7 +157,8 @@ pub(crate) const CONSTANTS: [Field; 9] = [
 ];
 
 impl Field {
-    /// The fields that [`Simulation::set_const`](crate::Simulation::set_const) computes and that physics depends on.
+    /// The fields that [`Simulation::set_const`](crate::Simulation::set_const) derives from other fields and that
+    /// affect the physics.
     pub const DERIVED: [Self; 9] = [
         Self::BodySubtreeMass,
         Self::BodyInvWeight,
@@ -169,51 +173,53 @@ impl Field {
 }
 
 model_arrays! {
-    /// An array of whole numbers of a model.
+    /// An integer array of a model.
     Index: i32, {
-        /// Parents of bodies, `[B]`.
+        /// Index of each body's parent body, `[bodies]`.
         BodyParent = body_parentid: |m| m.nbody,
-        /// The body that each body is welded to, `[B]`; 0 is the world.
+        /// Index of the body to which each body is rigidly attached, or its own, `[bodies]`. 0 is the world.
         BodyWeld = body_weldid: |m| m.nbody,
-        /// Types of joints: 0 free, 1 ball, 2 slide, 3 hinge, `[J]`.
+        /// Types of joints, `[joints]`: 0 free, 1 ball, 2 slide, 3 hinge.
         JointType = jnt_type: |m| m.njnt,
-        /// First entries of joints in `qpos`, `[J]`.
+        /// Index in `qpos` of each joint's first position, `[joints]`.
         JointPosition = jnt_qposadr: |m| m.njnt,
-        /// First entries of joints in `qvel`, `[J]`.
+        /// Index in `qvel` of each joint's first velocity, `[joints]`.
         JointVelocity = jnt_dofadr: |m| m.njnt,
-        /// Bodies of joints, `[J]`.
+        /// Index of each joint's body, `[joints]`.
         JointBody = jnt_bodyid: |m| m.njnt,
-        /// Types of geoms, of `mjtGeom`: 2 sphere, 3 capsule, 5 cylinder, 7 mesh, `[G]`.
+        /// Types of geoms, `[geoms]`, as in MuJoCo's `mjtGeom`: 2 sphere, 3 capsule, 5 cylinder, 7 mesh.
         GeomType = geom_type: |m| m.ngeom,
-        /// Bodies of geoms, `[G]`.
+        /// Index of each geom's body, `[geoms]`.
         GeomBody = geom_bodyid: |m| m.ngeom,
-        /// Contact types of geoms, `[G]`.
+        /// Contact types of geoms, `[geoms]`: bits that are compared with the other geom's contact affinity.
         GeomContactType = geom_contype: |m| m.ngeom,
-        /// Contact affinities of geoms, `[G]`.
+        /// Contact affinities of geoms, `[geoms]`: bits that are compared with the other geom's contact type.
         GeomContactAffinity = geom_conaffinity: |m| m.ngeom,
-        /// Priorities of geoms, `[G]`.
+        /// Priorities of geoms, `[geoms]`. The geom of higher priority determines the parameters of a contact.
         GeomPriority = geom_priority: |m| m.ngeom,
-        /// Contact dimensions of geoms, `[G]`.
+        /// Dimensions of the contacts of geoms, `[geoms]`: 1 frictionless, 3 with sliding friction, 4 also with
+        /// torsional friction, 6 also with rolling friction.
         GeomContactDimension = geom_condim: |m| m.ngeom,
-        /// First geoms of declared pairs, `[P]`.
+        /// Index of the first geom of each pair that the model declares, `[pairs]`.
         PairGeom1 = pair_geom1: |m| m.npair,
-        /// Second geoms of declared pairs, `[P]`.
+        /// Index of the second geom of each pair that the model declares, `[pairs]`.
         PairGeom2 = pair_geom2: |m| m.npair,
-        /// Contact dimensions of declared pairs, `[P]`.
+        /// Dimension of the contact of each pair of geoms that the model declares, `[pairs]`.
         PairContactDimension = pair_dim: |m| m.npair,
-        /// Types of dynamics of actuators, `[U]`; 0 is none.
+        /// Types of the actuators' internal dynamics, `[actuators]`; 0 is none.
         ActuatorDynamics = actuator_dyntype: |m| m.nu,
-        /// Types of gains of actuators, `[U]`; 0 is fixed.
+        /// Types of the actuators' gains, `[actuators]`; 0 is a fixed gain.
         ActuatorGainType = actuator_gaintype: |m| m.nu,
-        /// Types of biases of actuators, `[U]`; 0 none, 1 affine.
+        /// Types of the actuators' biases, `[actuators]`: 0 none, 1 affine.
         ActuatorBiasType = actuator_biastype: |m| m.nu,
-        /// Types of transmissions of actuators, `[U]`; 0 joint, 1 joint in the parent's frame.
+        /// Types of the actuators' transmissions, `[actuators]`: 0 to a joint, 1 to a joint in its parent's frame;
+        /// others to other elements.
         ActuatorTransmission = actuator_trntype: |m| m.nu,
-        /// Targets of actuators, `[U, 2]`.
+        /// Indices of the elements on which each actuator acts, `[actuators, 2]`.
         ActuatorTarget = actuator_trnid: |m| 2 * m.nu,
-        /// First numbers of sensors, `[S]`.
+        /// Index of each sensor's first number in the sensor data, `[sensors]`.
         SensorAddress = sensor_adr: |m| m.nsensor,
-        /// Numbers of each sensor, `[S]`.
+        /// Count of each sensor's numbers in the sensor data, `[sensors]`.
         SensorDimension = sensor_dim: |m| m.nsensor,
     }
 }
@@ -221,55 +227,56 @@ model_arrays! {
 model_arrays! {
     /// An array of flags of a model, 0 or 1.
     Flags: u8, {
-        /// Whether joints have limits, `[J]`.
+        /// Whether joints have limits, `[joints]`.
         JointLimited = jnt_limited: |m| m.njnt,
-        /// Whether controls have limits, `[U]`.
+        /// Whether the actuators' controls have limits, `[actuators]`.
         ActuatorControlLimited = actuator_ctrllimited: |m| m.nu,
-        /// Whether forces have limits, `[U]`.
+        /// Whether the actuators' forces have limits, `[actuators]`.
         ActuatorForceLimited = actuator_forcelimited: |m| m.nu,
     }
 }
 
-/// Options of a model that are whole numbers.
+/// The integer options of a model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Options {
-    /// 0 Euler, 1 RK4, 2 implicit.
+    /// The numerical integrator: 0 Euler, 1 RK4, 2 implicit.
     pub integrator: i32,
-    /// 0 all, 1 declared pairs only, 2 dynamic only.
+    /// The geoms that are checked for collisions: 0 all, 1 only declared pairs, 2 only pairs found by their contact
+    /// types.
     pub collision: i32,
-    /// Bits of `mjtDisableBit`.
+    /// The disabled parts of the physics, as bits of MuJoCo's `mjtDisableBit`.
     pub disable_flags: i32,
-    /// Bits of `mjtEnableBit`.
+    /// The enabled additional parts of the physics, as bits of MuJoCo's `mjtEnableBit`.
     pub enable_flags: i32,
 }
 
 impl Options {
-    /// No constraints at all.
+    /// The bit of [`Options::disable_flags`] that disables all constraints.
     pub const DISABLE_CONSTRAINT: i32 = 1;
-    /// No friction loss.
+    /// The bit of [`Options::disable_flags`] that disables dry friction of joints and tendons.
     pub const DISABLE_FRICTION_LOSS: i32 = 1 << 2;
-    /// No limits of joints and tendons.
+    /// The bit of [`Options::disable_flags`] that disables the limits of joints and tendons.
     pub const DISABLE_LIMIT: i32 = 1 << 3;
-    /// No contacts.
+    /// The bit of [`Options::disable_flags`] that disables contacts.
     pub const DISABLE_CONTACT: i32 = 1 << 4;
-    /// No springs, dampers and fluid forces.
+    /// The bit of [`Options::disable_flags`] that disables springs, dampers and fluid forces.
     pub const DISABLE_PASSIVE: i32 = 1 << 5;
-    /// No gravity.
+    /// The bit of [`Options::disable_flags`] that disables gravity.
     pub const DISABLE_GRAVITY: i32 = 1 << 6;
-    /// No actuation.
+    /// The bit of [`Options::disable_flags`] that disables all actuators.
     pub const DISABLE_ACTUATION: i32 = 1 << 10;
 }
 
 macro_rules! data_arrays {
     ($($(#[$doc:meta])* $field:ident = $raw:ident: $length:expr,)*) => {
-        /// An array that MuJoCo computes.
+        /// An array of a simulation: the state, or a quantity that MuJoCo computes.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
         pub enum Reading {
             $($(#[$doc])* $field,)*
         }
 
         impl Reading {
-            /// The first element of the array in these data of a model, and the number of elements.
+            /// A pointer to the first element of the array in a model's data, and the number of elements.
             pub(crate) fn place(self, d: &sys::mjData, m: &sys::mjModel) -> (*mut f64, usize) {
                 match self {
                     $(Self::$field => {
@@ -283,36 +290,36 @@ macro_rules! data_arrays {
 }
 
 data_arrays! {
-    /// Positions, `[Q]`.
+    /// Generalised positions, `[n_q]`.
     Positions = qpos: |m| m.nq,
-    /// Velocities, `[V]`.
+    /// Generalised velocities, `[n_v]`.
     Velocities = qvel: |m| m.nv,
-    /// Controls, `[U]`.
+    /// Controls of actuators, `[actuators]`.
     Controls = ctrl: |m| m.nu,
-    /// Activations, `[n_act]`.
+    /// Activations, the state of actuators with internal dynamics, `[n_act]`.
     Activations = act: |m| m.na,
-    /// Origins of bodies' frames in m, `[B, 3]`.
+    /// Origins of the bodies' frames in m, world frame, `[bodies, 3]`.
     BodyPositions = xpos: |m| 3 * m.nbody,
-    /// Rotation matrices of bodies' frames, row-major, `[B, 9]`.
+    /// Rotation matrices from the bodies' frames to the world frame, row-major, `[bodies, 9]`.
     BodyRotations = xmat: |m| 9 * m.nbody,
-    /// Centres of mass of bodies in m, `[B, 3]`.
+    /// Centres of mass of bodies in m, world frame, `[bodies, 3]`.
     BodyCentres = xipos: |m| 3 * m.nbody,
-    /// Positions of geoms in m, `[G, 3]`.
+    /// Positions of geoms in m, world frame, `[geoms, 3]`.
     GeomPositions = geom_xpos: |m| 3 * m.ngeom,
-    /// Positions of sites in m, `[site, 3]`.
+    /// Positions of sites in m, world frame, `[sites, 3]`.
     SitePositions = site_xpos: |m| 3 * m.nsite,
-    /// Inertias and masses of bodies about the centre of mass of their tree, `[B, 10]`.
+    /// Inertia and mass of each body about the centre of mass of its kinematic tree, `[bodies, 10]`.
     BodyInertias = cinert: |m| 10 * m.nbody,
-    /// Velocities of bodies about the centre of mass of their tree, rotation first, `[B, 6]`.
+    /// Velocity of each body about the centre of mass of its kinematic tree, `[bodies, 6]`: angular, then linear.
     BodyVelocities = cvel: |m| 6 * m.nbody,
-    /// External forces on bodies about the centre of mass of their tree, torque first, `[B, 6]`.
+    /// External force on each body about the centre of mass of its kinematic tree, `[bodies, 6]`: torque, then force.
     BodyExternalForces = cfrc_ext: |m| 6 * m.nbody,
-    /// Forces of actuators on degrees of freedom, `[V]`.
+    /// Total force of the actuators on each degree of freedom, `[dofs]`.
     DofActuation = qfrc_actuator: |m| m.nv,
-    /// Forces of constraints on degrees of freedom, `[V]`.
+    /// Total force of the constraints on each degree of freedom, `[dofs]`.
     DofConstraint = qfrc_constraint: |m| m.nv,
-    /// Forces of actuators, `[U]`.
+    /// Force of each actuator, `[actuators]`.
     ActuatorForces = actuator_force: |m| m.nu,
-    /// Numbers of sensors.
+    /// The numbers of all sensors, one sensor after the other.
     Sensors = sensordata: |m| m.nsensordata,
 }

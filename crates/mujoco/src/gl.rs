@@ -1,7 +1,7 @@
-//! An OpenGL context without a display, through EGL.
+//! OpenGL contexts without a display, created by EGL.
 //!
-//! libEGL is opened when the first context is made, so that programs run without it. Drivers do not survive being unloaded.
-//! So the library stays open, with its displays, which the process shares.
+//! libEGL is loaded when the first context is created, so that programs that draw nothing run without it. The library
+//! and its displays stay open until the process ends, because graphics drivers do not survive being unloaded.
 
 use crate::Error;
 use khronos_egl as egl;
@@ -14,10 +14,10 @@ use std::{
 type Egl = egl::DynamicInstance<egl::EGL1_4>;
 
 const LIBRARY: &str = "libEGL.so.1";
-/// Maximum number of graphics cards that are looked at.
+/// Maximal number of graphics cards that are tried.
 const MAX_DEVICES: usize = 32;
 
-// These numbers are those of EGL_EXT_platform_device and EGL_MESA_platform_surfaceless in the EGL registry.
+// The EGL registry defines these numbers for EGL_EXT_platform_device and EGL_MESA_platform_surfaceless.
 const PLATFORM_DEVICE: c_uint = 0x313F;
 const PLATFORM_SURFACELESS: c_uint = 0x31DD;
 #[rustfmt::skip]
@@ -31,9 +31,10 @@ const CONFIG: [egl::Int; 15] = [
     egl::STENCIL_SIZE, 8,
     egl::NONE,
 ];
-/// A surface of one pixel: every context may be made current with one, and pictures are drawn elsewhere.
+/// Attributes of a surface of one pixel. Any context can be made current with it. Pictures are drawn into another
+/// buffer.
 const SURFACE: [egl::Int; 5] = [egl::WIDTH, 1, egl::HEIGHT, 1, egl::NONE];
-/// The compatibility profile, which MuJoCo needs.
+/// Attributes of a context: none, which selects the compatibility profile that MuJoCo needs.
 const CONTEXT: [egl::Int; 1] = [egl::NONE];
 
 type GetPlatformDisplay = unsafe extern "system" fn(c_uint, *mut c_void, *const c_int) -> egl::EGLDisplay;
@@ -48,21 +49,22 @@ fn library() -> Result<&'static Egl, Error> {
 }
 
 fn open(name: &str) -> Result<Egl, Error> {
-    // SAFETY: the initialisers that run are those of the system's EGL library, which any program may load, and its
-    // functions have the types of the EGL registry.
+    // SAFETY: this loads the system's EGL library and runs its initialisers, as any program may, and its functions have
+    // the types of the EGL registry.
     unsafe { Egl::load_required_from_filename(name) }.map_err(|error| {
         let reason = error.to_string();
-        // The dynamic loader reports a missing file with these words, and a lack of memory or descriptors with others.
+        // The dynamic loader reports a missing file with these words. Other errors, such as too little memory, may go
+        // away.
         let is_installed = !reason.contains("No such file or directory");
         Error::NoOpenGl { reason, is_installed }
     })
 }
 
-/// Returns displays that need no screen, the likeliest first: each graphics card and the software renderer, then the
-/// platform's default.
+/// Returns the EGL displays that need no screen, in the order in which to try them: each graphics card, the software
+/// renderer, then the default display.
 fn displays(egl: &Egl) -> Vec<egl::Display> {
     let mut displays = Vec::new();
-    // `Egl::get_platform_display` would panic if EGL knows the platform and has no display of it.
+    // `Egl::get_platform_display` would panic if EGL knows a platform but has no display for it.
     if let Some(function) = egl.get_proc_address("eglGetPlatformDisplayEXT") {
         // SAFETY: the extension's function of the EGL registry's type.
         let get_platform_display = unsafe { mem::transmute::<extern "system" fn(), GetPlatformDisplay>(function) };
@@ -70,39 +72,39 @@ fn displays(egl: &Egl) -> Vec<egl::Display> {
         if let Some(function) = egl.get_proc_address("eglQueryDevicesEXT") {
             // SAFETY: the extension's function of the EGL registry's type.
             let query_devices = unsafe { mem::transmute::<extern "system" fn(), QueryDevices>(function) };
-            // SAFETY: room for as many devices as it is told of.
+            // SAFETY: the array has space for the number of devices that is passed.
             unsafe { query_devices(MAX_DEVICES as c_int, devices.as_mut_ptr(), &raw mut n) };
         }
         let devices = devices.iter().take(usize::try_from(n).unwrap_or(0)).map(|&device| (PLATFORM_DEVICE, device));
         for (platform, native) in devices.chain([(PLATFORM_SURFACELESS, ptr::null_mut())]) {
-            // SAFETY: a device that EGL named, or null, which the other platform takes; no attributes.
+            // SAFETY: the device comes from EGL, or is null, as the other platform requires; there are no attributes.
             let display = unsafe { get_platform_display(platform, native, ptr::null()) };
             if display != egl::NO_DISPLAY {
-                // SAFETY: a display that EGL gave.
+                // SAFETY: the display comes from EGL.
                 displays.push(unsafe { egl::Display::from_ptr(display) });
             }
         }
     }
-    // SAFETY: the default display is always legal to ask for.
+    // SAFETY: the default display may always be requested.
     displays.extend(unsafe { egl.get_display(egl::DEFAULT_DISPLAY) });
     displays
 }
 
-/// An OpenGL context without a display. It belongs to the thread that made it.
+/// An OpenGL context without a display. It can only be used in the thread that created it.
 pub(crate) struct Gl {
     egl: &'static Egl,
-    // Surface and context belong to `egl` and are valid as long as this value; the display is valid for ever. They hold raw
-    // pointers, which keep this value on its thread.
+    // Surface and context are valid as long as this value, the display for ever. They are raw pointers, so this type is
+    // not `Send`.
     display: egl::Display,
     surface: egl::Surface,
     context: Option<egl::Context>,
 }
 
 impl Gl {
-    /// A context on a graphics card if there is one that can be used, else in software.
+    /// Creates a context on the first usable graphics card, otherwise in the software renderer, and makes it current.
     ///
     /// # Errors
-    /// [`Error::NoOpenGl`].
+    /// [`Error::NoOpenGl`] if no display has a usable context.
     pub(crate) fn new() -> Result<Self, Error> {
         let egl = library()?;
         let mut reason = "EGL has no display".to_owned();
@@ -129,7 +131,7 @@ impl Gl {
         Ok(gl)
     }
 
-    /// Makes OpenGL's calls of this thread use this context.
+    /// Makes this the current context: later OpenGL calls of this thread use it.
     pub(crate) fn make_current(&self) -> Result<(), egl::Error> {
         self.egl.make_current(self.display, Some(self.surface), Some(self.surface), self.context)
     }
@@ -137,7 +139,7 @@ impl Gl {
 
 impl Drop for Gl {
     fn drop(&mut self) {
-        // A failure of the driver has no consequence here, and cannot be reported from `drop`.
+        // Failures are ignored: they have no consequence, and `drop` cannot report them.
         let _ = self.egl.make_current(self.display, None, None, None);
         if let Some(context) = self.context {
             let _ = self.egl.destroy_context(self.display, context);

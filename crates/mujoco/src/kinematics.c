@@ -1,7 +1,8 @@
-// Kinematics of hinges and slides, in MuJoCo's order of operations: each number is the same sum of the same
-// products. A rotation by the identity is left out where MuJoCo leaves it out, which decides the sign of a zero.
+// Forward kinematics of hinges and slides. The order of floating-point operations is MuJoCo's, so the results have the
+// same bytes. Where MuJoCo skips a rotation by the identity, this code skips it too, because it could change the sign
+// of a zero.
 //
-// Vectors are [3], quaternions [4], w first, and matrices [3, 3], row by row; motions [6], rotation first.
+// Shapes: vectors [3], quaternions [4] with w first, matrices [3, 3] row-major, motions [6] with rotation first.
 #include "kinematics.h"
 
 #include <math.h>
@@ -9,7 +10,7 @@
 
 #ifdef __x86_64__
 
-// Models with more bodies have their centres of mass computed by MuJoCo.
+// Maximal number of bodies for which perturb_com_pos computes centres of mass. It leaves larger models to MuJoCo.
 enum { MOST_BODIES = 32 };
 
 static inline int is_identity(const mjtNum* q) { return q[0] == 1 && q[1] == 0 && q[2] == 0 && q[3] == 0; }
@@ -24,19 +25,19 @@ static inline void subtract3(mjtNum* to, const mjtNum* a, const mjtNum* b) {
   for (int i = 0; i < 3; i++) to[i] = a[i] - b[i];
 }
 
-// `to` is neither `a` nor `b`.
+// Cross product of `a` and `b`. `to` must be neither `a` nor `b`.
 static inline void cross(mjtNum* to, const mjtNum* a, const mjtNum* b) {
   to[0] = a[1] * b[2] - a[2] * b[1];
   to[1] = a[2] * b[0] - a[0] * b[2];
   to[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-// `to` is not `v`.
+// Product of the matrix `m` and the vector `v`. `to` must not be `v`.
 static inline void by_matrix(mjtNum* to, const mjtNum* v, const mjtNum* m) {
   for (int i = 0; i < 3; i++) to[i] = m[3 * i] * v[0] + m[3 * i + 1] * v[1] + m[3 * i + 2] * v[2];
 }
 
-// `to` is not `v`.
+// Rotates `v` by the quaternion `q`. `to` must not be `v`.
 static inline void by_quaternion(mjtNum* to, const mjtNum* v, const mjtNum* q) {
   if (is_identity(q)) {
     copy3(to, v);
@@ -50,7 +51,7 @@ static inline void by_quaternion(mjtNum* to, const mjtNum* v, const mjtNum* q) {
   to[2] = v[2] + 2 * (q[1] * y - q[2] * x);
 }
 
-// `to` is neither `a` nor `b`.
+// Product of the quaternions `a` and `b`. `to` must be neither `a` nor `b`.
 static inline void product(mjtNum* to, const mjtNum* a, const mjtNum* b) {
   to[0] = a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3];
   to[1] = a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2];
@@ -58,6 +59,7 @@ static inline void product(mjtNum* to, const mjtNum* a, const mjtNum* b) {
   to[3] = a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0];
 }
 
+// Sets `q` to the quaternion of a rotation about a unit axis, by `angle` in rad.
 static inline void about(mjtNum* q, const mjtNum* axis, mjtNum angle) {
   mjtNum half = angle * 0.5, s = sin(half);
   q[0] = cos(half);
@@ -70,6 +72,7 @@ static inline void normalise(mjtNum* q) {
   for (int i = 0; i < 4; i++) q[i] = norm < mjMINVAL ? i == 0 : q[i] * inverse;
 }
 
+// Sets `m` to the rotation matrix of the quaternion `q`.
 static inline void matrix(mjtNum* m, const mjtNum* q) {
   if (is_identity(q)) {
     for (int i = 0; i < 9; i++) m[i] = i % 4 == 0;
@@ -88,7 +91,7 @@ static inline void matrix(mjtNum* m, const mjtNum* q) {
   m[8] = ww - xx - yy + zz;
 }
 
-// Moves a body by one of its joints, and stores the joint's anchor and axis.
+// Moves a body's position and orientation by the displacement of one of its joints. Stores the joint's anchor and axis.
 static inline void move(const mjModel* m, mjData* d, int joint, mjtNum* position, mjtNum* orientation) {
   mjtNum* anchor = d->xanchor + 3 * joint;
   mjtNum* axis = d->xaxis + 3 * joint;
@@ -109,8 +112,9 @@ static inline void move(const mjModel* m, mjData* d, int joint, mjtNum* position
   for (int i = 0; i < 3; i++) position[i] += (anchor[i] - position[i]) - back[i];
 }
 
-// Computes the pose of an element that is fixed to a body. `same` says what MuJoCo's compiler found it to share with the
-// body: nothing, the body's frame, or the frame of the body's inertia.
+// Computes the world pose of an element that is fixed to a body, from its pose in the body's frame. `same` is MuJoCo's
+// `sameframe`: 0 if the element has a frame of its own, 1 if it has the body's frame, otherwise it has the body's
+// inertial frame.
 static inline void attach(const mjData* d, int body, mjtByte same, const mjtNum* position, const mjtNum* orientation,
                           mjtNum* to, mjtNum* rotation) {
   if (same) {
@@ -125,6 +129,7 @@ static inline void attach(const mjData* d, int body, mjtByte same, const mjtNum*
   matrix(rotation, turned);
 }
 
+// Whether this file can compute the kinematics of the model.
 static int is_walked(const mjModel* m) {
   if (m->nsite || m->nmocap) return 0;
   for (int joint = 0; joint < m->njnt; joint++) {
@@ -164,8 +169,9 @@ void perturb_kinematics(const mjModel* m, mjData* d) {
   }
 }
 
-// The inertia of a body in a frame at `offset` from its centre of mass: the matrix's diagonal and the three beside it,
-// mass × offset, mass.
+// Sets `to`, [10], to the inertia of a body about a point at -`offset` from its centre of mass: the diagonal of the
+// inertia matrix, its three off-diagonal elements, mass × offset, and the mass. `diagonal` has the principal moments of
+// inertia, `m` the rotation of the inertial frame.
 static inline void inertia(mjtNum* to, const mjtNum* diagonal, const mjtNum* m, const mjtNum* offset, mjtNum mass) {
   mjtNum scaled[9];  // [axis, row]
   for (int i = 0; i < 9; i++) scaled[i] = m[i % 3 * 3 + i / 3] * diagonal[i / 3];
@@ -252,7 +258,7 @@ void perturb_com_vel(const mjModel* m, mjData* d) {
   }
 }
 
-#else  // elsewhere Debian's MuJoCo itself has products and sums that its compiler fused
+#else  // on other processors Debian's MuJoCo has fused multiply-add, whose bytes this code does not reproduce
 
 void perturb_kinematics(const mjModel* m, mjData* d) { mj_kinematics(m, d); }
 void perturb_com_pos(const mjModel* m, mjData* d) { mj_comPos(m, d); }

@@ -3,10 +3,10 @@
 
 #include <mujoco/mujoco.h>
 
-// What mj_kinematics, mj_comPos and mj_comVel compute, to the same bytes as a library that fuses no products and sums.
-// They are a quarter of a robot's timestep, most of which are calls through the library's table for a few
-// multiplications each. So trees of hinges and slides, without sites and mocap bodies, are walked here, and all other
-// models by MuJoCo. The stack of `data`, which mj_comPos uses, is left alone.
+// These functions compute the same bytes as mj_kinematics, mj_comPos and mj_comVel of a MuJoCo library that was
+// compiled without fused multiply-add. They are faster: MuJoCo's functions take a quarter of a robot's timestep, mostly
+// for calls of tiny library functions. Models with other joints than hinges and slides, with sites or with mocap bodies
+// are passed to MuJoCo's functions. Unlike mj_comPos, perturb_com_pos does not use the stack of `data`.
 void perturb_kinematics(const mjModel* model, mjData* data);
 void perturb_com_pos(const mjModel* model, mjData* data);
 void perturb_com_vel(const mjModel* model, mjData* data);

@@ -1,35 +1,35 @@
-//! Safe bindings to Debian's MuJoCo 2.2.2, as far as perturb needs them.
+//! Safe bindings to the parts of Debian's MuJoCo 2.2.2 that perturb needs.
 //!
-//! - [`Model`]: a compiled model; loaded from MJCF text, copied, read.
-//! - [`Simulation`]: a model of its own and the data that MuJoCo computes on it; stepped, edited, read.
-//! - [`Field`], [`Index`], [`Flags`] and [`Reading`]: the arrays of models and simulations, by name.
-//! - [`Renderer`]: pictures of a model, drawn without a display.
-//! - [`Error`], [`Warning`]: failures of MuJoCo. None ends the process, and none is ignored.
+//! - [`Model`]: a compiled model. It is compiled from MJCF, MuJoCo's XML format, or copied from another model.
+//! - [`Simulation`]: a copy of a model, which may be edited, and the physical state that MuJoCo computes for it.
+//! - [`Field`], [`Index`], [`Flags`] and [`Reading`]: the names of the arrays of models and simulations.
+//! - [`Renderer`]: draws pictures of a model without a display.
+//! - [`Error`], [`Warning`]: MuJoCo's failures. Fatal errors are returned instead of ending the process, and warnings
+//!   are reported as errors.
 //!
 //! ```
 //! use perturb_mujoco::{Kind, Model, Simulation};
 //!
-//! let model = Model::from_xml("<mujoco><worldbody><body name='ball'><freejoint/><geom size='.1'/></body></worldbody></mujoco>")?;
-//! let ball = model.id(Kind::Body, "ball")?;
-//! let mut simulation = Simulation::new(model)?;
-//! simulation.step1()?;
-//! simulation.step2()?;
-//! simulation.step1()?; // poses are those of the new state
-//! assert!(simulation.xipos(ball)[2] < 0.0);
+//! let model = Model::from_xml("<mujoco><worldbody><body name='ball'><freejoint/><geom
+//! size='.1'/></body></worldbody></mujoco>")?; let ball = model.id(Kind::Body, "ball")?; let mut simulation =
+//! Simulation::new(model)?; simulation.step1()?; simulation.step2()?; simulation.step1()?; // computes the poses of the
+//! new state assert!(simulation.xipos(ball)[2] < 0.0);
 //! # Ok::<(), perturb_mujoco::Error>(())
 //! ```
 //!
 //! # Threads
 //!
-//! MuJoCo's engine keeps no state outside `mjModel` and `mjData`, except its error handlers, which the shim installs per
-//! thread and per call, its callbacks, which nothing here sets, and the addresses of OpenGL's functions. Only the compiler
-//! of MJCF and drawing are not thread-safe; both are serialised.
+//! Different models and simulations may be used in different threads at the same time. MuJoCo's engine has little state
+//! outside `mjModel` and `mjData`: error handlers, which the C code in `shim.c` installs per thread and per call,
+//! callbacks, which this crate never sets, and the addresses of OpenGL's functions. Only the MJCF compiler and drawing
+//! are not thread-safe. This crate serialises them by mutexes.
 //!
 //! # Fatal errors
 //!
-//! Each call runs under `setjmp` in `shim.c`, and the handler jumps back there: across frames of MuJoCo's C engine
-//! only, never of Rust, nor of the C++ compiler. What the interrupted call left in `mjData` is undefined, so
-//! [`Simulation`] refuses all further calls; another takes its place.
+//! MuJoCo handles a fatal error by ending the process. Here each call runs under `setjmp` in `shim.c`, and the error
+//! handler jumps back there. The jump crosses only C frames of MuJoCo's engine, never Rust frames or those of the MJCF
+//! compiler, which is C++. The interrupted call leaves `mjData` in an undefined state. So the [`Simulation`] refuses
+//! all further calls, and the caller must make a new one.
 
 mod data;
 mod error;

@@ -1,4 +1,4 @@
-//! A compiled model.
+//! Compiled MuJoCo models.
 
 use crate::{
     Error,
@@ -12,38 +12,39 @@ use std::{
     sync::{Mutex, OnceLock, PoisonError},
 };
 
-/// Maximal number of files in MuJoCo's virtual file system, in addition to the model's text.
+/// Maximal number of files that a model may use. MuJoCo's virtual file system has space for 2000 files, the model's
+/// text included.
 const MAX_FILES: usize = 1999;
-/// Maximal length of a file's name, in bytes. MuJoCo has space for 1000.
+/// File names must be shorter than this, in bytes. MuJoCo has space for 1000.
 const MAX_FILE_NAME: usize = 900;
 
-/// A kind of named model element.
+/// A kind of model element that can have a name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// A body; number 0 is the world.
+    /// A rigid body. Body 0 is the world.
     Body,
-    /// A joint.
+    /// A joint, by which a body moves relative to its parent.
     Joint,
-    /// A geom.
+    /// A geom: a shape for collisions and pictures, attached to a body.
     Geom,
     /// An actuator.
     Actuator,
-    /// A site.
+    /// A site: a point of interest, attached to a body.
     Site,
     /// A camera.
     Camera,
     /// A sensor.
     Sensor,
-    /// A tendon.
+    /// A tendon, which connects joints or sites.
     Tendon,
-    /// A pair of geoms whose contact the model declares.
+    /// A pair of geoms whose contact parameters the model declares explicitly.
     Pair,
-    /// A keyframe.
+    /// A keyframe: a stored state.
     Keyframe,
 }
 
 impl Kind {
-    /// MJCF's word for the kind.
+    /// The name of this kind in MJCF, e.g. "joint".
     pub fn name(self) -> &'static str {
         match self {
             Self::Body => "body",
@@ -75,16 +76,19 @@ impl Kind {
     }
 }
 
-/// A compiled model. It is immutable, except through the [`Simulation`](crate::Simulation) that owns it.
+/// A compiled MuJoCo model: the bodies, joints, geoms and other elements with their parameters. Only a
+/// [`Simulation`](crate::Simulation) can edit the model that it owns.
 #[derive(Debug)]
 pub struct Model {
-    // Made by mj_loadXML or mj_copyModel, owned, freed in drop. Its sizes and index arrays never change.
+    // Comes from mj_loadXML or mj_copyModel. `self` owns it, and `drop` frees it. Its sizes and index arrays never
+    // change.
     pointer: NonNull<sys::mjModel>,
 }
 
 // SAFETY: mjModel is plain memory without ties to a thread, and `Model` owns it alone.
 unsafe impl Send for Model {}
-// SAFETY: through `&Model` nothing is written: the accessors read, and mj_copyModel and mj_name2id take it as const.
+// SAFETY: nothing is written through `&Model`: the accessors only read, and mj_copyModel and mj_name2id take const
+// pointers.
 unsafe impl Sync for Model {}
 
 /// A floating-point array of a model.
@@ -92,29 +96,29 @@ unsafe impl Sync for Model {}
 pub struct FloatArray {
     /// MuJoCo's name of the field, e.g. `body_mass`.
     pub name: &'static str,
-    /// The elements, row-major; single precision is widened.
+    /// The elements, row-major. Single-precision numbers are converted to double precision.
     pub values: Vec<f64>,
 }
 
 impl Model {
-    /// Compiles MJCF text. Takes about half a millisecond; one at a time in the process.
+    /// Compiles MJCF text to a model. Takes about 0.5 ms. Compilations in several threads wait for each other.
     ///
-    /// The text is trusted: MJCF can include other files.
+    /// Pass only trusted text, because MJCF can include any file of the disk.
     ///
     /// # Errors
-    /// [`Error::Version`], and [`Error::Compile`] with MuJoCo's reason.
+    /// [`Error::Version`] if the MuJoCo library has the wrong version, [`Error::Compile`] with MuJoCo's message.
     pub fn from_xml(xml: &str) -> Result<Self, Error> {
         Self::from_files(xml, &[])
     }
 
-    /// Compiles MJCF text that names files, each given by its name in lower case without a folder, and its bytes. One
-    /// compilation at a time in the process.
+    /// Compiles MJCF text that uses other files, such as meshes. `files` has the name, in lower case and without a
+    /// folder, and the content of each. Compilations in several threads wait for each other.
     ///
-    /// The text is trusted: MuJoCo reads a file from the disk if none of that name is given.
+    /// Pass only trusted text: MuJoCo reads a file that is not in `files` from the disk.
     ///
     /// # Errors
-    /// [`Error::Version`], and [`Error::Compile`] with MuJoCo's reason, or if there are more than 1999 files or one
-    /// longer than 2 GB.
+    /// [`Error::Version`] if the MuJoCo library has the wrong version. [`Error::Compile`] with MuJoCo's message, or if
+    /// there are more than 1999 files, or a file is longer than 2 GB.
     pub fn from_files(xml: &str, files: &[(&str, &[u8])]) -> Result<Self, Error> {
         static LOADING: Mutex<()> = Mutex::new(());
         check_library()?;
@@ -135,11 +139,11 @@ impl Model {
         let name_pointers: Vec<*const c_char> = names.iter().map(|name| name.as_ptr()).collect();
         let data_pointers: Vec<*const c_void> = files.iter().map(|(_, bytes)| bytes.as_ptr().cast()).collect();
         let mut message = [0u8; 1024];
-        // The mutex guards no data that a panic could leave half-written.
+        // A poisoned mutex is harmless, since it guards no data.
         let _loading = LOADING.lock().unwrap_or_else(PoisonError::into_inner);
         // SAFETY: `xml`, `message` and the three lists, with what they point to, are valid for the given sizes during
-        // the call, and all but `message` are only read. The names are terminated and fit in their places, and the files
-        // are not more than there are places. The mutex keeps other threads out of MuJoCo's compiler, and only this
+        // the call, and all but `message` are only read. The names are terminated and fit in the virtual file system,
+        // which also has space for all files. The mutex keeps other threads out of MuJoCo's compiler, and only this
         // function calls it.
         let pointer = unsafe {
             sys::perturb_mj_load(
@@ -158,26 +162,27 @@ impl Model {
             .ok_or_else(|| Error::Compile { reason: text_of(&message) })
     }
 
-    /// A copy that shares nothing with this model.
+    /// Makes an independent copy of this model.
     ///
     /// # Errors
-    /// [`Error::Fatal`] without memory.
+    /// [`Error::Fatal`] if there is not enough memory.
     pub fn try_clone(&self) -> Result<Self, Error> {
         // SAFETY: the pointer is a valid model for the lifetime of `self`; the result is a new one, or null.
         let pointer = unsafe { sys::perturb_mj_copy_model(self.pointer.as_ptr()) };
         NonNull::new(pointer).map(|pointer| Self { pointer }).ok_or_else(last_error)
     }
 
-    /// Whether all sizes of two models are the same: the numbers of elements, of names and of memory.
+    /// Whether this model and `other` have the same sizes: the number of each kind of element, the length of the names,
+    /// and the limits of memory.
     pub fn has_sizes_of(&self, other: &Self) -> bool {
         // SAFETY: two valid models, only read.
         unsafe { sys::perturb_mj_same_sizes(self.pointer.as_ptr(), other.pointer.as_ptr()) != 0 }
     }
 
-    /// The number of the element of that kind and name.
+    /// The index of the element with this kind and name.
     ///
     /// # Errors
-    /// [`Error::UnknownName`].
+    /// [`Error::UnknownName`] if there is no such element.
     pub fn id(&self, kind: Kind, name: &str) -> Result<usize, Error> {
         let unknown = || Error::UnknownName { kind: kind.name(), name: name.to_owned() };
         let c_name = CString::new(name).map_err(|_| unknown())?;
@@ -186,7 +191,7 @@ impl Model {
         usize::try_from(id).map_err(|_| unknown())
     }
 
-    /// The name of an element; `None` if it has none, or if there is no element of this number.
+    /// The name of the element with this kind and index. `None` if it has no name, or if there is no such element.
     pub fn name(&self, kind: Kind, id: usize) -> Option<&str> {
         if id >= self.count(kind) {
             return None;
@@ -200,7 +205,7 @@ impl Model {
         unsafe { CStr::from_ptr(name) }.to_str().ok().filter(|name| !name.is_empty())
     }
 
-    /// The number of elements of a kind.
+    /// The number of elements of this kind.
     pub fn count(&self, kind: Kind) -> usize {
         let m = self.raw();
         (match kind {
@@ -217,116 +222,116 @@ impl Model {
         }) as usize
     }
 
-    /// The number of generalised coordinates, Q.
+    /// The number of generalised positions, the length of `qpos`.
     pub fn n_q(&self) -> usize {
         self.raw().nq as usize
     }
 
-    /// The number of degrees of freedom, V.
+    /// The number of degrees of freedom, the length of `qvel`.
     pub fn n_v(&self) -> usize {
         self.raw().nv as usize
     }
 
-    /// The number of controls, U.
+    /// The number of controls, one for each actuator.
     pub fn n_u(&self) -> usize {
         self.raw().nu as usize
     }
 
-    /// The number of activations.
+    /// The number of activations: state variables of actuators that have internal dynamics.
     pub fn n_act(&self) -> usize {
         self.raw().na as usize
     }
 
-    /// The number of bodies, B, the world included.
+    /// The number of bodies, including the world.
     pub fn n_body(&self) -> usize {
         self.raw().nbody as usize
     }
 
-    /// The number of joints, J.
+    /// The number of joints.
     pub fn n_joint(&self) -> usize {
         self.raw().njnt as usize
     }
 
-    /// The number of geoms, G.
+    /// The number of geoms.
     pub fn n_geom(&self) -> usize {
         self.raw().ngeom as usize
     }
 
-    /// The length of a [state](crate::Simulation::state).
+    /// The number of elements that [`Simulation::state`](crate::Simulation::state) writes.
     pub fn n_state(&self) -> usize {
         1 + self.n_q() + 2 * self.n_v() + self.n_act() + self.n_u()
     }
 
-    /// The length of [constants](crate::Simulation::constants).
+    /// The number of elements that [`Simulation::constants`](crate::Simulation::constants) writes.
     pub fn n_constants(&self) -> usize {
         self.constants().into_iter().map(|(_, length)| length).sum()
     }
 
-    /// The timestep in seconds.
+    /// The simulated time of one timestep, in s.
     pub fn timestep(&self) -> f64 {
         self.raw().opt.timestep
     }
 
-    /// Masses in kg, `[B]`.
+    /// The masses of the bodies in kg, `[n_body]`.
     pub fn body_mass(&self) -> &[f64] {
         self.array(self.raw().body_mass, self.n_body())
     }
 
-    /// Principal moments of inertia in kg m², `[B, 3]`.
+    /// The principal moments of inertia of the bodies in kg m², `[n_body, 3]`.
     pub fn body_inertia(&self) -> &[f64] {
         self.array(self.raw().body_inertia, 3 * self.n_body())
     }
 
-    /// Sliding, torsional and rolling friction, `[G, 3]`.
+    /// The sliding, torsional and rolling friction coefficients of the geoms, `[n_geom, 3]`.
     pub fn geom_friction(&self) -> &[f64] {
         self.array(self.raw().geom_friction, 3 * self.n_geom())
     }
 
-    /// The index in `qpos` of each joint's first coordinate, `[J]`.
+    /// The index in `qpos` of each joint's first position, `[n_joint]`.
     pub fn joint_qpos_address(&self) -> impl ExactSizeIterator<Item = usize> {
         self.array(self.raw().jnt_qposadr, self.n_joint()).iter().map(|&id| id as usize)
     }
 
-    /// The index in `qvel` of each joint's first velocity, `[J]`.
+    /// The index in `qvel` of each joint's first velocity, `[n_joint]`.
     pub fn joint_dof_address(&self) -> impl ExactSizeIterator<Item = usize> {
         self.array(self.raw().jnt_dofadr, self.n_joint()).iter().map(|&id| id as usize)
     }
 
-    /// Each joint's limits in rad or m, `[J]`.
+    /// The lower and upper limit of each joint in rad or m, `[n_joint]`.
     pub fn joint_range(&self) -> impl ExactSizeIterator<Item = (f64, f64)> {
         self.array(self.raw().jnt_range, 2 * self.n_joint()).chunks_exact(2).map(|range| (range[0], range[1]))
     }
 
-    /// A floating-point array, or a part of the options.
+    /// The values of a floating-point array or option.
     pub fn field(&self, field: Field) -> &[f64] {
         let (start, length) = self.place(field);
         self.array(start, length)
     }
 
-    /// The number of elements of several fields.
+    /// The total number of elements in `fields`.
     pub fn n_fields(&self, fields: &[Field]) -> usize {
         fields.iter().map(|&field| self.place(field).1).sum()
     }
 
-    /// The first element of a field, and the number of its elements.
+    /// A pointer to the first element of a field, and the number of its elements.
     pub(crate) fn place(&self, field: Field) -> (*mut f64, usize) {
         // SAFETY: the pointer is a valid model for the lifetime of `self`, and is not written through a `&Model`.
         unsafe { field.place(self.as_ptr()) }
     }
 
-    /// An array of whole numbers: types, flags and numbers of other elements.
+    /// The values of an integer array: types of elements, or indices of other elements.
     pub fn index_array(&self, index: Index) -> &[i32] {
         let (start, length) = index.place(self.raw());
         self.array(start, length)
     }
 
-    /// An array of flags.
+    /// The values of an array of flags.
     pub fn flags(&self, flags: Flags) -> &[u8] {
         let (start, length) = flags.place(self.raw());
         self.array(start, length)
     }
 
-    /// The options that are whole numbers.
+    /// The integer options of the model.
     pub fn options(&self) -> Options {
         let opt = &self.raw().opt;
         Options {
@@ -337,14 +342,16 @@ impl Model {
         }
     }
 
-    /// An upper estimate of the memory of a simulation of this model in bytes: the model and MuJoCo's data.
+    /// Estimates the memory of a simulation of this model in bytes, from above. It includes the model and MuJoCo's
+    /// data.
     pub fn simulation_bytes(&self) -> usize {
         let m = self.raw();
         let [nv, njmax, nconmax, nstack, nu, nbody, n_m, nemax] =
             [m.nv, m.njmax, m.nconmax, m.nstack, m.nu, m.nbody, m.nM, m.nemax].map(|n| n.max(0) as usize);
         let number = size_of::<f64>();
-        // The arrays that grow with products of sizes: efc_J and its transpose with their column numbers, efc_AR with
-        // its column numbers, contacts, the stack, moments, the inertia's factors. All others grow with one size.
+        // These arrays grow with products of sizes or are large for other reasons: efc_J and its transpose with their
+        // column indices, efc_AR with its column indices, contacts, the stack, actuator moments, and the factors of the
+        // inertia matrix. All other arrays grow linearly with one size.
         let jacobian = 2 * njmax.saturating_mul(nv).saturating_mul(number + size_of::<i32>());
         let delassus = njmax.saturating_mul(njmax).saturating_mul(number + size_of::<i32>());
         let contacts = nconmax.saturating_mul(size_of::<sys::mjContact>());
@@ -355,12 +362,13 @@ impl Model {
             .fold(0, usize::saturating_add)
     }
 
-    /// The memory of the model in bytes.
+    /// The memory of the model itself, in bytes.
     pub fn model_bytes(&self) -> usize {
         size_of::<sys::mjModel>() + self.raw().nbuffer.max(0) as usize
     }
 
-    /// Every floating-point array, and the statistics as `stat`; for comparing models.
+    /// Copies every floating-point array of the model, and its statistics under the name `stat`. Meant for comparing
+    /// models.
     pub fn float_arrays(&self) -> Vec<FloatArray> {
         let mut arrays = Vec::new();
         for index in 0.. {
@@ -392,8 +400,7 @@ impl Model {
         arrays
     }
 
-    /// The floating-point arrays that edits of masses, inertias and friction change or that mj_setConst computes from them,
-    /// with their lengths.
+    /// Pointers to the arrays that [`Simulation::constants`](crate::Simulation::constants) copies, and their lengths.
     pub(crate) fn constants(&self) -> [(*mut f64, usize); 9] {
         CONSTANTS.map(|field| self.place(field))
     }
@@ -407,7 +414,7 @@ impl Model {
         self.pointer.as_ptr()
     }
 
-    /// `start` must be a field of this model with `length` elements.
+    /// Returns an array of this model as a slice. `start` must be an array of this model with `length` elements.
     fn array<T>(&self, start: *mut T, length: usize) -> &[T] {
         if length == 0 {
             return &[]; // the pointer may be null
@@ -425,14 +432,15 @@ impl Drop for Model {
     }
 }
 
-/// The error that this thread's last failed call left.
+/// Returns the error of the last call into `shim.c` that failed in this thread.
 pub(crate) fn last_error() -> Error {
     // SAFETY: the shim returns a terminated string of this thread, which lives until the thread's next failure.
     let message = unsafe { CStr::from_ptr(sys::perturb_mj_last_error()) };
     Error::Fatal { message: message.to_string_lossy().trim().to_owned() }
 }
 
-/// Compares the versions of header and library, once, and silences the log file.
+/// Checks, once in the process, that header and library have the same version. Also stops MuJoCo from writing a log
+/// file.
 fn check_library() -> Result<(), Error> {
     static CHECKED: OnceLock<Result<(), Error>> = OnceLock::new();
     CHECKED

@@ -1,4 +1,4 @@
-//! Pictures of a model.
+//! Draws pictures of a model into memory.
 
 use crate::{Error, Kind, Model, Simulation, gl::Gl, model::last_error, sys};
 use std::{
@@ -7,58 +7,63 @@ use std::{
     sync::{Mutex, MutexGuard, PoisonError},
 };
 
-/// Minimal number of geoms that a scene has space for. A model needs one for each of its geoms, and some for decorations.
+/// Minimal number of visual geoms that a scene has space for. A model needs one for each of its geoms, and more for
+/// decorations.
 const MIN_SCENE_GEOMS: usize = 200;
-/// Maximal number of geoms that a scene has space for.
+/// Maximal number of visual geoms that a scene has space for.
 const MAX_SCENE_GEOMS: usize = 20_000;
 
 /// The position and direction of a camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
-    /// The point in the middle of the picture, m, world frame.
+    /// The point in the middle of the picture, in m, world frame.
     pub look_at: [f64; 3],
-    /// The camera's distance from that point, m.
+    /// The distance from the camera to `look_at`, in m.
     pub distance: f64,
-    /// The direction of view, turned from +x about +z, degrees.
+    /// The horizontal direction of view in degrees: 0 is along +x, 90 along +y.
     pub azimuth: f64,
-    /// The direction's slope, negative if it looks down, degrees.
+    /// The angle of the direction of view above the horizontal plane, in degrees. Negative if the camera looks down.
     pub elevation: f64,
 }
 
-/// A camera of the model, or one that is placed for a picture.
+/// The camera of a picture: a camera of the model, or a free camera at any position.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum CameraView {
-    /// A placed camera.
+    /// A camera with this position and direction.
     Free(Camera),
-    /// The model's camera of this number.
+    /// The model's camera with this index.
     Fixed(usize),
 }
 
-/// Draws one model into memory. It belongs to its thread, as its OpenGL context does.
+/// Draws pictures of one model into memory. It can only be used in the thread that created it, because it has an OpenGL
+/// context.
 pub struct Renderer {
     gl: Gl,
     simulation: Simulation,
     option: Box<sys::mjvOption>,
-    /// Made by mjv_makeScene for the model, freed in drop.
+    /// The geoms to draw. Comes from mjv_makeScene for the model; `drop` frees it.
     scene: Box<sys::mjvScene>,
-    /// Made by mjr_makeContext for the model in `gl`, freed in drop; a default one before.
+    /// MuJoCo's drawing context. Comes from mjr_makeContext for the model, with `gl` current; `drop` frees it. Before
+    /// that it is an empty default context.
     context: Box<sys::mjrContext>,
-    /// The size of the context's buffer, pixels; (0, 0) while there is no context to be freed.
+    /// Width and height of the context's picture buffer, in pixels. (0, 0) while `context` is an empty default.
     size: (u16, u16),
 }
 
-/// MuJoCo keeps the addresses of OpenGL's functions in global variables, which each context writes anew.
+/// Held while MuJoCo uses OpenGL. MuJoCo keeps the addresses of OpenGL's functions in global variables, which are
+/// written whenever a context is created.
 static DRAWING: Mutex<()> = Mutex::new(());
 
 fn exclusive() -> MutexGuard<'static, ()> {
-    DRAWING.lock().unwrap_or_else(PoisonError::into_inner) // it guards nothing that a panic could leave half-written
+    DRAWING.lock().unwrap_or_else(PoisonError::into_inner) // a poisoned mutex is harmless: it guards no data
 }
 
 impl Renderer {
-    /// Prepares for drawing `model`, at its initial positions, in pictures of about this size in pixels.
+    /// Creates a renderer of `model` in its initial pose. `size` is the expected width and height of the pictures in
+    /// pixels; larger ones are possible, but the first one takes longer.
     ///
     /// # Errors
-    /// [`Error::NoOpenGl`], and [`Error::Fatal`] if OpenGL cannot do what MuJoCo needs.
+    /// [`Error::NoOpenGl`] without a usable OpenGL, [`Error::Fatal`] if OpenGL lacks a feature that MuJoCo needs.
     pub fn new(model: Model, size: (u16, u16)) -> Result<Self, Error> {
         let gl = Gl::new()?;
         let mut option = Box::new(MaybeUninit::zeroed());
@@ -73,7 +78,7 @@ impl Renderer {
         };
         let mut simulation = Simulation::new(model)?;
         simulation.kinematics()?;
-        // From here on `drop` frees what was made; the defaults may be freed too.
+        // From here on `drop` frees all parts. Freeing the defaults is allowed, too.
         let mut renderer = Self { gl, simulation, option, scene, context, size: (0, 0) };
         // SAFETY: a valid model and a default scene.
         check(unsafe {
@@ -87,16 +92,17 @@ impl Renderer {
         Ok(renderer)
     }
 
-    /// Returns the simulation that is drawn. Edit it to change the model or its positions.
+    /// The simulation that is drawn. Edit it to change the model or its pose, and call [`Simulation::kinematics`]
+    /// before drawing.
     pub fn simulation(&mut self) -> &mut Simulation {
         &mut self.simulation
     }
 
-    /// A picture of the model at the poses that were computed last: `[height, width, 3]`, red, green, blue, the
-    /// uppermost row first. After an error draw with another renderer.
+    /// Draws a picture of this width and height in pixels, with the poses that the simulation last computed. Returns
+    /// its pixels, `[height, width, 3]`: red, green and blue in 0 … 255, top row first.
     ///
     /// # Errors
-    /// [`Error::Fatal`].
+    /// [`Error::Fatal`]. The renderer must not be used afterwards.
     pub fn draw(&mut self, view: CameraView, (width, height): (u16, u16)) -> Result<Vec<u8>, Error> {
         let (most_wide, most_high) = self.size;
         if width > most_wide || height > most_high {
@@ -140,8 +146,8 @@ impl Renderer {
         let row = 3 * usize::from(width);
         let mut pixels = vec![0; row * usize::from(height)];
         let _drawing = self.enter()?;
-        // SAFETY: the context was made in `gl`, which is current; the picture has room for its pixels, and the buffer
-        // at least its size.
+        // SAFETY: the context was made in `gl`, which is current; `pixels` has the size of the picture, and the
+        // context's buffer is at least as large.
         check(unsafe {
             sys::perturb_mjr_draw(
                 &raw mut *self.scene,
@@ -151,7 +157,7 @@ impl Renderer {
                 pixels.as_mut_ptr(),
             )
         })?;
-        // OpenGL counts rows from below.
+        // OpenGL's first row is the lowest, so the order of rows is reversed.
         let (upper, lower) = pixels.split_at_mut(row * usize::from(height / 2));
         for (a, b) in upper.chunks_exact_mut(row).zip(lower.rchunks_exact_mut(row)) {
             a.swap_with_slice(b);
@@ -159,11 +165,11 @@ impl Renderer {
         Ok(pixels)
     }
 
-    /// Replaces the context by one with a buffer of this size.
+    /// Replaces the drawing context by one whose picture buffer has this width and height in pixels.
     fn make_room(&mut self, size: (u16, u16)) -> Result<(), Error> {
         let _drawing = self.enter()?;
-        // SAFETY: `gl` is current; the context is a default one or was made in it, and is a default one again after it
-        // was freed. Making one writes the size into the model, of which `&mut self` excludes other users.
+        // SAFETY: `gl` is current. The context is an empty default or was made in `gl`, and freeing makes it an empty
+        // default again. Making one writes the size into the model, of which `&mut self` excludes other users.
         unsafe {
             if mem::take(&mut self.size) != (0, 0) {
                 check(sys::perturb_mjr_free_context(&raw mut *self.context))?;
@@ -175,7 +181,7 @@ impl Renderer {
         Ok(())
     }
 
-    /// Makes the OpenGL context current and keeps other threads out.
+    /// Makes the OpenGL context current. The returned guard keeps other threads from using MuJoCo's OpenGL functions.
     fn enter(&self) -> Result<MutexGuard<'static, ()>, Error> {
         let guard = exclusive();
         match self.gl.make_current() {
@@ -188,8 +194,9 @@ impl Renderer {
 impl Drop for Renderer {
     fn drop(&mut self) {
         let drawing = self.enter();
-        // SAFETY: the context was made in `gl`, which is current, the scene for the model; both are freed once. A context
-        // that was made by half, or cannot be made current, is left to the end of `gl`.
+        // SAFETY: the context was made in `gl`, which is current, and the scene was made for the model; both are freed
+        // once. A context that is incomplete, or whose `gl` cannot be made current, is freed by the driver when `gl` is
+        // dropped.
         unsafe {
             if drawing.is_ok() && self.size != (0, 0) {
                 sys::perturb_mjr_free_context(&raw mut *self.context);
@@ -199,7 +206,8 @@ impl Drop for Renderer {
     }
 }
 
-/// Number of geoms that a scene has space for: one for each geom and site, and some for each joint, actuator and tendon.
+/// Returns the number of visual geoms for which a scene needs space: two for each geom and site, and some for the
+/// decorations of each joint, actuator and tendon.
 fn scene_geoms(model: &Model) -> c_int {
     let count = |kind| model.count(kind);
     let decorations = 4 * (count(Kind::Joint) + count(Kind::Actuator)) + 50 * count(Kind::Tendon);

@@ -1,5 +1,6 @@
-// MuJoCo answers a fatal error by printing, waiting for a key and ending the process. Here each call that may fail runs
-// under a handler of its own thread, which jumps back into the shim: only frames in C lie between.
+// Calls MuJoCo so that a fatal error does not end the process. By default MuJoCo prints the error, waits for a key and
+// ends the process. Here each call that may fail runs under a thread-local error handler that jumps back to this file.
+// The jump crosses only C frames.
 #include "shim.h"
 
 #include <math.h>
@@ -13,7 +14,7 @@
 
 #include "kinematics.h"
 
-// Exported, but in no header; MuJoCo's Python bindings use them in the same way.
+// The library exports these functions, but no header declares them. MuJoCo's Python bindings use them in the same way.
 typedef void (*Handler)(const char*);
 Handler _mjPRIVATE__get_tls_error_fn(void);
 void _mjPRIVATE__set_tls_error_fn(Handler handler);
@@ -27,11 +28,11 @@ static void on_error(const char* message) {
 }
 
 static void ignore_warning(const char* message) {
-  (void)message;  // counted in mjData.warning, where the Rust side reads it
+  (void)message;  // MuJoCo counts the warning in mjData.warning, which the Rust code reads
 }
 
-// Runs `statement`; `failed` becomes 1 if it raised an error. No local that `statement` writes survives the jump unless
-// it is volatile.
+// Runs `statement` under the error handler. Afterwards `failed` is 1 if it raised an error. Local variables that
+// `statement` writes must be volatile, because other variables are undefined after the jump.
 #define GUARDED(statement)                                \
   volatile int failed = 0;                                \
   jmp_buf here;                                           \
@@ -46,8 +47,8 @@ static void ignore_warning(const char* message) {
   _mjPRIVATE__set_tls_error_fn(previous);                 \
   landing = NULL;
 
-// An error outside of a guarded call, which the compiler of MJCF may raise: MuJoCo would write a log file, and wait for a
-// key, before it ended the process.
+// Handles a fatal error outside of GUARDED, which the MJCF compiler may raise. Unlike MuJoCo's own handler, it neither
+// writes a log file nor waits for a key.
 static void end_process(const char* message) {
   fprintf(stderr, "MuJoCo: %s\n", message);
   fflush(stderr);
@@ -63,7 +64,8 @@ const char* perturb_mj_last_error(void) { return last_error; }
 
 mjModel* perturb_mj_load(const char* xml, int xml_size, int n_files, const char* const* names, const void* const* data,
                          const int* sizes, char* error, int error_size) {
-  // 2 MB, of which a few pages are touched. mj_addFileVFS would read a file and mj_deleteFileVFS free `xml`.
+  // The struct has 2 MB, but only a few of its pages are used. It is filled by hand, because mj_addFileVFS would read
+  // the files from the disk, and mj_deleteFileVFS would free `xml`.
   mjVFS* vfs = calloc(1, sizeof(mjVFS));
   if (!vfs) {
     snprintf(error, error_size, "out of memory");
@@ -79,7 +81,7 @@ mjModel* perturb_mj_load(const char* xml, int xml_size, int n_files, const char*
     vfs->filesize[at] = sizes[i];
     vfs->filedata[at] = (void*)data[i];
   }
-  // No handler here: the loader is C++, which no jump may cross, and catches its engine's errors itself.
+  // Not guarded: the loader is C++, whose frames no jump may cross. It catches errors of the engine itself.
   mjModel* model = mj_loadXML("model.xml", vfs, error, error_size);
   mj_freeLastXML();
   free(vfs);
@@ -93,7 +95,7 @@ mjModel* perturb_mj_copy_model(const mjModel* source) {
 }
 
 int perturb_mj_same_sizes(const mjModel* a, const mjModel* b) {
-  // The sizes stand at the beginning, before the options.
+  // All sizes are at the start of the struct, before the options.
   return memcmp(&a->nq, &b->nq, offsetof(mjModel, opt) - offsetof(mjModel, nq)) == 0;
 }
 
@@ -134,11 +136,11 @@ int perturb_mj_step(const mjModel* model, mjData* data) {
 }
 
 struct perturb_mj_pairs {
-  mjModel view;  // the model, but with these pairs as the only ones: what mj_collision is given
-  int geoms[];   // for each pair the geom whose contacts it has: that of higher priority
+  mjModel view;  // a shallow copy of the model that declares exactly these pairs; the argument of mj_collision
+  int geoms[];   // each pair's geom of higher priority, whose contact parameters hold; then the index arrays of `view`
 };
 
-// MuJoCo's rules for two geoms that the model does not declare as a pair.
+// Whether two geoms can touch, by MuJoCo's rules for geoms that the model does not declare as a pair.
 static int can_touch(const mjModel* m, int a, int b) {
   return ((m->geom_contype[a] & m->geom_conaffinity[b]) || (m->geom_contype[b] & m->geom_conaffinity[a])) &&
          m->body_weldid[m->geom_bodyid[a]] != m->body_weldid[m->geom_bodyid[b]];
@@ -153,7 +155,7 @@ perturb_mj_pairs* perturb_mj_make_pairs(const mjModel* m) {
   for (int a = 0; a < m->ngeom; a++) {
     for (int b = a + 1; b < m->ngeom; b++) {
       if (!can_touch(m, a, b)) continue;
-      // For geoms of two moving bodies only the search knows whether they are near each other, so pairs cannot replace it.
+      // Geoms of two moving bodies need MuJoCo's search, and geoms of equal priority mix their contact parameters.
       if (m->geom_bodyid[a] != 0 || m->geom_priority[a] == m->geom_priority[b]) return NULL;
       n++;
     }
@@ -175,7 +177,7 @@ perturb_mj_pairs* perturb_mj_make_pairs(const mjModel* m) {
   view->pair_solimp = view->pair_solref + mjNREF * n;
   view->pair_margin = view->pair_solimp + mjNIMP * n;
   view->pair_gap = view->pair_margin + n;
-  // Sorted by body, then by the world's geom, which is MuJoCo's order of contacts.
+  // The pairs are sorted by body, then by the world's geom, as MuJoCo sorts contacts.
   int i = 0;
   for (int body = 1; body < m->nbody; body++) {
     for (int a = m->body_geomadr[0]; a < m->body_geomadr[0] + m->body_geomnum[0]; a++) {
@@ -201,7 +203,7 @@ perturb_mj_pairs* perturb_mj_make_pairs(const mjModel* m) {
 void perturb_mj_free_pairs(perturb_mj_pairs* pairs) { free(pairs); }
 
 static void collide(const mjModel* model, perturb_mj_pairs* pairs, mjData* data) {
-  // The friction may have been edited since the pairs were made.
+  // Copies the friction, which may have been edited since the pairs were made.
   for (int i = 0; i < pairs->view.npair; i++) {
     const mjtNum* from = model->geom_friction + 3 * pairs->geoms[i];
     mjtNum* to = pairs->view.pair_friction + 5 * i;
@@ -212,7 +214,7 @@ static void collide(const mjModel* model, perturb_mj_pairs* pairs, mjData* data)
   mj_collision(&pairs->view, data);
 }
 
-// Does what mj_checkPos and mj_checkVel do, which call a function for each number.
+// Does the same as mj_checkPos and mj_checkVel. It is faster, because they call a function for each number.
 static void check(const mjModel* m, mjData* d) {
   int good = 1;
   for (int i = 0; i < m->nq; i++) good &= fabs(d->qpos[i]) <= mjMAXVAL;
@@ -222,7 +224,7 @@ static void check(const mjModel* m, mjData* d) {
   mj_checkVel(m, d);
 }
 
-// Does what mj_fwdVelocity does.
+// Does the same as mj_fwdVelocity, but faster.
 static void velocity(const mjModel* m, mjData* d) {
   if (m->ntendon) {
     mj_fwdVelocity(m, d);
@@ -236,7 +238,7 @@ static void velocity(const mjModel* m, mjData* d) {
 }
 
 int perturb_mj_step_pairs(const mjModel* model, perturb_mj_pairs* pairs, mjData* data) {
-  // These are the parts of mj_step1, some of them replaced by faster ones.
+  // These are the parts of mj_step1 and mj_step2. Some are replaced by faster functions.
   GUARDED(check(model, data); perturb_kinematics(model, data); perturb_com_pos(model, data); mj_camlight(model, data);
           mj_tendon(model, data); mj_crb(model, data); mj_factorM(model, data); collide(model, pairs, data);
           mj_makeConstraint(model, data); mj_transmission(model, data); mj_projectConstraint(model, data);
@@ -272,8 +274,8 @@ int perturb_mjv_make_scene(const mjModel* model, mjvScene* scene, int most_geoms
 
 int perturb_mjv_update_scene(const mjModel* model, mjData* data, const mjvOption* option, mjvCamera* camera,
                              mjvScene* scene) {
-  // The camera is moved first: mjv_updateScene puts the headlight at the scene's camera before it moves the camera, so that
-  // a picture would depend on the one before.
+  // The camera is moved first. mjv_updateScene alone would put the headlight at the camera's previous position, so a
+  // picture would depend on the previous one.
   GUARDED(mjv_updateCamera(model, data, camera, scene);
           mjv_updateScene(model, data, option, NULL, camera, mjCAT_ALL, scene))
   return failed;
@@ -282,8 +284,8 @@ int perturb_mjv_update_scene(const mjModel* model, mjData* data, const mjvOption
 int perturb_mjr_make_context(mjModel* model, mjrContext* context, int width, int height) {
   model->vis.global.offwidth = width;
   model->vis.global.offheight = height;
-  // This calls MuJoCo's loader of OpenGL, which is C++. It raises an error only if no OpenGL library is loaded, but the
-  // current context belongs to one.
+  // mjr_makeContext calls MuJoCo's OpenGL loader, which is C++. The loader raises an error only if no OpenGL library is
+  // loaded. This cannot happen, because an OpenGL context is current.
   GUARDED(mjr_makeContext(model, context, mjFONTSCALE_50); mjr_setBuffer(mjFB_OFFSCREEN, context))
   if (!failed && context->currentBuffer != mjFB_OFFSCREEN) {
     snprintf(last_error, sizeof last_error, "OpenGL has no off-screen framebuffer");
@@ -324,7 +326,7 @@ int perturb_mj_array(const mjModel* m, int index, const char** name, const void*
   }
   MJMODEL_POINTERS
 #undef X
-  if (at == index) {  // the statistics follow from the arrays: five of them, the last of three numbers
+  if (at == index) {  // after the arrays come the statistics: four numbers and a vector of three
     *name = "stat";
     *elements = &m->stat;
     *count = (int)(sizeof(mjStatistic) / sizeof(mjtNum));

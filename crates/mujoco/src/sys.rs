@@ -1,4 +1,5 @@
-//! Generated declarations of MuJoCo and of the shim. After an edit of `shim.h`, or to use more of MuJoCo, run `make generate`.
+//! Generated declarations of MuJoCo's functions and of those in `shim.h`. Run `make generate` after editing `shim.h`,
+//! or to declare more of MuJoCo.
 #![allow(
     missing_docs,
     non_camel_case_types,

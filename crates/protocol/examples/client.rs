@@ -1,5 +1,5 @@
-//! The scenarios of `examples/clients` (C++ and Go) with this repository's own client, whose bytes they must give:
-//! `client ADDRESS SCENARIO FILE` writes every reply to a file, as the message `SessionResponse`.
+//! Plays the scenarios of the C++ and Go clients in `examples/clients` with the Rust client. `client ADDRESS SCENARIO
+//! FILE` writes every reply to a file, as a `SessionResponse` message. The other clients must write the same bytes.
 
 use std::error::Error;
 use std::{env, fs};
@@ -9,10 +9,10 @@ use perturb_protocol::{ClientError, Connection, Stream, TypedRequest};
 use prost::Message;
 use tonic::Code;
 
-/// The number of `error` in `SessionResponse`.
+/// The field number of `error` in `SessionResponse`.
 const ERROR: u32 = 15;
 
-/// A session, and its replies so far.
+/// A session and its encoded replies so far.
 struct Session {
     stream: Stream,
     replies: Vec<u8>,
@@ -26,7 +26,8 @@ impl Session {
         Ok((session, opened))
     }
 
-    /// Sends a request, whose field in `SessionRequest` has this number, and returns its reply.
+    /// Sends a request and returns its reply. `number` is the request's field number in `SessionRequest`, which is also
+    /// the reply's in `SessionResponse`.
     async fn ask<A>(&mut self, number: u32, request: A) -> Result<A::Reply, ClientError>
     where
         A: TypedRequest,
@@ -43,7 +44,7 @@ impl Session {
         reply
     }
 
-    /// Writes a reply as the field of `SessionResponse` with this number.
+    /// Stores a reply, encoded as the field of `SessionResponse` with this number.
     fn record(&mut self, number: u32, reply: &impl Message) {
         prost::encoding::message::encode(number, reply, &mut self.replies);
     }
@@ -54,7 +55,7 @@ impl Session {
 
     async fn play(&mut self, mut act: proto::Act) -> Result<(), ClientError> {
         while !self.ask(8, act).await?.finished {
-            act = proto::Act::default(); // the rest of the task
+            act = proto::Act::default(); // requests the rest of the task
         }
         Ok(())
     }
@@ -75,7 +76,8 @@ fn floats(array: &[u8]) -> Vec<f32> {
     array.as_chunks::<4>().0.iter().map(|number| f32::from_le_bytes(*number)).collect()
 }
 
-/// Pushes each cart under its falling pole. An observation is position, velocity, angle, angular velocity.
+/// Returns actions that push each cart under its falling pole. `observations` is float32 [N, 4]: position, velocity,
+/// angle, angular velocity.
 fn balance(observations: &[u8]) -> Vec<u8> {
     floats(observations)
         .as_chunks::<4>()
@@ -85,7 +87,8 @@ fn balance(observations: &[u8]) -> Vec<u8> {
         .collect()
 }
 
-/// Turns each of Hopper's three joints back. The positions of the joints are the numbers 8, 10 and 12 of 15.
+/// Returns actions that turn Hopper's three joints towards position 0. `observations` is float32 [N, 15]; the positions
+/// of the joints are the entries 8, 10 and 12.
 fn straighten(observations: &[u8]) -> Vec<u8> {
     let rows = floats(observations);
     let joints = rows.as_chunks::<15>().0.iter().flat_map(|row| [row[8], row[10], row[12]]);

@@ -1,4 +1,4 @@
-//! Waits for the other side of a session: spins for a moment if it usually answers at once.
+//! Low-latency waiting for the other side of a session: a wait spins first if the previous wait was short.
 
 use std::future::Future;
 use std::pin::pin;
@@ -7,37 +7,38 @@ use std::time::{Duration, Instant};
 
 use tokio::task::yield_now;
 
-/// Maximal time of spinning in a wait.
+/// Maximal time for which one wait spins before it blocks.
 const SPIN_MAX: Duration = Duration::from_micros(400);
-/// A wait spins if the one before took at most this long. It is longer than [`SPIN_MAX`], since events that come just too late
-/// are worth another try.
+/// A wait spins if the previous wait took at most this long. The limit is above [`SPIN_MAX`], so that an event just
+/// after the end of a spin does not stop the next wait from spinning.
 const SHORT_WAIT_MAX: Duration = Duration::from_micros(500);
 
-/// A yield that takes longer means that another thread wants the core: otherwise the core comes back at once.
+/// Longest duration of a `yield_now` on a free core. If it takes longer, another thread ran on the core in between.
 const YIELD_MAX: Duration = Duration::from_micros(5);
-/// Number of waits that block after two contended ones in a row, if the spin backs off: it may hold up the other side.
+/// Number of waits that block at once after two contended waits in a row, if [`AdaptiveSpin::back_off_when_contended`]
+/// was called. Spinning on a contended core may delay the very answer that it waits for.
 const BLOCKING_WAITS: u32 = 100;
 
-/// Decides for waits of one kind, one after the other, whether to spin before blocking. To block and wake a thread takes tens of
-/// microseconds, as long as a round trip with 256 steps of CartPole.
+/// Decides for successive waits of the same kind whether to spin before blocking. Blocking and waking a thread takes
+/// tens of microseconds, as long as a whole round trip with a step of 256 CartPoles.
 #[derive(Debug, Default)]
 pub struct AdaptiveSpin {
     was_short: bool,
     backs_off: bool,
-    /// Whether another thread wanted the core during the last wait that spun.
+    /// Whether another thread wanted the core during the last spin.
     was_contended: bool,
-    /// Number of next waits that block at once.
+    /// Number of coming waits that block without spinning.
     blocking_waits: u32,
 }
 
 impl AdaptiveSpin {
-    /// From now on spins less if other threads want the core.
+    /// Makes later waits spin less if other threads want the core.
     pub fn back_off_when_contended(&mut self) {
         self.backs_off = true;
     }
 
-    /// Waits for `event`. While it spins, it yields again and again: first to the thread's other tasks, one of which may
-    /// send the request, then the core to other threads.
+    /// Waits for `event`, and returns its output. While it spins, it yields repeatedly, first to the other async tasks
+    /// of the thread, one of which may have to send the request, then to other threads.
     pub async fn until<F: Future>(&mut self, event: F) -> F::Output {
         let begun = Instant::now();
         let mut event = pin!(event);
@@ -64,7 +65,7 @@ impl AdaptiveSpin {
     }
 }
 
-/// Spins until [`SPIN_MAX`] after `since`, and notes whether another thread wants the core.
+/// Spins until [`SPIN_MAX`] after `since`. Sets `is_contended` if another thread wants the core.
 async fn spin(since: Instant, is_contended: &mut bool) {
     while since.elapsed() < SPIN_MAX {
         yield_now().await;
@@ -81,10 +82,10 @@ mod tests {
     use std::sync::Arc;
     use std::task::Poll;
 
-    /// Threads that keep all cores busy make every wait of other tests long.
+    /// Serialises tests whose timing suffers from the busy threads of `spin_backs_off_when_contended`.
     static ALONE: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
 
-    /// Waits for an event that comes after `time`. Returns how often it was polled.
+    /// Waits for an event that occurs after `time`. Returns how often it was polled.
     async fn polls(spin: &mut AdaptiveSpin, time: Duration) -> usize {
         let mut polls = 0;
         let mut timer = pin!(tokio::time::sleep(time));
@@ -105,12 +106,12 @@ mod tests {
         assert!(!spin.was_short);
         polls(&mut spin, Duration::ZERO).await;
         assert!(spin.was_short);
-        // A select polls both whenever either is woken.
+        // A select polls both of its futures whenever one of them is woken.
         assert!(polls(&mut spin, long).await > 2, "spins");
         assert!(!spin.was_short, "and has learned that the event comes late");
     }
 
-    /// An event that comes at this time, and is polled until then.
+    /// An event that occurs at `time`, and asks to be polled again and again until then.
     async fn at(time: Instant) {
         poll_fn(|context| {
             context.waker().wake_by_ref();

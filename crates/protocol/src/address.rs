@@ -1,4 +1,4 @@
-//! Addresses of servers.
+//! Addresses of servers, as users write them.
 
 use std::fmt;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -10,31 +10,31 @@ use crate::limits::MAX_SOCKET_PATH_BYTES;
 /// The address of a server.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub enum Address {
-    /// A Unix socket, written `unix:/path`; a relative path is one of the working folder.
+    /// A Unix socket, written `unix:/path`. A relative path is relative to the working directory.
     Unix(PathBuf),
-    /// A TCP port, written `host:port`, `http://host:port` or `tcp://host:port`, with TLS `https://host:port`. An IPv6 host
-    /// is written in brackets.
+    /// A TCP port, written `host:port`, `http://host:port` or `tcp://host:port`, or with TLS `https://host:port`. An
+    /// IPv6 address is written in brackets.
     Tcp {
         /// A host name or an IP address, without brackets.
         host: Box<str>,
         /// The port, at least 1.
         port: u16,
-        /// With TLS, the name for which the server's certificate must be: the host, or the name from which the host's
-        /// address was resolved.
+        /// With TLS, the name that the server's certificate must have; without TLS, `None`. If `host` is an IP address
+        /// that was resolved from a name, this is still that name.
         tls: Option<Box<str>>,
     },
 }
 
-/// Why a text is not an address.
+/// The error for a text that is not the address of a server.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "`{text}` is not a server's address: {reason}; write `unix:/path`, `host:port`, `http://host:port` or \
      `tcp://host:port`, with TLS `https://host:port`"
 )]
 pub struct AddressError {
-    /// The text that was given.
+    /// The text.
     pub text: String,
-    /// The reason.
+    /// The reason why it is not an address.
     pub reason: String,
 }
 
@@ -47,13 +47,14 @@ impl FromStr for Address {
 }
 
 impl Address {
-    /// The text of this address with `https://` in place of `http://`.
+    /// The text of this address, with `https://` instead of `http://`.
     pub(crate) fn with_tls(&self) -> String {
         let text = self.to_string();
         text.strip_prefix("http://").map_or_else(|| text.clone(), |rest| format!("https://{rest}"))
     }
 
-    /// A command that starts a server at this address.
+    /// Returns a command line that starts a server at this address, as a hint for users. It names the security options
+    /// that such a server needs.
     pub fn start_command(&self) -> String {
         let (host, port, tls) = match self {
             Self::Unix(path) => return format!("perturb-server --listen unix:{}", path.display()),

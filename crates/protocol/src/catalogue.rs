@@ -1,4 +1,4 @@
-//! The catalogue of environments, and its form in JSON for programs that do not speak the protocol.
+//! The catalogue of environments, also as JSON for programs that do not speak the protocol.
 
 use std::borrow::Cow;
 
@@ -10,8 +10,9 @@ use crate::proto::{
     Quantity, Success, action_space::Kind,
 };
 
-/// The catalogue of a server as JSON, with the [`limits`] that hold for clients too. Keys are the protocol's names; versions
-/// are called D, R and E. JSON has no infinity: an open end is null.
+/// Converts the catalogue of a server to JSON, together with the [`limits`] that clients must keep. Keys are the
+/// protocol's field names; versions are called D, R and E. An infinite bound becomes `null`, because JSON has no
+/// infinity.
 pub fn to_json(catalogue: &ListEnvironmentsResponse) -> Value {
     json!({
         "server_version": catalogue.server_version,
@@ -22,7 +23,7 @@ pub fn to_json(catalogue: &ListEnvironmentsResponse) -> Value {
             "default_picture_pixels": limits::DEFAULT_PICTURE_PIXELS,
             "max_intervals": limits::MAX_INTERVALS,
             "max_socket_path_bytes": limits::MAX_SOCKET_PATH_BYTES,
-            // Names of version 0.1.
+            // The keys of version 0.1 for the values above.
             "usual_picture_pixels": limits::DEFAULT_PICTURE_PIXELS,
             "most_intervals": limits::MAX_INTERVALS,
             "longest_socket_path": limits::MAX_SOCKET_PATH_BYTES,
@@ -34,13 +35,13 @@ pub fn to_json(catalogue: &ListEnvironmentsResponse) -> Value {
 }
 
 impl Environment {
-    /// The parameter or disturbance of that name.
+    /// Returns the parameter or disturbance with this name.
     pub fn parameter(&self, name: &str) -> Option<&Parameter> {
         self.parameters.iter().chain(&self.disturbances).find(|parameter| parameter.name == name)
     }
 
-    /// The environment of a session that names parameters: with the [disturbances](Self::disturbed), if one of them is
-    /// among the names.
+    /// Returns the environment of a session whose request names the parameters `names`. If one of them is a
+    /// disturbance, the environment has [all disturbances](Self::disturbed) as parameters.
     pub fn with_parameters<'a>(&self, names: impl IntoIterator<Item = &'a str>) -> Cow<'_, Self> {
         let is_own = |name: &str| self.parameters.iter().any(|parameter| parameter.name == name);
         let is_disturbance = |name: &str| self.disturbances.iter().any(|disturbance| disturbance.name == name);
@@ -48,7 +49,8 @@ impl Environment {
         if names_one { Cow::Owned(self.disturbed()) } else { Cow::Borrowed(self) }
     }
 
-    /// The environment with its disturbances as further parameters, behind its own: that of a session which names one.
+    /// Returns the environment with all disturbances appended to its parameters. A session that names a disturbance has
+    /// this environment.
     #[must_use]
     pub fn disturbed(&self) -> Self {
         let mut disturbed = self.clone();
@@ -64,7 +66,7 @@ impl Environment {
         disturbed
     }
 
-    /// The environment of a session whose observations end with the `parameters` or not.
+    /// Returns the environment of a session. If `parameters` is true, its observations end with the parameters' values.
     #[must_use]
     pub fn observed(&self, parameters: bool) -> Self {
         let mut session = self.clone();
@@ -75,8 +77,8 @@ impl Environment {
     }
 }
 
-/// Returns how a disturbance is observed: its least value in R and E becomes -1, its greatest 1. Most disturbances have
-/// only one of R and E.
+/// Returns how an observation scales a disturbance: its minimum in the sets of versions R and E becomes -1, its maximum
+/// becomes 1.
 fn observation(disturbance: &Parameter) -> ParameterObservation {
     let sets = [&disturbance.random, &disturbance.extreme].into_iter().flatten();
     let intervals = sets.flat_map(|set| &set.intervals).map(|interval| (interval.low, interval.high));
@@ -96,7 +98,7 @@ fn observation(disturbance: &Parameter) -> ParameterObservation {
     ParameterObservation { entry: Some(entry), at_minus_one: low, at_plus_one: high }
 }
 
-/// An environment as JSON, see [`to_json`].
+/// Converts an environment to JSON, see [`to_json`].
 pub fn environment(environment: &Environment) -> Value {
     let action = match environment.action.as_ref().and_then(|action| action.kind.as_ref()) {
         Some(Kind::Discrete(discrete)) => json!({ "discrete": discrete.names }),

@@ -1,4 +1,4 @@
-//! Connects to a server: resolves its name, and checks that it takes sessions.
+//! Connects to a server: resolves its name, and checks that it accepts sessions.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io;
@@ -25,21 +25,22 @@ use crate::escape::escape_catalogue;
 use crate::limits::SERVICE;
 use crate::proto::{self, perturb_client::PerturbClient};
 
-/// Timeout of each part of making a connection.
+/// Timeout of each of the steps of a connection: resolving the name, connecting, and the health check.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
-/// Maximal size of a message.
+/// Maximal size of a message that a client sends or receives, in bytes.
 const MAX_MESSAGE_BYTES: usize = 256 << 20;
-/// Flow-control window: a reply of a large batch must not wait for permission to be sent.
+/// HTTP/2 flow-control window, in bytes. It is large so that the server can send the reply of a large batch without
+/// waiting for the client's permission.
 const WINDOW_BYTES: u32 = 16 << 20;
 
 /// The timeouts of a client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Timeouts {
-    /// Timeout of a reply.
+    /// Maximal time to wait for a reply.
     pub reply: Duration,
-    /// Time without bytes from the server before a keepalive ping is sent.
+    /// Time without data from the server after which the client sends a keepalive ping.
     pub keepalive_interval: Duration,
-    /// Timeout of the answer to a ping.
+    /// Maximal time to wait for the answer to a ping. Then the connection counts as lost.
     pub keepalive_limit: Duration,
 }
 
@@ -53,10 +54,10 @@ impl Default for Timeouts {
     }
 }
 
-/// The gRPC client of a connection.
+/// The gRPC client of a connection, which sends the token with each call.
 pub type Client = PerturbClient<InterceptedService<Channel, WithToken>>;
 
-/// A connection to a server that takes sessions.
+/// A connection to a server that accepted sessions when the connection was opened.
 #[derive(Clone, Debug)]
 pub struct Connection {
     address: Address,
@@ -66,27 +67,29 @@ pub struct Connection {
 }
 
 impl Connection {
-    /// Connects to `address`. The server must take sessions: one that is shutting down still answers, but is refused.
+    /// Connects to `address`, with the default timeouts and the credentials that environment variables name.
     ///
     /// # Errors
-    /// [`ClientError::Connect`], [`ClientError::Unsafe`].
+    /// [`ClientError::Connect`] if no server answers or the server is shutting down, [`ClientError::NotPerturb`] if
+    /// another program answers, [`ClientError::Unsafe`] if the credentials are unusable or either side does not trust
+    /// the other.
     pub async fn open(address: &Address) -> Result<Self, ClientError> {
         Self::open_with(address, Timeouts::default()).await
     }
 
-    /// Connects to `address` with these timeouts.
+    /// Connects to `address` as [`Connection::open`] does, but with these timeouts.
     ///
     /// # Errors
-    /// [`ClientError::Connect`], [`ClientError::Unsafe`].
+    /// The errors of [`Connection::open`].
     pub async fn open_with(address: &Address, timeouts: Timeouts) -> Result<Self, ClientError> {
         let wrong = |reason| ClientError::Unsafe { address: address.clone(), reason };
         Self::open_as(address, timeouts, Credentials::from_environment(address).map_err(wrong)?).await
     }
 
-    /// Connects to `address` with these credentials instead of the environment's.
+    /// Connects to `address` with these timeouts and credentials.
     ///
     /// # Errors
-    /// [`ClientError::Connect`], [`ClientError::Unsafe`].
+    /// The errors of [`Connection::open`].
     pub async fn open_as(
         address: &Address,
         timeouts: Timeouts,
@@ -119,10 +122,10 @@ impl Connection {
         })
     }
 
-    /// Connects to `address` without credentials, over byte streams that `connect` opens.
+    /// Connects over byte streams that `connect` opens, without credentials. `address` only names the server in errors.
     ///
     /// # Errors
-    /// [`ClientError::Connect`].
+    /// [`ClientError::Connect`], [`ClientError::NotPerturb`].
     pub async fn open_by<C, F, S>(address: &Address, timeouts: Timeouts, connect: C) -> Result<Self, ClientError>
     where
         C: Fn() -> F + Send + 'static,
@@ -184,12 +187,12 @@ impl Connection {
         self.timeouts
     }
 
-    /// A gRPC client of this connection.
+    /// Returns a gRPC client that uses this connection.
     pub fn client(&self) -> Client {
         self.client.clone()
     }
 
-    /// Whether the server answers anything within `limit`.
+    /// Whether the server answers a health check within `limit`, be it with an error.
     pub async fn is_alive(&self, limit: Duration) -> bool {
         let mut health = self.health.clone();
         match timeout(limit, health.check(HealthCheckRequest { service: SERVICE.into() })).await {
@@ -203,7 +206,8 @@ impl Connection {
     /// Requests the server's catalogue of environments.
     ///
     /// # Errors
-    /// [`ClientError::Lost`] or [`ClientError::TimedOut`].
+    /// [`ClientError::Lost`], [`ClientError::TimedOut`], or [`ClientError::NotPerturb`] if the server does not know the
+    /// request.
     pub async fn catalogue(&self) -> Result<proto::ListEnvironmentsResponse, ClientError> {
         let what = "the catalogue";
         let mut client = self.client();
@@ -222,17 +226,19 @@ impl Connection {
     }
 }
 
-/// The addresses that names resolve to.
+/// The IP addresses to which one or more host names resolve.
 #[derive(Debug, Default, PartialEq)]
 pub struct ResolvedAddresses {
-    /// Addresses of different machines, in the preferred protocol family.
+    /// Addresses of the IP version, 4 or 6, that the resolver listed first. Different addresses count as different
+    /// machines.
     pub preferred: Vec<Address>,
-    /// Addresses of the same machines in the other protocol family.
+    /// Addresses of the other IP version, assumed to belong to the same machines.
     pub fallback: Vec<Address>,
 }
 
 impl ResolvedAddresses {
-    /// All addresses, beginning with number `turn` of the preferred ones, modulo their number.
+    /// Returns all addresses in the order in which to try them. The preferred ones come first, rotated left by `turn`
+    /// positions, so that clients with different turns begin with different machines.
     pub fn into_order(mut self, turn: usize) -> Vec<Address> {
         if !self.preferred.is_empty() {
             let first = turn % self.preferred.len();
@@ -242,15 +248,15 @@ impl ResolvedAddresses {
         self.preferred
     }
 
-    /// Adds the addresses of another name.
+    /// Adds the addresses of another host name.
     pub fn extend(&mut self, other: Self) {
         self.preferred.extend(other.preferred);
         self.fallback.extend(other.fallback);
     }
 }
 
-/// Resolves `address`: to several addresses if its name has several, as that of a service with replicas. Their order does not
-/// depend on the order of the resolver's answer.
+/// Resolves the host name in `address`. The name of a service with replicas resolves to several addresses, which are
+/// returned in sorted order. A name of a single machine, an IP address and a Unix socket are returned unchanged.
 ///
 /// # Errors
 /// [`ClientError::Connect`] for a name that cannot be resolved.
@@ -265,24 +271,25 @@ pub async fn resolve(address: &Address) -> Result<ResolvedAddresses, ClientError
         .await
         .map_err(|_| fail(format!("its name was not resolved within {} s", CONNECT_TIMEOUT.as_secs())))?
         .map_err(|error| fail(format!("its name cannot be resolved: {error}")))?;
-    // The name is kept if it means a single machine: it tells users more than a number.
+    // A name tells users more than an IP address, so the name of a single machine is kept.
     Ok(if found.len() > 1 { sorted(found, tls.as_deref()) } else { one() })
 }
 
-/// Resolves a name in a thread of its own: a resolver that hangs then blocks nothing else. If no thread can be started this
-/// is an error, where tokio's own resolver would panic.
+/// Resolves a host name in a new thread, so that a resolver that hangs blocks nothing else. It is an error if no thread
+/// can be started; tokio's own resolver would panic.
 async fn look_up(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
     let name = host.to_owned();
     let (sender, found) = tokio::sync::oneshot::channel();
     let resolve = move || {
-        let _ = sender.send((name.as_str(), port).to_socket_addrs().map(Vec::from_iter)); // the caller's time may be over
+        // The send fails if the caller gave up waiting.
+        let _ = sender.send((name.as_str(), port).to_socket_addrs().map(Vec::from_iter));
     };
     std::thread::Builder::new().name("resolver".into()).spawn(resolve)?;
     found.await.unwrap_or_else(|_| Err(io::ErrorKind::Interrupted.into()))
 }
 
 fn sorted(mut found: Vec<SocketAddr>, tls: Option<&str>) -> ResolvedAddresses {
-    let prefers_ipv4 = found.first().is_some_and(SocketAddr::is_ipv4); // resolvers list reachable families first
+    let prefers_ipv4 = found.first().is_some_and(SocketAddr::is_ipv4); // resolvers list the reachable IP version first
     found.sort_unstable();
     found.dedup();
     let (preferred, fallback): (Vec<_>, Vec<_>) = found.into_iter().partition(|found| found.is_ipv4() == prefers_ipv4);
@@ -297,10 +304,11 @@ fn sorted(mut found: Vec<SocketAddr>, tls: Option<&str>) -> ResolvedAddresses {
     }
 }
 
-/// Connects to the first of `addresses`, at least one, whose server takes sessions.
+/// Tries the addresses in order, and connects to the first whose server accepts sessions. Logs a warning for each
+/// address that fails. `addresses` must not be empty.
 ///
 /// # Errors
-/// The error of each address.
+/// One error for each address, in order, if all fail.
 pub async fn connect_any(addresses: &[Address], timeouts: Timeouts) -> Result<Connection, Vec<ClientError>> {
     let mut errors = Vec::new();
     for (index, address) in addresses.iter().enumerate() {
@@ -317,10 +325,11 @@ pub async fn connect_any(addresses: &[Address], timeouts: Timeouts) -> Result<Co
     Err(errors)
 }
 
-/// Connects to the server at `address`: if its name stands for several machines, to any of them that takes sessions.
+/// Connects to the server at `address`. If the name resolves to several machines, connects to one that accepts
+/// sessions. Different processes begin with different machines.
 ///
 /// # Errors
-/// [`ClientError::Connect`] with what is wrong with each machine, [`ClientError::Unsafe`].
+/// [`ClientError::Connect`] with the reason for each machine, [`ClientError::NotPerturb`], [`ClientError::Unsafe`].
 pub async fn connect(address: &Address, timeouts: Timeouts) -> Result<Connection, ClientError> {
     let machines = resolve(address).await?.into_order(own_turn());
     connect_any(&machines, timeouts).await.map_err(|errors| match ClientError::from_all(errors) {
@@ -329,16 +338,17 @@ pub async fn connect(address: &Address, timeouts: Timeouts) -> Result<Connection
     })
 }
 
-/// The turn of this process, from its id and its host's name: processes of one machine differ in the id, containers in the
-/// name.
+/// Returns a number for [`ResolvedAddresses::into_order`] that spreads processes over machines. It is a hash of the
+/// process id and the host name: processes on one machine differ in the id, containers in the host name.
 fn own_turn() -> usize {
-    let mut hasher = DefaultHasher::new(); // always with the same key
+    let mut hasher = DefaultHasher::new(); // unlike `RandomState`, it has the same key in every process
     std::fs::read("/proc/sys/kernel/hostname").unwrap_or_default().hash(&mut hasher);
     std::process::id().hash(&mut hasher);
     hasher.finish() as usize
 }
 
-/// Asks a server for its health. A stopped or overloaded machine may accept connections and never answer.
+/// Checks by a health request that a server answers and accepts sessions. An accepted connection alone proves nothing:
+/// a stopped or overloaded machine may accept connections and never answer.
 async fn takes_sessions(address: &Address, channel: &Channel) -> Result<(), ClientError> {
     let refuse = |reason| ClientError::Connect { address: address.clone(), reason };
     let request = HealthCheckRequest { service: SERVICE.into() };
@@ -349,7 +359,7 @@ async fn takes_sessions(address: &Address, channel: &Channel) -> Result<(), Clie
         Ok(ServingStatus::NotServing) => Err(refuse("it is shutting down".into())),
         Ok(_) => Ok(()),
         Err(status) => match status.code() {
-            // A proxy that lets only perturb's own calls through.
+            // A proxy in between may refuse all calls but perturb's own.
             Code::NotFound | Code::PermissionDenied | Code::Unauthenticated | Code::Unimplemented => Ok(()),
             // The answer is not even a gRPC status.
             _ if std::error::Error::source(&status).is_some() => {

@@ -11,44 +11,47 @@ use tonic::{Request, Status};
 
 use crate::address::Address;
 
-/// Variable with the file of a client's token.
+/// Environment variable with the path of the file that holds a client's bearer token.
 pub const TOKEN_FILE: &str = "PERTURB_TOKEN_FILE";
-/// Variable with the file of the trusted authorities' certificates.
+/// Environment variable with the path of a PEM file of the authorities' certificates that the client trusts.
 pub const CA: &str = "PERTURB_CA";
-/// Variable with the file of a client's certificate.
+/// Environment variable with the path of a PEM file of a client's certificate chain.
 pub const CERT: &str = "PERTURB_CERT";
-/// Variable with the file of a client's private key.
+/// Environment variable with the path of a PEM file of a client's private key.
 pub const KEY: &str = "PERTURB_KEY";
-/// Variable that allows, if set to 1, to send a token unencrypted to other machines.
+/// Environment variable that, if set to 1, lets a client send its token unencrypted to other machines.
 pub const INSECURE: &str = "PERTURB_INSECURE";
-/// Files in which systems keep the authorities that they trust: Debian, Red Hat, Alpine and SUSE.
+/// PEM files of the authorities that an operating system trusts. Debian and Alpine have the first, Red Hat the second,
+/// SUSE the third.
 const SYSTEM_CA: [&str; 3] =
     ["/etc/ssl/certs/ca-certificates.crt", "/etc/pki/tls/certs/ca-bundle.crt", "/etc/ssl/ca-bundle.pem"];
 
-/// Maximum size of a file with certificates or a key, in bytes. A system's authorities have some 250 kB.
+/// Maximal size of a file of certificates or of a key, in bytes. The file of an operating system's authorities has some
+/// 250 kB.
 const MAX_CERTIFICATES_BYTES: u64 = 16 << 20;
-/// Maximum size of a file with a token, in bytes.
+/// Maximal size of a file with a token, in bytes.
 const MAX_TOKEN_FILE_BYTES: u64 = 64 << 10;
 
-/// Looks a variable up.
+/// A function that returns the value of an environment variable, if it is set.
 type Variable<'a> = &'a dyn Fn(&str) -> Option<OsString>;
 
-/// The credentials of a client. They are read for each connection, so that files may be replaced.
+/// The credentials of a client. They are read anew for each connection, so the files may be replaced while a program
+/// runs.
 #[derive(Default)]
 pub struct Credentials {
     /// The token, sent with every call.
     pub(crate) token: Option<BearerHeader>,
-    /// The certificate, shown to servers that ask for it.
+    /// The certificate and key that are presented to servers that request a client certificate.
     pub(crate) identity: Option<Identity>,
     pub(crate) trust: Trust,
 }
 
-/// A client's certificate with the chain to its authority's, and its key.
+/// A client's certificate chain, from its own certificate to its authority's, and its private key.
 type Identity = (Vec<CertificateDer<'static>>, PrivateKeyDer<'static>);
 
-/// The server certificates that are trusted.
+/// The server certificates that a client trusts.
 pub(crate) enum Trust {
-    /// Certificates that one of these authorities has signed.
+    /// Certificates that are signed by one of these authorities.
     Authorities(Vec<CertificateDer<'static>>),
     /// Only the first of these certificates.
     Pinned(Vec<CertificateDer<'static>>),
@@ -61,18 +64,20 @@ impl Default for Trust {
 }
 
 impl Credentials {
-    /// The credentials of the process's environment variables, for a server at this address.
+    /// Reads the credentials for a server at this address, as the process's environment variables say.
     ///
     /// # Errors
-    /// Those of [`Credentials::from_variables`].
+    /// The errors of [`Credentials::from_variables`].
     pub fn from_environment(address: &Address) -> Result<Self, String> {
         Self::from_variables(address, &environment)
     }
 
-    /// The credentials of these variables, for a server at this address. A Unix socket needs none.
+    /// Reads the credentials for a server at this address. `variable` looks up environment variables. A Unix socket
+    /// needs no credentials.
     ///
     /// # Errors
-    /// A sentence with the variable, the file and the reason.
+    /// A message with the variable, the file and the reason, if a file cannot be read, if certificate and key are not
+    /// both set, or if a token would be sent unencrypted to another machine.
     pub fn from_variables(address: &Address, variable: Variable<'_>) -> Result<Self, String> {
         let Address::Tcp { host, tls, .. } = address else { return Ok(Self::default()) };
         let file = |name| file(name, variable);
@@ -100,10 +105,11 @@ impl Credentials {
         Ok(Self { token, identity: identity(variable)?, trust })
     }
 
-    /// Credentials that trust only one server certificate, the first of a file of PEM.
+    /// Creates credentials that trust only one server certificate: the first in the PEM file `certificate`.
     ///
     /// # Errors
-    /// Those of the file, and of the variables for a client's certificate.
+    /// A message if the file cannot be read or has no certificate, or if the client's certificate or key, which
+    /// environment variables name, cannot be read.
     pub fn pinned(certificate: &Path) -> Result<Self, String> {
         let trust = Trust::Pinned(certificates("the server's certificate", certificate)?);
         Ok(Self { token: None, identity: identity(&environment)?, trust })
@@ -114,7 +120,7 @@ fn environment(name: &str) -> Option<OsString> {
     std::env::var_os(name)
 }
 
-/// The file that a variable names, if it does.
+/// Returns the path in an environment variable; `None` if the variable is unset or empty.
 fn file(name: &str, variable: Variable<'_>) -> Option<PathBuf> {
     variable(name).filter(|value| !value.is_empty()).map(PathBuf::from)
 }
@@ -162,11 +168,11 @@ fn token(path: &Path) -> Result<BearerHeader, String> {
     Ok(BearerHeader(value))
 }
 
-/// The header with a token. It is marked as sensitive, so that no log shows it.
+/// The value of the `authorization` header, with the token. It is marked as sensitive, which keeps it out of logs.
 #[derive(Clone, Debug)]
 pub(crate) struct BearerHeader(MetadataValue<Ascii>);
 
-/// Sends a token with each call, if there is one.
+/// A gRPC interceptor that adds the token, if there is one, to each call.
 #[derive(Clone, Debug, Default)]
 pub struct WithToken(pub(crate) Option<BearerHeader>);
 

@@ -1,4 +1,4 @@
-//! Uniform distributions over unions of intervals, as data.
+//! Uniform distributions over unions of intervals.
 
 use std::fmt;
 use std::str::FromStr;
@@ -9,11 +9,11 @@ use crate::limits::MAX_INTERVALS;
 use crate::proto;
 pub use crate::proto::Interval;
 
-/// Maximal number of intervals that an error repeats.
+/// Maximal number of intervals that an error message shows.
 const SHOWN_INTERVALS: usize = 8;
 
 impl Interval {
-    /// The interval [low, high].
+    /// Creates the closed interval [low, high].
     pub const fn new(low: f64, high: f64) -> Self {
         Self { low, high }
     }
@@ -29,39 +29,39 @@ impl fmt::Display for Interval {
     }
 }
 
-/// A uniform distribution over a union of intervals: an interval's probability is its share of the total length. One interval
-/// of length 0 is a fixed value.
+/// A uniform distribution over a union of intervals: an interval's probability is its share of the total length. A
+/// single interval of length 0 is a fixed value.
 ///
-/// WrittenDistribution `0.1` or `0.3..0.4,0.8..0.9`; in TOML and JSON a fixed value may also be a number.
+/// Its text is `0.1` or `0.3..0.4,0.8..0.9`. In TOML and JSON a fixed value may also be a number.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "WrittenDistribution", into = "WrittenDistribution")]
 pub struct Distribution(Vec<Interval>);
 
-/// Why intervals or a text are not a distribution.
+/// The error for intervals or a text that are not a distribution.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{got} is no set of values; expected {expected}")]
 pub struct DistributionError {
-    /// The intervals or the text.
+    /// The wrong intervals or text.
     pub got: String,
     /// The expected form.
     pub expected: &'static str,
 }
 
 impl Distribution {
-    /// The distribution that is always `value`.
+    /// Creates the distribution of a fixed `value`.
     ///
     /// # Panics
-    /// If it is not finite.
+    /// If `value` is not finite.
     pub fn fixed(value: f64) -> Self {
         assert!(value.is_finite(), "a fixed value of {value}");
         Self(vec![Interval::new(value, value)])
     }
 
-    /// The distribution over the union of `intervals`.
+    /// Creates the uniform distribution over the union of `intervals`.
     ///
     /// # Errors
-    /// [`DistributionError`] unless there are 1 to 64 intervals, all ends are finite, each `low` is at most its
-    /// `high`, they ascend without overlap, and of several each has a positive length.
+    /// [`DistributionError`] unless there are 1 to 64 intervals with finite ends and `low` ≤ `high`, in ascending order
+    /// without overlap. Several intervals must each have a positive length.
     pub fn union(intervals: &[Interval]) -> Result<Self, DistributionError> {
         let refuse = |expected| {
             let shown = &intervals[..intervals.len().min(SHOWN_INTERVALS)];
@@ -96,7 +96,8 @@ impl Distribution {
         &self.0
     }
 
-    /// The value at the fraction `u` in [0, 1) of the total length: uniform if `u` is.
+    /// Maps `u` in [0, 1) to the value at that fraction of the total length. If `u` is uniform, the value has this
+    /// distribution.
     pub fn at(&self, u: f64) -> f64 {
         let mut rest = u * self.0.iter().map(|i| i.length()).sum::<f64>();
         for interval in &self.0 {
@@ -105,14 +106,14 @@ impl Distribution {
             }
             rest -= interval.length();
         }
-        // A fixed value, or u so close to 1 that rounding ate the rest.
+        // A fixed value, or u is so close to 1 that rounding exceeded the total length.
         self.0[self.0.len() - 1].high
     }
 
-    /// The whole number at the fraction `u` in [0, 1) of all whole numbers in the intervals: each is as likely if `u` is
-    /// uniform. `None` if there are none.
+    /// Maps `u` in [0, 1) to one of the whole numbers in the intervals. If `u` is uniform, all of them are equally
+    /// likely. Returns `None` if the intervals contain no whole number.
     pub fn whole_number_at(&self, u: f64) -> Option<f64> {
-        // Intervals may share an end, which counts once.
+        // Adjacent intervals may share an end. A shared whole number counts only once.
         let numbers = |place: usize| {
             let Interval { low, high } = self.0[place];
             let is_shared = place > 0 && self.0[place - 1].high == low && low.fract() == 0.0;
@@ -129,13 +130,13 @@ impl Distribution {
         None
     }
 
-    /// Whether `value` is in one of the intervals, up to rounding.
+    /// Whether `value` is in one of the intervals, with a relative tolerance of 1e-9.
     pub fn contains(&self, value: f64) -> bool {
         let margin = 1e-9 * value.abs();
         self.0.iter().any(|interval| interval.low - margin <= value && value <= interval.high + margin)
     }
 
-    /// Whether all values of this are also values of `other`. Two intervals of `other` that touch count as one interval.
+    /// Whether every value of this distribution is also a value of `other`.
     pub fn is_within(&self, other: &Self) -> bool {
         let mut wider: Vec<Interval> = Vec::with_capacity(other.0.len());
         for &interval in &other.0 {
@@ -147,9 +148,9 @@ impl Distribution {
         self.0.iter().all(|own| wider.iter().any(|other| other.low <= own.low && own.high <= other.high))
     }
 
-    /// Whether some values of this are also values of `other`. A common end of two intervals does not count, since the
-    /// probability of drawing it is 0: R and E, which touch, do not overlap. A fixed value overlaps an interval whose end
-    /// it is.
+    /// Whether this distribution and `other` have values in common. Two intervals that share only an end do not
+    /// overlap, since the probability of drawing the end is 0. For instance, the intervals of versions R and E touch,
+    /// but do not overlap. A fixed value at the end of an interval overlaps the interval.
     pub fn overlaps(&self, other: &Self) -> bool {
         let meet = |one: &Interval, other: &Interval| {
             let low = one.low.max(other.low);
@@ -160,7 +161,7 @@ impl Distribution {
         self.0.iter().any(|one| other.0.iter().any(|other| meet(one, other)))
     }
 
-    /// The text that [`FromStr`] reads.
+    /// Returns the text from which [`FromStr`] reads exactly this distribution.
     pub fn written(&self) -> String {
         let interval = |&Interval { low, high }: &Interval| {
             if low == high { low.to_string() } else { format!("{low}..{high}") }
@@ -168,7 +169,7 @@ impl Distribution {
         self.0.iter().map(interval).collect::<Vec<_>>().join(",")
     }
 
-    /// Minimum and maximum.
+    /// The minimum and the maximum of the values.
     pub fn range(&self) -> (f64, f64) {
         (self.0[0].low, self.0[self.0.len() - 1].high)
     }
@@ -186,7 +187,7 @@ impl fmt::Display for Distribution {
 impl FromStr for Distribution {
     type Err = DistributionError;
 
-    /// A value, an interval `low..high`, or several intervals with commas between them.
+    /// Parses a value, an interval `low..high`, or several intervals separated by commas.
     fn from_str(text: &str) -> Result<Self, DistributionError> {
         let expected = "a value, an interval such as 0.3..0.4, or several with commas between them";
         let number = |text: &str| text.trim().parse::<f64>().ok();
@@ -204,7 +205,8 @@ impl FromStr for Distribution {
     }
 }
 
-/// Returns the number that a reader with a decimal comma would see in `text`, such as 7.5 in `7,5`.
+/// Returns the number in `text` if it is written with a decimal comma, with a point instead: 7.5 for `7,5`. Returns
+/// `None` for any other text.
 pub fn decimal_comma(text: &str) -> Option<String> {
     let (whole, fraction) = text.split_once(',')?;
     let digits = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
@@ -228,7 +230,7 @@ impl TryFrom<&proto::Distribution> for Distribution {
     }
 }
 
-/// A distribution in a file.
+/// A distribution as it is stored in a file.
 #[derive(Serialize, Deserialize)]
 #[serde(untagged)]
 enum WrittenDistribution {

@@ -1,7 +1,7 @@
-//! The names of disturbances: parameters that every environment can have in addition to its own, with the same meaning in
-//! all.
+//! The names and defaults of disturbances: parameters such as noise or delay that any environment can have in addition
+//! to its own parameters. They mean the same in every environment.
 
-/// Disturbances with 0 as their default.
+/// Names of the disturbances whose default value is 0.
 const NAMES: [&str; 10] = [
     "action_delay",
     "action_hold",
@@ -14,25 +14,26 @@ const NAMES: [&str; 10] = [
     "change_every",
     "change_probability",
 ];
-/// The names of the disturbances that say whether and when the physics change within an episode.
+/// Names of the disturbances that control whether and when the physics change within an episode.
 pub const CHANGES: [&str; 3] = ["change_at", "change_every", "change_probability"];
-/// The beginning of the names of the parameters after a change, before the parameter's own name.
+/// Prefix of the names of parameters that hold after a change of the physics: `changed_mass` replaces `mass`.
 pub const CHANGED: &str = "changed_";
-/// The scale of all actuators, whose default is 1. With `_` and an actuator's name behind it: the scale of that actuator.
+/// Name of the factor that scales the actions of all actuators. `action_scale_NAME` scales those of one actuator. The
+/// default is 1.
 const ACTION_SCALE: &str = "action_scale";
 
-/// The mean number of steps between pushes. There are no pushes as long as their size is 0.
+/// Name of the mean number of steps between two pushes. It has no effect while the size `push` is 0.
 const PUSH_INTERVAL: &str = "push_interval";
-/// The default of the mean interval of pushes, in steps.
+/// Default mean interval between two pushes, in steps.
 pub const DEFAULT_PUSH_INTERVAL: f64 = 100.0;
 
-/// Whether a parameter of this name is a disturbance.
+/// Whether the parameter with this name is a disturbance.
 pub fn is_disturbance(name: &str) -> bool {
     default_value(name).is_some() || name.starts_with(CHANGED)
 }
 
-/// The value of a disturbance that disturbs nothing; `None` for other parameters, and for those after a change, which do
-/// nothing where nothing changes.
+/// Returns the value at which a disturbance has no effect. Returns `None` for all other parameters, and for those with
+/// the prefix [`CHANGED`], which have no such value.
 pub fn default_value(name: &str) -> Option<f64> {
     let is_scale = name.strip_prefix(ACTION_SCALE).is_some_and(|rest| rest.is_empty() || rest.starts_with('_'));
     if name == PUSH_INTERVAL {

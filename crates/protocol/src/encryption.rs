@@ -1,4 +1,4 @@
-//! Encrypted connections.
+//! A client's TLS connections, and the reasons why a connection is not trusted.
 
 use std::future::Future;
 use std::io;
@@ -26,14 +26,14 @@ use tonic::codegen::{Service, http::Uri};
 
 use crate::credentials::{CA, CERT, Credentials, KEY, Trust};
 
-/// Time that a server has to show that it speaks TLS.
+/// Maximal time to wait for a server to show that it speaks TLS.
 const PROBE_TIMEOUT: Duration = Duration::from_secs(1);
-/// The first bytes of a client of HTTP/2.
+/// The first bytes that an HTTP/2 client sends.
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
-/// The first byte of an alert of TLS.
+/// The first byte of a TLS alert.
 const ALERT: u8 = 0x15;
 
-/// Makes encrypted connections to one server.
+/// Opens TLS connections to one server.
 #[derive(Clone)]
 pub(crate) struct Connector {
     host: String,
@@ -44,11 +44,11 @@ pub(crate) struct Connector {
     failure: TlsFailure,
 }
 
-/// The reason why no trusted connection is possible, once it is known.
+/// The reason why the last connection was not trusted by one of its sides; `None` if there is no such reason.
 type TlsFailure = Arc<Mutex<Option<String>>>;
 
 impl Connector {
-    /// A connector to the server at host and port, whose certificate must be for `name`.
+    /// Creates a connector to the server at this host and port. The server's certificate must be valid for `name`.
     ///
     /// # Errors
     /// The reason why the credentials cannot be used.
@@ -84,7 +84,8 @@ impl Connector {
         Ok(Self { host, port, name, config: Arc::new(config), shows_certificate, failure })
     }
 
-    /// The reason why the server is not trusted, or does not trust this client, if the connection failed because of it.
+    /// Returns why the client did not trust the server's certificate, or the server the client's. `None` if the
+    /// connection did not fail for such a reason.
     pub(crate) fn failure(&self) -> Option<String> {
         self.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
@@ -119,8 +120,8 @@ impl Service<Uri> for Connector {
     }
 }
 
-/// The reason why the server is not trusted. `None` for errors of the connection, e.g. bytes that were changed on the way: the
-/// next attempt may succeed.
+/// Describes why the server is not trusted. Returns `None` for errors of the transport, such as corrupted bytes, after
+/// which another attempt may succeed.
 fn words(error: &io::Error, host: &str) -> Option<String> {
     use CertificateError as Bad;
     let error = error.get_ref()?.downcast_ref::<Error>()?;
@@ -153,8 +154,8 @@ fn words(error: &io::Error, host: &str) -> Option<String> {
     })
 }
 
-/// A TLS stream that records the alert by which the server rejects the client's certificate. In TLS 1.3 the alert arrives after
-/// the handshake.
+/// A TLS stream that records the alert by which a server rejects the client's certificate. In TLS 1.3 this alert
+/// arrives only after the handshake.
 pub(crate) struct AlertRecordingStream {
     stream: TlsStream<TcpStream>,
     shows_certificate: bool,
@@ -173,7 +174,7 @@ impl AlertRecordingStream {
             | Alert::CertificateUnknown
             | Alert::UnknownCA
             | Alert::AccessDenied
-            | Alert::DecryptError), // the signature is not its issuer's
+            | Alert::DecryptError), // the certificate's signature is not its issuer's
         )) = error.get_ref().and_then(|error| error.downcast_ref())
         else {
             return;
@@ -217,7 +218,7 @@ impl AsyncWrite for AlertRecordingStream {
     }
 }
 
-/// Whether a server at this address speaks TLS: it answers a request without TLS with an alert.
+/// Whether the server at this address speaks TLS. Such a server answers an unencrypted request with a TLS alert.
 pub(crate) async fn speaks_tls(host: &str, port: u16) -> bool {
     let ask = async {
         let mut tcp = TcpStream::connect((host, port)).await?;
@@ -227,10 +228,10 @@ pub(crate) async fn speaks_tls(host: &str, port: u16) -> bool {
     matches!(timeout(PROBE_TIMEOUT, ask).await, Ok(Ok(ALERT)))
 }
 
-/// Trusts only one certificate, whatever its content.
+/// A verifier that trusts exactly one server certificate. It checks neither the name nor the dates in it.
 #[derive(Debug)]
 struct PinnedVerifier {
-    /// The first one is trusted.
+    /// Only the first certificate is trusted.
     pinned: Vec<CertificateDer<'static>>,
     provider: Arc<CryptoProvider>,
 }

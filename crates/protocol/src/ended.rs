@@ -1,20 +1,22 @@
-//! The end of an episode, as clients store it.
+//! The result of an episode, as clients store it.
 
 use crate::proto;
 
-/// An episode that ended, with the parameters that it ran with.
+/// The result of an episode that ended, and the physical parameters it ran with.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EndedEpisode {
-    /// The slot in the session's batch, 0 … N-1.
+    /// The index of the environment in the session's batch, 0 … N-1.
     pub slot: usize,
-    /// The environment's index: its place among the environments that were opened together, unless the client gave it or
-    /// restored it.
+    /// The environment's index, which with the seed fixes its random numbers. By default the environments that are
+    /// opened together count from 0. A client may give another first index, and a restored snapshot brings its own
+    /// index.
     pub environment_index: u32,
-    /// Counts the environment's episodes from 0.
+    /// The number of the episode, counted from 0 for each environment.
     pub episode_index: u64,
-    /// Counts the environment's trials from 0.
+    /// The number of the trial, counted from 0 for each environment. A trial is a series of episodes with the same
+    /// parameters.
     pub trial_index: u64,
-    /// Counts the trial's episodes from 0.
+    /// The number of the episode in its trial, from 0.
     pub episode_in_trial: u32,
     /// The undiscounted sum of the rewards.
     pub episode_return: f64,
@@ -22,21 +24,22 @@ pub struct EndedEpisode {
     pub length: u32,
     /// Whether the episode was a success.
     pub success: bool,
-    /// Whether the task ended the episode, as opposed to the step limit alone.
+    /// Whether the task ended the episode, e.g. because a pole fell. False if only the step limit ended it.
     pub terminated: bool,
-    /// Whether the physics diverged.
+    /// Whether the physics diverged, i.e. its state was no longer finite.
     pub diverged: bool,
-    /// The quantity that the environment's success rule compares; `None` if it was never measured.
+    /// The value that the environment's success rule compares with its threshold. `None` if it has no value, e.g. the
+    /// time to a goal that was never reached.
     pub achieved: Option<f64>,
-    /// The quantity that the rule of the paper's published code compares.
+    /// The value that the success rule of the paper's published code compares, which may differ from the paper's rule.
     pub code_achieved: Option<f64>,
-    /// The requested parameters, and those of the physics, in the catalogue's order.
+    /// The requested parameters, and the values read back from the physics, in the order of the catalogue.
     pub receipt: proto::Receipt,
 }
 
 impl EndedEpisode {
-    /// The end of an episode in `slot` of the batch, from a server's message; `None` if the message lacks the episode's address
-    /// or the receipt.
+    /// Converts a server's message about the environment at index `slot` of the batch. Returns `None` if the message
+    /// lacks the episode's numbers or its receipt.
     pub fn from_proto(end: proto::EpisodeEnd, slot: usize, terminated: bool) -> Option<Self> {
         let (episode, receipt) = end.episode.zip(end.receipt)?;
         Some(Self {

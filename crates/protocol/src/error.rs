@@ -1,4 +1,4 @@
-//! Errors between a client and its servers.
+//! Errors of a client that uses servers.
 
 use std::io::ErrorKind;
 use std::path::PathBuf;
@@ -11,69 +11,70 @@ use crate::escape::escape_lines;
 use crate::names::UnknownEnvironment;
 use crate::process_limit::spawn_failure;
 
-/// Default timeout of a reply. Even a batch of thousands of environments replies much sooner.
+/// Default maximal time to wait for a reply. Even a batch of thousands of environments replies much sooner.
 pub const REPLY_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// A failure of a server, of the connection to it, or of a request.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-#[expect(missing_docs, reason = "the sentences say what the fields are")]
+#[expect(missing_docs, reason = "the messages explain the fields")]
 pub enum ClientError {
     /// No server answers at the address.
     #[error("no server answers at {address}: {reason}; start one with `{}`, or correct --server", address.start_command())]
     Connect { address: Address, reason: String },
-    /// The program that answers at the address is no perturb-server.
+    /// Another program than perturb-server answers at the address.
     #[error(
         "what answers at {address} is no perturb-server: correct --server, or start one at a free port with \
          `perturb-server --listen tcp://127.0.0.1:0`"
     )]
     NotPerturb { address: Address },
-    /// The server is not trusted, or does not trust this client.
+    /// The client does not trust the server, the server does not trust the client, or the client's credentials are
+    /// unusable.
     #[error("no safe connection to the server at {address}: {reason}")]
     Unsafe { address: Address, reason: String },
-    /// Several servers were tried, and no server takes sessions.
+    /// Several servers were tried, and none of them accepts sessions.
     #[error(
         "no server answers ({reasons}); start one of them with `perturb-server --listen ADDRESS`, or correct --server"
     )]
     NoneConnects {
-        /// Every address with its error.
+        /// Each address and its error, separated by semicolons.
         reasons: String,
     },
-    /// The server understood a request and refused it. The session continues.
+    /// The server refused a request. The session continues.
     #[error("the server at {address} refused {request}: {message}")]
     Refused { address: Address, request: &'static str, code: Code, message: String },
-    /// The connection or the server is gone, and with it the session's environments.
+    /// The connection to the server is lost, and with it the session's environments.
     #[error("lost the server at {address} {}: {reason}", when(request))]
     Lost {
         address: Address,
         request: &'static str,
-        /// The status that ended the stream.
+        /// The gRPC status with which the stream ended.
         code: Code,
         reason: String,
     },
-    /// A reply did not come in time.
+    /// A reply did not arrive within the timeout.
     #[error("the server at {address} did not answer {request} within {} s", limit.as_secs_f64())]
     TimedOut { address: Address, request: &'static str, limit: Duration },
-    /// The program was asked to end while it waited for a server.
+    /// A signal asked the program to end while it waited for a server.
     #[error("stopped by signal {signal} while {action}")]
     Stopped {
         signal: i32,
-        /// The wait, as in "connecting".
+        /// The name of the interrupted wait, such as "connecting".
         action: String,
     },
     /// A reply does not follow the protocol.
     #[error("the server at {address} answered {request} with {got}, expected {expected}: are both of one version?")]
     Protocol { address: Address, request: &'static str, got: String, expected: String },
-    /// Servers of one run must serve the same environment.
+    /// The servers of one run describe an environment differently.
     #[error("the servers at {first} and {other} describe {environment} differently: run one version of perturb-server")]
     Disagreement { first: Address, other: Address, environment: String },
-    /// Servers of one run must serve the same model.
+    /// The servers of one run have different models of an environment.
     #[error(
         "the servers at {first} and {other} have different models of {environment}, with the hashes {hashes:?}: give both \
          the same files of the task, and restart them"
     )]
     Models { first: Address, other: Address, environment: String, hashes: Box<[String; 2]> },
-    /// The server has no such environment.
+    /// The server has no environment with the name or revision.
     #[error(transparent)]
     NoEnvironment(#[from] UnknownEnvironment),
     /// The server does not know [`Open::observe_parameters`](crate::proto::Open::observe_parameters).
@@ -82,7 +83,7 @@ pub enum ClientError {
          perturb-server of this version, or leave out `observe = \"parameters\"`"
     )]
     NoParameters { address: Address },
-    /// The number of snapshots is not that of the environments.
+    /// The number of snapshots differs from the number of environments to restore.
     #[error("there are {got} snapshots to restore, expected {expected}: one for each environment")]
     Snapshots { got: usize, expected: usize },
     /// The program `perturb-server` was not found.
@@ -91,13 +92,13 @@ pub enum ClientError {
          to its path, or name a running server with --server"
     )]
     NoServerProgram {
-        /// The places in which it was looked for.
+        /// The paths that were tried.
         tried: String,
     },
     /// The private server did not start.
     #[error("the private server {} did not start: {reason}", program.display())]
     Start { program: PathBuf, reason: String },
-    /// The private server refused folders of tasks.
+    /// The private server refused a task folder.
     #[error(
         "perturb-server refused a task of {}, for the reason above; `perturb-server --task DIR --check` checks a folder",
         list(tasks)
@@ -109,7 +110,7 @@ pub enum ClientError {
 }
 
 impl ClientError {
-    /// The address and the reason, for a list of several.
+    /// Returns the address and the reason in short, for a list of several errors.
     pub(crate) fn in_short(&self) -> String {
         match self {
             Self::Connect { address, reason } => format!("{address}: {reason}"),
@@ -119,7 +120,8 @@ impl ClientError {
         }
     }
 
-    /// A single error for all addresses that were tried.
+    /// Combines the errors of all addresses that were tried. Returns the first error if there is only one, or if all
+    /// are [`ClientError::Unsafe`]; otherwise [`ClientError::NoneConnects`].
     pub fn from_all(mut errors: Vec<Self>) -> Self {
         if errors.len() == 1 || errors.iter().all(|error| matches!(error, Self::Unsafe { .. })) && !errors.is_empty() {
             return errors.remove(0);
@@ -127,12 +129,12 @@ impl ClientError {
         Self::NoneConnects { reasons: errors.iter().map(Self::in_short).collect::<Vec<_>>().join("; ") }
     }
 
-    /// The signal by which the program was asked to end, if that is the error.
+    /// The number of the signal in [`ClientError::Stopped`]; `None` for other errors.
     pub fn signal(&self) -> Option<i32> {
         if let Self::Stopped { signal, .. } = self { Some(*signal) } else { None }
     }
 
-    /// Whether the request may succeed later or with another server: the request itself is not at fault.
+    /// Whether the same request may succeed later, or with another server.
     pub fn can_be_retried(&self) -> bool {
         match self {
             Self::Refused { code, .. } => *code == Code::ResourceExhausted, // full until other sessions end
@@ -153,8 +155,8 @@ impl ClientError {
         }
     }
 
-    /// Whether the server is gone or silent, or the connection to it. The session is lost, and the request may succeed when the
-    /// server is back.
+    /// Whether the server does not answer or the connection to it is lost. Then the session is lost, too. The request
+    /// may succeed when the server is back.
     pub fn is_absence(&self) -> bool {
         match self {
             Self::Lost { code, .. } => matches!(
@@ -173,27 +175,30 @@ impl ClientError {
     }
 }
 
-/// Paths, separated by commas.
+/// Joins paths with commas.
 fn list(paths: &[PathBuf]) -> String {
     paths.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
 }
 
-/// The time of an error: "during a step", "when it was to save a player".
+/// Returns when an error occurred, such as "during a step" or "when it was to save a player", from the name of a
+/// request.
 fn when(request: &str) -> String {
     if request.starts_with("to ") { format!("when it was {request}") } else { format!("during {request}") }
 }
 
-/// The reason why a call ended: the server's message, if there is one, escaped.
+/// Returns why a call failed: the system's error if the connection failed, otherwise the server's message, escaped for
+/// terminals.
 pub(crate) fn describe(status: &Status) -> String {
     match std::error::Error::source(status) {
-        // Messages of the transport are about frames and streams, which does not help users.
+        // The transport's own messages are about HTTP/2 frames and streams, which do not help users.
         Some(cause) => system_words(cause).unwrap_or_else(|| "the connection broke off".into()),
         None if status.message().is_empty() => format!("{:?}", status.code()),
         None => escape_lines(status.message()),
     }
 }
 
-/// Describes the operating system's error of a connection, e.g. "nobody listens there". `None` if there is no such error.
+/// Describes the operating system's error that caused `error`, such as "nobody listens there". Returns `None` if no
+/// such error is among its sources.
 pub(crate) fn system_words(error: &(dyn std::error::Error + 'static)) -> Option<String> {
     let mut chain = std::iter::successors(Some(error), |error| error.source());
     let system = chain.find_map(|error| error.downcast_ref::<std::io::Error>())?;

@@ -1,11 +1,11 @@
-//! Texts of servers, which may try to drive the terminal on which they are printed.
+//! Escapes texts from servers, since a hostile server could send control sequences to the user's terminal.
 
 use perturb_system::escape_terminal;
 
 use crate::proto::action_space::Kind;
 use crate::proto::{Channel, Environment, ListEnvironmentsResponse};
 
-/// Escapes what a terminal would obey in each line of a text, see [`escape_terminal`].
+/// Escapes the control characters in each line of a text, see [`escape_terminal`]. Line breaks stay.
 pub fn escape_lines(text: &str) -> String {
     text.split('\n').map(escape_terminal).collect::<Vec<_>>().join("\n")
 }
@@ -15,13 +15,13 @@ fn escape(text: &mut String) {
     *text = escape_lines(text);
 }
 
-/// Escapes all texts of a catalogue.
+/// Escapes all texts in a catalogue of environments.
 pub(crate) fn escape_catalogue(catalogue: &mut ListEnvironmentsResponse) {
     escape(&mut catalogue.server_version);
     catalogue.environments.iter_mut().for_each(escape_environment);
 }
 
-/// Escapes all texts of an environment's description.
+/// Escapes all texts in the description of an environment.
 pub fn escape_environment(environment: &mut Environment) {
     let Environment {
         name,

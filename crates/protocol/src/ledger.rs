@@ -1,8 +1,8 @@
-//! The ledger of a server: the parameter regions that every token drew from, line by line, each chained to all before it.
+//! The ledger of a server: a tamper-evident log of the parameter regions from which the holders of its tokens drew.
 //!
-//! A line is a digest, a space, and an [`LedgerEntry`] as JSON. The digest is SHA-256, in hexadecimal, of the digest of the line
-//! before (64 zeros before the first), a space, and the JSON. So a line cannot be changed, left out or added without changing
-//! all digests behind it. A single digest proves everything up to it.
+//! Each line is a digest, a space, and a [`LedgerEntry`] as JSON. The digest is the SHA-256, in hexadecimal, of the
+//! previous line's digest (64 zeros for the first line), a space, and the JSON. So changing, removing or inserting a
+//! line changes all later digests. Knowing the digest of one line is enough to verify all lines up to it.
 
 use std::io::{self, BufRead, BufReader, Read as _};
 use std::path::{Path, PathBuf};
@@ -12,17 +12,17 @@ use sha2::{Digest, Sha256};
 
 use crate::region::Region;
 
-/// Maximal length of a line with its end.
+/// Maximal length of a line, in bytes, including its line feed.
 pub const MAX_LINE_BYTES: u64 = 64 << 20;
-/// Number of digits of a digest.
+/// Number of hexadecimal digits in a digest.
 const DIGITS: usize = 64;
 
-/// A line without its digest.
+/// An entry of the ledger: the content of a line, without its digest.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LedgerEntry {
-    /// Counts the ledger's lines from 0.
+    /// The number of the line, from 0.
     pub n: u64,
-    /// The time of writing, ms since 1970.
+    /// The time of writing, in ms since the Unix epoch.
     pub unix_ms: u64,
     /// The event.
     #[serde(flatten)]
@@ -33,75 +33,77 @@ pub struct LedgerEntry {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub enum LedgerEvent {
-    /// A server began.
+    /// A server started.
     Began {
         /// The server's version.
         version: String,
         /// The server's commit.
         commit: String,
-        /// Bytes of a line that the server before did not finish, and that were removed: its request had no answer yet.
+        /// Size of the incomplete last line that the server found and removed, in bytes. The previous server stopped
+        /// while writing it, before it answered the request.
         unfinished: u64,
     },
-    /// A session draws from other regions from now on.
+    /// A session changed the regions from which its environments draw.
     Draws(DrawRecord),
-    /// A session was not allowed to draw from a region.
+    /// A session requested a region from which it may not draw.
     Refused {
         /// The session.
         #[serde(flatten)]
         who: LedgerSession,
         /// The region.
         region: Region,
-        /// The reason.
+        /// The reason of the refusal.
         reason: String,
     },
     /// The server ended, after all sessions had ended.
     Ended,
 }
 
-/// The session of an entry.
+/// The session that an entry is about.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LedgerSession {
-    /// Number of the session, unique until the server starts again.
+    /// The number of the session. Numbers start again when the server restarts.
     pub session: u64,
-    /// The name of the session's token; none if it needed none.
+    /// The name of the session's token; `None` if the server requires no tokens.
     pub token: Option<String>,
-    /// The environment.
+    /// The environment's name.
     pub environment: String,
     /// The environment's revision.
     pub revision: u32,
 }
 
-/// A change of the regions that environments of a session draw from.
+/// A change of the regions from which the environments of a session draw their parameters.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DrawRecord {
     /// The session.
     #[serde(flatten)]
     pub who: LedgerSession,
-    /// The new regions.
+    /// The regions from which environments begin to draw.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub regions: Vec<Region>,
-    /// Environments that begin to draw from them.
+    /// The environments that begin to draw from these regions.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub begins: Vec<DrawStart>,
-    /// Environments that no longer draw from the regions before.
+    /// The environments that stop drawing from their previous regions.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub ends: Vec<DrawEnd>,
 }
 
-/// Environments that begin to draw. The seed, an environment's index and an episode's number fix the episode.
+/// Environments that begin to draw from a region. The seed, the environment's index and the episode's number determine
+/// each episode's random numbers.
 ///
-/// Written as an array of its fields in their order. Older servers wrote an object, which is read, too.
+/// It is serialised as an array of its fields, in order. The objects of older servers can be read, too.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub struct DrawStart {
     /// The seed.
     pub seed: u64,
     /// The index of the first environment.
     pub index: u32,
-    /// The number of environments, with successive indices.
+    /// The number of environments; their indices are consecutive.
     pub count: u32,
-    /// The place of their region in [`DrawRecord::regions`].
+    /// The index of their region in [`DrawRecord::regions`].
     pub region: u32,
-    /// The first episode that is drawn from it.
+    /// The number of the first episode whose parameters are drawn from the region.
     pub episode: u64,
 }
 
@@ -111,16 +113,17 @@ impl Serialize for DrawStart {
     }
 }
 
-/// Environments that no longer draw from their region. Written as an array, as [`DrawStart`] is.
+/// Environments that stop drawing from their region. It is serialised as an array of its fields, like [`DrawStart`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub struct DrawEnd {
     /// The seed.
     pub seed: u64,
     /// The index of the first environment.
     pub index: u32,
-    /// The number of environments, with successive indices.
+    /// The number of environments; their indices are consecutive.
     pub count: u32,
-    /// The last episode that was begun; none if the request was refused or failed, and nothing was drawn.
+    /// The number of the last episode that began. `None` if the request was refused or failed, so that nothing was
+    /// drawn.
     pub episode: Option<u64>,
 }
 
@@ -130,10 +133,10 @@ impl Serialize for DrawEnd {
     }
 }
 
-/// The chain of the lines that were written or read so far.
+/// The end of a ledger's chain of digests, after the lines written or read so far.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Chain {
-    /// Number of lines.
+    /// Number of lines so far.
     lines: u64,
     /// Digest of the last line.
     head: String,
@@ -145,7 +148,7 @@ impl Default for Chain {
     }
 }
 
-/// Why a ledger cannot be read, or is not valid.
+/// The reason why a ledger cannot be read or is not valid.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The file cannot be read.
@@ -156,12 +159,12 @@ pub enum Error {
         /// The reason.
         source: io::Error,
     },
-    /// A line was changed.
+    /// A line is not valid, or does not match the lines before it.
     #[error("line {line} of {path} {what}: the file was changed after it was written, or is no ledger")]
     Broken {
         /// The file.
         path: PathBuf,
-        /// The line, from 1.
+        /// The number of the line, from 1.
         line: u64,
         /// The reason.
         what: &'static str,
@@ -169,7 +172,7 @@ pub enum Error {
 }
 
 impl Chain {
-    /// The number of lines.
+    /// The number of lines so far.
     pub fn lines(&self) -> u64 {
         self.lines
     }
@@ -179,10 +182,10 @@ impl Chain {
         &self.head
     }
 
-    /// Appends an event. Returns its line with the end of line.
+    /// Appends an event to the chain. Returns the line to write, including its line feed.
     ///
     /// # Errors
-    /// An event that cannot be written as JSON.
+    /// The serialiser's error if the event cannot be written as JSON.
     pub fn add(&mut self, event: &LedgerEvent, unix_ms: u64) -> serde_json::Result<String> {
         let entry = LedgerEntry { n: self.lines, unix_ms, event: event.clone() };
         let json = serde_json::to_string(&entry)?;
@@ -191,7 +194,8 @@ impl Chain {
         Ok(format!("{} {json}\n", self.head))
     }
 
-    /// Appends a line that was read, without its end. The error is the reason why it is not valid.
+    /// Checks a line that was read, given without its line feed, and appends it to the chain. The error is the reason
+    /// why it is not valid.
     fn take(&mut self, line: &str) -> Result<LedgerEntry, &'static str> {
         let (digest, json) = line.split_once(' ').ok_or("has no digest")?;
         let own = self.digest(json);
@@ -214,18 +218,18 @@ impl Chain {
 /// The result of reading a ledger.
 #[derive(Debug)]
 pub struct Read {
-    /// The chain after the last whole line.
+    /// The chain after the last complete line.
     pub chain: Chain,
-    /// Bytes of whole lines.
+    /// Size of the complete lines, in bytes.
     pub bytes: u64,
-    /// Bytes behind the whole lines: a line that a server did not finish, or that is being written.
+    /// Size of the incomplete line at the end, in bytes: a server is still writing it, or stopped while writing it.
     pub unfinished: u64,
 }
 
-/// Reads a ledger, checks its chain, and calls `each` with every entry and its digest.
+/// Reads a ledger and checks its chain of digests. Calls `each` with every entry and its digest.
 ///
 /// # Errors
-/// [`Error`].
+/// [`Error::Io`] if the file cannot be read, [`Error::Broken`] for the first line that is not valid.
 pub fn read(path: &Path, mut each: impl FnMut(LedgerEntry, &str)) -> Result<Read, Error> {
     let io = |source| Error::Io { path: path.to_owned(), source };
     let mut file = BufReader::new(perturb_system::open_plain(path).map_err(io)?.0);

@@ -1,14 +1,14 @@
 //! The contract between perturb's servers and their clients. Both sides use this crate.
 //!
 //! - [`proto`]: the messages.
-//! - [`Version`], [`Distribution`], [`Address`], [`limits`]: values with the same meaning on both sides.
+//! - [`Version`], [`Distribution`], [`Address`], [`limits`]: values that servers and clients share.
 //! - [`names`]: the accepted spellings of names.
 //! - [`catalogue`]: the environments and limits as JSON.
-//! - [`Connection`] and [`Stream`]: a client's side of a session, one typed reply for each request.
-//! - [`AdaptiveSpin`]: waiting for the other side with low latency.
+//! - [`Connection`] and [`Stream`]: a client's side of a session. Each type of request has its type of reply.
+//! - [`AdaptiveSpin`]: low-latency waiting for the other side.
 //! - [`credentials`]: a client's token and certificate, and the certificates that it trusts.
-//! - [`EndedEpisode`]: the end of an episode.
-//! - [`player`]: conversions between a player's messages and [`perturb_policy`].
+//! - [`EndedEpisode`]: the result of an episode.
+//! - [`player`]: conversions between protocol messages and the policy types of [`perturb_policy`].
 //! - [`PrivateServer`]: a server that belongs to one client program.
 #![forbid(unsafe_code)]
 
@@ -47,9 +47,10 @@ pub use reply::{Malformed, check_observations, check_step};
 pub use stream::{Stream, TypedRequest};
 pub use version::{UnknownVersion, Version};
 
-/// The protocols: generated from `proto`, whose comments specify every field. `perturb.v1` is here at the top.
+/// The messages and clients of all protocols, generated from the .proto files, whose comments specify every field. The
+/// types of `perturb.v1` are at the top level of this module.
 ///
-/// After an edit of a .proto file run `make generate`.
+/// Run `make generate` after editing a .proto file.
 #[allow(missing_docs, clippy::all)]
 pub mod proto {
     include!("generated/perturb.v1.rs");
@@ -70,9 +71,9 @@ pub mod proto {
         }
     }
 
-    /// Google's messages that dm_env_rpc uses.
+    /// The messages of Google's API that dm_env_rpc uses.
     pub mod google {
-        /// Errors.
+        /// The error message `google.rpc.Status`.
         pub mod rpc {
             include!("generated/google.rpc.rs");
         }

@@ -1,13 +1,13 @@
-//! Spellings of names, the same everywhere: case does not count, nor do `-` and `_`, and an environment may also have its id
-//! in Gymnasium. Other spellings are refused, with the name that was probably meant.
+//! Compares names as users write them. Case, `-` and `_` are ignored, and an environment may also be given by its
+//! Gymnasium id. Unknown names are refused with a suggestion of the most similar name.
 
-/// Similarity from which a name is suggested for another, by Jaro and Winkler's measure: 1 is the same. Lower similarities
-/// are mostly chance.
+/// Minimal Jaro-Winkler similarity of a suggested name, from 0 (unlike) to 1 (equal). Names of lower similarity mostly
+/// resemble each other by chance.
 const MIN_SIMILARITY: f64 = 0.8;
-/// The prefix of ids in Gymnasium.
+/// The namespace at the start of the environments' Gymnasium ids.
 const NAMESPACE: &str = "perturb/";
 
-/// Whether `written` stands for the name `known`: `cart-pole` for `CartPole`, `r+e` for `R+E`.
+/// Whether `written` is a spelling of the name `known`, such as `cart-pole` of `CartPole` or `r+e` of `R+E`.
 pub fn is_spelled(written: &str, known: &str) -> bool {
     letters(written).eq(letters(known))
 }
@@ -16,12 +16,13 @@ fn letters(name: &str) -> impl Iterator<Item = char> {
     name.chars().filter(|c| !matches!(c, '-' | '_')).map(|c| c.to_ascii_lowercase())
 }
 
-/// The place of the name that `written` stands for: an exact match, or else the first name of which it is a spelling.
+/// Returns the index of the name in `known` that `written` means: an exact match, otherwise the first name that differs
+/// only in case, `-` and `_`.
 pub fn find<'a>(written: &str, known: impl Iterator<Item = &'a str> + Clone) -> Option<usize> {
     known.clone().position(|name| name == written).or_else(|| known.clone().position(|name| is_spelled(written, name)))
 }
 
-/// The name that is most similar to `written`; `None` if none is similar enough.
+/// Returns the name in `known` that is most similar to `written`; `None` if no name is similar enough to be suggested.
 pub fn closest<'a>(written: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     let written: String = letters(written).collect();
     let alike = |name: &str| strsim::jaro_winkler(&written, &letters(name).collect::<String>());
@@ -29,51 +30,52 @@ pub fn closest<'a>(written: &str, known: impl Iterator<Item = &'a str>) -> Optio
     (best >= MIN_SIMILARITY).then_some(name)
 }
 
-/// " (did you mean `CartPole`?)", or nothing.
+/// Returns a suggestion for the end of an error message, such as " (did you mean `CartPole`?)". Empty if no name is
+/// similar enough.
 pub fn did_you_mean<'a>(written: &str, known: impl Iterator<Item = &'a str>) -> String {
     closest(written, known).map_or_else(String::new, |name| format!(" (did you mean `{name}`?)"))
 }
 
-/// An environment as it is written: its name in the catalogue, or its id in Gymnasium.
+/// An environment as a user writes it: by its catalogue name, or by its Gymnasium id, such as `perturb/CartPole-v1`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct EnvironmentName {
-    /// The name, without the id's other parts.
+    /// The name, without the namespace and revision of an id. Its spelling may differ from the catalogue's.
     pub name: String,
-    /// The revision that an id asks for.
+    /// The revision at the end of an id, such as 1 in `perturb/CartPole-v1`.
     pub revision: Option<u32>,
 }
 
-/// A name that no environment has.
+/// The error for a name or id that means no environment of the catalogue.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum UnknownEnvironment {
     /// No environment has the name.
     #[error("there is no environment {name:?}{hint}; there are {known}")]
     Name {
-        /// The name that was given.
+        /// The name as the user wrote it.
         name: String,
-        /// A hint at the name that was probably meant, or nothing.
+        /// The suggestion of [`did_you_mean`], possibly empty.
         hint: String,
-        /// The names of all environments.
+        /// The names of all environments, separated by commas.
         known: String,
     },
-    /// The environment has another revision.
+    /// The server's environment has another revision than the id.
     #[error(
         "`perturb/{name}-v{asked}` is another revision than that of the server, `perturb/{name}-v{served}`: write that, \
          or just `{name}`, or run a server of the revision"
     )]
     Revision {
-        /// The environment.
+        /// The environment's name.
         name: String,
-        /// The revision that was asked for.
+        /// The revision in the id.
         asked: u32,
-        /// The revision of the server.
+        /// The revision that the server has.
         served: u32,
     },
 }
 
 impl EnvironmentName {
-    /// Parses an id of Gymnasium; any other text is a name.
+    /// Splits a Gymnasium id into name and revision. Any other text is taken as a name.
     pub fn new(written: &str) -> Self {
         let plain = |name: &str| Self { name: name.to_owned(), revision: None };
         let id = written.get(..NAMESPACE.len()).filter(|start| start.eq_ignore_ascii_case(NAMESPACE));
@@ -84,10 +86,10 @@ impl EnvironmentName {
         }
     }
 
-    /// The place of the environment among the known names and revisions.
+    /// Returns the index of the environment in `known`, which lists the name and revision of each environment.
     ///
     /// # Errors
-    /// [`UnknownEnvironment`].
+    /// [`UnknownEnvironment`] if no environment has the name, or if the environment has another revision than the id.
     pub fn find<'a>(&self, known: impl Iterator<Item = (&'a str, u32)> + Clone) -> Result<usize, UnknownEnvironment> {
         let names = known.clone().map(|(name, _)| name);
         let Some(place) = find(&self.name, names.clone()) else {

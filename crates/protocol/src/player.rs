@@ -1,4 +1,5 @@
-//! Conversions of a player's parts between messages and [`perturb_policy`].
+//! Conversions between protocol messages and the types of [`perturb_policy`] that make up a player: the policy with its
+//! normalisers, random streams and memory.
 
 use bytes::Bytes;
 use perturb_policy::{CollectUntil, ObservationNormaliser, PlayerState, RewardNormaliser, RunningMoments};
@@ -7,13 +8,13 @@ use rand_chacha::rand_core::SeedableRng;
 
 use crate::proto;
 
-/// Why a message cannot be decoded.
+/// The error for a message that cannot be decoded.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{field} is {got}, expected {expected}")]
 pub struct DecodeError {
-    /// The field, e.g. "mean" or "moments.mean".
+    /// The path of the wrong field, e.g. "mean" or "moments.mean".
     pub field: String,
-    /// The value, e.g. "7 bytes".
+    /// The received value, e.g. "7 bytes".
     pub got: String,
     /// The expected value.
     pub expected: &'static str,
@@ -24,7 +25,7 @@ impl DecodeError {
         Self { field: field.into(), got: got.into(), expected }
     }
 
-    /// Adds the name of the field that holds the message.
+    /// Puts the name of the enclosing message's field before the path.
     pub fn within(self, field: &str) -> Self {
         Self { field: format!("{field}.{}", self.field), ..self }
     }
@@ -58,7 +59,7 @@ impl TryFrom<&proto::Moments> for RunningMoments {
     type Error = DecodeError;
 
     fn try_from(moments: &proto::Moments) -> Result<Self, DecodeError> {
-        /// Larger counts are not exact in float64.
+        /// Maximal count of observations: larger whole numbers are not exact in float64.
         const MAX_COUNT: u64 = 1 << 53;
         if moments.count > MAX_COUNT {
             return Err(DecodeError::new("count", moments.count.to_string(), "at most 2^53"));
@@ -69,10 +70,11 @@ impl TryFrom<&proto::Moments> for RunningMoments {
     }
 }
 
-/// Builds an observation normaliser. If O exceeds the number of means, the trailing entries are not normalised.
+/// Builds the normaliser of observations of length O, `observation_size`. If the statistics are of fewer entries, the
+/// last entries of an observation are not normalised.
 ///
 /// # Errors
-/// [`DecodeError`], also if there are fewer than means.
+/// [`DecodeError`] if the message is malformed or its statistics are of more than O entries.
 pub fn observation_normaliser(
     moments: &proto::Moments,
     observation_size: usize,
@@ -105,7 +107,7 @@ impl TryFrom<&proto::RewardMoments> for RewardNormaliser {
 }
 
 impl From<&ChaCha8Rng> for proto::RandomStream {
-    /// Converts a stream. Positions are modulo 2^64 words.
+    /// Converts a random stream. Its position, in 32-bit words, is taken modulo 2^64.
     fn from(stream: &ChaCha8Rng) -> Self {
         let key = stream.get_seed().to_vec().into();
         let position = stream.get_word_pos() as u64;
@@ -127,7 +129,7 @@ impl TryFrom<&proto::RandomStream> for ChaCha8Rng {
 }
 
 impl From<&PlayerState> for proto::PlayerState {
-    /// Converts all but the stream of actions.
+    /// Converts all fields except the random stream of the actions.
     fn from(state: &PlayerState) -> Self {
         Self {
             observations: floats(&state.observations),
@@ -138,10 +140,11 @@ impl From<&PlayerState> for proto::PlayerState {
     }
 }
 
-/// Builds a player's state, with the stream of its next actions. Does not check that its arrays have the player's shapes.
+/// Builds a player's state from a message and the random stream of its next actions. The caller must check the lengths
+/// of the arrays.
 ///
 /// # Errors
-/// [`DecodeError`], also if a number is not finite.
+/// [`DecodeError`] if an array is malformed or a number is not finite.
 pub fn player_state(state: &proto::PlayerState, actions: ChaCha8Rng) -> Result<PlayerState, DecodeError> {
     if let Some(slot) = state.starts.iter().position(|&flag| flag > 1) {
         let got = format!("{} in slot {slot}", state.starts[slot]);
@@ -169,7 +172,7 @@ pub fn doubles(numbers: &[f64]) -> Bytes {
 /// Decodes finite little-endian float32 numbers.
 ///
 /// # Errors
-/// [`DecodeError`] if bytes are left over or a number is not finite.
+/// [`DecodeError`] if the length is not a multiple of 4 bytes or a number is not finite. `field` names the array in it.
 pub fn read_floats(field: &str, bytes: &[u8]) -> Result<Vec<f32>, DecodeError> {
     let (words, rest) = bytes.as_chunks::<4>();
     if !rest.is_empty() {

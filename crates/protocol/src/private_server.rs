@@ -1,4 +1,4 @@
-//! A server that belongs to this program, on a private Unix socket.
+//! A server that a client program starts for itself, on a private Unix socket.
 
 use std::fs::{DirBuilder, Permissions};
 use std::io::{BufRead, BufReader, ErrorKind};
@@ -18,57 +18,61 @@ use crate::error::ClientError;
 use crate::process_limit::spawn_failure;
 
 const PROGRAM: &str = "perturb-server";
-/// Variable with the path of the program.
+/// Environment variable with the path of the server's program.
 const VARIABLE: &str = "PERTURB_SERVER";
-/// Timeout of a start.
+/// Maximal time from the start of a server until it listens.
 const START_TIMEOUT: Duration = Duration::from_secs(20);
-/// Additional timeout of a start for each task folder, which the server first loads in a process of its own.
+/// Additional time to start for each task folder, because the server first loads each folder in a separate process.
 const TASK_TIMEOUT: Duration = Duration::from_secs(120);
-/// Exit status of a server that refused its settings.
+/// Exit status by which `perturb-server` reports that it refused its command line or a task folder.
 const REFUSED_STATUS: i32 = 2;
-/// Time that a server has to end before it is killed.
+/// Time to wait for a server to end by itself before it is killed.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(5);
-/// Interval between two checks of a server that is starting or ending.
+/// Interval between two checks whether this process was asked to stop, while it waits for a server to start. Also the
+/// time for which a failed server may finish exiting.
 const STOP_POLL_INTERVAL: Duration = Duration::from_millis(50);
-/// Time to wait for a server's last lines after its end.
+/// Maximal time to wait for the rest of a server's standard error after the server has ended.
 const STDERR_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Gets the lines that private servers write to standard error.
+/// Receives the lines that private servers write to standard error; set by [`PrivateServer::set_stderr_handler`].
 static STDERR_HANDLER: OnceLock<fn(String)> = OnceLock::new();
 
-/// A `perturb-server` that lives no longer than this value, and no longer than this process: the server ends when its standard
-/// input is closed, which happens even if this process is killed.
+/// A `perturb-server` that this process starts for itself. It ends when this value is dropped. It also ends when this
+/// process ends, even if it is killed: closing the server's standard input ends the server.
 ///
-/// The server runs in its own process group, so that Ctrl-C reaches only this process, which can then finish its work.
+/// The server runs in its own process group. So Ctrl-C reaches only this process, which can finish its work with the
+/// server.
 #[derive(Debug)]
 pub struct PrivateServer {
     program: PathBuf,
     process: Process,
     address: Address,
     workers: Option<usize>,
-    /// Folders of tasks that it serves in addition to the built-in environments.
+    /// Task folders that the server serves in addition to the built-in environments.
     tasks: Vec<PathBuf>,
-    /// The directory of the socket, which only its owner may enter.
+    /// The directory of the socket, accessible only to the current user.
     directory: TempDir,
 }
 
 impl PrivateServer {
-    /// Starts a server, `perturb-server --private`, with `workers` physics threads (`None`: one a core), and waits until it
-    /// listens.
+    /// Starts `perturb-server --private` and waits until it listens. `workers` is the number of physics threads, `None`
+    /// one for each core.
     ///
     /// # Errors
-    /// [`ClientError::NoServerProgram`] if the program is missing, [`ClientError::Start`] if it ends or does not listen within
-    /// 20 s.
+    /// [`ClientError::NoServerProgram`] if the program is not found, [`ClientError::Start`] if it cannot be started,
+    /// ends, or does not listen within 20 s, [`ClientError::System`] if the directory of the socket cannot be created.
     pub fn start(workers: Option<usize>) -> Result<Self, ClientError> {
         Self::start_unless(workers, &[], &|| None)
     }
 
-    /// Starts a server like [`PrivateServer::start`] that also serves the tasks in the folders `tasks`, unless `stopped`
-    /// gives the signal by which this process was asked to end.
+    /// Starts a server as [`PrivateServer::start`] does, which also serves the task folders `tasks`. While it waits, it
+    /// calls `stopped` every 50 ms. The wait ends if `stopped` returns the number of a signal that asked this process
+    /// to end.
     ///
     /// # Errors
-    /// Those of [`PrivateServer::start`], with two more minutes for each folder; [`ClientError::Stopped`];
-    /// [`ClientError::Tasks`] if the server refuses a folder, after it wrote the reason to standard error.
+    /// The errors of [`PrivateServer::start`], with two more minutes to start for each folder. [`ClientError::Stopped`]
+    /// if `stopped` returned a signal. [`ClientError::Tasks`] if the server refused a folder; the server writes the
+    /// reason to standard error.
     pub fn start_unless(
         workers: Option<usize>,
         tasks: &[PathBuf],
@@ -96,19 +100,19 @@ impl PrivateServer {
         Ok(Self { program, process, address, workers, tasks: tasks.to_vec(), directory })
     }
 
-    /// Passes every line that servers started from now on write to standard error to `handler`. Without it they write to this
-    /// process's standard error themselves, in between its own output. Lines after this process was killed are lost. Only the
-    /// first call has an effect.
+    /// Sets a function that receives each line that private servers write to standard error. It applies to servers that
+    /// are started later. Without a handler, servers write to this process's standard error directly, between its own
+    /// output. Only the first call has an effect.
     pub fn set_stderr_handler(handler: fn(String)) {
         let _ = STDERR_HANDLER.set(handler);
     }
 
-    /// Ends the server, if it still runs, and starts it again at the same address.
+    /// Kills the server, if it still runs, and starts it again at the same address.
     ///
     /// # Errors
-    /// Those of [`PrivateServer::start_unless`].
+    /// The errors of [`PrivateServer::start_unless`].
     pub fn restart(&mut self, stopped: &dyn Fn() -> Option<i32>) -> Result<(), ClientError> {
-        self.process.kill(); // a server that still runs does not answer
+        self.process.kill(); // the caller restarts a server that runs only if it does not answer
         let again = |source| ClientError::System { action: "create the server's private directory again", source };
         own_directory(self.directory.path()).map_err(again)?;
         self.process = spawn(&find_program()?, &self.address, self.workers, &self.tasks, stopped)?;
@@ -120,25 +124,26 @@ impl PrivateServer {
         &self.address
     }
 
-    /// The error of a server that listens but does not take sessions, for `reason`.
+    /// Creates the error for a server that listens but does not accept sessions, with the `reason`. If the server has
+    /// ended, the error has its exit status instead.
     pub fn unusable(&mut self, reason: &str) -> ClientError {
-        thread::sleep(STOP_POLL_INTERVAL); // a server that ends closes its connections a moment earlier
+        thread::sleep(STOP_POLL_INTERVAL); // a server closes its connections just before it ends
         let ended = self.exit_status().map(|status| format!("it ended with {status}"));
         let reason = ended.unwrap_or_else(|| format!("it listens, but does not take sessions: {reason}"));
         ClientError::Start { program: self.program.clone(), reason }
     }
 
-    /// The process id.
+    /// The process id of the server.
     pub fn process_id(&self) -> u32 {
         self.process.child.id()
     }
 
-    /// Ends the server at once, for instance because it does not answer.
+    /// Kills the server, for instance because it does not answer. [`PrivateServer::restart`] starts it again.
     pub fn kill(&mut self) {
         self.process.kill();
     }
 
-    /// The exit status; `None` while the server runs.
+    /// The exit status of the server; `None` while it runs.
     pub fn exit_status(&mut self) -> Option<ExitStatus> {
         self.process.child.try_wait().ok().flatten()
     }
@@ -153,12 +158,12 @@ impl Drop for PrivateServer {
 #[derive(Debug)]
 struct Process {
     child: Child,
-    /// Disconnects after all lines of standard error were handled; `None` without a handler.
+    /// A channel that disconnects after the handler received the last line of standard error. `None` without a handler.
     stderr_done: Option<Receiver<()>>,
 }
 
 impl Process {
-    /// Closes the process's standard input, and waits until it has ended.
+    /// Ends the process by closing its standard input. Kills it if it still runs 5 s later.
     fn end(&mut self) {
         drop(self.child.stdin.take());
         let deadline = Instant::now() + SHUTDOWN_TIMEOUT;
@@ -168,21 +173,22 @@ impl Process {
         self.kill();
     }
 
-    /// The exit status as a number; `None` while the process runs, or after a signal.
+    /// The exit code; `None` while the process runs, or if a signal ended it.
     fn exit_code(&mut self) -> Option<i32> {
         self.child.try_wait().ok().flatten().and_then(|status| status.code())
     }
 
     fn kill(&mut self) {
-        // An error means that it has ended.
+        // An error means that the process has ended already.
         let _ = self.child.kill();
         let _ = self.child.wait();
-        // A process that inherited the standard error may live on, so the wait is limited.
+        // The wait is limited, because a child of the server may still hold its standard error open.
         self.stderr_done.take().map(|done| done.recv_timeout(STDERR_TIMEOUT));
     }
 }
 
-/// Creates the directory again, which a server deletes at its regular end. An existing one must belong to this user alone.
+/// Creates the directory of the socket again, because a server deletes it at its regular end. If it exists, it must
+/// belong to the current user and be accessible only to that user; otherwise this is an error.
 fn own_directory(path: &Path) -> std::io::Result<()> {
     match DirBuilder::new().mode(0o700).create(path) {
         Err(error) if error.kind() == ErrorKind::AlreadyExists => {
@@ -195,7 +201,7 @@ fn own_directory(path: &Path) -> std::io::Result<()> {
     }
 }
 
-/// Starts `program`, and waits until it listens, unless `stopped` gives a signal.
+/// Starts the server's program, and waits until it listens or `stopped` returns a signal.
 fn spawn(
     program: &Path,
     address: &Address,
@@ -251,22 +257,22 @@ fn spawn(
     }
 }
 
-/// Why a server is not ready.
+/// The reason why a server did not become ready.
 enum NotReady {
     Reason(String),
-    /// This process was asked to end, by the signal of this number.
+    /// The signal with this number asked this process to end.
     Stopped(i32),
 }
 
-/// Passes the lines of `stderr` to `handler` until the end, so that the server never waits for a reader. The end is signalled by
-/// the drop of the sender.
+/// Passes each line of `stderr` to `handler` until the end. Reading it all keeps the server from blocking on a full
+/// pipe. Dropping `_done` at the end tells the receiver that all lines were handled.
 fn forward_stderr(stderr: ChildStderr, handler: &fn(String), _done: &Sender<()>) {
     for line in BufReader::new(stderr).split(b'\n').map_while(Result::ok) {
         handler(String::from_utf8_lossy(&line).into_owned());
     }
 }
 
-/// Waits until `child` prints that it listens.
+/// Waits until the server prints that it listens, ends, or exceeds `timeout`, or until `stopped` returns a signal.
 fn wait_until_ready(
     child: &mut Child,
     lines: Option<Receiver<String>>,
@@ -295,20 +301,21 @@ fn wait_until_ready(
     }
 }
 
-/// Reads the lines of the output until its end, so that the server never waits for a reader.
+/// Starts a thread that reads all lines of a server's standard output. Reading it all keeps the server from blocking on
+/// a full pipe.
 fn read_lines(output: ChildStdout) -> std::io::Result<Receiver<String>> {
     let (sender, receiver) = channel();
     let read = move || {
         for line in BufReader::new(output).lines().map_while(Result::ok) {
-            let _ = sender.send(line); // nobody listens once the server is ready
+            let _ = sender.send(line); // fails once the server is ready, because the receiver is gone
         }
     };
     thread::Builder::new().name("stdout".into()).spawn(read)?;
     Ok(receiver)
 }
 
-/// Finds the server's program: `$PERTURB_SERVER`, else beside the running program, else in its parent directory (tests run in
-/// `target/release/deps`), else on the PATH.
+/// Finds the server's program. `$PERTURB_SERVER` names it; otherwise it is looked for in the directory of the running
+/// program, in the parent of that directory (tests run in `target/release/deps`), and on the PATH.
 fn find_program() -> Result<PathBuf, ClientError> {
     if let Some(path) = std::env::var_os(VARIABLE) {
         let path = PathBuf::from(path);

@@ -1,8 +1,8 @@
-//! Explains that a process or a thread could not be started because of a limit.
+//! Error text for a process or thread that cannot be started because of a process limit.
 
 use std::io::{Error, ErrorKind};
 
-/// Describes the failure to start a process or a thread. Names the limit, if that is the reason.
+/// Describes why a process or thread could not be started. If a process limit is the reason, the text names the limit.
 pub fn spawn_failure(error: &Error) -> String {
     match error.kind() {
         ErrorKind::WouldBlock => format!("{error}: {}", limit()),
@@ -21,7 +21,7 @@ fn limit() -> String {
     }
 }
 
-/// The soft limit in the text of `/proc/self/limits`; `None` without a limit.
+/// Parses the soft limit of processes from the text of `/proc/self/limits`. `None` if it is unlimited.
 fn max_processes(limits: &str) -> Option<u64> {
     limits.lines().find_map(|line| line.strip_prefix("Max processes")?.split_whitespace().next()?.parse().ok())
 }

@@ -1,4 +1,4 @@
-//! Regions of parameter values: the sets that parameters are drawn from, and whether two overlap.
+//! Regions of the parameter space from which environments draw, and whether two regions overlap.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -9,15 +9,16 @@ use crate::disturbance::{CHANGED, CHANGES, default_value, is_disturbance};
 use crate::version::Version;
 use crate::{Distribution, DistributionError, proto};
 
-/// A region in the space of all parameters: one box, in which each parameter has a set of its own, or several boxes, as R+E.
+/// A region of the parameter space: a union of boxes. A box has a set of values for each parameter. The region of
+/// version R+E has two boxes, the box of R and the box of E.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "WrittenRegion", into = "WrittenRegion")]
 pub struct Region(Vec<ParameterBox>);
 
-/// A box: a set of values for each parameter, by name.
+/// A box in the parameter space: the set of values of each parameter, by the parameter's name.
 pub type ParameterBox = BTreeMap<String, Distribution>;
 
-/// A region in a file: sets of values as [`Distribution::written`], which loses no digit.
+/// A region as it is stored in files: each set of values as the text of [`Distribution::written`], which is exact.
 type WrittenRegion = Vec<BTreeMap<String, String>>;
 
 impl From<Region> for WrittenRegion {
@@ -39,13 +40,13 @@ impl TryFrom<WrittenRegion> for Region {
 }
 
 impl Region {
-    /// The region of these boxes.
+    /// Creates a region from its boxes.
     pub fn new(boxes: Vec<ParameterBox>) -> Self {
         Self(boxes)
     }
 
-    /// The region that `version` of an environment draws from. A parameter in `own` has its set of values from there. If
-    /// `own` names a disturbance, the region has all disturbances.
+    /// Returns the region from which an environment draws its parameters in a `version`. The sets of values in `own`
+    /// replace those of the version. If `own` names a disturbance, all disturbances become part of the region.
     pub fn from_version(environment: &proto::Environment, version: Version, own: &ParameterBox) -> Self {
         let environment = environment.with_parameters(own.keys().map(String::as_str));
         let of_part = |part: &Version| {
@@ -64,13 +65,14 @@ impl Region {
         Self(version.parts().iter().map(of_part).collect())
     }
 
-    /// The boxes.
+    /// The boxes whose union is the region.
     pub fn boxes(&self) -> &[ParameterBox] {
         &self.0
     }
 
-    /// The boxes of the physics: those before a change within an episode, and, where there can be one, those after it, which
-    /// have the sets of `changed_mass` for `mass`. What says when the physics change is left out.
+    /// Returns the boxes of the physical parameters. If the physics can change within an episode, there are two boxes
+    /// for each box of the region: before the change, and after it, where the set of `changed_mass` replaces that of
+    /// `mass`. The disturbances that say when the physics change are left out.
     fn physics(&self) -> Vec<ParameterBox> {
         let is_never = |values: &Distribution| values.range() == (0.0, 0.0);
         let of_box = |values: &ParameterBox| {
@@ -89,8 +91,9 @@ impl Region {
         self.0.iter().flat_map(of_box).collect()
     }
 
-    /// Whether each box of this region is inside one of the boxes of `others`. A disturbance that only one of two boxes
-    /// names has its default in the other. Physics that change within an episode have a box before and one after.
+    /// Whether each box of this region is inside a box of one of `others`. A disturbance that is missing from a box
+    /// counts as its default value. If the physics can change within an episode, the values before and after the change
+    /// are compared separately.
     pub fn is_within<'a>(&self, others: impl IntoIterator<Item = &'a Self>) -> bool {
         let is_in =
             |own: &ParameterBox, other: &ParameterBox| pairs(own, other, Distribution::is_within, default_value);
@@ -98,8 +101,9 @@ impl Region {
         self.physics().iter().all(|own| others.iter().any(|other| is_in(own, other)))
     }
 
-    /// Whether a part of this region is in `other`, see [`Distribution::overlaps`]. A disturbance that only one of two
-    /// boxes names is not compared. So a region that was held out without disturbances is also held out with any.
+    /// Whether this region and `other` have values in common, see [`Distribution::overlaps`]. A disturbance that is
+    /// missing from one of two boxes is not compared. So a region that is held out without naming disturbances is held
+    /// out with every disturbance.
     pub fn overlaps(&self, other: &Self) -> bool {
         let others = other.physics();
         let overlap = |own, other| pairs(own, other, Distribution::overlaps, |_| None);
@@ -107,8 +111,9 @@ impl Region {
     }
 }
 
-/// Whether `holds` is true for the sets of every parameter. False if only one box has a parameter that is no disturbance. A
-/// disturbance that one of the boxes lacks has there the value that `lacking` returns; with `None` it is ignored.
+/// Whether `holds` is true for the two boxes' sets of every parameter. False if a parameter that is not a disturbance
+/// is in only one of the boxes. `lacking` gives the value of a disturbance in a box without it. If it gives `None`, the
+/// disturbance is ignored.
 fn pairs(
     one: &ParameterBox,
     other: &ParameterBox,

@@ -1,15 +1,15 @@
-//! Checks a server's reply to a step, for all clients. A reply that breaks the protocol is an error, so that no policy
+//! Checks a server's replies for all clients. A reply that violates the protocol becomes an error, so that no policy
 //! learns from it.
 
 use crate::proto;
 
-/// A reply that breaks the protocol.
+/// The error for a reply that violates the protocol.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{got}; expected {expected}")]
 pub struct Malformed {
-    /// The description of the received reply.
+    /// The wrong part of the reply, e.g. "8 bytes of rewards".
     pub got: String,
-    /// The description of the reply that the protocol demands.
+    /// The value that the protocol requires instead.
     pub expected: String,
 }
 
@@ -19,12 +19,14 @@ impl Malformed {
     }
 }
 
-/// Checks the reply to a step of N environments with observations `[N, O]`: the length of each array, that flags are 0 or
-/// 1, that numbers are finite, and that exactly the episodes that the flags end are listed, each once, in the order of
-/// their slots. The observation of an episode whose physics diverged may hold any numbers.
+/// Checks the reply to a step of N environments with observations of length O:
+///
+/// - The arrays have the lengths that follow from N and O.
+/// - Flags are 0 or 1, and numbers are finite. Only an observation of diverged physics may hold any numbers.
+/// - `ended` lists exactly the environments that are flagged as terminated or truncated, each once, by ascending slot.
 ///
 /// # Errors
-/// [`Malformed`].
+/// [`Malformed`] with the first violation.
 pub fn check_step(stepped: &proto::Stepped, num_envs: usize, observation_size: usize) -> Result<(), Malformed> {
     let proto::Stepped { observations, rewards, terminated, truncated, ended, final_observations, .. } = stepped;
     let size = |rows: usize| rows.saturating_mul(observation_size).saturating_mul(4);
@@ -43,10 +45,11 @@ pub fn check_step(stepped: &proto::Stepped, num_envs: usize, observation_size: u
     Ok(())
 }
 
-/// Checks the observations `[M, O]` of a reply that begins episodes: their length, and that they are finite.
+/// Checks the first observations of episodes, float32 `[M, O]`: their length, and that they are finite. M is `rows`, O
+/// is `observation_size`.
 ///
 /// # Errors
-/// [`Malformed`].
+/// [`Malformed`] with the first violation.
 pub fn check_observations(observations: &[u8], rows: usize, observation_size: usize) -> Result<(), Malformed> {
     check_length("observations", observations, rows.saturating_mul(observation_size).saturating_mul(4))?;
     check_rows(observations, observation_size, &[])
@@ -104,14 +107,14 @@ fn check_rows(observations: &[u8], observation_size: usize, ended: &[proto::Epis
     Ok(())
 }
 
-/// Exponent bits of a float32; all of them are set in NaN and infinities.
+/// The exponent bits of a float32. In NaN and infinities all of them are set.
 const EXPONENT: u32 = 0x7f80_0000;
 
-/// Returns the place of the first little-endian float32 that is not finite.
+/// Returns the index of the first little-endian float32 that is not finite.
 fn first_not_finite(bytes: &[u8]) -> Option<usize> {
     let words = bytes.as_chunks::<4>().0;
     let wrong = |word: &[u8; 4]| u32::from_le_bytes(*word) & EXPONENT == EXPONENT;
-    // Without a branch for each number: nearly always all of them are finite.
+    // A pass without branches comes first, because nearly always all numbers are finite.
     if !words.iter().fold(false, |found, word| found | wrong(word)) {
         return None;
     }

@@ -1,4 +1,4 @@
-//! A session's stream, typed: every request has its reply.
+//! A client's side of a session: sends typed requests and receives their typed replies.
 
 mod lease;
 
@@ -22,22 +22,22 @@ use crate::error::{ClientError, lost, timed_out};
 use crate::escape::{escape_environment, escape_lines};
 use crate::proto::{self, SessionRequest, SessionResponse, session_request::Request, session_response::Response};
 
-/// Requests that may wait in the channel before they are sent.
+/// Number of requests that the channel to the sending task holds. More requests wait in [`Stream::send`].
 const QUEUE_LENGTH: usize = 4;
-/// Time that [`Stream::close`] waits for the server.
+/// Maximal time that [`Stream::close`] waits for the server to end the session.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// A request of a session, with the type of its reply.
+/// A type of request of a session, which names the type of its reply.
 pub trait TypedRequest: Into<Request> {
     /// The type of the reply.
     type Reply;
-    /// The name of the request in errors.
+    /// The request as error messages name it, e.g. "a step".
     const NAME: &'static str;
 
-    /// Takes the reply out of a response.
+    /// Extracts the reply to this type of request from a response.
     ///
     /// # Errors
-    /// The name of a response that is not the reply.
+    /// The field name of the response, if it is another type of reply.
     fn reply(response: Response) -> Result<Self::Reply, &'static str>;
 }
 
@@ -85,25 +85,26 @@ requests! {
     Resume => Resumed, Resume, Resumed, "resumed", "to take up a session";
 }
 
-/// A session. Requests may be sent ahead; replies are taken in the order of their requests.
+/// A client's session on a server. Requests may be sent before earlier replies are received. Replies are received in
+/// the order of their requests.
 ///
-/// A session that was opened with [a lease](proto::Open::lease) survives the loss of its connection: it is resumed over another,
-/// with a warning in the log. At most as many requests as the lease says may wait for their replies.
+/// A session opened with [a lease](proto::Open::lease) survives the loss of its connection: it is resumed over a new
+/// connection, with a warning in the log. The lease limits the number of requests whose replies are still due.
 #[derive(Debug)]
 pub struct Stream {
     connection: Connection,
     raw: RawStream,
-    /// Replies that came while a request could not be sent.
+    /// Replies that arrived while [`Stream::send_ahead`] waited, not yet received by the caller.
     arrived: VecDeque<SessionResponse>,
-    /// Number of requests whose replies were not taken.
+    /// Number of requests whose replies the caller has not received yet.
     unanswered: usize,
-    /// The end of the stream, or a reply that nobody requested, which came while no request was unanswered.
+    /// The end of the stream, or a reply without a request, that arrived while no request was unanswered.
     unrequested: Option<Result<Option<SessionResponse>, Status>>,
     spin: AdaptiveSpin,
     lease: Option<ClientLease>,
 }
 
-/// A bidirectional gRPC stream.
+/// The bidirectional gRPC stream of a session.
 #[derive(Debug)]
 struct RawStream {
     requests: mpsc::Sender<SessionRequest>,
@@ -111,8 +112,10 @@ struct RawStream {
 }
 
 impl RawStream {
-    /// Begins a stream with its first request, and with space for `room` more. The first request is in the channel before the
-    /// call is made, since a server may wait for it before it answers at all.
+    /// Starts a stream with its first request. The channel of requests has space for `room` requests more than usual.
+    /// The first request is queued before the call starts, because a server may wait for it before it accepts the call.
+    ///
+    /// The inner error is the status with which the server refused the call.
     async fn begin(
         connection: &Connection,
         first: impl Into<Request>,
@@ -132,10 +135,11 @@ impl RawStream {
 }
 
 impl Stream {
-    /// Opens environments.
+    /// Opens a session with its environments. Returns it with the server's reply.
     ///
     /// # Errors
-    /// [`ClientError::Refused`] with the server's sentence, and the failures of a connection.
+    /// [`ClientError::Refused`] with the server's message, [`ClientError::Lost`], [`ClientError::TimedOut`],
+    /// [`ClientError::Protocol`].
     pub async fn open(connection: &Connection, open: proto::Open) -> Result<(Self, proto::Opened), ClientError> {
         let raw = RawStream::begin(connection, open, 0).await?;
         let raw = raw.map_err(|status| lost(connection.address(), proto::Open::NAME, &status))?;
@@ -149,8 +153,8 @@ impl Stream {
         Ok((stream, opened))
     }
 
-    /// From now on [spins](AdaptiveSpin) less while waiting for replies if other threads want the core: for one of several
-    /// programs that keep all cores busy.
+    /// Makes later waits for replies [spin](AdaptiveSpin) less if other threads want the core. Call it in a program
+    /// that shares the cores with other busy programs.
     pub fn back_off_when_contended(&mut self) {
         self.spin.back_off_when_contended();
     }
@@ -160,29 +164,31 @@ impl Stream {
         self.connection.address()
     }
 
-    /// Sends a request.
+    /// Sends a request. Receive its reply with [`Stream::receive`].
     ///
     /// # Errors
-    /// [`ClientError::Lost`].
+    /// [`ClientError::Lost`] if the stream has ended. With a lease the request is kept, and sent again after the
+    /// resumption.
     pub async fn send<A: TypedRequest>(&mut self, request: A) -> Result<(), ClientError> {
         self.note_request().await;
         let message = SessionRequest { request: Some(request.into()) };
         if let Some(lease) = &mut self.lease {
-            // If it is lost, it is sent again while the reply is waited for.
+            // If the request is lost, `receive` sends it again after the session is resumed.
             lease.on_request(&message);
             let _ = self.raw.requests.send(message).await;
             return Ok(());
         }
-        // The channel has space for a request, and is closed only after the stream has ended.
+        // The channel is closed only after the stream has ended.
         let ended = |_| lost(self.connection.address(), A::NAME, &Status::unavailable("the stream has ended"));
         self.raw.requests.send(message).await.map_err(ended)
     }
 
-    /// Sends one of many requests whose replies are taken later. A server stops reading requests while its replies are not
-    /// read. So replies that come while this request has to wait are stored. With a lease this is [`Stream::send`].
+    /// Sends one of many requests whose replies are received later. While the request waits to be sent, arriving
+    /// replies are stored, because a server stops reading requests while its replies are not read. With a lease, which
+    /// limits the number of unanswered requests, this is the same as [`Stream::send`].
     ///
     /// # Errors
-    /// [`ClientError::Lost`].
+    /// [`ClientError::Lost`] if the stream has ended.
     pub async fn send_ahead<A: TypedRequest>(&mut self, request: A) -> Result<(), ClientError> {
         if self.lease.is_some() {
             return self.send(request).await;
@@ -205,7 +211,8 @@ impl Stream {
         }
     }
 
-    /// Counts a request. Before, looks for a reply that nobody requested: a later request would take it for its own.
+    /// Counts a request that will be sent. First checks for a reply without a request, which would otherwise be taken
+    /// for the reply to this request.
     async fn note_request(&mut self) {
         if self.unanswered == 0 && self.unrequested.is_none() {
             let replies = &mut self.raw.replies;
@@ -217,23 +224,24 @@ impl Stream {
         self.unanswered += 1;
     }
 
-    /// Ends a session with a lease, which the server would otherwise hold until the lease ends. Other sessions end when they are
-    /// dropped. Waits at most a second.
+    /// Ends the session. Needed only with a lease: the server keeps a leased session until the lease ends, but ends any
+    /// other session as soon as this value is dropped. Waits at most one second.
     pub async fn close(self) {
         let Self { raw: RawStream { requests, mut replies }, lease, .. } = self;
         drop(requests);
         if lease.is_some() {
-            // The session's end is not checked: the lease ends anyway.
+            // A failure does no harm, since the lease ends by itself.
             let _ =
                 tokio::time::timeout(CLOSE_TIMEOUT, async { while let Ok(Some(_)) = replies.message().await {} }).await;
         }
     }
 
-    /// Takes the reply to the oldest request that has none yet, which must have been an `A`.
+    /// Waits for the reply to the oldest request whose reply was not received yet. That request must have had the type
+    /// `A`.
     ///
     /// # Errors
-    /// [`ClientError::Refused`] with the server's sentence; then the session lives on. Otherwise the failures of a
-    /// connection.
+    /// [`ClientError::Refused`] with the server's message; the session continues. [`ClientError::Lost`],
+    /// [`ClientError::TimedOut`] and [`ClientError::Protocol`]; the session is lost.
     pub async fn receive<A: TypedRequest>(&mut self) -> Result<A::Reply, ClientError> {
         if let Some(Ok(Some(_))) = &self.unrequested {
             return Err(self.mismatch::<A>("a second reply to an earlier request".into(), "one reply to each".into()));
@@ -257,7 +265,7 @@ impl Stream {
         }
     }
 
-    /// The next message that comes, of another stream if this one is lost and there is a lease.
+    /// Returns the next message from the server. With a lease, first resumes the session if its stream is lost.
     async fn message<A: TypedRequest>(&mut self) -> Result<Option<SessionResponse>, ClientError> {
         let limit = self.connection.timeouts().reply;
         let mut taken_up = 0;
@@ -299,20 +307,20 @@ impl Stream {
         }
     }
 
-    /// Sends a request and takes its reply.
+    /// Sends a request and waits for its reply. The replies to all earlier requests must have been received.
     ///
     /// # Errors
-    /// Those of [`Stream::receive`].
+    /// The errors of [`Stream::receive`].
     pub async fn ask<A: TypedRequest>(&mut self, request: A) -> Result<A::Reply, ClientError> {
-        // If the stream has ended already, its status says why.
+        // An error is ignored here: if the stream has ended, `receive` returns the reason.
         let _ = self.send(request).await;
         self.receive::<A>().await
     }
 
-    /// Little-endian f32 numbers, exactly as many as `out` takes.
+    /// Decodes the little-endian float32 array `field` of a reply to `A` into `out`.
     ///
     /// # Errors
-    /// [`ClientError::Protocol`] if there are more or fewer.
+    /// [`ClientError::Protocol`] if `bytes` does not have exactly the length of `out`.
     pub fn decode<A: TypedRequest>(
         &self,
         field: &'static str,
@@ -328,7 +336,8 @@ impl Stream {
         Ok(())
     }
 
-    /// The error for a reply to an `A` that does not follow the protocol.
+    /// Creates the error for a reply to a request of type `A` that violates the protocol: what it contains, and what it
+    /// should contain.
     pub fn mismatch<A: TypedRequest>(&self, got: String, expected: String) -> ClientError {
         ClientError::Protocol { address: self.address().clone(), request: A::NAME, got, expected }
     }
@@ -343,7 +352,7 @@ mod tests {
 
     use crate::proto::DESCRIPTORS;
 
-    /// Other clients rely on this rule of the protocol.
+    /// Clients in other languages rely on this rule of the protocol.
     #[test]
     fn reply_has_the_number_of_its_request() {
         let files = FileDescriptorSet::decode(DESCRIPTORS).unwrap().file;

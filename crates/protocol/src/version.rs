@@ -1,4 +1,4 @@
-//! The versions of every environment: the paper's three, and two of them together.
+//! The versions of an environment: the paper's D, R and E, and the mixture R+E.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,35 +7,36 @@ use serde::{Deserialize, Serialize};
 
 use crate::proto;
 
-/// A version of an environment: the distributions of its parameters.
+/// A version of an environment: it selects the distributions from which the environment's parameters are drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String")]
 pub enum Version {
-    /// Default: fixed values.
+    /// Default: every parameter has its default value.
     D,
-    /// Random: drawn from intervals around the defaults.
+    /// Random: parameters are drawn from intervals around their defaults.
     R,
-    /// Extreme: drawn from sets outside those intervals.
+    /// Extreme: parameters are drawn from outside the intervals of R.
     E,
-    /// R or E, each in half of the trials.
+    /// R or E: each trial draws all its parameters from R or all from E, with probability 1/2.
     #[serde(rename = "R+E")]
     RE,
 }
 
-/// A text that names no version.
+/// The error for a text that is not the name of a version.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("there is no version `{0}`; expected D, R, E or R+E")]
 pub struct UnknownVersion(String);
 
 impl Version {
-    /// The paper's, in its order.
+    /// The paper's versions, in the paper's order.
     pub const ALL: [Version; 3] = [Version::D, Version::R, Version::E];
-    /// The paper's versions, and R+E.
+    /// All versions: the paper's, and R+E.
     pub const KNOWN: [Version; 4] = [Version::D, Version::R, Version::E, Version::RE];
-    /// The names of [`Version::KNOWN`].
+    /// The names of the versions, in the order of [`Version::KNOWN`].
     pub const NAMES: [&str; 4] = ["D", "R", "E", "R+E"];
 
-    /// Versions that a trial is drawn from with equal probability: R and E for R+E, else the version itself.
+    /// The versions from which a trial is drawn with equal probability: R and E for R+E, otherwise only the version
+    /// itself.
     pub fn parts(self) -> &'static [Version] {
         match self {
             Version::D => &[Version::D],
@@ -45,13 +46,13 @@ impl Version {
         }
     }
 
-    /// The name in ids and file names, where only letters, digits, `.`, `-` and `_` are allowed. No parameter set of a user can
-    /// have the name of R+E.
+    /// The name for ids and file names, which consist of letters, digits, `.`, `-` and `_`. R+E is called `R-or-E`, a
+    /// name that user-defined parameter sets may not have.
     pub fn file_name(self) -> &'static str {
         if self == Version::RE { "R-or-E" } else { Self::NAMES[self as usize] }
     }
 
-    /// The protocol's name for the version.
+    /// The version as a protocol value.
     pub fn to_proto(self) -> proto::Version {
         match self {
             Version::D => proto::Version::Default,
@@ -61,7 +62,7 @@ impl Version {
         }
     }
 
-    /// The version with this name in the protocol; `None` if it is unspecified.
+    /// The version of a protocol value; `None` if it is unspecified.
     pub fn from_proto(version: proto::Version) -> Option<Self> {
         Version::KNOWN.into_iter().find(|known| known.to_proto() == version)
     }
@@ -76,7 +77,7 @@ impl fmt::Display for Version {
 impl FromStr for Version {
     type Err = UnknownVersion;
 
-    /// The name, in large letters or small ones.
+    /// Parses a name such as `R+E`. Case does not matter.
     fn from_str(text: &str) -> Result<Self, UnknownVersion> {
         let named = |version: &Version| Version::NAMES[*version as usize].eq_ignore_ascii_case(text);
         Version::KNOWN.into_iter().find(named).ok_or_else(|| UnknownVersion(text.into()))

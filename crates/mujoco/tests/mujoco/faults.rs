@@ -1,9 +1,10 @@
-//! Failures of MuJoCo: none ends the process, and none goes unreported.
+//! MuJoCo's failures are reported as errors, and never end the process.
 
 use perturb_mujoco::{Error, Model, Simulation, Warning};
 use std::{sync::Barrier, thread};
 
-/// Boxes that fall onto the floor. The stack is large enough in flight, without constraints, and too small at the impact.
+/// Boxes that fall onto the floor. MuJoCo's stack is large enough while they fall, but too small for the contacts of
+/// the impact.
 const SMALL_STACK: &str = r#"
 <mujoco>
   <option solver="Newton"/>
@@ -30,7 +31,7 @@ fn simulation(xml: &str) -> Simulation {
     Simulation::new(Model::from_xml(xml).unwrap()).unwrap()
 }
 
-/// Steps until something goes wrong, at most for a simulated second.
+/// Steps until an error occurs, for at most one simulated second.
 fn fall(simulation: &mut Simulation) -> Result<(), Error> {
     for _ in 0..500 {
         simulation.step1()?;
@@ -121,7 +122,7 @@ fn a_wrong_model_is_refused_with_mujocos_reason() {
     assert!(reason("<mujoco><wheel/></mujoco>").contains("wheel"));
     assert!(!reason("no xml").is_empty());
     assert!(!reason("").is_empty());
-    // A fatal error of the engine inside the compiler.
+    // The engine raises a fatal error while the compiler runs.
     assert!(reason(&SMALL_STACK.replace("500", "1")).contains("Stack overflow"));
 }
 

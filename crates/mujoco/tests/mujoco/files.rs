@@ -1,8 +1,8 @@
-//! Models whose text names files: all of them are given, none is read from the disk.
+//! Models that use files: the caller passes the content of the files, and none is read from the disk.
 
 use perturb_mujoco::{Error, Kind, Model};
 
-/// A tetrahedron with a corner of 1 m, as binary STL.
+/// A tetrahedron with three edges of 1 m along the axes, as binary STL.
 fn tetrahedron() -> Vec<u8> {
     let corners = [[0.0f32, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
     let mut bytes = vec![0; 80];
@@ -29,7 +29,8 @@ fn a_mesh_comes_from_the_given_bytes() {
     let model = Model::from_files(MODEL, &[("other.stl", b"unused"), ("m0.stl", &mesh)]).unwrap();
     let body = model.id(Kind::Body, "corner").unwrap();
     let volume = model.body_mass()[body] / 1000.0;
-    // Corners are float32, and MuJoCo moves and turns them to the centre of mass: eight digits are left.
+    // MuJoCo stores the vertices as float32, relative to the centre of mass, so the results have some eight exact
+    // digits.
     assert!((volume - 1.0 / 6.0).abs() < 1e-8, "{volume} m³");
 }
 

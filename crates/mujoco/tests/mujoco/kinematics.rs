@@ -1,10 +1,10 @@
-//! Our own kinematics of hinges and slides gives the same bytes as MuJoCo's.
+//! The kinematics of `kinematics.c` gives the same bytes as MuJoCo's.
 
 use crate::states::state;
 use perturb_mujoco::{Model, Simulation};
 
-/// A model with all special cases: joints that are not at their bodies' origins, askew axes and frames, bodies with several
-/// joints or none, two trees, an inertia that is given, and geoms that are at the body's origin or elsewhere.
+/// A model with many special cases: joints away from their bodies' origins, oblique axes and frames, bodies with
+/// several joints or none, two kinematic trees, an explicit inertia, and geoms at the body's origin and elsewhere.
 const MOBILE: &str = r#"
 <mujoco>
   <size njmax="300" nconmax="60" nstack="60000"/>
@@ -38,7 +38,8 @@ const MOBILE: &str = r#"
   <actuator><velocity joint="elbow" kv="0.1"/></actuator>
 </mujoco>"#;
 
-/// A chain of `n` bodies with one hinge each, whose axes alternate. Each body has one geom, centred at its centre of mass.
+/// A chain of `n` bodies with one hinge each. The hinges' axes alternate. Each body has one geom, centred at its centre
+/// of mass.
 fn chain(n: usize) -> String {
     let link = |i| {
         let axis = if i % 2 == 0 { "0 1 0" } else { "0.6 0 0.8" };
@@ -57,7 +58,7 @@ fn simulation(xml: &str) -> Simulation {
     Simulation::new(Model::from_xml(xml).unwrap()).unwrap()
 }
 
-/// The poses and velocities of all bodies, as bits, which also distinguish 0 from -0.
+/// Returns the poses and velocities of all bodies as bits, which distinguish 0 from -0.
 fn bodies(simulation: &Simulation) -> Vec<u64> {
     let of = |body| {
         let places = [simulation.xpos(body), simulation.xipos(body)];
@@ -78,7 +79,7 @@ fn compare(xml: &str) -> usize {
             for simulation in [&mut own, &mut mujoco] {
                 simulation.reset().unwrap();
                 let qpos = simulation.qpos_mut().iter_mut().enumerate();
-                // The first poses are the model's own, with a single joint moved: most rotations are then by 0.
+                // In the first poses only one joint is displaced, so most rotations are by the angle 0.
                 qpos.filter(|(i, _)| turn > 200 || turn as usize / 200 == i + 1).for_each(|(i, position)| {
                     *position += f64::from(turn) * 0.0005 * [1.0, -0.3, 0.7][i % 3];
                 });
@@ -86,7 +87,7 @@ fn compare(xml: &str) -> usize {
                 qvel.for_each(|(velocity, scale)| *velocity = scale * f64::from(turn / 200) * 0.1);
             }
         }
-        // Other simulations compute the poses, because both functions replace the given quaternions by normalised ones.
+        // New simulations compute the poses, because both functions normalise the quaternions of the state in place.
         for simulation in &mut seen {
             simulation.set_state(&state(&own)).unwrap();
         }
@@ -125,7 +126,7 @@ fn what_is_not_walked_is_mujocos() {
     };
     let swing = r#"<joint type="hinge" axis="0 0 1"/>"#;
     let ball = with(swing, r#"<joint type="ball"/>"#);
-    // A force at a site needs the site's position, …
+    // An actuator at a site needs the site's position, …
     let site = with(r#"<geom type="box" size=".02"#, r#"<site name="grip" pos=".1 0 0"/><geom type="box" size=".02"#)
         .replace(
             "<actuator>",

@@ -1,4 +1,4 @@
-//! The tests of the bindings, one program, so that it is linked once.
+//! The tests of the bindings. They are one program, which is linked only once.
 #![allow(clippy::unwrap_used)]
 
 mod faults;

@@ -1,4 +1,4 @@
-//! A step without the search for near geoms gives the same bytes as MuJoCo's own step.
+//! A step without the search for nearby geoms gives the same bytes as MuJoCo's own step.
 
 use crate::states::state;
 use perturb_mujoco::{Error, Model, Simulation, Warning};
@@ -6,7 +6,7 @@ use perturb_mujoco::{Error, Model, Simulation, Warning};
 const HOPPER: &str = include_str!("../../../../models/hopper.xml");
 const HALF_CHEETAH: &str = include_str!("../../../../models/half_cheetah.xml");
 
-/// A crate slides into a corner of two planes and over a kerb; its lid touches them, too.
+/// A crate with a lid that slides over a kerb into the corner of two planes. Crate and lid can touch all of them.
 const CORNER: &str = r#"
 <mujoco>
   <size njmax="300" nconmax="60" nstack="60000"/>
@@ -31,7 +31,7 @@ fn simulation(xml: &str) -> Simulation {
     Simulation::new(Model::from_xml(xml).unwrap()).unwrap()
 }
 
-/// Steps both simulations, with other friction now and then, and compares them. Returns the number of contacts.
+/// Steps both simulations, changes the friction now and then, and compares the states. Returns the number of contacts.
 fn compare(xml: &str, speed: f64) -> usize {
     let (mut own, mut mujoco) = (simulation(xml), simulation(xml));
     let mut touched = 0;
@@ -80,7 +80,7 @@ fn what_needs_the_search_has_it() {
         CORNER.replace(from, to)
     };
     for xml in [
-        corner(r#"size=".04" conaffinity="0" priority="1""#, r#"size=".04" conaffinity="0" priority="0""#), // mixes with the second plane
+        corner(r#"size=".04" conaffinity="0" priority="1""#, r#"size=".04" conaffinity="0" priority="0""#), // contacts mix both geoms' parameters
         corner(
             r#"condim="6"/>"#,
             r#"condim="6"/><body pos="0.5 1 0"><geom type="box" size=".05 1 .02" contype="0"/></body>"#,

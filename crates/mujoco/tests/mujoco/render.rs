@@ -1,9 +1,9 @@
-//! Pictures. They need OpenGL in software: Debian's libegl1 and libgl1-mesa-dri.
+//! Pictures of models. These tests need software OpenGL: Debian's libegl1 and libgl1-mesa-dri.
 
 use perturb_mujoco::{Camera, CameraView, Error, Model, Renderer};
 use std::{sync::Barrier, thread};
 
-/// A red ball to the right of, and above, a blue one, before the camera of [`CAMERA`].
+/// A red ball and a blue ball. In the picture of [`CAMERA`] the red one is above and to the right of the blue one.
 const BALLS: &str = r#"
 <mujoco>
   <visual><headlight ambient="1 1 1" diffuse="0 0 0" specular="0 0 0"/></visual>

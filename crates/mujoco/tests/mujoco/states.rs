@@ -1,8 +1,9 @@
-//! One simulation serves any number of states and edited models: what it did for one cannot be seen by the next.
+//! One simulation can serve many states and edited models in turn, and earlier computations do not affect later ones.
 
 use perturb_mujoco::{Error, Kind, Model, Simulation, Warning};
 
-/// A block slides and tips on the floor; a motor turns its flywheel, whose damping makes the integration implicit.
+/// A block that slides and tips on the floor, with a flywheel that a motor turns. Euler's method integrates the
+/// flywheel's damping implicitly.
 const BLOCK: &str = r#"
 <mujoco>
   <option solver="Newton"/>
@@ -37,7 +38,7 @@ fn constants(simulation: &Simulation) -> Vec<f64> {
     constants
 }
 
-/// Changes mass, inertia and friction, for each number differently.
+/// Edits mass, inertia and friction, differently for each `number`.
 fn edit(simulation: &mut Simulation, number: usize) {
     let block = simulation.model().id(Kind::Body, "block").unwrap();
     let scale = 1.0 + number as f64;
@@ -48,7 +49,7 @@ fn edit(simulation: &mut Simulation, number: usize) {
     simulation.reset().unwrap();
 }
 
-/// Throws the block, for each number differently.
+/// Throws the block, differently for each `number`.
 fn throw(simulation: &mut Simulation, number: usize) {
     let number = number as f64;
     simulation.qvel_mut()[..6].copy_from_slice(&[3.0, 0.5 * number, 0.0, 0.0, 1.0 + number, 2.0]);
@@ -68,7 +69,7 @@ fn states_in_one_simulation_evolve_as_each_alone() {
     }
     let mut touched = 0;
     for turn in 0..2000 {
-        let number = ((turn * 2_654_435_761) >> 9) % N; // in a mixed order
+        let number = ((turn * 2_654_435_761) >> 9) % N; // a pseudo-random order
         let (constants, own) = &mut states[number];
         shared.set_constants(constants);
         shared.set_state(own).unwrap();

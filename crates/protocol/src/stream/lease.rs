@@ -1,4 +1,4 @@
-//! A client's side of a lease: the requests without replies, and the resumption of a session whose connection was lost.
+//! A client's side of a lease: stores unanswered requests, and resumes a session whose connection was lost.
 
 use std::collections::VecDeque;
 use std::error::Error;
@@ -14,25 +14,28 @@ use super::{RawStream, TypedRequest};
 use crate::connection::Connection;
 use crate::proto::{self, SessionRequest, SessionResponse, session_response::Response};
 
-/// Pause between the first attempt, which is immediate, and the second. The pause doubles with each attempt.
+/// Pause between the first and the second attempt to resume. The first attempt is immediate, and the pause doubles
+/// after each attempt.
 const MIN_PAUSE: Duration = Duration::from_millis(50);
-/// Upper limit of the pause between two attempts.
+/// Maximal pause between two attempts to resume.
 const MAX_PAUSE: Duration = Duration::from_secs(2);
-/// Number of losses in a row without a reply, after which the session is given up.
+/// Number of resumptions of the session without a reply in between, after which the next loss of the connection ends
+/// the session.
 pub(super) const MAX_RESUMES_WITHOUT_REPLY: u32 = 8;
-/// Number of refused connections in a row, after which the server counts as gone.
+/// Number of refused connections in a row after which the client stops trying: no server listens at the address any
+/// more.
 const MAX_REFUSED: u32 = 4;
 
-/// A lease, by which a session is resumed.
+/// The right to resume a session over a new connection, with what the client needs for it.
 pub(super) struct ClientLease {
     name: Bytes,
     time: Duration,
     last_reply: u64,
-    /// Requests without a reply. The reply to the first has the number after `last_reply`.
+    /// Requests whose replies were not received, oldest first. The oldest one's reply has the number `last_reply` + 1.
     waiting: VecDeque<SessionRequest>,
 }
 
-/// Why a session was not resumed.
+/// The reason why an attempt to resume a session failed.
 enum ResumeFailure {
     /// Another attempt may succeed.
     Retry,
@@ -42,7 +45,7 @@ enum ResumeFailure {
     Permanent,
 }
 
-/// Hides the lease's name, which is a secret.
+/// Leaves out the lease's name, which is a secret.
 impl fmt::Debug for ClientLease {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.debug_struct("ClientLease")
@@ -53,7 +56,7 @@ impl fmt::Debug for ClientLease {
 }
 
 impl ClientLease {
-    /// The lease that a server granted, if it did.
+    /// Returns the lease that the server granted; `None` if it granted none.
     pub(super) fn from_proto(opened: &proto::Opened) -> Option<Self> {
         let time = Duration::from_secs(opened.lease_seconds.into());
         (!opened.lease.is_empty()).then(|| Self {
@@ -64,19 +67,20 @@ impl ClientLease {
         })
     }
 
-    /// Notes a request that is sent.
+    /// Stores a request that is being sent, to send it again after a resumption.
     pub(super) fn on_request(&mut self, request: &SessionRequest) {
         self.waiting.push_back(request.clone());
     }
 
-    /// Notes a reply that was received.
+    /// Counts a received reply, and drops its request.
     pub(super) fn on_reply(&mut self) {
         self.waiting.pop_front();
         self.last_reply += 1;
     }
 
-    /// Resumes the session over another stream, and sends those requests again that did not arrive. Tries until the lease ends,
-    /// unless the server is gone or no longer has the session.
+    /// Resumes the session over a new stream, and sends again the requests that did not reach the server. Retries until
+    /// the lease ends. Returns `None` if it ended, if no server listens any more, or if the server no longer has the
+    /// session.
     pub(super) async fn resume(&self, connection: &Connection) -> Option<RawStream> {
         let since = Instant::now();
         let mut pause = MIN_PAUSE;
@@ -99,7 +103,7 @@ impl ClientLease {
 
     async fn attempt(&self, connection: &Connection) -> Result<RawStream, ResumeFailure> {
         let resume = proto::Resume { lease: self.name.clone(), last_reply: self.last_reply };
-        // The channel connects again by itself.
+        // tonic's channel reconnects by itself.
         let begun = RawStream::begin(connection, resume, self.waiting.len()).await.map_err(|_| ResumeFailure::Retry)?;
         let mut stream = begun.map_err(ResumeFailure::from_status)?;
         let limit = connection.timeouts().reply;
@@ -112,7 +116,7 @@ impl ClientLease {
         {
             return Err(ResumeFailure::Retry);
         }
-        // Any other response is most likely an error.
+        // Any other response, most likely an error, is final.
         let resumed = proto::Resume::reply(response).map_err(|_| ResumeFailure::Permanent)?;
         let arrived = resumed.last_reply.checked_sub(self.last_reply).ok_or(ResumeFailure::Permanent)?;
         let arrived = usize::try_from(arrived).map_err(|_| ResumeFailure::Permanent)?;
@@ -133,12 +137,12 @@ impl ResumeFailure {
     }
 }
 
-/// Whether a call was ended by the connection, and not by the server.
+/// Whether a call ended because the connection failed, and not by the server's own status.
 pub(super) fn is_of_connection(status: &Status) -> bool {
     status.source().is_some()
 }
 
-/// The operating system's error of a connection.
+/// Returns the kind of the operating system's error among a status's sources.
 fn system_error(status: &Status) -> Option<ErrorKind> {
     let mut chain = std::iter::successors(status.source(), |error: &&(dyn Error + 'static)| (*error).source());
     chain.find_map(|error| error.downcast_ref::<std::io::Error>()).map(std::io::Error::kind)
