@@ -96,14 +96,14 @@ __all__ = [
 _register_all()
 _register_tasks()
 
-# Names of version 0.1, by which the same things are still found in version 0.2.
+# The new name of each deprecated name. The names of version 0.1 work until version 0.3.
 _DEPRECATED = {"assess": "evaluate", "Part": "Bin", "Cell": "Bin2D"}
 
 
-if not _typing.TYPE_CHECKING:  # type checkers know the present names alone
+if not _typing.TYPE_CHECKING:  # hidden from type checkers, so that they reject deprecated names
 
     def __getattr__(name: str) -> _typing.Any:
-        """Find a deprecated name, with a warning that names the new one."""
+        """Return the object of a deprecated name. Issue a DeprecationWarning that states the new name."""
         if name not in _DEPRECATED:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         new = _DEPRECATED[name]

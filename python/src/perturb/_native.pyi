@@ -8,19 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 class Failure(Exception):  # noqa: N818
-    """Arguments: the kind of failure, a gRPC code or 0, and the other side's or the transport's words."""
+    """A failure of the native module. Its arguments are the kind of failure, a gRPC status code or 0, and a message."""
 
 class Events:
-    """Episodes that began and ended in a request."""
+    """The episodes that began or ended in one request."""
 
     def single(self) -> dict[str, Any]:
-        """Info of one environment by itself."""
+        """Return the info of a single environment."""
 
     def batch(self, moved: NDArray[np.bool_] | None, same_step: bool) -> dict[str, Any]:
-        """Infos of a batch."""
+        """Return the infos of a batch. `moved` is the mask of environments that took a step; None means all."""
 
 class Opened:
-    """The reply that opened a session."""
+    """The reply to opening a session."""
 
     @property
     def environment(self) -> str: ...
@@ -31,19 +31,19 @@ class Opened:
     @property
     def events(self) -> Events: ...
 
-# Observations, rewards, terminated, truncated, and what began or ended.
+# The outcome of a step: observations, rewards, terminated flags, truncated flags, and episodes that began or ended.
 Stepped: TypeAlias = tuple[
     NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_], Events | None
 ]
 
 class NativeServer:
-    """A server of this process. Sessions end with it."""
+    """An embedded server. Its sessions end when it is closed."""
 
     def __init__(self, task: tuple[Path, str, str] | None = None) -> None: ...
     def close(self) -> None: ...
 
 class Session:
-    """A stream to a server, which owns a batch of environments."""
+    """A stream to a server. It owns a batch of environments."""
 
     timeout: float
     @property
@@ -97,7 +97,7 @@ def catalogue(address: str, timeout: float) -> str:
     """Return a server's catalogue as JSON."""
 
 class Policy:
-    """A checkpoint that was read."""
+    """A policy, loaded from a checkpoint."""
 
     @staticmethod
     def load(path: str) -> Policy: ...
@@ -129,7 +129,7 @@ class Policy:
     def player(self, num_envs: int, seed: int, first_environment_index: int) -> Player: ...
 
 class Player:
-    """Acts in N environments, and remembers."""
+    """Chooses actions in N environments with a policy, and stores the policy's memory."""
 
     def begin(self, observations: NDArray[np.float32]) -> None: ...
     def act(self) -> NDArray[Any]: ...
@@ -137,12 +137,12 @@ class Player:
         self, observations: NDArray[np.float32], rewards: NDArray[np.float32], starts: NDArray[np.bool_]
     ) -> None: ...
 
-# Facts about a policy: the version that it was trained on, steps of its training, the seed of its tests, their
-# episodes, # what it observed, and whether it was deterministic.
+# The fields of results.PolicyMetadata: training version, training steps, seed and episodes of the tests, observations,
+# and whether the policy was deterministic.
 PolicyMetadata: TypeAlias = tuple[str | None, int | None, int, int, str, bool | None]
 
 class Assessment:
-    """The tests of an agent in one environment."""
+    """The recorded tests of related policies in one environment."""
 
     def __init__(self, agent: str, policies: list[tuple[PolicyMetadata, Records]]) -> None: ...
     @staticmethod
@@ -155,23 +155,22 @@ class Assessment:
 def compare(
     conditions: list[tuple[str, list[tuple[str, Records]]]], sets: list[str], score: str, baseline: str | None
 ) -> str:
-    """Compare conditions in the tests on these sets, as JSON."""
+    """Compare conditions in the tests on these sets. Return JSON."""
 
 def report_page(assessments: list[Assessment], beside: list[str]) -> str:
-    """The report page, HTML."""
+    """Return the report page of assessments, and of the folders `beside` with experiments and assessments, as HTML."""
 
-# A set of a test: its name, its version, values that are drawn in place of the version's, and contexts if it has a
-# list.
+# A test set: its name, its version, the intervals that replace the version's by parameter, and its contexts or None.
 Set: TypeAlias = tuple[str, str, dict[str, list[tuple[float, float]]], list[dict[str, float]] | None]
 
 def make_set(name: str, version: str, values: list[tuple[str, str]]) -> Set:
-    """The set that texts of experiment files make."""
+    """Make a test set from values in the syntax of experiment files."""
 
 def read_csv_set(name: str, version: str, path: str) -> Set:
-    """The set of the rows of a CSV file."""
+    """Read a test set from a CSV file with one context per row."""
 
 def read_sets(path: str) -> list[Set]:
-    """The sets of an experiment file."""
+    """Read the test sets of an experiment file."""
 
 HEATMAP_SET: str
 MAX_HEATMAP_POINTS: int
@@ -179,10 +178,10 @@ MAX_HEATMAP_POINTS: int
 def heatmap_contexts(
     axes: Sequence[tuple[str, float, float]], points: int, fixed: dict[str, float]
 ) -> list[dict[str, float]]:
-    """The contexts of a heatmap over two parameters, each with its range."""
+    """Return the contexts of a heatmap over two parameters. `axes` has the name and the range of each parameter."""
 
 class Tests:
-    """The tests of a policy, one set after the other."""
+    """Records the tests of a policy on one set after the other."""
 
     def __init__(
         self, sets: list[Set], episodes: int, seed: int, success: str | None, policy: str, episodes_per_trial: int
@@ -235,13 +234,13 @@ class Records:
     def success_by_parameter(self, name: str, parameter: str) -> list[tuple[float, float, int, int, float, float]]: ...
 
 def read_results(path: str) -> tuple[dict[str, Any], list[tuple[str, str]]]:
-    """A results table's columns by their names, and the plans of its studies."""
+    """Read a results table. Return its columns by name, and the name and experiment file of each study."""
 
 def wilson(successes: int, episodes: int) -> tuple[float, float]:
-    """The 95 % interval of a rate, 0 … 1."""
+    """Return the 95 % Wilson interval of a success rate, 0 … 1."""
 
 def metrics(rates: dict[str, float]) -> tuple[float | None, float | None, float | None]:
-    """The paper's three numbers of success rates by scenario."""
+    """Return Default, Interpolation and Extrapolation, %, from success rates, %, by scenario such as `DR`."""
 
 def published(environment: str) -> list[tuple[str, list[tuple[float, float | None] | None]]]:
-    """The paper's methods with the mean and deviation of their three numbers."""
+    """Return the paper's methods, each with the mean and standard deviation of its three metrics, %."""

@@ -21,12 +21,15 @@ class Address:
         return self.target
 
 
-# The server that runs in this process.
+# The address of the embedded server, which runs in this process.
 EMBEDDED = Address("embedded")
 
 
 def parse_address(text: str) -> Address:
-    """Parse `unix:/path`, `host:port` (`http://` or `tcp://` before it), `https://host:port`, and `embedded`.
+    """Parse the address of a server.
+
+    Valid addresses are `unix:/path`, `host:port`, `http://host:port` and `tcp://host:port` without TLS,
+    `https://host:port` with TLS, and `embedded`.
 
     Raises:
         InvalidArgumentError: if the address is malformed. The message says what is wrong.
@@ -48,7 +51,7 @@ def parse_address(text: str) -> Address:
                 raise refuse("the path after unix:// must be absolute")
         if not path:
             raise refuse("the path of the socket is missing")
-        path = str(Path(path).absolute())  # a server's own words may be relative to the working folder
+        path = str(Path(path).absolute())  # a relative path is relative to the working directory
         if len(path.encode()) > MAX_SOCKET_PATH_BYTES:
             raise refuse(f"the path of the socket is longer than the {MAX_SOCKET_PATH_BYTES} bytes that Linux allows")
         return Address(f"unix:{path}")
@@ -70,6 +73,6 @@ def parse_address(text: str) -> Address:
 
 def _is_ipv6(host: str) -> bool:
     try:
-        return ipaddress.IPv6Address(host).scope_id is None  # a scope is not for URLs
+        return ipaddress.IPv6Address(host).scope_id is None  # URLs cannot contain a scope such as %eth0
     except ValueError:
         return False

@@ -1,4 +1,4 @@
-"""Assessments: records of every episode of tests, and the figures that follow from them."""
+"""Assessments: recorded test episodes of policies, and the statistics that are computed from them."""
 
 from __future__ import annotations
 
@@ -25,14 +25,18 @@ if TYPE_CHECKING:
 
 
 class Assessment:
-    """Recorded tests of an agent's policies in one environment. Shown as a table, in a notebook too.
+    """The recorded tests of one policy, or of several related policies, in one environment.
+
+    `print` and notebooks show an assessment as a table.
 
     Attributes:
-        agent: what reports call it: the `name` of the tests, or the policies' kind.
-        environment: its name.
-        success: what counted as a success, such as `steps at least 195`.
-        parameters: the environment's parameters and their units.
-        results: the figures of each test, in the order of training and test versions.
+        agent: the name of the policies in reports: the argument `name` of `evaluate`, or else the kind of the policies,
+            such as `ppo ff`.
+        environment: the name of the environment.
+        success: the success rule as a phrase, such as `steps at least 195`. None if the server decided about success
+            and stated no rule.
+        parameters: the unit of each parameter of the environment, by the parameter's name.
+        results: the statistics of each test, ordered by training version and then by test set.
     """
 
     def __init__(self, agent: str, assessed: Sequence[PolicyRecords]) -> None:
@@ -56,13 +60,19 @@ class Assessment:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle what `save` writes."""
+        """Pickle the files that `save` writes."""
         with tempfile.TemporaryDirectory(prefix="perturb-") as folder:
             native(self._native.write, folder, False)
             return _unpickled_assessment, (read_folder(folder),)
 
     def __getitem__(self, scenario: str) -> Result:
-        """The figures of a scenario, such as `DR` or `D on corners`, or of a test, such as `corners`."""
+        """Return the result of a scenario, such as `DR` or `D on corners`.
+
+        The name of a test set, such as `corners`, is enough if only one policy was tested on that set.
+
+        Raises:
+            UnknownNameError: if there is no such scenario. The message lists the known ones.
+        """
         for result in self.results:
             if result.scenario == scenario:
                 return result
@@ -74,30 +84,34 @@ class Assessment:
 
     @property
     def metrics(self) -> dict[str, float | None]:
-        """The paper's three numbers, %. A number is None if a scenario that it needs was not tested.
+        """The three metrics of Packer et al. (2018, arXiv:1810.12282), in %, by name.
 
-        Default is the success rate of DD, Interpolation of RR, Extrapolation the geometric mean of DR, DE and RE
-        (Packer et al., 2018, arXiv:1810.12282).
+        `Default` is the success rate of scenario DD, and `Interpolation` is that of RR. `Extrapolation` is the
+        geometric mean of the success rates of DR, DE and RE. A metric is None if one of its scenarios was not tested.
         """
         rates = {result.scenario: result.success_percent for result in self.results if result.trained_on is not None}
         return dict(zip(METRICS, _native.metrics(rates), strict=True))
 
     @property
     def published(self) -> dict[str, dict[str, tuple[float, float | None] | None]]:
-        """The paper's numbers in this environment, %, by method and metric: mean and deviation over five runs."""
+        """The metrics that Packer et al. (2018) published for this environment, in %, by method and metric.
+
+        Each value is the mean and the standard deviation over five runs. It is None if the paper does not have it.
+        """
         return {
             method: dict(zip(METRICS, numbers, strict=True)) for method, numbers in _native.published(self.environment)
         }
 
     def success_by_parameter(self, scenario: str, parameter: str) -> tuple[Bin, ...]:
-        """Success over a parameter in a test: in tenths of the range of its values, in the parameter's unit.
+        """Return the success rate of a scenario in each bin of a parameter's range.
 
-        Parts have gaps where a tenth of the range has no values, as between E's two intervals. The result is empty if
-        the parameter does not vary.
+        The range of the parameter's values is divided into ten bins of equal width. Bin edges are in the parameter's
+        unit. A tenth of the range that holds no values, such as the gap between E's two intervals, has no bin. The
+        result is empty if the parameter does not vary in this scenario.
 
         Raises:
-            UnknownNameError: for a scenario that was not tested.
-            InvalidArgumentError: for another parameter than the environment's.
+            UnknownNameError: if the scenario was not tested.
+            InvalidArgumentError: if the environment has no such parameter.
         """
         result, records = self._find(scenario)
         parts = native(records.success_by_parameter, result.tested_on, parameter)
@@ -114,13 +128,14 @@ class Assessment:
         )
 
     def success_by_parameters(self, scenario: str, x: str, y: str) -> tuple[Bin2D, ...]:
-        """Success over two parameters in a test: in the parts of `success_by_parameter` of either, by y, then x.
+        """Return the success rate of a scenario in each cell of a grid over two parameters.
 
-        Nothing if one of them does not vary.
+        The grid combines the bins that `success_by_parameter` returns for x and for y. Cells are ordered by y, then by
+        x. The result is empty if one of the two parameters does not vary in this scenario.
 
         Raises:
-            UnknownNameError: for a scenario that was not tested.
-            InvalidArgumentError: for another parameter than the environment's.
+            UnknownNameError: if the scenario was not tested.
+            InvalidArgumentError: if the environment has no such parameter.
         """
         result, records = self._find(scenario)
         cells = native(records.success_by_parameters, result.tested_on, x, y)
@@ -130,14 +145,19 @@ class Assessment:
         )
 
     def worst_contexts(self, scenario: str, count: int = 10) -> tuple[Context, ...]:
-        """Give the contexts of a test with the lowest success rates, the worst first; of equal ones the lowest return.
+        """Return the contexts of a scenario with the lowest success rates, worst first.
 
-        For a list, contexts are its own. If parameters are drawn, contexts are parts of the parameter space with some
-        40 episodes each. The same episodes choose the worst parts and say how bad they are, so these parts look worse
-        than they are. A result's `worst_contexts_percent` does not have this bias.
+        Contexts with equal success rates are ordered by mean return, lowest first. If the test set is a list or a grid,
+        the contexts are those of the list or grid. If parameters are drawn, each context is a region of the parameter
+        space with about 40 episodes. Then the same episodes both select the worst regions and measure them, so these
+        regions look worse than they are. `Result.worst_contexts_percent` does not have this bias.
+
+        Args:
+            scenario: such as `DE`.
+            count: maximum number of contexts to return.
 
         Raises:
-            UnknownNameError: for a scenario that was not tested.
+            UnknownNameError: if the scenario was not tested.
         """
         result, records = self._find(scenario)
         every = records.columns()
@@ -165,10 +185,10 @@ class Assessment:
         return tuple(contexts[: requests.count(count, "count", 1)])
 
     def varying_parameters(self, scenario: str) -> tuple[str, ...]:
-        """Give the names of the parameters that vary in a test.
+        """Return the names of the parameters that vary between the episodes of a scenario.
 
         Raises:
-            UnknownNameError: for a scenario that was not tested.
+            UnknownNameError: if the scenario was not tested.
         """
         result, records = self._find(scenario)
         columns = records.columns()
@@ -176,10 +196,10 @@ class Assessment:
         return tuple(name for name in self.parameters if len(set(columns[f"requested_{name}"][tested].tolist())) > 1)
 
     def judged_by(self, success: SuccessRule) -> Assessment:
-        """Give the same episodes with another rule of success.
+        """Return an assessment of the same episodes, judged by another success rule.
 
         Args:
-            success: as in `evaluate`; a threshold must be of a quantity that was recorded.
+            success: the success rule, as in `evaluate`. A threshold can only use a quantity that was recorded.
 
         Raises:
             InvalidArgumentError: if the rule is malformed, or needs a quantity that was not recorded.
@@ -194,19 +214,23 @@ class Assessment:
     def plot_curves(
         self, parameter: str, scenarios: Sequence[str] | None = None, *, title: str | None = None, axes: Any = None
     ) -> Any:
-        """Draw success over a parameter, with 95 % Wilson intervals: a line for each scenario where it varies.
+        """Plot the success rate over a parameter, with 95 % Wilson intervals.
+
+        Each scenario in which the parameter varies has one line. Needs matplotlib: `pip install 'perturb-rl[plot]'`.
 
         Args:
-            parameter: its name.
-            scenarios: names of scenarios; by default all.
-            title: by default the environment and the rule of success.
-            axes: matplotlib's axes to draw on; by default new ones.
+            parameter: name of the parameter.
+            scenarios: names of scenarios. By default all.
+            title: title of the plot. By default the environment and the success rule.
+            axes: matplotlib's axes to draw on. By default new ones.
 
-        Returns the axes. Needs matplotlib: `pip install 'perturb-rl[plot]'`.
+        Returns:
+            The axes.
 
         Raises:
             ImportError: if matplotlib is not installed.
-            UnknownNameError, InvalidArgumentError: for an unknown scenario or parameter, or one that does not vary.
+            UnknownNameError: if a scenario was not tested.
+            InvalidArgumentError: if the parameter is unknown, or varies in none of the scenarios.
         """
         named = [result.scenario for result in self.results] if scenarios is None else list(scenarios)
         lines = {name: self.success_by_parameter(name, parameter) for name in named}
@@ -215,31 +239,36 @@ class Assessment:
     def plot_heatmap(
         self, scenario: str, x: str, y: str, *, title: str | None = None, cbar: bool = True, axes: Any = None
     ) -> Any:
-        """Draw success over two parameters of a test as a heatmap.
+        """Plot the success rate of a scenario over two parameters as a heatmap.
+
+        Needs matplotlib: `pip install 'perturb-rl[plot]'`.
 
         Args:
             scenario: such as `DE`.
-            x: the parameter along x.
-            y: the parameter along y.
-            title: by default the environment, the rule of success and the scenario.
-            cbar: whether there is a colour bar.
-            axes: matplotlib's axes to draw on; by default new ones.
+            x: the parameter on the x axis.
+            y: the parameter on the y axis.
+            title: title of the plot. By default the environment, the success rule and the scenario.
+            cbar: whether to draw a colour bar.
+            axes: matplotlib's axes to draw on. By default new ones.
 
-        Returns the axes. Needs matplotlib: `pip install 'perturb-rl[plot]'`.
+        Returns:
+            The axes.
 
         Raises:
             ImportError: if matplotlib is not installed.
-            UnknownNameError, InvalidArgumentError: for an unknown scenario or parameter, or one that does not vary.
+            UnknownNameError: if the scenario was not tested.
+            InvalidArgumentError: if a parameter is unknown, or does not vary in this scenario.
         """
         cells = self.success_by_parameters(scenario, x, y)
         title = title or f"{self._title()}: {scenario}"
         return plots.heatmap(cells, x, y, self.parameters, title, axes, cbar)
 
     def columns(self) -> dict[str, Any]:
-        """Every episode, as arrays [episodes] by name: those of `perturb evaluate --records`, after `trained_on`.
+        """Return all recorded episodes as columns: arrays [episodes] by column name.
 
-        `trained_on`, `set`, `model_hash` and `ending` are arrays of text. `achieved` is NaN where an episode achieved
-        nothing.
+        The first column, `trained_on`, is the version that the policy was trained on. The others are the columns of
+        `perturb evaluate --records`. `trained_on`, `set`, `model_hash` and `ending` are arrays of text. `achieved` is
+        NaN where an episode has no value of the quantity that the success rule compares.
         """
         tables = [(one.trained_on, one.records.columns()) for one in self._assessed]
         names = list(tables[0][1])
@@ -254,7 +283,7 @@ class Assessment:
         return columns
 
     def to_pandas(self) -> Any:
-        """Every episode, as a pandas DataFrame of `columns`.
+        """Return all recorded episodes as a pandas DataFrame, with the columns of `columns`.
 
         Raises:
             ImportError: if pandas is not installed.
@@ -268,32 +297,34 @@ class Assessment:
         return pd.DataFrame(self.columns())
 
     def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write `assessment.json`, and for each policy a file such as `perturb evaluate --records` writes.
+        """Save the assessment to a folder.
 
-        `perturb report` shows such a folder beside an experiment, and `to_html` beside other assessments.
-        `perturb audit` replays the tests of perturb's policies.
+        The folder gets a file `assessment.json` and, for each policy, a file of records as `perturb evaluate --records`
+        writes it. Pass the folder to `perturb report` to show the assessment beside an experiment, or to `to_html` to
+        show it beside other assessments. `perturb audit` replays the tests if the policies were trained by perturb.
 
         Args:
-            folder: it must be new or empty, unless an assessment in it may be overwritten.
-            overwrite: whether it may.
+            folder: path of the folder. It must be new or empty, or hold an assessment and `overwrite` must be true.
+            overwrite: whether to replace an assessment that is in the folder.
 
         Raises:
-            InvalidArgumentError: if it holds something else.
-            OSError: if it cannot be written.
+            InvalidArgumentError: if the folder is not empty and must not be overwritten.
+            OSError: if a file cannot be written.
         """
         native(self._native.write, os.fspath(folder), overwrite)
-        self._native = native(_native.Assessment.read, os.fspath(folder))  # which knows its folder's name
+        self._native = native(_native.Assessment.read, os.fspath(folder))  # reads the folder's name, too
 
     @staticmethod
     def load(folder: str | os.PathLike[str]) -> Assessment:
-        """Read what `save` wrote.
+        """Load an assessment from a folder that `save` wrote.
 
         Raises:
-            InvalidArgumentError: if there is no assessment, or one that is damaged or of a later version of perturb.
+            InvalidArgumentError: if the folder has no assessment, or if the assessment is damaged or was written by a
+                later version of perturb.
         """
         read = native(_native.Assessment.read, os.fspath(folder))
         assessment = _assessment(read)
-        assessment._native = read  # which knows its folder's name
+        assessment._native = read  # knows the folder's name
         return assessment
 
     def to_html(
@@ -302,18 +333,19 @@ class Assessment:
         *,
         beside: Sequence[str | os.PathLike[str] | Assessment] = (),
     ) -> str:
-        """Make the page of `perturb report`: tables and figures in one file that needs nothing else.
+        """Make the report page of `perturb report`: a self-contained HTML page with tables and figures.
 
         Args:
-            path: a file to write it to, too.
-            beside: what else is on the page: other assessments, or their folders, and at most one experiment (the
-                `--out` of `perturb run`, or the study of a results table, `FILE.parquet/STUDY`), whose rule of success
-                then judges all.
+            path: a file to write the page to. By default the page is only returned.
+            beside: other assessments, or their folders, to show on the same page. At most one entry may be an
+                experiment: the `--out` folder of `perturb run`, or a study of a results table, `FILE.parquet/STUDY`.
+                The success rule of the experiment then judges all assessments.
 
-        Returns the page, HTML.
+        Returns:
+            The page as HTML.
 
         Raises:
-            InvalidArgumentError: for a folder that is neither, or is damaged.
+            InvalidArgumentError: if a folder is damaged, or holds neither an assessment nor an experiment.
             OSError: if a file cannot be read or written.
         """
         if isinstance(beside, str | os.PathLike | Assessment):
@@ -334,22 +366,26 @@ class Assessment:
         task: str | os.PathLike[str] | None = None,
         timeout: float = 60.0,
     ) -> Audit:
-        """Test the same policy again in all recorded episodes, and compare all results.
+        """Repeat all recorded episodes with the same policy, and compare the outcomes with the records.
 
-        Use it for policies that only Python can load; `perturb audit` replays those of perturb, on any machine. A
-        policy that samples with torch or NumPy gives equal results on the same kind of machine with the same packages.
+        Use this method for policies that only Python can load. `perturb audit` replays policies that perturb trained,
+        on any machine. A policy that samples with torch or NumPy gives equal outcomes only on the same kind of machine
+        with the same packages.
 
         Args:
-            policy: what was tested: a policy, or a mapping of all by what they were trained on.
+            policy: the tested policy. If several policies were tested, a mapping from the version that each was trained
+                on to the policy.
             normalizer: as in `evaluate`.
             server: as in `evaluate`.
-            task: as in `evaluate`. A folder whose files changed gives other episodes.
+            task: as in `evaluate`. If files in the folder have changed since, the episodes differ.
             timeout: as in `evaluate`.
 
         Raises:
-            PolicyError: for another policy than the recorded one, or one that fails.
-            InvalidArgumentError: for a mapping with other keys than what was trained on.
-            ServerConnectionError, ServerTimeoutError, ServerStartError: as in `evaluate`.
+            PolicyError: if this is not the recorded policy, or if the policy fails.
+            InvalidArgumentError: if the keys of the mapping are not the versions that the policies were trained on.
+            ServerConnectionError: as in `evaluate`.
+            ServerTimeoutError: as in `evaluate`.
+            ServerStartError: as in `evaluate`.
         """
         return replay(self._assessed, self.agent, policy, normalizer, server, task, timeout)
 

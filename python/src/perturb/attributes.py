@@ -1,4 +1,4 @@
-"""Attributes of environments that cannot be assigned, because the assignment would change nothing."""
+"""Refusal of attribute assignments that would have no effect, such as `env.length = 1.0`."""
 
 from __future__ import annotations
 
@@ -29,16 +29,19 @@ def refuse_assignment(name: str, description: Description) -> AssignmentError:
 
 
 class CheckedAttributes:
-    """Refuses new attributes after the object is made. Classes outside this package may add attributes."""
+    """Base class that refuses new public attributes once the object is constructed.
+
+    Subclasses that are defined outside this package may add attributes.
+    """
 
     _description: Description
     _is_made = False
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Assign an attribute that exists.
+        """Assign an existing attribute.
 
         Raises:
-            AssignmentError: for a parameter's name, and for another public name that does not exist.
+            AssignmentError: if the name is that of a parameter, or a public name that does not exist.
         """
         if self._is_made and not name.startswith("_"):
             is_own = name in self.__dict__ or hasattr(type(self), name)

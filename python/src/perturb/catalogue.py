@@ -1,7 +1,8 @@
-"""Descriptions of the environments, so that an environment can be made without a server, and before a fork.
+"""Descriptions of the built-in environments, read from the file catalogue.json.
 
-The build of the package asked a server for them and wrote catalogue.json. Whenever a session opens, they are compared
-with those of the server in use; a difference is an error.
+They make it possible to construct an environment without a server, also before a fork. The build of the package
+requested the descriptions from a server and wrote them to catalogue.json. When a session opens, its environment's
+description is compared with the server's. A difference is an error.
 """
 
 from __future__ import annotations
@@ -25,17 +26,18 @@ if TYPE_CHECKING:
 
 Range = tuple[float, float]
 
-# Namespace of the ids in Gymnasium.
+# Namespace of the environments' ids in Gymnasium.
 NAMESPACE = "perturb/"
 
 
 @dataclass(frozen=True)
 class Success:
-    """The rule of success: a comparison of what an episode achieved with a threshold."""
+    """A success rule: compares a quantity that an episode achieved with a threshold."""
 
     description: str
-    # The quantity that is compared, such as "steps", and its unit.
+    # The compared quantity, such as "steps".
     quantity: str
+    # The unit of the quantity and of the threshold.
     unit: str
     # "at_least" or "at_most".
     comparison: str
@@ -44,36 +46,43 @@ class Success:
 
 @dataclass(frozen=True)
 class Description:
-    """An environment's name, revision and spaces. `actions` is the number of choices, or the range of each number.
+    """The description of an environment.
 
-    `control_timestep` is the simulated time in one step, s.
+    Two descriptions are equal if their names, revisions, spaces and timesteps are equal.
     """
 
     name: str
     revision: int
+    # The range of each number of an observation, [O].
     observation: tuple[Range, ...]
+    # The number of choices of a discrete action, or the range of each number of a continuous action.
     actions: int | tuple[Range, ...]
+    # Simulated time in one step, s.
     control_timestep: float
-    # Ranges of the parameters that follow the observation if parameters are observed.
+    # The ranges of the parameters at the end of an observation, for sessions that observe parameters.
     parameter_observations: tuple[Range, ...] = field(default=(), compare=False)
-    # The rule of this package's version; the server's, whose word is `is_success`, may be another.
+    # The success rule in this package's version. The server that decides `is_success` may have a different rule.
     success: Success | None = field(default=None, compare=False)
-    # By name the least and the greatest value of each parameter of the physics that is accepted.
+    # The lowest and the highest accepted value of each parameter of the physics, by name.
     parameters: Mapping[str, Range] = field(default_factory=dict, compare=False)
-    # The same of each disturbance, which a session has only if it names one.
+    # The lowest and the highest accepted value of each disturbance, by name. A session has disturbances only if its
+    # parameters name at least one disturbance.
     disturbances: Mapping[str, Range] = field(default_factory=dict, compare=False)
-    # By name the value of each disturbance that disturbs nothing.
+    # The value at which each disturbance has no effect, by name.
     undisturbed: Mapping[str, float] = field(default_factory=dict, compare=False)
-    # By name the range in which each disturbance is observed.
+    # The range of each disturbance's entry in observations, by name.
     disturbance_observations: Mapping[str, Range] = field(default_factory=dict, compare=False)
-    # An episode is truncated after so many steps; None if that is not known.
+    # Number of steps after which an episode is truncated. None if unknown.
     step_limit: int | None = field(default=None, compare=False)
     # SHA-256 of the model in hexadecimal digits; empty without a model.
     model_hash: str = field(default="", compare=False)
 
     @classmethod
     def read(cls, entry: Mapping[str, Any]) -> Description:
-        """Parse an environment of catalogue.json, or of a server. An open end of a range is null."""
+        """Parse the JSON description of an environment from catalogue.json or from a server.
+
+        A null at an end of a range means that the range is unbounded there.
+        """
 
         def ranges(channels: Iterable[Mapping[str, float | None]]) -> tuple[Range, ...]:
             ends = ((channel["low"], channel["high"]) for channel in channels)
@@ -97,7 +106,10 @@ class Description:
         )
 
     def with_parameters(self, names: Iterable[str]) -> Description:
-        """Return the description for a session with these parameters. One disturbance among them adds all others."""
+        """Return the description for a session whose parameters have these names.
+
+        If one of the names is a disturbance, all disturbances become parameters of the returned description.
+        """
         added = {name: ends for name, ends in self.disturbances.items() if name not in self.parameters}
         if added.keys().isdisjoint(names):
             return self
@@ -110,11 +122,11 @@ class Description:
 
     @property
     def is_disturbed(self) -> bool:
-        """Whether the disturbances are among the parameters."""
+        """Whether the parameters include the disturbances."""
         return not self.disturbances.keys().isdisjoint(self.parameters)
 
     def observing_parameters(self) -> Description:
-        """Return the description for a session whose observations end with the parameters."""
+        """Return the description for a session that appends the parameters to its observations."""
         return replace(self, observation=self.observation + self.parameter_observations)
 
     @property
@@ -123,20 +135,27 @@ class Description:
         return isinstance(self.actions, int)
 
     def metadata(self) -> dict[str, Any]:
-        """Gymnasium's metadata: modes of rendering, pictures per second of real time; and the rule of success."""
+        """Return the `metadata` of a Gymnasium environment, with the success rule as the additional key `success`.
+
+        `render_fps` is the number of pictures per second at which a film of one picture per step runs in real time.
+        """
         pictures = {"render_modes": ["rgb_array"], "render_fps": 1 / self.control_timestep}
         return pictures if self.success is None else {**pictures, "success": asdict(self.success)}
 
     def observation_space(self) -> spaces.Box:
-        """A float32 Box [O]."""
+        """Return the observation space, a float32 Box [O]."""
         return _box(self.observation)
 
     def action_space(self) -> spaces.Discrete | spaces.Box:
-        """Discrete from 0, or a float32 Box [A]."""
+        """Return the action space: a Discrete that starts at 0, or a float32 Box [A]."""
         return spaces.Discrete(self.actions) if isinstance(self.actions, int) else _box(self.actions)
 
     def require_equal(self, served: Description) -> None:
-        """Raise ProtocolError if the server's environment is not this one."""
+        """Check that the server's environment is this one.
+
+        Raises:
+            ProtocolError: if the revision, the spaces or the timestep differ.
+        """
         if served.revision != self.revision:
             raise ProtocolError(
                 f"the server has revision {served.revision} of {self.name}, this package has {self.revision}: "
@@ -146,7 +165,11 @@ class Description:
             raise ProtocolError(f"the server describes {self.name} as {served}, this package as {self}")
 
     def require_same_model(self, served: Description) -> None:
-        """Raise ProtocolError if the server's model is not this one."""
+        """Check that the server loaded the same model file.
+
+        Raises:
+            ProtocolError: if the hash of the server's model differs.
+        """
         if served.model_hash != self.model_hash:
             raise ProtocolError(
                 f"the files of {self.name} changed since it was made: its model was {self.model_hash}, the server's is "
@@ -155,7 +178,10 @@ class Description:
 
 
 def _observed(disturbance: Mapping[str, Any]) -> Range:
-    """The range in which a disturbance is observed: -1 to 1 are its least and its greatest value in R and E."""
+    """Return the range of a disturbance's entry in observations.
+
+    The entry is scaled so that -1 and 1 are the lowest and the highest value that R and E draw.
+    """
     ends = [end for interval in (*disturbance["R"], *disturbance["E"]) for end in interval]
     least, greatest = min(ends), max(ends)
 
@@ -174,23 +200,24 @@ def _box(ranges: tuple[Range, ...]) -> spaces.Box:
 _WRITTEN: Mapping[str, Any] = json.loads(resources.files(__package__).joinpath("catalogue.json").read_text("utf-8"))
 _LIMITS: Mapping[str, Any] = _WRITTEN["limits"]
 
-# All that the server told of its environments.
+# The descriptions as the server wrote them in JSON.
 CATALOGUE_ENTRIES: tuple[Mapping[str, Any], ...] = tuple(_WRITTEN["environments"])
 CATALOGUE: dict[str, Description] = {
     description.name: description for description in map(Description.read, CATALOGUE_ENTRIES)
 }
-# Width and height of a picture: the least and the most, and unless told otherwise.
+# Limits for the width and for the height of a picture, in pixels.
 MIN_PIXELS, MAX_PIXELS = _LIMITS["picture_pixels"]
+# The default width and height of a picture, in pixels.
 DEFAULT_PIXELS: int = _LIMITS["usual_picture_pixels"]
-# The longest path that a Unix socket can have, in bytes.
+# The maximum length of a Unix socket's path, in bytes.
 MAX_SOCKET_PATH_BYTES: int = _LIMITS["longest_socket_path"]
 
 
 def find(name: str) -> Description:
-    """Find an environment by its name or id: letters count in either case, `-` and `_` not at all.
+    """Find a built-in environment by its name or id. Case and the characters `-` and `_` are ignored.
 
     Raises:
-        InvalidArgumentError: with the names that there are.
+        InvalidArgumentError: if there is no such environment. The message lists the known ones.
     """
     for description in CATALOGUE.values():
         if is_spelled(name, description):
@@ -205,10 +232,10 @@ def find(name: str) -> Description:
 
 
 def is_spelled(name: str, description: Description) -> bool:
-    """Whether a name or id stands for this environment.
+    """Whether a name or id means this environment. Case and the characters `-` and `_` are ignored.
 
     Raises:
-        InvalidArgumentError: for an id of another revision.
+        InvalidArgumentError: if the id has another revision than the environment.
     """
     written, revision = _name_and_revision(name)
     if _letters(description.name) != _letters(written):

@@ -1,4 +1,4 @@
-"""Settings and session that a single environment and a batch have in common."""
+"""The client of a server: the settings and the session that a single environment and a batch have in common."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
     from ._native import Events, Opened
 
-# Default limit for a reply, s.
+# Default maximum time to wait for a reply, s.
 TIMEOUT = 60.0
 
 
 class OpenedSession(NamedTuple):
-    """The reply that opened a session: observations [N, O] and the first episodes."""
+    """The reply to opening a session, with the first observations [N, O] and the first episodes."""
 
     opened: Opened
     observations: NDArray[np.float32]
@@ -35,16 +35,20 @@ class OpenedSession(NamedTuple):
 
 
 class ResetRequest(NamedTuple):
-    """A reset of M environments: a mask bool [N] or None for all; M seeds or none; parameters; exact states or none."""
+    """A request to reset M of the N environments."""
 
+    # Bool [N], true for the M environments to reset; None resets all.
     mask: NDArray[np.bool_] | None
+    # M seeds. Empty continues with the next episode of each environment's last seed.
     seeds: Sequence[int]
+    # Intervals that replace earlier ones, by parameter.
     parameters: requests.Intervals
+    # Exact initial states, float64 [M, S] as bytes, or empty.
     states: bytes
 
 
 class Client:
-    """N environments of a server. The session is opened by the first reset, in the process that calls it."""
+    """N environments of a server. The first reset opens the session, in the process that calls reset."""
 
     def __init__(
         self,
@@ -81,14 +85,14 @@ class Client:
             local_server.find_program()  # so that a missing program is reported now, not at the first reset
         self._single = single
         self._parameters = requests.distributions(parameters)
-        # Parameters of each environment that replace the batch's; empty if no environment has any.
+        # For each environment, the parameters that replace those of the batch. Empty if no environment has its own.
         self._own: list[requests.Intervals] = []
         if contexts is not None:
             self._set_contexts(requests.contexts(contexts))
         named = {*self._parameters, *(name for own in self._own for name in own)}
         self.description = self.description.with_parameters(named)
         if self.description.is_disturbed:
-            # Contexts come when the session is open, which has disturbances only if its parameters name one.
+            # A session has disturbances only if the parameters that open it name one. Contexts are sent later.
             first, value = next(iter(self.description.undisturbed.items()))
             self._parameters = {first: [(value, value)], **self._parameters}
         if observe_parameters:
@@ -108,7 +112,7 @@ class Client:
         self._closed = False
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return everything but the session. A copy, in this process or another, must be reset first."""
+        """Return the settings without the session. The caller must reset a copy before its first step."""
         if self._was_restored:
             raise OutOfOrderError(
                 "environments cannot be copied after a snapshot was restored, because a copy would not know its "
@@ -121,7 +125,7 @@ class Client:
         """The open session.
 
         Raises:
-            OutOfOrderError: if there is none, or it is gone.
+            OutOfOrderError: if no session was opened, or if the client was closed.
         """
         self._require_not_closed()
         if self._session is None:
@@ -129,12 +133,14 @@ class Client:
         return self._session
 
     def open(self, seeds: Sequence[int], generator: np.random.Generator) -> OpenedSession | None:
-        """Open a session, unless one is open. If the reset gives no seeds, the generator draws one.
+        """Open a session if none is open. Return None if one is open already.
 
-        Each environment gets the parameters that earlier resets and contexts gave to it.
+        The environments begin with the first of `seeds`, or with a seed that the generator draws if there are none.
+        Each environment keeps the parameters that its context or an earlier reset set.
 
         Raises:
-            OutOfOrderError: if the last session is gone and a snapshot was restored in it.
+            OutOfOrderError: if the last session was lost after a snapshot had been restored in it. Then the parameters
+                are not known.
         """
         self._require_not_closed()
         if self._session is not None:
@@ -172,7 +178,7 @@ class Client:
         return begun
 
     def check_size(self) -> None:
-        """Open and close a session, so that the server refuses a batch that is too large for it."""
+        """Open and close a session, to find out whether the server accepts a batch of this size."""
         self.open([0], np.random.default_rng())
         self.session.close()
         self._session = None
@@ -188,7 +194,7 @@ class Client:
         self._own = [fixed[slot % count] for slot in range(self.num_envs)]
 
     def _give_own(self, session: Session, opened: Opened, seed: int) -> OpenedSession:
-        """Give environments their own parameters: one request for all that have the same."""
+        """Set the parameters of each environment. Environments with equal parameters share one request."""
         slots: dict[Any, list[int]] = {}
         for slot, own in enumerate(self._own):
             if own:
@@ -197,11 +203,14 @@ class Client:
             mask = np.zeros(self.num_envs, np.bool_)
             mask[alike] = True
             session.reset(mask.tobytes(), [seed] * len(alike), self._own[alike[0]], b"")
-        # Begin the same episodes once more, all together.
+        # Begin the same episodes again, all in one reset.
         return OpenedSession(opened, *session.reset(b"", [seed] * self.num_envs, {}, b""))
 
     def reset(self, groups: Sequence[ResetRequest]) -> tuple[NDArray[np.float32], list[Events]]:
-        """Begin new episodes: observations [N, O]. Parameters stay, also if the session has to be opened again."""
+        """Begin new episodes. Return observations [N, O], and the episodes that each request began.
+
+        The client remembers the parameters, so that they also apply after the session is opened again.
+        """
         events = []
         for mask, seeds, parameters, states in groups:
             observations, begun = self.session.reset(_bytes(mask), seeds, parameters, states)
@@ -211,7 +220,7 @@ class Client:
         return observations, events
 
     def _keep(self, mask: NDArray[np.bool_] | None, parameters: requests.Intervals) -> None:
-        """Remember parameters that environments have from now on."""
+        """Store parameters that the selected environments keep for later episodes. `mask` None selects all."""
         if mask is None or mask.all():
             self._parameters = {**self._parameters, **parameters}
             self._own = [{name: it for name, it in own.items() if name not in parameters} for own in self._own]
@@ -221,37 +230,40 @@ class Client:
             self._own[slot] = {**self._own[slot], **parameters}
 
     def last_ended(self) -> NDArray[np.bool_]:
-        """Return which environments' episodes ended in the last step and were not reset since, [N]."""
+        """Return a mask [N] of the environments whose episode ended in the last step and that were not reset since."""
         if self._session is None or not self._session.usable():
             return np.zeros(self.num_envs, np.bool_)
         return self._session.last_ended()
 
     def snapshot(self, mask: NDArray[np.bool_] | None) -> list[bytes]:
-        """Save the selected environments."""
+        """Save the environments that the mask selects, one snapshot each. None selects all."""
         return self.session.snapshot(_bytes(mask))
 
     def restore(self, snapshots: Sequence[bytes], mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
-        """Restore saved environments. Return observations [N, O]; other environments have their last ones."""
+        """Restore snapshots into the environments that the mask selects. None selects all.
+
+        Returns the observations [N, O] of all environments. Environments that are not selected have their last ones.
+        """
         if not all(isinstance(snapshot, bytes) for snapshot in snapshots):
             raise InvalidArgumentError("a snapshot is not of the type bytes; expected what snapshot() returned")
         session = self.session
         try:
             restored = session.restore(_bytes(mask), snapshots)
         except BaseException:
-            # A refusal, after which the session is usable, has changed nothing.
+            # If the session is still usable, the server refused the request and changed nothing.
             self._was_restored = self._was_restored or not session.usable()
             raise
-        self._was_restored = True  # from here on nobody but the server knows the parameters
+        self._was_restored = True  # from now on only the server knows the parameters
         return restored
 
     def render(self, slot: int) -> NDArray[np.uint8]:
-        """Draw an environment: an array [height, width, 3]."""
+        """Draw the environment in a slot of the batch. Return a picture, uint8 [height, width, 3]."""
         if not self._drawn:
             raise OutOfOrderError("render() is for environments that were made with render_mode='rgb_array'")
         return self.session.render(slot, self._width, self._height)
 
     def close(self) -> None:
-        """Close the session; this process's own server ends with its last session."""
+        """Close the session. A private server ends when its last session is closed."""
         self._closed = True
         if self._session is not None:
             self._session.close()

@@ -1,4 +1,4 @@
-"""The result of a comparison: tables, files and pictures of it."""
+"""The result of a comparison, as tables, files and plots."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Table = Literal["means", "differences", "episodes"]
 
-# Heading and unit of differences by the score that is compared.
+# For each compared score: the heading of its column, and the heading of the column with differences.
 _HEADINGS = {"success": ("success, %", "points"), "return": ("return", "difference"), "length": ("length", "steps")}
 _INTERVALS = (
     "Intervals have 95 %. Those over seeds are t intervals and speak of other seeds: they cover the mean in 95 % also "
@@ -33,16 +33,18 @@ _INTERVALS = (
 
 
 class Comparison:
-    """Conditions compared in the same tests. Shown as tables, in a notebook too.
+    """The result of `compare`: the conditions' mean scores in the same tests, and the differences between them.
+
+    `print` and notebooks show a comparison as tables.
 
     Attributes:
-        environment: its name.
-        score: what is compared: `success`, `return` or `length`.
-        success: what counted as a success.
-        means: the mean of each condition in each test, by test.
-        differences: the differences of conditions in each test, by test.
-        verdict: a sentence that says what these numbers decide.
-        evaluations: the assessment of each policy, by condition and key.
+        environment: the name of the environment.
+        score: the compared score: `success`, `return` or `length`.
+        success: the success rule as a phrase. None if the server decided about success and stated no rule.
+        means: the mean score of each condition in each test, ordered by test.
+        differences: the difference of each compared pair of conditions in each test, ordered by test.
+        verdict: a sentence with the conclusion from these numbers.
+        evaluations: the assessment of each policy, by condition and then by the policy's key.
     """
 
     def __init__(
@@ -63,7 +65,7 @@ class Comparison:
         self.success = first.success
 
     def mean(self, condition: str, tested_on: str) -> ConditionMean:
-        """Give the mean of a condition in a test.
+        """Return the mean score of a condition in a test.
 
         Raises:
             UnknownNameError: if there is no such condition or test. The message lists the known ones.
@@ -75,9 +77,10 @@ class Comparison:
         raise UnknownNameError(f"there is no {condition!r} on {tested_on}; there are {known}")
 
     def rows(self, table: Table = "means") -> list[dict[str, Any]]:
-        """Give a table as rows by column: `means`, `differences`, or `episodes`, every episode of every policy.
+        """Return a table as a list of rows. Each row is a dictionary by column name, and a missing number is None.
 
-        A missing number is None.
+        Args:
+            table: `means`, `differences`, or `episodes` for one row per episode of every policy.
         """
         if table == "means":
             return [
@@ -117,7 +120,10 @@ class Comparison:
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
     def columns(self) -> dict[str, Any]:
-        """Every episode of every policy, as arrays [episodes]: `condition`, `key`, then `Assessment.columns`."""
+        """Return all recorded episodes of all policies as columns: arrays [episodes] by column name.
+
+        The columns are `condition`, `key` (the policy's key in its condition) and those of `Assessment.columns`.
+        """
         parts = [
             {"condition": condition, "key": key, **assessment.columns()}
             for condition, policies in self.evaluations.items()
@@ -133,7 +139,7 @@ class Comparison:
         return columns
 
     def to_pandas(self, table: Table = "means") -> Any:
-        """Give a table of `rows` as a pandas DataFrame.
+        """Return one of the tables of `rows` as a pandas DataFrame.
 
         Raises:
             ImportError: if pandas is not installed.
@@ -147,7 +153,7 @@ class Comparison:
         return pd.DataFrame(self.columns() if table == "episodes" else self.rows(table))
 
     def to_csv(self, path: str | os.PathLike[str] | None = None, table: Table = "means") -> str:
-        """Give a table of `rows` as CSV, which is also written to `path`.
+        """Return one of the tables of `rows` as CSV text, and write it to `path` if that is not None.
 
         Raises:
             OSError: if the file cannot be written.
@@ -162,13 +168,13 @@ class Comparison:
         return written.getvalue()
 
     def to_latex(self, table: Literal["means", "differences"] = "means") -> str:
-        """Give a table as LaTeX's `tabular`, with the rules of the package booktabs."""
+        """Return a table as a LaTeX `tabular` environment. It uses the commands of the package booktabs."""
         if table not in ("means", "differences"):
             raise InvalidArgumentError(f"table={table!r}; expected 'means' or 'differences'")
         return as_latex(self._means_table() if table == "means" else self._differences_table())
 
     def to_html(self, path: str | os.PathLike[str] | None = None) -> str:
-        """Make a page of the verdict and the tables, in one file that needs nothing else, and write it to `path`.
+        """Return a self-contained HTML page with the verdict and the tables. Write it to `path` if that is not None.
 
         Raises:
             OSError: if the file cannot be written.
@@ -199,24 +205,27 @@ class Comparison:
         cbar: bool = True,
         axes: Any = None,
     ) -> Any:
-        """Draw the success of each condition over parameters, as the mean over its policies.
+        """Plot the success rate of each condition over the parameters that vary in a test.
 
-        Over two parameters there is a heatmap for each condition, all with one scale of colours; over one there is a
-        curve for each condition.
+        Success rates are over the episodes of all policies of a condition. If two parameters vary, each condition has a
+        heatmap, and all heatmaps share one colour scale. If one parameter varies, each condition has a curve. Needs
+        matplotlib: `pip install 'perturb-rl[plot]'`.
 
         Args:
-            tested_on: the test, by default the last one in which a parameter varies.
-            x: the parameter along x, by default the first that varies.
-            y: the parameter along y, by default the next that varies.
-            title: by default the environment, the rule of success and the test.
-            cbar: whether heatmaps have a colour bar.
-            axes: matplotlib's axes to draw on, one for each heatmap; by default new ones.
+            tested_on: the test. By default the last one in which a parameter varies.
+            x: the parameter on the x axis. By default the first that varies.
+            y: the parameter on the y axis. By default the next that varies.
+            title: title of the plot. By default the environment, the success rule and the test.
+            cbar: whether to draw a colour bar beside heatmaps.
+            axes: matplotlib's axes to draw on, one for each heatmap. By default new ones.
 
-        Returns the axes: an array for heatmaps. Needs matplotlib: `pip install 'perturb-rl[plot]'`.
+        Returns:
+            The axes of the curves, or an array with the axes of each heatmap.
 
         Raises:
             ImportError: if matplotlib is not installed.
-            UnknownNameError, InvalidArgumentError: for an unknown test or parameter, or one that does not vary.
+            UnknownNameError: if there is no such test.
+            InvalidArgumentError: if a parameter is unknown, or if none varies in the test.
         """
         first = self._assessments()[0]
         tests = list(dict.fromkeys(it.tested_on for it in self.means))

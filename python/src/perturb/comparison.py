@@ -1,4 +1,4 @@
-"""Compare conditions, such as ways of training, over their seeds and in the same episodes."""
+"""Comparison of conditions, such as training methods, over several seeds and in the same test episodes."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from .requests import Version
     from .success_rules import SuccessRule
 
-# Episodes of each test and the seed of all tests, unless saved assessments have others.
+# Default number of episodes of each test, and default seed of the tests. Saved assessments have their own.
 EPISODES, SEED = 1000, 1
-# The document that tells the folder of an assessment.
+# The file by which the folder of an assessment is recognised.
 _ASSESSMENT = "assessment.json"
 
 Score = Literal["success", "return", "length"]
@@ -51,40 +51,49 @@ def compare(
     timeout: float = TIMEOUT,
     progress: bool | None = None,
 ) -> Comparison:
-    """Compare conditions: does a change help, over seeds, and where the physics changes?
+    """Compare conditions, such as training methods, by testing their policies in the same episodes.
 
         comparison = perturb.compare({"no DR": [m1, m2, m3], "DR": [m4, m5, m6]}, "Hopper", episodes=1000)
         print(comparison.verdict)
 
-    All policies play the same episodes. Each condition has a mean with two intervals: over its policies, which speaks
-    of other seeds, and over episodes, which speaks of these policies in other episodes. Differences are of pairs of
-    policies with the same key where both conditions have the same keys, else between unpaired policies by Welch's test.
+    Each condition consists of one or several policies that were trained with different seeds. The mean score of a
+    condition has two 95 % intervals. The interval over policies estimates what other training seeds would give. The
+    interval over episodes estimates what the same policies would give in other episodes.
+
+    If two conditions have the same keys, their policies are compared in pairs with equal keys. Otherwise the policies
+    are unpaired, and Welch's test compares the conditions.
 
     Args:
-        conditions: by free names a policy or several, which differ by their seeds: a list, whose places are the keys of
-            pairs, or a mapping by keys such as seeds. Policies of `load_policy` in a list have their seeds for keys. A
-            policy is what `evaluate` takes, an `Assessment`, or a path of a saved assessment or of a checkpoint.
-        environment: as in `evaluate`. Leave it out if all are assessments.
-        versions: as in `evaluate`; of assessments the tests that are compared, by default all that they have in common.
-        episodes: as in `evaluate`, by default those of the first assessment, else 1000.
-        seed: of all tests, by default that of the first assessment, else 1.
+        conditions: the policies of each condition, by a name of your choice: one policy, a list, or a mapping by keys
+            such as training seeds. The key of a policy in a list is its seed if all are policies of `load_policy` with
+            distinct seeds, and else its position. A policy is one that `evaluate` accepts, an `Assessment`, or the
+            path of a saved assessment or of a checkpoint.
+        environment: as in `evaluate`. Leave it out if all policies are assessments.
+        versions: as in `evaluate`. For assessments, the tests to compare: by default all that they have in common.
+        episodes: as in `evaluate`. By default the number of the first assessment, or 1000 without assessments.
+        seed: seed of all tests. By default the seed of the first assessment, or 1 without assessments.
         parameters: as in `evaluate`.
         contexts: as in `evaluate`.
         base: as in `evaluate`.
-        score: what is compared: `success` (rates in %), `return` or `length`.
-        baseline: the condition that all others are compared with. By default each is compared with each before it.
-        success: as in `evaluate`; assessments are judged anew by it.
+        score: the score to compare: `success` (rates in %), `return` or `length` (steps).
+        baseline: the condition that all others are compared with. By default all pairs of conditions are compared.
+        success: as in `evaluate`. Episodes of assessments are judged again by this rule.
         observe: as in `evaluate`.
         deterministic: as in `evaluate`.
-        normalizer: False for models whose observations were not normalised; by default the models' own.
+        normalizer: False for models whose observations were not normalised. By default each model's own VecNormalize.
         server: as in `evaluate`.
         task: as in `evaluate`.
         timeout: as in `evaluate`.
         progress: as in `evaluate`.
 
     Raises:
-        InvalidArgumentError: for what cannot be compared: other environments, tests or rules of success, no policy.
-        PolicyError, UnknownNameError, ServerConnectionError, ServerTimeoutError, ServerStartError: as in `evaluate`.
+        InvalidArgumentError: if a condition has no policy, or if the environments, tests or success rules of the
+            policies differ.
+        PolicyError: as in `evaluate`.
+        UnknownNameError: as in `evaluate`.
+        ServerConnectionError: as in `evaluate`.
+        ServerTimeoutError: as in `evaluate`.
+        ServerStartError: as in `evaluate`.
     """
     given = _conditions(conditions)
     saved = [one for policies in given.values() for one in policies.values() if isinstance(one, Assessment)]
@@ -211,7 +220,7 @@ def _policy(condition: str, policy: Any) -> Any:
 
 
 def _common_tests(saved: Sequence[Assessment]) -> list[_native.Set]:
-    """Return the tests that all assessments have, in the order of the first."""
+    """Return the tests that all assessments have in common, in the order of the first assessment."""
     names = [set(one._assessed[0].records.sets) for one in saved]
     common = set.intersection(*names)
     if not common:

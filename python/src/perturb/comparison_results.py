@@ -9,20 +9,26 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class ConditionMean:
-    """A condition in a test: the mean of its policies' scores, success rates in % unless another score is compared."""
+    """The mean score of a condition in one test.
+
+    Scores are success rates in %, undiscounted returns, or episode lengths in steps.
+    """
 
     condition: str
+    # The name of the test set.
     tested_on: str
     # The mean score of each policy.
     by_seed: tuple[float, ...]
-    # The mean over policies.
+    # The mean of `by_seed`.
     mean: float
-    # The 95 % t interval over policies, which speaks of other seeds. None with fewer than three.
+    # The 95 % t interval over policies. It estimates what other training seeds would give. None with fewer than three
+    # policies.
     seeds_interval: Interval | None
-    # Episodes of each policy.
+    # The number of episodes of each policy.
     episodes: int
-    # The 95 % interval over episodes, which speaks of these policies in other episodes: Wilson's of success rates, with
-    # the effective number of the episodes that all policies play; else a t interval.
+    # The 95 % interval over episodes. It estimates what the same policies would give in other episodes. For success
+    # rates it is a Wilson interval with the effective number of episodes, because all policies play the same ones. For
+    # other scores it is a t interval.
     episodes_interval: Interval | None
 
     @property
@@ -33,26 +39,37 @@ class ConditionMean:
 
 @dataclass(frozen=True)
 class ConditionDifference:
-    """Two conditions in a test: the difference x - y, in percentage points unless another score is compared."""
+    """The difference between two conditions in one test: the mean score of x minus the mean score of y.
 
+    Differences of success rates are in percentage points.
+    """
+
+    # The names of the two conditions.
     x: str
     y: str
+    # The name of the test set.
     tested_on: str
-    # Numbers of policies of x and y.
+    # The numbers of policies of x and of y.
     seeds: tuple[int, int]
-    # Whether policies of x and y with the same key are pairs; and the difference of each pair.
+    # Whether policies of x and y with the same key are compared as pairs.
     paired: bool
+    # The difference of each pair; empty without pairs.
     by_seed: tuple[float, ...]
+    # The difference of the mean scores.
     difference: float
-    # The 95 % t interval over pairs; without pairs Welch's. None with fewer than three policies of either.
+    # The 95 % t interval of the difference over pairs, or Welch's interval without pairs. None if x or y has fewer than
+    # three policies.
     seeds_interval: Interval | None
-    # The 95 % interval over episodes, of differences of the same episode if both played the same.
+    # The 95 % interval of the difference over episodes. It is computed from the differences within each episode if both
+    # conditions played the same episodes.
     episodes_interval: Interval | None
+    # Whether both conditions played the same episodes.
     same_episodes: bool
-    # The probability, 0 … 1, that a policy of x has a higher mean than one of y (Mann and Whitney, 1947).
+    # The probability, 0 … 1, that a policy of x has a higher mean score than a policy of y (Mann and Whitney, 1947).
     improvement: float
-    # The p-value of the t test over pairs, or of Welch's, and corrected after Holm for all that is compared.
+    # The p-value of the paired t test, or of Welch's test without pairs.
     p: float | None
+    # The p-value after Holm's correction for all differences of the comparison.
     p_holm: float | None
-    # A sentence that says no more than these numbers.
+    # A sentence with the conclusion from these numbers.
     verdict: str

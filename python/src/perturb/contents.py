@@ -1,4 +1,4 @@
-"""Folders as values: what pickles of policies and assessments hold."""
+"""The contents of folders as values, so that policies and assessments can be pickled."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from pathlib import Path
 
 
 def read_folder(folder: str) -> dict[str, bytes]:
-    """Read the plain files of a folder, by name."""
+    """Return the content of each file in a folder, by file name. Subfolders are left out."""
     return {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir()) if path.is_file()}
 
 
 def write_folder(folder: str, files: dict[str, bytes]) -> None:
-    """Write files into a folder that is there."""
+    """Write files, given by name, into an existing folder."""
     for name, content in files.items():
         (Path(folder) / Path(name).name).write_bytes(content)

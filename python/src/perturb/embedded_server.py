@@ -1,4 +1,4 @@
-"""The embedded server: environments in this process, as perturb-server serves them, without a connection."""
+"""The embedded server, which runs the same environments as perturb-server in this process, without a connection."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from .local_server import find_program
 if TYPE_CHECKING:
     from .local_server import TaskFolder
 
-# Held while models are loaded, compiled or drawn, and by forks. A process that was forked meanwhile would inherit locks
-# that no thread releases. A thread that holds the lock of `local_server` must not wait for this one.
+# A lock that is held while models are loaded, compiled or drawn, and during a fork. Otherwise a forked process could
+# inherit locks that no thread releases. A thread that holds the lock of `local_server` must not wait for this lock.
 loading = threading.RLock()
 
 
@@ -29,7 +29,7 @@ class EmbeddedServer:
         self.users = 0
         try:
             with loading:
-                # A model may end the process that loads it, so perturb-server loads the model first.
+                # A broken model can kill the process that loads it, so a perturb-server process loads the model first.
                 self.native = _native.NativeServer(None if task is None else (find_program(), task.path, task.files))
         except _native.Failure as error:
             kind, _, words = error.args

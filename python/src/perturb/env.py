@@ -29,28 +29,29 @@ class PerturbEnv(CheckedAttributes, gymnasium.Env[NDArray[np.float32], Any]):
     """A single environment of a perturb-server.
 
     Args:
-        environment: a name of docs/environments.md, such as `CartPole`; with `task` its name, or None.
-        version: where parameters come from: `D` their defaults, `R` random, `E` extreme, `R+E` one of
-            both, each in half of the trials.
-        server: `unix:/path`, `host:port`, or `embedded` for one in this process; None starts a private server.
-        task: the folder of a task, which the server of this process's own then serves; see docs/tasks.md. The
-            environment is that of the folder.
-        parameters: replaces the version's set of the named parameters: a value, an interval `(low, high)`, or several
-            `[(low, high), …]`.
-        environment_index: fixes all randomness, together with the seed. Environment i of a vector with the same
-            first index and seed gives the same bytes as this one with the index and the seed i higher.
-        episodes_per_trial: parameters are drawn anew after so many episodes.
-        observe: `state`, or `parameters` for observations that have the episode's parameters at their end, scaled to
-            -1 … 1 over the range of R and E.
-        receipts: whether infos have parameters and receipt.
-        reward_terms: whether every step's info has the terms of the reward.
-        timeout: how long a reply may take, s.
-        render_mode: `rgb_array` lets `render` draw; None.
+        environment: the environment's name in docs/environments.md, such as `CartPole`. With `task`, the name of the
+            task or None.
+        version: the distribution of the parameters: `D` (the defaults), `R` (random), `E` (extreme), or `R+E`
+            (R or E, with probability ½ in each trial).
+        server: the server's address, `unix:/path` or `host:port`, or `embedded` for a server in this process. None
+            starts a private server.
+        task: the folder of a task to serve; see docs/tasks.md. It needs a private or an embedded server.
+        parameters: values that replace those of the version, by parameter: a number, an interval `(low, high)`, or
+            several intervals `[(low, high), …]`.
+        environment_index: the index of the environment. It fixes all randomness, together with the seed. An environment
+            with index k + i and seed s + i gives the same bytes as environment i of a batch with the first index k and
+            seed s.
+        episodes_per_trial: the number of episodes after which parameters are drawn again.
+        observe: `state`, or `parameters` to append the episode's parameters to observations. They are scaled so that
+            the range of R and E together becomes -1 … 1.
+        receipts: whether infos have the keys `parameters` and `receipt`.
+        reward_terms: whether the info of each step has the terms of the reward.
+        timeout: maximum time to wait for a reply, s.
+        render_mode: `rgb_array` to make `render` available, or None.
         width: width of pictures, in pixels.
         height: height of pictures, in pixels.
 
-    The connection is made by the first `reset`. Observations, float32 [O], and pictures are the caller's own to
-    keep and to change.
+    The first `reset` connects to the server. The caller may keep and change observations, float32 [O], and pictures.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012  (each environment adds its render_fps)
@@ -104,13 +105,13 @@ class PerturbEnv(CheckedAttributes, gymnasium.Env[NDArray[np.float32], Any]):
             requests.actions, description=self._client.description, shape=self.action_space.shape or ()
         )
         self._description = self._client.description
-        # The parameters that act at the next reset.
+        # Parameters that the next reset sends to the server.
         self._next_parameters: requests.Intervals = {}
         self._is_made = True
 
     @property
     def spec(self) -> EnvSpec | None:
-        """The specification from which Gymnasium made the environment, with the server's step limit."""
+        """The specification from which `gymnasium.make` made the environment, with the server's step limit."""
         return self._spec
 
     @spec.setter
@@ -118,13 +119,14 @@ class PerturbEnv(CheckedAttributes, gymnasium.Env[NDArray[np.float32], Any]):
         self._spec = requests.with_step_limit(spec, self._description)
 
     def set_parameters(self, parameters: requests.Parameters) -> None:
-        """Change the physics from the next reset on.
+        """Change parameters of the physics from the next reset on.
 
         Args:
-            parameters: as at `make`. Other parameters stay as they are.
+            parameters: values by parameter, as in the constructor. Other parameters keep their distribution.
 
         Raises:
-            UnknownNameError, InvalidArgumentError: for wrong names and values; nothing has changed.
+            UnknownNameError: if there is no such parameter. Nothing has changed.
+            InvalidArgumentError: if a value is malformed or out of bounds. Nothing has changed.
         """
         self._next_parameters |= requests.parameter_values(parameters, self._description)
 
@@ -134,14 +136,17 @@ class PerturbEnv(CheckedAttributes, gymnasium.Env[NDArray[np.float32], Any]):
         """Begin the next episode.
 
         Args:
-            seed: begins the seed's first episode; without it, the next episode of the last seed (at the first reset a
-                random seed).
-            options: `parameters`, as at `make`, from now on; `state`, an exact initial state [S] for this episode.
+            seed: the seed whose first episode begins. Without it, the next episode of the last seed begins. At the
+                first reset the default seed is random.
+            options: the key `parameters` changes parameters from now on, as in the constructor. The key `state` sets an
+                exact initial state [S] for this episode.
 
         Raises:
-            InvalidArgumentError: and nothing has changed.
-            ServerConnectionError, ServerTimeoutError, ServerStartError: and the environment is gone; a later reset
-                opens another session.
+            InvalidArgumentError: if an argument is wrong. Nothing has changed.
+            ServerConnectionError: if the server cannot be reached, or the connection broke. The environment is lost; a
+                later reset opens another session.
+            ServerTimeoutError: if the server did not reply in time. The environment is lost, too.
+            ServerStartError: if the private server did not start.
         """
         seeds = [] if seed is None else [requests.seed(seed)]
         given = requests.options(options, OPTIONS)
@@ -159,36 +164,38 @@ class PerturbEnv(CheckedAttributes, gymnasium.Env[NDArray[np.float32], Any]):
         return observations[0], events.single()
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Advance by one step. Actions beyond the range of a Box are clipped by the environment.
+        """Advance by one step. The environment clips continuous actions to the range of its action space.
 
         Raises:
-            InvalidArgumentError: and the environment has not moved.
+            InvalidArgumentError: if the action is wrong. The environment has not moved.
             OutOfOrderError: before the first reset, and after the end of an episode.
-            ServerConnectionError, ServerTimeoutError: and the environment is gone.
+            ServerConnectionError: if the connection broke. The environment is lost.
+            ServerTimeoutError: if the server did not reply in time. The environment is lost.
         """
         client = self._client
         return (client._session or client.session).step_single(action, self._encode)
 
     def snapshot(self) -> bytes:
-        """Save the environment whole: physics, parameters, counters, random streams."""
+        """Save the whole environment: physics, parameters, counters and random streams."""
         return self._client.snapshot(None)[0]
 
     def restore(self, snapshot: bytes) -> NDArray[np.float32]:
-        """Bring a saved environment back, also one of another process; returns the observation at which it was saved.
+        """Restore a snapshot, which may be from another process. Return the observation at which it was saved.
 
-        What follows is what followed the snapshot, byte for byte.
+        The same actions then give the same bytes as after the snapshot.
         """
         self._client.open([], self.np_random)
         observation: NDArray[np.float32] = self._client.restore([snapshot], None)[0]
         return observation
 
     def render(self) -> NDArray[np.uint8]:
-        """Draw the environment as it is now: red, green and blue, uint8 [height, width, 3]. Changes nothing.
+        """Draw the present state as an RGB picture, uint8 [height, width, 3]. The environment does not change.
 
         Raises:
             OutOfOrderError: before the first reset, or without `render_mode="rgb_array"`.
-            RenderError: if the server cannot draw; it says what is missing.
-            ServerConnectionError, ServerTimeoutError: and the environment is gone.
+            RenderError: if the server cannot draw. The message has the reason.
+            ServerConnectionError: if the connection broke. The environment is lost.
+            ServerTimeoutError: if the server did not reply in time. The environment is lost.
         """
         return self._client.render(0)
 

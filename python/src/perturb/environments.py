@@ -1,4 +1,4 @@
-"""The catalogue of environments, and the parameters of their physics that can be changed."""
+"""The public catalogue: the environments, and the parameters of their physics that can be changed."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of an environment's physics that can be set.
+    """A physical parameter of an environment, whose value can be set.
 
     Attributes:
-        name: such as `length`.
-        unit: SI, `1` if dimensionless.
-        description: what it is.
-        low: the least value that is accepted, in the unit, as all that follow.
-        high: the greatest.
-        default: its value on D.
-        random: the intervals that R draws from, [(low, high), …].
-        extreme: those of E.
+        name: the parameter's name, such as `length`.
+        unit: the SI unit of all values, or `1` if the parameter is dimensionless.
+        description: what the parameter is.
+        low: the lowest accepted value.
+        high: the highest accepted value.
+        default: the value in version D.
+        random: the intervals that version R draws from, [(low, high), …].
+        extreme: the intervals that version E draws from, [(low, high), …].
     """
 
     name: str
@@ -48,17 +48,17 @@ class Environment:
     """An environment of the catalogue.
 
     Attributes:
-        name: as `evaluate` and the servers call it, such as `CartPole`.
-        id: as `gymnasium.make` calls it, such as `perturb/CartPole-v1`.
-        revision: raised by every change of dynamics, reward or observation.
-        description: what it is.
-        step_limit: an episode is truncated after so many steps.
+        name: the name for `evaluate` and servers, such as `CartPole`.
+        id: the id for `gymnasium.make`, such as `perturb/CartPole-v1`.
+        revision: a number that every change of dynamics, reward or observation raises.
+        description: what the environment is.
+        step_limit: the number of steps after which an episode is truncated.
         control_timestep: simulated time in one step, s.
-        observation: names of an observation's entries, [O].
-        parameters: by their names, in the order of receipts.
-        success: the rule of success; None if there is none.
-        model_hash: SHA-256 of the model in hexadecimal digits; empty without a model.
-        heatmap_axes: the two parameters of usual heatmaps, or none.
+        observation: the names of an observation's entries, [O].
+        parameters: the parameters by name, in the order of receipts.
+        success: the success rule, or None.
+        model_hash: SHA-256 of the MuJoCo model in hexadecimal digits. Empty without a model.
+        heatmap_axes: the default parameters on the x and y axis of heatmaps. Empty if there is no default.
     """
 
     name: str
@@ -76,25 +76,26 @@ class Environment:
 
     @property
     def observation_space(self) -> spaces.Box:
-        """A float32 Box [O]."""
+        """The observation space, a float32 Box [O]."""
         return (self._description or CATALOGUE[self.name]).observation_space()
 
     @property
     def action_space(self) -> spaces.Discrete | spaces.Box:
-        """Discrete from 0, or a float32 Box [A]."""
+        """The action space: a Discrete that starts at 0, or a float32 Box [A]."""
         return (self._description or CATALOGUE[self.name]).action_space()
 
 
 def environments(*, task: str | os.PathLike[str] | None = None) -> dict[str, Environment]:
-    """Every environment that this package knows, by name: those of the server that it was built with.
+    """Return the environments of this package's catalogue, by name.
 
-    They are compared with a server's whenever a session opens.
+    The catalogue was read from a server when the package was built. When a session opens, its environment is compared
+    with the server's.
 
     Args:
-        task: the folder of a task, whose environment is then the last one; see docs/tasks.md.
+        task: the folder of a task, whose environment is added at the end; see docs/tasks.md.
 
     Raises:
-        InvalidArgumentError: if it is not a folder of a task. The message has the reason.
+        InvalidArgumentError: if `task` is not a task folder. The message has the reason.
     """
     folder = find_folder(task)
     entries = CATALOGUE_ENTRIES if folder is None else (*CATALOGUE_ENTRIES, entry(folder))

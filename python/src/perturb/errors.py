@@ -1,4 +1,4 @@
-"""Everything that this package raises. Each message says what came, what was expected and what to do."""
+"""The errors of this package. Each message says what was received, what was expected and what to do."""
 
 from __future__ import annotations
 
@@ -8,17 +8,20 @@ class PerturbError(Exception):
 
 
 class InvalidArgumentError(PerturbError, ValueError):
-    """A value is wrong: a NaN action, an array of a wrong shape, a parameter outside its bounds."""
+    """An argument is wrong, for example a NaN action, an array of a wrong shape, or a parameter out of bounds."""
 
 
 class AssignmentError(PerturbError, AttributeError):
-    """An attribute cannot be assigned, because that would change nothing. The message says which call would."""
+    """An attribute cannot be assigned, because the assignment would have no effect.
+
+    The message names the call that changes the physics.
+    """
 
 
 class UnknownNameError(PerturbError, KeyError):
-    """The server knows no environment, or no parameter, of this name."""
+    """There is no environment, parameter, test or condition of this name."""
 
-    __str__ = Exception.__str__  # a KeyError would put quotation marks around the sentence
+    __str__ = Exception.__str__  # KeyError's own __str__ puts quotation marks around the message
 
 
 class PolicyError(PerturbError, ValueError):
@@ -26,30 +29,33 @@ class PolicyError(PerturbError, ValueError):
 
 
 class NotAllowedError(PerturbError, PermissionError):
-    """The token's role does not allow the parameters that would be drawn."""
+    """The role of this client's token does not permit the requested parameters."""
 
 
 class ServerFullError(PerturbError, RuntimeError):
-    """The server has no room for so many environments or sessions."""
+    """The server has reached its limit of environments, sessions or memory."""
 
 
 class ServerUnavailableError(PerturbError, RuntimeError):
-    """The server cannot do it now, but may later; for example, it cannot write its ledger. Nothing has changed."""
+    """The server cannot serve the request now, for example because it cannot write its ledger.
+
+    Nothing has changed. The request may succeed later.
+    """
 
 
 class RenderError(PerturbError, RuntimeError):
-    """The server cannot draw the environment, which is unharmed.
+    """The server cannot draw the environment. The environment itself is not affected.
 
-    It has no graphics library, or is older than pictures; the physics diverged; or the drawing failed.
+    Either the server has no graphics library or is too old to draw, or the physics diverged, or the drawing failed.
     """
 
 
 class OutOfOrderError(PerturbError, RuntimeError):
-    """A call out of order: a step before the first reset, or after an episode's end without a reset."""
+    """A method was called out of order, for example `step` before the first `reset` or after the end of an episode."""
 
 
 class ServerDefectError(PerturbError, RuntimeError):
-    """The server failed by a defect of its own."""
+    """The server failed because of a bug. The environments of the session are lost."""
 
 
 class ProtocolError(PerturbError, RuntimeError):
@@ -57,18 +63,18 @@ class ProtocolError(PerturbError, RuntimeError):
 
 
 class ServerConnectionError(PerturbError, ConnectionError):
-    """No server answers, or the connection to it broke. The environments of the session are gone."""
+    """No server answers at the address, or the connection broke. The environments of the session are lost."""
 
 
 class ServerTimeoutError(PerturbError, TimeoutError):
-    """The server did not answer in time. The environments of the session are gone."""
+    """The server did not reply within the timeout. The environments of the session are lost."""
 
 
 class ServerStartError(PerturbError, RuntimeError):
-    """The program perturb-server was not found, or the private server did not start."""
+    """A program of perturb was not found, or a private or embedded server did not start."""
 
 
-# gRPC's status codes, as the protocol's message Error has them.
+# The error class for each gRPC status code in the protocol's message Error.
 _BY_CODE: dict[int, type[PerturbError]] = {
     3: InvalidArgumentError,
     5: UnknownNameError,
@@ -81,10 +87,13 @@ _BY_CODE: dict[int, type[PerturbError]] = {
 
 
 def refusal(kind: str, code: int, message: str) -> PerturbError:
-    """Turn the protocol's Error, a refusal of a request by the server, into an exception with the server's sentence."""
-    if kind == "render" and code in (9, 13):  # a drawing that failed leaves the environments alone
+    """Return the exception for a request that the server refused with the protocol's message Error.
+
+    `kind` is the kind of request, such as `step` or `render`.
+    """
+    if kind == "render" and code in (9, 13):  # a failed drawing does not affect the environments
         return RenderError(message)
-    if kind == "render" and code == 3:  # sizes are checked before they are sent: it does not know the request
+    if kind == "render" and code == 3:  # sizes were checked before, so the server does not know this kind of request
         return RenderError(f"the server cannot draw, it may be older than this package: {message}")
     error = _BY_CODE.get(code)
     return ProtocolError(f"error with the unknown code {code}: {message}") if error is None else error(message)

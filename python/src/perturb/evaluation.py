@@ -1,4 +1,4 @@
-"""Test any policy as `perturb evaluate` tests perturb's own: the same episodes, recorded the same way."""
+"""Tests of any policy in the episodes of `perturb evaluate`, recorded in the same way."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .requests import Version
     from .success_rules import SuccessRule
 
-# Names of the sets that `parameters=` and `contexts=` make.
+# Names of the test sets that the arguments `parameters` and `contexts` of `evaluate` make.
 DRAWN, LISTED = "parameters", "contexts"
 
 
@@ -46,65 +46,74 @@ def evaluate(
     timeout: float = TIMEOUT,
     progress: bool | None = None,
 ) -> Assessment:
-    """Test a policy, or policies trained on D, R and E, in episodes that no training has seen.
+    """Test a policy, or several policies by their training version, in episodes that no training has seen.
 
-    The episodes are those of `perturb evaluate` with the same environment, seed and number: environments, indices,
-    parameters and initial states. A loaded policy also samples the same actions, so its records are the same bytes.
+    The episodes are those of `perturb evaluate` with the same environment, seed and number of episodes: they have the
+    same environment indices, parameters and initial states. A policy of `load_policy` also samples the same actions, so
+    its records have the same bytes.
 
     Args:
         policy: one of
 
-            - what `load_policy` gave;
-            - a function `actions = f(observations)` of float32 [N, O], which are its own to change. Actions are
-              integers [N] from 0, or numbers [N, A], which environments clip to their range;
-            - a function with memory, `actions, memory = f(observations, memory, starts)`. `memory` is None in the first
-              call of a test, later what the function returned. Where `starts`, bool [N], is true, an episode begins,
-              and the function must forget that row. N, and the environment of each row, stay the same in a test.
-              The number of required arguments tells whether a function has memory;
-            - a stable-baselines3 model, or one of sb3_contrib with memory, with the VecNormalize that it has;
-            - a torch module of float32 [N, O], which runs in evaluation mode without gradients. For choices it returns
-              numbers [N, n], of which the greatest counts, or integers [N]; otherwise numbers [N, A];
-            - a mapping of such by the version that each was trained on, `{"D": …, "R": …, "E": …}`: all pairs are
-              tested, with all three the paper's nine scenarios.
-        environment: a name of docs/environments.md, such as `CartPole`; with `task` its name, or None.
-        versions: the versions to test on, `D`, `R`, `E` and `R+E`, and sets of `perturb.sets`. By default D, R and E,
-            or none if parameters or contexts are given.
-        episodes: episodes of each test, at least 1. A policy that was trained over trials plays so many trials, and the
-            last episode of each counts. Each context of a list has equally many, at least 1.
-        seed: fixes all randomness, 0 … 2^64 - 1. By default the seed of the loaded policy's training, or 1.
-        parameters: a further test, called `parameters`, in which these values replace those of the version `base`: by
-            name a number, an interval `(low, high)` or `"low..high"`, or several.
-        contexts: a further test, called `contexts`, on each of these values of parameters.
-        base: the version of the parameters that these two do not name.
-        trained_on: the version that the policy was trained on, which names its scenarios. Leave it out for a loaded
-            policy, which knows it.
-        success: the rule of success: `text` (the environment's rule, as the paper's text has it; the default), `code`
-            (as the paper's published code has it), or a threshold such as `steps=90`, `return>=300` or `length<=90`; or
-            a function of the columns of `Assessment.columns`, arrays [episodes] by name, that returns bool [episodes].
-        observe: `state` (default), or `parameters` for observations that have the parameters at their end. Leave it out
-            for a loaded policy, which knows it.
-        deterministic: of a stable-baselines3 model: whether it takes the mode of its actions' distribution instead of
-            sampling. True by default, as in stable-baselines3's `evaluate_policy`. A loaded policy of perturb samples.
-        normalizer: of a stable-baselines3 model: a VecNormalize, which is only read, or the path that its `save` wrote;
-            False for none. By default the model's own. A model that was loaded without its environment no longer has
-            it, and is refused if it was trained under one. With a mapping of policies, a mapping, too.
-        name: the policy's name in records and reports. By default records have its id, its kind with a checksum of its
-            weights, or its function, and reports have its kind.
-        server: `unix:/path`, `host:port`, or `embedded` for one in this process; None starts a private server.
-        task: the folder of a task, which the server of this process's own then serves; see docs/tasks.md.
-        timeout: how long a reply may take, s.
-        progress: whether to show on standard error how many episodes were played; by default on a terminal only.
+            - a policy that `load_policy` returned.
+            - a function `actions = f(observations)`. Observations are float32 [N, O], and the function may change them.
+              Actions are integers [N] counted from 0, or numbers [N, A], which environments clip to their range.
+            - a function with memory, `actions, memory = f(observations, memory, starts)`, recognised by its three
+              required arguments. `memory` is None in the first call of a test, and then the value that the last call
+              returned. `starts`, bool [N], is true where an episode begins; the function must reset the memory of that
+              row. N, and the environment of each row, stay the same during a test.
+            - a stable-baselines3 model, also a recurrent one of sb3_contrib, with its VecNormalize if it has one.
+            - a torch module that maps observations, float32 [N, O]. It runs in evaluation mode without gradients. For
+              discrete actions it returns logits [N, n], and the action with the greatest one is taken, or integers [N].
+              For continuous actions it returns numbers [N, A].
+            - a mapping from training versions to policies, `{"D": …, "R": …, "E": …}`. Each policy is tested on each
+              version. Three policies thus give the paper's nine scenarios.
+        environment: the environment's name in docs/environments.md, such as `CartPole`. With `task`, the name of the
+            task or None.
+        versions: the versions to test on (`D`, `R`, `E`, `R+E`), and sets of `perturb.sets`. By default D, R and E, or
+            none if `parameters` or `contexts` is given.
+        episodes: number of episodes of each test, at least 1. An RL² policy plays this number of trials, and only the
+            last episode of each trial counts. If a set has a list of contexts, the episodes are divided equally among
+            the contexts, and each context has at least one.
+        seed: fixes all randomness, 0 … 2^64 - 1. By default the training seed of a policy of `load_policy`, else 1.
+        parameters: adds a test called `parameters`. In it, these values replace those of the version `base`, by
+            parameter: a number, an interval `(low, high)` or `"low..high"`, or several.
+        contexts: adds a test called `contexts`, on this list of contexts. A context has a value of each parameter that
+            it names.
+        base: the version of all parameters that `parameters` or `contexts` do not name.
+        trained_on: the version that the policy was trained on, for the names of its scenarios. Leave it out for a
+            policy of `load_policy`, which knows its version.
+        success: the success rule. `text` is the environment's rule, which follows the paper's text (default). `code`
+            follows the paper's published code. A threshold is a text such as `steps=90`, `return>=300` or `length<=90`.
+            A function gets the columns of `Assessment.columns`, arrays [episodes] by name, and returns bool [episodes].
+        observe: `state` (default), or `parameters` to append the parameters to observations. Leave it out for a policy
+            of `load_policy`, which knows what it observes.
+        deterministic: for a stable-baselines3 model, whether to take the mode of the action distribution instead of
+            sampling. True by default, as in stable-baselines3's `evaluate_policy`. Policies of `load_policy` sample.
+        normalizer: for a stable-baselines3 model, its VecNormalize, which is only read, or the path of a saved one.
+            False for none. By default the VecNormalize of the model's environment. A model that was loaded without its
+            environment has none, and is refused if it was trained with one. If `policy` is a mapping, a mapping with
+            the same keys.
+        name: the policy's name in records and reports. By default records have the policy's id, its class with a
+            checksum of its weights, or the function's name. Reports have the policy's kind.
+        server: the server's address, `unix:/path` or `host:port`, or `embedded` for a server in this process. None
+            starts a private server.
+        task: the folder of a task to serve; see docs/tasks.md. It needs a private or an embedded server.
+        timeout: maximum time to wait for a reply, s.
+        progress: whether to show the number of played episodes on standard error. By default only on a terminal.
 
-    While a policy that is not perturb's acts, NumPy's global random numbers and torch's are seeded by the test;
-    afterwards they are what they were. So a model that samples with torch gives the same bytes again, on the same
-    machine.
+    While a function or a model of another library acts, the test seeds the global random generators of NumPy and torch,
+    and then restores them. A model that samples with torch therefore gives the same bytes again, on the same machine.
 
     Raises:
-        PolicyError: if the policy does not fit the environment, or fails; nothing was recorded.
-        InvalidArgumentError, UnknownNameError: for wrong names, sets or numbers, before anything is played; for actions
-            of a wrong shape or kind.
-        ProtocolError: if episodes ran with other parameters than they were to run with.
-        ServerConnectionError, ServerTimeoutError, ServerStartError: and nothing was recorded.
+        PolicyError: if the policy does not fit the environment, or fails. Nothing was recorded.
+        InvalidArgumentError: if a name, set or number is wrong (before any episode is played), or if actions have a
+            wrong shape or type.
+        UnknownNameError: if there is no such parameter.
+        ProtocolError: if the parameters that the server applied differ from the requested ones.
+        ServerConnectionError: if the server cannot be reached, or the connection broke. Nothing was recorded.
+        ServerTimeoutError: if the server did not reply in time. Nothing was recorded.
+        ServerStartError: if the private server did not start. Nothing was recorded.
     """
     requests.seconds(timeout, "timeout")
     address = None if server is None else parse_address(server)
@@ -132,10 +141,10 @@ def plain_sets(
     contexts: Sequence[Mapping[str, float]] | None,
     base: str,
 ) -> list[_native.Set]:
-    """Return the sets that the arguments of `evaluate` name.
+    """Return the test sets that the arguments of `evaluate` select, in the native module's form.
 
     Raises:
-        InvalidArgumentError: if there are none, or for what is no set.
+        InvalidArgumentError: if no set is selected, or if an argument is malformed.
     """
     base = requests.version(base, "base")
     own = parameters is not None or contexts is not None

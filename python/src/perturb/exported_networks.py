@@ -1,4 +1,4 @@
-"""Trained policies as networks of other frameworks: torch modules and ONNX models."""
+"""Export of trained policies to other frameworks: torch modules and ONNX models."""
 
 from __future__ import annotations
 
@@ -19,34 +19,38 @@ if TYPE_CHECKING:
 
     from . import _native
 
-# Added to variances before their root is taken, and the bound of normalised observations (docs/checkpoints.md).
+# Constants of the observation normaliser (docs/checkpoints.md): the number added to variances before the square root,
+# and the bound to which normalised observations are clipped.
 _EPSILON, _BOUND = 1e-8, 10.0
-# An operator set of ONNX that has all operators used here, and the format that belongs to it.
+# The version of ONNX's operator set, which has all operators used here, and the file format version that goes with it.
 _OPSET, _IR_VERSION = 17, 8
 
 
 @dataclass(frozen=True)
 class Network:
-    """The arrays of a policy in order of use: normalisation, layers with tanh, an optional LSTM, a linear head."""
+    """The arrays of a policy network, in the order in which an observation passes them.
 
-    # Float64 [O]: x becomes clip((x - mean) / deviation, -bound, bound).
+    An observation is normalised and passes hidden layers with tanh, an LSTM if there is one, and a linear output layer.
+    """
+
+    # Observations x are normalised to clip((x - mean) / deviation, -bound, bound). The three arrays are float64 [O].
     mean: NDArray[np.float64]
     deviation: NDArray[np.float64]
     bound: NDArray[np.float64]
-    # Weights [out, in] and biases [out] of the layers with tanh.
+    # Weights [out, in] and biases [out] of the hidden layers.
     hidden: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
-    # Weights of the input [4H, in] and of the memory [4H, H], and biases [4H], of the gates i, f, g, o. None without
-    # memory.
+    # The LSTM's input weights [4H, in], recurrent weights [4H, H] and biases [4H], with the gates in the order i, f, g,
+    # o. None for a feed-forward policy.
     lstm: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]] | None
-    # Weights and biases of the logits or means.
+    # Weights and biases of the output layer, which returns logits or means.
     head: tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 def read(policy: _native.Policy) -> Network:
-    """Read the arrays of a policy.
+    """Read the arrays of a policy network from the policy's checkpoint.
 
     Raises:
-        PolicyError: for a policy of RL², which also sees rewards.
+        PolicyError: if the policy is an RL² policy, because exported networks have no inputs for actions and rewards.
     """
     if policy.sees_rewards:
         raise PolicyError(
@@ -86,7 +90,10 @@ def _safetensors(data: bytes) -> dict[str, NDArray[np.float32]]:
 
 
 def _moments(normalizer: Mapping[str, Any] | None, size: int) -> tuple[NDArray[np.float64], ...]:
-    """Return means, deviations and bounds [size] of observations. Entries that are not normalised stay unchanged."""
+    """Return the means, standard deviations and bounds [size] that normalise observations.
+
+    Entries that are not normalised have mean 0, deviation 1 and the greatest float64 as their bound.
+    """
     mean, deviation, bound = np.zeros(size), np.ones(size), np.full(size, np.finfo(np.float64).max)
     if normalizer is not None:
         moments = normalizer["moments"]
@@ -97,7 +104,7 @@ def _moments(normalizer: Mapping[str, Any] | None, size: int) -> tuple[NDArray[n
 
 
 def to_torch(network: Network) -> Any:
-    """Make a torch module of a network; see `Policy.to_torch`."""
+    """Convert a network to a torch module; see `Policy.to_torch`."""
     try:
         import torch
     except ImportError as error:
@@ -112,7 +119,10 @@ def to_torch(network: Network) -> Any:
         return layer
 
     class PolicyNetwork(torch.nn.Module):  # type: ignore[misc]
-        """Observations [N, O] to logits [N, n] or means [N, A]; with memory also the memory before and after."""
+        """Maps observations [N, O] to logits [N, n] or means [N, A].
+
+        A recurrent network also takes the memory, and returns the new memory as a second value.
+        """
 
         def __init__(self) -> None:
             super().__init__()

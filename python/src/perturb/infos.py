@@ -1,4 +1,8 @@
-"""Infos of a batch as in Gymnasium's vector environments: arrays [N], each with a mask of environments with a value."""
+"""The `infos` dictionary of a batch, in the format of Gymnasium's vector environments.
+
+Each key has an array [N] of values. The same key with an underscore before it has a mask [N], which is true for the
+environments that have a value.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ from typing import Any
 
 
 def merge(infos: dict[str, Any], later: dict[str, Any]) -> None:
-    """Add later infos to infos. If both have a value for an environment, the later one replaces the earlier."""
+    """Add the entries of `later` to `infos`, in place. New values replace older values of the same environment."""
     for key, values in later.items():
         if key.startswith("_"):
             continue

@@ -1,9 +1,9 @@
-"""A perturb-server of this process's own, on a private Unix socket, and how environments share it.
+"""Private servers: perturb-server processes that this process starts, and that listen on private Unix sockets.
 
-All environments that were made without `server=` share one server; those of each `task=` share another one. A server
-starts with its first environment and ends with its last. It also ends with this process, however that ends, because
-this process holds the other end of its standard input. Environments with `server="embedded"` share embedded servers in
-the same way.
+All environments without `server=` and `task=` share one private server. The environments of each task folder share
+another one. A private server is started by its first session and ends with its last. It also ends when this process
+ends or is killed, because then the pipe to the server's standard input is closed. Sessions with `server="embedded"`
+share embedded servers in the same way.
 """
 
 from __future__ import annotations
@@ -27,23 +27,25 @@ from .catalogue import MAX_SOCKET_PATH_BYTES
 from .errors import PerturbError, ServerStartError
 
 PROGRAM = "perturb-server"
-# Variable that names the program.
+# Environment variable with the path of the program.
 VARIABLE = "PERTURB_SERVER"
-# The program inside a wheel, if the wheel has it.
+# Path of the program inside an installed wheel. Some wheels do not contain it.
 BUNDLED = Path(__file__).with_name("_programs") / PROGRAM
-# Limit for the start of a server, s.
+# Maximum time for a server to start, s.
 START_LIMIT = 20.0
-# Further limit for the start of a server that loads a task's folder, s.
+# Additional time for a server that loads a task folder, s.
 TASK_LIMIT = 120.0
-# Limit for the end of a server, after which it is killed, s.
+# Maximum time for a server to end, s. Then it is killed.
 END_LIMIT = 5.0
 
 
 def find_program() -> Path:
-    """Find the program perturb-server: what PERTURB_SERVER names, else the package's own, else that on PATH.
+    """Find the program perturb-server.
+
+    The environment variable PERTURB_SERVER is tried first, then the program inside the package, then PATH.
 
     Raises:
-        ServerStartError: with how to get it.
+        ServerStartError: if there is no such program. The message says how to install it.
     """
     how = (
         "install a wheel that has it (`make wheel`), build it with `make build` in a clone of perturb and set "
@@ -67,16 +69,16 @@ def find_program() -> Path:
 
 @dataclass(frozen=True)
 class TaskFolder:
-    """A folder with a task.toml, and the state of its files. Environments of equal task folders share a server."""
+    """A task folder and the state of its files. Environments share a server if both are equal."""
 
-    # Absolute path.
+    # Absolute path of the folder.
     path: str
-    # Digest of the names, sizes and times of the files that a task can have read.
+    # Digest of the names, sizes and modification times of all files that a task may read.
     files: str
 
 
 class LocalServer:
-    """A running server. It lives no longer than this object, and no longer than this process."""
+    """A running private server. It ends when this object is deleted, or when this process ends."""
 
     def __init__(self, task: TaskFolder | None = None) -> None:
         self.task = task
@@ -84,7 +86,7 @@ class LocalServer:
         program = find_program()
         self._owner = os.getpid()
         try:
-            directory = tempfile.mkdtemp(prefix="perturb-")  # only its owner may enter
+            directory = tempfile.mkdtemp(prefix="perturb-")  # only this user may enter it
         except OSError as error:
             raise ServerStartError(
                 f"the private server {program} did not start: there is no folder for its socket ({error}); "
@@ -106,28 +108,28 @@ class LocalServer:
             raise ServerStartError(f"the private server {program} did not start: {error}") from error
         self._directory = directory
         self._unended = weakref.finalize(self, _end, self.process, directory, self._owner)
-        self._unended.atexit = False  # _at_exit ends what is left, after the sessions
+        self._unended.atexit = False  # _at_exit ends remaining servers, after the sessions were closed
         _running.add(self)
         self._wait_until_ready(program)
 
     def end(self) -> None:
         """End the server and wait until it has ended. Close its sessions first."""
-        # Not by a call of the finalizer: finalizers do nothing any more when _at_exit runs.
+        # The finalizer itself is not called, because it would do nothing while _at_exit runs.
         if self._unended.detach() is not None:
             _end(self.process, self._directory, self._owner)
 
     def exit_status(self) -> int | None:
-        """Return the exit status, as `subprocess` does, or None while the server runs."""
+        """Return the exit status in the form of `Popen.returncode`, or None while the server runs."""
         return self.process.poll()
 
     def forget_in_child(self) -> None:
-        """In a forked process: let go of the pipe, so that the server ends with the parent alone."""
+        """Close a forked process's copy of the pipe, so that the server ends when the parent process ends."""
         if self.process.stdin is not None:
             self.process.stdin.close()
 
     def _wait_until_ready(self, program: Path) -> None:
         lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        # Reads to the end of the output, so that the server never waits for a reader.
+        # This thread reads all of the server's output, so that the server never blocks on a full pipe.
         threading.Thread(target=_read, args=(self.process.stdout, lines), daemon=True).start()
         limit = START_LIMIT if self.task is None else START_LIMIT + TASK_LIMIT
         deadline = time.monotonic() + limit
@@ -147,7 +149,7 @@ class LocalServer:
 
 
 class OwnServer(Protocol):
-    """A server of this process's own, which environments share."""
+    """A private or embedded server of this process, which sessions share. `users` counts these sessions."""
 
     task: TaskFolder | None
     users: int
@@ -171,7 +173,7 @@ def _spawn(program: Path, address: Address, task: TaskFolder | None) -> subproce
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         bufsize=0,
-        start_new_session=True,  # Ctrl-C is for the learner, which may still want its environments
+        start_new_session=True,  # Ctrl-C interrupts only this process, which may still need its environments
     )
 
 
@@ -184,7 +186,7 @@ def _read(output: IO[bytes], lines: queue.SimpleQueue[str | None]) -> None:
 
 def _end(process: subprocess.Popen[bytes], directory: str, owner: int) -> None:
     if os.getpid() != owner:
-        return  # the parent's server is not a forked process's to end
+        return  # a forked process must not end the server of its parent
     if process.stdin is not None:
         with contextlib.suppress(OSError):
             process.stdin.close()
@@ -196,18 +198,20 @@ def _end(process: subprocess.Popen[bytes], directory: str, owner: int) -> None:
     shutil.rmtree(directory, ignore_errors=True)
 
 
-# Every server whose pipe this process holds.
+# The private servers of this process.
 _running: weakref.WeakSet[LocalServer] = weakref.WeakSet()
 _lock = threading.Lock()
-# The servers that run, by their kind and their task's folder; None for the server without one.
+# The shared servers, by class and task folder. The task folder is None for a server of the built-in environments.
 _shared: dict[tuple[type[OwnServer], TaskFolder | None], Any] = {}
 
 
 def acquire(kind: type[Server], task: TaskFolder | None = None) -> Server:
-    """Share this process's server of a kind for a task, or for none; start it if it does not run.
+    """Return this process's shared server of a class and a task folder, and start it if it does not run.
+
+    Each call needs a call of `release`.
 
     Raises:
-        ServerStartError: if there is no program, or it does not start.
+        ServerStartError: if the program was not found, or the server did not start.
     """
     with _lock:
         server: Server | None = _shared.get((kind, task))
@@ -219,9 +223,10 @@ def acquire(kind: type[Server], task: TaskFolder | None = None) -> Server:
 
 
 def release(server: OwnServer, *, wait: bool = True) -> bool:
-    """Give up a share of a server. The last release ends the server.
+    """Release a server that `acquire` returned. The release of its last user ends the server.
 
-    Without `wait`, return False and do nothing if another thread holds the lock, for instance to start a server.
+    Return True if the server was released. If `wait` is false and another thread holds the lock, for example to start a
+    server, do nothing and return False.
     """
     lock = _lock
     if not lock.acquire(blocking=wait):
@@ -229,7 +234,7 @@ def release(server: OwnServer, *, wait: bool = True) -> bool:
     try:
         key = type(server), server.task
         if server is not _shared.get(key):
-            return True  # it died and was replaced
+            return True  # the server died and another one replaced it
         server.users -= 1
         if server.users > 0:
             return True

@@ -1,4 +1,7 @@
-"""The VecNormalize of a stable-baselines3 model. Without it a model sees observations that it was not trained on."""
+"""Finds the VecNormalize of a stable-baselines3 model.
+
+A model that was trained with a VecNormalize fails without it, because its observations then have another scale.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from .errors import PolicyError
 if TYPE_CHECKING:
     from .catalogue import Description
 
-# How far an observation may be from a fitted scale and shift, relative to the spread of its values: float32's rounding.
+# Maximum error of a fitted linear function, relative to the range of its values. It allows for float32's rounding.
 AFFINE_TOLERANCE = 1e-3
 
 
@@ -22,13 +25,13 @@ def find_normalizer(model: Any, given: Any, description: Description) -> Any:
     """Return the VecNormalize of a model, or None if it has none.
 
     Args:
-        model: of stable-baselines3.
-        given: a VecNormalize; the path of one that was saved; False for none; None for the model's own.
-        description: of the environment.
+        model: a model of stable-baselines3.
+        given: a VecNormalize, or the path of a saved one; False for none; None for the model's own.
+        description: the description of the environment in which the model is tested.
 
     Raises:
-        PolicyError: for what is no VecNormalize, or one of other observations; if the model was trained under one, or
-            may have been, that it no longer has.
+        PolicyError: if `given` is not a VecNormalize, or is one for observations of another shape; or if the model may
+            have been trained with a VecNormalize that it no longer has.
     """
     if given is False:
         return None
@@ -54,7 +57,7 @@ def find_normalizer(model: Any, given: Any, description: Description) -> Any:
 
 
 def _read(path: Path) -> Any:
-    """Read what `VecNormalize.save` wrote. As with stable-baselines3's own `load`, the file must be trusted."""
+    """Load a VecNormalize that `VecNormalize.save` wrote. The file is a pickle, so its source must be trusted."""
     try:
         with path.open("rb") as file:
             return pickle.load(file)
@@ -67,11 +70,12 @@ def _read(path: Path) -> Any:
 
 
 def _require_untouched(model: Any) -> None:
-    """Refuse a model that was trained under a VecNormalize and was loaded without it.
+    """Refuse a model that was trained with a VecNormalize and was loaded without it.
 
-    stable-baselines3 keeps the last original observations of such a model in `_last_original_obs`. Off-policy
-    algorithms keep them of every model. The last observations of one that was trained under VecNormalize are then the
-    original ones, scaled and shifted; of another model they are those of the next step.
+    stable-baselines3 stores the last observations of a model in `_last_obs`. In `_last_original_obs` it stores the last
+    observations before normalisation. On-policy algorithms set `_last_original_obs` only under a VecNormalize.
+    Off-policy algorithms always set it. Under a VecNormalize `_last_obs` is then a scaled and shifted copy of
+    `_last_original_obs`; without one it has the observations of the following step.
     """
     original, last = getattr(model, "_last_original_obs", None), getattr(model, "_last_obs", None)
     if original is None:
@@ -95,11 +99,11 @@ def _require_untouched(model: Any) -> None:
 
 
 def _is_affine(original: np.ndarray[Any, Any], last: np.ndarray[Any, Any]) -> bool:
-    """Whether each column of `last` [N, O] is that of `original`, scaled and shifted; N is at least 3."""
+    """Whether each column of `last` [N, O] is a linear function of that column of `original`. N is at least 3."""
     for x, y in zip(original.T, last.T, strict=True):
         spread = np.ptp(y)
         if np.ptp(x) == 0 or spread == 0:
-            if np.ptp(x) != spread:  # equal numbers become equal ones
+            if np.ptp(x) != spread:  # a linear function with a non-zero slope maps equal numbers to equal numbers
                 return False
             continue
         fitted = np.polyval(np.polyfit(x, y, 1), x)

@@ -1,7 +1,7 @@
-"""Adapters through which `evaluate` plays perturb's policies, functions, stable-baselines3's and torch's models.
+"""Adapters with which `evaluate` runs policies of any kind: perturb's, functions, and models of other libraries.
 
-This module imports neither stable-baselines3 nor torch: an object can be an instance of their classes only if its owner
-imported them.
+This module does not import stable-baselines3 or torch itself. If a policy is an object of one of their classes, the
+caller has already imported the library.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 
 
 class Player(Protocol):
-    """Plays in N environments that are reset in the step that ends an episode."""
+    """Chooses actions in N environments that reset in the same step in which an episode ends."""
 
     def begin(self, observations: NDArray[np.float32]) -> None:
-        """Begin an episode everywhere, with observations [N, O]."""
+        """Begin an episode in every environment, with observations [N, O]."""
 
     def act(self) -> Any:
         """Return the next actions: integers [N] from 0, or numbers [N, A]."""
@@ -41,7 +41,10 @@ class Player(Protocol):
     def observe(
         self, observations: NDArray[np.float32], rewards: NDArray[np.float32], starts: NDArray[np.bool_]
     ) -> None:
-        """Take observations [N, O], rewards [N], and flags [N] of observations that are the first of an episode."""
+        """Record the outcome of the last actions: observations [N, O] and rewards [N].
+
+        `starts` [N] is true where the observation is the first one of an episode.
+        """
 
 
 @dataclass(frozen=True)
@@ -52,13 +55,13 @@ class PolicyUnderTest:
     name: str
     # Makes a player from the number of environments N and the seed of a test.
     player: Callable[[int, int], Player]
-    # The agent's name in reports, which is the same for policies that were trained alike.
+    # The name in reports. Policies of one training method share it.
     agent: str = ""
-    # The loaded policy, if it is perturb's own.
+    # The policy, if it is one of `load_policy`.
     loaded: Policy | None = None
-    # Steps of its training, if known.
+    # Number of training steps, if known.
     timesteps: int | None = None
-    # Whether it takes the mode of its actions' distribution; None if that is not known.
+    # Whether the policy takes the mode of its action distribution instead of sampling. None if unknown.
     deterministic: bool | None = None
 
 
@@ -70,7 +73,8 @@ def prepare(
     `deterministic` is True, False, or None for the default of the policy's kind.
 
     Raises:
-        PolicyError: for what is no policy, or none of this environment.
+        PolicyError: if the object is not a policy, does not fit the environment, or does not have an option that is
+            set.
     """
     if isinstance(policy, Policy):
         if deterministic or normalizer not in (None, False) or name is not None:
@@ -110,7 +114,11 @@ def _is(policy: Any, module: str, name: str) -> bool:
 
 
 def _remembers(function: Callable[..., Any]) -> bool:
-    """Whether a function requires three arguments, which means that it has memory."""
+    """Whether a function has memory, which it shows by requiring three arguments.
+
+    Raises:
+        PolicyError: if the function requires another number of arguments than one or three.
+    """
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):  # some compiled functions have no signature
@@ -128,7 +136,10 @@ def _remembers(function: Callable[..., Any]) -> bool:
 
 
 class _Function:
-    """actions = f(observations), or with memory actions, memory = f(observations, memory, starts)."""
+    """A player of a Python function.
+
+    The function is `actions = f(observations)`, or `actions, memory = f(observations, memory, starts)` with memory.
+    """
 
     def __init__(self, function: Callable[..., Any], remembers: bool) -> None:
         self._function = function
@@ -140,7 +151,7 @@ class _Function:
         self._observations, self._starts = observations, np.ones(len(observations), np.bool_)
 
     def act(self) -> Any:
-        observations = self._observations.copy()  # a copy, which the function may change
+        observations = self._observations.copy()  # the function may change its argument
         if not self._remembers:
             return self._function(observations)
         came = self._function(observations, self._memory, self._starts)
@@ -186,8 +197,8 @@ def _stable_baselines(
 class _Module:
     """A player of a torch module.
 
-    For discrete actions the module returns a number for each choice, [N, n], and the choice with the greatest number is
-    taken. It may instead return the choices, integers [N]. For continuous actions it returns numbers [N, A].
+    For discrete actions the module returns logits [N, n], and the action with the greatest logit is taken. It may also
+    return the actions themselves, integers [N]. For continuous actions it returns numbers [N, A].
     """
 
     def __init__(self, module: Any, description: Description) -> None:
@@ -204,7 +215,7 @@ class _Module:
         import torch
 
         training = self._module.training
-        self._module.eval()  # ends dropout and updates of batch normalisation
+        self._module.eval()  # turns off dropout, and updates of batch normalisation
         try:
             with torch.no_grad():
                 seen = torch.from_numpy(self._observations.copy()).to(self._device, self._dtype)
@@ -247,7 +258,7 @@ def _statistics(normalizer: Any) -> Iterator[bytes]:
 
 
 def _digest(parts: Iterator[bytes]) -> str:
-    """Return a checksum of a module's weights as a name, so that equal weights have equal names."""
+    """Return a checksum as eight hexadecimal digits. It is part of the name of a policy without an id."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(part)
@@ -256,7 +267,10 @@ def _digest(parts: Iterator[bytes]) -> str:
 
 @contextlib.contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Seed NumPy's global generator within a `with` block, and torch's if it is loaded; then restore both."""
+    """Seed the global generator of NumPy, and that of torch if it is loaded, within a `with` block.
+
+    The end of the block restores both generators.
+    """
     before = np.random.get_state()
     np.random.seed(seed % 2**32)
     try:

@@ -1,4 +1,4 @@
-"""Pictures of assessments. Drawing them needs matplotlib."""
+"""Plots of assessments, drawn with matplotlib."""
 
 from __future__ import annotations
 
@@ -15,9 +15,12 @@ if TYPE_CHECKING:
 
 
 def curves(lines: Mapping[str, Sequence[Bin]], parameter: str, units: Mapping[str, str], title: str, axes: Any) -> Any:
-    """Draw success, %, at the middle of each part of a parameter's range, with a band for its interval.
+    """Plot success rates, %, over a parameter. Each named line has a point per bin, and a band for the intervals.
 
-    A line has a gap where parts do not touch.
+    A line has a gap where two bins are not adjacent.
+
+    Raises:
+        InvalidArgumentError: if no line has bins.
     """
     axes = _axes(axes)
     drawn = {name: parts for name, parts in lines.items() if parts}
@@ -47,7 +50,7 @@ def curves(lines: Mapping[str, Sequence[Bin]], parameter: str, units: Mapping[st
 def heatmap(
     cells: Sequence[Bin2D], x: str, y: str, units: Mapping[str, str], title: str, axes: Any, cbar: bool = True
 ) -> Any:
-    """Draw success, %, in the parts of two parameters' ranges. Parts without episodes stay white."""
+    """Plot success rates, %, over two parameters as a heatmap. Cells without episodes stay white."""
     axes = _axes(axes)
     if not cells:
         raise InvalidArgumentError(f"{x} or {y} does not vary in this test: there is no heatmap over them")
@@ -67,7 +70,7 @@ def heatmaps(
     cbar: bool,
     axes: Any,
 ) -> Any:
-    """Draw a heatmap for each name, with the same axes and one scale of colours. Returns an array of axes."""
+    """Plot a row of heatmaps, one for each name, with the same axes and colour scale. Return an array of axes."""
     if axes is None:
         plt = _pyplot()
         size = (3.2 * len(panels) + 0.8, 3.6)
@@ -93,7 +96,7 @@ def heatmaps(
 
 
 def pooled(policies: Sequence[Sequence[Bin]]) -> list[Bin]:
-    """Return success in each part of a parameter's range, over the episodes of all policies."""
+    """Pool the bins of several policies: sum successes and episodes in each bin of a parameter's range."""
     counted: dict[tuple[float, float], list[int]] = {}
     for part in (part for parts in policies for part in parts):
         counts = counted.setdefault((part.low, part.high), [0, 0])
@@ -109,7 +112,7 @@ def pooled(policies: Sequence[Sequence[Bin]]) -> list[Bin]:
 
 
 def pooled_2d(policies: Sequence[Sequence[Bin2D]]) -> list[Bin2D]:
-    """Return success in each part of two parameters' ranges, over the episodes of all policies."""
+    """Pool the grids of several policies: sum successes and episodes in each cell of two parameters' ranges."""
     counted: dict[tuple[tuple[float, float], tuple[float, float]], list[int]] = {}
     for cell in (cell for cells in policies for cell in cells):
         both = counted.setdefault((cell.x, cell.y), [0, 0])
@@ -122,7 +125,7 @@ def pooled_2d(policies: Sequence[Sequence[Bin2D]]) -> list[Bin2D]:
 
 
 def _draw_cells(cells: Sequence[Bin2D], x: str, y: str, units: Mapping[str, str], axes: Any) -> Any:
-    """Draw the parts on axes, and return the scale of colours, which all panels share."""
+    """Draw the cells of a heatmap on axes. Return the colour scale, which all panels share."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.patches import Rectangle
@@ -141,7 +144,10 @@ def _draw_cells(cells: Sequence[Bin2D], x: str, y: str, units: Mapping[str, str]
 
 
 def _widened(parts: set[tuple[float, float]]) -> dict[tuple[float, float], tuple[float, float]]:
-    """Return points of a grid as intervals: a point has no width, so it is drawn halfway to its neighbours."""
+    """Return the interval in which each part of an axis is drawn.
+
+    An interval is drawn as it is. A grid point has no width, so it is drawn up to halfway to its neighbours.
+    """
     ordered = sorted(parts)
     if any(low != high for low, high in ordered):
         return {part: part for part in ordered}

@@ -1,4 +1,4 @@
-"""Trained policies of perturb, which act by the learner's arithmetic, to the same bytes."""
+"""Policies that perturb's learner trained. They choose the same actions as in the learner, byte for byte."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ if TYPE_CHECKING:
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
-    """Load what `perturb train` made: the `--out` of a training, or the checkpoint folder in it.
+    """Load a policy that `perturb train` wrote, from the `--out` folder of the training or its checkpoint folder.
 
     Raises:
-        PolicyError: if there is no checkpoint, or one that is damaged or of a later program; it names the file.
+        PolicyError: if the folder has no checkpoint, or if the checkpoint is damaged or was written by a later version
+            of perturb. The message names the file.
     """
     if not isinstance(path, str | os.PathLike):
         raise InvalidArgumentError(f"path is {path!r}; expected the folder of a training")
@@ -30,20 +31,22 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
 
 
 class Policy:
-    """A trained policy, with its normalisers, which stay as training left them.
+    """A trained policy with its normalisers. The normalisers no longer change.
 
     Attributes:
-        id: names the policy: the iterations of its training, and a checksum of its weights.
+        id: identifies the policy by the number of its training iterations and a checksum of its weights.
         environment: the name of the environment that it was trained in.
-        version: where parameters came from in training: `D`, `R`, `E` or `R+E`.
-        trained_on: the same with the sets that replaced the version's, such as `D with length [0.3, 0.4]`.
-        method: what trained it, such as `ppo ff` or `rl2-ppo rc N=2`.
-        episodes_per_trial: episodes over which it remembers; 1 without trials.
-        has_memory: whether it is recurrent.
-        sees_rewards: whether it also sees the rewards and ends of a trial's episodes (RL²).
-        observe: what it sees: `state`, or `parameters` for the environment's parameters beside it.
-        seed: that of its training.
-        observation_size: O.
+        version: the version that its training parameters came from: `D`, `R`, `E` or `R+E`.
+        trained_on: the version, with any values that replaced the version's, such as `D with length [0.3, 0.4]`.
+        method: the algorithm and architecture, such as `ppo ff` or `rl2-ppo rc N=2`.
+        episodes_per_trial: the number of episodes after which the memory of an RL² policy is reset; 1 for other
+            policies.
+        has_memory: whether the policy is recurrent.
+        sees_rewards: whether the policy also takes the last action, its reward and the ends of episodes as inputs
+            (RL²).
+        observe: what the policy observes: `state`, or `parameters` for the state and the environment's parameters.
+        seed: the seed of its training.
+        observation_size: the number O of values in an observation.
     """
 
     def __init__(self, loaded: _native.Policy) -> None:
@@ -61,7 +64,7 @@ class Policy:
         self.observation_size: int = loaded.observation_size
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the whole checkpoint, so that a process on another machine has it, too."""
+        """Pickle the whole checkpoint, so that a process on another machine can load it."""
         with tempfile.TemporaryDirectory(prefix="perturb-") as folder:
             native(self._native.save, folder)
             return _unpickled_policy, (read_folder(folder),)
@@ -70,11 +73,11 @@ class Policy:
         return f"<perturb policy {self.id}: {self.method} in {self.environment}, trained on {self.trained_on}>"
 
     def actor(self, num_envs: int = 1, seed: int = 0, first_environment_index: int = 0) -> Actor:
-        """Act in N environments.
+        """Return an actor that chooses actions in N environments.
 
         Args:
-            num_envs: N.
-            seed: fixes the sampled actions, together with each environment's index and the number of its trial.
+            num_envs: the number N of environments.
+            seed: fixes the sampled actions, together with the environment's index and the trial's index.
             first_environment_index: the index of the first environment.
         """
         count = requests.count(num_envs, "num_envs", 1)
@@ -88,27 +91,27 @@ class Policy:
     def to_torch(self) -> Any:
         """Return the policy as a torch module, with its normalisation, for deployment or further training.
 
-        The module of a feed-forward policy maps observations [N, O] to logits [N, n] of choices or means [N, A] of
-        numbers. The module of a recurrent policy maps (observations, memory, starts) to (outputs, memory). Pass the
-        memory None first, and then the memory that the last call returned. Rows where `starts`, bool [N], is true begin
-        with an empty memory.
+        The module of a feed-forward policy maps observations [N, O] to outputs: logits [N, n] for discrete actions, or
+        means [N, A] for continuous ones. The module of a recurrent policy maps (observations, memory, starts) to
+        (outputs, memory). Pass None as the first memory, and later the memory that the last call returned. The memory
+        of a row is reset if `starts`, bool [N], is true there.
 
         Raises:
             ImportError: if torch is not installed.
-            PolicyError: for a policy of RL², which also sees rewards.
+            PolicyError: if the policy is an RL² policy, because exported networks do not see rewards.
         """
         return exported_networks.to_torch(exported_networks.read(self._native))
 
     def to_onnx(self, path: str | os.PathLike[str]) -> None:
-        """Write the policy as an ONNX model, with its normalisation.
+        """Write the policy to a file as an ONNX model, with its normalisation.
 
-        The input is `observations`, float32 [N, O]. The output is `outputs`, logits [N, n] or means [N, A]. A recurrent
-        policy also has its memory as inputs `h` and `c` [N, H], which are 0 at the start of an episode, and as outputs
-        `next_h` and `next_c`.
+        The input is `observations`, float32 [N, O]. The output is `outputs`: logits [N, n] for discrete actions, or
+        means [N, A] for continuous ones. The model of a recurrent policy also has the LSTM's state as inputs `h` and
+        `c` [N, H], and the next state as outputs `next_h` and `next_c`. Pass zeros at the start of an episode.
 
         Raises:
             ImportError: if onnx is not installed.
-            PolicyError: for a policy of RL², which also sees rewards.
+            PolicyError: if the policy is an RL² policy, because exported networks do not see rewards.
         """
         exported_networks.to_onnx(exported_networks.read(self._native), os.fspath(path))
 
@@ -120,7 +123,7 @@ def _unpickled_policy(files: dict[str, bytes]) -> Policy:
 
 
 class Actor:
-    """A policy that acts in N environments. It samples actions and keeps the policy's memory.
+    """A policy that chooses actions in N environments. It samples the actions and stores the policy's memory.
 
         actor = policy.actor(num_envs=8, seed=1)
         actions = actor(observations)
@@ -128,8 +131,8 @@ class Actor:
             observations, rewards, terminated, truncated, infos = envs.step(actions)
             actions = actor(observations, starts=terminated | truncated, rewards=rewards)
 
-    The environments must be reset in the step that ends an episode (`autoreset_mode="SameStep"`). An actor can be
-    pickled before its first action.
+    The environments must reset in the same step in which an episode ends (`autoreset_mode="SameStep"`). An actor can be
+    pickled only before its first action.
     """
 
     def __init__(self, policy: Policy, num_envs: int, seed: int, first_environment_index: int) -> None:
@@ -151,13 +154,13 @@ class Actor:
     ) -> NDArray[Any]:
         """Sample actions: int64 [N], counted from 0, or float32 [N, A].
 
-        Numbers may lie outside the range of actions; environments clip them.
+        Continuous actions may lie outside the action space. Environments clip them.
 
         Args:
-            observations: [N, O], not normalised. The first call begins a trial in every environment.
-            starts: bool [N], true where the observation is the first one of an episode; by default nowhere. Where the
-                last episode ended a trial, the policy forgets the trial.
-            rewards: [N], rewards of the last actions, not normalised; for policies that see them (RL²).
+            observations: observations [N, O], not normalised. The first call begins a trial in every environment.
+            starts: bool [N], true where the observation is the first one of an episode. By default false everywhere.
+                When an episode starts that is the first of a new trial, the policy's memory is reset.
+            rewards: rewards [N] of the last actions, not normalised. Only RL² policies need them.
 
         Raises:
             PolicyError: if a shape is wrong, or if the policy's outputs are not finite.
@@ -177,12 +180,16 @@ class Actor:
         return actions
 
     def reset(self) -> None:
-        """Forget everything: the next call begins the first trial again, with the same random numbers."""
+        """Reset the actor. The next call begins the first trial again, with the same random numbers."""
         self._begun = False
 
 
 def _array(values: ArrayLike, dtype: type[np.generic], name: str) -> NDArray[Any]:
-    """Convert values to an array. Refuse text, flags in place of numbers, and numbers in place of flags."""
+    """Convert values to an array of a type.
+
+    Raises:
+        PolicyError: for text, for booleans in place of numbers or numbers in place of booleans, and for a wrong rank.
+    """
     array = np.asarray(values)
     kinds = "b" if dtype is np.bool_ else "iuf"
     if array.dtype.kind not in kinds:
@@ -195,7 +202,7 @@ def _array(values: ArrayLike, dtype: type[np.generic], name: str) -> NDArray[Any
 
 
 def native(call: Callable[..., Any], *arguments: Any) -> Any:
-    """Call the native module, and raise its failures as errors of this package."""
+    """Call a function of the native module. Convert the native module's `Failure` to an error of this package."""
     try:
         return call(*arguments)
     except _native.Failure as failure:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import sys
 import time
 
-# Seconds between two lines. On a terminal a line replaces the one before it, so the interval is shorter there.
+# Interval between two progress lines on a terminal and in a log, s. On a terminal each line replaces the last one.
 _TERMINAL_INTERVAL, _LOG_INTERVAL = 0.2, 5.0
 
 
 class Progress:
-    """Shows how many of a test's episodes were played.
+    """Shows on standard error how many episodes of a test or a training are done.
 
     Args:
-        show: whether to show it; None shows it on a terminal only.
+        show: whether to show progress. None shows it on a terminal only.
     """
 
     def __init__(self, show: bool | None) -> None:
@@ -23,7 +23,7 @@ class Progress:
         self._written = False
 
     def update(self, what: str, done: int, total: int) -> None:
-        """Show that so many of `total` episodes of a test are done."""
+        """Show that `done` of `total` episodes are done. `what` names the test or training."""
         now = time.monotonic()
         if not self._shown or (now < self._next and done < total):
             return
@@ -33,7 +33,7 @@ class Progress:
         self._written = True
 
     def finish(self) -> None:
-        """Remove the line from a terminal."""
+        """Remove the progress line from the terminal."""
         if self._written and self._terminal:
             self._write("\r\x1b[K")
         self._written = False

@@ -1,4 +1,4 @@
-"""The ids by which `gymnasium.make` and `make_vec` find the environments."""
+"""Registers the environments' ids for `gymnasium.make` and `gymnasium.make_vec`."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ import gymnasium
 
 from .catalogue import CATALOGUE
 
-# The paper's names of the versions.
+# The suffixes that stand for the versions in the ids of the paper's code.
 _OLD_SUFFIXES = {"D": "", "R": "RandomNormal", "E": "RandomExtreme"}
 
 
 def register_all() -> None:
-    """Register `perturb/CartPole-v1` and so on and the paper's ids, such as `SunblazeCartPoleRandomNormal-v0`.
+    """Register an id such as `perturb/CartPole-v1` for each environment.
 
-    The ids have no step limit, because the server has it: a limit here would be wrong after a snapshot is restored.
+    The ids of the paper's code, such as `SunblazeCartPoleRandomNormal-v0`, are registered, too. No id has a step limit
+    of Gymnasium, because the server counts the steps. Gymnasium's count would be wrong after a snapshot is restored.
     """
     for name, description in CATALOGUE.items():
         register_id(f"perturb/{name}-v{description.revision}", environment=name)
@@ -22,7 +23,7 @@ def register_all() -> None:
 
 
 def register_id(identifier: str, **settings: str) -> None:
-    """Register an id with the settings of its environments, unless the id is registered already."""
+    """Register an id, with the keyword arguments of its environments, unless it is registered already."""
     if identifier not in gymnasium.registry:
         gymnasium.register(
             identifier,

@@ -1,7 +1,7 @@
-"""Conversion of users' values into the protocol's: versions, distributions, seeds, actions, states, masks.
+"""Conversion of users' arguments to the protocol's values: versions, parameters, seeds, actions, states, masks.
 
-This module checks only what the conversion would lose or change: shapes and kinds of numbers. The server judges values,
-because its messages are better.
+This module checks types and shapes, because the conversion would otherwise lose or change data. Most values are left to
+the server to check.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
     from .catalogue import Description
 
-# A value, an interval (low, high), or a union of intervals [(low, high), …]; or one of them as text: "0.7", "0.5..1.1",
-# "0.1..0.2,0.8..1.0", as in experiment files and options of the programs.
+# The values of a parameter: a number, an interval (low, high), or several intervals [(low, high), …]. Each can also be
+# a text as in experiment files and program options: "0.7", "0.5..1.1", "0.1..0.2,0.8..1.0".
 ParameterSet: TypeAlias = float | str | tuple[float, float] | Sequence[tuple[float, float]]
 Parameters: TypeAlias = Mapping[str, ParameterSet]
 
-# Sets of values by name, in the protocol's form.
+# The intervals [(low, high), …] of each parameter, by the parameter's name.
 Intervals: TypeAlias = dict[str, list[tuple[float, float]]]
 
 # Names of the versions that parameters come from.
@@ -44,7 +44,11 @@ _INT32 = np.iinfo(np.int32)
 
 
 def version(name: Any, what: str = "version") -> Version:
-    """Return D, R, E or R+E for a version's name in upper or lower case."""
+    """Return a version's name in upper case: D, R, E or R+E.
+
+    Raises:
+        InvalidArgumentError: if it is not the name of a version.
+    """
     for known in VERSIONS:
         if isinstance(name, str) and name.upper() == known:
             return known
@@ -55,14 +59,14 @@ def version(name: Any, what: str = "version") -> Version:
 
 
 def observes_parameters(observe: Any) -> bool:
-    """Whether observations have the parameters at their end."""
+    """Whether the option `observe` appends the parameters to observations."""
     if observe not in ("state", "parameters"):
         raise InvalidArgumentError(f"observe={observe!r} is none of 'state' and 'parameters' (both, state first)")
     return bool(observe == "parameters")
 
 
 def autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    """Return Gymnasium's mode of autoreset, given as the mode or as its value."""
+    """Return Gymnasium's AutoresetMode for a mode or its text value."""
     try:
         return AutoresetMode(mode)
     except ValueError as error:
@@ -71,7 +75,7 @@ def autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
 
 
 def distributions(parameters: Parameters | None) -> Intervals:
-    """Return intervals by parameter's name; they replace the intervals of the version."""
+    """Convert the option `parameters` to intervals by parameter. None gives no intervals."""
     if parameters is None:
         return {}
     if not isinstance(parameters, Mapping):
@@ -82,12 +86,12 @@ def distributions(parameters: Parameters | None) -> Intervals:
 
 
 def frozen(intervals: Intervals) -> tuple[Any, ...]:
-    """Return intervals as a key of dictionaries; equal intervals have equal keys."""
+    """Return intervals as a hashable value. Equal intervals give equal values."""
     return tuple(sorted((name, tuple(values)) for name, values in intervals.items()))
 
 
 def contexts(listed: Any) -> list[dict[str, float]]:
-    """Return a list of at least one context: values of parameters by name."""
+    """Convert the option `contexts` to a list of contexts. A context has a number for each parameter that it names."""
     if isinstance(listed, str | Mapping) or not isinstance(listed, Sequence):
         raise InvalidArgumentError(
             f"contexts is {listed!r}; expected a list such as [{{'length': 0.3}}, {{'length': 0.5}}]"
@@ -113,10 +117,12 @@ def _name(name: Any) -> str:
 
 
 def parse_set(name: str, version: str, texts: Sequence[tuple[str, str]]) -> _native.Set:
-    """Understand values of parameters as experiment files and the programs' options write them.
+    """Make a test set from the text values of its parameters, in the syntax of experiment files.
+
+    `texts` has pairs of a parameter's name and its values.
 
     Raises:
-        InvalidArgumentError: with what came and what is expected.
+        InvalidArgumentError: if a text is malformed. The message says what is expected.
     """
     try:
         return _native.make_set(name, version, list(texts))
@@ -154,7 +160,7 @@ def _distribution(name: str, value: ParameterSet) -> list[tuple[float, float]]:
 
 
 def _numbers(value: Any, wrong: InvalidArgumentError) -> NDArray[np.float64]:
-    """Convert numbers to float64; refuse text."""
+    """Convert numbers to a float64 array. Raise `wrong` for anything else, such as text."""
     try:
         array = np.asarray(value)
         if array.dtype.kind not in "iuf":
@@ -165,7 +171,7 @@ def _numbers(value: Any, wrong: InvalidArgumentError) -> NDArray[np.float64]:
 
 
 def seed(value: Any, name: str = "seed") -> int:
-    """Return a seed, an integer from 0 to 2^64 - 1, which the protocol can carry."""
+    """Check a seed, an integer from 0 to 2^64 - 1, and return it as an int."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -176,7 +182,11 @@ def seed(value: Any, name: str = "seed") -> int:
 
 
 def seeds(value: Any, num_envs: int) -> list[int | None]:
-    """Return the seeds of N environments: s + i for one seed s, or the list's own. None keeps an environment's seed."""
+    """Return the seeds of N environments.
+
+    One seed s gives environment i the seed s + i. A list has a seed for each environment; None in it continues with the
+    environment's last seed.
+    """
     if value is None:
         return [None] * num_envs
     if not isinstance(value, Sequence | np.ndarray) or getattr(value, "ndim", 1) == 0:
@@ -188,7 +198,11 @@ def seeds(value: Any, num_envs: int) -> list[int | None]:
 
 
 def step_limit(value: Any, description: Description) -> None:
-    """Refuse a step limit that differs from the server's. Gymnasium's `make_vec` passes on the limit of the id."""
+    """Check the argument `max_episode_steps`, which `gymnasium.make_vec` passes to a batch.
+
+    Raises:
+        InvalidArgumentError: if it differs from the server's step limit.
+    """
     if value not in (None, -1, description.step_limit):
         raise InvalidArgumentError(
             f"max_episode_steps={value!r}: a batch has the step limit of the server, {description.step_limit}; leave "
@@ -197,7 +211,10 @@ def step_limit(value: Any, description: Description) -> None:
 
 
 def with_step_limit(spec: EnvSpec | None, description: Description) -> EnvSpec | None:
-    """Return the specification with the server's step limit, which wrappers look for, unless it names another."""
+    """Return a copy of a specification with the server's step limit, because some wrappers read it there.
+
+    A specification that has a step limit is returned unchanged.
+    """
     if spec is None or spec.max_episode_steps is not None:
         return spec
     limited = copy.copy(spec)
@@ -206,13 +223,17 @@ def with_step_limit(spec: EnvSpec | None, description: Description) -> EnvSpec |
 
 
 def settings(initialiser: Callable[..., None]) -> list[str]:
-    """Return the names of the settings with which an environment can be made."""
+    """Return the names of the parameters of a constructor, without `self` and `**kwargs`."""
     parameters = inspect.signature(initialiser).parameters.values()
     return [it.name for it in parameters if it.name != "self" and it.kind is not it.VAR_KEYWORD]
 
 
 def no_unknown(unknown: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Refuse settings that an environment does not have."""
+    """Check that a constructor got no unknown keyword arguments.
+
+    Raises:
+        InvalidArgumentError: if there is one. The message suggests the known name that is closest.
+    """
     if unknown:
         name = next(iter(unknown))
         meant = difflib.get_close_matches(name, known, n=1)
@@ -221,11 +242,13 @@ def no_unknown(unknown: Mapping[str, Any], known: Sequence[str]) -> None:
 
 
 def parameter_values(parameters: Parameters, description: Description) -> Intervals:
-    """Return intervals that replace the version's. Names and bounds are checked, because the server sees them later.
+    """Convert parameters to intervals, and check names and bounds.
+
+    `distributions` leaves these checks to the server. They are needed here if the server gets the values only later.
 
     Raises:
-        UnknownNameError: if the environment has no parameter of a name.
-        InvalidArgumentError: for values that are malformed or out of bounds.
+        UnknownNameError: if the environment has no such parameter.
+        InvalidArgumentError: if a value is malformed or out of bounds.
     """
     values = distributions(parameters)
     for name, intervals in values.items():
@@ -247,7 +270,7 @@ def parameter_values(parameters: Parameters, description: Description) -> Interv
 
 
 def count(value: Any, name: str, least: int) -> int:
-    """Return an integer that fits into the protocol's uint32."""
+    """Check an integer from `least` to 2^32 - 1, and return it as an int."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -258,7 +281,7 @@ def count(value: Any, name: str, least: int) -> int:
 
 
 def pixels(value: Any, name: str) -> int:
-    """Return the width or height of a picture, in pixels, within the limits of servers."""
+    """Check the width or height of a picture, in pixels, and return it as an int."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -269,7 +292,7 @@ def pixels(value: Any, name: str) -> int:
 
 
 def render_mode(value: Any) -> None:
-    """Return `rgb_array`, the only mode of rendering, or None."""
+    """Check the option `render_mode`: `rgb_array`, the only mode that draws, or None."""
     if value == "human":
         raise InvalidArgumentError(
             "render_mode='human' needs a window, which gymnasium.wrappers.HumanRendering opens: give it an environment "
@@ -280,7 +303,7 @@ def render_mode(value: Any) -> None:
 
 
 def seconds(value: Any, name: str) -> float:
-    """Return a positive number of seconds; it may be infinite."""
+    """Check a number of seconds, which is positive and may be infinite, and return it as a float."""
     try:
         number = float(value) if isinstance(value, numbers.Real) and not isinstance(value, bool) else 0.0
     except OverflowError:
@@ -291,14 +314,20 @@ def seconds(value: Any, name: str) -> float:
 
 
 def actions(values: Any, description: Description, shape: tuple[int, ...]) -> bytes:
-    """Return the bytes of all environments' actions: int32 [N] or float32 [N, A]. Errors name the user's own shape."""
+    """Convert the actions of all environments to the protocol's bytes: int32 [N] or float32 [N, A].
+
+    `shape` is the expected shape of `values`.
+
+    Raises:
+        InvalidArgumentError: if the shape or the type is wrong. The message states the shape that the user passed.
+    """
     array = np.asarray(values)
     if array.shape != shape:
         raise InvalidArgumentError(f"the action has the shape {array.shape}; expected {shape}")
     if not description.discrete:
         if array.dtype.kind not in "iuf":
             raise InvalidArgumentError(f"the action has the type {array.dtype}; expected numbers")
-        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused
+        with np.errstate(over="ignore"):  # numbers too large for float32 become infinite, which the server refuses
             return array.astype("<f4").tobytes()
     if array.dtype.kind not in "iub":
         raise InvalidArgumentError(f"the action has the type {array.dtype}; expected integers")
@@ -308,7 +337,10 @@ def actions(values: Any, description: Description, shape: tuple[int, ...]) -> by
 
 
 def states(values: Any, num_envs: int, *, batched: bool) -> bytes:
-    """Return exact initial states, float64: [S] of a single environment, [M, S] of M selected ones."""
+    """Convert exact initial states to the protocol's bytes, float64.
+
+    `values` are [S] for a single environment, or [M, S] if `batched`, for the M environments to reset.
+    """
     expected = f"{num_envs} rows of numbers, one for each reset environment" if batched else "a row of numbers"
     wrong = InvalidArgumentError(f"options['state'] is {values!r}; expected {expected}")
     array = _numbers(values, wrong)
@@ -318,7 +350,7 @@ def states(values: Any, num_envs: int, *, batched: bool) -> bytes:
 
 
 def mask(value: Any, num_envs: int, name: str) -> NDArray[np.bool_]:
-    """Return a boolean array [N] that selects at least one environment, as Gymnasium's `reset_mask`."""
+    """Check a mask, bool [N], that selects at least one environment, as Gymnasium's `reset_mask`, and return it."""
     is_mask = isinstance(value, np.ndarray) and value.dtype == np.bool_ and value.shape == (num_envs,)
     if not is_mask or not value.any():
         raise InvalidArgumentError(
@@ -329,7 +361,7 @@ def mask(value: Any, num_envs: int, name: str) -> NDArray[np.bool_]:
 
 
 def options(given: Mapping[str, Any] | None, known: Sequence[str]) -> Mapping[str, Any]:
-    """Return the options of a reset; refuse unknown ones."""
+    """Check the argument `options` of `reset` for unknown keys, and return it. None becomes an empty dictionary."""
     if given is None:
         return {}
     if not isinstance(given, Mapping):

@@ -1,4 +1,4 @@
-"""Results of tests of policies, as data."""
+"""Data classes with the results of tests."""
 
 from __future__ import annotations
 
@@ -15,67 +15,78 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PolicyMetadata:
-    """Facts about a policy that its records do not have."""
+    """Metadata of a tested policy that its records do not contain."""
 
-    # The version that the policy was trained on; None if it is not known, or if it was no version.
+    # The version that the policy was trained on. None if unknown, or if it was trained on a custom set.
     trained_on: str | None
-    # Steps of its training, of all environments together; None if not known.
+    # Number of training steps, of all environments together. None if unknown.
     timesteps: int | None
-    # The seed from which the seeds of its tests follow, and the requested episodes of each test.
+    # The seed that the seeds of all tests are derived from.
     seed: int
+    # The requested number of episodes of each test.
     episodes: int
-    # `state` or `parameters`.
+    # What the policy observes: `state` or `parameters`.
     observe: str
-    # Whether the policy took the mode of its actions' distribution; None if that is not known.
+    # Whether the policy took the mode of its action distribution instead of sampling. None if unknown.
     deterministic: bool | None
 
     def plain(self) -> _native.PolicyMetadata:
-        """Return the facts in the native module's form."""
+        """Return the metadata as a tuple for the native module."""
         return (self.trained_on, self.timesteps, self.seed, self.episodes, self.observe, self.deterministic)
 
 
 @dataclass(frozen=True)
 class PolicyRecords:
-    """The recorded tests of one policy."""
+    """The recorded tests of one policy, with the policy's metadata."""
 
     known: PolicyMetadata
     records: _native.Records
 
     @property
     def trained_on(self) -> str | None:
-        """The version that the policy was trained on, if it is known."""
+        """The version that the policy was trained on. None if unknown."""
         return self.known.trained_on
 
 
 @dataclass(frozen=True)
 class Result:
-    """The figures of one test. Rates are in %, their intervals hold with 95 % confidence (Wilson, 1927)."""
+    """The statistics of one test: a policy on one test set. All intervals are 95 % confidence intervals."""
 
-    # The version that the policy was trained on, if that is known, and the set that it was tested on.
+    # The version that the policy was trained on. None if unknown.
     trained_on: str | None
+    # The name of the test set.
     tested_on: str
     # The policy's name in records.
     policy: str
+    # The number of episodes.
     episodes: int
+    # The success rate, %.
     success_percent: float
+    # The Wilson interval (1927) of the success rate, %.
     success_interval: tuple[float, float]
-    # Undiscounted, never normalised; its interval is a bootstrap's over episodes (percentiles of 1000 resamples, 95 %).
+    # The mean return, undiscounted and not normalised.
     mean_return: float
+    # The bootstrap interval of the mean return: percentiles of 1000 resamples of the episodes.
     return_interval: tuple[float, float]
-    # Mean length of episodes, in steps.
+    # The mean length of episodes, in steps.
     mean_length: float
-    # CVaR 10 %: the mean of the worst tenth of returns, rounded up (Rockafellar and Uryasev, 2000), and its interval.
+    # CVaR 10 % (Rockafellar and Uryasev, 2000): the mean of the lowest tenth of returns, whose number is rounded up.
     cvar_return: float
+    # The bootstrap interval of CVaR.
     cvar_interval: tuple[float, float]
-    # The success rate in the worst tenth of contexts: parts of the parameter space of some 40 episodes each, chosen by
-    # one half of the episodes and judged by the other. None where there are fewer than ten parts, as on D.
+    # The success rate, %, in the worst tenth of contexts. Contexts are regions of the parameter space with about 40
+    # episodes each. One half of the episodes selects the worst contexts, and the other half measures the success rate.
+    # None if there are fewer than ten contexts, as on D.
     worst_contexts_percent: float | None
-    # Whether actions were the mode of the policy's distribution, and not sampled; None if that is not known.
+    # Whether the policy took the mode of its action distribution instead of sampling. None if unknown.
     deterministic: bool | None = None
 
     @property
     def scenario(self) -> str:
-        """Training and test versions, such as `DR` or `D on corners`; the test alone if the training is not known."""
+        """The training version and the test set, such as `DR` or `D on corners`.
+
+        Only the test set if the training version is unknown.
+        """
         if self.trained_on is None:
             return self.tested_on
         named = self.tested_on in requests.VERSIONS
@@ -84,43 +95,52 @@ class Result:
 
 @dataclass(frozen=True)
 class Bin:
-    """Success in a part of a parameter's range, `low` to `high`. Rates are in %, None without episodes."""
+    """Success in one bin of a parameter's range, from `low` to `high` in the parameter's unit."""
 
     low: float
     high: float
     successes: int
     episodes: int
+    # The success rate, %. None without episodes.
     success_percent: float | None
+    # The 95 % Wilson interval of the success rate, %. None without episodes.
     success_interval: tuple[float, float] | None
 
 
 @dataclass(frozen=True)
 class Bin2D:
-    """Success in a part of two parameters' ranges, each `(low, high)`. The rate is in %, None without episodes."""
+    """Success in one cell of a grid over two parameters."""
 
+    # The range (low, high) of the first parameter.
     x: tuple[float, float]
+    # The range (low, high) of the second parameter.
     y: tuple[float, float]
     successes: int
     episodes: int
+    # The success rate, %. None without episodes.
     success_percent: float | None
 
 
 @dataclass(frozen=True)
 class Context:
-    """Success in a context, or in a part of the parameter space. Rates are in %, the interval is Wilson's, 95 %."""
+    """Success in one context of a list, or in one region of the parameter space if parameters are drawn."""
 
-    # Least and greatest value in its episodes of each parameter that varies, by name; equal in a context of a list.
+    # The lowest and highest value of each varying parameter in these episodes, by name. Equal for a context of a list.
     parameters: Mapping[str, tuple[float, float]]
     successes: int
     episodes: int
+    # The success rate, %.
     success_percent: float
+    # The 95 % Wilson interval of the success rate, %.
     success_interval: tuple[float, float]
     mean_return: float
 
 
 @dataclass(frozen=True)
 class Audit:
-    """Comparison of a repeated test with its records. `different` has a sentence for each episode that differs."""
+    """The result of repeating recorded tests: the differences between the new episodes and the records."""
 
+    # The number of compared episodes.
     episodes: int
+    # A sentence for each episode that differs.
     different: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""The table of results that `perturb export` writes."""
+"""Reading of the results table that `perturb export` writes."""
 
 from __future__ import annotations
 
@@ -13,22 +13,24 @@ from .policy import native
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-# Counts, which a failed cell does not have.
+# Columns of integers. They have no value in the row of a failed cell.
 COUNTS = ("revision", "after_episodes", "episodes", "successes", "timesteps")
 
 
 def read_results(path: str | os.PathLike[str], settings: Iterable[str] = ()) -> Any:
-    """Read a table of `perturb export` as a pandas DataFrame: a row for each cell, test set and tested policy.
+    """Read a results table of `perturb export` as a pandas DataFrame.
 
-    `docs/results-table.md` describes the columns. `success_percent` is added. `frame.attrs["plans"]` has the text of
-    each study's experiment file.
+    The table has a row for each experiment cell, test set and tested policy. `docs/results-table.md` describes the
+    columns. The column `success_percent` is added. `frame.attrs["plans"]` has the text of each study's experiment file,
+    by the study's name.
 
     Args:
         path: the Parquet file.
-        settings: names of settings that become columns, such as `learning_rate`; of methods without one it is None.
+        settings: names of training settings to add as columns, such as `learning_rate`. The value is None for a method
+            without this setting.
 
     Raises:
-        InvalidArgumentError: if it is no such table, or one of a later schema.
+        InvalidArgumentError: if the file is not a results table, or was written by a later version of perturb.
         ImportError: if pandas is not installed.
     """
     try:

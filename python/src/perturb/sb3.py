@@ -1,4 +1,4 @@
-"""A batch of environments as a stable-baselines3 VecEnv: one round trip a step, and no wrappers needed.
+"""A batch of environments as a stable-baselines3 VecEnv, with one round trip to the server for each step.
 
 from stable_baselines3 import PPO
 import perturb.sb3
@@ -34,26 +34,27 @@ if TYPE_CHECKING:
 
     from .requests import Parameters
 
-# Methods that `env_method` calls, with their number of arguments.
+# Methods that `env_method` accepts, with their number of arguments.
 _METHODS = {"snapshot": 0, "restore": 1, "render": 0, "set_parameters": 1}
-# Settings that have one value for stable-baselines3.
+# Settings of PerturbVectorEnv whose values stable-baselines3 determines.
 _FIXED = ("autoreset_mode", "copy")
 
 
 def make_vec_env(
     environment: str | None = None, num_envs: int = 1, *, seed: int | None = None, **settings: Any
 ) -> PerturbVecEnv:
-    """Make N environments of one session, as a stable-baselines3 VecEnv.
+    """Make a stable-baselines3 VecEnv of N environments in one session.
 
     Args:
-        environment: a name of docs/environments.md, such as `CartPole`; with `task` its name, or None.
-        num_envs: N.
-        seed: environment i begins with the seed s + i. By default seeds are random.
-        **settings: those of `PerturbVectorEnv`, such as `version`, `parameters`, `contexts`, `server` and `task`,
-            but for `autoreset_mode` and `copy`.
+        environment: the environment's name in docs/environments.md, such as `CartPole`. With `task`, the name of the
+            task or None.
+        num_envs: the number N of environments.
+        seed: a seed s; environment i begins with the seed s + i. By default seeds are random.
+        **settings: settings of `PerturbVectorEnv`, such as `version`, `parameters`, `contexts`, `server` and `task`,
+            except `autoreset_mode` and `copy`. The default of `receipts` is False here.
 
     Raises:
-        InvalidArgumentError: for settings that are wrong or not known.
+        InvalidArgumentError: if a setting is wrong or unknown.
     """
     for name in _FIXED:
         if name in settings:
@@ -64,14 +65,20 @@ def make_vec_env(
 
 
 class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-baselines3 is not there for every check
-    """N environments of a session. `batch` is the session's PerturbVectorEnv.
+    """N environments of one session as a stable-baselines3 VecEnv. `batch` is the session's PerturbVectorEnv.
 
-    The info of an episode's last step has `terminal_observation` [O], `TimeLimit.truncated` (the step limit ended it,
-    and not the task), `episode` with its undiscounted return `r` and its length `l`, as Monitor gives them but for the
-    time, and `is_success`, `diverged`, `achieved`; with `receipts=True` also `parameters`, `receipt` and `context_id`.
-    Other infos are empty, but for `reward_terms` on request. A reset's are `reset_infos`.
+    The info of an episode's last step has these keys:
 
-    `env_method("set_parameters", {"length": 0.7})` changes the physics from each environment's next episode on.
+    - `terminal_observation` [O];
+    - `TimeLimit.truncated`: whether only the step limit ended the episode;
+    - `episode`: the undiscounted return `r` and the length `l` in steps, as from Monitor, but without the time `t`;
+    - `is_success`, `diverged` and `achieved`;
+    - `parameters`, `receipt` and `context_id`, with `receipts=True`.
+
+    With `reward_terms=True` every info has `reward_terms`. All other infos are empty. The attribute `reset_infos` has
+    the infos of the last reset.
+
+    Call `env_method("set_parameters", {"length": 0.7})` to change the physics from each environment's next episode on.
     """
 
     def __init__(self, batch: PerturbVectorEnv, seed: int | None = None) -> None:
@@ -79,7 +86,7 @@ class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-
         self._returns = np.zeros(batch.num_envs, np.float64)
         self._lengths = np.zeros(batch.num_envs, np.int64)
         super().__init__(batch.num_envs, batch.single_observation_space, batch.single_action_space)
-        self.metadata = dict(batch.metadata)  # of which VecVideoRecorder wants render_fps
+        self.metadata = dict(batch.metadata)  # VecVideoRecorder reads render_fps from it
         self._description = batch._description
         self._is_made = True
         if seed is not None:
@@ -88,13 +95,13 @@ class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-
     def reset(self) -> NDArray[np.float32]:
         """Begin the next episodes. Return observations float32 [N, O].
 
-        stable-baselines3 calls `reset` once, when a training begins. Call `env_method("set_parameters", …)` to change
-        the physics later. Call `seed(s)` before `reset` to begin with the seeds s + i. Call `set_options` before it to
-        pass the options of `PerturbEnv.reset`, `parameters` and `state`: one dictionary for all environments, or a list
-        of N.
+        stable-baselines3 calls `reset` once, when a training begins. To change the physics later, call
+        `env_method("set_parameters", …)`. Call `seed(s)` before `reset` to begin with the seeds s + i. Call
+        `set_options` before `reset` to pass the options `parameters` and `state` of `PerturbEnv.reset`, as one
+        dictionary for all environments or as a list of N dictionaries.
 
-        If the options differ, all environments are reset together, and then those with options again, one by one.
-        Without seeds, the environments with options skip an episode.
+        If the options of the environments differ, all environments are reset together first. Then each environment with
+        options is reset again. Without seeds, these environments skip one episode.
         """
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
         first, *others = self._options
@@ -123,13 +130,13 @@ class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-
         return observations
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Send the actions of a step without waiting for its outcome."""
+        """Send the actions of a step without waiting for the reply."""
         self.batch.send(actions)
 
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], list[dict[str, Any]]]:
-        """Receive a step: observations float32 [N, O], rewards float32 [N], flags of ends [N], and infos.
+        """Receive the outcome of a step: observations float32 [N, O], rewards float32 [N], dones bool [N], and infos.
 
-        Where an episode ended, the observation is the first one of the next episode.
+        If an episode ended, the environment's observation is the first one of the next episode.
         """
         observations, rewards, terminated, truncated, batched = self.batch.recv()
         dones = terminated | truncated
@@ -152,16 +159,16 @@ class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-
         self.batch.close()
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
-        """Return an attribute that all environments share, such as `metadata`, once for each selected environment."""
+        """Return a list with one copy of an attribute, such as `metadata`, for each selected environment."""
         spaces = {"observation_space": "single_observation_space", "action_space": "single_action_space"}
         value = getattr(self.batch, spaces.get(attr_name, attr_name))
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
-        """Refuse: environments have nothing that can be assigned.
+        """Raise an error, because no attribute of the environments can be assigned.
 
         Raises:
-            AssignmentError: always, with what changes parameters.
+            AssignmentError: always. The message names the calls that change parameters.
         """
         del value, indices
         raise refuse_assignment(attr_name, self._description)
@@ -169,12 +176,14 @@ class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-
     def env_method(
         self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call `snapshot`, `restore` (the same snapshot in each), `render` or `set_parameters` of each environment.
+        """Call a method of each selected environment, and return the list of results.
 
-        `set_parameters(parameters)` acts from each environment's next episode on.
+        The methods are `snapshot()`, `restore(snapshot)`, `render()` and `set_parameters(parameters)`. `restore`
+        restores the same snapshot in each selected environment. `set_parameters` takes effect in each environment's
+        next episode.
 
         Raises:
-            AttributeError: for another method.
+            AttributeError: for any other method or number of arguments.
         """
         slots = list(self._get_indices(indices))
         if method_name not in _METHODS or method_kwargs or len(method_args) != _METHODS[method_name]:
@@ -199,23 +208,25 @@ class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-
         return [rows[slot].copy() for slot in slots]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: int | Iterable[int] | None = None) -> list[bool]:
-        """Return True for Monitor, because infos have its `episode`, and False for all other wrappers."""
+        """Return True for Monitor, because infos have Monitor's key `episode`, and False for all other wrappers."""
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """A picture of each environment, with `render_mode="rgb_array"`."""
+        """Return an RGB picture of each environment. Needs `render_mode="rgb_array"`."""
         return list(self.batch.render())
 
 
 class CurriculumCallback(BaseCallback):  # type: ignore[misc]  # stable-baselines3 is not there for every check
-    """Changes the physics while a stable-baselines3 model learns, from each environment's next episode on.
+    """A stable-baselines3 callback that changes the physics on a schedule while a model learns.
 
         schedule = {0: {"length": "0.4..0.6"}, 50_000: {"length": "0.2..0.8"}}
         model.learn(100_000, callback=perturb.sb3.CurriculumCallback(schedule))
 
+    A change takes effect in each environment's next episode.
+
     Args:
-        schedule: parameters by the number of steps of all environments from which on they count; or a function of that
-            number, which returns parameters, or None for those of before.
+        schedule: a mapping from numbers of steps, of all environments together, to the parameters that apply from this
+            step on. Or a function that gets the number of steps and returns parameters, or None for no change.
         verbose: 1 prints each change.
     """
 
@@ -231,7 +242,7 @@ class CurriculumCallback(BaseCallback):  # type: ignore[misc]  # stable-baseline
         self._current: Parameters | None = None
 
     def _on_training_start(self) -> None:
-        self._current = None  # the environments may be others than those of an earlier training
+        self._current = None  # an earlier training may have had other environments
         self._update()
 
     def _on_rollout_start(self) -> None:
@@ -241,7 +252,7 @@ class CurriculumCallback(BaseCallback):  # type: ignore[misc]  # stable-baseline
         return True
 
     def _update(self) -> None:
-        """Set the parameters of the schedule's present stage, if they changed."""
+        """Set the schedule's parameters for the present number of steps, if they changed."""
         if callable(self._schedule):
             parameters = self._schedule(self.num_timesteps)
         else:

@@ -1,8 +1,8 @@
-"""A session: one stream to a server, which owns a batch of environments. Requests go out, replies come back in order.
+"""A session: one stream to a server that owns a batch of environments. Replies come in the order of the requests.
 
-The native module has the stream. This module starts the private server and writes the messages of the stream's errors.
-A session belongs to the process that opened it. It is opened when it is first needed, not when an environment is made,
-so a process that is forked before that opens its own.
+The native module implements the stream. This module starts the private server if one is needed, and converts the
+stream's failures to errors with messages. A session belongs to the process that opened it. The first reset opens it, so
+a process that is forked before the first reset opens its own session.
 """
 
 from __future__ import annotations
@@ -47,23 +47,25 @@ if TYPE_CHECKING:
 
 Reply = TypeVar("Reply")
 
-# Interval of keepalive pings to a silent server, and the limit for its answer, s. The limit is long because a busy
-# machine is no reason to lose environments. When a server ends, its system closes its sockets at once.
+# Interval of keepalive pings to a silent server, and maximum time to wait for their answer, s. The maximum is long, so
+# that a busy machine does not lose environments. When a server ends, its operating system closes its sockets at once.
 KEEPALIVE_INTERVAL, KEEPALIVE_LIMIT = 10.0, 20.0
 # Interval at which idle sessions answer the server's keepalive pings, s.
 POLL_INTERVAL = 0.25
-# Pauses of this process that may explain a lost connection: from so many seconds on, for so many seconds afterwards.
+# A pause of this process may explain a lost connection: minimum length of such a pause, and time for which it is
+# remembered, s.
 PAUSE_LIMIT, PAUSE_MEMORY = 2.0, 60.0
-# gRPC's codes of streams that a server ended.
+# gRPC status codes with which a server ends a stream.
 DEADLINE_EXCEEDED, RESOURCE_EXHAUSTED, OUT_OF_RANGE, UNIMPLEMENTED, UNAUTHENTICATED = 4, 8, 11, 12, 16
 
 
 class Session:
-    """A session with a server: an address, or None for this process's own server.
+    """A session with the server at an address, or with a private server if the address is None.
 
-    `task` is a folder that this process's own server, or the embedded one, serves.
+    `task` is the task folder that the private or embedded server serves.
 
-    A session that is lost (the server died, a reply took too long, the wait for it was interrupted) stays lost.
+    A session is lost if the server dies, if a reply takes too long, or if the wait for a reply is interrupted. A lost
+    session cannot be used again.
     """
 
     def __init__(
@@ -82,13 +84,13 @@ class Session:
             self._local = local_server.acquire(LocalServer, task)
             server = self._local.address
         elif server == EMBEDDED:
-            with embedded_server.loading:  # always taken before the lock of the shared servers
+            with embedded_server.loading:  # lock order: this lock before the lock of the shared servers
                 self._local = local_server.acquire(EmbeddedServer, task)
         self.address: Address = server
         self._owner = os.getpid()
         self._limit = timeout
         self._embedded = server == EMBEDDED
-        # Resets and steps of a task from a folder may compile a model with other lengths.
+        # Resets and steps of a task from a folder may compile a model again.
         self._compiles = self._embedded and task is not None
         self._lost: str | None = None
         self._opened = False
@@ -102,14 +104,14 @@ class Session:
             single,
         )
         self._resources: _Resources = (self._native, self._local, self._owner)
-        # Python may collect a session anywhere, also while a lock is held, so the finalizer does nothing else.
+        # Python may delete a session at any time, also while a lock is held, so the finalizer only notes the resources.
         self._forget = weakref.finalize(self, _unclosed.append, self._resources)
-        self._forget.atexit = False  # _at_exit closes what is left
+        self._forget.atexit = False  # _at_exit closes the remaining sessions
         _keepalive.add(self)
 
     @property
     def waits(self) -> bool:
-        """Whether a thread waits for a reply."""
+        """Whether a thread is waiting for a reply."""
         return self._native.waits
 
     @property
@@ -121,7 +123,7 @@ class Session:
         self._limit = self._native.timeout = seconds
 
     def usable(self) -> bool:
-        """Whether requests can be sent: the session is neither lost nor opened by another process."""
+        """Whether requests can be sent: the session is not lost, and this process opened it."""
         return os.getpid() == self._owner and self._gone() is None
 
     def require_usable(self) -> None:
@@ -140,7 +142,8 @@ class Session:
             raise OutOfOrderError(f"this environment is gone, call reset() to begin anew: {gone}")
 
     def _gone(self) -> str | None:
-        """Return why the session has ended, or None. A second Ctrl-C may have come before the first was noted."""
+        """Return the reason why the session has ended, or None if it has not."""
+        # If a second Ctrl-C interrupts the handling of the first, the native session has ended without a reason here.
         return self._lost or ("it was interrupted, or its connection ended" if self._native.ended else None)
 
     def open(self, **request: Any) -> _native.Opened:
@@ -150,61 +153,70 @@ class Session:
         return opened
 
     def step(self, actions: Any, encode: Callable[[Any], bytes]) -> _native.Stepped:
-        """Advance every environment."""
+        """Advance every environment by one step. `encode` converts actions of unusual types to bytes."""
         return self._call("step", self._native.step, actions, encode)
 
     def step_single(
         self, action: Any, encode: Callable[[Any], bytes]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Advance an environment by itself: observation [O], reward, both flags, and the info."""
+        """Advance a single environment by one step.
+
+        Return its observation [O], reward, terminated and truncated flags, and info.
+        """
         if self._compiles:
             return self._call("step", self._native.step_single, action, encode)
-        try:  # not by _call, which takes long beside a step without a connection
+        try:  # without _call, whose time is long compared with a step of an embedded environment
             return self._native.step_single(action, encode)
         except BaseException as error:  # noqa: BLE001
             raise self._failed("step", error) from None
 
     def send(self, actions: Any, encode: Callable[[Any], bytes]) -> None:
-        """Ask for a step, whose outcome `recv` gives."""
+        """Request a step without waiting for the reply. `recv` returns its outcome."""
         self._call("step", self._native.send, actions, encode)
 
     def recv(self) -> _native.Stepped:
-        """Wait for the oldest step that was sent."""
+        """Wait for the reply to the oldest step that was sent, and return its outcome."""
         return self._call("step", self._native.recv)
 
     def reset(
         self, mask: bytes, seeds: Sequence[int], parameters: Intervals, states: bytes
     ) -> tuple[NDArray[np.float32], _native.Events]:
-        """Begin new episodes. Return observations [N, O] (the last ones of other environments) and the episodes."""
+        """Begin new episodes. Return observations [N, O], and the episodes that began.
+
+        Environments that are not reset have their last observations.
+        """
         return self._call("reset", self._native.reset, mask, seeds, parameters, states)
 
     def last_ended(self) -> NDArray[np.bool_]:
-        """Return which environments' episodes ended in the last step and were not reset since, [N]."""
+        """Return a mask [N] of the environments whose episode ended in the last step and that were not reset since."""
         return self._native.last_ended()
 
     @property
     def under_way(self) -> int:
-        """The number of steps that were sent and not received."""
+        """The number of steps that were sent and whose reply was not received yet."""
         return self._native.under_way
 
     def snapshot(self, mask: bytes) -> list[bytes]:
-        """Save environments."""
+        """Save the environments that the mask selects, one snapshot each. An empty mask selects all."""
         return self._call("snapshot", self._native.snapshot, mask)
 
     def restore(self, mask: bytes, snapshots: Sequence[bytes]) -> NDArray[np.float32]:
-        """Restore saved environments. Return observations [N, O]; other environments have their last ones."""
+        """Restore snapshots into the environments that the mask selects. Return observations [N, O].
+
+        Environments that are not selected have their last observations.
+        """
         return self._call("restore", self._native.restore, mask, snapshots)
 
     def render(self, slot: int, width: int, height: int) -> NDArray[np.uint8]:
-        """Draw an environment: [height, width, 3]."""
+        """Draw the environment in a slot. Return a picture, uint8 [height, width, 3]."""
         return self._call("render", self._native.render, slot, width, height)
 
     def poll_io(self) -> None:
-        """Answer the server's keepalive pings; the keepalive thread calls it."""
+        """Answer the server's keepalive pings. The keepalive thread calls this method."""
         self._native.poll_io()
 
     def close(self) -> None:
-        """End the session; the server frees its environments."""
+        """End the session. The server then frees its environments."""
         self._lost = self._lost or "it was closed"
         self._close()
         _close_unclosed()
@@ -217,19 +229,22 @@ class Session:
         loads = self._compiles or (self._embedded and kind in ("open", "render"))
         try:
             if loads:
-                # Released before `_failed` closes the session, which takes the lock of the shared servers.
+                # The lock is released before `_failed` closes the session and takes the lock of the shared servers.
                 with embedded_server.loading:
                     return call(*arguments, **fields)
             return call(*arguments, **fields)
-        except BaseException as error:  # noqa: BLE001  (Ctrl-C ends a session, too)
+        except BaseException as error:  # noqa: BLE001  (KeyboardInterrupt also ends a session)
             raise self._failed(kind, error) from None
 
     def _failed(self, kind: str, error: BaseException) -> BaseException:
-        """Return the error to raise in place of the native module's. Nearly all errors end the session."""
+        """Return the error to raise in place of an error of the native module. Most errors end the session.
+
+        `kind` is the kind of request, such as `step`.
+        """
         if not isinstance(error, _native.Failure):
             if not self._native.ended:
-                return error  # the actions' shape or kind: nothing was sent
-            # Ctrl-C: the reply to come would have been taken for that to the next request.
+                return error  # the actions had a wrong shape or type, and nothing was sent
+            # Ctrl-C interrupted the wait. The late reply would be taken for the reply to the next request.
             self._lost = self._lost or f"the wait for the reply to {kind} was interrupted"
             self._close()
             return error
@@ -238,7 +253,7 @@ class Session:
             if code == UNAUTHENTICATED:  # a token that is missing, wrong or revoked ends the stream
                 return self._fail(self._explain(kind, what, code, words))
             refused = refusal(kind, code, words)
-            # A refusal changes nothing; a defect of the server costs the environments.
+            # A refused request changes nothing. A bug in the server ends the session.
             return self._fail(refused) if isinstance(refused, ServerDefectError) else refused
         if what == "malformed":
             return ProtocolError(words)
@@ -258,7 +273,7 @@ class Session:
         return error
 
     def _explain(self, kind: str, what: str, code: int, words: str) -> PerturbError:
-        """Say what ended the stream and what to do."""
+        """Return an error whose message says what ended the stream, and what to do."""
         where = "the embedded server" if self.address == EMBEDDED else f"the server at {self.address}"
         lost = f"lost {where} during {kind}"
         if what == "timed out":
@@ -295,7 +310,7 @@ class Session:
                 f"start one with `perturb-server --listen {_listen(self.address)}`, or correct server="
             )
         pause = _keepalive.longest_pause()
-        if pause >= PAUSE_LIMIT and code != DEADLINE_EXCEEDED:  # an idle session has the server's own reason
+        if pause >= PAUSE_LIMIT and code != DEADLINE_EXCEEDED:  # with this code the server ends idle sessions itself
             return ServerConnectionError(
                 f"{lost}: {words}. This process did not run for {pause:.0f} s (Ctrl-Z, a debugger, a suspended "
                 "computer, or code that holds Python's lock), and did not answer the server's keepalive pings "
@@ -305,7 +320,7 @@ class Session:
 
 
 def _listen(address: Address) -> str:
-    """Return the `--listen` value, and the flags with it, that start a server at an address."""
+    """Return the value of `--listen`, and further options, with which perturb-server listens at an address."""
     text = str(address)
     if text.startswith("unix:"):
         return text
@@ -314,15 +329,17 @@ def _listen(address: Address) -> str:
     return f"tcp://{rest}{guards}"
 
 
-# Resources of a session that have to be closed: the stream, the private server, and the process that opened it.
+# Resources of a session that must be closed: the stream, the private or embedded server, and the id of the process that
+# opened the session.
 _Resources: TypeAlias = "tuple[_native.Session, LocalServer | EmbeddedServer | None, int]"
-# Resources of sessions that nobody closed. The next session that is opened or closed closes them, or the thread does.
+# Resources of sessions that were deleted without a call of `close`. The next call that opens or closes a session closes
+# them, or the keepalive thread does.
 _unclosed: collections.deque[_Resources] = collections.deque()
 
 
 def _close_unclosed(*, wait: bool = True) -> None:
-    """Close the sessions that nobody closed. Without `wait`, leave the rest if a server is being started."""
-    with contextlib.suppress(IndexError):  # another thread may be at it, too
+    """Close the resources of deleted sessions. If `wait` is false, stop when a server is being started."""
+    with contextlib.suppress(IndexError):  # another thread may have taken the last entry
         while True:
             resources = _unclosed.popleft()
             if not _close(*resources, wait=wait):
@@ -333,9 +350,9 @@ def _close_unclosed(*, wait: bool = True) -> None:
 def _close(
     native: _native.Session, local: LocalServer | EmbeddedServer | None, owner: int, *, wait: bool = True
 ) -> bool:
-    """Close a session's resources. Return False if the server was not released: call again."""
+    """Close a session's resources. Return False if the server was not released, and the caller must call again."""
     if os.getpid() != owner:
-        return True  # what a forked process inherited is the parent's
+        return True  # resources that a forked process inherited belong to its parent
     native.close()  # a second call does nothing
     return local is None or local_server.release(local, wait=wait)
 
@@ -345,20 +362,20 @@ def _now() -> float:
 
 
 class _KeepaliveThread:
-    """A thread that answers pings for idle sessions, because a connection has no thread of its own."""
+    """A thread that answers keepalive pings for idle sessions, whose connections have no thread of their own."""
 
     def __init__(self) -> None:
         self._sessions: weakref.WeakSet[Session] = weakref.WeakSet()
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._ended = threading.Event()
-        # Time of the thread's last run, and length and end of the longest recent pause, s, by a clock that counts
-        # suspended time.
+        # Time of the thread's last run, s. The clock also counts while the computer is suspended.
         self._last_run = _now()
+        # Length and end of the longest recent pause, s.
         self._pause = (0.0, 0.0)
 
     def longest_pause(self) -> float:
-        """Return the longest time for which this process did not run in the last minute, s."""
+        """Return the length of the longest pause of this process that ended in the last minute, s. 0 without pauses."""
         self._note_pause()
         length, end = self._pause
         return length if _now() - end < PAUSE_MEMORY else 0.0
@@ -378,13 +395,13 @@ class _KeepaliveThread:
                 self._thread.start()
 
     def end(self) -> None:
-        """End the thread, so that it is not in the native module when Python exits."""
+        """End the thread. It must not run in the native module while Python exits."""
         self._ended.set()
         if self._thread is not None:
             self._thread.join()
 
     def sessions(self) -> list[Session]:
-        """Return the sessions that still exist."""
+        """Return the sessions that were not deleted."""
         with self._lock:
             return list(self._sessions)
 
@@ -392,8 +409,8 @@ class _KeepaliveThread:
         while not self._ended.wait(POLL_INTERVAL):
             self._note_pause()
             self._last_run = _now()
-            self._look()  # in a frame of its own: a sleeping keeper keeps no session alive
-            _close_unclosed(wait=False)  # pings must be answered also while a server starts
+            self._look()  # a separate function, so that no local variable keeps a session alive during the wait
+            _close_unclosed(wait=False)  # without waiting, because pings must be answered while a server starts
 
     def _look(self) -> None:
         for session in self.sessions():
@@ -417,4 +434,4 @@ def _at_exit() -> None:
 
 os.register_at_fork(after_in_child=_native.note_fork)
 os.register_at_fork(after_in_child=_after_fork_in_child)
-atexit.register(_at_exit)  # runs before the private server is ended, which was registered before
+atexit.register(_at_exit)  # runs before the private server is ended, whose handler was registered earlier

@@ -1,10 +1,10 @@
-"""Sets to test policies on beside D, R, E and R+E: drawn parameters, grids and lists, as in experiment files.
+"""Custom test sets, in addition to D, R, E and R+E: drawn parameters, grids and lists, as in experiment files.
 
     corners = perturb.sets.grid("corners", {"length": [0.1, 1.0], "mass": "0.05..0.5/4"})
     long = perturb.sets.drawn("long_poles", {"length": (0.7, 0.8)}, base="R")
     perturb.evaluate(policy, "CartPole", versions=["D", long, corners])
 
-Lists of contexts, of grids too, can also be trained on: `contexts=` of PerturbVectorEnv and `perturb.sb3.make_vec_env`.
+Grids and lists can also be trained on. Pass them as `contexts` to PerturbVectorEnv or `perturb.sb3.make_vec_env`.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ __all__ = ["Set", "drawn", "grid", "heatmap", "listed", "read", "read_csv", "sam
 
 @dataclass(frozen=True)
 class Set:
-    """A set to test policies on. The functions of this module make sets.
+    """A custom set of parameter values to test policies on. The functions of this module make sets.
 
     Attributes:
-        name: its name in results.
-        base: the version of the parameters that the set does not name.
-        parameters: the intervals [(low, high), …] from which parameters are drawn for each episode, by name; a fixed
+        name: the set's name in results.
+        base: the version that all other parameters come from.
+        parameters: for each parameter, the intervals [(low, high), …] from which it is drawn for each episode. A fixed
             value is an interval of length 0. Empty for grids and lists.
-        contexts: the contexts of a grid or a list, values of parameters by name, each with equally many episodes; else
-            None.
+        contexts: the contexts of a grid or a list. A context has a value of each parameter that it names, and all
+            contexts get the same number of episodes. None if parameters are drawn.
     """
 
     name: str
@@ -50,16 +50,16 @@ class Set:
 
 
 def drawn(name: str, parameters: Mapping[str, requests.ParameterSet], *, base: requests.Version = "D") -> Set:
-    """Make a set whose parameters are drawn anew for each episode.
+    """Make a set whose parameters are drawn for each episode.
 
     Args:
-        name: letters, digits and _.
-        parameters: by name a value, an interval `(low, high)`, several `[(low, high), …]`, or a text as in experiment
-            files, `"0.3..0.4,0.8..0.9"`; in the parameter's unit.
-        base: where other parameters come from.
+        name: the set's name, of letters, digits and _.
+        parameters: the values of each parameter, in its unit: a number, an interval `(low, high)`, several intervals
+            `[(low, high), …]`, or a text as in experiment files, such as `"0.3..0.4,0.8..0.9"`.
+        base: the version that all other parameters come from.
 
     Raises:
-        InvalidArgumentError: for what is no such set.
+        InvalidArgumentError: if an argument is malformed.
     """
     made = _made(name, base, {key: _drawn(key, values) for key, values in _mapping(parameters).items()})
     if made.contexts is not None:
@@ -68,26 +68,33 @@ def drawn(name: str, parameters: Mapping[str, requests.ParameterSet], *, base: r
 
 
 def grid(name: str, points: Mapping[str, float | Sequence[float] | str], *, base: requests.Version = "D") -> Set:
-    """Make a grid: every combination of these points for equally many episodes, the first parameter varying fastest.
+    """Make a grid: a set with one context for every combination of the points. The first parameter varies fastest.
+
+    All contexts get the same number of episodes.
 
     Args:
-        name: letters, digits and _.
-        points: by name a value, several `[0.1, 0.2]`, or a text as in experiment files: `"0.1..1.0/10"` is ten points
-            from 0.1 to 1.0. In the parameter's unit. At most 16 384 combinations.
-        base: where other parameters come from.
+        name: the set's name, of letters, digits and _.
+        points: the points of each parameter, in its unit: a number, a list such as `[0.1, 0.2]`, or a text as in
+            experiment files. `"0.1..1.0/10"` means ten points from 0.1 to 1.0. At most 16 384 combinations.
+        base: the version that all other parameters come from.
 
     Raises:
-        InvalidArgumentError: for what is no such grid.
+        InvalidArgumentError: if an argument is malformed.
     """
     made = _made(name, base, {key: _points(key, values) for key, values in _mapping(points).items()})
     return made if made.contexts is not None else listed(name, [_values(made.parameters)], base=base)
 
 
 def listed(name: str, contexts: Sequence[Mapping[str, float]], *, base: requests.Version = "D") -> Set:
-    """Make a list of contexts, values of parameters by name, each for equally many episodes.
+    """Make a set of the given contexts. All contexts get the same number of episodes.
+
+    Args:
+        name: the set's name, of letters, digits and _.
+        contexts: the contexts. Each is a mapping from parameters to values, in the parameter's unit.
+        base: the version that all other parameters come from.
 
     Raises:
-        InvalidArgumentError: for what is no such list.
+        InvalidArgumentError: if an argument is malformed.
     """
     return Set(_name(name), requests.version(base, "base"), {}, tuple(requests.contexts(contexts)))
 
@@ -101,13 +108,22 @@ def sampled(
     seed: int = 1,
     task: str | os.PathLike[str] | None = None,
 ) -> Set:
-    """Make a list of contexts drawn from R or E once: for training on a chosen number of them, or for testing.
+    """Make a set of contexts that are drawn once from R or E.
 
-    Each parameter is uniform over its intervals. The same seed gives the same contexts, and a smaller count gives the
-    first ones of a larger count. `task` is the folder of the environment's task, if it has one.
+    Use it to train on a limited number of contexts, or to test on the same contexts again. Each parameter is drawn
+    uniformly from its intervals. The same seed gives the same contexts. A smaller count gives the first contexts of a
+    larger count.
+
+    Args:
+        name: the set's name, of letters, digits and _.
+        environment: the environment's name.
+        count: the number of contexts.
+        version: the version to draw from, `R` or `E`.
+        seed: fixes the contexts, 0 … 2^64 - 1.
+        task: the folder of the environment's task, if it is a task from a folder.
 
     Raises:
-        InvalidArgumentError: for an unknown environment, a version other than R and E, or a count below 1.
+        InvalidArgumentError: if the environment is unknown, the version is neither R nor E, or the count is below 1.
     """
     parameters = _environment(environment, task).parameters
     version = requests.version(version)
@@ -139,24 +155,24 @@ def heatmap(
     fixed: Mapping[str, float] | None = None,
     task: str | os.PathLike[str] | None = None,
 ) -> Set:
-    """Make the set of a heatmap over two parameters. Reports draw a heatmap for each policy that was tested on it.
+    """Make a grid over two parameters for a heatmap. Reports draw a heatmap for each policy that was tested on it.
 
-    The set's name is `heatmap`, and its tests are those of `perturb heatmap`. The range that R and E have together is
-    divided into equal parts along each axis, and the points stand in their middles.
+    The set is named `heatmap` and equals the set of `perturb heatmap`. Along each axis, the range that R and E cover
+    together is divided into `points` equal bins, and the grid points are the centres of the bins.
 
     Args:
-        environment: its name.
-        x: the parameter along x; by default that of the environment's usual heatmap.
-        y: along y.
-        points: along each axis, 2 … 100. Each point has equally many of a test's episodes, at least 1.
-        base: where other parameters come from.
-        fixed: values of others.
-        task: the folder of the environment's task, if it has one.
+        environment: the environment's name.
+        x: the parameter on the x axis. By default the first of the environment's `heatmap_axes`.
+        y: the parameter on the y axis. By default the second of the environment's `heatmap_axes`.
+        points: the number of points along each axis, 2 … 100. All points get the same number of episodes, at least 1.
+        base: the version that all other parameters come from.
+        fixed: fixed values of other parameters, by name.
+        task: the folder of the environment's task, if it is a task from a folder.
 
     Raises:
-        UnknownNameError: for an unknown environment or parameter.
-        InvalidArgumentError: for other numbers of points, for one parameter twice, or if x and y are left out and the
-            environment has no usual heatmap.
+        UnknownNameError: if x or y is not a parameter of the environment.
+        InvalidArgumentError: if the environment is unknown, if the number of points is out of range, if a parameter is
+            given twice, or if x or y is left out and the environment has no default axes.
     """
     known = _environment(environment, task)
     usual = known.heatmap_axes or (None, None)
@@ -179,20 +195,22 @@ def heatmap(
 
 
 def read_csv(name: str, path: str | os.PathLike[str], *, base: requests.Version = "D") -> Set:
-    """Read a list of contexts: a header of parameters, then a row for each context.
+    """Read a set of contexts from a CSV file.
+
+    The header has the names of the parameters. Each further row is a context.
 
     Raises:
         OSError: if the file cannot be read.
-        InvalidArgumentError: for what is no such list, with the line.
+        InvalidArgumentError: if the file is malformed. The message names the line.
     """
     return _set(native(_native.read_csv_set, _name(name), requests.version(base, "base"), os.fspath(path)))
 
 
 def read(path: str | os.PathLike[str]) -> dict[str, Set]:
-    """Read the sets of an experiment file, its tables `[sets.NAME]`, by their names.
+    """Read the sets of an experiment file, the tables `[sets.NAME]`, by name.
 
     Raises:
-        InvalidArgumentError: if it cannot be read, with the table and the key.
+        InvalidArgumentError: if the file is malformed or cannot be read. The message names the table and the key.
     """
     return {made[0]: _set(made) for made in native(_native.read_sets, os.fspath(path))}
 
@@ -200,7 +218,11 @@ def read(path: str | os.PathLike[str]) -> dict[str, Set]:
 def contexts_of(
     chosen: Set, version: requests.Version, parameters: requests.Parameters | None
 ) -> Sequence[Mapping[str, float]]:
-    """Give the contexts of a grid or a list, for environments with this version and these parameters."""
+    """Return the contexts of a set, for environments that are constructed with a version and parameters.
+
+    Raises:
+        InvalidArgumentError: if the set has no contexts, if its base is not the version, or if there are parameters.
+    """
     if chosen.contexts is None:
         raise InvalidArgumentError(
             f"the set {chosen.name!r} is drawn for each episode and has no contexts: give "
@@ -269,7 +291,11 @@ def _points(name: str, values: Any) -> str:
 
 
 def _values(parameters: Mapping[str, Sequence[tuple[float, float]]]) -> dict[str, float]:
-    """Return the values of a grid of one point."""
+    """Return the values of a grid that has a single point.
+
+    Raises:
+        InvalidArgumentError: if a parameter has an interval instead of a point.
+    """
     wrong = [
         name for name, intervals in parameters.items() if len(intervals) != 1 or intervals[0][0] != intervals[0][1]
     ]

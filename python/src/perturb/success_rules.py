@@ -1,4 +1,4 @@
-"""Rules of success beyond the environment's own: thresholds of an episode's return or length, and functions."""
+"""Success rules that Python applies to recorded episodes: thresholds of the return or length, and functions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
     from . import _native
 
-# A text, or a function of the columns of recorded episodes that returns bool [episodes].
+# A success rule as a text, or as a function. The function gets the columns of recorded episodes, and returns bool
+# [episodes].
 SuccessRule: TypeAlias = str | Callable[[Mapping[str, Any]], Any]
 
 _THRESHOLD = re.compile(r"\s*(return|length)\s*(>=|<=|=)\s*(\S+)\s*")
@@ -25,16 +26,22 @@ _THRESHOLD = re.compile(r"\s*(return|length)\s*(>=|<=|=)\s*(\S+)\s*")
 
 @dataclass(frozen=True)
 class OwnRule:
-    """A rule by which recorded episodes are judged after they were played."""
+    """A success rule that Python applies to recorded episodes."""
 
+    # The name of the quantity that is compared, such as `return`, or the name of a function.
     quantity: str
+    # Whether success means at least the threshold; otherwise at most the threshold.
     at_least: bool
     threshold: float
-    # Computes the quantity of each episode from the records' columns.
+    # Returns the quantity of each episode, [episodes], from the records' columns.
     values: Callable[[Mapping[str, Any]], Any]
 
     def judge(self, records: _native.Records) -> _native.Records:
-        """Return the same episodes, judged by this rule."""
+        """Return records of the same episodes, judged by this rule.
+
+        Raises:
+            InvalidArgumentError: if the function returns a wrong shape or type.
+        """
         columns = records.columns()
         episodes = len(columns["seed"])
         values: NDArray[Any] = np.asarray(self.values(columns))
@@ -50,9 +57,10 @@ class OwnRule:
 
 
 def parse(rule: SuccessRule | None) -> tuple[str | None, OwnRule | None]:
-    """Return the rule that the native module applies while it records, and the rule for the finished records.
+    """Parse a success rule. Return the rule for the native module, and the rule for Python.
 
-    At most one of them is not None. `return=NUMBER` means at least this return.
+    The native module applies its rule while episodes are recorded. Python applies its rule to the finished records. At
+    most one of the two is not None. `return=NUMBER` means at least this return.
 
     Raises:
         InvalidArgumentError: if the rule is neither a text nor a function, or if a threshold is malformed.
@@ -83,6 +91,6 @@ def parse(rule: SuccessRule | None) -> tuple[str | None, OwnRule | None]:
 
 
 def is_own(rule: str | None) -> bool:
-    """Whether a recorded rule, `QUANTITY=NUMBER`, is one of this module's, and not the environment's."""
+    """Whether Python applied the recorded rule `QUANTITY=NUMBER`, as opposed to the native module."""
     quantity = "" if rule is None else rule.partition("=")[0]
     return quantity in ("return", "length") or quantity.endswith("()")

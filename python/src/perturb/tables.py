@@ -1,4 +1,4 @@
-"""Assessments as tables, for terminals and notebooks."""
+"""Tables of results as text for terminals, as HTML for notebooks, and as LaTeX."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from .results import Result
 
 METRICS = ("Default", "Interpolation", "Extrapolation")
-# Words for the choice of actions, by whether the policy was deterministic.
+# The words in tables for how actions were chosen, by whether the policy was deterministic.
 ACTIONS = {True: "the mode", False: "sampled", None: ""}
 
 
@@ -20,7 +20,11 @@ def tables(
     metrics: Mapping[str, float | None],
     published: Mapping[str, Mapping[str, tuple[float, float | None] | None]],
 ) -> list[list[list[str]]]:
-    """Return tables as rows of cells, headings first: the tests' figures, and the three metrics beside the paper's."""
+    """Return the tables of an assessment. A table is a list of rows of cells, and its first row has the headings.
+
+    The first table has the statistics of each test. The second one compares the three metrics with the paper's. It is
+    left out if there are no metrics, or if the paper has none for the environment.
+    """
     known = any(result.trained_on is not None for result in results)
     head = ["scenario" if known else "tested on", "episodes", "success, %", "95 %", "worst contexts, %"]
     tests = [[*head, "return", "CVaR 10 %", "length", "actions", "policy"]]
@@ -47,7 +51,7 @@ def _spread(number: tuple[float, float | None] | None) -> str:
 
 
 def text(table: list[list[str]]) -> str:
-    """Return the table as text, with the first column aligned to the left."""
+    """Return a table as text. The first column is aligned to the left and the others to the right."""
     widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
     lines = (
         [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
@@ -57,7 +61,7 @@ def text(table: list[list[str]]) -> str:
 
 
 def as_html(table: list[list[str]]) -> str:
-    """Return the table as HTML."""
+    """Return a table as an HTML element."""
 
     def row(cells: list[str], tag: str) -> str:
         return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
@@ -66,7 +70,7 @@ def as_html(table: list[list[str]]) -> str:
 
 
 def as_latex(table: list[list[str]]) -> str:
-    """Return the table as LaTeX's `tabular` with the rules of booktabs."""
+    """Return a table as a LaTeX `tabular` environment. It uses the commands of the package booktabs."""
     special = {"%": r"\%", "&": r"\&", "_": r"\_", "#": r"\#", "$": r"\$", "−": "$-$", ">": "$>$", "<": "$<$"}
 
     def row(cells: list[str]) -> str:

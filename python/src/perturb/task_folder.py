@@ -1,4 +1,4 @@
-"""Descriptions of environments: built-in ones, tasks of a folder, and tasks that a running server has."""
+"""Finds the description of an environment: a built-in one, a task in a folder, or a task of a running server."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ if TYPE_CHECKING:
 
     from .address import Address
 
-# Ends of the names of files that a task can have read.
+# Suffixes of files that a task may read.
 _SUFFIXES = {".toml", ".xml", ".mjcf", ".stl", ".obj", ".msh", ".png", ".skn", ".bin", ".hf"}
-# Limit for a server to describe a folder, s. It loads the folder within a minute of processor time first.
+# Maximum time for perturb-server to describe a task folder, s. Loading the folder may take up to a minute of CPU time.
 _LIMIT = 120.0
 
 
 def find_folder(task: str | os.PathLike[str] | None, server: object = None) -> TaskFolder | None:
-    """Find the folder that `task=` names; None if it names none.
+    """Return the task folder that the argument `task` names, or None if `task` is None.
 
     Raises:
-        InvalidArgumentError: for what is no such folder, and beside a server, which serves what it was started with.
+        InvalidArgumentError: if it is not a task folder, or if `server` is the address of a running server, which
+            serves the tasks that it was started with.
     """
     if task is None:
         return None
@@ -54,11 +55,11 @@ def find_folder(task: str | os.PathLike[str] | None, server: object = None) -> T
 
 @functools.lru_cache(maxsize=64)
 def entry(task: TaskFolder) -> Mapping[str, Any]:
-    """Return the description of the task, as in catalogue.json, by a server that serves the folder.
+    """Return the description of a task in the JSON format of catalogue.json. perturb-server loads the folder for it.
 
     Raises:
-        InvalidArgumentError: if the server refuses the folder, with its sentence.
-        ServerStartError: if there is no program, or it fails.
+        InvalidArgumentError: if perturb-server refuses the folder. The error has its message.
+        ServerStartError: if perturb-server was not found, or fails.
     """
     program = local_server.find_program()
     command = [str(program), "--private", "--log", "error", "--catalogue", "--task", task.path]
@@ -92,10 +93,19 @@ def _fingerprint(path: Path) -> str:
 def describe(
     environment: str | None, task: TaskFolder | None, server: Address | None = None, timeout: float = 60.0
 ) -> Description:
-    """Describe an environment: that of a task's folder, a built-in one, or one that the server has.
+    """Return the description of an environment.
+
+    With `task` it is the task in the folder. Otherwise the name is looked up among the built-in environments first, and
+    then among the environments of the server.
+
+    Args:
+        environment: the environment's name. It may be None with `task`.
+        task: the task folder, or None.
+        server: the address of a running server, or None.
+        timeout: maximum time to wait for the server's reply, s.
 
     Raises:
-        InvalidArgumentError: for an unknown name.
+        InvalidArgumentError: if the name is unknown, or is not the name of the task.
     """
     if task is not None:
         known = Description.read(entry(task))
@@ -120,7 +130,10 @@ def describe(
 
 
 def _served(server: Address, timeout: float) -> list[Description]:
-    """Return the environments of a server; none if it does not answer. The next request then raises the error."""
+    """Return the descriptions of a server's environments.
+
+    The list is empty if the server does not answer. The first request of a session then raises the error.
+    """
     try:
         told = _native.catalogue(str(server), timeout)
     except _native.Failure:

@@ -1,4 +1,4 @@
-"""Folders of tasks for `perturb-server --task`."""
+"""Makes task folders, for the argument `task` and for `perturb-server --task`, and registers their ids."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import gymnasium
 from .registration import register_id
 from .task_folder import entry, find_folder
 
-#: The tasks of Gymnasium that this package has task files for: ids and files.
+#: The task file of each Gymnasium task that this package can convert, by Gymnasium's id.
 GYMNASIUM_TASKS: Final[dict[str, str]] = {
     "Ant-v5": "ant_v5.toml",
     "HalfCheetah-v5": "half_cheetah_v5.toml",
@@ -29,7 +29,7 @@ GYMNASIUM_TASKS: Final[dict[str, str]] = {
     "Walker2d-v5": "walker2d_v5.toml",
 }
 
-#: The tasks of dm_control's suite that this package has task files for: domain and task, and files.
+#: The task file of each task of dm_control's suite that this package can convert, by domain and task.
 DM_CONTROL_TASKS: Final[dict[str, str]] = {
     "acrobot-swingup": "dm_acrobot_swingup.toml",
     "acrobot-swingup_sparse": "dm_acrobot_swingup_sparse.toml",
@@ -40,20 +40,20 @@ DM_CONTROL_TASKS: Final[dict[str, str]] = {
 
 
 def from_gymnasium(id: str, folder: str | Path) -> Path:  # noqa: A002 - Gymnasium calls it so
-    """Writes a folder of one of Gymnasium's MuJoCo tasks: the task file, Gymnasium's model and Gymnasium's licence.
+    """Write a task folder for one of Gymnasium's MuJoCo tasks: the task file, the model, and Gymnasium's licence.
 
-    The model comes from the installed package gymnasium. MuJoCo and Gymnasium's own dependencies on it are not needed.
+    The model is copied from the installed package gymnasium. The Python package mujoco is not needed.
 
     Args:
         id: the id in Gymnasium, such as "Walker2d-v5"; see `GYMNASIUM_TASKS`.
-        folder: where to write. It is made if it does not exist, and files of the same names are overwritten.
+        folder: the folder to write. It is created if necessary, and files of the same names are overwritten.
 
     Returns:
-        The folder, for `perturb-server --task`.
+        The folder, for `task` and `perturb-server --task`.
 
     Raises:
-        ValueError: there is no task file for this id.
-        FileNotFoundError: the installed gymnasium has no such model, or none is installed.
+        ValueError: if there is no task file for this id.
+        FileNotFoundError: if gymnasium is not installed, or its version has no such model.
     """
     if id not in GYMNASIUM_TASKS:
         raise ValueError(f"there is no task file for {id!r}; there are {', '.join(GYMNASIUM_TASKS)}")
@@ -63,21 +63,22 @@ def from_gymnasium(id: str, folder: str | Path) -> Path:  # noqa: A002 - Gymnasi
 
 
 def from_dm_control(task: str, folder: str | os.PathLike[str]) -> Path:
-    """Writes a folder of a task of dm_control's suite: the task file, dm_control's model and dm_control's licence.
+    """Write a task folder for a task of dm_control's suite: the task file, the model, and dm_control's licence.
 
-    The model comes from the installed package dm_control, whose dependencies are not needed: `pip install --no-deps
-    dm_control`. Observations and rewards are dm_control's; comments in the task file say what is not.
+    The model is copied from the installed package dm_control. Its dependencies are not needed, so `pip install
+    --no-deps dm_control` is enough. Observations and rewards equal those of dm_control. Comments in the task file list
+    everything that differs.
 
     Args:
         task: domain and task, such as "cheetah-run"; see `DM_CONTROL_TASKS`.
-        folder: where to write. It is made if it does not exist, and files of the same names are overwritten.
+        folder: the folder to write. It is created if necessary, and files of the same names are overwritten.
 
     Returns:
-        The folder, for `task=` and `perturb-server --task`.
+        The folder, for `task` and `perturb-server --task`.
 
     Raises:
-        ValueError: there is no task file for this task.
-        FileNotFoundError: the installed dm_control has no such model, or none is installed.
+        ValueError: if there is no task file for this task.
+        FileNotFoundError: if dm_control is not installed, or its version has no such model.
     """
     if task not in DM_CONTROL_TASKS:
         raise ValueError(f"there is no task file for {task!r}; there are {', '.join(DM_CONTROL_TASKS)}")
@@ -89,24 +90,28 @@ def from_dm_control(task: str, folder: str | os.PathLike[str]) -> Path:
 
 
 def register(folder: str | os.PathLike[str]) -> str:
-    """Registers the task of a folder, so that `gymnasium.make` finds it by the returned id, `perturb/MyRobot-v0`.
+    """Register the task in a folder with Gymnasium. Return its id, such as `perturb/MyRobot-v0`.
 
-    `gymnasium.make("perturb/Task-v0", task=folder)` makes it without this call.
+    Afterwards `gymnasium.make` accepts this id. Without registration, use
+    `gymnasium.make("perturb/Task-v0", task=folder)`.
 
     Raises:
-        InvalidArgumentError: for what is no such folder, with the reason.
+        InvalidArgumentError: if it is not a task folder. The message has the reason.
     """
     task = find_folder(folder)
     assert task is not None
     told = entry(task)
     identifier = f"perturb/{told['name']}-v{told['revision']}"
-    gymnasium.registry.pop(identifier, None)  # it may be of another folder
+    gymnasium.registry.pop(identifier, None)  # the id may belong to another folder
     register_id(identifier, environment=told["name"], task=task.path)
     return identifier
 
 
 def register_ids() -> None:
-    """Registers the ids of tasks that are made with `task=`: `perturb/Task-v0` for any, and those of the files here."""
+    """Register the ids of tasks from folders, for `gymnasium.make` with the argument `task`.
+
+    `perturb/Task-v0` is for any task. The tasks that this module can write have ids such as `perturb/Walker2dV5-v0`.
+    """
     register_id("perturb/Task-v0")
     for name in GYMNASIUM_TASKS:
         own = name.replace("-v5", "V5")
@@ -132,18 +137,18 @@ def _write(file: str, models: Path, target: Path, package: str, included: list[s
 
 
 def _model(task: str) -> str:
-    """Return the name of the model's file, which a task file states."""
+    """Return the name of the model file that a task file states."""
     line = next(line for line in task.splitlines() if line.startswith("model = "))
     return line.split('"')[1]
 
 
 def _assets() -> Path:
-    """The folder of Gymnasium's models."""
+    """Return the folder of Gymnasium's models."""
     return _package("gymnasium") / "envs" / "mujoco" / "assets"
 
 
 def _package(name: str) -> Path:
-    """The folder of a package. Importing its MuJoCo environments would need MuJoCo."""
+    """Return the folder of an installed package without importing it, because an import may need MuJoCo."""
     found = util.find_spec(name)
     if found is None or not found.submodule_search_locations:
         raise FileNotFoundError(f"the package {name} is missing; install it with: pip install {name}")
@@ -151,7 +156,7 @@ def _package(name: str) -> Path:
 
 
 def _licence(package: str) -> str:
-    """The licence of an installed package."""
+    """Return the licence text of an installed package."""
     with contextlib.suppress(metadata.PackageNotFoundError):
         for file in metadata.files(package) or []:
             if file.name.upper().startswith("LICENSE"):
@@ -159,7 +164,7 @@ def _licence(package: str) -> str:
     return f"This model is a part of {package}, which has {_LICENCES[package]}\n"
 
 
-# Licences of the packages, and where they stand.
+# The licence of each package and its address, for an installation without the licence file.
 _LICENCES = {
     "gymnasium": "the MIT licence: https://github.com/Farama-Foundation/Gymnasium",
     "dm_control": "the Apache License 2.0: https://github.com/google-deepmind/dm_control",

@@ -1,4 +1,4 @@
-"""Plays and records the tests of a policy, for the first time or again."""
+"""Plays and records the tests of a policy, and repeats recorded tests."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .task_folder import describe, find_folder
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of a test."""
+    """Settings of a policy's tests; see `evaluate`."""
 
     environment: str
     sets: list[_native.Set]
@@ -64,7 +64,8 @@ def replay(
         known, records = one.known, one.records
         acts, own_normalizer = given[one.trained_on]
         name = agent if records.policy == agent and not isinstance(acts, Policy) else None
-        # An own rule of success judged the records after they were played, and its function is not known here.
+        # Python judged these records by a rule that may be a function. The function is not stored, so `success` and
+        # `achieved` are not compared.
         own = success_rules.is_own(records.rule)
         settings = Settings(
             records.environment,
@@ -88,7 +89,7 @@ def replay(
 
 
 def _differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
-    """Return a sentence for each episode that differs."""
+    """Compare the columns of two records of the same episodes. Return a sentence for each episode that differs."""
     same: dict[str, Any] = {}
     for name, values in before.items():
         a, b = np.asarray(values), np.asarray(after[name])
@@ -111,12 +112,12 @@ def play(
     name: str | None,
     expected: str | None = None,
 ) -> tuple[str, PolicyRecords]:
-    """Test one policy. Return the agent's name in reports, and the records of the test.
+    """Test one policy on all sets. Return the policy's name in reports, and the records of the tests.
 
-    `expected` is the policy's name in the records that this test repeats, or None for a new test.
+    `expected` is the policy's name in the records of tests that are repeated, or None for new tests.
 
     Raises:
-        PolicyError: if the policy does not fit, or its name is not the expected one.
+        PolicyError: if the policy does not fit the environment, or if its name is not the expected one.
     """
     environment, observe = settings.environment, settings.observe
     names = [name for _, _, drawn, contexts in settings.sets for named in (drawn, *(contexts or ())) for name in named]
@@ -146,7 +147,7 @@ def play(
             "observe": seen,
             "timeout": settings.timeout,
         }
-        # The records of all sets have the disturbances that one of them names.
+        # All sets share one table of records. If one set names a disturbance, the others must have them, too.
         set_name, version, drawn, contexts = one_set
         if description.is_disturbed and not description.undisturbed.keys() & drawn.keys():
             first, value = next(iter(description.undisturbed.items()))
@@ -161,7 +162,7 @@ def play(
 
 
 def policies(policy: Any, trained_on: str | None, normalizer: Any) -> list[tuple[str | None, Any, Any]]:
-    """Return a tuple for each policy: the version that it was trained on, the policy, and its normaliser."""
+    """Return a tuple for each policy: its training version (None if unknown), the policy, and its normaliser."""
     if not isinstance(policy, Mapping):
         return [(None if trained_on is None else requests.version(trained_on, "trained_on"), policy, normalizer)]
     if trained_on is not None:
@@ -181,10 +182,10 @@ def policies(policy: Any, trained_on: str | None, normalizer: Any) -> list[tuple
 
 
 def _of_loaded(policy: Policy, environment: str, trained: str | None, observe: str | None) -> str:
-    """Return what a loaded policy observes.
+    """Return what a policy of `load_policy` observes: `state` or `parameters`.
 
     Raises:
-        PolicyError: if the policy was trained in another environment, or does not fit the other settings.
+        PolicyError: if its environment, training version or observations differ from the arguments.
     """
     if policy.environment != environment:
         raise PolicyError(f"the policy {policy.id} was trained in {policy.environment}, not in {environment}")
@@ -204,7 +205,7 @@ def _test(
     episodes_per_trial: int,
     show: Callable[[int, int], None],
 ) -> None:
-    """Play the episodes of one set."""
+    """Play and record the episodes of the test on one set, which is number `place` of the policy's sets."""
     _, version, drawn, contexts = one_set
     seed, num_envs = native(tests.plan, place)
     client = Client(

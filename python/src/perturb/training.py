@@ -1,4 +1,4 @@
-"""Train perturb's own policies from Python, by the program `perturb`."""
+"""Trainings with perturb's learner, run by the program `perturb` in a process of its own."""
 
 from __future__ import annotations
 
@@ -24,27 +24,28 @@ from .policy import Policy, load_policy
 from .progress import Progress
 
 PROGRAM = "perturb"
-# Variable that names the program.
+# Environment variable with the path of the program.
 VARIABLE = "PERTURB_PROGRAM"
-# The program inside a wheel, if the wheel has it.
+# Path of the program inside an installed wheel. Some wheels do not contain it.
 BUNDLED = Path(__file__).with_name("_programs") / PROGRAM
-# Seconds between two looks at a training's log.
+# Interval at which a training's log is read for the progress, s.
 _POLL_INTERVAL = 0.2
-# Exit status of the program for a wrong argument.
+# Exit status with which the program reports a wrong argument.
 _USAGE = 2
 
 
 @dataclass(frozen=True)
 class Training:
-    """A finished training."""
+    """The result of a finished training."""
 
     # The trained policy.
     policy: Policy
-    # Its folder: configuration, logs, TensorBoard scalars, checkpoint. `perturb train --resume` trains on there.
+    # The folder of the training: configuration, logs, TensorBoard scalars, checkpoint. `perturb train --resume`
+    # continues the training in this folder.
     folder: Path
-    # The columns of progress.csv, float64 [iterations] by name; NaN where there is no number.
+    # The columns of progress.csv by name, float64 [iterations]. Missing numbers are NaN.
     progress: Mapping[str, Any]
-    # The numbers that `perturb train --json` writes.
+    # The content of the file that `perturb train --json` writes.
     result: Mapping[str, Any]
 
 
@@ -64,27 +65,29 @@ def train(
     server: str | None = None,
     progress: bool | None = None,
 ) -> Training:
-    """Train a policy with perturb's learner, as `perturb train` does, and wait for it.
+    """Train a policy with perturb's learner, as `perturb train` does, and wait until the training has finished.
 
     Args:
-        environment: a name of docs/environments.md, such as `CartPole`.
-        version: the version that the parameters come from.
-        parameters: values that replace the version's: numbers, or texts such as `"0.3..0.4"`.
+        environment: the environment's name in docs/environments.md, such as `CartPole`.
+        version: the distribution of the parameters: `D` (the defaults), `R` (random), `E` (extreme), or `R+E`.
+        parameters: values that replace those of the version, by parameter: numbers, or texts such as `"0.3..0.4"`.
         algorithm: `ppo`, `a2c`, `epopt-ppo`, `epopt-a2c`, `rl2-ppo` or `rl2-a2c`.
-        architecture: `ff` or `rc`; `rc` needs an installation by `make install-recurrent`.
-        observe: `state` or `parameters`.
-        episodes: of the training; by default 15 000.
-        seed: fixes all randomness: the same seed gives the same policy, byte for byte.
+        architecture: the policy network: `ff` (feed-forward) or `rc` (recurrent). `rc` needs `perturb-recurrent`, which
+            `make install-recurrent` installs.
+        observe: `state`, or `parameters` to append the parameters to observations.
+        episodes: number of training episodes. By default 15 000.
+        seed: fixes all randomness. The same seed gives the same policy, byte for byte.
         settings: other settings of docs/algorithms.md, such as `{"learning_rate": 3e-3}`.
-        out: the folder of the run, which must be new or empty; by default `runs/<environment>-<algorithm>-<time>`.
-        overwrite: whether a run that is there is deleted.
-        server: `unix:/path` or `host:port`; None starts a private server.
-        progress: whether to show the episodes so far on standard error; by default on a terminal only.
+        out: the folder of the training, which must be new or empty. By default
+            `runs/<environment>-<algorithm>-<time>`.
+        overwrite: whether to delete a training that is in the folder.
+        server: the server's address, `unix:/path` or `host:port`. None starts a private server.
+        progress: whether to show the number of finished episodes on standard error. By default only on a terminal.
 
     Raises:
-        InvalidArgumentError: for what the program refuses, with its words.
-        ServerStartError: if the program is not there.
-        PerturbError: if the training fails, with the program's words.
+        InvalidArgumentError: if the program refuses an argument. The error has the program's message.
+        ServerStartError: if the program was not found.
+        PerturbError: if the training fails. The error has the program's message.
     """
     if server is not None and str(server) == EMBEDDED.target:
         raise InvalidArgumentError(
@@ -112,8 +115,8 @@ def train(
 
 
 def _run(command: list[str], folder: Path | None, episodes: int | None, progress: bool | None) -> None:
-    """Run the program to its end, and show how many episodes its log has."""
-    # If no server is given, the program starts the perturb-server on PATH. It must be the one of this package.
+    """Run the program until it ends, and show the number of episodes in its log."""
+    # The program may start the first perturb-server on PATH, so PATH begins with the folder of this package's server.
     environment = {**os.environ, "PATH": os.pathsep.join([str(find_server().parent), os.environ.get("PATH", "")])}
     shown = Progress(progress)
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)
@@ -126,7 +129,7 @@ def _run(command: list[str], folder: Path | None, episodes: int | None, progress
                 done = 0 if folder is None else _episodes_so_far(folder / "progress.csv")
                 if done and episodes:
                     shown.update(f"training in {folder}", min(done, episodes), episodes)
-    except BaseException:  # Ctrl-C: the program writes a checkpoint and ends
+    except BaseException:  # after Ctrl-C, the program writes a checkpoint and ends
         process.send_signal(signal.SIGINT)
         process.communicate()
         raise
@@ -141,7 +144,7 @@ def _episodes_so_far(log: Path) -> int:
     try:
         lines = log.read_text("utf-8").splitlines()
         return int(dict(zip(lines[0].split(","), lines[-1].split(","), strict=True))["rollout/episodes"])
-    except (OSError, ValueError, IndexError, KeyError):  # nothing was logged so far
+    except (OSError, ValueError, IndexError, KeyError):  # nothing is in the log yet
         return 0
 
 

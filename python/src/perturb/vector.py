@@ -1,4 +1,4 @@
-"""A batch of environments, as `gymnasium.vector.VectorEnv`: one round trip a step, whatever their number."""
+"""A batch of environments, as `gymnasium.vector.VectorEnv`. A step of the batch takes one round trip to the server."""
 
 from __future__ import annotations
 
@@ -25,43 +25,44 @@ if TYPE_CHECKING:
     from ._native import Stepped
 
 OPTIONS = ("parameters", "state", "reset_mask")
-# Beyond so many environments the server is asked whether it takes them before arrays are made for them.
+# A batch with more environments first asks the server whether it accepts them, before it allocates arrays.
 CHECKED_ENVIRONMENTS = 100_000
 
 
 class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
-    """N environments of a perturb-server.
+    """A batch of N environments of a perturb-server.
 
     Args:
-        environment: a name of docs/environments.md, such as `CartPole`; with `task` its name, or None.
-        num_envs: N.
-        version: where parameters come from: `D` their defaults, `R` random, `E` extreme, `R+E` one of
-            both, each in half of the trials.
-        server: `unix:/path`, `host:port`, or `embedded` for one in this process; None starts a private server.
-        task: the folder of a task, which the private or the embedded server then serves; see docs/tasks.md. The
-            environment is that of the folder.
-        parameters: replaces the version's set of the named parameters: a value, an interval `(low, high)`, or several
-            `[(low, high), …]`.
-        autoreset_mode: Gymnasium's mode, which decides what happens to environments whose episode has ended.
-        first_environment_index: the index of the first environment. A batch that is split gives the same bytes as a
-            whole one if each part has its place here, and seeds to match.
-        episodes_per_trial: parameters are drawn anew after so many episodes.
-        observe: `state`, or `parameters` for observations that have the episode's parameters at their end, scaled to
-            -1 … 1 over the range of R and E.
-        receipts: whether infos have parameters and receipt.
-        reward_terms: whether every step's infos have the terms of the reward.
-        copy: has no effect, and is accepted because Gymnasium's own vector environments have it. Observations and
-            pictures are always the caller's own to keep and to change.
-        timeout: how long a reply may take, s.
-        render_mode: `rgb_array` lets `render` draw; None.
+        environment: the environment's name in docs/environments.md, such as `CartPole`. With `task`, the name of the
+            task or None.
+        num_envs: the number N of environments.
+        version: the distribution of the parameters: `D` (the defaults), `R` (random), `E` (extreme), or `R+E`
+            (R or E, with probability ½ in each trial).
+        server: the server's address, `unix:/path` or `host:port`, or `embedded` for a server in this process. None
+            starts a private server.
+        task: the folder of a task to serve; see docs/tasks.md. It needs a private or an embedded server.
+        parameters: values that replace those of the version, by parameter: a number, an interval `(low, high)`, or
+            several intervals `[(low, high), …]`.
+        autoreset_mode: Gymnasium's AutoresetMode, which decides what happens to environments whose episode has ended.
+        first_environment_index: the index k of the first environment; environment i has index k + i. To split a batch
+            into parts that give the same bytes, pass the index and the seed of each part's first environment.
+        episodes_per_trial: the number of episodes after which parameters are drawn again.
+        observe: `state`, or `parameters` to append the episode's parameters to observations. They are scaled so that
+            the range of R and E together becomes -1 … 1.
+        receipts: whether infos have the keys `parameters` and `receipt`.
+        reward_terms: whether the infos of each step have the terms of the reward.
+        copy: has no effect. It exists because Gymnasium's own vector environments have it. Callers may always keep and
+            change observations and pictures.
+        timeout: maximum time to wait for a reply, s.
+        render_mode: `rgb_array` to make `render` available, or None.
         width: width of pictures, in pixels.
         height: height of pictures, in pixels.
-        contexts: a list of at most N contexts, values of parameters by name, or a grid or list of `perturb.sets`.
-            Environment i has context i modulo their number in all its episodes. The version and `parameters` decide
-            about parameters that a context does not name. A reset's parameters replace those of contexts.
-        max_episode_steps: no other than the server's step limit; `make_vec` passes it on.
+        contexts: a list of C contexts, at most N, or a grid or list of `perturb.sets`. A context has a value of each
+            parameter that it names. Environment i has context i modulo C in all episodes. Other parameters come from
+            the version and `parameters`. Parameters of a reset replace those of contexts.
+        max_episode_steps: must be None or the server's step limit. `gymnasium.make_vec` passes it.
 
-    The connection is made by the first `reset`. Rewards are float32 [N], flags bool [N].
+    The first `reset` connects to the server. Rewards are float32 [N]; terminated and truncated flags are bool [N].
     """
 
     _spec: EnvSpec | None = None
@@ -127,17 +128,17 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._encode = partial(requests.actions, description=description, shape=self.action_space.shape or ())
         self._reward_terms = reward_terms
-        # Parameters that act from the next episode on, by slot.
+        # Parameters that take effect in the next episode, by slot.
         self._next_parameters: dict[int, requests.Intervals] = {}
-        # In next-step mode: environments whose next step is an autoreset, which has no reward and no reward terms. Kept
-        # only if something depends on it.
+        # In next-step mode, the mask of environments whose next step is an autoreset. Such a step has no reward and no
+        # reward terms. The mask is updated only if `_keeps_resetting` is true.
         self._resetting = np.zeros(self.num_envs, dtype=np.bool_)
         self._keeps_resetting = reward_terms
         self._is_made = True
 
     @property
     def spec(self) -> EnvSpec | None:
-        """The specification from which Gymnasium made the batch, with the server's step limit."""
+        """The specification from which `gymnasium.make_vec` made the batch, with the server's step limit."""
         return self._spec
 
     @spec.setter
@@ -153,21 +154,25 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         """Begin the next episodes.
 
         Args:
-            seed: environment i begins the first episode of the seed s + i, or of the i-th of N seeds; without it, or
-                where that is None, the next episode of its last seed (at the first reset a random seed).
-            options: `parameters`, as at `make`, from now on; `state`, exact initial states [M, S] for this episode;
-                `reset_mask`, bool [N], which environments are reset, by default all.
+            seed: a seed s, with which environment i begins the first episode of the seed s + i; or a list of N seeds.
+                Without a seed, or where the list has None, an environment begins the next episode of its last seed. At
+                the first reset the default seed is random.
+            options: the key `reset_mask`, bool [N], selects the M environments to reset, by default all. The key
+                `parameters` changes parameters from now on, as in the constructor. The key `state` sets exact initial
+                states [M, S] for this episode.
 
         Raises:
-            InvalidArgumentError: and nothing has changed.
-            ServerConnectionError, ServerTimeoutError, ServerStartError: and the environments are gone; a later reset
-                opens another session.
+            InvalidArgumentError: if an argument is wrong. Nothing has changed.
+            ServerConnectionError: if the server cannot be reached, or the connection broke. The environments are lost;
+                a later reset opens another session.
+            ServerTimeoutError: if the server did not reply in time. The environments are lost, too.
+            ServerStartError: if the private server did not start.
         """
         given = requests.options(options, OPTIONS)
         mask = None
         if given.get("reset_mask") is not None:
             mask = requests.mask(given["reset_mask"], self.num_envs, "options['reset_mask']")
-            self._client.session.require_usable()  # a new one would hold other episodes than the mask leaves alone
+            self._client.session.require_usable()  # a new session would also reset environments outside the mask
         selected = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
         seeds = requests.seeds(seed, self.num_envs)
         parameters = requests.distributions(given.get("parameters"))
@@ -194,7 +199,7 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         parameters: requests.Intervals,
         states: bytes,
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin the next episodes of the selected environments: one request for all that are reset alike."""
+        """Begin the next episodes of the selected environments. Equal resets share one request."""
         alike: dict[Any, list[int]] = {}
         for place, slot in enumerate(selected):
             own = self._next_parameters.get(slot)
@@ -223,17 +228,18 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         return observations, infos
 
     def set_parameters(self, parameters: requests.Parameters, mask: NDArray[np.bool_] | None = None) -> None:
-        """Change the physics from the next episode of each environment on.
+        """Change parameters of the physics from the next episode of each environment on.
 
-        The running episode of an environment keeps its parameters. When the episode has ended, its environment is reset
-        once more, so one episode index is passed over. While several steps are under way, the change waits.
+        The current episode of an environment keeps its parameters. At its end, the environment is reset a second time,
+        so one episode index is skipped. The change waits until there are no unreceived steps.
 
         Args:
-            parameters: as at `make`. Other parameters stay as they are.
-            mask: bool [N], the environments; by default all.
+            parameters: values by parameter, as in the constructor. Other parameters keep their distribution.
+            mask: bool [N], selects the environments to change, by default all.
 
         Raises:
-            UnknownNameError, InvalidArgumentError: for wrong names and values; nothing has changed.
+            UnknownNameError: if there is no such parameter. Nothing has changed.
+            InvalidArgumentError: if a value is malformed or out of bounds. Nothing has changed.
         """
         values = requests.parameter_values(parameters, self._description)
         slots = range(self.num_envs) if mask is None else np.flatnonzero(requests.mask(mask, self.num_envs, "mask"))
@@ -246,52 +252,57 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
     def step(
         self, actions: Any
     ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Advance every environment by one step. Actions beyond the range of a Box are clipped by the environment.
+        """Advance every environment by one step. Environments clip continuous actions to the range of the action space.
 
         Raises:
-            InvalidArgumentError: and no environment has moved.
-            OutOfOrderError: before the first reset; with autoreset disabled, if an episode has ended and was not reset.
-            ServerConnectionError, ServerTimeoutError: and the environments are gone.
+            InvalidArgumentError: if an action is wrong. No environment has moved.
+            OutOfOrderError: before the first reset; with autoreset disabled, also if an environment whose episode has
+                ended was not reset.
+            ServerConnectionError: if the connection broke. The environments are lost.
+            ServerTimeoutError: if the server did not reply in time. The environments are lost.
         """
         return self._outcome(self._client.session.step(actions, self._encode))
 
     def send(self, actions: Any) -> None:
-        """Send the actions of a step without waiting for its outcome, which `recv` returns.
+        """Send the actions of a step without waiting for the reply. `recv` returns the step's outcome.
 
-        Several batches can step at the same time in this way, each in a session of its own. One batch can have up to 64
-        steps under way, if the actions do not depend on the outcomes of these steps.
+        Several batches can thus step at the same time, each in its own session. One batch can have up to 64 unreceived
+        steps. This is useful if actions do not depend on the outcomes of these steps.
 
         Raises:
-            InvalidArgumentError: for a wrong shape or kind of numbers; `recv` raises it for wrong values.
-            OutOfOrderError: before the first reset, or if 64 steps are under way.
-            ServerConnectionError, ServerTimeoutError: and the environments are gone.
+            InvalidArgumentError: if the actions have a wrong shape or type. For wrong values, `recv` raises it.
+            OutOfOrderError: before the first reset, or if there are 64 unreceived steps.
+            ServerConnectionError: if the connection broke. The environments are lost.
+            ServerTimeoutError: if the request could not be sent in time. The environments are lost.
         """
         self._client.session.send(actions, self._encode)
 
     def recv(
         self,
     ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Receive the oldest step that was sent and not received, as `step` returns it.
+        """Wait for the oldest step that `send` sent, and return its outcome in the form of `step`.
 
-        Until all are received, nothing but `send` and `recv` may be called.
+        While there are unreceived steps, only `send` and `recv` may be called.
 
         Raises:
-            InvalidArgumentError: if an action is wrong. No environment moves in this step; later steps are still made.
-            OutOfOrderError: if no step is under way; with autoreset disabled, if an episode has ended.
-            ServerConnectionError, ServerTimeoutError: and the environments are gone.
+            InvalidArgumentError: if an action is wrong. No environment moves in this step. Later steps still run.
+            OutOfOrderError: if there is no unreceived step; with autoreset disabled, also if an environment whose
+                episode has ended was not reset.
+            ServerConnectionError: if the connection broke. The environments are lost.
+            ServerTimeoutError: if the server did not reply in time. The environments are lost.
         """
         return self._outcome(self._client.session.recv())
 
     def snapshot(self, mask: NDArray[np.bool_] | None = None) -> list[bytes]:
-        """Save the M environments that the mask [N] selects, by default all, as M bytes objects in order."""
+        """Save the M environments that the mask [N] selects, by default all. Return M snapshots in the same order."""
         return self._client.snapshot(None if mask is None else requests.mask(mask, self.num_envs, "mask"))
 
     def restore(self, snapshots: Sequence[bytes], mask: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-        """Restore saved environments into the M slots that the mask [N] selects, by default all.
+        """Restore M snapshots into the environments that the mask [N] selects, by default all.
 
         Returns the observations [N, O]. Restored environments have the observations at which they were saved, and the
-        others have their last ones. The same actions then give the same bytes as after the snapshot. If one environment
-        cannot be restored, none is.
+        others have their last ones. The same actions then give the same bytes as after the snapshot. If one snapshot
+        cannot be restored, no environment changes.
         """
         selected = None
         if mask is not None:
@@ -305,18 +316,19 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
     def render(self) -> tuple[NDArray[np.uint8], ...]:
         """Draw the present state of each environment, as an RGB picture, uint8 [height, width, 3].
 
-        In same-step mode the environment of an ended episode is at the start of the next one already.
+        In same-step mode, an environment whose episode just ended shows the start of its next episode.
 
         Raises:
             OutOfOrderError: before the first reset, or without `render_mode="rgb_array"`.
-            RenderError: if the server cannot draw; it says what is missing.
-            ServerConnectionError, ServerTimeoutError: and the environments are gone.
+            RenderError: if the server cannot draw. The message has the reason.
+            ServerConnectionError: if the connection broke. The environments are lost.
+            ServerTimeoutError: if the server did not reply in time. The environments are lost.
         """
         return tuple(self._client.render(slot) for slot in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002
         """Free the environments on the server."""
-        # An environment whose settings were refused has no client. Older Gymnasiums close it all the same.
+        # If the constructor raised an error, there is no client. Older versions of Gymnasium close the object anyway.
         if hasattr(self, "_client"):
             self._client.close()
 
