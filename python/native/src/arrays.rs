@@ -1,7 +1,7 @@
-//! The protocol's bytes as NumPy arrays.
+//! Conversion of the protocol's bytes to NumPy arrays.
 //!
-//! Numbers are copied once, out of the received message into memory of the array's own: within the message they lie at
-//! any address, where NumPy would be slow and PyTorch refuse them.
+//! Each array is a copy, because numbers in a received message may be misaligned. NumPy is slow with misaligned arrays,
+//! and PyTorch refuses them. Python may change the arrays.
 
 use numpy::ndarray::Array2;
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
@@ -9,30 +9,31 @@ use pyo3::prelude::*;
 
 use crate::failure::{MALFORMED, failure};
 
-/// Length of rows that are short.
+/// Maximum length of a row for which [`row`] is faster than [`floats`].
 const MAX_SHORT_ROW: usize = 64;
 
-/// float32 `[n]`, to change.
+/// Returns the bytes as an array, float32 `[n]`.
 ///
 /// # Errors
-/// If there are more or fewer.
+/// If the bytes are not `n` numbers.
 pub fn floats<'py>(py: Python<'py>, data: &[u8], n: usize) -> PyResult<Bound<'py, PyArray1<f32>>> {
     Ok(PyArray1::from_vec(py, numbers(data, &[n])?))
 }
 
-/// float32 `[rows, columns]`, to change.
+/// Returns the bytes as an array, float32 `[rows, columns]`.
 ///
 /// # Errors
-/// If there are more or fewer.
+/// If the bytes are not `rows · columns` numbers.
 pub fn rows<'py>(py: Python<'py>, data: &[u8], rows: usize, columns: usize) -> PyResult<Bound<'py, PyArray2<f32>>> {
     let numbers = Array2::from_shape_vec([rows, columns], numbers(data, &[rows, columns])?);
     Ok(PyArray2::from_owned_array(py, numbers.map_err(|error| failure(MALFORMED, 0, error.to_string()))?))
 }
 
-/// float32 `[n]` of few numbers, to change: memory of NumPy's costs less than a vector that it has to free.
+/// Returns the bytes as an array, float32 `[n]`. It is faster than [`floats`] for short rows, because it copies them
+/// into memory that NumPy allocates.
 ///
 /// # Errors
-/// If there are more or fewer.
+/// If the bytes are not `n` numbers.
 pub fn row<'py>(py: Python<'py>, data: &[u8], n: usize) -> PyResult<Bound<'py, PyArray1<f32>>> {
     let (mut row, (words, rest)) = ([0.0; MAX_SHORT_ROW], data.as_chunks::<4>());
     if words.len() != n || !rest.is_empty() || n > MAX_SHORT_ROW {
@@ -42,10 +43,10 @@ pub fn row<'py>(py: Python<'py>, data: &[u8], n: usize) -> PyResult<Bound<'py, P
     Ok(PyArray1::from_slice(py, &row[..n]))
 }
 
-/// bool `[n]`, to change.
+/// Returns the bytes as an array, bool `[n]`. Each byte that is not 0 is true.
 ///
 /// # Errors
-/// If there are more or fewer.
+/// If there are not `n` bytes.
 pub fn flags<'py>(py: Python<'py>, data: &[u8], n: usize) -> PyResult<Bound<'py, PyArray1<bool>>> {
     if data.len() != n {
         return Err(failure(MALFORMED, 0, format!("the server sent {} flags; expected {n}", data.len())));
@@ -53,18 +54,18 @@ pub fn flags<'py>(py: Python<'py>, data: &[u8], n: usize) -> PyResult<Bound<'py,
     Ok(PyArray1::from_vec(py, data.iter().map(|&flag| flag != 0).collect()))
 }
 
-/// uint8 `[height, width, 3]`, to change; the caller has compared the sizes.
+/// Returns the pixels as an array, uint8 `[height, width, 3]`. The caller has checked the number of bytes.
 ///
 /// # Errors
-/// NumPy's.
+/// If NumPy cannot reshape the array.
 pub fn picture<'py>(py: Python<'py>, data: &[u8], size: [usize; 3]) -> PyResult<Bound<'py, PyArray3<u8>>> {
     PyArray1::from_slice(py, data).reshape(size)
 }
 
-/// Little-endian float32 numbers, as many as an array of this shape has.
+/// Decodes little-endian float32 numbers.
 ///
 /// # Errors
-/// If there are more or fewer.
+/// If their number is not that of an array with this shape.
 pub fn numbers(data: &[u8], shape: &[usize]) -> PyResult<Vec<f32>> {
     let (words, rest) = data.as_chunks::<4>();
     let expected = shape.iter().try_fold(1_usize, |size, length| size.checked_mul(*length));

@@ -1,4 +1,4 @@
-//! Assessments: an agent's recorded tests as folders, and as reports beside experiments.
+//! The Python class of an assessment, which reads and writes folders of recorded tests, and the report page.
 
 use std::path::PathBuf;
 
@@ -10,11 +10,11 @@ use pyo3::prelude::*;
 use crate::failure::{INVALID, failure};
 use crate::records::Records;
 
-/// Facts about a policy beside its records: the version that it was trained on, the steps of its training, the seed of
-/// its tests, their episodes, what it observed, and whether it was deterministic.
+/// The fields of [`PolicyMetadata`] for Python: training version, training steps, seed of the tests, episodes of each
+/// test, observations, and whether the policy was deterministic.
 type KnownOf = (Option<String>, Option<u64>, u64, u64, String, Option<bool>);
 
-/// The tests of an agent in one environment.
+/// The recorded tests of one policy, or of several related policies, in one environment.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Assessment(ExternalEvaluation);
 
@@ -35,18 +35,18 @@ impl Assessment {
         ExternalEvaluation::read(&path).map(Self).map_err(refused)
     }
 
-    /// Writes the assessment into a folder. `overwrite` permits replacing the one that is there.
+    /// Writes the assessment into a folder. `overwrite` permits it to replace an assessment in the folder.
     fn write(&self, path: PathBuf, overwrite: bool) -> PyResult<()> {
         self.0.write(&path, overwrite).map_err(refused)
     }
 
-    /// The agent's name in reports.
+    /// The name of the policies in reports.
     #[getter]
     fn agent(&self) -> &str {
         &self.0.agent
     }
 
-    /// Returns the policies with their records.
+    /// Returns the metadata and the records of each policy.
     fn policies(&self) -> Vec<(KnownOf, Records)> {
         let of = |policy: &ExternalPolicy| {
             let PolicyMetadata { trained_on, timesteps, seed, episodes, observe, deterministic } = policy.known.clone();
@@ -58,7 +58,7 @@ impl Assessment {
     }
 }
 
-/// The report page of assessments, and of the experiments and assessments in the folders `beside`, as HTML.
+/// Returns the report page of `assessments`, and of the experiments and assessments in the folders `beside`, as HTML.
 #[pyfunction]
 pub fn report_page(py: Python<'_>, assessments: Vec<PyRef<'_, Assessment>>, beside: Vec<PathBuf>) -> PyResult<String> {
     let assessed = assessments.iter().map(|one| one.0.clone()).collect();

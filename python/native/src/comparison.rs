@@ -1,4 +1,4 @@
-//! Conditions compared, for Python: the same numbers and sentences as those of `perturb compare`.
+//! The comparison of conditions for Python. It returns the numbers and sentences of `perturb compare`.
 
 use perturb_records::comparison::{self, ComparedCondition, ComparedScore};
 use pyo3::prelude::*;
@@ -6,10 +6,11 @@ use pyo3::prelude::*;
 use crate::failure::{INVALID, failure};
 use crate::records::Records;
 
-/// A condition: its name, and its policies by key. Policies of two conditions with the same key are a pair.
+/// A condition: its name, and its policies, each with a key. Policies of two conditions are paired by equal keys.
 type NamedCondition<'py> = (String, Vec<(String, PyRef<'py, Records>)>);
 
-/// Compares conditions in the tests on the given sets by `success`, `return` or `length`. Returns JSON.
+/// Compares conditions by their scores in the tests on the given sets. `score` is `success`, `return` or `length`.
+/// Returns JSON.
 #[pyfunction]
 #[pyo3(signature = (conditions, sets, score, baseline))]
 pub fn compare(

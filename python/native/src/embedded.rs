@@ -1,4 +1,4 @@
-//! The embedded server: the same pool and the same handler of sessions as in `perturb-server`, in this process.
+//! The embedded server: runs the pool and the session handler of `perturb-server` in this process.
 
 use std::collections::VecDeque;
 use std::future::{Future, poll_fn};
@@ -19,11 +19,11 @@ use tonic::Status;
 
 use crate::failure::{INVALID, LOST, MISMATCH, REFUSED, RequestFailure, UNREACHABLE, failure};
 
-/// A task's folder, as Python names it: the program that loads it first, its path, and the digest of its files.
+/// A task folder in Python's form: the path of `perturb-server`, the path of the folder, and the digest of its files.
 type TaskFolder = (PathBuf, PathBuf, String);
 
-/// Catalogues with the task of a folder, by its path and digest. What a folder holds stays in memory until the process
-/// ends, so each is loaded once.
+/// The catalogues with the task of a folder, by the folder's path and digest. A loaded task stays in memory until the
+/// process ends, so each folder is loaded only once.
 #[cfg(feature = "mujoco")]
 static LOADED: Mutex<Vec<((PathBuf, String), Catalogue)>> = Mutex::new(Vec::new());
 
@@ -46,10 +46,10 @@ fn catalogue_with(_: TaskFolder) -> PyResult<Catalogue> {
     Err(failure(INVALID, 0, "this package was built without MuJoCo, which task= needs here: leave server= out"))
 }
 
-/// A server in this process. Its sessions end with it.
+/// The embedded server as a Python class. Its sessions end when it is closed.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct NativeServer {
-    /// `None` after [`end`](Self::end).
+    /// `None` after [`close`](Self::close).
     server: Mutex<Option<Arc<server::EmbeddedServer>>>,
     /// The process that started the server.
     owner: u32,
@@ -57,8 +57,8 @@ pub struct NativeServer {
 
 #[pymethods]
 impl NativeServer {
-    /// Starts the server's threads. The server also serves the task in the folder `task`, if one is given. A
-    /// perturb-server in a process of its own loads the task first, because a model may end the process that loads it.
+    /// Starts the server's threads. If `task` is given, the server also serves that task folder. A separate
+    /// `perturb-server` process loads the task first, because a broken model can kill the process that loads it.
     #[new]
     #[pyo3(signature = (task = None))]
     fn new(py: Python<'_>, task: Option<TaskFolder>) -> PyResult<Self> {
@@ -69,7 +69,7 @@ impl NativeServer {
         Ok(Self { server: Mutex::new(Some(Arc::new(server))), owner: std::process::id() })
     }
 
-    /// Ends the threads. Close the sessions first.
+    /// Ends the server's threads. Close its sessions first.
     fn close(&self, py: Python<'_>) {
         if std::process::id() == self.owner {
             let server = self.server.lock().unwrap_or_else(PoisonError::into_inner).take();
@@ -96,17 +96,18 @@ impl Drop for NativeServer {
 
 /// The answer to a request: a response, or the status that ends the session.
 type Answer = Result<SessionResponse, Status>;
-/// A request under way, which owns the session meanwhile.
+/// The future of a running step. It owns the session, and returns it with the answer.
 type StepUnderWay = Pin<Box<dyn Future<Output = (server::EmbeddedSession, Answer)> + Send>>;
 
-/// A session of the embedded server. Steps may be sent ahead; replies are taken in the order of their requests.
+/// A session of the embedded server. Steps may be sent before earlier replies are received. Replies come in the order
+/// of the requests.
 pub struct EmbeddedStream {
-    /// None while a step that was sent ahead is under way.
+    /// `None` while a step is running.
     session: Option<server::EmbeddedSession>,
     running: Option<StepUnderWay>,
-    /// Hands the step after the running one to the pool. `None` once that step was handed over.
+    /// Queues the step after the running one in the pool. `None` after it was called.
     offer: Option<Box<dyn FnOnce(SessionRequest) + Send>>,
-    /// Steps that wait for the running one.
+    /// Steps that wait until the running one has finished.
     waiting: VecDeque<SessionRequest>,
     /// Answers that were not received yet.
     answers: VecDeque<Answer>,
@@ -132,7 +133,8 @@ impl EmbeddedStream {
         })
     }
 
-    /// Makes a request, or none if it was sent before, and takes the reply.
+    /// Sends a request and waits for its reply. `None` sends nothing and waits for the reply to the oldest step that
+    /// [`send`](Self::send) sent.
     ///
     /// # Errors
     /// [`RequestFailure`].
@@ -143,7 +145,7 @@ impl EmbeddedStream {
         }
     }
 
-    /// Makes a request and takes its reply. No step may be under way.
+    /// Sends a request and waits for its reply. All earlier steps must have been received.
     ///
     /// # Errors
     /// [`RequestFailure`].
@@ -157,7 +159,8 @@ impl EmbeddedStream {
         })
     }
 
-    /// Begins a step, or queues it behind the steps that were sent before. Must be called in the context of a tokio runtime.
+    /// Begins a step, or queues it behind the steps that were sent before. Must be called in the context of a tokio
+    /// runtime.
     pub fn send(&mut self, step: proto::Step) {
         let request = SessionRequest { request: Some(step.into()) };
         self.waiting.push_back(request);
@@ -165,7 +168,7 @@ impl EmbeddedStream {
         self.advance();
     }
 
-    /// Waits for the oldest step.
+    /// Waits for the reply to the oldest step that was sent and not received.
     ///
     /// # Errors
     /// [`RequestFailure`].
@@ -180,7 +183,7 @@ impl EmbeddedStream {
         reply::<A>(answer)
     }
 
-    /// Starts the steps in `waiting` one after another, until one does not finish at its first poll.
+    /// Starts the steps in `waiting` in order, until one of them does not finish at once.
     fn advance(&mut self) {
         while self.running.is_none() {
             let Some(request) = self.waiting.pop_front() else { return };
@@ -203,12 +206,12 @@ impl EmbeddedStream {
         }
     }
 
-    /// Offers the next step to the pool, so that it begins when the running one ends.
+    /// Queues the next step in the pool, so that it begins as soon as the running step ends.
     fn offer_next(&mut self) {
         if let Some(next) = self.waiting.front()
             && let Some(offer) = self.offer.take()
         {
-            offer(next.clone()); // the bytes of its actions are shared
+            offer(next.clone()); // a cheap clone, which shares the bytes of the actions
         }
     }
 }
@@ -224,12 +227,12 @@ fn reply<A: TypedRequest>(answer: Answer) -> Result<A::Reply, RequestFailure> {
     }
 }
 
-/// The failure of a stream that is used in a wrong order.
+/// Returns the failure for a bug in this module, when a stream is used in a wrong order.
 fn defect() -> RequestFailure {
     RequestFailure::Ended(failure(MISMATCH, 0, "no session: a defect of the native module"))
 }
 
-/// Polls a future once. A future that is ready at once needs neither a runtime nor a wake-up.
+/// Polls a future once, and returns its output if it is ready. This needs no runtime.
 pub fn poll_once<T>(future: Pin<&mut (dyn Future<Output = T> + Send + '_)>) -> Option<T> {
     match future.poll(&mut Context::from_waker(Waker::noop())) {
         Poll::Ready(come) => Some(come),

@@ -1,16 +1,17 @@
-//! A table of episodes with their receipts, from which infos are made.
+//! A table of episodes with their receipts. Infos are built from it.
 
 use perturb_protocol::proto;
 use pyo3::prelude::*;
 
 use crate::failure::{MALFORMED, failure};
 
-/// Episodes with their receipts.
+/// Episodes with their receipts, one row each.
 #[derive(Default)]
 pub struct EpisodeTable {
-    /// Slot in the batch, indices of environment, trial and episode, and the episode's number in its trial.
+    /// For each of `m` episodes: slot in the batch, environment index, trial index, episode index, and the episode's
+    /// number in its trial.
     pub episodes: Vec<[u64; 5]>,
-    /// `[m, P + Q]`: what was requested, then what was applied.
+    /// `[m, P + Q]`: the requested values of each episode, and then its applied values.
     values: Vec<f64>,
     /// Number of requested values P.
     requested: usize,
@@ -24,10 +25,10 @@ impl EpisodeTable {
         Self { requested, width: requested + applied, ..Self::default() }
     }
 
-    /// Adds messages; those without a receipt are left out.
+    /// Adds the episodes of messages. Messages without a receipt are skipped.
     ///
     /// # Errors
-    /// If receipts have other lengths.
+    /// If a receipt has a wrong number of values.
     pub fn with_messages<'a>(mut self, messages: impl Iterator<Item = EpisodeMessage<'a>>) -> PyResult<Self> {
         for (slot, episode, receipt) in messages {
             let (Some(episode), Some(receipt)) = (episode, receipt) else { continue };
@@ -42,7 +43,8 @@ impl EpisodeTable {
         Ok(self)
     }
 
-    /// Reads arrays into two tables; the first has the first `ended` episodes.
+    /// Decodes the protocol's arrays of `episodes` (uint64 `[m, 5]`) and `values` (float64 `[m, P + Q]`). Returns a
+    /// table of the first `ended` episodes and a table of the others.
     ///
     /// # Errors
     /// If the lengths of the arrays do not match.
@@ -65,7 +67,7 @@ impl EpisodeTable {
         self.episodes.iter().copied().zip(self.values.chunks(self.width.max(1)))
     }
 
-    /// Returns the receipt of the `index`th episode, without the model's hash, which the session knows.
+    /// Returns the receipt of the `index`th episode, with the given model hash.
     pub fn receipt(&self, index: usize, model_hash: &str) -> Option<proto::Receipt> {
         let (_, values) = self.rows().nth(index)?;
         let (requested, applied) = values.split_at(self.requested);
@@ -73,10 +75,10 @@ impl EpisodeTable {
     }
 }
 
-/// A message about an episode: its slot, and the episode and the receipt if the message has them.
+/// The content of a message about an episode: its slot, and the episode and the receipt if the message has them.
 pub type EpisodeMessage<'a> = (u32, Option<&'a proto::Episode>, Option<&'a proto::Receipt>);
 
-/// The error for episodes that do not fit the batch.
+/// Returns the error for episodes that do not fit the batch.
 pub fn mismatched_episodes() -> PyErr {
     failure(MALFORMED, 0, "the server sent episodes that do not fit the batch, or receipts of other lengths")
 }

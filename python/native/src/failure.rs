@@ -1,4 +1,4 @@
-//! Failures as data. The package turns them into errors with sentences.
+//! The exception `Failure` of the native module. The Python package converts it to its own errors with full messages.
 
 use perturb_protocol::{ClientError, Malformed};
 use pyo3::create_exception;
@@ -9,10 +9,10 @@ create_exception!(
     perturb._native,
     Failure,
     PyException,
-    "Arguments: the kind of failure, a gRPC code or 0, and the other side's or the transport's words."
+    "A failure of the native module. Its arguments are the kind of failure, a gRPC status code or 0, and a message."
 );
 
-/// Kind of failure: the server refused a request and says why. The session goes on.
+/// Kind of failure: the server refused a request. The message has the reason. The session can be used further.
 pub const REFUSED: &str = "refused";
 /// Kind of failure: no connection could be made.
 pub const UNREACHABLE: &str = "unreachable";
@@ -20,28 +20,27 @@ pub const UNREACHABLE: &str = "unreachable";
 pub const LOST: &str = "lost";
 /// Kind of failure: a reply did not come in time.
 pub const TIMED_OUT: &str = "timed out";
-/// Kind of failure: the reply belongs to another kind of request.
+/// Kind of failure: the server sent the reply to another kind of request.
 pub const MISMATCH: &str = "mismatch";
 /// Kind of failure: the arrays of a reply have a wrong length.
 pub const MALFORMED: &str = "malformed";
-/// Kind of failure: a value cannot be sent.
+/// Kind of failure: an argument is invalid.
 pub const INVALID: &str = "invalid";
 /// Kind of failure: the session has ended, belongs to another process, or is in use by another thread.
 pub const UNUSABLE: &str = "unusable";
-
 /// Kind of failure: a policy cannot be loaded, does not fit the environment, or cannot act.
 pub const POLICY: &str = "policy";
 
-/// Why a request has no reply.
+/// The reason why a request has no reply.
 pub enum RequestFailure {
-    /// The server refused the request and says why. The session goes on.
+    /// The server refused the request. The session can be used further.
     Refused(PyErr),
     /// The session has ended.
     Ended(PyErr),
 }
 
 impl RequestFailure {
-    /// The failure for Python.
+    /// Returns the Python error.
     pub fn into_error(self) -> PyErr {
         match self {
             Self::Refused(error) | Self::Ended(error) => error,
@@ -49,20 +48,21 @@ impl RequestFailure {
     }
 }
 
-/// gRPC's code for a failed authentication: the client does not trust the server, or the server refuses the client.
+/// The gRPC status code for failed authentication: the client does not trust the server, or the server refuses the
+/// client.
 const UNAUTHENTICATED: i32 = 16;
 
-/// A failure for Python.
+/// Makes a `Failure` exception from its kind, gRPC status code and message.
 pub fn failure(kind: &'static str, code: i32, words: impl Into<String>) -> PyErr {
     Failure::new_err((kind, code, words.into()))
 }
 
-/// A reply whose content breaks the protocol.
+/// Makes the `Failure` exception for a reply that breaks the protocol.
 pub fn malformed(error: &Malformed) -> PyErr {
     failure(MALFORMED, 0, format!("the server sent {error}"))
 }
 
-/// Converts an error of the protocol's client for Python.
+/// Converts an error of the protocol's client to a `Failure` exception.
 pub fn from_client(error: &ClientError) -> PyErr {
     match error {
         ClientError::Refused { code, message, .. } => failure(REFUSED, *code as i32, message),

@@ -1,20 +1,21 @@
-//! The dictionaries `info` and `infos`. They are filled in Rust, column by column. Filling them in Python took longer than
-//! the steps of the environments.
+//! The dictionaries `info` (of one environment) and `infos` (of a batch). They are filled in Rust, because filling them
+//! in Python took longer than the steps of the environments.
 //!
-//! A reset's info has, if receipts were asked for:
+//! With receipts, the info of a reset has these keys:
 //!
-//! - `parameters`: what was drawn or given, by name;
-//! - `receipt`: which episode this is (`environment_index`, `trial_index`, `episode_index`), `applied`, the values read
-//!   back from the physics, by name, and `model_hash`, the 32 bytes of the model's SHA-256, zeros without a model: a number
-//!   as all others, because libraries that convert infos to other arrays cannot convert text;
+//! - `parameters`: the requested value of each parameter, by name;
+//! - `receipt`: a dictionary with the episode's `environment_index`, `trial_index` and `episode_index`; `applied`, the
+//!   values that were read back from the physics, by name; and `model_hash`, the 32 bytes of the model's SHA-256, or
+//!   zeros without a model. The hash is numbers, because libraries that convert infos to other arrays cannot convert
+//!   text;
 //! - `context_id`: the trial's index, which counts the draws of parameters.
 //!
-//! The info of an episode's last step has these too, `is_success`, `diverged` and `achieved`, the value of the quantity that
-//! the rule of success compares, NaN where nothing was achieved. Every step's has `reward_terms`, if they were asked for.
-//! Nothing in them depends on the clock.
+//! The info of an episode's last step has the same keys for this episode. It also has `is_success`, `diverged` and
+//! `achieved`, the value of the quantity that the success rule compares (NaN if the episode has none). With reward
+//! terms, the info of every step has `reward_terms`. No value depends on the clock.
 //!
-//! In a batch's infos, each key holds an array `[N]`, and the key with an underscore before it a mask of the environments
-//! that have it, as `VectorEnv._add_info` of Gymnasium makes them. All dictionaries are plain ones.
+//! In the infos of a batch, each key has an array `[N]` of values. The key with an underscore before it has a mask
+//! `[N]` of the environments that have a value, as Gymnasium's `VectorEnv._add_info` makes it.
 
 use std::sync::Arc;
 
@@ -30,14 +31,14 @@ use crate::episode_table::{EpisodeTable, mismatched_episodes};
 /// Number of bytes of a SHA-256.
 const HASH_BYTES: usize = 32;
 
-/// Returns the bytes of a hash that is written in hexadecimal digits; zeros for another text.
+/// Decodes a hash from hexadecimal digits. Returns zeros if the text is not a SHA-256.
 fn hash_bytes(text: &str) -> [u8; HASH_BYTES] {
     let digits: Option<Vec<u8>> = text.chars().map(|digit| digit.to_digit(16).map(|digit| digit as u8)).collect();
     let bytes = digits.map(|digits| digits.as_chunks::<2>().0.iter().map(|[high, low]| 16 * high + low).collect());
     bytes.and_then(|bytes: Vec<u8>| bytes.try_into().ok()).unwrap_or_default()
 }
 
-/// A key of infos, and the key of its mask, which says which environments have a value.
+/// A key of infos, and the key of its mask.
 struct Label {
     key: Py<PyString>,
     mask: Py<PyString>,
@@ -49,7 +50,7 @@ impl Label {
     }
 }
 
-/// Keys of a session's infos, as Python strings that are made once.
+/// The keys of a session's infos as Python strings, so that they are made only once.
 pub struct InfoKeys {
     /// Number of environments N.
     num_envs: usize,
@@ -82,7 +83,7 @@ fixed_labels! {
 }
 
 impl InfoKeys {
-    /// Makes the keys of N environments.
+    /// Makes the keys for a session of `num_envs` environments.
     pub fn new(py: Python<'_>, environment: &proto::Environment, num_envs: usize) -> Self {
         Self {
             num_envs,
@@ -101,13 +102,14 @@ impl InfoKeys {
     }
 }
 
-/// Episodes that began and ended in a request.
+/// The episodes that began or ended in one request, from which infos are made.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Events {
     labels: Arc<InfoKeys>,
     ended: Vec<proto::EpisodeEnd>,
-    /// Receipts of the ended episodes; empty if the session has no receipts. `started_episodes` has those of begun episodes.
+    /// Receipts of the episodes that ended; empty if the session has no receipts.
     ended_episodes: EpisodeTable,
+    /// Receipts of the episodes that began; empty if the session has no receipts.
     started_episodes: EpisodeTable,
     final_observations: Vec<f32>,
     /// Size O of an observation.
@@ -116,10 +118,10 @@ pub struct Events {
 }
 
 impl Events {
-    /// Episodes that began.
+    /// Makes the events of a request that only began episodes, such as a reset.
     ///
     /// # Errors
-    /// If they do not fit.
+    /// If a slot or a receipt does not fit the batch.
     pub fn begun(labels: &Arc<InfoKeys>, started: Vec<proto::EpisodeStart>) -> PyResult<Self> {
         let started = started.iter().map(|start| (start.slot, start.episode.as_ref(), start.receipt.as_ref()));
         Self {
@@ -134,10 +136,10 @@ impl Events {
         .checked()
     }
 
-    /// Returns the episodes of a step; `None` if nothing began or ended, and no reward terms came.
+    /// Makes the events of a step. Returns `None` if no episode began or ended and the reply has no reward terms.
     ///
     /// # Errors
-    /// If they do not fit.
+    /// If a slot, a receipt or the length of an array does not fit the batch.
     pub fn stepped(labels: &Arc<InfoKeys>, stepped: proto::Stepped, observation_size: usize) -> PyResult<Option<Self>> {
         let proto::Stepped { ended, started, final_observations, reward_terms, receipt_episodes, .. } = stepped;
         if ended.is_empty() && started.is_empty() && reward_terms.is_empty() && receipt_episodes.is_empty() {
@@ -167,7 +169,7 @@ impl Events {
         .map(Some)
     }
 
-    /// The episodes that ended, with their receipts.
+    /// Returns the episodes that ended, with their receipts.
     pub fn ended(&self) -> impl Iterator<Item = proto::EpisodeEnd> {
         let receipt = |index| self.ended_episodes.receipt(index, &self.labels.model_hash);
         let whole = move |(index, end): (usize, &proto::EpisodeEnd)| proto::EpisodeEnd {
@@ -189,7 +191,7 @@ impl Events {
 
 #[pymethods]
 impl Events {
-    /// Infos of one environment by itself.
+    /// Returns the info of a single environment.
     pub fn single<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let (info, known) = (PyDict::new(py), &self.labels.known);
         if !self.reward_terms.is_empty() {
@@ -225,8 +227,9 @@ impl Events {
         Ok(info)
     }
 
-    /// Infos of a batch. `moved`, bool `[N]`, says which environments took a step, at first all; `same_step` has the
-    /// infos of ended episodes apart from those of the ones that began in their place.
+    /// Returns the infos of a batch. `moved`, bool `[N]`, is the mask of environments that took a step; `None` means
+    /// all. With `same_step`, the infos of ended episodes are in `final_info`, apart from those of the episodes that
+    /// began.
     #[pyo3(signature = (moved, same_step))]
     fn batch<'py>(
         &self,
@@ -264,7 +267,7 @@ impl Events {
     }
 }
 
-/// A mask of infos.
+/// The mask array `[N]` of a key of infos.
 type Mask<'py> = Bound<'py, PyArray1<bool>>;
 
 impl Events {
@@ -283,8 +286,8 @@ impl Events {
         set(infos, &known.achieved, self.column(py, achieved), &mask)
     }
 
-    /// Adds the episodes that began or ended, with their parameters. The last of the `parts` counts for an environment that
-    /// is in two.
+    /// Adds the parameters and receipts of the episodes in `parts`. For an environment with an episode in two parts,
+    /// the later part counts.
     fn receipts<const P: usize>(&self, infos: &Bound<'_, PyDict>, parts: [&EpisodeTable; P]) -> PyResult<()> {
         let rows = || parts.iter().flat_map(|part| part.rows());
         if rows().next().is_none() {
@@ -332,7 +335,7 @@ impl Events {
         set(infos, &self.labels.known.reward_terms, named, &mask)
     }
 
-    /// Values `[N]`, zero where there are none.
+    /// Makes an array `[N]` from pairs of a slot and a value. Other slots are zero.
     fn column<'py, T: Element + Copy + Default>(
         &self,
         py: Python<'py>,
@@ -343,7 +346,7 @@ impl Events {
         PyArray1::from_vec(py, column)
     }
 
-    /// A mask `[N]`, not to change: many keys have the same one.
+    /// Makes the mask `[N]` of `slots`. The array is read-only, because several keys share it.
     fn mask<'py>(&self, py: Python<'py>, slots: impl Iterator<Item = usize>) -> (Vec<bool>, Mask<'py>) {
         let mut mask = vec![false; self.labels.num_envs];
         slots.for_each(|slot| mask[slot] = true);

@@ -1,16 +1,16 @@
 //! The Python package's native module, `perturb._native`: sessions of the protocol, as Python objects and NumPy arrays.
 //!
-//! - [`session`]: a session that waits for its replies without Python's lock, hears of signals, and survives forks.
-//! - [`embedded`]: the server in this process, and its side of a session.
-//! - [`session_runtime`]: the runtime of a session's connection, driven by the thread that waits.
+//! - [`session`]: a session, which releases Python's lock while it waits, handles signals, and survives forks.
+//! - [`embedded`]: the server in this process, and its sessions.
+//! - [`session_runtime`]: the async runtime of a session's connection, driven by the waiting thread.
 //! - [`requests`]: conversion of Python's values to requests.
-//! - [`arrays`], [`infos`]: replies, as arrays and dictionaries; [`episode_table`]: the episodes that these are made of.
-//! - [`policy`]: trained policies that act here, by the learner's arithmetic.
-//! - [`sets`], [`testing`], [`records`]: tests of policies that act in Python, recorded as `perturb` records its own tests.
-//! - [`assessed`]: folders and reports of such tests; [`comparison`]: comparisons of them.
-//! - [`failure`]: failures as data, which the Python package turns into its errors.
+//! - [`arrays`], [`infos`]: conversion of replies to arrays and dictionaries; [`episode_table`]: the episodes in infos.
+//! - [`policy`]: trained policies, which choose the same actions as in the learner.
+//! - [`sets`], [`testing`], [`records`]: test sets, tests of policies that act in Python, and the records of tests.
+//! - [`assessed`]: folders and reports of tests; [`comparison`]: comparisons of tests.
+//! - [`failure`]: the exception that the Python package converts to its errors.
 #![forbid(unsafe_code)]
-// The map above is for readers of this crate. All items are private, because only Python uses them.
+// The list above links to private modules for readers of this crate. Nothing is public, because only Python uses it.
 #![allow(rustdoc::private_intra_doc_links)]
 
 use pyo3::prelude::*;
@@ -30,7 +30,7 @@ mod session_runtime;
 mod sets;
 mod testing;
 
-/// The module `perturb._native`; `perturb/_native.pyi` has its types.
+/// The module `perturb._native`. `perturb/_native.pyi` declares its types.
 #[pymodule]
 mod _native {
     #[pymodule_export]
@@ -53,10 +53,10 @@ mod _native {
     use super::sets::{heatmap_contexts, make_set, read_csv_set, read_sets};
     #[pymodule_export]
     use super::testing::Tests;
-    /// Name of the set that `perturb.sets.heatmap` makes. Reports draw a heatmap of the tests on it.
+    /// Name of the test set that `perturb.sets.heatmap` makes. Reports draw the tests on it as heatmaps.
     #[pymodule_export]
     const HEATMAP_SET: &str = perturb_records::Heatmap::SET;
-    /// Maximum number of points along a heatmap's axis.
+    /// Maximum number of points along each axis of a heatmap.
     #[pymodule_export]
     const MAX_HEATMAP_POINTS: usize = perturb_records::MAX_POINTS;
 }

@@ -1,4 +1,4 @@
-//! Trained policies, as they act: the learner's arithmetic.
+//! The Python classes of a trained policy and of its player, which chooses actions with the learner's arithmetic.
 
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, TryLockError};
@@ -10,18 +10,18 @@ use pyo3::prelude::*;
 
 use crate::failure::{POLICY, UNUSABLE, failure};
 
-/// A checkpoint that was read.
+/// A policy, loaded from a checkpoint.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Policy {
     pub(crate) checkpoint: Checkpoint,
-    /// Iterations of its training, and a checksum of its weights.
+    /// Identifies the policy by the number of its training iterations and a checksum of its weights.
     #[pyo3(get)]
     id: String,
 }
 
 #[pymethods]
 impl Policy {
-    /// Reads the checkpoint in a folder, or in its folder `checkpoint`.
+    /// Loads the checkpoint in a folder, or in the folder `checkpoint` below it.
     #[staticmethod]
     fn load(path: PathBuf) -> PyResult<Self> {
         let checkpoint = Checkpoint::load(&path).map_err(|error| refused(&error))?;
@@ -29,7 +29,8 @@ impl Policy {
         Ok(Self { checkpoint, id })
     }
 
-    /// Writes the checkpoint into a folder, which is created if it is not there. Its training cannot be resumed there.
+    /// Writes the checkpoint into a folder, which is created if necessary. The files are not enough to resume the
+    /// training.
     fn save(&self, path: PathBuf) -> PyResult<()> {
         self.checkpoint.save(&path, None).map_err(|error| refused(&error))
     }
@@ -40,31 +41,31 @@ impl Policy {
         &self.checkpoint.state.config.common.environment
     }
 
-    /// The version of the parameters in training.
+    /// The version that the training parameters came from.
     #[getter]
     fn version(&self) -> String {
         self.checkpoint.state.config.common.version.to_string()
     }
 
-    /// The version in training, with the sets that replaced parts of it.
+    /// The version that the training parameters came from, with any values that replaced the version's.
     #[getter]
     fn trained_on(&self) -> String {
         self.checkpoint.state.config.common.trained_on()
     }
 
-    /// The method that trained it, e.g. "ppo ff".
+    /// The algorithm and architecture, e.g. "ppo ff".
     #[getter]
     fn method(&self) -> String {
         self.checkpoint.state.config.method().to_string()
     }
 
-    /// Number of episodes in a trial. The policy remembers over the episodes of a trial.
+    /// Number of episodes in a trial. The policy's memory is reset at the end of a trial.
     #[getter]
     fn episodes_per_trial(&self) -> u32 {
         self.checkpoint.state.config.settings.episodes_per_trial()
     }
 
-    /// Whether the policy also sees rewards and ends of episodes (RL²).
+    /// Whether the policy also takes the last action, its reward and the ends of episodes as inputs (RL²).
     #[getter]
     fn sees_rewards(&self) -> bool {
         self.checkpoint.state.config.settings.has_trials()
@@ -76,31 +77,31 @@ impl Policy {
         self.checkpoint.policy.memory_size() > 0
     }
 
-    /// "state" or "parameters".
+    /// What the policy observes: "state" or "parameters".
     #[getter]
     fn observe(&self) -> String {
         self.checkpoint.state.config.common.observe.to_string()
     }
 
-    /// The seed of its training.
+    /// The seed of the policy's training.
     #[getter]
     fn seed(&self) -> u64 {
         self.checkpoint.state.config.common.seed
     }
 
-    /// Steps of its training, of all environments together.
+    /// Number of training steps, of all environments together.
     #[getter]
     fn timesteps(&self) -> u64 {
         self.checkpoint.state.counters.timesteps
     }
 
-    /// Size O of an observation.
+    /// Number O of values in an observation.
     #[getter]
     fn observation_size(&self) -> usize {
         self.checkpoint.state.environment_spec.observation.len()
     }
 
-    /// Plays in N environments with successive indices.
+    /// Makes a player for N environments. Their indices are successive numbers from `first_environment_index`.
     fn player(&self, num_envs: usize, seed: u64, first_environment_index: u32) -> PyResult<Player> {
         let player =
             self.checkpoint.player(num_envs, seed, first_environment_index).map_err(|error| refused(&error))?;
@@ -117,16 +118,17 @@ impl Policy {
 }
 
 impl Policy {
-    /// Checks that `served` is the environment that the policy was trained in.
+    /// Checks that the server's environment `served` is the one that the policy was trained in.
     ///
     /// # Errors
-    /// [`POLICY`], with the difference, if it is another one.
+    /// [`POLICY`], with the difference, if it is not.
     pub(crate) fn check_unchanged(&self, served: &perturb_protocol::proto::Environment) -> PyResult<()> {
         self.checkpoint.state.check_unchanged(served).map_err(|error| refused(&error))
     }
 }
 
-/// A policy that acts in N environments, with its memory of each. Only one thread at a time may use it.
+/// A policy that chooses actions in N environments, with its memory for each of them. Only one thread at a time may use
+/// it.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Player(Mutex<Playing>);
 
@@ -134,10 +136,12 @@ struct Playing {
     player: perturb_policy::Player,
     action: ActionKind,
     seed: u64,
-    /// `[N]` index of the present trial, and number of the present episode in the trial.
+    /// For each of N environments: index of the present trial, and number of the present episode in this trial.
     trials: Vec<(u64, u32)>,
+    /// Episodes that ended in the last step.
     ended: Vec<SlotEnd>,
-    /// `[ended, O]` zeros in place of final observations, which a player takes but acting does not use.
+    /// Zeros `[ended, O]` in place of final observations. The player's interface requires them, but actions do not
+    /// depend on them.
     finals: Vec<f32>,
 }
 
@@ -148,13 +152,13 @@ impl Player {
         self.own()?.begin(&observations)
     }
 
-    /// The next actions: int64 `[N]`, or float32 `[N, A]`.
+    /// Samples the next actions: int64 `[N]`, or float32 `[N, A]`.
     fn act<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         self.own()?.act(py)
     }
 
-    /// Takes the outcome of the last actions: observations `[N, O]`, rewards `[N]`, and `starts` `[N]`. `starts` is true
-    /// where an episode ended and the observation is the first one of the next episode.
+    /// Records the outcome of the last actions: observations `[N, O]`, rewards `[N]`, and `starts` `[N]`. `starts` is
+    /// true where an episode ended and the observation is the first one of the next episode.
     fn observe(
         &self,
         observations: PyReadonlyArray2<'_, f32>,
@@ -182,7 +186,7 @@ impl Playing {
         let observations = self.rows(observations)?;
         self.trials.fill((0, 0));
         self.player.begin(&observations, None).map_err(|error| refused(&error))?;
-        // The random streams may be at later trials; they return to the first.
+        // The random streams may have advanced to later trials. They return to the first trial.
         (0..self.trials.len()).for_each(|slot| self.player.begin_trial(slot, self.seed, 0));
         Ok(())
     }
@@ -229,7 +233,7 @@ impl Playing {
         self.player.observe(&outcome, None).map_err(|error| refused(&error))
     }
 
-    /// Returns observations `[N, O]` as contiguous numbers.
+    /// Copies observations `[N, O]` to a vector, row by row.
     fn rows(&self, observations: &PyReadonlyArray2<'_, f32>) -> PyResult<Vec<f32>> {
         let expected = [self.trials.len(), self.player.observation_size()];
         if observations.shape() != expected {

@@ -1,4 +1,4 @@
-//! Recorded test episodes and their statistics, for Python. Files and statistics are those of studies.
+//! The Python class of recorded test episodes, with their files and statistics. Experiments use the same ones.
 
 use std::path::PathBuf;
 
@@ -15,23 +15,25 @@ use pyo3::types::PyDict;
 use crate::failure::{INVALID, failure};
 use crate::sets::{Set, to_python};
 
-/// Resamples of the bootstrap over episodes.
+/// Number of resamples of the bootstrap over episodes.
 const RESAMPLES: usize = 1000;
 
-/// Mean and deviation, %.
+/// A mean and its standard deviation if known, %.
 type MeanAndDeviation = (f64, Option<f64>);
 
-/// A part of a parameter's range: low, high, successes, episodes, and the interval of the success rate, %.
+/// A bin of a parameter's range: lower and upper edge, successes, episodes, and both ends of the success rate's 95 %
+/// interval, %.
 type BinRow = (f64, f64, u64, u64, f64, f64);
 
-/// A part of two parameters' ranges: low and high of either, successes, episodes.
+/// A cell of a grid over two parameters: the edges in x, the edges in y, successes, episodes.
 type GridRow = ((f64, f64), (f64, f64), u64, u64);
 
-/// Episodes, success % and its interval, mean return and its interval, mean length, the mean of the worst tenth of returns
-/// and its interval, and the success rate in the worst tenth of contexts, %.
+/// The statistics of a test: number of episodes, success rate (%) and its interval, mean return and its interval, mean
+/// length (steps), mean of the worst tenth of returns and its interval, success rate in the worst tenth of contexts
+/// (%).
 type ResultRow = (u64, f64, (f64, f64), f64, (f64, f64), f64, f64, (f64, f64), Option<f64>);
 
-/// A results table: its columns by name, and the plan of each study with its name.
+/// A results table: its columns by name, and the name and experiment file of each study.
 type ResultsColumns<'py> = (Bound<'py, PyDict>, Vec<(String, String)>);
 
 /// The recorded tests of a policy.
@@ -40,13 +42,13 @@ pub struct Records(pub(crate) perturb_records::Records);
 
 #[pymethods]
 impl Records {
-    /// Reads a Parquet file.
+    /// Reads records from a Parquet file.
     #[staticmethod]
     fn read(path: PathBuf) -> PyResult<Self> {
         perturb_records::Records::read(&path).map(Self).map_err(|error| failure(INVALID, 0, error.to_string()))
     }
 
-    /// Writes a Parquet file, whole or not at all.
+    /// Writes the records to a Parquet file. If an error occurs, an existing file is not changed.
     fn write(&self, path: PathBuf) -> PyResult<()> {
         self.0.write(&path).map_err(|error| failure(INVALID, 0, error.to_string()))
     }
@@ -63,7 +65,7 @@ impl Records {
         &self.0.about.policy
     }
 
-    /// The rule of success, as a sentence.
+    /// The success rule as a phrase. `None` if the server decided about success and stated no rule.
     #[getter]
     fn success(&self) -> Option<String> {
         self.0.about.success.as_ref().map(ToString::to_string)
@@ -75,28 +77,28 @@ impl Records {
         self.0.about.parameters.iter().map(|it| (it.name.as_str(), it.unit.as_str())).collect()
     }
 
-    /// The names of the sets that were tested on, in order.
+    /// The names of the test sets, in the order of the tests.
     #[getter]
     fn sets(&self) -> Vec<&str> {
         self.0.about.tests.iter().map(|test| test.set.name.as_str()).collect()
     }
 
-    /// Arrays by the names of the file's columns; where there is no number, NaN.
+    /// Returns the columns of the records' file, by name. Missing numbers are NaN.
     fn columns<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let columns = PyDict::new(py);
         add_columns(&columns, self.0.columns())?;
         Ok(columns)
     }
 
-    /// Returns the same episodes, judged by a rule in the spelling of `--success`.
+    /// Returns records of the same episodes, judged by a success rule in the syntax of `--success`.
     fn judged_by(&self, rule: &str) -> PyResult<Self> {
         let invalid = |error: perturb_settings::ValueError| failure(INVALID, 0, error.to_string());
         let rule: Rule = rule.parse().map_err(invalid)?;
         self.0.clone().judged_by(&rule).map(Self).map_err(invalid)
     }
 
-    /// Returns the same episodes, judged by a threshold of a quantity. `values` `[n]` has the quantity of each episode; NaN
-    /// is no success.
+    /// Returns records of the same episodes, judged by a threshold. `values` `[n]` has the value of `quantity` in each
+    /// episode. NaN is a failure.
     fn judged(
         &self,
         quantity: String,
@@ -110,19 +112,19 @@ impl Records {
         judged.map(Self).map_err(|error| failure(INVALID, 0, error.to_string()))
     }
 
-    /// The sets that were tested on, in order.
+    /// Returns the test sets, in the order of the tests.
     fn tests(&self) -> Vec<Set> {
         self.0.about.tests.iter().map(|test| to_python(&test.set)).collect()
     }
 
-    /// The rule of success in the spelling of `--success`; `None` if the server decided.
+    /// The success rule in the syntax of `--success`. `None` if the server decided about success and stated no rule.
     #[getter]
     fn rule(&self) -> Option<String> {
         let success = self.0.about.success.as_ref();
         success.map(|criterion| format!("{}={}", criterion.quantity, criterion.threshold))
     }
 
-    /// The figures of the test on a set.
+    /// Returns the statistics of the test on a set.
     fn result(&self, py: Python<'_>, name: &str) -> ResultRow {
         py.detach(|| {
             let result = self.0.result(name, None);
@@ -152,12 +154,13 @@ impl Records {
         })
     }
 
-    /// Returns `[n]`, for each episode of the test on a set, the part of the parameter space that it lies in, from 0.
+    /// Returns the context of each episode `[n]` of the test on a set: the number, from 0, of a context in a list, or
+    /// of a region of the parameter space.
     fn parts(&self, name: &str) -> Vec<usize> {
         Outcomes::new(&self.0, name).parts()
     }
 
-    /// Success over two parameters on a set, by y, then x.
+    /// Returns the success on a set in each cell of a grid over two parameters, ordered by y and then x.
     fn success_by_parameters(&self, name: &str, x: &str, y: &str) -> PyResult<Vec<GridRow>> {
         let places = [self.place(x)?, self.place(y)?];
         let outcomes = Outcomes::new(&self.0, name);
@@ -171,7 +174,7 @@ impl Records {
         Ok(pairs.zip(counted).map(cell).collect())
     }
 
-    /// Success over a parameter on a set.
+    /// Returns the success on a set in each bin of a parameter's range.
     fn success_by_parameter(&self, name: &str, parameter: &str) -> PyResult<Vec<BinRow>> {
         let place = self.place(parameter)?;
         let outcomes = Outcomes::new(&self.0, name);
@@ -186,7 +189,7 @@ impl Records {
 }
 
 impl Records {
-    /// Returns the place of a parameter among those of the environment.
+    /// Returns the position of a parameter in the environment's list of parameters.
     fn place(&self, parameter: &str) -> PyResult<usize> {
         let names: Vec<&str> = self.0.about.parameters.iter().map(|it| it.name.as_str()).collect();
         names.iter().position(|known| *known == parameter).ok_or_else(|| {
@@ -196,7 +199,8 @@ impl Records {
     }
 }
 
-/// Adds `columns` to a dictionary: arrays, or lists of texts. Missing numbers are NaN, missing texts None.
+/// Adds columns to a Python dictionary, as arrays of numbers or lists of texts. Missing numbers are NaN, and missing
+/// texts are None.
 fn add_columns(dictionary: &Bound<'_, PyDict>, columns: Vec<(String, ColumnValues<'_>)>) -> PyResult<()> {
     let py = dictionary.py();
     let numbers = |name: String, numbers: Vec<f64>| dictionary.set_item(name, PyArray1::from_vec(py, numbers));
@@ -212,7 +216,7 @@ fn add_columns(dictionary: &Bound<'_, PyDict>, columns: Vec<(String, ColumnValue
                 numbers(name, values.into_iter().map(|number| number.unwrap_or(f64::NAN)).collect())?;
             }
             ColumnValues::OptionalUnsigned64(values) => {
-                // Exact below 2^53, which no count of episodes or steps reaches.
+                // The conversion is exact up to 2^53. No count of episodes or steps is larger.
                 numbers(name, values.into_iter().map(|count| count.map_or(f64::NAN, |count| count as f64)).collect())?;
             }
         }
@@ -220,7 +224,8 @@ fn add_columns(dictionary: &Bound<'_, PyDict>, columns: Vec<(String, ColumnValue
     Ok(())
 }
 
-/// Reads a table of `perturb export`: arrays by the names of its columns, and the text of each study's plan by its name.
+/// Reads a results table of `perturb export`. Returns its columns by name, and the name and experiment file of each
+/// study.
 #[pyfunction]
 pub fn read_results(py: Python<'_>, path: PathBuf) -> PyResult<ResultsColumns<'_>> {
     let table = py.detach(|| ResultsTable::read(&path)).map_err(|error| failure(INVALID, 0, error.to_string()))?;
@@ -230,13 +235,14 @@ pub fn read_results(py: Python<'_>, path: PathBuf) -> PyResult<ResultsColumns<'_
     Ok((columns, plans.collect()))
 }
 
-/// The 95 % interval of a success rate after Wilson (1927), 0 … 1.
+/// Returns the 95 % Wilson interval (1927) of a success rate, 0 … 1.
 #[pyfunction]
 pub fn wilson(successes: u64, episodes: u64) -> (f64, f64) {
     perturb_records::statistics::wilson(successes, episodes)
 }
 
-/// The paper's three numbers, Default, Interpolation and Extrapolation, of success rates, %, by scenario, e.g. "DR".
+/// Returns Default, Interpolation and Extrapolation, %. `rates` has the success rate of each scenario, %, such as "DR".
+/// A metric is `None` if one of its scenarios is missing.
 #[pyfunction]
 pub fn metrics(rates: std::collections::HashMap<String, f64>) -> (Option<f64>, Option<f64>, Option<f64>) {
     let [default, interpolation, extrapolation] =
@@ -244,7 +250,8 @@ pub fn metrics(rates: std::collections::HashMap<String, f64>) -> (Option<f64>, O
     (default, interpolation, extrapolation)
 }
 
-/// The paper's methods in an environment, with the mean and deviation over five runs of their three numbers, %.
+/// Returns the paper's methods in an environment. Each has the mean and the standard deviation over five runs of
+/// Default, Interpolation and Extrapolation, %.
 #[pyfunction]
 pub fn published(environment: &str) -> Vec<(String, Vec<Option<MeanAndDeviation>>)> {
     let numbers = |method| {

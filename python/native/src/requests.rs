@@ -1,4 +1,5 @@
-//! Conversion of Python's values to requests. The Python package has checked types and shapes; the server checks values.
+//! Conversion of Python's values to requests. The Python package has checked types and shapes. The server checks
+//! values.
 
 use std::collections::HashMap;
 
@@ -11,10 +12,10 @@ use pyo3::types::{PyBytes, PyInt, PyType};
 
 use crate::failure::{INVALID, failure};
 
-/// Sets of parameters: by name, intervals from low to high.
+/// The intervals `(low, high)` of each parameter, by the parameter's name.
 pub type IntervalsByName = HashMap<String, Vec<(f64, f64)>>;
 
-/// Converts sets of parameters for the protocol.
+/// Converts the intervals of parameters to the protocol's distributions.
 pub fn distributions(parameters: IntervalsByName) -> HashMap<String, proto::Distribution> {
     let interval = |(low, high)| proto::Interval { low, high };
     let distribution =
@@ -22,20 +23,20 @@ pub fn distributions(parameters: IntervalsByName) -> HashMap<String, proto::Dist
     parameters.into_iter().map(|(name, intervals)| (name, distribution(intervals))).collect()
 }
 
-/// D, R, E or R+E.
+/// Parses a version: `D`, `R`, `E` or `R+E`.
 ///
 /// # Errors
-/// For another text.
+/// If the text is not the name of a version.
 pub fn version(name: &str) -> PyResult<proto::Version> {
     let version: Version =
         name.parse().map_err(|error: perturb_protocol::UnknownVersion| failure(INVALID, 0, error.to_string()))?;
     Ok(version.to_proto())
 }
 
-/// Gymnasium's name of a mode.
+/// Parses Gymnasium's name of an autoreset mode.
 ///
 /// # Errors
-/// For another text.
+/// If the text is not the name of a mode.
 pub fn autoreset_mode(name: &str) -> PyResult<proto::AutoresetMode> {
     match name {
         "NextStep" => Ok(proto::AutoresetMode::NextStep),
@@ -45,19 +46,20 @@ pub fn autoreset_mode(name: &str) -> PyResult<proto::AutoresetMode> {
     }
 }
 
-/// Shape and kind of a session's actions.
+/// The shape and type of a session's actions.
 pub struct Actions {
     /// Number of environments N.
     pub num_envs: usize,
-    /// Numbers in an action, A; `None` for discrete actions.
+    /// The number A of values in a continuous action; `None` for discrete actions.
     pub size: Option<usize>,
-    /// Whether actions have no first axis, as those of a single environment.
+    /// Whether there is a single environment, whose actions have no batch axis.
     pub single: bool,
 }
 
 impl Actions {
-    /// Encodes actions for the protocol: int32 `[N]`, or float32 `[N, A]`. Arrays of the usual types and the right shape are
-    /// read directly. `fallback` converts everything else to bytes, or refuses it.
+    /// Encodes actions for the protocol: int32 `[N]`, or float32 `[N, A]`. Arrays of the usual types with the right
+    /// shape are read directly. For everything else, calls the Python function `fallback`, which returns bytes or
+    /// raises an error.
     ///
     /// # Errors
     /// The errors of `fallback`.
@@ -83,7 +85,8 @@ impl Actions {
             .or_else(|| self.read(actions, |choice: i32| Some(choice.to_le_bytes())))
     }
 
-    /// The numbers of an array that has this type, the expected shape, and its elements in a row.
+    /// Encodes the numbers of an array. Returns `None` if it does not have type `T`, the expected shape, and contiguous
+    /// elements, or if `encode` returns `None` for a number.
     fn read<T: Element + Copy>(
         &self,
         actions: &Bound<'_, PyAny>,
@@ -104,7 +107,7 @@ impl Actions {
     }
 }
 
-/// Whether this is one of Python's or NumPy's integers, which policies mostly give; a truth value is none.
+/// Whether this is an integer of Python or NumPy. A bool does not count.
 fn is_integer(action: &Bound<'_, PyAny>) -> bool {
     static NUMPY_INTEGER: PyOnceLock<Py<PyType>> = PyOnceLock::new();
     action.is_exact_instance_of::<PyInt>()

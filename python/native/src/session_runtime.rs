@@ -1,5 +1,5 @@
-//! The connection under a session. The thread that waits for a reply drives it. A thread of the connection's own would
-//! have to hand each reply over, which costs more than a step.
+//! The async runtime of a session's connection. The thread that waits for a reply runs it. A separate thread for the
+//! connection would have to pass each reply on, which takes longer than a step.
 
 use std::future::Future;
 use std::io;
@@ -13,14 +13,15 @@ use tokio::runtime::{Builder, Runtime};
 use tokio::sync::Notify;
 use tokio::task::yield_now;
 
-/// Interval at which a waiting thread checks for signals. Python runs signal handlers only between two of its instructions.
+/// Interval at which a waiting thread calls Python's signal handlers. Python itself calls them only between two Python
+/// instructions.
 const SIGNAL_CHECK_INTERVAL: Duration = Duration::from_millis(20);
-/// Number of times that a thread yields to the connection's tasks, so that they write a request or the end of a session.
-/// One task takes the message up, and another one sends it.
+/// Number of times that a thread yields to the connection's tasks, so that they write pending messages. A message
+/// passes through several tasks before it is written.
 const POLL_YIELDS: usize = 4;
 
-/// Maximum number of runtimes. Each session has its own, so that threads with a session each do not wait for each other.
-/// Further sessions share them, because each runtime takes four file descriptors.
+/// Maximum number of runtimes. Up to this number, each session has its own runtime, so that sessions in different
+/// threads do not wait for each other. Further sessions share runtimes, because a runtime needs four file descriptors.
 const MAX_RUNTIMES: usize = 16;
 
 /// A future that a thread waits for.
@@ -57,7 +58,7 @@ impl CloseSignal {
     }
 }
 
-/// A runtime that drives connections' tasks while a thread waits.
+/// A tokio runtime, on which a waiting thread runs the tasks of connections.
 struct Reactor {
     /// `None` only while the reactor is dropped.
     runtime: Option<Runtime>,
@@ -65,7 +66,7 @@ struct Reactor {
     owner: u32,
 }
 
-/// Runtimes that are in use.
+/// The runtimes that are in use.
 static REACTORS: Mutex<Vec<Weak<Reactor>>> = Mutex::new(Vec::new());
 
 impl Reactor {
@@ -76,7 +77,7 @@ impl Reactor {
 
     /// Returns a new runtime, or the one with the fewest sessions if there are [`MAX_RUNTIMES`].
     fn find() -> io::Result<Arc<Self>> {
-        // In a forked process the lock may be held for ever by a thread that was not copied.
+        // In a forked process, the lock may be held forever, because the fork did not copy the thread that holds it.
         let Ok(mut reactors) = REACTORS.try_lock() else { return Self::new() };
         let own = std::process::id();
         let used: Vec<_> = reactors.iter().filter_map(Weak::upgrade).filter(|reactor| reactor.owner == own).collect();
@@ -97,13 +98,14 @@ impl Drop for Reactor {
         if std::process::id() == self.owner {
             runtime.shutdown_background(); // does not wait for a running DNS lookup
         } else {
-            // A forked process shares the parent's epoll. Dropping the runtime would remove the parent's connection from it.
+            // A forked process shares the parent's epoll. Dropping the runtime would remove the parent's connection
+            // from it.
             std::mem::forget(runtime);
         }
     }
 }
 
-/// The runtime in which a session waits.
+/// The runtime with which a session waits for replies.
 pub struct SessionRuntime {
     reactor: Arc<Reactor>,
 }
@@ -117,10 +119,10 @@ impl SessionRuntime {
         Ok(Self { reactor: Reactor::find()? })
     }
 
-    /// Waits, at most until the deadline. Python's lock is released, and taken only for the checks for signals.
+    /// Waits for a future until the deadline. Python's lock is released during the wait, except for signal checks.
     ///
     /// # Errors
-    /// [`WaitError`]; the future was dropped then.
+    /// [`WaitError`] if the wait ended before the future was ready.
     pub fn wait<T: Send>(
         &self,
         py: Python<'_>,
@@ -155,8 +157,8 @@ impl SessionRuntime {
         }
     }
 
-    /// Calls a function that does not block, without Python's lock. It runs on this thread, in the context of the runtime,
-    /// so it may spawn tasks.
+    /// Calls a function on this thread without Python's lock. The function must not block. It runs in the context of
+    /// the runtime, so it may spawn tasks.
     pub fn now<T: Send>(&self, py: Python<'_>, work: impl FnOnce() -> T + Send) -> T {
         py.detach(|| {
             let _context = self.reactor.runtime.as_ref().map(Runtime::enter);
@@ -164,8 +166,8 @@ impl SessionRuntime {
         })
     }
 
-    /// Lets the connection write pending bytes and answer the server's keepalive pings. The caller must not hold Python's
-    /// lock.
+    /// Lets the connection write pending messages and answer the server's keepalive pings. The caller must not hold
+    /// Python's lock.
     pub fn poll_io(&self) {
         if let Some(runtime) = &self.reactor.runtime {
             runtime.block_on(async {

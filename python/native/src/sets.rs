@@ -1,4 +1,4 @@
-//! Sets that policies are tested on, between Python and the crates: versions, drawn parameters, grids, lists of contexts.
+//! Conversion of test sets between Python and Rust: versions, drawn parameters, grids, and lists of contexts.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
@@ -14,10 +14,12 @@ use pyo3::prelude::*;
 use crate::failure::{INVALID, failure};
 use crate::requests::IntervalsByName;
 
-/// A set: its name, its version, the intervals that replace the version's, and the contexts if they are listed.
+/// A test set in Python's form: its name, its version, the intervals that replace the version's, and the contexts of a
+/// grid or a list.
 pub type Set = (String, String, IntervalsByName, Option<Vec<BTreeMap<String, f64>>>);
 
-/// Makes a set, drawn or a grid, from values of parameters in the spelling of experiment files.
+/// Makes a test set from the values of each parameter in the syntax of experiment files. Intervals make a drawn set,
+/// and points make a grid.
 #[pyfunction]
 pub fn make_set(name: &str, version: &str, values: Vec<(String, String)>) -> PyResult<Set> {
     let assignments = values.into_iter().map(|(parameter, values)| format!("{parameter}={values}").parse());
@@ -25,21 +27,22 @@ pub fn make_set(name: &str, version: &str, values: Vec<(String, String)>) -> PyR
     set_of(name, parse(version)?, assignments).map(|set| to_python(&set)).map_err(|error| invalid(&error))
 }
 
-/// Reads a set of contexts from a CSV file, one context a row.
+/// Reads a test set from a CSV file with one context per row.
 #[pyfunction]
 pub fn read_csv_set(name: &str, version: &str, path: PathBuf) -> PyResult<Set> {
     let text = files::read(&path).map_err(|error| PyOSError::new_err(error.to_string()))?;
     set_of_csv(name, parse(version)?, &text).map(|set| to_python(&set)).map_err(|error| invalid(&error))
 }
 
-/// Reads the sets of an experiment file.
+/// Reads the test sets of an experiment file.
 #[pyfunction]
 pub fn read_sets(path: PathBuf) -> PyResult<Vec<Set>> {
     let sets = Plan::own_sets(&path).map_err(|error| invalid(&error))?;
     Ok(sets.iter().map(to_python).collect())
 }
 
-/// Returns the contexts of a heatmap over two parameters, each with its range and `points` points along it.
+/// Returns the contexts of a heatmap over two parameters. `axes` has the name, the lowest and the highest value of each
+/// parameter, `points` the number of points along each axis, and `fixed` the values of other parameters.
 #[pyfunction]
 pub fn heatmap_contexts(
     axes: [(String, f64, f64); 2],
@@ -58,7 +61,7 @@ pub fn heatmap_contexts(
     Heatmap::contexts(&axes.map(axis), points.min(MAX_POINTS), &fixed)
 }
 
-/// Converts a set for Python.
+/// Converts a test set to Python's form.
 pub fn to_python(set: &TestSet) -> Set {
     let intervals = |values: &Distribution| values.intervals().iter().map(|it| (it.low, it.high)).collect();
     let drawn = set.drawn().iter().map(|(name, values)| (name.clone(), intervals(values))).collect();
@@ -69,7 +72,7 @@ pub fn to_python(set: &TestSet) -> Set {
     (set.name.clone(), set.version.to_string(), drawn, contexts)
 }
 
-/// Converts a set from Python.
+/// Converts a test set from Python's form.
 pub fn from_python((name, version, drawn, contexts): Set) -> PyResult<TestSet> {
     let version = parse(&version)?;
     let contexts = match contexts {

@@ -1,4 +1,4 @@
-//! Tests of a policy that acts in Python: which episodes are played, and how they are recorded, as `perturb evaluate` does.
+//! Tests of a policy that acts in Python. The choice of episodes and the records are those of `perturb evaluate`.
 
 use std::sync::Arc;
 
@@ -19,7 +19,7 @@ use crate::records::Records;
 use crate::session::Opened;
 use crate::sets::{Set, from_python};
 
-/// The tests of a policy, one set after the other.
+/// Plans and records the tests of a policy, one set after the other.
 #[pyclass(module = "perturb._native")]
 pub struct Tests {
     sets: Vec<TestSet>,
@@ -28,8 +28,9 @@ pub struct Tests {
     success: Option<Rule>,
     policy: String,
     episodes_per_trial: u32,
-    /// The environment that the first session opened, and the records.
+    /// The environment that the first session opened, and the records of all tests.
     begun: Option<(Arc<proto::Environment>, perturb_records::Records)>,
+    /// The running test.
     counting: Option<TestCollector>,
 }
 
@@ -50,7 +51,8 @@ impl Tests {
         Ok(Self { sets, episodes, seed, success, policy, episodes_per_trial, begun: None, counting: None })
     }
 
-    /// Begins the test on the set in this place: the seed of its environments, and their number N.
+    /// Begins the test on the set number `place`, counted from 0. Returns the seed and the number N of its
+    /// environments.
     fn plan(&mut self, place: usize) -> PyResult<(u64, usize)> {
         let Some(set) = self.sets.get(place) else { return Err(failure(UNUSABLE, 0, "there is no such set")) };
         let counting = TestCollector::new(
@@ -65,8 +67,8 @@ impl Tests {
         Ok(plan)
     }
 
-    /// Takes the environment of a test's session after it was opened. Checks the first one against all sets, and against the
-    /// environment that a loaded policy was trained in.
+    /// Checks the environment of a test's session after the session was opened. The first one must fit all sets, and
+    /// the environment that a loaded policy was trained in. Later ones must equal the first.
     #[pyo3(signature = (opened, policy))]
     fn opened(&mut self, opened: &Opened, policy: Option<&Policy>) -> PyResult<()> {
         let served = opened.served();
@@ -86,7 +88,8 @@ impl Tests {
         Ok(())
     }
 
-    /// Takes the episodes that ended in a step. Returns the number of episodes counted so far, and the number wanted.
+    /// Records the episodes that ended in a step. Returns the number of recorded episodes, and the number that the test
+    /// needs.
     fn take(&mut self, events: Option<&Events>, terminated: PyReadonlyArray1<'_, bool>) -> PyResult<(u64, u64)> {
         let Some(counting) = &mut self.counting else { return Err(failure(UNUSABLE, 0, "no test has begun")) };
         if let Some(events) = events {
@@ -103,7 +106,7 @@ impl Tests {
         Ok(counting.progress())
     }
 
-    /// Records the episodes.
+    /// Finishes the running test, and adds its episodes to the records.
     fn finish(&mut self) -> PyResult<()> {
         let (Some(counting), Some((environment, records))) = (self.counting.take(), &mut self.begun) else {
             return Err(failure(UNUSABLE, 0, "no test has begun"));
@@ -111,7 +114,7 @@ impl Tests {
         counting.finish(environment, records).map_err(|error| failure(MALFORMED, 0, error.to_string()))
     }
 
-    /// Returns the records.
+    /// Returns the records of all finished tests.
     fn records(&self) -> PyResult<Records> {
         let Some((_, records)) = &self.begun else { return Err(failure(UNUSABLE, 0, "no test has begun")) };
         Ok(Records(records.clone()))

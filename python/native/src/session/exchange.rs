@@ -1,4 +1,4 @@
-//! Exchange of requests and replies by one thread of the process that opened the stream.
+//! Exchange of requests and replies. Only one thread at a time, in the process that opened the stream, can do it.
 
 use std::pin::pin;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -15,10 +15,10 @@ use crate::failure::{RequestFailure, TIMED_OUT, UNUSABLE, failure};
 use crate::infos::InfoKeys;
 use crate::session_runtime::{SessionRuntime, WaitError};
 
-/// Number of forks between this process and the one that loaded the module.
+/// Number of forks since the module was loaded, in the chain of processes that led to this process.
 pub(super) static FORKS: AtomicU32 = AtomicU32::new(0);
 
-/// Notes that this process was forked.
+/// Counts a fork. Python calls it in each forked process.
 #[pyfunction]
 pub fn note_fork() {
     FORKS.fetch_add(1, Ordering::Relaxed);
@@ -28,7 +28,7 @@ pub fn note_fork() {
 pub(super) enum SessionState {
     New,
     Idle(Box<OpenSession>),
-    /// A thread waits for a reply and owns the open session meanwhile.
+    /// A thread is waiting for a reply. It owns the open session until the reply arrives.
     Busy,
     Ended,
 }
@@ -38,7 +38,7 @@ pub(super) struct OpenSession {
     pub(super) transport: Transport,
     pub(super) runtime: SessionRuntime,
     pub(super) labels: Arc<InfoKeys>,
-    /// Steps that were sent and not received.
+    /// Number of steps that were sent and whose reply was not received yet.
     pub(super) under_way: usize,
 }
 
@@ -52,16 +52,17 @@ impl Session {
         timeout.and_then(|timeout| Instant::now().checked_add(timeout))
     }
 
-    /// Returns M, the number of environments that the mask selects.
+    /// Returns the number M of environments that the mask selects. An empty mask selects all.
     pub(super) fn selected(&self, mask: &[u8]) -> usize {
         if mask.is_empty() { self.actions.num_envs } else { mask.iter().filter(|&&selected| selected != 0).count() }
     }
 
-    /// Refuses a session of the parent process. A forked process must not touch it: its locks may be held for ever.
+    /// Checks that this process made the session. A forked process must not use the session of its parent, whose locks
+    /// may be held forever.
     pub(super) fn require_own(&self) -> PyResult<()> {
         let is_own = match self.server {
             SessionServer::Address(..) => std::process::id() == self.owner,
-            // A system call for the process would take a tenth of a small step.
+            // The system call for the process's id would take a tenth of the time of a small step.
             SessionServer::Embedded(_) => self.forks == FORKS.load(Ordering::Relaxed),
         };
         if is_own {
@@ -70,7 +71,8 @@ impl Session {
         Err(failure(UNUSABLE, 0, "another process opened the session"))
     }
 
-    /// Takes the session for this thread alone, if at most `max_under_way` steps are under way.
+    /// Takes the open session for this thread. Fails if more than `max_under_way` steps are under way, i.e. were sent
+    /// and not received.
     pub(super) fn take(&self, max_under_way: usize) -> PyResult<Box<OpenSession>> {
         self.require_own()?;
         let mut state = self.state();
@@ -130,8 +132,9 @@ impl Session {
         self.exchange::<A>(py, open, None)
     }
 
-    /// Sends a request and receives its reply. `None` sends nothing and receives the reply of the oldest step that was sent
-    /// ahead. After a refusal the session goes on; other errors end it.
+    /// Sends a request and receives its reply. `None` sends nothing, and receives the reply to the oldest step that was
+    /// sent and not received. If the server refuses the request, the session can be used further. All other errors end
+    /// it.
     fn exchange<A>(
         &self,
         py: Python<'_>,
@@ -144,7 +147,7 @@ impl Session {
     {
         let OpenSession { transport, runtime, labels, .. } = &mut *open;
         let labels = Arc::clone(labels);
-        // A future for both would be as large as the larger one, and is moved.
+        // Two separate futures, because a common one would have the size of the larger and would have to be moved.
         let come = match transport {
             Transport::Stream { stream, .. } => {
                 let pending = pin!(Transport::exchange(stream, request));
@@ -184,7 +187,8 @@ impl Session {
 impl Drop for Session {
     fn drop(&mut self) {
         if std::process::id() != self.owner {
-            // The session is a copy of the parent's. Its locks may be held for ever, and its connection is the parent's.
+            // This session is a fork's copy of the parent's session. It is not dropped, because its locks may be held
+            // forever, and because its connection belongs to the parent.
             let state = self.state.get_mut().unwrap_or_else(PoisonError::into_inner);
             std::mem::forget(std::mem::replace(state, SessionState::Ended));
         }
@@ -192,7 +196,8 @@ impl Drop for Session {
 }
 
 impl OpenSession {
-    /// Ends the stream by a message, so that the server frees the environments even if a forked process holds the socket.
+    /// Ends the stream with a message to the server. The server then frees the environments even if a forked process
+    /// keeps the socket open.
     pub(super) fn close(self, py: Python<'_>) {
         let Self { transport, runtime, .. } = self;
         let is_embedded = transport.is_embedded();
@@ -205,7 +210,7 @@ impl OpenSession {
     }
 }
 
-/// Ends a session when dropped, unless its opening succeeded and forgot the guard.
+/// Ends a session when it is dropped. Once the session is open, the caller forgets the guard.
 pub(super) struct OpeningGuard<'a>(pub(super) &'a Session);
 
 impl Drop for OpeningGuard<'_> {
@@ -222,7 +227,7 @@ pub(super) fn explain(broken: WaitError) -> PyErr {
     }
 }
 
-/// Converts seconds to a duration. Returns `None`, no limit, for infinity and for more than a `Duration` holds.
+/// Converts seconds to a duration. Returns `None`, which means no limit, if the number is infinite or too large.
 pub(super) fn duration(seconds: f64) -> Option<Duration> {
     Duration::try_from_secs_f64(seconds).ok()
 }

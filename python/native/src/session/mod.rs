@@ -3,7 +3,7 @@
 //!
 //! - [`exchange`]: ownership of the session by one thread, requests and replies.
 //! - [`transport`]: the gRPC stream, or the embedded server.
-//! - [`opened`]: the reply that opened it.
+//! - [`opened`]: the reply to opening the session.
 
 mod exchange;
 mod opened;
@@ -35,9 +35,9 @@ pub use exchange::note_fork;
 pub use opened::Opened;
 pub use transport::NamedServer;
 
-/// Maximum number of steps under way. Their replies are kept until they are received.
+/// Maximum number of steps that may be sent before the first reply is received. It bounds the memory of stored replies.
 const MAX_STEPS_UNDER_WAY: usize = 64;
-/// The outcome of a step: observations, rewards, both flags, and the episodes that began or ended.
+/// The outcome of a step: observations, rewards, terminated flags, truncated flags, and episodes that began or ended.
 type StepArrays<'py> = (
     Bound<'py, PyArray2<f32>>,
     Bound<'py, PyArray1<f32>>,
@@ -46,14 +46,14 @@ type StepArrays<'py> = (
     Option<Events>,
 );
 
-/// The outcome of a step of an environment by itself: observation, reward, both flags, and the info.
+/// The outcome of a step of a single environment: observation, reward, terminated flag, truncated flag, and info.
 type SingleStep<'py> = (Bound<'py, PyArray1<f32>>, f64, bool, bool, Bound<'py, PyDict>);
 
-/// A session of a server, which owns a batch of environments.
+/// A session with a server. It owns a batch of environments.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Session {
     server: SessionServer,
-    /// Limit for a reply; `None` for no limit.
+    /// Maximum time to wait for a reply; `None` for no limit.
     timeout: Mutex<Option<Duration>>,
     actions: Actions,
     /// Number O of values in an observation.
@@ -67,20 +67,24 @@ pub struct Session {
     last: Mutex<LastStep>,
 }
 
-/// The state of a batch after the last reply, apart from the arrays that Python has, which are Python's to change.
+/// The state of a batch after the last reply. It is a copy, because Python may change the arrays that it got.
 #[derive(Default)]
 struct LastStep {
-    /// float32 `[N, O]`. A reset or restoration of some environments leaves the others' observations as they are.
+    /// The last observations, float32 `[N, O]`. They complete the observations of a request that resets or restores
+    /// only some environments.
     observations: Bytes,
-    /// `[N]` flags of episodes that ended and were not reset since; empty if there are none.
+    /// Flags `[N]` of environments whose episode was terminated in the last step and that were not reset since; empty
+    /// if there are none. `truncated` has the flags of truncated episodes.
     terminated: Bytes,
     truncated: Bytes,
 }
 
 #[pymethods]
 impl Session {
-    /// Makes a session with the server at an address, or with the embedded server. Times are in seconds, and may be
-    /// infinite. `action_size` is None for discrete actions. Actions of a `single` environment have no first axis.
+    /// Makes a session with the server at an address, or with the embedded server. [`open`](Self::open) connects to it.
+    /// `timeout` is the maximum time to wait for a reply. `keepalive` is the interval of keepalive pings and the
+    /// maximum time to wait for their answer. Times are in seconds, and may be infinite. `action_size` is None for
+    /// discrete actions. Actions of a `single` environment have no batch axis.
     #[new]
     #[pyo3(signature = (server, timeout, keepalive, num_envs, observation_size, action_size, single))]
     fn new(
@@ -94,7 +98,7 @@ impl Session {
     ) -> PyResult<Self> {
         let forever = |seconds| duration(seconds).unwrap_or(Duration::MAX);
         let timeouts = Timeouts {
-            reply: Duration::MAX, // waits have a limit of their own, which can be changed
+            reply: Duration::MAX, // `timeout` limits each wait, because it can be changed later
             keepalive_interval: forever(keepalive.0),
             keepalive_limit: forever(keepalive.1),
         };
@@ -111,13 +115,13 @@ impl Session {
         })
     }
 
-    /// Sets the limit for a reply, s.
+    /// Sets the maximum time to wait for a reply, s.
     #[setter]
     fn set_timeout(&self, seconds: f64) {
         *unpoisoned(&self.timeout) = duration(seconds);
     }
 
-    /// Whether a thread waits for a reply.
+    /// Whether a thread is waiting for a reply.
     #[getter]
     fn waits(&self) -> bool {
         matches!(*self.state(), SessionState::Busy)
@@ -129,7 +133,7 @@ impl Session {
         self.require_own().is_err() || matches!(*self.state(), SessionState::Ended)
     }
 
-    /// Number of steps that were sent and not received.
+    /// Number of steps that were sent and whose reply was not received yet.
     #[getter]
     fn under_way(&self) -> usize {
         match &*self.state() {
@@ -138,7 +142,8 @@ impl Session {
         }
     }
 
-    /// Returns which environments' episodes ended in the last step and were not reset since: bool `[N]`.
+    /// Returns the mask, bool `[N]`, of environments whose episode ended in the last step and that were not reset
+    /// since.
     fn last_ended<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<bool>> {
         let last = unpoisoned(&self.last);
         let mut ended = vec![false; self.actions.num_envs];
@@ -148,7 +153,7 @@ impl Session {
         PyArray1::from_vec(py, ended)
     }
 
-    /// Connects, and creates the environments.
+    /// Connects to the server, creates the environments, and begins their first episodes.
     #[pyo3(signature = (*, environment, version, parameters, seed, first_environment_index, episodes_per_trial, autoreset_mode, receipts, reward_terms, observe_parameters))]
     #[expect(clippy::too_many_arguments, reason = "each is a field of the request, given by its name")]
     fn open(
@@ -179,10 +184,10 @@ impl Session {
             receipts,
             reward_terms,
             observe_parameters,
-            // For a single environment messages cost no more than arrays.
+            // For a single environment, messages are as cheap as arrays.
             receipt_arrays: receipts && !self.actions.single,
             groups: Vec::new(),
-            lease: 0, // a batch that loses its connection is lost
+            lease: 0, // the session cannot be resumed after its connection is lost
         };
         {
             let mut state = self.state();
@@ -196,7 +201,7 @@ impl Session {
         let opening = pin!(self.server.clone().open(request));
         let come = runtime.wait(py, opening, self.deadline(), &self.closing).map_err(explain)?;
         let (transport, opened) = come.map_err(RequestFailure::into_error)?;
-        // An older server leaves parameters out of observations, which the package reports better.
+        // An older server ignores `observe_parameters`. The Python package then raises an error with a better message.
         if opened.observes_parameters == observe_parameters {
             check_observations(&opened.observations, n, self.observation_size).map_err(|error| malformed(&error))?;
         }
@@ -216,7 +221,8 @@ impl Session {
         })
     }
 
-    /// Advances every environment. `encode` converts actions of unusual types to bytes, or refuses them.
+    /// Advances every environment by one step. The Python function `encode` converts actions of unusual types to bytes,
+    /// or raises an error.
     fn step<'py>(
         &self,
         py: Python<'py>,
@@ -229,7 +235,8 @@ impl Session {
         self.stepped(py, &labels, stepped)
     }
 
-    /// Advances an environment by itself: observation `[O]`, reward, both flags, and the info.
+    /// Advances a single environment by one step. Returns observation `[O]`, reward, terminated and truncated flag, and
+    /// info.
     fn step_single<'py>(
         &self,
         py: Python<'py>,
@@ -251,7 +258,7 @@ impl Session {
         Ok((observation, reward.into(), terminated, truncated, info))
     }
 
-    /// The first half of a step: sends the actions, and waits for nothing.
+    /// Sends the actions of a step without waiting for the reply.
     fn send(&self, py: Python<'_>, actions: &Bound<'_, PyAny>, encode: &Bound<'_, PyAny>) -> PyResult<()> {
         let request = proto::Step { actions: self.actions.encode(actions, encode)? };
         let mut open = self.take(MAX_STEPS_UNDER_WAY - 1)?;
@@ -284,7 +291,7 @@ impl Session {
         }
     }
 
-    /// The second half: the outcome of the oldest step that was sent.
+    /// Waits for the reply to the oldest step that was sent and not received, and returns its outcome.
     fn recv<'py>(&self, py: Python<'py>) -> PyResult<StepArrays<'py>> {
         let open = self.take(MAX_STEPS_UNDER_WAY)?;
         if open.under_way == 0 {
@@ -295,7 +302,8 @@ impl Session {
         self.stepped(py, &labels, stepped)
     }
 
-    /// Begins new episodes. Returns observations `[N, O]`, with the last ones of other environments, and the episodes.
+    /// Begins new episodes in the environments that the mask selects. Returns observations `[N, O]`, and the episodes
+    /// that began. Other environments have their last observations.
     fn reset<'py>(
         &self,
         py: Python<'py>,
@@ -318,7 +326,7 @@ impl Session {
         Ok((observations, Events::begun(&labels, done.started)?))
     }
 
-    /// Saves environments.
+    /// Saves the environments that the mask selects, one snapshot each.
     fn snapshot<'py>(&self, py: Python<'py>, mask: &[u8]) -> PyResult<Vec<Bound<'py, PyBytes>>> {
         let open = self.take(0)?;
         let (_, saved) = self.ask(py, open, proto::Snapshot { mask: Bytes::copy_from_slice(mask) })?;
@@ -329,7 +337,8 @@ impl Session {
         Ok(saved.snapshots.iter().map(|snapshot| PyBytes::new(py, snapshot)).collect())
     }
 
-    /// Restores saved environments. Returns observations `[N, O]`, with the last ones of other environments.
+    /// Restores snapshots into the environments that the mask selects. Returns observations `[N, O]`. Other
+    /// environments have their last observations.
     fn restore<'py>(
         &self,
         py: Python<'py>,
@@ -339,12 +348,13 @@ impl Session {
         let snapshots = snapshots.into_iter().map(Bytes::from).collect();
         let open = self.take(0)?;
         let (_, restored) = self.ask(py, open, proto::Restore { mask: Bytes::copy_from_slice(mask), snapshots })?;
-        // Observations of an environment whose physics diverged may be any numbers.
+        // Only the length is checked. Observations may not be finite, because the physics of a snapshot may have
+        // diverged.
         arrays::numbers(&restored.observations, &[self.selected(mask), self.observation_size])?;
         self.merged(py, mask, &restored.observations)
     }
 
-    /// Draws an environment: uint8 `[height, width, 3]`.
+    /// Draws the environment in a slot. Returns a picture, uint8 `[height, width, 3]`.
     fn render<'py>(&self, py: Python<'py>, slot: u32, width: u32, height: u32) -> PyResult<Bound<'py, PyArray3<u8>>> {
         let open = self.take(0)?;
         let (_, rendered) = self.ask(py, open, proto::Render { slot, width, height })?;
@@ -358,12 +368,13 @@ impl Session {
         arrays::picture(py, &rendered.pixels, size)
     }
 
-    /// Answers the server's keepalive pings while no thread waits for a reply.
+    /// Answers the server's keepalive pings. Does nothing while a thread waits for a reply, because that thread answers
+    /// them.
     fn poll_io(&self, py: Python<'_>) {
         if std::process::id() != self.owner {
             return;
         }
-        // The state is locked without Python's lock, because a thread that has Python's lock may wait for the state.
+        // Python's lock is released first, because a thread that holds it may be waiting for the lock of the state.
         py.detach(|| {
             if let Ok(SessionState::Idle(open)) = self.state.try_lock().as_deref()
                 && !open.transport.is_embedded()
@@ -373,7 +384,7 @@ impl Session {
         });
     }
 
-    /// Ends the session; the server frees its environments. A thread that waits for a reply gets an error.
+    /// Ends the session. The server then frees its environments. A thread that waits for a reply gets an error.
     fn close(&self, py: Python<'_>) {
         if std::process::id() != self.owner {
             return;
@@ -381,7 +392,7 @@ impl Session {
         self.closing.close();
         let mut state = self.state();
         if matches!(*state, SessionState::Busy) {
-            return; // the thread that waits ends the session
+            return; // the waiting thread ends the session
         }
         if let SessionState::Idle(open) = std::mem::replace(&mut *state, SessionState::Ended) {
             drop(state);
@@ -391,8 +402,8 @@ impl Session {
 }
 
 impl Session {
-    /// Replaces the observations of the environments that the mask selects by `rows` `[M, O]`, whose length was checked.
-    /// An empty mask selects all. Returns the observations `[N, O]` of all environments.
+    /// Replaces the stored observations of the environments that the mask selects by `rows` `[M, O]`. An empty mask
+    /// selects all. Returns the observations `[N, O]` of all environments. The caller has checked the length of `rows`.
     fn merged<'py>(&self, py: Python<'py>, mask: &[u8], rows: &Bytes) -> PyResult<Bound<'py, PyArray2<f32>>> {
         let mut last = unpoisoned(&self.last);
         let width = 4 * self.observation_size;
@@ -411,7 +422,7 @@ impl Session {
         arrays::rows(py, &last.observations, self.actions.num_envs, self.observation_size)
     }
 
-    /// Checks the reply to a step, and keeps what later replies are merged with.
+    /// Checks the reply to a step, and stores its observations and flags as the last ones.
     fn note(&self, stepped: &proto::Stepped) -> PyResult<()> {
         check_step(stepped, self.actions.num_envs, self.observation_size).map_err(|error| malformed(&error))?;
         *unpoisoned(&self.last) = LastStep {
@@ -440,7 +451,7 @@ impl Session {
     }
 }
 
-/// Returns a server's catalogue as JSON.
+/// Requests the catalogue of the server at an address. Returns it as JSON. `timeout` is in seconds.
 #[pyfunction]
 pub fn catalogue(py: Python<'_>, address: &str, timeout: f64) -> PyResult<String> {
     let address = Address::from_str(address).map_err(|error| failure(INVALID, 0, error.to_string()))?;

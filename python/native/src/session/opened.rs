@@ -1,4 +1,4 @@
-//! The reply that opened a session.
+//! The reply to opening a session.
 
 use std::sync::Arc;
 
@@ -10,26 +10,26 @@ use pyo3::prelude::*;
 use crate::arrays;
 use crate::infos::Events;
 
-/// The reply that opened a session.
+/// The reply to opening a session.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Opened {
-    /// The environment that was opened, as JSON of the catalogue.
+    /// The description of the opened environment, in the JSON format of the catalogue.
     #[pyo3(get)]
     pub(super) environment: String,
-    /// Whether observations have parameters at their end.
+    /// Whether observations end with the parameters.
     #[pyo3(get)]
     pub(super) observes_parameters: bool,
     pub(super) served: Arc<proto::Environment>,
     pub(super) observations: Bytes,
     pub(super) shape: [usize; 2],
-    /// The begun episodes.
+    /// The first episodes.
     #[pyo3(get)]
     pub(super) events: Py<Events>,
 }
 
 #[pymethods]
 impl Opened {
-    /// First observations, `[N, O]`.
+    /// The first observations, `[N, O]`.
     #[getter]
     fn observations<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f32>>> {
         arrays::rows(py, &self.observations, self.shape[0], self.shape[1])
@@ -37,7 +37,7 @@ impl Opened {
 }
 
 impl Opened {
-    /// Returns the environment that was opened.
+    /// Returns the server's description of the opened environment.
     pub fn served(&self) -> &Arc<proto::Environment> {
         &self.served
     }

@@ -10,7 +10,7 @@ use pyo3::prelude::*;
 use crate::embedded::{EmbeddedStream, NativeServer};
 use crate::failure::{self, INVALID, RequestFailure, failure};
 
-/// A server, as Python names it.
+/// A server in Python's form.
 #[derive(FromPyObject)]
 pub enum NamedServer<'py> {
     /// The address of a server.
@@ -23,12 +23,15 @@ pub enum NamedServer<'py> {
 #[derive(Clone)]
 pub(super) enum SessionServer {
     Address(Address, Timeouts),
-    /// The embedded server, which the session does not keep alive until it is open.
+    /// The embedded server. The reference is weak, so it does not keep the server alive.
     Embedded(Weak<embedded::EmbeddedServer>),
 }
 
 impl SessionServer {
-    /// Parses the address, or takes the embedded server, that Python gave.
+    /// Converts a server from Python's form.
+    ///
+    /// # Errors
+    /// If the address is malformed.
     pub(super) fn new(named: &NamedServer<'_>, timeouts: Timeouts) -> PyResult<Self> {
         match named {
             NamedServer::Address(address) => {
@@ -58,7 +61,7 @@ impl SessionServer {
 }
 
 /// The transport of an open session's requests and replies. A stream is dropped before its connection.
-#[allow(clippy::large_enum_variant)] // a session has one
+#[allow(clippy::large_enum_variant)] // each session has only one transport
 pub(super) enum Transport {
     Stream {
         stream: Stream,
@@ -69,13 +72,13 @@ pub(super) enum Transport {
 }
 
 impl Transport {
-    /// Whether the server is in this process, so that there is no connection to write to or read from.
+    /// Whether the server runs in this process. Then there is no connection.
     pub(super) fn is_embedded(&self) -> bool {
         matches!(self, Self::Embedded(_))
     }
 
-    /// Sends a request and receives its reply. `None` sends nothing and receives the reply of the oldest step that was sent
-    /// ahead by [`send`](Self::send).
+    /// Sends a request and receives its reply. `None` sends nothing, and receives the reply to the oldest step that
+    /// [`send`](Self::send) sent.
     pub(super) async fn exchange<A: TypedRequest>(
         stream: &mut Stream,
         request: Option<A>,
@@ -86,7 +89,7 @@ impl Transport {
         }
     }
 
-    /// Sends a step ahead. A later [`exchange`](Self::exchange) of `None` receives its reply.
+    /// Sends a step without waiting for its reply. A later [`exchange`](Self::exchange) of `None` receives the reply.
     pub(super) async fn send(&mut self, step: proto::Step) -> Result<(), RequestFailure> {
         match self {
             Self::Stream { stream, .. } => stream.send_ahead(step).await.map_err(failed),
