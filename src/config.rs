@@ -1,4 +1,5 @@
-//! The server's configuration: defaults, then a TOML file, then environment variables, then flags.
+//! The server's configuration. Its sources, each of which overrides the previous: defaults, a TOML file, environment
+//! variables, command-line flags.
 
 use clap::Parser;
 use config::{Environment, File, FileFormat};
@@ -13,18 +14,19 @@ use std::{
 use tracing_subscriber::filter::{LevelFilter, Targets};
 
 const ENV_PREFIX: &str = "PERTURB_SERVER";
-/// Upper limit of timeouts and intervals, a day: the transport adds them to the present, which must not overflow.
+/// The maximum of timeouts and intervals, s: one day. The transport adds them to the present time, which must not
+/// overflow.
 const MAX_SECONDS: u64 = 86_400;
-/// Lower limit of the memory for bytes in flight. Pictures need more.
+/// The minimum of `max_memory`, bytes. Pictures need more.
 const MIN_MEMORY: usize = 1 << 20;
-/// The number of cores for which there is a transport thread by default: physics needs most of them.
+/// The number of cores for each transport thread, by default. It is high because physics needs most of the cores.
 const CORES_PER_TRANSPORT_THREAD: usize = 8;
-/// Upper limit of the transport threads. More would not have enough to do on any machine.
+/// The maximum number of transport threads. More would not have enough to do on any machine.
 const MAX_TRANSPORT_THREADS: usize = 128;
-/// The maximum length of the file of settings.
+/// The maximum length of the configuration file, bytes.
 const MAX_CONFIG_BYTES: u64 = 1 << 20;
-/// The settings of `--private`. Limits protect shared servers only. The program may compute for long between two steps;
-/// its death closes the socket and the pipe anyway.
+/// The settings of `--private`. They remove the limits, which protect only shared servers. Timeouts are long because
+/// the program may compute for long between two steps; if it dies, its socket and pipe are closed anyway.
 const PRIVATE: &str = "
     exit_with_stdin = true
     transport_threads = 1
@@ -49,8 +51,8 @@ pub struct Arguments {
     #[arg(long, value_name = "FILE", env = "PERTURB_SERVER_CONFIG")]
     #[serde(skip)]
     pub config: Option<PathBuf>,
-    /// Address to listen on: unix:/path/to/socket, or tcp://address:port; port 0 takes a free one. Repeatable. The server
-    /// prints its addresses on standard output. [default: tcp://127.0.0.1:7447]
+    /// Address to listen on: unix:/path/to/socket, or tcp://address:port; port 0 takes a free port. Repeatable. The
+    /// server prints its addresses on standard output. [default: tcp://127.0.0.1:7447]
     #[arg(long, value_name = "ADDRESS")]
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub listen: Vec<String>,
@@ -58,8 +60,8 @@ pub struct Arguments {
     #[arg(long, value_name = "N")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub workers: Option<usize>,
-    /// Number of threads that talk to clients. A connection stays on one of them. [default: one for each eight cores, at
-    /// least one]
+    /// Number of transport threads, which talk to clients. A connection stays on one of them. [default: one for each
+    /// eight cores, at least one]
     #[arg(long, value_name = "N")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub transport_threads: Option<usize>,
@@ -75,54 +77,57 @@ pub struct Arguments {
     #[arg(long, value_name = "BYTES")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_message_bytes: Option<usize>,
-    /// Maximum number of bytes in flight over all sessions: requests, replies, pictures, policies that act. Requests
-    /// beyond it are refused. [default: a quarter of the memory of the machine, or of the container's limit]
+    /// Maximum number of bytes in flight, over all sessions: requests, replies, pictures, and policies that the server
+    /// runs. Further requests are refused. [default: a quarter of the memory of the machine, or of the container's
+    /// limit]
     #[arg(long, value_name = "BYTES")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_memory: Option<usize>,
-    /// Maximum number of sessions of one machine, or of one user of a Unix socket; 0 = --max-sessions. [default: 0]
+    /// Maximum number of sessions of one client machine, or of one local user over a Unix socket; 0 = --max-sessions.
+    /// [default: 0]
     #[arg(long, value_name = "N")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_peer_sessions: Option<usize>,
-    /// Timeout for a connection to begin, and for a session to be opened. [default: 10]
+    /// Time within which a client must finish the handshake of a connection, and then open a session. [default: 10]
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub handshake_seconds: Option<u64>,
-    /// Timeout for a client to finish a request, or to read a reply; 0 = never. [default: 300]
+    /// Time within which a client must finish sending a request, or read a reply; 0 = no limit. [default: 300]
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stall_seconds: Option<u64>,
-    /// Time that running sessions have after SIGTERM. [default: 30]
+    /// Time for which running sessions may continue after SIGTERM. [default: 30]
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub grace_seconds: Option<u64>,
-    /// Time after which sessions that send nothing are ended; 0 = never. [default: 0]
+    /// Time after which a session that sends no request is ended; 0 = no limit. [default: 0]
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub idle_seconds: Option<u64>,
-    /// Time that a session with a lease survives without a connection, so that its client can resume it; 0 = no leases.
-    /// [default: 60]
+    /// Time for which a session with a lease survives the loss of its connection, so that its client can resume it; 0 =
+    /// no leases. [default: 60]
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lease_seconds: Option<u64>,
-    /// Interval of keepalive pings on silent connections. A connection that does not answer within this time is closed,
+    /// Interval of keepalive pings on idle connections. A connection that does not answer within this time is closed,
     /// and its environments are freed. [default: 60]
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keepalive_seconds: Option<u64>,
-    /// TOML file of tokens. Every call over TCP must show one. Each has a name and sha256 (or token), and optionally
-    /// max_sessions, max_envs, max_steps_per_second, max_bytes, and a role that says what it may draw from. The file is
-    /// read again when it changes.
+    /// TOML file of tokens. Every call over TCP must carry one of them. Each token has a name and sha256 (or token),
+    /// and optionally max_sessions, max_envs, max_steps_per_second, max_bytes, and a role that limits the parameters it
+    /// may draw. The file is read again when it changes.
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tokens: Option<PathBuf>,
-    /// File that records what every token draws from (distribution, seed, indices, episodes), before it does, in lines
-    /// that are chained by hashes. `perturb audit --ledger` reads it. An existing file is continued.
+    /// File in which the server records every draw of parameters before it happens, with token, distribution, seed,
+    /// indices and episodes. Its lines form a hash chain. `perturb audit --ledger` reads it. An existing file is
+    /// continued.
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ledger: Option<PathBuf>,
-    /// The server's certificate for TLS on its TCP addresses, in PEM, with the intermediate certificates. The files of
-    /// TLS are read again when they change.
+    /// The server's certificate for TLS on its TCP addresses, in PEM, with the intermediate certificates. The TLS files
+    /// are read again when they change.
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls_cert: Option<PathBuf>,
@@ -130,21 +135,21 @@ pub struct Arguments {
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls_key: Option<PathBuf>,
-    /// Certificates in PEM of the authorities that may sign clients' certificates. Without it clients need no
+    /// Certificates in PEM of the authorities that may sign clients' certificates. If not given, clients need no
     /// certificate.
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls_client_ca: Option<PathBuf>,
-    /// Address of the metrics for Prometheus, at the path /metrics: tcp://127.0.0.1:port or unix:/path. Everybody who
-    /// can connect can read them. [default: none]
+    /// Address at which Prometheus reads the metrics, under the path /metrics: tcp://127.0.0.1:port or unix:/path.
+    /// Everybody who can connect can read them. [default: none]
     #[arg(long, value_name = "ADDRESS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub metrics: Option<String>,
-    /// Let other machines use this server without tokens, or without encryption.
+    /// Allow other machines to use this server without tokens or without encryption.
     #[arg(long)]
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub insecure: bool,
-    /// Octal mode of the files of Unix sockets: 0660 admits the group, 0666 everybody. [default: 0600]
+    /// Octal permissions of Unix socket files: 0660 admits the group, 0666 everybody. [default: 0600]
     #[arg(long, value_name = "MODE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub socket_mode: Option<String>,
@@ -153,69 +158,71 @@ pub struct Arguments {
     #[arg(long, value_name = "FILTER")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub log: Option<String>,
-    /// Shut down when standard input closes. A server that a program starts through a pipe then ends with the program,
-    /// however that ends.
+    /// Shut down when standard input closes. A server that a program starts through a pipe then ends with that program,
+    /// even if the program crashes.
     #[arg(long)]
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub exit_with_stdin: bool,
-    /// Serve only the program that starts this server: --exit-with-stdin, no limits, an hour of silence between two
-    /// requests, a second to end. The server then ignores variables and files, which are for servers that people run.
+    /// Serve only the program that starts this server: implies --exit-with-stdin, removes limits, allows an hour of
+    /// silence between two requests, and shuts down within a second. The server then ignores environment variables and
+    /// --config.
     #[arg(long)]
     #[serde(skip)]
     pub private: bool,
-    /// Folder with an MJCF model and a file task.toml, which is served as another environment; see docs/tasks.md.
+    /// Folder with an MJCF model and a file task.toml, to be served as an additional environment; see docs/tasks.md.
     /// Repeatable.
     #[arg(long = "task", value_name = "FOLDER")]
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub tasks: Vec<PathBuf>,
-    /// Start no server, but load the folders of --task, each in a process of its own, and describe them: observations,
-    /// actions, rewards, parameters, sizes, speed, and edits without an effect.
+    /// Instead of starting a server, load the folders of --task, each in a process of its own, and describe them:
+    /// observations, actions, rewards, parameters, sizes, speed, and parameters without an effect.
     #[arg(long, group = "instead")]
     #[serde(skip)]
     pub check: bool,
-    /// Start no server, but print a JSON schema of task.toml.
+    /// Instead of starting a server, print a JSON schema of task.toml.
     #[arg(long, group = "instead")]
     #[serde(skip)]
     pub task_schema: bool,
-    /// Load this folder under limits of memory and processor time, and describe it. A server starts itself with this flag
+    /// Load this folder under limits of memory and CPU time, and describe it. A server runs itself with this flag
     /// before it loads a folder.
     #[arg(long, value_name = "FOLDER", group = "instead", hide = true)]
     #[serde(skip)]
     pub check_task: Option<PathBuf>,
-    /// Also measure the speed of the folder of --check-task.
+    /// With --check-task, also measure the speed of the environment.
     #[arg(long, hide = true, requires = "check_task")]
     #[serde(skip)]
     pub measure_task: bool,
-    /// Start no server, but ask the running one with these settings, at its first address, whether it accepts sessions.
-    /// The exit status is 0 if it does, else 1. For health checks of containers.
+    /// Instead of starting a server, check whether the running server with these settings accepts sessions, at its
+    /// first address. The exit status is 0 if it does, otherwise 1. For health checks of containers.
     #[arg(long, group = "instead")]
     #[serde(skip)]
     pub health: bool,
-    /// Start no server, but print as JSON what it would serve: the environments with their spaces, parameters and
-    /// success rules, and the limits that clients must keep.
+    /// Instead of starting a server, print as JSON what it would serve: the environments with their spaces, parameters
+    /// and success rules, and the limits that clients must keep.
     #[arg(long, group = "instead")]
     #[serde(skip)]
     pub catalogue: bool,
-    /// Start no server, but print the contract, perturb/v1/perturb.proto, from which clients in any language are made.
+    /// Instead of starting a server, print its protocol, perturb/v1/perturb.proto, from which clients in any language
+    /// can be generated.
     #[arg(long, group = "instead")]
     #[serde(skip)]
     pub proto: bool,
-    /// Start no server, but print a new token on standard output, and its entry for the file of --tokens on standard
-    /// error.
+    /// Instead of starting a server, print a new token on standard output, and its entry for the file of --tokens on
+    /// standard error.
     #[arg(long, value_name = "NAME", group = "instead")]
     #[serde(skip)]
     pub new_token: Option<String>,
-    /// Start no server, but print the completions of these flags for a shell.
+    /// Instead of starting a server, print the shell completions of these flags.
     #[arg(long, value_name = "SHELL", group = "instead")]
     #[serde(skip)]
     pub completions: Option<clap_complete::Shell>,
-    /// Start no server, but print the manual page.
+    /// Instead of starting a server, print the manual page.
     #[arg(long, group = "instead")]
     #[serde(skip)]
     pub man: bool,
 }
 
-/// The validated configuration.
+/// The validated configuration of a server.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
@@ -223,7 +230,7 @@ pub struct Config {
     pub listen: Vec<ListenAddress>,
     /// The number of physics threads, 1 … 1024.
     pub workers: usize,
-    /// The number of threads that talk to clients, 1 … 128.
+    /// The number of transport threads, which talk to clients, 1 … 128.
     pub transport_threads: usize,
     /// Maximum number of environments, over all sessions, 1 … 2^24.
     pub max_envs: usize,
@@ -233,23 +240,23 @@ pub struct Config {
     pub max_message_bytes: usize,
     /// Maximum number of bytes in flight, at least 1 MiB.
     pub max_memory: usize,
-    /// Maximum number of sessions of a peer; 0 = `max_sessions`.
+    /// Maximum number of sessions of one peer (machine or user); 0 = `max_sessions`.
     pub max_peer_sessions: usize,
-    /// Timeout for a connection to begin, and for a session to be opened, s, 1 … 86400.
+    /// Time within which a client must finish the handshake of a connection, and then open a session, s, 1 … 86400.
     pub handshake_seconds: u64,
-    /// Timeout for a client to finish a request, or to read a reply, s, at most 86400; 0 = never.
+    /// Time within which a client must finish sending a request, or read a reply, s, at most 86400; 0 = no limit.
     pub stall_seconds: u64,
-    /// Time that running sessions have after SIGTERM, s.
+    /// Time for which running sessions may continue after SIGTERM, s.
     pub grace_seconds: u64,
-    /// Time after which sessions that send nothing are ended, s; 0 = never.
+    /// Time after which a session that sends no request is ended, s; 0 = no limit.
     pub idle_seconds: u64,
-    /// Time that a session with a lease survives without a connection, s, at most 86400; 0 = no leases.
+    /// Time for which a session with a lease survives the loss of its connection, s, at most 86400; 0 = no leases.
     pub lease_seconds: u64,
-    /// Interval of keepalive pings on silent connections, s, 1 … 86400.
+    /// Interval of keepalive pings on idle connections, s, 1 … 86400.
     pub keepalive_seconds: u64,
-    /// The file of tokens that callers must show.
+    /// The token file; if `None`, calls need no token.
     pub tokens: Option<PathBuf>,
-    /// The file that records all draws.
+    /// The ledger file, which records all draws.
     pub ledger: Option<PathBuf>,
     /// The server's certificate for TLS.
     pub tls_cert: Option<PathBuf>,
@@ -257,17 +264,17 @@ pub struct Config {
     pub tls_key: Option<PathBuf>,
     /// The authorities that may sign clients' certificates.
     pub tls_client_ca: Option<PathBuf>,
-    /// The address of the metrics.
+    /// The address of the metrics page; `None` for no metrics.
     pub metrics: Option<ListenAddress>,
     /// Whether other machines may use this server without tokens or without encryption.
     pub insecure: bool,
-    /// The mode of Unix sockets' files.
+    /// The permissions of Unix socket files.
     pub socket_mode: SocketMode,
     /// The log filter.
     pub log: String,
     /// Whether to shut down when standard input closes.
     pub exit_with_stdin: bool,
-    /// The folders whose tasks are served beside the built-in environments.
+    /// The folders of tasks that are served in addition to the built-in environments.
     pub tasks: Vec<PathBuf>,
 }
 
@@ -307,7 +314,8 @@ fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 
-/// Returns a quarter of the machine's memory, or of the limit of this process's container or service, in bytes.
+/// Returns a quarter of the machine's memory or, if lower, of the memory limit of this process's container or service,
+/// bytes.
 fn default_memory() -> usize {
     let rustix::system::Sysinfo { totalram, mem_unit, .. } = rustix::system::sysinfo();
     let machine = (totalram as usize).saturating_mul(mem_unit as usize);
@@ -316,7 +324,7 @@ fn default_memory() -> usize {
     (group.unwrap_or(machine).min(machine) / 4).max(MIN_MEMORY)
 }
 
-/// Returns the lowest memory limit of this process's control group and those around it, in bytes; `groups` is the text of
+/// Returns the lowest memory limit of this process's control group and its ancestors, bytes. `groups` is the text of
 /// `/proc/self/cgroup`.
 fn group_memory(root: &Path, groups: &str) -> Option<usize> {
     let own = groups.lines().find_map(|line| line.strip_prefix("0::/")).unwrap_or_default();
@@ -326,10 +334,10 @@ fn group_memory(root: &Path, groups: &str) -> Option<usize> {
 
 /// Returns the environment variables that are settings.
 fn variables() -> Environment {
-    // Other programs' variables need not be UTF-8. A setting that is not UTF-8 is refused, with its invalid characters
-    // replaced.
+    // Variables of other programs need not be UTF-8. A setting that is not UTF-8 gets replacement characters and is
+    // then refused.
     let text = std::env::vars_os().map(|(k, v)| (k.to_string_lossy().into_owned(), v.to_string_lossy().into_owned()));
-    // The variable that names the file is no setting.
+    // PERTURB_SERVER_CONFIG names the configuration file, and is not itself a setting.
     let settings = text
         .filter(|(name, value)| !name.eq_ignore_ascii_case("PERTURB_SERVER_CONFIG") && !is_service_link(name, value));
     Environment::with_prefix(ENV_PREFIX)
@@ -341,13 +349,13 @@ fn variables() -> Environment {
         .source(Some(settings.collect()))
 }
 
-/// Whether a variable is one that Kubernetes injects into every container for a Service whose name begins with
-/// `perturb-server`, such as `PERTURB_SERVER_PORT=tcp://10.96.3.7:7447` or `PERTURB_SERVER_SERVICE_HOST`.
+/// Whether Kubernetes has set this variable. It sets such variables in every container if a Service has a name that
+/// begins with `perturb-server`: e.g. `PERTURB_SERVER_PORT=tcp://10.96.3.7:7447` or `PERTURB_SERVER_SERVICE_HOST`.
 fn is_service_link(name: &str, value: &str) -> bool {
     let Some(rest) = name.strip_prefix(ENV_PREFIX) else { return false };
     let is_number = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
     let is_port = |rest: &str| {
-        // NUMBER_PROTOCOL, or that with _PROTO, _PORT or _ADDR
+        // `NUMBER_PROTOCOL`, optionally followed by `_PROTO`, `_PORT` or `_ADDR`.
         let mut parts = rest.split('_');
         parts.next().is_some_and(is_number)
             && parts.next().is_some_and(|protocol| matches!(protocol, "TCP" | "UDP" | "SCTP"))
@@ -365,7 +373,7 @@ fn is_service_link(name: &str, value: &str) -> bool {
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Deserialize)]
 #[serde(try_from = "String")]
 pub enum ListenAddress {
-    /// A TCP address and port; port 0 = any free one.
+    /// A TCP address and port; port 0 stands for any free port.
     Tcp(SocketAddr),
     /// The path of a Unix socket.
     Unix(PathBuf),
@@ -388,7 +396,7 @@ impl TryFrom<String> for ListenAddress {
 }
 
 impl ListenAddress {
-    /// Returns the address as `--listen` takes it.
+    /// Returns the address in the syntax of `--listen`.
     pub fn written(&self) -> String {
         match self {
             Self::Tcp(address) => format!("tcp://{address}"),
@@ -406,13 +414,13 @@ impl fmt::Display for ListenAddress {
     }
 }
 
-/// The mode of a Unix socket's file. Users who may write to the file may connect.
+/// The permissions of a Unix socket's file. Users who may write to the file may connect.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
 pub struct SocketMode(u32);
 
 impl SocketMode {
-    /// Returns the mode's bits.
+    /// Returns the permission bits.
     pub fn bits(self) -> u32 {
         self.0
     }
@@ -428,7 +436,7 @@ impl TryFrom<String> for SocketMode {
     type Error = String;
 
     fn try_from(text: String) -> Result<Self, String> {
-        // The owner must be able to read and write, and nobody to execute.
+        // The owner must be able to read and write, and nobody may execute.
         let bits = u32::from_str_radix(&text, 8).ok().filter(|bits| bits & !0o066 == 0o600);
         bits.map(Self).ok_or_else(|| {
             format!("{text:?} is no mode of a socket; expected an octal mode such as 0600, 0660 or 0666")
@@ -440,18 +448,18 @@ impl TryFrom<String> for SocketMode {
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A source cannot be read, or has an unknown key or a value of a wrong type.
+    /// A source of settings cannot be read, or has an unknown key or a value of a wrong type.
     #[error("the configuration cannot be read: {0}; --help lists the settings")]
     Source(#[from] config::ConfigError),
-    /// The file of settings is a pipe, a device or a folder, or too large.
+    /// The configuration file is a pipe, a device or a folder, or it is too large.
     #[error("cannot read {path}: {reason}; correct --config")]
     File {
-        /// The file.
+        /// The path of the file.
         path: String,
-        /// Why not.
+        /// The cause.
         reason: String,
     },
-    /// Other machines could use the server, or read along.
+    /// Other machines could use the server, or eavesdrop on its connections.
     #[error(
         "{address} can be reached by other machines, and {lacks}: pass --tls-cert, --tls-key and --tokens (or \
          --tls-client-ca); or pass --insecure if everybody who reaches that address may use the server and read along"
@@ -459,7 +467,7 @@ pub enum Error {
     Insecure {
         /// The address that the server would listen on.
         address: String,
-        /// The missing protection.
+        /// The missing protection, as a part of a sentence.
         lacks: &'static str,
     },
     /// Other machines could read the metrics.
@@ -469,32 +477,32 @@ pub enum Error {
          read them"
     )]
     InsecureMetrics {
-        /// The address of the metrics.
+        /// The address of `--metrics`.
         address: String,
     },
     /// A value is out of its range.
     #[error("{key} is {got}; expected {expected}")]
     Value {
-        /// The setting.
+        /// The name of the setting.
         key: &'static str,
-        /// The value that was given.
+        /// The value of the setting.
         got: String,
-        /// The values that are accepted.
+        /// The values that are allowed.
         expected: &'static str,
     },
 }
 
-/// Checks that a file of settings is a plain one.
+/// Checks that the configuration file is a regular file and not too large.
 fn require_plain_file(path: &Path) -> Result<(), Error> {
     let refused = |error: std::io::Error| Error::File { path: path.display().to_string(), reason: error.to_string() };
     perturb_system::read_plain(path, MAX_CONFIG_BYTES).map(drop).map_err(refused)
 }
 
 impl Config {
-    /// Merges defaults, file, environment variables and flags, and validates the result.
+    /// Merges the defaults, the configuration file, environment variables and flags, and validates the result.
     ///
     /// # Errors
-    /// [`Error`]: nothing has been bound or started.
+    /// [`Error`], if a source cannot be read or a value is invalid.
     pub fn load(arguments: &Arguments) -> Result<Self, Error> {
         let mut builder = config::Config::builder();
         if arguments.private {
@@ -576,28 +584,28 @@ impl Config {
         Ok(self)
     }
 
-    /// Returns the complete filter. A level applies to this program's own lines. Lines of its libraries mostly follow from
-    /// what clients send, so only their errors are logged, unless a filter asks for more.
+    /// Returns the filter of log lines. If the setting is a level, it applies to this program's own lines. Most lines
+    /// of its libraries are caused by what clients send, so only their errors are logged.
     pub fn filter(&self) -> Targets {
         match self.log.parse::<LevelFilter>() {
             Ok(level) => Targets::new().with_default(level.min(LevelFilter::ERROR)).with_target("perturb", level),
-            Err(_) => self.log.parse().unwrap_or_default(), // `Config::load` has refused wrong filters
+            Err(_) => self.log.parse().unwrap_or_default(), // cannot fail: `Config::load` has checked the filter
         }
     }
 
-    /// Returns the files of TLS, if TLS is requested.
+    /// Returns the TLS files, or `None` if TLS is not configured.
     pub fn tls(&self) -> Option<TlsFiles> {
         let (cert, key) = self.tls_cert.clone().zip(self.tls_key.clone())?;
         Some(TlsFiles { cert, key, client_ca: self.tls_client_ca.clone() })
     }
 
-    /// The grace period.
+    /// The grace period of a shutdown.
     pub fn grace(&self) -> Duration {
         Duration::from_secs(self.grace_seconds)
     }
 }
 
-/// The files of TLS, in PEM.
+/// The paths of the TLS files, which are in PEM.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TlsFiles {
     /// The server's certificate, and the intermediate certificates.
@@ -609,7 +617,7 @@ pub struct TlsFiles {
 }
 
 impl TlsFiles {
-    /// Returns the paths in the order in which the server reads the files.
+    /// Returns the paths of the certificate, the key and the authorities (if any), in this order.
     pub fn paths(&self) -> Vec<PathBuf> {
         [Some(&self.cert), Some(&self.key), self.client_ca.as_ref()].into_iter().flatten().cloned().collect()
     }

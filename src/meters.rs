@@ -1,4 +1,4 @@
-//! Counters of steps, episodes and times. They are atomics, so counting takes neither a lock nor memory.
+//! Counters of steps, episodes and durations. They are atomics, so counting needs neither a lock nor an allocation.
 
 use std::{
     array,
@@ -9,12 +9,14 @@ use std::{
     time::Duration,
 };
 
-/// Number of bounds of a [`Histogram`]. The first is 1 µs, each further one is twice the one before, and the last is 8.4 s.
+/// The number of bounds of a [`Histogram`]. The first bound is 1 µs, each further bound is twice the previous one, and
+/// the last is 8.4 s.
 pub const N_BOUNDS: usize = 24;
 
 /// A histogram of durations.
 pub struct Histogram {
-    /// For each bound the number of durations up to it and longer than the bound before; then the number of longer ones.
+    /// For each bound, the number of durations up to this bound and above the previous one; finally, the number above
+    /// all bounds.
     counts: [AtomicU64; N_BOUNDS + 1],
     nanos: AtomicU64,
 }
@@ -34,8 +36,8 @@ impl Histogram {
         self.nanos.fetch_add(nanos, Ordering::Relaxed);
     }
 
-    /// Returns for each bound, in s, and finally for infinity, the number of durations up to it and longer than the bound
-    /// before.
+    /// Returns each bound, in s, with the number of durations up to this bound and above the previous one. The last
+    /// bound is infinity.
     pub fn counts(&self) -> [(f64, u64); N_BOUNDS + 1] {
         let bound = |place| if place < N_BOUNDS { (1u64 << place) as f64 / 1e6 } else { f64::INFINITY };
         array::from_fn(|place| (bound(place), self.counts[place].load(Ordering::Relaxed)))
@@ -47,38 +49,38 @@ impl Histogram {
     }
 }
 
-/// The classes of batch sizes: the maximum size of each, and its label in metrics.
+/// The classes of batch sizes: each class's maximum size and its label in metrics.
 const BATCH_SIZE_CLASSES: [(usize, &str); 5] =
     [(1, "1"), (16, "2-16"), (256, "17-256"), (4096, "257-4096"), (usize::MAX, "4097+")];
 
-/// Counters of all environments of one name.
+/// Counters of all environments with the same name.
 #[derive(Default)]
 pub struct Meter {
-    /// Steps, counted for each environment.
+    /// The number of steps, summed over the environments.
     pub steps: AtomicU64,
-    /// Ended episodes.
+    /// The number of ended episodes.
     pub episodes: AtomicU64,
     times: [Histogram; BATCH_SIZE_CLASSES.len()],
 }
 
 impl Meter {
-    /// Returns the histogram of steps of batches of this size: the time of a step of all its environments, from the
-    /// validation of the request to the reply.
+    /// Returns the histogram of step times for batches of `size` environments. A step time runs from the validation of
+    /// the request to the reply.
     pub fn times(&self, size: usize) -> &Histogram {
         &self.times[BATCH_SIZE_CLASSES.iter().position(|(greatest, _)| size <= *greatest).unwrap_or_default()]
     }
 
-    /// Returns the histogram of each class of batch sizes, with the class's label.
+    /// Returns each class of batch sizes: its label, and the histogram of its step times.
     pub fn classes(&self) -> impl Iterator<Item = (&'static str, &Histogram)> {
         BATCH_SIZE_CLASSES.iter().map(|(_, name)| *name).zip(&self.times)
     }
 }
 
-/// Counters of one batch, which also count for all environments of its name.
+/// Counts the steps of one batch, and adds them to the counters of all environments with the same name.
 pub struct Tally {
-    /// The counters of all environments of the name.
+    /// The counters of all environments with the same name.
     pub meter: Arc<Meter>,
-    /// The batch's own steps.
+    /// The steps of this batch, summed over its environments.
     steps: AtomicU64,
 }
 
@@ -95,7 +97,7 @@ impl Tally {
         self.meter.episodes.fetch_add(episodes as u64, Ordering::Relaxed);
     }
 
-    /// Returns the batch's steps so far, counted for each environment.
+    /// Returns the number of the batch's steps so far, summed over its environments.
     pub fn steps(&self) -> u64 {
         self.steps.load(Ordering::Relaxed)
     }

@@ -1,9 +1,10 @@
-//! Priorities of threads. The transport comes before all others, at any niceness of the process.
+//! Priorities of threads. The transport threads have a higher priority than all others.
 
 use std::sync::OnceLock;
 
-/// Raises this thread's niceness by `by` above the process's. If the system refuses, the thread keeps its niceness. The
-/// first call in the process reads the process's niceness, so it must come from a thread that has not changed its own.
+/// Lowers the priority of the calling thread: sets its niceness to the process's niceness plus `by`. If the system
+/// refuses, only logs that. The first call in the process reads the process's niceness, so it must come from a thread
+/// whose niceness has not been changed.
 pub(crate) fn lower(by: i32) {
     static NICENESS: OnceLock<i32> = OnceLock::new();
     let niceness = *NICENESS.get_or_init(|| rustix::process::getpriority_process(None).unwrap_or(0));

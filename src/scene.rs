@@ -1,12 +1,13 @@
-//! The content of an environment's picture, as data. Environments describe it; renderers know no environment.
+//! The content of an environment's picture, as data. Environments make it, and renderers draw it without knowing the
+//! environment.
 
-/// A point in m, y upwards. An infinite coordinate is the picture's edge.
+/// The coordinates [x, y] of a point, m; y points upwards. An infinite coordinate means the edge of the picture.
 pub type Point = [f64; 2];
 
-/// Red, green, blue.
+/// A colour: red, green, blue, each 0 … 255.
 pub type Colour = [u8; 3];
 
-/// Colours that colour-blind people tell apart (Okabe and Ito, 2008), and greys.
+/// Colours that colour-blind people can distinguish (Okabe and Ito, 2008), and greys.
 #[allow(missing_docs, reason = "their names say it")]
 pub mod colour {
     use super::Colour;
@@ -26,25 +27,25 @@ pub mod colour {
 /// The content of a picture.
 #[derive(Debug, Clone)]
 pub enum Scene {
-    /// Shapes in a plane.
+    /// A drawing of shapes in a plane.
     Drawing(Drawing),
-    /// A MuJoCo model.
+    /// A picture of a MuJoCo model.
     #[cfg(feature = "mujoco")]
     Model(PosedModel),
 }
 
-/// Shapes, from back to front. Numbers may be very large.
+/// A drawing of shapes in a plane. Coordinates may be very large.
 #[derive(Debug, Clone)]
 pub struct Drawing {
     /// The lower left corner of the rectangle that must be visible.
     pub low: Point,
-    /// The upper right corner of that rectangle.
+    /// The upper right corner of the rectangle that must be visible.
     pub high: Point,
     /// The shapes, from back to front.
     pub shapes: Vec<Shape>,
 }
 
-/// A shape of one colour.
+/// A shape, drawn in a single colour.
 #[derive(Debug, Clone)]
 pub enum Shape {
     /// A filled polygon.
@@ -69,40 +70,40 @@ pub enum Shape {
         points: Vec<Point>,
         /// The width, m.
         width: f64,
-        /// The colour.
+        /// The colour of the line.
         colour: Colour,
     },
     /// A dashed line through points.
     Dashes {
         /// The points in order.
         points: Vec<Point>,
-        /// The width, m.
+        /// The width of the dashes, m.
         width: f64,
         /// The colour.
         colour: Colour,
     },
-    /// The line of a graph.
+    /// The graph of a function, as a line.
     Graph {
-        /// The line's course.
+        /// The function.
         graph: Graph,
         /// The width, m.
         width: f64,
         /// The colour.
         colour: Colour,
     },
-    /// The area below a graph.
+    /// The area below the graph of a function.
     Ground {
-        /// The upper edge.
+        /// The function, whose graph is the upper edge of the area.
         graph: Graph,
         /// The colour.
         colour: Colour,
     },
 }
 
-/// A height as a function of x.
+/// A function of x, and the range of x that is drawn.
 #[derive(Debug, Clone, Copy)]
 pub struct Graph {
-    /// The height at x, both in m.
+    /// Returns the height at x, m; x is in m, too.
     pub height: fn(f64) -> f64,
     /// The minimum of x, m.
     pub from: f64,
@@ -111,7 +112,7 @@ pub struct Graph {
 }
 
 impl Drawing {
-    /// Makes a blank drawing, of which at least the rectangle from `low` to `high` must be visible.
+    /// Makes an empty drawing. At least the rectangle from `low` to `high` will be visible.
     pub fn new(low: Point, high: Point) -> Self {
         Self { low, high, shapes: Vec::new() }
     }
@@ -121,122 +122,122 @@ impl Drawing {
         self.shapes.push(Shape::Polygon { corners: corners.to_vec(), colour });
     }
 
-    /// Adds a filled rectangle, by its lower left and upper right corner.
+    /// Adds a filled rectangle, given its lower left and upper right corners.
     pub fn rectangle(&mut self, [x0, y0]: Point, [x1, y1]: Point, colour: Colour) {
         self.polygon(&[[x0, y0], [x1, y0], [x1, y1], [x0, y1]], colour);
     }
 
-    /// Adds a filled disc of a radius in m.
+    /// Adds a filled disc. `radius` is in m.
     pub fn disc(&mut self, centre: Point, radius: f64, colour: Colour) {
         self.shapes.push(Shape::Disc { centre, radius, colour });
     }
 
-    /// Adds a line through points, with round ends, of a width in m.
+    /// Adds a line through `points`, with round ends. `width` is in m.
     pub fn line(&mut self, points: &[Point], width: f64, colour: Colour) {
         self.shapes.push(Shape::Line { points: points.to_vec(), width, colour });
     }
 
-    /// Adds a dashed line through points, of a width in m.
+    /// Adds a dashed line through `points`. `width` is in m.
     pub fn dashes(&mut self, points: &[Point], width: f64, colour: Colour) {
         self.shapes.push(Shape::Dashes { points: points.to_vec(), width, colour });
     }
 
-    /// Adds the line of a graph, of a width in m.
+    /// Adds the graph of a function as a line. `width` is in m.
     pub fn graph(&mut self, graph: Graph, width: f64, colour: Colour) {
         self.shapes.push(Shape::Graph { graph, width, colour });
     }
 
-    /// Fills the area below a graph.
+    /// Adds the filled area below the graph of a function.
     pub fn ground(&mut self, graph: Graph, colour: Colour) {
         self.shapes.push(Shape::Ground { graph, colour });
     }
 
-    /// Adds a rod with a bright outline that sets it off from what is behind.
+    /// Adds a rod, a thick line with a bright outline that makes it stand out from the background.
     pub fn rod(&mut self, from: Point, to: Point, width: f64, colour: Colour) {
         self.line(&[from, to], 1.25 * width, colour::BACKGROUND);
         self.line(&[from, to], width, colour);
     }
 
-    /// Adds a joint: a dark disc with a bright middle.
+    /// Adds a joint: a dark disc with a bright centre.
     pub fn joint(&mut self, at: Point, radius: f64) {
         self.disc(at, radius, colour::DARK);
         self.disc(at, 0.45 * radius, colour::BACKGROUND);
     }
 }
 
-/// Returns the point at a distance from `from`, in the direction of an angle from +x, rad.
+/// Returns the point at `distance` m from `from`, in the direction `angle`, rad, measured from the x axis.
 #[expect(clippy::disallowed_methods, reason = "a picture need not be the same everywhere")]
 pub fn polar(from: Point, distance: f64, angle: f64) -> Point {
     let (sin, cos) = angle.sin_cos();
     [from[0] + distance * cos, from[1] + distance * sin]
 }
 
-/// A MuJoCo model at certain positions.
+/// A MuJoCo model in a certain pose.
 #[cfg(feature = "mujoco")]
 #[derive(Debug, Clone)]
 pub struct PosedModel {
-    /// The model and its look, which do not change.
+    /// The model and how it is drawn; the same for all pictures of the environment.
     pub look: &'static Look,
-    /// The MJCF with other lengths, if they are not those of the look.
+    /// The edited MJCF, if the episode's lengths differ from those of the original model.
     pub edited: Option<String>,
-    /// The positions, `[Q]`.
+    /// The generalised positions, `[Q]`.
     pub qpos: Vec<f64>,
 }
 
-/// The look of a MuJoCo model in pictures.
+/// A MuJoCo model with everything that is needed to draw it.
 #[cfg(feature = "mujoco")]
 #[derive(Debug, Clone, Copy)]
 pub struct Look {
     /// The environment's name.
     pub name: &'static str,
-    /// The model, as MJCF.
+    /// The model's MJCF text.
     pub mjcf: &'static str,
-    /// The files that the MJCF names, with their bytes.
+    /// The files that the MJCF refers to: name and content of each.
     pub files: &'static [(String, Vec<u8>)],
-    /// Ground, light and colours that pictures add; `None` if the model has its own.
+    /// Ground, light and colours that are added for pictures; `None` if the model has its own.
     pub scenery: Option<Scenery>,
-    /// The camera.
+    /// The camera from which the model is drawn.
     pub view: ModelView,
 }
 
-/// Ground, light and colours that pictures add to a MuJoCo model that has none.
+/// Ground, light and colours that are added for pictures to a MuJoCo model without them.
 #[cfg(feature = "mujoco")]
 #[derive(Debug, Clone, Copy)]
 pub struct Scenery {
-    /// Elements that follow the model's own: ground, light, sky.
+    /// MJCF elements that are added after the model's own: ground, light, sky.
     pub mjcf: &'static str,
-    /// The geom that the scenery replaces.
+    /// The name of the geom that the added ground replaces.
     pub hidden: &'static str,
-    /// Geoms and their colours: red, green, blue, in 0 … 1.
+    /// The names of geoms, each with its colour: red, green, blue, each 0 … 1.
     pub colours: &'static [(&'static str, [f32; 3])],
 }
 
-/// The camera of a MuJoCo model's pictures.
+/// The camera from which a MuJoCo model is drawn.
 #[cfg(feature = "mujoco")]
 #[derive(Debug, Clone, Copy)]
 pub enum ModelView {
-    /// Beside a robot that runs along x.
+    /// A camera that follows a robot along x and looks at it from the side.
     Beside {
-        /// The body that the camera follows.
+        /// The name of the body that the camera follows.
         followed: &'static str,
-        /// The camera's distance, m.
+        /// The distance of the camera from the body, m.
         distance: f64,
         /// The height that the camera looks at, m.
         height: f64,
     },
-    /// By the model's camera of this number.
+    /// The camera of the model with this number.
     Camera(usize),
-    /// By a camera that is placed.
+    /// A camera that looks at a point.
     Placed {
         /// The point that the camera looks at, m.
         look_at: [f64; 3],
-        /// The camera's distance from that point, m.
+        /// The distance of the camera from this point, m.
         distance: f64,
-        /// The direction of view, turned from +x about +z, degrees.
+        /// The horizontal direction of view, as an angle from the x axis, counter-clockwise seen from above, degrees.
         azimuth: f64,
-        /// The direction's slope, negative if it looks down, degrees.
+        /// The vertical direction of view, as an angle above the horizon; negative if the camera looks down, degrees.
         elevation: f64,
-        /// The body that the point moves with.
+        /// The number of the body with which the point moves; `None` for a fixed point.
         followed: Option<usize>,
     },
 }

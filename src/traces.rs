@@ -1,5 +1,5 @@
-//! Traces for OpenTelemetry: each request's span, with its log lines, is sent to a collector. Needs a build with the
-//! feature `otel`, and the variable `OTEL_EXPORTER_OTLP_ENDPOINT` with the collector's address.
+//! Traces for OpenTelemetry. The span of each request, with its log lines, is sent to a collector. Requires a build
+//! with the feature `otel`, and the address of the collector in the environment variable `OTEL_EXPORTER_OTLP_ENDPOINT`.
 
 use opentelemetry::trace::TracerProvider;
 use opentelemetry_otlp::SpanExporter;
@@ -15,13 +15,13 @@ use tracing_subscriber::{
     Layer, filter::Targets, fmt, layer::SubscriberExt, registry::LookupSpan, util::SubscriberInitExt,
 };
 
-/// OpenTelemetry's variable with the address of the collector.
+/// The environment variable that contains the address of the collector.
 pub const ENDPOINT: &str = "OTEL_EXPORTER_OTLP_ENDPOINT";
-/// The server's name at the collector, if `OTEL_SERVICE_NAME` is not set.
+/// The name of this service at the collector, unless `OTEL_SERVICE_NAME` is set.
 const SERVICE: &str = "perturb-server";
 const SERVICE_VARIABLE: &str = "OTEL_SERVICE_NAME";
 
-/// Sends spans. When it is dropped, sends the remaining ones.
+/// Sends spans to the collector. When it is dropped, it sends all spans that are left.
 pub struct Traces {
     provider: SdkTracerProvider,
     _end: oneshot::Sender<()>,
@@ -35,10 +35,11 @@ impl Drop for Traces {
     }
 }
 
-/// Starts the log on standard error with this filter, and if a collector is named, a thread that sends spans.
+/// Starts the log on standard error, filtered by `filter`. If a collector is configured, also starts a thread that
+/// sends spans, and returns its handle.
 ///
 /// # Errors
-/// If the variables are wrong, or the system starts no thread.
+/// If OpenTelemetry's environment variables are invalid, or the operating system cannot start a thread.
 pub fn init(filter: Targets) -> Result<Option<Traces>, Box<dyn Error>> {
     let (traces, spans) = start()?.unzip();
     let lines = fmt::layer().with_writer(io::stderr).with_ansi(io::stderr().is_terminal()).with_filter(filter);
@@ -46,7 +47,7 @@ pub fn init(filter: Targets) -> Result<Option<Traces>, Box<dyn Error>> {
     Ok(traces)
 }
 
-/// Returns a layer whose spans are sent; `None` if no collector is named.
+/// Makes a tracing layer that sends spans to the collector. Returns `None` if no collector is configured.
 fn start<S>() -> Result<Option<(Traces, impl Layer<S>)>, Box<dyn Error>>
 where
     S: Subscriber + for<'a> LookupSpan<'a>,

@@ -28,14 +28,14 @@ use tokio::{
 #[cfg(not(feature = "otel"))]
 use tracing_subscriber::{layer::SubscriberExt, util::SubscriberInitExt};
 
-/// The contract, as its file in the repository.
+/// The text of the protocol's file in the repository.
 const CONTRACT: &str = include_str!("../../proto/perturb/v1/perturb.proto");
 
 fn main() -> ExitCode {
-    let _ = perturb_system::ignore_sigxfsz(); // without it, only a limit of file sizes ends the program
+    let _ = perturb_system::ignore_sigxfsz(); // if this fails, the only loss is that a file-size limit ends the program
     let arguments = Arguments::parse();
     if let Some(page) = about(&arguments) {
-        // The reader may close the pipe early.
+        // Ignored: the reader may close the pipe early.
         let _ = io::stdout().write_all(&page);
         return ExitCode::SUCCESS;
     }
@@ -68,7 +68,7 @@ fn main() -> ExitCode {
         let lines = tracing_subscriber::fmt::layer()
             .with_writer(io::stderr)
             .with_ansi(io::IsTerminal::is_terminal(&io::stderr()))
-            .log_internal_errors(false); // they would go to standard error, which is what fails, and end the program
+            .log_internal_errors(false); // they would also go to standard error; if that fails, the program would end
         tracing_subscriber::registry().with(lines).with(config.filter()).init();
     }
     #[cfg(feature = "otel")]
@@ -105,12 +105,13 @@ fn main() -> ExitCode {
     }
 }
 
-/// Prints an error. Failures of printing are ignored.
+/// Prints an error on standard error, and ignores failures to print it.
 fn complain(words: impl std::fmt::Display) {
     let _ = writeln!(io::stderr(), "perturb-server: {words}");
 }
 
-/// Returns the text that the command line asks for instead of a server: completions, the schema of tasks, or the manual page.
+/// Returns the text that the command line requests instead of a server, if any: shell completions, the protocol, the
+/// schema of tasks, or the manual page.
 fn about(arguments: &Arguments) -> Option<Vec<u8>> {
     let (mut command, mut page) = (Arguments::command(), Vec::new());
     if let Some(shell) = arguments.completions {
@@ -127,9 +128,9 @@ fn about(arguments: &Arguments) -> Option<Vec<u8>> {
     Some(page)
 }
 
-/// Why the program fails.
+/// Why the program fails, which determines its exit status.
 enum Failure {
-    /// An address is not available, or a file or folder of the settings cannot be used.
+    /// A setting cannot be used: an address is not available, or a file or folder is invalid.
     Setting(Box<dyn Error>),
     Other(Box<dyn Error>),
 }
@@ -146,8 +147,8 @@ impl<E: Into<Box<dyn Error>>> From<E> for Failure {
     }
 }
 
-/// Removes the folders of a private server's sockets, because the program that made them may have been killed. Folders
-/// with files stay.
+/// Removes the empty folders that contained a private server's sockets, because the program that made them may have
+/// been killed. Folders with files are kept.
 fn remove_folders(config: &Config) {
     for address in &config.listen {
         if let ListenAddress::Unix(path) = address {
@@ -156,8 +157,8 @@ fn remove_folders(config: &Config) {
     }
 }
 
-/// Returns the environments that are served: the built-in ones and those of the settings' folders. Each folder is first
-/// loaded in a process of its own. If `measured`, the reports have the folders' speed.
+/// Loads the environments to serve: the built-in ones and those of the configured folders. Each folder is first loaded
+/// in a process of its own. If `measured`, the reports contain the speed of the folders' environments.
 #[cfg(feature = "mujoco")]
 fn environments(config: &Config, measured: bool) -> Result<Environments, Failure> {
     let mut environments = Environments { catalogue: tasks::catalogue(), folders: Vec::new(), reports: Vec::new() };
@@ -183,17 +184,17 @@ fn environments(config: &Config, _measured: bool) -> Result<Environments, Failur
     Err(Failure::setting("--task: this server was built without MuJoCo; build it with the feature `mujoco`"))
 }
 
-/// The environments that are served.
+/// The environments to serve.
 struct Environments {
     catalogue: Catalogue,
     #[cfg(feature = "mujoco")]
     folders: Vec<folder::Folder>,
-    /// Reports of the folders, for `--check`.
+    /// The descriptions of the folders' environments, for `--check`.
     #[cfg(feature = "mujoco")]
     reports: Vec<String>,
 }
 
-/// Logs, once for each folder, that its files changed. Old and new sessions use the files that were loaded.
+/// Logs once for each folder if its files change. All sessions continue to use the files as they were loaded.
 #[cfg(feature = "mujoco")]
 async fn watch_folders(mut folders: Vec<folder::Folder>) {
     const FILES_CHECK_INTERVAL: std::time::Duration = std::time::Duration::from_secs(5);
@@ -212,7 +213,7 @@ async fn watch_folders(mut folders: Vec<folder::Folder>) {
     }
 }
 
-/// Loads the folders of the settings in processes of their own, and prints descriptions of them.
+/// Loads the configured folders, each in a process of its own, and prints their descriptions.
 #[cfg(feature = "mujoco")]
 fn check(config: &Config) -> Result<(), Failure> {
     if config.tasks.is_empty() {
@@ -227,7 +228,7 @@ fn check(config: &Config) -> Result<(), Failure> {
     environments(config, true).map(|_| ())
 }
 
-/// Loads a folder under limits, and prints its description.
+/// Loads a folder under limits of memory and CPU time, and prints its description.
 #[cfg(feature = "mujoco")]
 fn check_task(path: &std::path::Path, measured: bool) -> ExitCode {
     let report = folder::child::limit_this_process()
@@ -254,11 +255,13 @@ fn task_schema() -> Vec<u8> {
 
 fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
     raise_descriptors();
-    // The first transport thread. Each has a runtime of its own: a hand-over between threads doubles latency.
+    // The runtime of the first transport thread. Each transport thread has a runtime of its own, because passing a
+    // request between threads doubles latency.
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let guards = Security::load(config, &environments.catalogue).map_err(Failure::setting)?;
     let result = runtime.block_on(async {
-        // This comes before the addresses are printed, because their reader may send a signal at once.
+        // Signal handlers are set before the addresses are printed, because the reader of the addresses may send a
+        // signal at once.
         let shutdown = shutdown(config.exit_with_stdin)?;
         tokio::spawn(reload_on_hangup(signal(SignalKind::hangup())?, guards.reloader()));
         let mut listeners = Vec::new();
@@ -271,7 +274,7 @@ fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
         };
         for address in &config.listen {
             let listener = Listener::bind(address, config.socket_mode).await.map_err(Failure::setting)?;
-            // The program that started the server need not read on.
+            // Ignored: the program that started the server may have closed the pipe.
             let _ = writeln!(io::stdout(), "listening on {}", told(&listener.address()?, config));
             listeners.push(listener);
         }
@@ -286,16 +289,16 @@ fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
         server::run(listeners, metrics, config, &guards, environments.catalogue.clone(), shutdown).await?;
         Ok(())
     });
-    // Connections that did not close by themselves must not delay the end of the program.
+    // Does not wait for connections that are still open.
     runtime.shutdown_background();
     result
 }
 
-/// The address as clients write it.
+/// Returns an address in the syntax that clients use.
 fn told(address: &ListenAddress, config: &Config) -> String {
     match address {
         ListenAddress::Tcp(tcp) if config.tls_cert.is_some() => format!("https://{tcp}"),
-        // A client may have another working folder.
+        // Absolute, because a client may have another working directory.
         ListenAddress::Unix(path) => {
             ListenAddress::Unix(std::path::absolute(path).unwrap_or_else(|_| path.clone())).to_string()
         }
@@ -303,8 +306,8 @@ fn told(address: &ListenAddress, config: &Config) -> String {
     }
 }
 
-/// The first TCP address as gRPC's own tools and libraries write it, which know no `http://`. Addresses of sockets are
-/// the same for them.
+/// Returns the first TCP address in the syntax of gRPC's own tools and libraries, which do not accept `http://`. The
+/// syntax for Unix sockets is the same everywhere.
 fn grpc_target(listeners: &[Listener]) -> Option<String> {
     listeners.iter().find_map(|listener| match listener.address() {
         Ok(ListenAddress::Tcp(tcp)) => Some(tcp.to_string()),
@@ -312,7 +315,7 @@ fn grpc_target(listeners: &[Listener]) -> Option<String> {
     })
 }
 
-/// Reads the files of tokens and TLS again at each SIGHUP, which ends no server.
+/// Reloads the token and TLS files at each SIGHUP. SIGHUP does not end the server.
 async fn reload_on_hangup(mut hangups: Signal, reloader: Reloader) {
     while hangups.recv().await.is_some() {
         if !reloader.reload() {
@@ -321,7 +324,7 @@ async fn reload_on_hangup(mut hangups: Signal, reloader: Reloader) {
     }
 }
 
-/// Raises the limit of file descriptors to the system's hard limit, because each connection needs one.
+/// Raises the limit of file descriptors to the hard limit, because each connection needs one.
 fn raise_descriptors() {
     let limit = getrlimit(Resource::Nofile);
     if let Err(error) = setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit }) {
@@ -336,14 +339,15 @@ fn print_catalogue(environments: &Environments, config: &Config) -> Result<(), F
     Ok(())
 }
 
-/// Asks the running server with the same settings for its health.
+/// Checks the health of the running server that has the same configuration.
 fn health(config: &Config) -> Result<(), Failure> {
     let listen = config.listen.first().ok_or("no address is given")?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     Ok(runtime.block_on(probe(listen, config.tls_cert.as_deref()))?)
 }
 
-/// Resolves at SIGTERM, SIGINT, or, if asked for, when standard input closes. A second signal exits at once.
+/// Resolves at SIGTERM or SIGINT, or, if `exit_with_stdin`, when standard input closes. A second signal exits
+/// immediately.
 fn shutdown(exit_with_stdin: bool) -> io::Result<impl Future<Output = ()>> {
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
     let (closed, stdin) = oneshot::channel::<()>();
@@ -351,7 +355,7 @@ fn shutdown(exit_with_stdin: bool) -> io::Result<impl Future<Output = ()>> {
         std::thread::Builder::new()
             .name("stdin".into())
             .spawn(move || {
-                // Input is ignored; its end, or an error, is the signal.
+                // The input is ignored. Its end, or an error, is the signal.
                 let _ = io::copy(&mut io::stdin().lock().by_ref(), &mut io::sink());
                 drop(closed);
             })

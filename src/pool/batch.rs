@@ -1,4 +1,4 @@
-//! A session's environments: requests in, gathered replies out.
+//! The environments of a session. Each request is run on the pool's workers, and its outputs are gathered into a reply.
 
 use super::{
     Error,
@@ -29,62 +29,66 @@ use std::{
 };
 use tokio::{sync::oneshot, time::Instant};
 
-/// The cost of a step of one shard, µs: large compared with the overhead of the queue, but small enough that sessions
-/// take turns.
+/// The minimum and maximum cost of a step of one shard, µs. The minimum makes the overhead of the queue small in
+/// comparison; the maximum lets sessions take turns.
 const SHARD_COST_US: RangeInclusive<f64> = 20.0..=200.0;
-/// The number of shards for each worker, so that workers finish together. There are fewer if these would be too cheap.
+/// The number of shards for each worker, so that all workers finish at about the same time. There are fewer shards if
+/// these would be cheaper than [`SHARD_COST_US`].
 const SHARDS_PER_WORKER: f64 = 32.0;
-/// The minimum cost of one worker's share, µs, at which a batch is split among the workers.
+/// The minimum cost of a worker's part of a batch, µs. Cheaper batches are not split among all workers.
 const MIN_WORKER_SHARE_US: f64 = 10.0;
-/// Batches of at most this many environments are freed on the transport's thread, because this takes only a moment.
+/// Batches of at most this many environments are freed on the transport thread, since this takes only a moment.
 const INLINE_DROP_MAX_ENVS: usize = 64;
 
-/// The reset of one environment. It begins a new episode, and with a seed or distributions also a new trial.
+/// The reset of one environment. It begins a new episode. If there is a new seed or new distributions, it also begins a
+/// new trial.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ResetEntry {
-    /// The slot in the batch.
+    /// The environment's slot in the batch.
     pub slot: usize,
-    /// A new seed.
+    /// A new seed; `None` keeps the seed.
     pub seed: Option<u64>,
-    /// New distributions, one for each parameter.
+    /// New distributions, one for each parameter; `None` keeps the distributions.
     pub distributions: Option<Arc<[Distribution]>>,
-    /// An exact initial state, `[S]`, finite.
+    /// An exact initial state, `[S]`, finite; `None` draws the initial state.
     pub state: Option<Vec<f64>>,
 }
 
-/// A batch of environments. Dropping the batch frees them at once, or as soon as the running shards have finished.
+/// The environments of a session. Dropping the batch frees them as soon as no worker runs them.
 pub struct Batch {
     settings: BatchSettings,
-    /// N.
+    /// N, the number of environments.
     size: usize,
     shard_size: usize,
     job: Arc<Job>,
     workers: Arc<StepScheduler>,
     n_workers: usize,
     buffer: BytesMut,
-    /// The number of requests that were handed to the workers.
+    /// The number of requests that were passed to the workers so far.
     n_requests: u64,
-    /// Whether a request was handed to the workers and its end has not been awaited.
+    /// Whether a request was passed to the workers and its end has not been awaited yet.
     under_way: bool,
-    /// The start time of the next request, if it is a pipelined step.
+    /// If the next request is a pipelined step that has already started: its start time.
     pipelined_since: Option<Instant>,
-    /// The playing policy, until a request other than `act` changes the environments.
+    /// The policy of the last `act`. Any other request that changes the environments drops it.
     runner: Option<Box<PolicyRunner>>,
-    /// The hook that runs when the environments are freed.
+    /// Runs when the environments are freed.
     drop_hook: Option<DropHook>,
-    /// Dropped when the environments are freed, which [`Batch::close`] waits for. As the last field it is dropped last.
+    /// Dropped when the environments have been freed; [`Batch::close`] waits for that. It must be the last field,
+    /// because fields are dropped in order.
     freed: Option<oneshot::Sender<()>>,
 }
 
-/// A hook that runs when the environments are freed. It gets their draws, in order of slots.
+/// A hook that runs when a batch's environments are freed. Its argument has the seed, environment index and episode
+/// index of each environment's last episode, in order of slots.
 pub type DropHook = Box<dyn FnOnce(Vec<Draw>) + Send + Sync>;
 
 impl Batch {
-    /// Makes the environments, on the pool's workers, and begins their first episodes. Returns the batch with its first
-    /// observations, f32 `[N, O]`, and the episodes begun (only with receipts).
+    /// Creates the environments on the pool's workers, and begins their first episodes. Returns the batch, the first
+    /// observations, f32 `[N, O]`, and, if the settings have receipts, the episodes that began.
     ///
     /// # Errors
-    /// [`Error::Full`], or [`Error::Environment`] if a model cannot be loaded.
+    /// [`Error::Full`] if the pool has no room, [`Error::Environment`] if a model cannot be loaded.
     pub async fn open(pool: &Pool, settings: BatchSettings) -> Result<(Self, Bytes, Vec<(u32, EpisodeStart)>), Error> {
         let (workers, size) = (pool.queue(), settings.size());
         let owned = (Arc::new(workers.capacity.reserve(size)?), Arc::new(Tally::new(pool.meter(settings.spec.name))));
@@ -115,26 +119,26 @@ impl Batch {
         Ok((batch, observations, started))
     }
 
-    /// The settings of the batch.
+    /// The settings with which the batch was opened.
     pub fn settings(&self) -> &BatchSettings {
         &self.settings
     }
 
-    /// N: the number of environments, without those that were released.
+    /// N, the number of environments. Released environments do not count.
     pub fn size(&self) -> usize {
         self.size
     }
 
-    /// Steps of an environment so far.
+    /// The number of steps so far, summed over the environments.
     pub fn steps(&self) -> u64 {
         self.job.tally.steps()
     }
 
-    /// Advances every environment by one step. Discrete actions are i32 `[N]`, each a choice of the space; continuous
-    /// ones f32 `[N, A]`, finite: the caller has checked them.
+    /// Advances every environment by one step. `actions` are little-endian: for a discrete space i32 `[N]`, each a
+    /// valid choice; for a continuous space f32 `[N, A]`, finite. The caller must have checked them.
     ///
     /// # Errors
-    /// [`Error::Ended`] in [`Autoreset::Disabled`], [`Error::Defect`].
+    /// [`Error::Ended`] if autoreset is disabled and an episode has ended, [`Error::Defect`] if a worker panicked.
     pub async fn step(&mut self, actions: &[u8]) -> Result<StepResult, Error> {
         let start = match self.pipelined_since.take() {
             Some(start) => start,
@@ -157,7 +161,7 @@ impl Batch {
         let number = self.next_request();
         let ended = self.workers.wait(&self.job, number).await;
         self.under_way = false;
-        // If a pipelined step followed at once, the worker has already gathered the result.
+        // If a pipelined step followed this one, the worker has already gathered the result of this step.
         let (pipelined_since, end) = {
             let mut pipelined = lock(&self.job.pipelined);
             (pipelined.take_result(), pipelined.ended_at())
@@ -173,7 +177,7 @@ impl Batch {
         }
     }
 
-    /// The result of the step that has ended.
+    /// Gathers the result of the step that ran from `start` to `end`.
     fn step_result(&mut self, start: Instant, end: Instant) -> StepResult {
         self.observe(start, end);
         let reward_terms = self.settings.reward_terms;
@@ -184,20 +188,21 @@ impl Batch {
         self.job.tally.meter.times(self.size).observe(end.saturating_duration_since(start));
     }
 
-    /// Returns the queue for a pipelined step. Returns `None` if the client must see the result of a step before the
-    /// next one, or if steps may run on the session's own thread.
+    /// Returns a handle to queue the next step while a step is running. Returns `None` if the client must see a step's
+    /// result before it sends the next step, or if steps may run on the session's own thread.
     pub fn step_queue(&self) -> Option<StepQueue> {
         let (job, spec, size) = (Arc::clone(&self.job), self.settings.spec, self.size);
         let follows = self.settings.autoreset != Autoreset::Disabled && job.needs_workers();
         follows.then_some(StepQueue { job, spec, size })
     }
 
-    /// Runs a rollout of a policy. Without a new policy the previous one continues, and without a new task the previous
-    /// task. The caller has checked that there is a policy, that the previous task is done if another begins, that the
-    /// mode is [`Autoreset::SameStep`], and that policy and weights fit.
+    /// Lets a policy play several steps. If `turn` has no new policy, the previous policy continues; if it has no new
+    /// task, the previous task continues. The caller must have checked that there is a policy, that a new task does not
+    /// replace an unfinished one, that the mode is [`Autoreset::SameStep`], and that policy and weights fit the batch.
     ///
     /// # Errors
-    /// [`Error::Policy`] if numbers are not finite, [`Error::Defect`]. After either the next call needs a new policy.
+    /// [`Error::Policy`] if numbers are not finite, [`Error::Defect`] if a worker panicked. After an error, the next
+    /// call needs a new policy.
     pub async fn act(&mut self, turn: RolloutRequest) -> Result<Rollout, Error> {
         self.ready().await?;
         let task = Box::new(RolloutTask::new(turn, self.runner.take()));
@@ -209,16 +214,16 @@ impl Batch {
         Ok(played)
     }
 
-    /// The playing policy, if there is one.
+    /// The policy that the next rollout continues, if there is one.
     pub fn policy_runner(&self) -> Option<&PolicyRunner> {
         self.runner.as_deref()
     }
 
-    /// Frees the environments in these slots, which are in order. At least one environment stays. The others move to
-    /// the slots from 0 on and are unchanged otherwise.
+    /// Frees the environments in `slots`, which must be in order. At least one environment must remain. The remaining
+    /// environments are renumbered from slot 0, and unchanged otherwise.
     ///
     /// # Errors
-    /// [`Error::Defect`].
+    /// [`Error::Defect`], if a worker panicked.
     pub async fn release(&mut self, slots: &[usize]) -> Result<(), Error> {
         self.ready().await?;
         self.runner = None;
@@ -248,11 +253,11 @@ impl Batch {
         Ok(())
     }
 
-    /// Begins new episodes, in order of slots. Returns their first observations, f32 `[M, O]`, and, with receipts, the
-    /// episodes.
+    /// Begins new episodes in some environments. `entries` must be in order of slots. Returns the first observations of
+    /// the M episodes, f32 `[M, O]`, and, if the settings have receipts, the episodes that began.
     ///
     /// # Errors
-    /// [`Error::Defect`].
+    /// [`Error::Defect`], if a worker panicked.
     pub async fn reset(&mut self, entries: Vec<ResetEntry>) -> Result<(Bytes, Vec<(u32, EpisodeStart)>), Error> {
         self.ready().await?;
         let slots: Vec<usize> = entries.iter().map(|entry| entry.slot).collect();
@@ -274,10 +279,10 @@ impl Batch {
         Ok((self.observations(&slots), collect(&self.job.shards, |shard| &mut shard.started)))
     }
 
-    /// Saves environments, in order of slots.
+    /// Returns a snapshot of each environment in `slots`, which must be in order.
     ///
     /// # Errors
-    /// [`Error::Defect`].
+    /// [`Error::Defect`], if a worker panicked.
     pub async fn snapshot(&mut self, slots: Vec<usize>) -> Result<Vec<Bytes>, Error> {
         self.ready().await?;
         let commands = self.split(slots, |&slot| slot);
@@ -286,11 +291,11 @@ impl Batch {
         Ok(collect(&self.job.shards, |shard| &mut shard.snapshots).into_iter().map(Bytes::from).collect())
     }
 
-    /// Restores environments, in order of slots: all, or none if one cannot be. Returns their observations, f32
-    /// `[M, O]`.
+    /// Restores the environments in some slots from snapshots. `entries` must be in order of slots. If one cannot be
+    /// restored, none is changed. Returns the observations of the M restored environments, f32 `[M, O]`.
     ///
     /// # Errors
-    /// [`Error::Environment`] for a snapshot that cannot be restored, [`Error::Defect`].
+    /// [`Error::Environment`] if a snapshot cannot be restored, [`Error::Defect`] if a worker panicked.
     pub async fn restore(&mut self, entries: Vec<(usize, Bytes)>) -> Result<Bytes, Error> {
         self.ready().await?;
         let slots: Vec<usize> = entries.iter().map(|entry| entry.0).collect();
@@ -309,35 +314,36 @@ impl Batch {
         Ok(self.observations(&slots))
     }
 
-    /// The present distributions of a slot, one for each parameter.
+    /// Returns the current distributions of a slot's environment, one for each parameter.
     pub fn distributions(&self, slot: usize) -> Vec<Distribution> {
         lock(&self.job.shards[slot / self.shard_size]).distributions(slot).to_vec()
     }
 
-    /// The address of a slot's draws: seed, environment and episode.
+    /// Returns the address of the current episode in a slot: seed, environment index and episode index.
     pub fn draw(&self, slot: usize) -> Draw {
         lock(&self.job.shards[slot / self.shard_size]).draw(slot)
     }
 
-    /// Sets the hook that runs when the environments are freed. It gets their draws, in order of slots.
+    /// Sets the hook that runs when the environments are freed.
     pub fn when_freed(&mut self, hook: DropHook) {
         self.drop_hook = Some(hook);
     }
 
-    /// Frees the environments. Resolves when they are freed and others have room.
+    /// Frees the environments. Resolves when they are freed and the pool has room for others.
     pub fn close(mut self) -> impl Future<Output = ()> + Send + use<> {
         let (freed, is_freed) = oneshot::channel();
         self.freed = Some(freed);
         drop(self);
         async move {
-            let _ = is_freed.await; // the sender's end is the answer
+            let _ = is_freed.await; // resolves with an error when the sender is dropped
         }
     }
 
-    /// Waits for a request whose future was dropped early. Call it before the next request: workers may still be
-    /// running the old one and a step queued behind it. A rollout ends with its present step.
+    /// Waits for a request whose future was dropped before it resolved. Call it before the next request, because
+    /// workers may still be running the old request, and a step queued behind it. A rollout ends after its current
+    /// step.
     pub async fn finish_abandoned(&mut self) {
-        // The next request reports a failure of the abandoned one.
+        // Errors are ignored here: the next request reports them.
         if self.under_way {
             self.job.is_halted.store(true, Ordering::Relaxed);
             lock(&self.job.pipelined).stop();
@@ -353,11 +359,11 @@ impl Batch {
         }
     }
 
-    /// Returns the scene of a slot, or `None` if its physics diverged. It is read on the calling thread, because no
-    /// request runs and little is read.
+    /// Returns the scene to draw of a slot's environment, or `None` if its physics diverged. The calling thread reads
+    /// it, since no request is running and little is read.
     ///
     /// # Errors
-    /// [`Error::Defect`].
+    /// [`Error::Defect`], if a worker panicked.
     pub fn scene(&self, slot: usize) -> Result<Option<Scene>, Error> {
         if self.job.failed() {
             return Err(Error::Defect);
@@ -365,8 +371,8 @@ impl Batch {
         Ok(lock(&self.job.shards[slot / self.shard_size]).scene(slot))
     }
 
-    /// Returns an upper bound of the length of each environment's snapshot, in bytes. It holds until a distribution is
-    /// replaced by one of more intervals.
+    /// Returns an upper bound of the length of each environment's snapshot, bytes. It holds until a reset replaces a
+    /// distribution by one with more intervals.
     pub fn max_snapshot_bytes(&self) -> usize {
         let own = lock(&self.job.shards[0]).max_snapshot_bytes();
         let distributions = |group: &SlotGroup| distributions_bytes(&group.episodes.distributions);
@@ -374,7 +380,8 @@ impl Batch {
         own + largest
     }
 
-    /// Prepares for a request other than a pipelined step: waits until none runs, and checks that none has failed.
+    /// Prepares for a request other than a pipelined step: waits until no request is running, and checks that none has
+    /// failed.
     async fn ready(&mut self) -> Result<(), Error> {
         self.finish_abandoned().await;
         self.job.result()
@@ -387,7 +394,7 @@ impl Batch {
         result
     }
 
-    /// Counts a request that is handed to the workers now. Returns its number.
+    /// Counts a request that is passed to the workers now. Returns its number.
     fn next_request(&mut self) -> u64 {
         self.under_way = true;
         self.n_requests += 1;
@@ -414,7 +421,7 @@ impl Batch {
         Err(Error::Ended { slots: ended.join(", ") + &more })
     }
 
-    /// Splits entries into a list for each shard, by the slot that `slot_of` reads from an entry.
+    /// Splits entries into one list for each shard. `slot_of` returns the slot of an entry.
     fn split<T>(&self, entries: Vec<T>, slot_of: impl Fn(&T) -> usize) -> Vec<Vec<T>> {
         let mut lists: Vec<Vec<T>> = self.job.shards.iter().map(|_| Vec::new()).collect();
         for entry in entries {
@@ -423,7 +430,7 @@ impl Batch {
         lists
     }
 
-    /// Gives each shard a command, made from its first slot and its list.
+    /// Gives each shard a command, which `make` makes from the shard's first slot and its list.
     fn command<T>(&self, lists: Vec<Vec<T>>, make: impl Fn(usize, Vec<T>) -> Command) {
         let mut lists = lists.into_iter();
         for shard in &self.job.shards {
@@ -455,9 +462,9 @@ impl Drop for Batch {
             if let Some(hook) = self.drop_hook.take() {
                 hook(draws(&self.job));
             }
-            return; // freed here, so that there is room at once
+            return; // frees the environments here, so the pool has room immediately
         }
-        // The last owner of the job frees the environments. It must be neither this thread nor a worker.
+        // The last owner of the job frees the environments. It should be neither this thread nor a worker.
         let mut deferred = Some((Arc::clone(&self.job), self.runner.take(), self.drop_hook.take(), self.freed.take()));
         self.workers.reaper.drop_later(Box::new(move || {
             let is_alone = deferred.as_ref().is_none_or(|(job, ..)| Arc::strong_count(job) == 1);
@@ -466,19 +473,19 @@ impl Drop for Batch {
                     hook(draws(&job));
                 }
                 drop((job, runner));
-                drop(freed); // after the environments
+                drop(freed); // after the environments are freed
             }
             is_alone
         }));
     }
 }
 
-/// Returns the draws of all environments of a job, in order of slots.
+/// Returns the addresses of the current episodes of a job's environments, in order of slots.
 fn draws(job: &Job) -> Vec<Draw> {
     job.shards.iter().flat_map(|shard| lock(shard).draws().collect::<Vec<_>>()).collect()
 }
 
-/// Makes the job of a batch of `size` environments.
+/// Makes the job that the workers run for a batch of `size` environments.
 fn job(
     settings: &BatchSettings,
     shards: Vec<Mutex<Shard>>,
@@ -490,7 +497,7 @@ fn job(
     Arc::new(Job::new(shards, workers, owned, cost, pipelined))
 }
 
-/// Cuts groups into parts of `size` slots, the last of which may have fewer.
+/// Cuts groups into parts of `size` slots each. The last part may have fewer.
 fn cut(groups: &[SlotGroup], size: usize) -> Vec<Vec<SlotGroup>> {
     let (mut parts, mut part, mut free_slots) = (Vec::new(), Vec::new(), size);
     for group in groups {
@@ -499,7 +506,7 @@ fn cut(groups: &[SlotGroup], size: usize) -> Vec<Vec<SlotGroup>> {
             let taken = deferred.size.min(free_slots);
             part.push(SlotGroup { size: taken, ..deferred.clone() });
             deferred.size -= taken;
-            // Once nothing is left of the group, this index is never used and may overflow.
+            // The index may overflow when nothing is left of the group, but then it is never used.
             deferred.episodes.environment_index = deferred.episodes.environment_index.wrapping_add(taken as u32);
             free_slots -= taken;
             if free_slots == 0 {
@@ -512,8 +519,8 @@ fn cut(groups: &[SlotGroup], size: usize) -> Vec<Vec<SlotGroup>> {
     parts
 }
 
-/// The number of environments in a shard: by cost, but small enough that every worker has a shard, if a shard is worth
-/// a wake-up.
+/// Returns the number of environments in a shard. The cost of a shard's step is kept within limits, and every worker
+/// gets a shard if that is worth waking it.
 fn shard_size(spec: &EnvironmentSpec, batch: usize, workers: usize) -> usize {
     let by_workers = batch.div_ceil(workers);
     let share = spec.step_cost * by_workers as f64;

@@ -1,4 +1,4 @@
-//! The pool's budget of environments.
+//! The limit on the number of environments in a pool.
 
 use super::Error;
 use std::sync::{
@@ -7,7 +7,7 @@ use std::sync::{
 };
 use tokio::sync::Notify;
 
-/// The number of environments in use, with its limit.
+/// Counts the environments in use, and limits their number.
 pub(super) struct Capacity {
     used: AtomicUsize,
     limit: usize,
@@ -16,12 +16,12 @@ pub(super) struct Capacity {
 }
 
 impl Capacity {
-    /// A budget of at most `limit` environments.
+    /// Makes the counter of a pool with room for `limit` environments.
     pub(super) fn new(limit: usize) -> Self {
         Self { used: AtomicUsize::new(0), limit, changed: Notify::new() }
     }
 
-    /// Environments in use.
+    /// The number of environments in use.
     pub(super) fn used(&self) -> usize {
         self.used.load(Ordering::Relaxed)
     }
@@ -31,12 +31,12 @@ impl Capacity {
         self.limit
     }
 
-    /// Waits until the number of environments in use has changed since the last call, for one caller.
+    /// Waits until the number of environments in use has changed since the last call. Only one task may wait.
     pub(super) async fn changed(&self) {
         self.changed.notified().await;
     }
 
-    /// Takes `requested` environments out of the budget until the permit is dropped.
+    /// Reserves room for `requested` environments until the permit is dropped.
     pub(super) fn reserve(self: &Arc<Self>, requested: usize) -> Result<Permit, Error> {
         let limit = self.limit;
         let fits = |used: usize| used.checked_add(requested).filter(|&sum| sum <= limit);
@@ -55,14 +55,14 @@ impl Capacity {
     }
 }
 
-/// A part of the pool's budget of environments.
+/// Room for a number of environments in the pool. Dropping it frees the room.
 pub(super) struct Permit {
     capacity: Arc<Capacity>,
     count: AtomicUsize,
 }
 
 impl Permit {
-    /// Returns environments of the permit to the budget, at most as many as it has.
+    /// Frees the room for `count` environments, at most as many as the permit has.
     pub(super) fn release(&self, count: usize) {
         self.count.fetch_sub(count, Ordering::Relaxed);
         self.capacity.release(count);

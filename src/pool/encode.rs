@@ -1,8 +1,8 @@
-//! Encodes arrays for the wire: little-endian, without gaps.
+//! Encodes arrays as messages contain them: little-endian, without gaps.
 
 use bytes::BytesMut;
 
-/// Appends f32.
+/// Appends f32 values.
 pub(super) fn push_f32(buffer: &mut BytesMut, values: &[f32]) {
     let start = buffer.len();
     buffer.resize(start + 4 * values.len(), 0);
@@ -10,7 +10,7 @@ pub(super) fn push_f32(buffer: &mut BytesMut, values: &[f32]) {
     words.iter_mut().zip(values).for_each(|(to, from)| *to = from.to_le_bytes());
 }
 
-/// Appends numbers of 64 bits.
+/// Appends numbers of 64 bits, as `encode` converts each to bytes.
 pub(super) fn push_wide<T: Copy>(buffer: &mut BytesMut, values: &[T], encode: impl Fn(T) -> [u8; 8]) {
     let start = buffer.len();
     buffer.resize(start + 8 * values.len(), 0);
@@ -18,7 +18,7 @@ pub(super) fn push_wide<T: Copy>(buffer: &mut BytesMut, values: &[T], encode: im
     words.iter_mut().zip(values).for_each(|(to, from)| *to = encode(*from));
 }
 
-/// Appends u8, 0 or 1.
+/// Appends flags as u8, 0 or 1.
 pub(super) fn push_flags(buffer: &mut BytesMut, flags: &[bool]) {
     let start = buffer.len();
     buffer.resize(start + flags.len(), 0);

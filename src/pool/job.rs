@@ -1,4 +1,4 @@
-//! The shards of a batch, and the state of its running request.
+//! The shards of a batch, and the state of the request that the workers run on them.
 
 use super::{
     Error, capacity::Permit, pipelined_step::PipelinedStep, rollout::task::RolloutTask, shard::Shard, sync::lock,
@@ -14,52 +14,56 @@ use std::{
 };
 use tokio::sync::Notify;
 
-/// Batches cheaper than this run on the session's thread, since a hand-over to a worker costs more.
+/// Batches whose step costs less than this, in µs, are stepped on the session's thread, since passing them to a worker
+/// costs more.
 pub(super) const INLINE_MAX_US: f64 = 20.0;
-/// This limit applies instead if no other session has stepped since this one did. No other session waits then, and up
-/// to this cost a second worker saves less than a hand-over costs.
+/// The limit that applies instead of [`INLINE_MAX_US`], in µs, to a session that also made the previous step on the
+/// server. Then no other session is waiting, and up to this cost a second worker saves less than passing the batch to
+/// it costs.
 pub(super) const INLINE_MAX_US_UNCONTENDED: f64 = 80.0;
-/// Batches whose steps are at most this expensive are reset on the session's thread, too, µs. A reset costs a few steps.
+/// Batches whose step costs at most this, in µs, are also reset on the session's thread. A reset costs as much as a few
+/// steps.
 pub(super) const INLINE_RESET_MAX_US: f64 = 4.0;
-/// The maximum cost of a job for whose end the session polls before it sleeps, µs.
+/// The maximum cost of a job, in µs, for which the session polls for the end before it sleeps.
 const POLL_MAX_US: f64 = 50.0;
-/// The number of polls, which take about twice [`POLL_MAX_US`].
+/// The number of polls. Together they take about twice [`POLL_MAX_US`].
 const POLLS_BEFORE_WAIT: usize = 50;
 
-/// The continuation of a job at a step's end.
+/// The next action of a job after a step.
 pub(super) enum Continuation {
     Nothing,
-    /// Another step of the rollout.
+    /// Runs another step of the rollout.
     Step,
-    /// The pipelined step, which is another request.
+    /// Runs the pipelined step, which is a request of its own.
     Request,
 }
 
-/// The shards of a batch and the state of its running request. At most one request runs, and one pipelined step waits
-/// behind it.
+/// The work of a batch, as the workers see it: its shards, and the state of the running request. At most one request
+/// runs, and at most one pipelined step waits behind it.
 pub(super) struct Job {
     pub(super) shards: Vec<Mutex<Shard>>,
-    /// For each worker the range of shards that it takes first, and the next shard of the range. A worker that gets the
-    /// same environments at each step finds them in its core's cache. A worker whose range is done helps the others.
+    /// For each worker, the range of shards that it runs first, and the index of the next shard in that range. A worker
+    /// that runs the same environments at each step finds them in its core's cache. When its range is done, it helps
+    /// other workers.
     ranges: Vec<(Range<usize>, AtomicUsize)>,
-    /// The number of parts that have not finished.
+    /// The number of parts (shards, or the start of a rollout) that have not finished.
     remaining: AtomicUsize,
-    /// The running rollout of a policy, if there is one.
+    /// The running rollout, if there is one.
     rollout: Mutex<Option<Box<RolloutTask>>>,
-    /// The pipelined step that may follow a step. It is used only without a rollout.
+    /// The pipelined step that may follow the running step. Not used during a rollout.
     pub(super) pipelined: Mutex<PipelinedStep>,
-    /// Whether the next part is the beginning of the rollout and not a shard.
+    /// Whether the next part is the start of a rollout, which is no shard.
     begins_rollout: AtomicBool,
-    /// The number of requests that were handed to the workers and have ended.
+    /// The number of requests that the workers have finished so far.
     pub(super) ended: AtomicU64,
     /// Notified whenever a request has ended.
     pub(super) done: Notify,
-    /// Whether the session is gone, so that shards that have not run are skipped.
+    /// Whether the session has ended. If so, shards that have not run yet are skipped.
     pub(super) abandoned: AtomicBool,
-    /// Whether the rollout must end with its present step, because nobody waits for it any more.
+    /// Whether the rollout must end after its current step, because its future was dropped.
     pub(super) is_halted: AtomicBool,
     failed: AtomicBool,
-    /// The cost of a step of all environments, µs.
+    /// The estimated cost of a step of all environments, µs.
     pub(super) cost: f64,
     /// The number of times that the session polls for the end of a request before it sleeps.
     pub(super) polls: usize,
@@ -68,7 +72,7 @@ pub(super) struct Job {
 }
 
 impl Job {
-    /// A job of these shards, for this number of workers, whose steps take about `cost` µs.
+    /// Makes the job of a batch, for `workers` workers. `cost` is the estimated cost of a step of all environments, µs.
     pub(super) fn new(
         shards: Vec<Mutex<Shard>>,
         workers: usize,
@@ -97,12 +101,12 @@ impl Job {
         }
     }
 
-    /// Whether workers step the batch even if no other session steps.
+    /// Whether the batch is always stepped by workers, and never on the session's thread.
     pub(super) fn needs_workers(&self) -> bool {
         self.cost > INLINE_MAX_US_UNCONTENDED
     }
 
-    /// Whether a worker has panicked while it ran the job.
+    /// Whether a worker has panicked in this job.
     pub(super) fn failed(&self) -> bool {
         self.failed.load(Ordering::Relaxed)
     }
@@ -111,7 +115,7 @@ impl Job {
         if self.failed() { Err(Error::Defect) } else { Ok(()) }
     }
 
-    /// Makes every shard available to the workers.
+    /// Makes all shards available to the workers.
     pub(super) fn prepare(&self) {
         for (range, next) in &self.ranges {
             next.store(range.start, Ordering::Relaxed);
@@ -119,8 +123,8 @@ impl Job {
         self.remaining.store(self.shards.len(), Ordering::Relaxed);
     }
 
-    /// Claims a shard that no worker has taken, if possible of the worker's own range. The caller has taken a part from
-    /// the queue, so a shard is left.
+    /// Claims a shard that no worker has taken, preferably from the worker's own range. There is one, because the
+    /// caller has taken a part from the queue.
     fn claim(&self, worker: usize) -> usize {
         loop {
             for i in 0..self.ranges.len() {
@@ -133,7 +137,7 @@ impl Job {
         }
     }
 
-    /// Makes the beginning of a rollout available to the workers.
+    /// Makes the start of a rollout available to the workers, as the job's only part.
     pub(super) fn prepare_rollout(&self, rollout: Box<RolloutTask>) {
         *lock(&self.rollout) = Some(rollout);
         self.is_halted.store(false, Ordering::Relaxed);
@@ -141,14 +145,14 @@ impl Job {
         self.remaining.store(1, Ordering::Relaxed);
     }
 
-    /// Takes the rollout after it has ended, or if it will never run.
+    /// Takes the rollout out of the job, after its end or if it will never run.
     pub(super) fn take_rollout(&self) -> Option<Box<RolloutTask>> {
         lock(&self.rollout).take()
     }
 
-    /// Runs a part of the job that the caller has taken from the queue. Returns whether it was the last part.
+    /// Runs a part of the job, after the caller has taken it from the queue. Returns whether it was the last part.
     pub(super) fn run_part(&self, worker: usize) -> bool {
-        // The beginning of a rollout is the job's only part.
+        // The start of a rollout is the job's only part.
         if self.begins_rollout.swap(false, Ordering::Relaxed) {
             self.remaining.store(0, Ordering::Release);
             return true;
@@ -162,7 +166,7 @@ impl Job {
         self.done.notify_one();
     }
 
-    /// Decides at a step's end whether another step follows. None follows if the pool is `closing`.
+    /// Decides after a step whether another step follows. None follows if the pool is `closing`.
     pub(super) fn after_step(&self, closing: bool) -> Continuation {
         if self.failed() || self.abandoned.load(Ordering::Relaxed) {
             lock(&self.pipelined).stop();
@@ -181,7 +185,7 @@ impl Job {
         self.catch_panic(Continuation::Step, || rollout.after_step(&self.shards, is_halted))
     }
 
-    /// Returns `next` if `is_wanted` returns true. Marks the job as failed if it panics.
+    /// Returns `next` if `is_wanted` returns true, otherwise `Nothing`. If `is_wanted` panics, marks the job as failed.
     fn catch_panic(&self, next: Continuation, is_wanted: impl FnOnce() -> bool) -> Continuation {
         match catch_unwind(AssertUnwindSafe(is_wanted)) {
             Ok(true) => next,
@@ -194,7 +198,7 @@ impl Job {
         }
     }
 
-    /// Runs a shard. Returns whether it was the last.
+    /// Runs a shard's command. Returns whether it was the last shard to finish.
     pub(super) fn run(&self, index: usize) -> bool {
         if !self.abandoned.load(Ordering::Relaxed) {
             let run = AssertUnwindSafe(|| lock(&self.shards[index]).run());
@@ -206,7 +210,7 @@ impl Job {
                 }
             }
         }
-        // Release, so that the worker that reads 0 sees what every shard wrote.
+        // Acquire and release: the worker that finishes last sees the outputs of all shards.
         self.remaining.fetch_sub(1, Ordering::AcqRel) == 1
     }
 }

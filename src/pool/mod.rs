@@ -1,16 +1,16 @@
-//! Batches of environments, stepped by worker threads.
+//! Runs batches of environments on worker threads.
 //!
-//! A batch is cut into shards, each with its environments and its own output buffers. A request puts the batch into the
-//! workers' queue; a worker takes one shard of the batch at the queue's head and puts the batch back at its tail if
-//! shards remain, so that batches of different sessions take turns, whatever their sizes. The last shard to finish
-//! wakes the session, which gathers the outputs into one reply. Which worker ran which shard cannot be seen from
-//! outside.
+//! A batch is cut into shards, each with its own environments and output buffers. A request puts the batch into the
+//! workers' queue. A worker takes one shard of the batch at the front of the queue. If shards remain, it puts the batch
+//! at the back, so that batches of different sessions take turns, whatever their sizes. The last shard to finish wakes
+//! the session, which gathers the outputs into one reply. Results do not depend on which worker ran which shard.
 //!
-//! A pipelined step is requested while another one runs. It begins as soon as that step ends: the last shard's worker
-//! gathers the outputs and puts the batch back into the queue before the session is woken.
+//! A pipelined step is a step that is requested while another step of the batch is running. It starts as soon as the
+//! running step ends: the worker of the last shard gathers the outputs and puts the batch back into the queue, before
+//! the session is woken.
 //!
-//! During a rollout of a policy the last shard's worker gathers the outputs, computes the next actions and puts the
-//! batch back into the queue. Only the end of the rollout wakes the session.
+//! During a rollout of a policy, the worker of the last shard gathers the outputs, computes the next actions and puts
+//! the batch back into the queue. The session is woken only at the end of the rollout.
 
 mod batch;
 mod capacity;
@@ -39,37 +39,37 @@ pub use step_result::StepResult;
 
 use crate::env;
 
-/// A refused or failed request.
+/// Why a request to a batch was refused or failed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// An environment or a snapshot is not valid. Nothing was changed.
+    /// An environment or a snapshot is invalid. Nothing was changed.
     #[error(transparent)]
     Environment(#[from] env::Error),
-    /// The pool has no room. Nothing was changed.
+    /// The pool has no room for the environments. Nothing was changed.
     #[error(
         "{requested} environments were asked for, but {used} of this server's {limit} are in use; open fewer, or later"
     )]
     Full {
-        /// The batch size that was asked for.
+        /// The number of environments that were requested.
         requested: usize,
-        /// Environments in use.
+        /// The number of environments in use.
         used: usize,
         /// The maximum number of environments.
         limit: usize,
     },
-    /// Autoreset is disabled and some environments have ended. Nothing was changed.
+    /// A step was requested although autoreset is disabled and some episodes have ended. Nothing was changed.
     #[error(
         "the episodes of slots {slots} have ended and autoreset is disabled; reset these slots before the next step"
     )]
     Ended {
-        /// The first few of these slots, separated by commas.
+        /// The first few slots whose episodes have ended, separated by commas.
         slots: String,
     },
     /// An input or an output of a policy is not finite.
     #[error("the policy's play has ended: {0}; hand over another policy")]
     Policy(#[from] perturb_policy::Error),
-    /// A worker panicked: a defect of the server. The batch is lost.
+    /// A worker panicked, which is a defect of the server. The batch is lost.
     #[error(
         "the simulation failed because of a server bug; open a new session, and report the bug with the server's log"
     )]

@@ -1,5 +1,5 @@
-//! A pipelined step is requested while another one runs. It begins as soon as that step ends, while the session is
-//! still being woken to answer the first request.
+//! Pipelined steps: a step that is requested while another step is running starts as soon as that step ends, while the
+//! session is still being woken to answer the first request.
 
 use super::{
     shard::{Shard, set_actions},
@@ -9,34 +9,35 @@ use bytes::{Bytes, BytesMut};
 use std::sync::Mutex;
 use tokio::time::Instant;
 
-/// The pipelined step of a job.
+/// The state of a job's pipelined step.
 #[derive(Default)]
 pub(super) struct PipelinedStep {
-    /// Whether a step is running that a pipelined step may follow. The last worker of the running step checks for one.
+    /// Whether a step is running. The worker that ends it checks for a pipelined step.
     is_under_way: bool,
-    /// The next step's actions.
+    /// The actions of the pipelined step, if one is queued.
     actions: Option<Bytes>,
-    /// Result and completion time of the step before the running one, until the session collects it.
+    /// The result and end time of the step that the pipelined step followed, until the session takes it.
     result: Option<(StepResult, Instant)>,
-    /// The end time of the last step that no pipelined step followed.
+    /// The end time of the last step that was not followed by a pipelined step.
     ended: Option<Instant>,
     buffer: BytesMut,
     reward_terms: bool,
 }
 
 impl PipelinedStep {
-    /// Makes the state without a pipelined step. `reward_terms` says whether steps report the reward's terms.
+    /// Makes the state without a pipelined step. `reward_terms` says whether step results contain the terms of the
+    /// reward.
     pub(super) fn new(reward_terms: bool) -> Self {
         Self { reward_terms, ..Self::default() }
     }
 
-    /// Records that a step begins.
+    /// Records that a step starts.
     pub(super) fn begin(&mut self) {
         self.is_under_way = true;
     }
 
-    /// Ends a step. If another one is queued, stores the result and gives the shards their next actions. Returns
-    /// whether one was queued.
+    /// Called after a step. If a pipelined step is queued, stores the result of the ended step and gives the shards the
+    /// next actions. Returns whether a step was queued.
     pub(super) fn after_step(&mut self, shards: &[Mutex<Shard>]) -> bool {
         let Some(actions) = self.actions.take() else {
             (self.is_under_way, self.ended) = (false, Some(Instant::now()));
@@ -48,22 +49,22 @@ impl PipelinedStep {
         true
     }
 
-    /// Drops the queued step.
+    /// Drops the queued step, and accepts no other until the next step starts.
     pub(super) fn stop(&mut self) {
         (self.is_under_way, self.actions) = (false, None);
     }
 
-    /// Takes the result and the end time of the last step, if a pipelined step has followed it.
+    /// Takes the result and the end time of the last step, if a pipelined step followed it.
     pub(super) fn take_result(&mut self) -> Option<(StepResult, Instant)> {
         self.result.take()
     }
 
-    /// The end time of the last step that no pipelined step followed.
+    /// The end time of the last step that was not followed by a pipelined step.
     pub(super) fn ended_at(&self) -> Option<Instant> {
         self.ended
     }
 
-    /// Queues a step with these actions, if a step runs and its result is not stored yet.
+    /// Queues a step with these actions, if a step is running and the session has taken the previous result.
     pub(super) fn offer(&mut self, actions: Bytes) {
         if self.is_under_way && self.result.is_none() {
             self.actions = Some(actions);

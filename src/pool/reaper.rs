@@ -1,4 +1,4 @@
-//! A thread that frees the environments of closed sessions.
+//! The thread that frees the environments of closed sessions.
 
 use super::sync::lock;
 use crate::priority::lower;
@@ -14,19 +14,19 @@ use std::{
     time::Duration,
 };
 
-/// The niceness of the thread. It is low in priority because no request waits for it.
+/// The niceness of the thread. Its priority is low because no request waits for it.
 const REAPER_NICENESS: i32 = 3;
 
-/// Frees a closed session's batch, and returns whether it could. It runs on the reaper's thread, because freeing
-/// thousands of environments would block the transport's thread for too long.
+/// Frees a closed session's batch, if it is no longer in use. Returns whether it did. The reaper's thread calls this,
+/// because freeing thousands of environments would block the transport thread for too long.
 pub(super) type DeferredDrop = Box<dyn FnMut() -> bool + Send>;
-/// The interval at which freeing is retried for a batch that was still in use.
+/// The interval at which freeing a batch that was still in use is retried.
 const REAP_INTERVAL: Duration = Duration::from_millis(1);
 
-/// The handle of the thread, until it is closed.
+/// The handle to the reaper's thread.
 pub(super) struct Reaper {
     drops: Mutex<Option<mpsc::Sender<DeferredDrop>>>,
-    /// The number of batches that are not freed yet.
+    /// The number of queued batches that have not been freed yet.
     pending: Arc<AtomicUsize>,
 }
 
@@ -34,7 +34,7 @@ impl Reaper {
     /// Starts the thread.
     ///
     /// # Errors
-    /// If the operating system starts no thread.
+    /// If the operating system cannot start a thread.
     pub(super) fn start() -> io::Result<(Self, JoinHandle<()>)> {
         let (drops, received) = mpsc::channel::<DeferredDrop>();
         let pending = Arc::<AtomicUsize>::default();
@@ -48,28 +48,28 @@ impl Reaper {
         Ok((Self { drops: Mutex::new(Some(drops)), pending }, thread))
     }
 
-    /// Hands a batch to the thread, which frees it.
+    /// Queues a batch to be freed by the thread.
     pub(super) fn drop_later(&self, deferred: DeferredDrop) {
         if let Some(drops) = &*lock(&self.drops) {
             self.pending.fetch_add(1, Ordering::AcqRel);
-            let _ = drops.send(deferred); // its thread ends only with the pool
+            let _ = drops.send(deferred); // cannot fail: the thread runs as long as this sender exists
         }
     }
 
-    /// Waits until all batches that were handed over so far are freed.
+    /// Waits until all queued batches have been freed.
     pub(super) async fn idle(&self) {
         while self.pending.load(Ordering::Acquire) > 0 {
             tokio::time::sleep(REAP_INTERVAL).await;
         }
     }
 
-    /// Ends the thread when it has nothing left to free.
+    /// Ends the thread. Later batches are freed by the thread that drops them.
     pub(super) fn close(&self) {
         *lock(&self.drops) = None;
     }
 }
 
-/// Frees each batch that comes, as soon as it is not in use, until the pool ends.
+/// Frees queued batches as soon as they are not in use, until the sender is dropped.
 fn reap(received: &mpsc::Receiver<DeferredDrop>, pending: &AtomicUsize) {
     let mut left: Vec<DeferredDrop> = Vec::new();
     loop {

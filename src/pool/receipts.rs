@@ -1,13 +1,14 @@
-//! Receipts as arrays, so that a large batch needs no message for each episode.
+//! Receipts as arrays. With them, a large batch needs no message for each episode.
 
 use crate::env::Episodes;
 
-/// The receipts of some episodes, as columns.
+/// The receipts of m episodes, as arrays.
 #[derive(Debug, Default)]
 pub(super) struct ReceiptColumns {
-    /// `[m, 5]`: slot of the batch, indices of environment, trial and episode, and the episode's number in its trial.
+    /// `[m, 5]`: for each episode its slot in the batch, environment index, trial index, episode index, and number
+    /// within its trial.
     pub(super) episodes: Vec<u64>,
-    /// `[m, P + Q]`: the requested values, then the applied ones.
+    /// `[m, P + Q]`: for each episode its P requested values, then its Q applied values.
     pub(super) values: Vec<f64>,
 }
 
@@ -18,7 +19,7 @@ impl ReceiptColumns {
         self.values.clear();
     }
 
-    /// Adds the present episode of the environment in this slot of the batch.
+    /// Adds the receipt of an environment's current episode. `slot` is the environment's slot in the batch.
     pub(super) fn push(&mut self, slot: usize, episodes: &Episodes) {
         let id = episodes.id();
         let numbers = [id.environment_index.into(), id.trial_index, id.episode_index, id.episode_in_trial.into()];

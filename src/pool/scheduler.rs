@@ -1,4 +1,4 @@
-//! The worker threads and their queue.
+//! The pool's worker threads, and the queue from which they take work.
 
 use super::{
     Error,
@@ -24,24 +24,24 @@ use std::{
 };
 use tokio::time::Instant;
 
-/// The number of times that an idle worker yields its core before it sleeps. Waking a worker takes longer than a step
-/// of many small environments.
+/// The number of times that an idle worker yields its core before it sleeps. Waking a sleeping worker takes longer than
+/// a step of many small environments.
 const YIELDS_BEFORE_SLEEP: usize = 100;
 
-/// The niceness of the workers. The transport's thread, which only works in short bursts, goes before them.
+/// The niceness of the workers. The transport threads take precedence, since they work only in short bursts.
 const WORKER_NICENESS: i32 = 1;
 
-/// Worker threads that step batches, and the count of environments they may hold.
+/// The worker threads that run batches, and the limit on the number of environments.
 pub struct Pool {
     shared: Arc<StepScheduler>,
     threads: Vec<JoinHandle<()>>,
 }
 
 impl Pool {
-    /// Starts `workers` threads (at least 1) for at most `max_environments` environments at a time.
+    /// Starts `workers` threads, at least 1, for at most `max_environments` environments at a time.
     ///
     /// # Errors
-    /// If the operating system starts no thread.
+    /// If the operating system cannot start a thread.
     pub fn new(workers: usize, max_environments: usize) -> io::Result<Self> {
         let (reaper, freeing) = Reaper::start()?;
         let shared = Arc::new(StepScheduler {
@@ -73,7 +73,7 @@ impl Pool {
         self.threads.len() - 1
     }
 
-    /// Environments in use.
+    /// The number of environments in use.
     pub fn environments(&self) -> usize {
         self.shared.capacity.used()
     }
@@ -83,27 +83,27 @@ impl Pool {
         self.shared.capacity.limit()
     }
 
-    /// Waits until the number of environments in use has changed since the last call. Only one caller may wait.
+    /// Waits until the number of environments in use has changed since the last call. Only one task may wait.
     pub async fn changed(&self) {
         self.shared.capacity.changed().await;
     }
 
-    /// The counters of the environments of this name.
+    /// Returns the counters of steps and episodes for the environment with this name.
     pub fn meter(&self, environment: &'static str) -> Arc<Meter> {
         Arc::clone(lock(&self.shared.meters).entry(environment).or_default())
     }
 
-    /// The counters of all environments for which [`Pool::meter`] was called, by name.
+    /// Returns the counters of all environments for which [`Pool::meter`] was called, by name.
     pub fn meters(&self) -> BTreeMap<&'static str, Arc<Meter>> {
         lock(&self.shared.meters).clone()
     }
 
-    /// The times that batches spent in the queue before a worker took a part.
+    /// Returns the histogram of the times that batches waited in the queue until a worker took a shard.
     pub fn waits(&self) -> &Histogram {
         &self.shared.waits
     }
 
-    /// Waits until the environments of all batches that were dropped so far are freed.
+    /// Waits until the environments of all dropped batches have been freed.
     pub async fn freed(&self) {
         self.shared.reaper.idle().await;
     }
@@ -126,50 +126,50 @@ impl Drop for Pool {
     }
 }
 
-/// The queue of the workers, which the batches share.
+/// The state that workers and batches share: the queue of jobs, counters, and limits.
 pub(super) struct StepScheduler {
     pub(super) reaper: Reaper,
     pub(super) capacity: Arc<Capacity>,
     queue: Mutex<JobQueue>,
-    /// The number of jobs in the queue, readable without its lock.
+    /// The number of jobs in the queue, to be read without locking the queue.
     waiting: AtomicUsize,
     ready: Condvar,
-    /// Whether the pool is closing, so that rollouts end with their present step.
+    /// Whether the pool is closing. If so, rollouts end after their current step.
     closing: AtomicBool,
-    /// The job that stepped last. The pointer is only compared.
+    /// The job that was stepped last. The pointer is only compared, never dereferenced.
     last_stepped: AtomicPtr<Job>,
     meters: Mutex<BTreeMap<&'static str, Arc<Meter>>>,
     waits: Histogram,
 }
 
 struct JobQueue {
-    /// FIFO of jobs, each with its number of unclaimed parts (at least 1), which are shards or the beginning of a
-    /// rollout, and the time at which it was enqueued.
+    /// A FIFO of jobs, each with its number of parts that no worker has taken, at least 1, and the time at which it was
+    /// enqueued. A part is a shard or the start of a rollout.
     jobs: VecDeque<(Arc<Job>, usize, Instant)>,
-    /// The number of workers that wait for `ready`.
+    /// The number of workers that sleep until `ready` is notified.
     sleeping: usize,
     closed: bool,
 }
 
 impl StepScheduler {
-    /// Runs a step of all shards on this thread if the job is cheap. Returns whether it did.
+    /// Runs a step of all shards on the calling thread, if the job is cheap. Returns whether it did.
     pub(super) fn step_inline(&self, job: &Job) -> bool {
         let tiny = if self.mark_last_stepped(job) { INLINE_MAX_US_UNCONTENDED } else { INLINE_MAX_US };
         run_inline(job, tiny)
     }
 
-    /// Runs the resets of all shards on this thread if they are cheap. Returns whether it did.
+    /// Runs the resets of all shards on the calling thread, if the job is cheap. Returns whether it did.
     pub(super) fn reset_inline(&self, job: &Job) -> bool {
         run_inline(job, INLINE_RESET_MAX_US)
     }
 
-    /// Queues a step of all shards for the workers. A pipelined step may follow.
+    /// Queues a step of all shards for the workers. A pipelined step may follow it.
     pub(super) fn begin_step(&self, job: &Arc<Job>) {
         lock(&job.pipelined).begin();
         self.begin(job);
     }
 
-    /// Runs the job's request `number` on the workers: queues all shards and waits for the last one.
+    /// Runs a request on the workers: queues all shards and waits for the end of request number `number`.
     pub(super) async fn run(&self, job: &Arc<Job>, number: u64) -> Result<(), Error> {
         self.begin(job);
         self.wait(job, number).await
@@ -178,10 +178,10 @@ impl StepScheduler {
     fn begin(&self, job: &Arc<Job>) {
         job.prepare();
         let shards = job.shards.len();
-        self.push(job, shards, shards); // its lock publishes the job's counters
+        self.push(job, shards, shards); // the queue's lock makes the job's counters visible to the workers
     }
 
-    /// Runs a rollout on the workers. Returns it when it has ended.
+    /// Runs a rollout on the workers, as request number `number`. Returns the rollout after its end.
     pub(super) async fn run_rollout(
         &self,
         job: &Arc<Job>,
@@ -195,30 +195,30 @@ impl StepScheduler {
         job.take_rollout().ok_or(Error::Defect)
     }
 
-    /// Records that a job steps. Returns whether the previous step was this job's, too.
+    /// Records that a job is stepped. Returns whether the previously stepped job was the same.
     fn mark_last_stepped(&self, job: &Job) -> bool {
         let job = std::ptr::from_ref(job).cast_mut();
         self.last_stepped.swap(job, Ordering::Relaxed) == job
     }
 
-    /// Waits until the first `number` requests of a job that were handed to the workers have ended.
+    /// Waits until the workers have finished the first `number` requests of a job.
     pub(super) async fn wait(&self, job: &Arc<Job>, number: u64) -> Result<(), Error> {
         let has_ended = || job.ended.load(Ordering::Acquire) >= number;
-        // A job of low cost is polled before the session sleeps, because waking costs more than many steps.
+        // For a cheap job, the session polls before it sleeps, because waking the session costs more than many steps.
         for _ in 0..job.polls {
             if has_ended() {
                 break;
             }
             tokio::task::yield_now().await;
         }
-        // The notification may belong to the previous request; check the counter again.
+        // The notification may belong to the previous request, so the counter is checked again.
         while !has_ended() {
             job.done.notified().await;
         }
         job.result()
     }
 
-    /// Puts a job with this number of parts at the queue's tail, and wakes at most `helpers` workers.
+    /// Puts a job with `parts` parts at the back of the queue, and wakes at most `helpers` workers.
     fn push(&self, job: &Arc<Job>, parts: usize, helpers: usize) {
         let now = Instant::now();
         let mut queue = lock(&self.queue);
@@ -226,7 +226,7 @@ impl StepScheduler {
         self.waiting.store(queue.jobs.len(), Ordering::Release);
         let sleeping = queue.sleeping;
         drop(queue);
-        // A notification is a system call even if no worker sleeps.
+        // Skipped if no worker sleeps, because a notification is always a system call.
         match sleeping.min(helpers) {
             0 => {}
             1 => self.ready.notify_one(),
@@ -234,8 +234,8 @@ impl StepScheduler {
         }
     }
 
-    /// Takes one part of the job at the queue's head. If parts remain, the job goes to the tail for other workers.
-    /// Returns `None` when the queue is closed.
+    /// Takes one part of the job at the front of the queue. If parts remain, moves the job to the back, for other
+    /// workers. Returns `None` after the queue was closed.
     fn pop(&self) -> Option<Arc<Job>> {
         for _ in 0..YIELDS_BEFORE_SLEEP {
             if self.waiting.load(Ordering::Acquire) > 0 {
@@ -272,8 +272,8 @@ impl StepScheduler {
         }
     }
 
-    /// Called at the end of a job's last part. Begins another step if a rollout or a pipelined step wants one, and
-    /// notifies the session if a request has ended.
+    /// Called after the last part of a job. Starts another step if a rollout or a pipelined step needs one. Notifies
+    /// the session if a request has ended.
     fn after_step(&self, job: &Arc<Job>) {
         loop {
             let next = job.after_step(self.closing.load(Ordering::Relaxed));
@@ -282,8 +282,8 @@ impl StepScheduler {
             }
             job.prepare();
             let shards = job.shards.len();
-            // Jobs in the queue have their turn first. If none waits and the job has one part, this worker runs it at
-            // once: through the queue an idle worker could take a job that is in this worker's cache.
+            // Waiting jobs come first. If none waits and the job has a single shard, this worker runs it directly.
+            // Through the queue, an idle worker might take the job, which is in this worker's cache.
             let is_own = shards == 1 && self.waiting.load(Ordering::Acquire) == 0;
             if !is_own {
                 self.push(job, shards, shards - 1);
@@ -300,7 +300,7 @@ impl StepScheduler {
     }
 }
 
-/// Runs all shards on this thread if the job costs at most `max_us` µs. Returns whether it did.
+/// Runs all shards on the calling thread if a step of the job costs at most `max_us` µs. Returns whether it did.
 fn run_inline(job: &Job, max_us: f64) -> bool {
     if job.cost > max_us {
         return false;

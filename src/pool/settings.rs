@@ -1,49 +1,49 @@
-//! The settings of a batch.
+//! The settings with which a batch is opened.
 
 use crate::env::{EnvironmentSpec, Settings};
 
-/// The settings of a batch.
+/// The settings with which a batch of environments is opened.
 #[derive(Debug, Clone)]
 pub struct BatchSettings {
-    /// The environment.
+    /// The description of the environment that all slots have.
     pub spec: &'static EnvironmentSpec,
-    /// The slots, at least one group.
+    /// The groups of slots, at least one, in order of slots.
     pub groups: Vec<SlotGroup>,
-    /// The autoreset mode.
+    /// The autoreset mode, which determines when an environment is reset after the end of an episode.
     pub autoreset: Autoreset,
-    /// Whether episodes carry receipts.
+    /// Whether the starts and ends of episodes are reported with receipts.
     pub receipts: bool,
-    /// Whether the receipts in replies to steps are arrays.
+    /// Whether step results have receipts as arrays instead of as messages.
     pub receipt_arrays: bool,
-    /// Whether steps report the reward's terms.
+    /// Whether step results contain the terms of the reward.
     pub reward_terms: bool,
-    /// Whether observations have the parameters at their end.
+    /// Whether the episode's parameters are appended to observations.
     pub observe_parameters: bool,
 }
 
-/// Successive slots with settings of their own.
+/// A number of successive slots whose episodes have the same settings.
 #[derive(Debug, Clone)]
 pub struct SlotGroup {
     /// The number of slots, at least 1.
     pub size: usize,
-    /// The settings of the group's episodes, which fix all randomness. `environment_index` is the index of the first
-    /// slot, and the index of the last slot fits a u32.
+    /// The settings of the group's episodes. They determine all randomness. `environment_index` is the index of the
+    /// first slot; the index of the last slot must fit a u32.
     pub episodes: Settings,
 }
 
 impl BatchSettings {
-    /// N, when the batch is opened.
+    /// N, the number of environments when the batch is opened.
     pub fn size(&self) -> usize {
         self.groups.iter().map(|group| group.size).sum()
     }
 
-    /// O: the length of an observation.
+    /// O, the number of entries of an observation.
     pub fn observation_size(&self) -> usize {
         let parameters = if self.observe_parameters { self.spec.parameters.len() } else { 0 };
         self.spec.observation.len() + parameters
     }
 
-    /// Episodes in a trial, if all groups have as many.
+    /// The number of episodes in a trial, or `None` if groups differ in it.
     pub fn episodes_per_trial(&self) -> Option<u32> {
         let mut each = self.groups.iter().map(|group| group.episodes.episodes_per_trial);
         let first = each.next()?;
@@ -51,13 +51,13 @@ impl BatchSettings {
     }
 }
 
-/// The autoreset mode of an environment whose episode has ended (Gymnasium's three modes).
+/// Gymnasium's three autoreset modes, which determine when an environment is reset after the end of an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Autoreset {
-    /// The next step ignores its action and resets the environment.
+    /// The next step ignores the environment's action and resets the environment.
     NextStep,
     /// The step that ends the episode also resets the environment.
     SameStep,
-    /// The environment is reset only by the client.
+    /// Only the client resets the environment.
     Disabled,
 }

@@ -14,15 +14,15 @@ use crate::{
 use bytes::Bytes;
 use std::sync::{Arc, Mutex};
 
-/// A command for a shard. Slots are counted within the shard.
+/// A command for a shard. Its slots are relative to the shard's first slot.
 pub(super) enum Command {
     Open,
     Step,
     Reset(Vec<SlotReset>),
-    /// Begins the next episode in every environment.
+    /// Begins the next episode in every environment of the shard.
     ResetAll,
     Snapshot(Vec<usize>),
-    /// Restores these snapshots. The previous states are kept for [`Command::RollBack`].
+    /// Restores these snapshots, and keeps the previous states for [`Command::RollBack`].
     Restore(Vec<(usize, Bytes)>),
     /// Undoes the last restore.
     RollBack,
@@ -37,51 +37,51 @@ pub(super) struct SlotReset {
 }
 
 impl SlotReset {
-    /// A reset that begins the next episode of the current trial.
+    /// Makes a reset that begins the next episode of the current trial.
     pub(super) fn next_episode(slot: usize) -> Self {
         Self { slot, seed: None, distributions: None, state: None }
     }
 }
 
-/// Environments of neighbouring slots with their inputs and outputs. `n` is their number.
+/// The environments of `n` successive slots, with the inputs and outputs of their steps.
 pub(super) struct Shard {
     pub(super) first_slot: usize,
     pub(super) size: usize,
     spec: &'static EnvironmentSpec,
-    /// The environments that [`Command::Open`] makes.
+    /// The groups of slots whose environments [`Command::Open`] creates.
     groups: Vec<SlotGroup>,
     autoreset: Autoreset,
     receipts: bool,
     receipt_arrays: bool,
     observe_parameters: bool,
-    /// O.
+    /// O, the number of entries of an observation.
     observation_size: usize,
     pub(super) command: Command,
     slots: Vec<Episodes>,
     backups: Vec<(usize, Vec<u8>)>,
-    /// Discrete: `[n]`, validated.
+    /// The actions in a discrete space, `[n]`, valid choices.
     pub(super) choices: Vec<u32>,
-    /// Continuous: `[n, A]`, validated.
+    /// The actions in a continuous space, `[n, A]`, finite.
     pub(super) vectors: Vec<f32>,
-    /// `[n, O]`
+    /// The current observations, `[n, O]`.
     pub(super) observations: Vec<f32>,
-    /// `[n]`
+    /// The rewards of the last step, `[n]`.
     pub(super) rewards: Vec<f32>,
-    /// `[n]`
+    /// 1 where the task ended the episode in the last step, `[n]`.
     pub(super) terminated: Vec<u8>,
-    /// `[n]`
+    /// 1 where the step limit ended the episode in the last step, `[n]`.
     pub(super) truncated: Vec<u8>,
-    /// `[n, terms]`
+    /// The terms of the rewards of the last step, `[n, terms]`.
     pub(super) reward_terms: Vec<f32>,
-    /// `[k, O]`
+    /// The last observations of the episodes in `ended`, `[k, O]`.
     pub(super) final_observations: Vec<f32>,
-    /// `[k]`: slot of the batch and the episode that ended there.
+    /// The episodes that ended in the last command, `[k]`, each with its slot in the batch.
     pub(super) ended: Vec<(u32, EpisodeEnd)>,
-    /// Slot of the batch and the episode that began there.
+    /// The episodes that began in the last command, each with its slot in the batch; only with receipts as messages.
     pub(super) started: Vec<(u32, EpisodeStart)>,
-    /// The receipts of `ended`, if receipts are arrays.
+    /// The receipts of the episodes in `ended`, if receipts are arrays.
     pub(super) ended_receipts: ReceiptColumns,
-    /// The receipts of the episodes that began in a step, if receipts are arrays.
+    /// The receipts of the episodes that began in the last step, if receipts are arrays.
     pub(super) started_receipts: ReceiptColumns,
     pub(super) snapshots: Vec<Vec<u8>>,
     pub(super) failure: Option<env::Error>,
@@ -89,14 +89,15 @@ pub(super) struct Shard {
 }
 
 impl Shard {
-    /// Makes a shard of the slots from `first_slot` on. [`Command::Open`] makes its environments later.
+    /// Makes a shard for the slots of `groups`, of which `first_slot` is the first. [`Command::Open`] creates its
+    /// environments.
     pub(super) fn new(settings: &BatchSettings, groups: Vec<SlotGroup>, first_slot: usize) -> Self {
         let size = groups.iter().map(|group| group.size).sum();
         Self { groups, command: Command::Open, ..Self::with_environments(settings, Vec::new(), (first_slot, size)) }
     }
 
-    /// Makes a shard of `size` slots from `first_slot` on with these environments. Of its outputs only the observations
-    /// are valid.
+    /// Makes a shard of `size` slots from `first_slot` on, with existing environments. Only its observations are valid
+    /// until the next step.
     pub(super) fn with_environments(
         settings: &BatchSettings,
         slots: Vec<Episodes>,
@@ -141,48 +142,50 @@ impl Shard {
         shard
     }
 
-    /// Takes the environments out of the shard.
+    /// Removes the environments from the shard and returns them.
     pub(super) fn take_slots(&mut self) -> Vec<Episodes> {
         std::mem::take(&mut self.slots)
     }
 
-    /// The index of each environment, and its present trial's.
+    /// The environment index and the current trial index of each environment.
     pub(super) fn trials(&self) -> impl Iterator<Item = (u32, u64)> {
         self.slots.iter().map(|episodes| (episodes.id().environment_index, episodes.id().trial_index))
     }
 
-    /// The slots of the batch whose episodes have ended.
+    /// The slots of this shard, as numbered in the batch, whose episodes have ended.
     pub(super) fn ended_slots(&self) -> impl Iterator<Item = usize> {
         let ended = self.slots.iter().enumerate().filter(|(_, episodes)| episodes.ended());
         ended.map(|(slot, _)| self.first_slot + slot)
     }
 
-    /// The present distributions of a slot of the batch.
+    /// The current distributions of the environment in a slot. `slot` is numbered in the batch.
     pub(super) fn distributions(&self, slot: usize) -> &[Distribution] {
         &self.slots[slot - self.first_slot].settings().distributions
     }
 
-    /// The draws of a slot of the batch.
+    /// The address of the current episode in a slot: seed, environment index and episode index. `slot` is numbered in
+    /// the batch.
     pub(super) fn draw(&self, slot: usize) -> Draw {
         self.slots[slot - self.first_slot].draw()
     }
 
-    /// The draws of each environment.
+    /// The address of each environment's current episode: seed, environment index and episode index.
     pub(super) fn draws(&self) -> impl Iterator<Item = Draw> {
         self.slots.iter().map(Episodes::draw)
     }
 
-    /// The scene of a slot of the batch.
+    /// The scene to draw of the environment in a slot. `slot` is numbered in the batch.
     pub(super) fn scene(&self, slot: usize) -> Option<Scene> {
         self.slots[slot - self.first_slot].scene()
     }
 
-    /// An upper bound of the length of the first environment's snapshot without its distributions, in bytes.
+    /// An upper bound of the length of the first environment's snapshot, without its distributions, bytes.
     pub(super) fn max_snapshot_bytes(&self) -> usize {
         self.slots.first().map_or(0, Episodes::max_snapshot_bytes)
     }
 
-    /// Carries out the command. Returns how many environments took a step, and how many episodes ended.
+    /// Carries out the command. Returns the number of environments that took a step, and the number of episodes that
+    /// ended.
     pub(super) fn run(&mut self) -> (usize, usize) {
         self.ended.clear();
         self.started.clear();
@@ -209,7 +212,7 @@ impl Shard {
             for i in 0..group.size {
                 match (self.spec.make)() {
                     Ok(environment) => {
-                        // The caller of open has checked that the last index fits.
+                        // Cannot overflow: the opener of the batch has checked the group's last index.
                         let environment_index = group.episodes.environment_index + i as u32;
                         let settings = Settings { environment_index, ..group.episodes.clone() };
                         let episodes = Episodes::new(environment, settings);
@@ -228,14 +231,14 @@ impl Shard {
         }
     }
 
-    /// Advances every environment. Returns how many took a step instead of beginning an episode.
+    /// Advances every environment. Returns the number of environments that took a step. The others began an episode.
     fn step(&mut self) -> usize {
         let (n_terms, mut steps) = (self.terms.len(), 0);
         for slot in 0..self.size {
             let episodes = &mut self.slots[slot];
             if episodes.ended() {
-                // Only next-step mode gets here: same-step leaves none ended and restores none, disabled refuses the
-                // step.
+                // This happens in next-step mode only. Same-step mode leaves no episode ended and restores none.
+                // Disabled mode refuses the step.
                 episodes.begin(None);
                 self.rewards[slot] = 0.0;
                 self.terminated[slot] = 0;
@@ -323,7 +326,7 @@ impl Shard {
     }
 
     fn note_start(&mut self, slot: usize) {
-        // Without receipts clients count episodes themselves, and an id would cost every reset a message.
+        // Without receipts, clients count episodes themselves; reporting starts would cost a message for every reset.
         if self.receipts {
             self.started.push(((self.first_slot + slot) as u32, self.slots[slot].started(true)));
         }
@@ -335,14 +338,14 @@ impl Shard {
     }
 }
 
-/// Gives every shard its part of a batch's actions, i32 `[N]` or f32 `[N, A]`.
+/// Gives every shard its part of a batch's actions, little-endian i32 `[N]` or f32 `[N, A]`.
 pub(super) fn set_actions(shards: &[Mutex<Shard>], actions: &[u8]) {
     let mut words = actions.as_chunks::<4>().0.iter();
     for shard in shards {
         let mut shard = lock(shard);
         let Shard { choices, vectors, .. } = &mut *shard;
-        // One of the two is empty. `words` is second in each `zip`: if it were first, `zip` would take and lose a word of
-        // the next shard.
+        // Either `choices` or `vectors` is empty. `words` must be the second argument of `zip`: as the first, `zip`
+        // would consume a word that belongs to the next shard.
         choices.iter_mut().zip(&mut words).for_each(|(to, from)| *to = u32::from_le_bytes(*from));
         vectors.iter_mut().zip(&mut words).for_each(|(to, from)| *to = f32::from_le_bytes(*from));
     }

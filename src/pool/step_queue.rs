@@ -1,24 +1,24 @@
-//! The queue for a pipelined step.
+//! The handle by which a session queues a pipelined step.
 
 use super::job::Job;
 use crate::env::EnvironmentSpec;
 use bytes::Bytes;
 use std::sync::Arc;
 
-/// A handle by which a step can be queued behind the running one.
+/// Queues a step of a batch behind its running step.
 pub struct StepQueue {
     pub(super) job: Arc<Job>,
-    /// The environment of the batch.
+    /// The description of the batch's environment.
     pub spec: &'static EnvironmentSpec,
-    /// N.
+    /// N, the number of environments in the batch.
     pub size: usize,
 }
 
 impl StepQueue {
-    /// Queues a step with these checked actions behind the running step, if there is one. The batch's next request must
-    /// then be that step.
+    /// Queues a step with these actions, if a step is running; otherwise does nothing. The caller must have checked the
+    /// actions, and must make this step the batch's next request.
     pub fn enqueue(&self, actions: Bytes) {
-        // If the lock is taken, a worker is already ending the step, and it is too late to queue another.
+        // If the lock is taken, a worker is already ending the running step. Then it is too late to queue another.
         if let Ok(mut pipelined) = self.job.pipelined.try_lock() {
             pipelined.offer(actions);
         }

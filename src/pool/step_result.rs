@@ -1,4 +1,4 @@
-//! The result of a step, gathered from the shards.
+//! The result of a step, and how it is gathered from the shards.
 
 use super::{
     encode::{push_f32, push_wide},
@@ -10,40 +10,40 @@ use crate::env::{EpisodeEnd, EpisodeStart};
 use bytes::{Bytes, BytesMut};
 use std::sync::Mutex;
 
-/// The outcome of a step; arrays are little-endian, as on the wire.
+/// The result of a step of N environments, in which K episodes ended. Arrays are little-endian, as in messages.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct StepResult {
-    /// f32 `[N, O]`
+    /// The observations after the step, f32 `[N, O]`.
     pub observations: Bytes,
-    /// f32 `[N]`
+    /// The rewards, f32 `[N]`.
     pub rewards: Bytes,
-    /// u8 `[N]`
+    /// 1 where the task ended the episode, u8 `[N]`.
     pub terminated: Bytes,
-    /// u8 `[N]`
+    /// 1 where the step limit ended the episode, u8 `[N]`. Both flags may be 1.
     pub truncated: Bytes,
-    /// f32 `[N, terms]`, or empty
+    /// The terms of the rewards, f32 `[N, terms]`; empty unless requested.
     pub reward_terms: Bytes,
-    /// f32 `[K, O]`
+    /// The last observations of the episodes that ended, f32 `[K, O]`.
     pub final_observations: Bytes,
-    /// `[K]`: slot and episode.
+    /// The K episodes that ended, each with its slot, in order of slots.
     pub ended: Vec<(u32, EpisodeEnd)>,
-    /// Slot and episode; only with receipts.
+    /// The episodes that autoreset began, each with its slot; only with receipts as messages.
     pub started: Vec<(u32, EpisodeStart)>,
-    /// u64 `[M, 5]`, only with receipts as arrays: slot, indices of environment, trial and episode, number in the
-    /// trial. The rows of the episodes that ended come before those of the episodes that began.
+    /// The episodes of `receipt_values`, u64 `[M, 5]`; only with receipts as arrays. Columns: slot, environment index,
+    /// trial index, episode index, number within the trial. The K ended episodes come before the episodes that began.
     pub receipt_episodes: Bytes,
-    /// f64 `[M, P + Q]`: requested and applied values.
+    /// The receipts of these M episodes, f64 `[M, P + Q]`: P requested values, then Q applied values.
     pub receipt_values: Bytes,
 }
 
-/// The shards whose outputs are gathered, and the buffer from which the gathered arrays are split off.
+/// Gathers the outputs of shards. The arrays are split off from `buffer`, whose memory is reused.
 pub(super) struct ShardOutputs<'a> {
     pub(super) shards: &'a [Mutex<Shard>],
     pub(super) buffer: &'a mut BytesMut,
 }
 
 impl ShardOutputs<'_> {
-    /// Gathers the outputs of the last step from the shards. The reward's terms are left out unless `reward_terms`.
+    /// Gathers the result of the last step. The terms of the rewards are omitted unless `reward_terms`.
     pub(super) fn step_result(mut self, reward_terms: bool) -> StepResult {
         StepResult {
             observations: self.observations(),
@@ -59,7 +59,7 @@ impl ShardOutputs<'_> {
         }
     }
 
-    /// Gathers the present observations of all environments, f32 `[N, O]`.
+    /// Gathers the current observations of all environments, f32 `[N, O]`.
     pub(super) fn observations(&mut self) -> Bytes {
         self.f32(|shard| &shard.observations)
     }
@@ -71,7 +71,7 @@ impl ShardOutputs<'_> {
         self.buffer.split().freeze()
     }
 
-    /// Gathers receipts of the episodes that ended in all shards, then of those that began.
+    /// Gathers a column of the receipts: first of all ended episodes, then of all episodes that began.
     fn receipts<T: Copy>(&mut self, column: fn(&ReceiptColumns) -> &Vec<T>, encode: fn(T) -> [u8; 8]) -> Bytes {
         let parts: [fn(&Shard) -> &ReceiptColumns; 2] =
             [|shard| &shard.ended_receipts, |shard| &shard.started_receipts];
@@ -91,7 +91,7 @@ impl ShardOutputs<'_> {
     }
 }
 
-/// Gathers the lists of all shards into one.
+/// Moves the lists of all shards into one list.
 pub(super) fn collect<T>(shards: &[Mutex<Shard>], field: impl Fn(&mut Shard) -> &mut Vec<T>) -> Vec<T> {
     let mut all = Vec::new();
     for shard in shards {

@@ -1,8 +1,9 @@
-//! Locking that ignores poisoning.
+//! Locking of mutexes regardless of poisoning.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// Locks the mutex even if a thread has panicked with it. The `failed` flag of a batch refuses it after a panic.
+/// Locks a mutex even if a thread panicked while it held the lock. After a panic, the `failed` flag of the job refuses
+/// further requests.
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

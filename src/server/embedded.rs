@@ -1,9 +1,9 @@
-//! A server inside of a client's process: the same pool and the same handler of sessions, and no transport. A program
-//! that links this library, such as the Python package's native module, hands requests over as messages and gets
+//! A server inside a client's process. It has the same pool and the same session handler as `perturb-server`, but no
+//! network: a program that links this library, such as the Python package's native module, passes requests and receives
 //! replies as messages.
 //!
-//! Limits are those of `perturb-server --private`, except that the number of sessions is not limited. Nobody else uses
-//! the server, so there are no tokens, no leases, no ledger and no metrics.
+//! The limits are the limits of `perturb-server --private`, except that the number of sessions is unlimited. Only this
+//! process uses the server, so there are no tokens, no leases, no ledger and no metrics.
 
 use super::{
     api::perturb_v1::{
@@ -27,7 +27,7 @@ use prost::Message;
 use std::{io, sync::Arc, time::Duration};
 use tonic::Status;
 
-/// Why there is no server.
+/// Why an embedded server cannot start.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum StartError {
@@ -37,25 +37,25 @@ pub enum StartError {
     /// The operating system cannot start a thread.
     #[error(transparent)]
     Io(#[from] io::Error),
-    /// The settings of a private server are refused: a defect.
+    /// The built-in settings of a private server are invalid, which is a defect.
     #[error(transparent)]
     Config(#[from] config::Error),
 }
 
-/// A server of this process. Its threads end when it and its last session are dropped.
+/// A server in this process. Its threads end when it and all its sessions have been dropped.
 pub struct EmbeddedServer {
     context: Arc<ServerContext>,
     budget: Budget,
     decoder: Decoder,
-    /// The most bytes of a request.
+    /// The maximum length of a request, bytes.
     max_bytes: usize,
 }
 
 impl EmbeddedServer {
-    /// Starts the threads of a server of these environments.
+    /// Starts a server, and its threads, for the environments of `catalogue`.
     ///
     /// # Errors
-    /// [`StartError`].
+    /// [`StartError`], if an environment or a thread cannot be made.
     pub fn start(catalogue: Catalogue) -> Result<Self, StartError> {
         let config = Config {
             lease_seconds: 0, // no connection is lost
@@ -77,14 +77,14 @@ impl EmbeddedServer {
         })
     }
 
-    /// A session that is not open yet.
+    /// Starts a session. Its first request must be `Open`.
     pub fn session(&self) -> EmbeddedSession {
         let handler = Session::new(Arc::clone(&self.context), None, self.budget.clone());
         EmbeddedSession { handler, decoder: self.decoder.clone(), max_bytes: self.max_bytes }
     }
 }
 
-/// A session. Dropping it frees its environments.
+/// A session of an embedded server. Dropping it frees its environments.
 pub struct EmbeddedSession {
     handler: Session,
     decoder: Decoder,
@@ -92,14 +92,14 @@ pub struct EmbeddedSession {
 }
 
 impl EmbeddedSession {
-    /// Answers a request. A refusal is a response, too, and the session stays open. Needs the context of a tokio
-    /// runtime. A step of a small batch is done when the future is polled for the first time, on the thread that polls.
+    /// Answers a request. If the request is refused, the response says why, and the session stays open. Must be called
+    /// within a tokio runtime. A small batch is stepped on the thread that polls the future, during the first poll.
     ///
     /// # Errors
-    /// The status with which a server would end the stream.
+    /// The gRPC status with which `perturb-server` would end the session's stream, e.g. if the request is too large.
     pub async fn answer(&mut self, request: SessionRequest) -> Result<SessionResponse, Status> {
         let request = match request.request {
-            // A step has nothing but its actions, which the handler checks.
+            // A step contains only actions, and the handler checks their length.
             Some(Request::Step(_)) => Ok(request),
             _ => Box::pin(self.checked(request)).await?,
         };
@@ -110,13 +110,13 @@ impl EmbeddedSession {
         Ok(answer.map_or_else(Session::error_response, |reply| reply.response))
     }
 
-    /// Returns a function that offers the next step to the pool while `request` runs, or `None` if the next step must
-    /// wait. The caller must have a step that it offered answered next.
+    /// Returns a function that queues the next step in the pool while `request` runs, or `None` if the next step must
+    /// wait. After a call of the function, the next request to [`answer`](Self::answer) must be the step passed to it.
     pub fn pipeline(&self, request: &SessionRequest) -> Option<impl FnOnce(SessionRequest) + Send + use<>> {
         self.handler.pipeline(request)
     }
 
-    /// Bounds a request's size and counts its entries, as a server does.
+    /// Checks a request's size and its numbers of entries, as `perturb-server` does before decoding.
     async fn checked(&self, request: SessionRequest) -> Result<Result<SessionRequest, Error>, Status> {
         let limits = self.handler.request_limits();
         let limits = RequestLimits { bytes: limits.bytes.min(self.max_bytes), ..limits };

@@ -1,6 +1,6 @@
-//! The classes of errors that clients get: the gRPC code of each, its word in metrics and logs, and its counter. Each
-//! layer has its own error enum, which maps each variant to a class by [`RequestError`]. Only this module maps classes
-//! to codes.
+//! The classes of errors that clients receive. Each class has a gRPC code, a word for metrics and logs, and a counter.
+//! Each layer has its own error enum and maps its variants to classes with [`RequestError`]. Only this module maps
+//! classes to gRPC codes.
 
 use crate::{env, pool, render};
 use std::{
@@ -13,37 +13,37 @@ use std::{
 };
 use tonic::{Code, Status};
 
-/// An error that is returned to the client of a request, a call or a stream.
+/// An error that the server returns to a client, as the answer to a request or as the end of a call.
 pub trait RequestError: Error {
     /// The error's class.
     fn kind(&self) -> ErrorKind;
 }
 
-/// Ends a call or a stream with an error's code and message.
+/// Returns the gRPC status that ends a call or stream with this error's code and message.
 pub fn status(error: &impl RequestError) -> Status {
     Status::new(error.kind().code(), error.to_string())
 }
 
-/// A field has a value that it cannot have.
+/// A field of a request has a value that is not allowed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("{field} is {got}; expected {expected}")]
 pub struct InvalidValue {
-    /// The path of the field in the protocol; in dm_env_rpc the setting, action or property.
+    /// The path of the field in the request; in dm_env_rpc the name of the setting, action or property.
     pub field: Cow<'static, str>,
-    /// The value that came.
+    /// The value in the request.
     pub got: String,
-    /// The values that are accepted, and what to do.
+    /// The values that are allowed, and what the client should do.
     pub expected: String,
 }
 
 impl InvalidValue {
-    /// An error of this field.
+    /// Makes the error for this field.
     pub fn new(field: impl Into<Cow<'static, str>>, got: impl ToString, expected: impl ToString) -> Self {
         Self { field: field.into(), got: got.to_string(), expected: expected.to_string() }
     }
 }
 
-/// Errors since the server began, by class.
+/// The number of errors since the server started, by class.
 #[derive(Clone)]
 pub struct ErrorCounters(Arc<[AtomicU64]>);
 
@@ -54,12 +54,13 @@ impl Default for ErrorCounters {
 }
 
 impl ErrorCounters {
-    /// Adds one.
+    /// Adds one error of this class.
     pub fn count(&self, kind: ErrorKind) {
         self.0[kind as usize].fetch_add(1, Ordering::Relaxed);
     }
 
-    /// The count of each class. Classes without an event are listed with 0, so that a rate shows their first event.
+    /// Returns the count of each class. Classes without an error are listed with 0, so Prometheus' `rate` sees their
+    /// first error.
     pub fn counts(&self) -> impl Iterator<Item = (ErrorKind, u64)> {
         ErrorKind::ALL.iter().zip(&*self.0).map(|(kind, count)| (*kind, count.load(Ordering::Relaxed)))
     }
@@ -67,7 +68,7 @@ impl ErrorCounters {
 
 macro_rules! error_kinds {
     ($($kind:ident = $code:ident, $reason:literal;)*) => {
-        /// The class of an error. It holds no data of a client.
+        /// The class of an error. It contains no client data.
         #[derive(Debug, Clone, Copy, PartialEq, Eq)]
         #[allow(missing_docs, reason = "each has its word in metrics and logs")]
         pub enum ErrorKind { $($kind,)* }
@@ -81,7 +82,7 @@ macro_rules! error_kinds {
                 match self { $(Self::$kind => Code::$code,)* }
             }
 
-            /// The word in metrics and logs. No two kinds have the same word and the same code.
+            /// The word that names the class in metrics and logs. Classes with the same word have different codes.
             pub fn reason(self) -> &'static str {
                 match self { $(Self::$kind => $reason,)* }
             }
@@ -117,8 +118,8 @@ error_kinds! {
     NoToken = Unauthenticated, "no_token";
     WrongToken = Unauthenticated, "wrong_token";
     RevokedToken = Unauthenticated, "revoked_token";
-    // The first is for a request beyond the whole quota, which a retry cannot help; the second for one beyond what
-    // is left of it.
+    // `MoreThanTokenQuota` is for a request that exceeds the whole quota: a retry cannot help. `TokenQuota` is for a
+    // request that exceeds what is left of the quota now.
     MoreThanTokenQuota = InvalidArgument, "token_quota";
     TokenQuota = ResourceExhausted, "token_quota";
     TokenRate = ResourceExhausted, "token_rate";

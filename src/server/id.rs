@@ -1,11 +1,11 @@
-//! Random names that cannot be guessed.
+//! Random names, of leases and worlds, that clients cannot guess.
 
 use super::error::{ErrorKind, RequestError};
 
-/// 128 random bits.
+/// A random name of 128 bits.
 pub type Id = [u8; 16];
 
-/// The operating system gives no random bits, so a name could be guessed.
+/// The operating system provides no random bits, so the server cannot make a name that nobody can guess.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("the system gives no random numbers; ask for no lease, or name a world by the setting world_name")]
 pub struct NoRandomness;
@@ -16,10 +16,10 @@ impl RequestError for NoRandomness {
     }
 }
 
-/// Returns 128 random bits of the operating system. They do not depend on any seed.
+/// Returns 128 random bits from the operating system. They do not depend on any seed.
 ///
 /// # Errors
-/// [`NoRandomness`].
+/// [`NoRandomness`], if the operating system has no random bits.
 pub fn random() -> Result<Id, NoRandomness> {
     let mut bytes = Id::default();
     let got = rustix::rand::getrandom(&mut bytes, rustix::rand::GetRandomFlags::empty());

@@ -1,12 +1,13 @@
-//! The server, from gRPC requests to gRPC replies. Each module uses only those below it:
+//! The server: everything between a gRPC request and its reply. Each module uses only modules further down this list:
 //!
-//! - [`embedded`]: a server inside of a client's process, without a transport.
-//! - `startup`: startup and shutdown; [`security`]: the files of tokens, TLS and the ledger.
+//! - [`embedded`]: a server inside a client's process, without a network.
+//! - `startup`: starts the server and shuts it down; [`security`]: loads tokens, TLS settings and the ledger from
+//!   files.
 //! - [`metrics`]: the page that Prometheus scrapes.
-//! - [`api`]: the protocols, with all validation.
-//! - [`session`]: the transport of a session, and leases.
-//! - [`transport`]: messages off the wire and onto it, and the memory for both.
-//! - [`audit`]: the check of a session's draws against its token's role, and the ledger of draws.
+//! - [`api`]: the two protocols; all validation of requests.
+//! - [`session`]: runs sessions of either protocol; leases, by which a session survives the loss of its connection.
+//! - [`transport`]: reads messages from the network and sends replies, within a memory budget.
+//! - [`audit`]: checks from which distributions a token may draw, and records all draws in the ledger.
 //! - [`auth`]: tokens, their quotas and roles.
 //! - [`net`]: connections, their limits and encryption.
 //! - [`shutdown`]: the phases of a shutdown; [`error`]: the classes of errors, with their gRPC codes; [`limits`], [`id`].

@@ -1,4 +1,4 @@
-//! Tokens, TLS and the ledger, loaded from the files that the configuration names.
+//! Loads tokens, TLS settings and the ledger from the files that the configuration names.
 
 use super::{
     audit::ledger::Ledger,
@@ -14,25 +14,25 @@ use crate::{
 };
 use std::{io, path::PathBuf};
 
-/// The tokens, TLS and the ledger of a server; by default a server has none of them.
+/// A server's tokens, TLS settings and ledger. The default has none of them.
 #[derive(Default)]
 pub struct Security {
-    /// The tokens that callers must show.
+    /// The tokens; every call must carry one of them.
     pub tokens: Option<Tokens>,
     /// The TLS settings of TCP connections.
     pub tls: Option<Tls>,
     /// The ledger of all draws.
     pub ledger: Option<Ledger>,
-    /// The watchers, whose threads read the files again when they change.
+    /// The watchers whose threads read the files again when these change.
     watches: Vec<FileWatcher>,
 }
 
 impl Security {
-    /// Loads the files that the configuration names, and loads them again when they change. The file of tokens may name
-    /// the environments of `catalogue`.
+    /// Loads the files that the configuration names, and watches them for changes. The token file may refer to the
+    /// environments of `catalogue`.
     ///
     /// # Errors
-    /// If a file is wrong. The message names the file and what was expected.
+    /// If a file cannot be read or is invalid. The message names the file and what was expected.
     pub fn load(config: &Config, catalogue: &Catalogue) -> io::Result<Self> {
         let mut guards = Self::default();
         if let Some(path) = &config.tokens {
@@ -48,7 +48,7 @@ impl Security {
         Ok(guards)
     }
 
-    /// Returns a reloader, which makes the files of tokens and TLS be read again at once.
+    /// Returns a handle that has the token and TLS files read again immediately.
     pub fn reloader(&self) -> Reloader {
         Reloader::new(&self.watches)
     }

@@ -1,50 +1,52 @@
-//! Shutting down in order: no new sessions, a grace period for running ones, then the end.
+//! The phases of a shutdown: no new sessions, a grace period for running sessions, the end.
 
 use tokio::sync::watch;
 
 /// The phase of the shutdown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum ShutdownPhase {
-    /// Serving.
+    /// The server serves and accepts new sessions.
     Running,
-    /// New sessions are refused, and running ones continue.
+    /// New sessions are refused; running sessions continue.
     Draining,
-    /// Running sessions are ended.
+    /// All sessions are ended.
     Closed,
 }
 
-/// A view of the shutdown. A view that was made by [`Drain::enter`] counts as a running session.
+/// A handle that observes the phase of the shutdown. A handle made by [`Drain::enter`] also counts as a running session
+/// until it is dropped.
 #[derive(Clone)]
 pub struct Drain {
     phase: watch::Receiver<ShutdownPhase>,
-    /// Held by sessions: when the last clone is gone, no session runs.
+    /// Held by sessions only. When all receivers are dropped, no session runs.
     _session: Option<watch::Receiver<()>>,
     sessions: watch::Sender<()>,
 }
 
-/// Drives the shutdown.
+/// Sets the phase of the shutdown, and waits for sessions to end.
 pub struct Controller {
-    /// The phase as each view sees it.
+    /// The sender of the phase to the handles of each transport thread.
     phases: Vec<watch::Sender<ShutdownPhase>>,
     sessions: watch::Sender<()>,
 }
 
 impl Controller {
-    /// A controller in [`ShutdownPhase::Running`], and a view of it.
+    /// Makes a controller in [`ShutdownPhase::Running`], and a handle that observes it.
     pub fn new() -> (Self, Drain) {
         let (phase, view) = watch::channel(ShutdownPhase::Running);
         let sessions = watch::Sender::new(());
         (Self { phases: vec![phase], sessions: sessions.clone() }, Drain { phase: view, _session: None, sessions })
     }
 
-    /// Another view, for another thread: sessions look at the phase with each request, and two views share no lock.
+    /// Makes a handle for another thread. Sessions read the phase at each request, and handles of different threads
+    /// share no lock.
     pub fn view(&mut self) -> Drain {
         let (phase, view) = watch::channel(ShutdownPhase::Running);
         self.phases.push(phase);
         Drain { phase: view, _session: None, sessions: self.sessions.clone() }
     }
 
-    /// Moves on to a phase.
+    /// Sets the phase that all handles observe.
     pub fn set(&self, phase: ShutdownPhase) {
         self.phases.iter().for_each(|view| _ = view.send_replace(phase));
     }
@@ -56,7 +58,7 @@ impl Controller {
 }
 
 impl Drain {
-    /// Returns a view for a session, which counts as running as long as it holds the view.
+    /// Returns a handle for a session. The session counts as running until the handle is dropped.
     pub fn enter(&self) -> Self {
         Self { _session: Some(self.sessions.subscribe()), ..self.clone() }
     }
@@ -78,7 +80,7 @@ impl Drain {
 
     async fn reached(&mut self, wanted: ShutdownPhase) {
         if self.phase.wait_for(|phase| *phase >= wanted).await.is_err() {
-            std::future::pending().await // the controller is gone: nobody will close
+            std::future::pending().await // the controller was dropped, so the phase never changes again
         }
     }
 }

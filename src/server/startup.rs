@@ -54,20 +54,20 @@ use tonic_health::{
 };
 use tower::{Layer, ServiceBuilder};
 
-/// The flow-control window of a stream, bytes. It has room for the actions of ten thousand robots.
+/// The HTTP/2 flow-control window of a stream, bytes: enough for one step's actions of ten thousand robots.
 const STREAM_WINDOW_BYTES: u32 = 1 << 20;
-/// The flow-control window of a connection, bytes. It has room for 16 sessions whose requests pile up, before they
-/// stall the others.
+/// The HTTP/2 flow-control window of a connection, bytes. Unread requests of 16 sessions fit in it before they block
+/// the connection's other sessions.
 const CONNECTION_WINDOW_BYTES: u32 = 16 * STREAM_WINDOW_BYTES;
-/// The maximum number of streams of a connection besides its sessions: health, the catalogue, reflection.
+/// The maximum number of streams of a connection in addition to its sessions: health checks, the catalogue, reflection.
 const MAX_OTHER_STREAMS: usize = 16;
-/// The timeout of calls that are not streams.
+/// The timeout of unary calls (calls with a single reply).
 const UNARY_TIMEOUT: Duration = Duration::from_secs(10);
-/// The maximum length of a request outside the streams of sessions. Such a request is a name or empty.
+/// The maximum length of a unary request, bytes. Such a request is a name or empty.
 const MAX_UNARY_BYTES: usize = 1 << 10;
-/// The time in which connections must close at the end of a shutdown.
+/// The time that connections get to close at the end of a shutdown.
 const CONNECTION_CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
-/// The services whose health can be asked for by name.
+/// The gRPC services whose health status clients can query by name.
 const SERVICES: [&str; 2] =
     [PerturbServer::<PerturbService>::NAME, EnvironmentServer::<dm_env_rpc::service::DmEnvRpcService>::NAME];
 
@@ -81,21 +81,23 @@ pub enum Error {
     /// An operation of the operating system failed.
     #[error(transparent)]
     Io(#[from] io::Error),
-    /// A connection could not be served.
+    /// The gRPC transport failed.
     #[error("the transport failed: {0}")]
     Transport(#[from] tonic::transport::Error),
-    /// The descriptors for reflection cannot be read.
+    /// The Protocol Buffers descriptors for gRPC reflection cannot be read.
     #[error("reflection failed: {0}")]
     Reflection(#[from] tonic_reflection::server::Error),
 }
 
-/// Serves these environments on the listeners, and metrics on another, if there is one, until `shutdown` resolves. Then
-/// it drains: new sessions are refused, running ones may continue for the grace period, and connections are closed.
-/// Must run on a tokio runtime; a current-thread one is fastest. It is the first of the transport threads; it also accepts
-/// connections. The others have runtimes of their own.
+/// Serves the environments of `catalogue` on `listeners`, and the metrics page on the listener `metrics` if there is
+/// one. Returns after a shutdown, which begins when `shutdown` resolves: new sessions are refused, running sessions may
+/// continue for the grace period, then all connections are closed.
+///
+/// Must run on a tokio runtime; a current-thread runtime is fastest. The calling thread accepts connections and is the
+/// first transport thread. Each further transport thread has a runtime of its own.
 ///
 /// # Errors
-/// [`Error`], before anything is served, or when a listener fails.
+/// [`Error`], if the server cannot start or a listener fails.
 pub async fn run(
     listeners: Vec<Listener>,
     metrics: Option<Listener>,
@@ -147,12 +149,13 @@ pub async fn run(
     tokio::select! {
         () = shutdown => {}
         () = capacity_health::report_capacity(&health, &state.limiter, &state.pool) => {}
-        // None of them ends by itself unless it fails.
+        // Before the shutdown, a server task ends only if it fails.
         Some(ended) = servers.join_next() => return ended.map_err(io::Error::other)?,
     }
     shut_down(config, &controller, &health, &sources.requests, servers).await;
     if let Some(ledger) = &guards.ledger {
-        // The end of a session's draws is recorded when its environments are freed.
+        // The ledger records the last draws of a session when its environments are freed, so the ledger is closed after
+        // that.
         if timeout(CONNECTION_CLOSE_TIMEOUT, state.pool.freed()).await.is_err() {
             tracing::warn!("the ledger ends before all environments are freed");
         }
@@ -161,7 +164,7 @@ pub async fn run(
     Ok(())
 }
 
-/// The optional parts of the contract that this server knows, in alphabetical order; docs/protocol.md lists them.
+/// The optional protocol features that this server supports, in alphabetical order. docs/protocol.md describes them.
 const FEATURES: &[&str] = &[
     "act",
     "disturbances",
@@ -175,11 +178,11 @@ const FEATURES: &[&str] = &[
     "save_player",
 ];
 
-/// The catalogue of a server with these settings, as a message. Builds each environment once, so that a model that
-/// cannot be loaded is known before anything is served.
+/// Returns the catalogue of a server with these settings as a message. Builds each environment once, so a model that
+/// cannot be loaded is found before the server starts.
 ///
 /// # Errors
-/// [`env::Error`].
+/// [`env::Error`], if an environment cannot be built.
 pub fn listing(catalogue: &Catalogue, config: &Config) -> Result<proto::ListEnvironmentsResponse, env::Error> {
     let is_served = |feature: &&str| *feature != "lease" || config.lease_seconds > 0;
     let environments = catalogue.specs().map(|spec| Ok(convert::environment(spec, (spec.make)()?.model_hash())));
@@ -209,7 +212,8 @@ struct ServerParts {
 impl ServerParts {
     fn new(config: &Config, catalogue: Catalogue, drain: Drain) -> io::Result<Self> {
         let pool = Arc::new(Pool::new(config.workers, config.max_envs)?);
-        // Every counter exists from the start, so that a rate shows its first event.
+        // Creates the counters of every environment now. A counter that appeared with its first event would hide that
+        // event from Prometheus' `rate`.
         catalogue.names().for_each(|name| _ = pool.meter(name));
         let seconds = |count: u64| (count > 0).then(|| Duration::from_secs(count));
         let handshake = Duration::from_secs(config.handshake_seconds);
@@ -289,7 +293,7 @@ impl ServerParts {
     }
 }
 
-/// All services, each with its layers.
+/// Builds the router of all gRPC services: authentication, raw request bodies, compression, size limits.
 fn router<H: Health>(
     config: &Config,
     state: &ServerParts,
@@ -300,7 +304,7 @@ fn router<H: Health>(
 ) -> Result<Router, Error> {
     let auth = AuthLayer::new(tokens, state.errors.clone());
     let perturb = PerturbServer::new(service)
-        .max_decoding_message_size(MAX_UNARY_BYTES) // of all but sessions
+        .max_decoding_message_size(MAX_UNARY_BYTES) // for unary requests; sessions have limits of their own
         .max_encoding_message_size(usize::MAX)
         .accept_compressed(CompressionEncoding::Gzip)
         .accept_compressed(CompressionEncoding::Deflate);
@@ -326,10 +330,10 @@ fn router<H: Health>(
         .initial_stream_window_size(STREAM_WINDOW_BYTES)
         .initial_connection_window_size(CONNECTION_WINDOW_BYTES)
         .max_concurrent_streams(streams)
-        .timeout(UNARY_TIMEOUT) // until an answer begins, which that of a stream does at once
+        .timeout(UNARY_TIMEOUT) // until the response begins; a session's response begins at once
         .add_service(perturb)
         .add_service(worlds)
-        // Health needs no token: a monitor need not be able to use the server.
+        // Health checks need no token, so a monitoring system can check a server that it may not use.
         .add_service(health.max_decoding_message_size(MAX_UNARY_BYTES))
         .add_service(auth.layer(reflection_v1.max_decoding_message_size(MAX_UNARY_BYTES)))
         .add_service(auth.layer(reflection_v1alpha.max_decoding_message_size(MAX_UNARY_BYTES))))
@@ -341,14 +345,14 @@ fn reflection() -> tonic_reflection::server::Builder<'static> {
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
 }
 
-/// Serves metrics, until the set of tasks is dropped.
+/// Serves the metrics page until the returned set of tasks is dropped.
 fn answer_scrapers(listener: Listener, sources: &Arc<MetricsSources>) -> JoinSet<()> {
     let mut tasks = JoinSet::new();
     tasks.spawn(metrics::endpoint::serve(listener, Arc::clone(sources)));
     tasks
 }
 
-/// Watches how late this thread, the one at `place`, wakes, if somebody may ask for it; for ever.
+/// Measures how late transport thread number `place` wakes up, if the metrics are served. Never resolves.
 async fn watch_lag(sources: Option<Arc<MetricsSources>>, place: usize) {
     match sources {
         Some(sources) => sources.threads[place].watch_lag().await,
@@ -374,7 +378,8 @@ async fn closed(mut drain: Drain) {
     drain.closed().await;
 }
 
-/// Refuses new sessions, lets running ones continue for the grace period, and closes connections.
+/// Shuts the server down: refuses new sessions, lets running sessions continue for the grace period, closes
+/// connections.
 async fn shut_down(
     config: &Config,
     controller: &Controller,
@@ -394,8 +399,8 @@ async fn shut_down(
     for (protocol, counts) in requests {
         tracing::info!(protocol, "requests: {counts}");
     }
-    let farewell = async { while servers.join_next().await.is_some() {} };
-    if timeout(CONNECTION_CLOSE_TIMEOUT, farewell).await.is_err() {
+    let all_closed = async { while servers.join_next().await.is_some() {} };
+    if timeout(CONNECTION_CLOSE_TIMEOUT, all_closed).await.is_err() {
         tracing::debug!("some connections did not close by themselves");
     }
 }

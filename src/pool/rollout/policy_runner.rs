@@ -1,4 +1,4 @@
-//! A policy that plays a batch.
+//! A policy that chooses the actions of a batch on the server.
 
 use crate::{
     env::EpisodeEnd,
@@ -14,50 +14,52 @@ use perturb_policy::{
 use rand_chacha::ChaCha8Rng;
 use std::sync::Mutex;
 
-/// A policy that has not played yet. Its parts fit each other and the batch.
+/// A policy as a client sent it, before its first step. The sender has checked that its parts fit each other and the
+/// batch.
 #[derive(Debug, Clone)]
 pub struct Policy {
-    /// The shape of the networks.
+    /// The layer sizes of the networks.
     pub spec: PolicySpec,
-    /// The inputs of the networks, in their initial state.
+    /// The builder of the networks' inputs, in its initial state.
     pub inputs: Inputs,
     /// The normalisers of observations and rewards.
     pub normalisers: Normalisers,
-    /// The random streams of the actions.
+    /// Whether the policy is trained or tested, with the random stream of its actions.
     pub role: PolicyRole,
-    /// The saved state from which a training continues. Without one a trial begins in every environment.
+    /// The saved state from which a training continues. If `None`, a trial begins in every environment.
     pub state: Option<PlayerState>,
-    /// All weights in a row, `[P]`, finite.
+    /// All weights of the networks, `[P]`, finite.
     pub weights: Vec<f32>,
-    /// Episodes in a trial.
+    /// The number of episodes in a trial.
     pub episodes_per_trial: u32,
 }
 
-/// The random streams of the actions, and whether running statistics are updated.
+/// Whether a policy is trained or tested. It determines the random streams of the actions, and whether the normalisers'
+/// running statistics are updated.
 #[derive(Debug, Clone)]
-#[allow(clippy::large_enum_variant)] // a policy has one
+#[allow(clippy::large_enum_variant)] // there is only one for each policy
 pub enum PolicyRole {
-    /// All actions are drawn from one stream, and statistics are updated.
+    /// All actions are drawn from this stream, and statistics are updated.
     Training(ChaCha8Rng),
-    /// The actions of each trial are drawn from a stream of its own, and statistics are frozen.
+    /// The actions of each trial are drawn from a stream of the trial's own, and statistics are frozen.
     Testing {
-        /// The seed. With the indices of the environment and the trial it determines the stream.
+        /// The seed, which together with the environment index and the trial index determines a trial's stream.
         seed: u64,
     },
 }
 
-/// A playing policy, in its state between two steps.
+/// A policy that plays a batch, in its state between two steps.
 pub struct PolicyRunner {
     player: Player,
     pub(in crate::pool) task: RemainingRollout,
     /// The seed of [`PolicyRole::Testing`]; `None` in training.
     seed: Option<u64>,
-    /// The outputs of the last step.
+    /// The outputs of the last step, of all shards.
     pub(in crate::pool) step: StepBuffers,
     spec: PolicySpec,
 }
 
-/// The outputs of a step of all environments. The buffers are reused at each step.
+/// The outputs of one step of all environments. The buffers are reused for each step.
 #[derive(Default)]
 pub(in crate::pool) struct StepBuffers {
     observations: Vec<f32>,
@@ -66,12 +68,12 @@ pub(in crate::pool) struct StepBuffers {
     pub(in crate::pool) truncated: Vec<bool>,
     final_observations: Vec<f32>,
     ended: Vec<SlotEnd>,
-    /// The ends of the episodes that ended in the step, with their slots.
+    /// The episodes that ended in the step, each with its slot.
     pub(in crate::pool) ends: Vec<(u32, EpisodeEnd)>,
 }
 
 impl PolicyRunner {
-    /// Begins with a policy in the environments of `shards`, at the start of a trial or from its saved state.
+    /// Starts a policy in the environments of `shards`: from its saved state, or at the start of a trial.
     pub(in crate::pool) fn begin(policy: Policy, shards: &[Mutex<Shard>]) -> Result<Self, Error> {
         let Policy { spec, inputs, normalisers, role, state, weights, episodes_per_trial } = policy;
         let trials: Vec<(u32, u64)> =
@@ -94,33 +96,33 @@ impl PolicyRunner {
         Ok(runner)
     }
 
-    /// The policy's shape.
+    /// The layer sizes of the policy's networks.
     pub fn spec(&self) -> &PolicySpec {
         &self.spec
     }
 
-    /// The player of the policy.
+    /// The player, which holds the networks, normalisers and random streams.
     pub fn player(&self) -> &Player {
         &self.player
     }
 
-    /// The task that the policy plays.
+    /// The part of the current task that is still to be played.
     pub fn task(&self) -> &RemainingRollout {
         &self.task
     }
 
-    /// Loads new weights `[P]`.
+    /// Replaces the weights of the networks by `weights`, `[P]`.
     pub(in crate::pool) fn load(&mut self, weights: &[f32]) -> Result<(), Error> {
         Ok(self.player.load(weights)?)
     }
 
-    /// Begins a task. Returns whether all environments must be reset first.
+    /// Starts a task. Returns whether all environments must be reset first.
     pub(in crate::pool) fn begin_task(&mut self, task: CollectUntil) -> bool {
         self.task = task.begin(self.player.n_envs());
         matches!(task, CollectUntil::Episodes(_))
     }
 
-    /// Begins the task's episodes in environments that have just been reset.
+    /// Starts the episodes of a task, after all environments were reset.
     pub(in crate::pool) fn begin_episodes(&mut self, shards: &[Mutex<Shard>]) -> Result<(), Error> {
         let Self { player, task, seed, step, .. } = self;
         step.gather_observations(shards);
@@ -135,14 +137,14 @@ impl PolicyRunner {
         Ok(())
     }
 
-    /// Chooses actions and gives them to the shards. Returns them in the encoding of the wire.
+    /// Chooses the next actions and gives them to the shards. Returns them, encoded as in messages.
     pub(in crate::pool) fn act(&mut self, shards: &[Mutex<Shard>]) -> Result<&[u8], Error> {
         let actions = self.player.act()?;
         set_actions(shards, actions);
         Ok(actions)
     }
 
-    /// Gathers the outcome of the actions from the shards.
+    /// Gathers the outputs of a step from the shards, and records them in the player and the task.
     pub(in crate::pool) fn observe(&mut self, shards: &[Mutex<Shard>]) -> Result<(), Error> {
         let Self { player, task, step, .. } = self;
         step.gather(shards);
@@ -150,7 +152,7 @@ impl PolicyRunner {
         Ok(player.observe(&step.outcome(), Some(task))?)
     }
 
-    /// V of the present observations, `[N]`.
+    /// The values V of the current observations, `[N]`.
     pub(in crate::pool) fn last_values(&mut self) -> Result<&[f32], Error> {
         Ok(self.player.last_values(&self.task)?)
     }

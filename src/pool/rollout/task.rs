@@ -1,7 +1,8 @@
-//! A rollout: the steps of one reply to `act`, which a policy plays without involving the session.
+//! A rollout: the steps of one reply to `act`. A policy plays them on the workers, without the session.
 //!
-//! The worker that runs a step's last shard gathers the outcome, chooses the next actions and gives them to the shards.
-//! Then the job goes to the queue's tail, like that of any other step. The session is woken at the rollout's end.
+//! The worker that runs the last shard of a step gathers the outputs, chooses the next actions and gives them to the
+//! shards. Then the job goes to the back of the queue, as after any other step. The session is woken at the end of the
+//! rollout.
 
 use super::policy_runner::{Policy, PolicyRunner};
 use crate::{
@@ -17,89 +18,91 @@ use bytes::BytesMut;
 use perturb_policy::{CollectUntil, RemainingRollout, RolloutStep};
 use std::sync::Mutex;
 
-/// A reply ends at about this length: many gRPC libraries receive no more than 4 MiB.
+/// The approximate maximum length of a reply, bytes: many gRPC libraries receive no more than 4 MiB.
 const MAX_REPLY_BYTES: usize = 4_000_000;
-/// The estimated length of an episode's end without its receipt.
+/// The estimated encoded length of an episode's end without its receipt, bytes.
 const EPISODE_END_BYTES: usize = 100;
-/// The initial capacity of buffers, in steps, if the number of steps is not known.
+/// The initial capacity of buffers, in steps, if the number of steps is not known in advance.
 const INITIAL_CAPACITY_STEPS: usize = 256;
 
-/// The parameters of one rollout.
+/// A request for one rollout.
 #[derive(Debug, Clone)]
 pub struct RolloutRequest {
-    /// The policy to play; if `None`, the previous one continues.
+    /// The policy to play; if `None`, the previous policy continues.
     pub policy: Option<Policy>,
-    /// New weights of the previous policy, `[P]`, finite; if `None`, it keeps its own.
+    /// New weights for the previous policy, `[P]`, finite; if `None`, it keeps its weights.
     pub weights: Option<Vec<f32>>,
-    /// A new task; if `None`, the previous one continues.
+    /// The task to start; if `None`, the previous task continues.
     pub task: Option<CollectUntil>,
-    /// The maximum number of steps, at least 1.
+    /// The maximum number of steps in this rollout, at least 1.
     pub max_steps: usize,
-    /// Whether only the episodes that ended are recorded.
+    /// Whether only ended episodes are recorded, and no steps.
     pub only_ended: bool,
 }
 
-/// A rollout of T steps of N environments. Arrays are little-endian, row-major `[T, N, …]`, as on the wire.
+/// The result of a rollout: T steps of N environments, in arrays `[T, N, …]`, row-major and little-endian, as in
+/// messages.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Rollout {
-    /// T.
+    /// T, the number of steps.
     pub steps: usize,
-    /// f32 `[T, N, I]`
+    /// The inputs of the policy, normalised, f32 `[T, N, I]`.
     pub observations: BytesMut,
-    /// u8 `[T, N]`
+    /// 1 where the input is the first of a trial, u8 `[T, N]`.
     pub starts: BytesMut,
-    /// i32 `[T, N]` or f32 `[T, N, A]`
+    /// The sampled actions, i32 `[T, N]` or f32 `[T, N, A]`.
     pub actions: BytesMut,
-    /// f32 `[T, N]`
+    /// The log-probabilities or log-densities of the actions, f32 `[T, N]`.
     pub log_probs: BytesMut,
-    /// f32 `[T, N]`
+    /// The values V of the inputs, f32 `[T, N]`.
     pub values: BytesMut,
-    /// f32 `[T, N]`
+    /// The rewards, normalised, f32 `[T, N]`.
     pub rewards: BytesMut,
-    /// u8 `[T, N]`
+    /// 1 where the task ended the last episode of a trial, u8 `[T, N]`.
     pub terminated: BytesMut,
-    /// u8 `[T, N]`
+    /// 1 where the step limit ended the last episode of a trial, u8 `[T, N]`.
     pub truncated: BytesMut,
-    /// f32 `[T, N]`
+    /// The value V of the last observation where `truncated` is 1, otherwise 0, f32 `[T, N]`.
     pub truncation_values: BytesMut,
-    /// The episodes that ended and count for the task, in order of steps and slots.
+    /// The episodes that ended and count for the task, in order of steps, then of slots.
     pub ended: Vec<EndedAt>,
-    /// Whether the task is done.
+    /// Whether the task was finished in this rollout.
     pub finished: bool,
-    /// f32 `[N]`: V of the present observations, when finished.
+    /// The values V of the observations after the last step, f32 `[N]`; empty unless the task is finished.
     pub last_values: BytesMut,
-    /// f32 `[N, S]`: the memory of the policy at the task's beginning, if it began in this rollout.
+    /// The recurrent policy's memory before the first step of the task, f32 `[N, 2H]`; empty unless the task began in
+    /// this rollout.
     pub memory: BytesMut,
-    /// The estimated length of `ended`.
+    /// The estimated encoded length of `ended`, bytes.
     ended_bytes: usize,
 }
 
-/// An episode that ended.
+/// An episode that ended during a rollout.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EndedAt {
-    /// The step of the rollout.
+    /// The step in which the episode ended, from 0 at the start of the rollout.
     pub step: usize,
-    /// The slot.
+    /// The slot of the environment.
     pub slot: u32,
-    /// The episode that ended.
+    /// The facts about the ended episode.
     pub end: EpisodeEnd,
-    /// Whether the task ended it.
+    /// Whether the task ended the episode.
     pub terminated: bool,
-    /// Whether the step limit ended it.
+    /// Whether the step limit ended the episode.
     pub truncated: bool,
 }
 
-/// The event that a rollout waits for.
+/// The event for which a rollout is waiting.
 enum RolloutPhase {
-    /// The rollout has not begun: it waits for a worker.
+    /// A worker that starts the rollout.
     Begin,
-    /// All environments are being reset.
+    /// The reset of all environments.
     Reset,
-    /// All environments are taking a step.
+    /// A step of all environments.
     Step,
 }
 
-/// The state of a rollout.
+/// The state of a rollout on the workers.
 pub(in crate::pool) struct RolloutTask {
     request: RolloutRequest,
     runner: Option<Box<PolicyRunner>>,
@@ -109,18 +112,19 @@ pub(in crate::pool) struct RolloutTask {
 }
 
 impl RolloutTask {
-    /// Makes a rollout. `runner` is the previous policy, which plays if the request has no new one.
+    /// Makes a rollout that has not started yet. `runner` is the previous policy, which continues unless the request
+    /// has a new one.
     pub(in crate::pool) fn new(request: RolloutRequest, runner: Option<Box<PolicyRunner>>) -> Self {
         Self { request, runner, phase: RolloutPhase::Begin, rollout: Rollout::default(), error: None }
     }
 
-    /// Returns the policy and the rollout, or the error with which the rollout failed.
+    /// Returns the policy and the result of the rollout, or the error with which the rollout failed.
     pub(in crate::pool) fn finish(self) -> Result<(Option<Box<PolicyRunner>>, Rollout), Error> {
         self.error.map_or(Ok((self.runner, self.rollout)), Err)
     }
 
-    /// Records the outcome of the shards' last command and gives them the next one. Returns false at the rollout's end,
-    /// which comes at once if it is `halted`.
+    /// Called after each command of the shards. Records its outputs and gives the shards the next command. Returns
+    /// false at the end of the rollout. If `halted`, the rollout ends now.
     pub(in crate::pool) fn after_step(&mut self, shards: &[Mutex<Shard>], halted: bool) -> bool {
         match self.advance(shards) {
             Ok(goes_on) => goes_on && !halted,
@@ -179,7 +183,7 @@ impl RolloutTask {
 }
 
 impl Rollout {
-    /// Allocates the arrays, and records the policy's memory if a task `begins`.
+    /// Allocates the arrays. If a task `begins`, also records the policy's memory.
     fn begin(&mut self, runner: &PolicyRunner, begins: bool, request: &RolloutRequest) {
         if request.only_ended {
             return;
@@ -230,7 +234,7 @@ impl Rollout {
         push_f32(&mut self.truncation_values, step.truncation_values);
     }
 
-    /// The estimated length after one more step, bytes.
+    /// The estimated encoded length of the rollout after one more step, bytes.
     fn size(&self) -> usize {
         let arrays = [&self.observations, &self.actions, &self.log_probs, &self.values, &self.rewards];
         let others = [&self.truncation_values, &self.starts, &self.terminated, &self.truncated];
@@ -239,7 +243,7 @@ impl Rollout {
     }
 }
 
-/// The estimated length of an episode's end on the wire.
+/// The estimated encoded length of an episode's end, bytes.
 fn end_bytes(end: &EpisodeEnd) -> usize {
     let receipt = end.receipt.as_ref();
     EPISODE_END_BYTES + receipt.map_or(0, |r| 8 * (r.requested.len() + r.applied.len()) + r.model_hash.len())

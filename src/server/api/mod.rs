@@ -1,4 +1,4 @@
-//! The protocols that the server speaks.
+//! The two gRPC protocols that the server offers.
 
 pub mod dm_env_rpc;
 pub mod perturb_v1;

@@ -1,4 +1,5 @@
-//! The audit of a session's draws: the token's role must allow each draw, and the ledger records it before it happens.
+//! Audits a session's draws of parameters: the token's role must allow each draw, and the ledger records it before it
+//! happens.
 
 use super::{
     Error,
@@ -19,28 +20,29 @@ use std::sync::{
     atomic::{AtomicU32, Ordering},
 };
 
-/// Checks and records what one session, or one world, draws from.
+/// Checks and records the draws of one session, or of one dm_env_rpc world.
 #[derive(Clone)]
 pub struct DrawAuditor {
     bearer: Option<Bearer>,
     ledger: Option<Ledger>,
     session: u64,
-    /// The number of refusals so far.
+    /// The number of draws that were refused so far.
     refused: Arc<AtomicU32>,
 }
 
-/// The maximum number of refusals of one session in the ledger. A client can repeat a refused request without end.
+/// The maximum number of refusals of one session in the ledger, because a client can repeat a refused request
+/// endlessly.
 const MAX_LOGGED_REFUSALS: u32 = 100;
 
-/// The number of bytes of a ledger's line that are charged as one step.
+/// The number of bytes of a ledger line that are charged as one step.
 const LINE_BYTES_PER_STEP: usize = 16;
 
-/// Draws that were recorded in the ledger before they happen. Those that fail are withdrawn.
+/// Draws that the ledger has recorded before they happen. If they fail, the ledger must record that as well.
 #[derive(Default)]
 pub struct PendingDraws(Vec<DrawStart>);
 
 impl PendingDraws {
-    /// Returns the ends of these draws, none of which happened.
+    /// Returns ledger entries that say that none of these draws happened.
     fn withdraw(self) -> Vec<DrawEnd> {
         self.0
             .into_iter()
@@ -49,7 +51,7 @@ impl PendingDraws {
     }
 }
 
-/// An environment that begins to draw.
+/// The next draw of an environment, and the distributions of its parameters.
 #[derive(Clone, Copy)]
 struct NextDraw<'a> {
     draw: Draw,
@@ -57,16 +59,16 @@ struct NextDraw<'a> {
 }
 
 impl DrawAuditor {
-    /// The audit of a new session with this token.
+    /// Makes the auditor of a new session. `None` for `bearer` or `ledger`: no token, or no ledger.
     pub fn new(bearer: Option<Bearer>, ledger: Option<Ledger>) -> Self {
         let session = ledger.as_ref().map_or(0, Ledger::session);
         Self { bearer, ledger, session, refused: Arc::default() }
     }
 
-    /// Checks and records the draws of environments that are about to be made.
+    /// Checks and records the draws of environments that a session is about to create.
     ///
     /// # Errors
-    /// [`Error::NotAllowed`], [`Error::NoLedger`].
+    /// [`Error::NotAllowed`] if the role forbids a draw, [`Error::NoLedger`] if the ledger cannot be written.
     pub async fn open(&self, settings: &BatchSettings) -> Result<PendingDraws, Error> {
         if self.is_free() {
             return Ok(PendingDraws::default());
@@ -90,7 +92,7 @@ impl DrawAuditor {
         let (mut previous, mut starts) = (Vec::new(), Vec::new());
         for ResetEntry { slot, seed, distributions, .. } in entries {
             if seed.is_none() && distributions.is_none() {
-                continue; // it continues as before
+                continue; // the reset continues the current sequence of draws
             }
             let before = batch.draw(*slot);
             let next = match *seed {
@@ -122,7 +124,8 @@ impl DrawAuditor {
             let are_drawn =
                 |of_box: &[Distribution]| of_box.iter().zip(&saved.values).all(|(set, value)| set.contains(*value));
             if !boxes.clone().any(are_drawn) {
-                // A client may have forged the snapshot's parameters. They hold until the trial ends.
+                // Its parameters cannot have come from its distributions: the client may have forged the snapshot. The
+                // parameters stay in force until the trial ends, so they are checked like a draw.
                 starts.push((saved.draw, saved.values.iter().copied().map(Distribution::fixed).collect()));
             }
             starts.push((saved.draw, saved.distributions));
@@ -132,13 +135,13 @@ impl DrawAuditor {
         self.begin(spec, begins, previous).await
     }
 
-    /// Withdraws the draws of environments that could not be made.
+    /// Records that the draws of `begun` did not happen, because the environments could not be created.
     pub fn open_failed(&self, spec: &EnvironmentSpec, begun: PendingDraws) {
         self.note(spec, Vec::new(), Vec::new(), begun.withdraw());
     }
 
-    /// Withdraws the draws of environments that could not be restored. The environments in these slots continue as
-    /// before.
+    /// Records that the draws of `begun` did not happen, because the environments in `slots` could not be restored.
+    /// They continue as before.
     pub fn restore_failed(&self, batch: &Batch, slots: &[usize], begun: PendingDraws) {
         let spec = batch.settings().spec;
         let previous: Vec<_> = slots.iter().map(|slot| (batch.draw(*slot), batch.distributions(*slot))).collect();
@@ -147,7 +150,7 @@ impl DrawAuditor {
         self.note(spec, regions, begins, begun.withdraw());
     }
 
-    /// Records the environments that a session is about to release.
+    /// Records that the environments in `slots`, which the session is about to release, end their draws.
     pub fn release(&self, batch: &Batch, slots: &[usize]) {
         if self.ledger.is_some() {
             let previous = slots.iter().map(|slot| batch.draw(*slot));
@@ -155,7 +158,7 @@ impl DrawAuditor {
         }
     }
 
-    /// Records the end of a batch when it is dropped.
+    /// Arranges that the ledger records the end of the batch's draws when the batch is dropped.
     pub fn record_drop(&self, batch: &mut Batch) {
         if self.ledger.is_some() {
             let (own, spec) = (self.clone(), batch.settings().spec);
@@ -164,7 +167,7 @@ impl DrawAuditor {
         }
     }
 
-    /// Checks that the token may draw from these distributions, and records a refusal.
+    /// Checks that the token's role allows draws from these distributions. Records a refusal in the ledger.
     pub fn check(&self, spec: &EnvironmentSpec, distributions: &[Distribution]) -> Result<(), Error> {
         let Some(role) = self.bearer.as_ref().and_then(|bearer| bearer.role()) else { return Ok(()) };
         let region = spec.region(distributions);
@@ -180,7 +183,8 @@ impl DrawAuditor {
         Err(Error::NotAllowed { role: role.name().into(), environment: spec.name, region: region.to_string(), reason })
     }
 
-    /// Charges the token for a line of this length in steps, so that its step rate also limits the ledger's growth.
+    /// Charges the token for a ledger line of this length, in steps, so the token's rate also limits the growth of the
+    /// ledger.
     fn charge_line(&self, bytes: usize) {
         if let Some(bearer) = &self.bearer {
             bearer.charge(0, bytes.div_ceil(LINE_BYTES_PER_STEP) as u64);
@@ -192,13 +196,13 @@ impl DrawAuditor {
         ledger.write_later(event);
     }
 
-    /// Whether nothing needs to be checked or recorded.
+    /// Whether draws need neither a check nor a record.
     fn is_free(&self) -> bool {
         self.ledger.is_none() && self.bearer.as_ref().is_none_or(|bearer| bearer.role().is_none())
     }
 
-    /// Checks the draws that are about to begin, and records them in one ledger line with the draws that they end. Each
-    /// of `begins` has the draw of the first of some successive environments, and the number of these environments.
+    /// Checks draws that are about to begin, and records them, with the draws that they replace (`ends`), in one ledger
+    /// line. Each item of `begins` is a number of successive environments, and the first environment's draw.
     async fn begin<'a>(
         &self,
         spec: &EnvironmentSpec,
@@ -245,7 +249,7 @@ impl DrawAuditor {
     }
 }
 
-/// Groups neighbouring environments that begin equal draws. Returns the regions that they draw from, and the groups.
+/// Groups successive environments that begin equal draws. Returns the regions that they draw from, and the groups.
 fn group_begins<'a>(
     spec: &EnvironmentSpec,
     begins: impl Iterator<Item = (NextDraw<'a>, usize)>,
@@ -271,7 +275,7 @@ fn group_begins<'a>(
     (regions, group_begins)
 }
 
-/// Groups neighbouring environments that end draws of the same seed and episode.
+/// Groups successive environments that end draws of the same seed and episode.
 fn group_ends(draws: impl IntoIterator<Item = Draw>) -> Vec<DrawEnd> {
     let mut group_ends: Vec<DrawEnd> = Vec::new();
     for Draw { seed, environment_index: index, episode_index } in draws {

@@ -1,39 +1,39 @@
-//! Why something may not be sampled.
+//! Reasons for refusing a draw of parameters.
 
 use crate::{
     env,
     server::error::{ErrorKind, InvalidValue, RequestError},
 };
 
-/// An error of the check of a role, or of the ledger.
+/// A draw is not allowed, or the ledger cannot record it.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The distributions of a snapshot cannot be read.
+    /// The distributions in a snapshot cannot be read.
     #[error(transparent)]
     Environment(#[from] env::Error),
-    /// The request needs a longer line than the ledger accepts.
+    /// The request would need a longer line than the ledger accepts.
     #[error(transparent)]
     Value(#[from] InvalidValue),
-    /// The token's role does not allow it.
+    /// The token's role does not allow the draw.
     #[error(
         "a token of the role {role:?} may not draw from {region} of {environment}: {reason}; ask for what it may draw \
          from, or who runs this server for another token"
     )]
     NotAllowed {
-        /// The role.
+        /// The name of the role.
         role: String,
-        /// The environment.
+        /// The name of the environment.
         environment: &'static str,
-        /// The region that was to be drawn from.
+        /// The region of the parameter space that the draw was from.
         region: String,
-        /// Why not.
+        /// The reason, as a part of a sentence.
         reason: String,
     },
     /// The ledger cannot be written.
     #[error("this server writes down what is drawn, and cannot: {reason}; try again later, or tell who runs it")]
     NoLedger {
-        /// Why not.
+        /// The cause.
         reason: String,
     },
 }

@@ -1,4 +1,5 @@
-//! Writes the ledger, which records every draw of a token before it happens. See [`perturb_protocol::ledger`].
+//! Writes the ledger, a file that records every draw of parameters before it happens. [`perturb_protocol::ledger`]
+//! defines its format.
 
 use super::Error;
 use crate::server::error::InvalidValue;
@@ -18,13 +19,13 @@ use std::{
 };
 use tokio::sync::oneshot;
 
-/// The interval at which the file is looked at while nothing is written.
+/// The interval at which the file is checked while nothing is written.
 const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
-/// A line to be written, and the sender that tells the caller when the line is on the disk.
+/// An event to be written, and the channel that reports that it is on the disk.
 type WriteRequest = (LedgerEvent, Option<oneshot::Sender<Result<(), String>>>);
 
-/// A server's ledger. A thread of its own writes it.
+/// A handle to the server's ledger, which is written by a thread of its own.
 #[derive(Clone)]
 pub struct Ledger {
     lines: Sender<WriteRequest>,
@@ -32,7 +33,7 @@ pub struct Ledger {
     status: Arc<LedgerStatus>,
 }
 
-/// The state of the file, for metrics.
+/// The state of the ledger file, for metrics.
 #[derive(Default)]
 pub struct LedgerStatus {
     is_lost: AtomicBool,
@@ -40,22 +41,23 @@ pub struct LedgerStatus {
 }
 
 impl LedgerStatus {
-    /// Whether the file still has what this server wrote. If not, requests that draw are refused.
+    /// Whether the file still contains everything that this server wrote. If not, requests that draw are refused.
     pub fn is_intact(&self) -> bool {
         !self.is_lost.load(Ordering::Relaxed)
     }
 
-    /// The length of the file's complete lines, bytes.
+    /// The total length of the file's complete lines, bytes.
     pub fn bytes(&self) -> u64 {
         self.bytes.load(Ordering::Relaxed)
     }
 }
 
 impl Ledger {
-    /// Continues the ledger at `path` after a check of its chain, or begins a new one.
+    /// Opens the ledger at `path`. Checks the hash chain of an existing ledger and continues it, or creates a new
+    /// ledger.
     ///
     /// # Errors
-    /// If the file is not a valid ledger, another server writes it, or it cannot be written.
+    /// If the file is not a valid ledger, another server is writing it, or it cannot be written.
     pub fn open(path: &Path) -> io::Result<Self> {
         if path.metadata().is_ok_and(|metadata| !metadata.is_file()) {
             return Err(io::Error::other("that is no file, and a ledger is read again when the server begins"));
@@ -82,7 +84,7 @@ impl Ledger {
         let start = LedgerEvent::Began { version, commit, unfinished: existing.unfinished };
         writer.write([&start]).map_err(io::Error::other)?;
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        File::open(folder)?.sync_all()?; // the name of a new file, too
+        File::open(folder)?.sync_all()?; // puts the directory entry of a new file on the disk
         let (lines, received) = channel();
         let status = Arc::clone(&writer.status);
         std::thread::Builder::new()
@@ -92,23 +94,23 @@ impl Ledger {
         Ok(Self { lines, sessions: Arc::default(), status })
     }
 
-    /// The state of the file.
+    /// Returns the state of the ledger file.
     pub fn status(&self) -> &LedgerStatus {
         &self.status
     }
 
-    /// A number for a session.
+    /// Returns a new number for a session, unique until the server ends.
     pub fn session(&self) -> u64 {
         self.sessions.fetch_add(1, Ordering::Relaxed)
     }
 
-    /// Writes a line, and waits until it is on the disk. Returns an upper bound of the [line's length](line_bytes) in
-    /// bytes.
+    /// Writes an event as a line, and waits until it is on the disk. Returns an upper bound of the [line's
+    /// length](line_bytes) in bytes.
     ///
     /// # Errors
     /// [`Error::NoLedger`] if the file cannot be written, [`Error::Value`] if the line would be too long.
     pub async fn write(&self, event: LedgerEvent) -> Result<usize, Error> {
-        // Requests are bounded in bytes, but their numbers are longer as text.
+        // The length of requests is limited, but the same numbers take more bytes as text.
         let size = line_bytes(&event);
         if size as u64 > MAX_LINE_BYTES / 2 {
             let got = format!("{size} bytes as a line of this server's ledger");
@@ -120,7 +122,7 @@ impl Ledger {
             .into());
         }
         let (done, written) = oneshot::channel();
-        let _ = self.lines.send((event, Some(done))); // it fails only if the thread is gone; then no answer comes
+        let _ = self.lines.send((event, Some(done))); // fails only if the thread has ended; then `written` fails, too
         let reason = match written.await {
             Ok(Ok(())) => return Ok(size),
             Ok(Err(reason)) => reason,
@@ -129,12 +131,12 @@ impl Ledger {
         Err(Error::NoLedger { reason })
     }
 
-    /// Queues a line without waiting for it. A line that cannot be written now is tried again with the next one.
+    /// Queues an event without waiting. If it cannot be written, it is tried again with the next event.
     pub fn write_later(&self, event: LedgerEvent) {
         let _ = self.lines.send((event, None));
     }
 
-    /// Writes the line that the server ends, after all queued lines.
+    /// Writes that the server ends, after all queued events.
     pub async fn close(&self) {
         if let Err(error) = self.write(LedgerEvent::Ended).await {
             tracing::error!("{error}");
@@ -142,36 +144,37 @@ impl Ledger {
     }
 }
 
-/// Returns an upper bound of the length of an event's line, bytes.
+/// Returns an upper bound of the length of an event's line in the ledger, bytes.
 pub fn line_bytes(event: &LedgerEvent) -> usize {
-    /// The digest, the number, the time and the end of the line.
+    /// An upper bound of the length of the line's digest, number, time and line end.
     const FRAME_BYTES: usize = 128;
-    // The writer reports an event that cannot be written as JSON.
+    // The writer thread reports an event that cannot be written as JSON.
     serde_json::to_vec(event).map_or(0, |json| json.len()) + FRAME_BYTES
 }
 
-/// The state of the ledger's thread. `bytes` and `chain` cover the complete lines of the file.
+/// The state of the writer thread. `bytes` and `chain` describe the complete lines of the file.
 struct LedgerWriter {
     file: File,
     path: PathBuf,
     bytes: u64,
     chain: Chain,
-    /// Whether the file may have a part of a line after the first `bytes`, left by a failed write.
+    /// Whether a failed write may have left an incomplete line after the first `bytes`.
     is_torn: bool,
-    /// Lines that nobody waits for and that could not be written yet.
+    /// Events from [`Ledger::write_later`] that could not be written yet.
     pending: Vec<WriteRequest>,
     status: Arc<LedgerStatus>,
 }
 
 impl LedgerWriter {
-    /// Writes lines as they come. All lines that are queued by then go to the disk together.
+    /// Writes events until all handles are dropped. Events that are queued at the same time are written to the disk
+    /// together.
     fn run(mut self, received: &Receiver<WriteRequest>) {
         loop {
             let first = match received.recv_timeout(CHECK_INTERVAL) {
                 Ok(first) => first,
                 Err(RecvTimeoutError::Disconnected) => return,
                 Err(RecvTimeoutError::Timeout) => {
-                    let _ = self.check_file(); // it has logged what is wrong
+                    let _ = self.check_file(); // logs the error itself
                     continue;
                 }
             };
@@ -196,7 +199,7 @@ impl LedgerWriter {
         }
     }
 
-    /// Checks that the file at the path is still the one that was written. Logs when it is lost, and when it is back.
+    /// Checks that the file at the path is still the file that was written. Logs when it is lost, and when it is back.
     ///
     /// # Errors
     /// If the file was moved, replaced or changed: a text that says which, and how to continue.
@@ -237,7 +240,7 @@ impl LedgerWriter {
         Ok(())
     }
 
-    /// Writes all lines, or none on an error, and waits for the disk.
+    /// Writes all events as lines, and waits until they are on the disk. On an error, writes none.
     fn write<'a>(&mut self, events: impl IntoIterator<Item = &'a LedgerEvent>) -> Result<(), String> {
         #[expect(clippy::disallowed_methods, reason = "lines have their time; what is drawn does not depend on it")]
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
@@ -251,7 +254,7 @@ impl LedgerWriter {
             self.is_torn = false;
         }
         if let Err(error) = self.file.write_all(lines.as_bytes()).and_then(|()| self.file.sync_data()) {
-            // A failed write may leave a part of a line, which is cut off.
+            // Cuts off the incomplete line that a failed write may leave.
             self.is_torn = self.file.set_len(self.bytes).is_err();
             return Err(error.to_string());
         }

@@ -1,4 +1,4 @@
-//! The audit of draws: the check of a token's role, and the ledger.
+//! The audit of draws: checks them against the token's role, and records them in the ledger.
 
 pub mod draws;
 mod error;

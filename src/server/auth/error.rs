@@ -1,27 +1,27 @@
-//! Why a token is refused, or does not allow a request.
+//! Reasons for rejecting a token, or a request that was made with it.
 
 use crate::server::error::{ErrorKind, RequestError};
 
-/// An error that concerns the caller's token.
+/// Why a call was rejected because of its token, or a request because of the token's limits.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A call without a token.
+    /// A call has no token, but this server requires one.
     #[error(
         "this server asks for a token, and none came; ask who runs it for one, and name the file that has it in \
          PERTURB_TOKEN_FILE, or send it as the metadata `authorization: Bearer TOKEN`"
     )]
     NoToken,
-    /// A call with a token that this server does not know.
+    /// A call has a token that this server does not know.
     #[error("this server does not know the token that came; ask who runs it for one that is good")]
     WrongToken,
-    /// The session's token was removed from the file of tokens, or got another role.
+    /// The session's token was removed from the token file, or its role was changed there.
     #[error("the token {name:?} was revoked, or has another role now; ask who runs this server")]
     RevokedToken {
         /// The token's name.
         name: String,
     },
-    /// The request would exceed a quota of the token.
+    /// The request would exceed one of the token's quotas.
     #[error(
         "the token {name:?} may have {limit} {what} here, and {wanted} more would be too many; ask for less, or \
          close a session"
@@ -31,12 +31,12 @@ pub enum Error {
         name: String,
         /// The amount that was requested.
         wanted: usize,
-        /// The quota.
+        /// The maximum amount for the token.
         limit: usize,
-        /// Sessions, environments or bytes in flight.
+        /// The unit: sessions, environments or bytes in flight.
         what: &'static str,
     },
-    /// A token's environments have stepped too fast for too long.
+    /// The token's sessions have run more steps than its rate allows, and would have to wait for too long.
     #[error(
         "the token {name:?} may take {rate} steps a second here, including the price of other requests, and its sessions are \
          {seconds} s ahead of that; step fewer environments at a time or in fewer sessions, or try again later"
@@ -44,9 +44,9 @@ pub enum Error {
     TooFast {
         /// The token's name.
         name: String,
-        /// The most steps a second.
+        /// The maximum rate, steps per second.
         rate: u32,
-        /// The time until its environments may step again.
+        /// The time after which the token's environments may step again, s.
         seconds: u64,
     },
 }

@@ -1,4 +1,4 @@
-//! Files that are read again when they change.
+//! Watches files of tokens and certificates, and has them reloaded when they change.
 
 use perturb_system::{explain_no_thread, read_plain};
 use std::{
@@ -8,42 +8,42 @@ use std::{
     time::Duration,
 };
 
-/// The interval at which the files are read.
+/// The interval at which the watched files are read.
 const POLL_INTERVAL: Duration = Duration::from_millis(500);
 
-/// The maximum length of a file of tokens or certificates.
+/// The maximum length of a watched file, bytes.
 const MAX_FILE_BYTES: u64 = 1 << 20;
 
-/// Watches files, on a thread of its own, until it and its [reloaders](Reloader) are dropped.
+/// Watches files on a thread of its own. The thread ends when this and all its [reloaders](Reloader) have been dropped.
 pub struct FileWatcher(Sender<()>);
 
-/// Makes watchers read their files again at once.
+/// A handle that makes file watchers reload their files immediately.
 #[derive(Clone, Default)]
 pub struct Reloader(Vec<Sender<()>>);
 
 impl Reloader {
-    /// Makes a reloader of the files of these watchers.
+    /// Makes a reloader for these watchers.
     pub fn new(watchers: &[FileWatcher]) -> Self {
         Self(watchers.iter().map(|FileWatcher(look)| look.clone()).collect())
     }
 
-    /// Makes the watchers read their files again at once, even if they have not changed. Returns whether there is a
+    /// Makes the watchers reload their files immediately, even if they have not changed. Returns `false` if there is no
     /// watcher.
     pub fn reload(&self) -> bool {
         for look in &self.0 {
-            let _ = look.send(()); // a watcher that is gone needs no files
+            let _ = look.send(()); // fails if the watcher's thread has ended
         }
         !self.0.is_empty()
     }
 }
 
-/// The contents of the files, in their order, or why they cannot be read.
+/// The contents of the files, in the order of their paths, or the reason why they cannot be read.
 pub type Contents = Result<Vec<Vec<u8>>, String>;
 
-/// Reads plain files, without waiting for anything: a pipe is refused.
+/// Reads files. Refuses anything but regular files, so it never blocks, e.g. on a pipe.
 ///
 /// # Errors
-/// A sentence that names the file.
+/// A sentence that names the file which cannot be read.
 pub fn read(paths: &[PathBuf]) -> Contents {
     let read = |path: &Path| {
         read_plain(path, MAX_FILE_BYTES).map_err(|error| format!("cannot read {}: {error}", path.display()))
@@ -52,12 +52,12 @@ pub fn read(paths: &[PathBuf]) -> Contents {
 }
 
 impl FileWatcher {
-    /// Calls `reload` with the contents of the files after a change. It waits until two readings agree, since a writer
-    /// may not be done, but not if a [`Reloader`] asks. `before` is the contents at the start. An error is logged, and
-    /// the files are watched further.
+    /// Starts a thread that calls `reload` with the contents of the files whenever they have changed from `before`. A
+    /// change is taken up once two successive readings are equal, because a writer may still be writing. A [`Reloader`]
+    /// skips this check. Errors are logged, and watching continues.
     ///
     /// # Errors
-    /// If there is no thread.
+    /// If the operating system cannot start a thread.
     pub fn start(
         what: &'static str,
         paths: Vec<PathBuf>,

@@ -1,4 +1,4 @@
-//! The layer that authenticates calls.
+//! The tower layer that authenticates gRPC calls.
 
 use super::Tokens;
 use crate::server::{
@@ -18,7 +18,8 @@ use tonic::{
 };
 use tower::Layer;
 
-/// A service that answers only calls with a valid token, or all calls if the server has no tokens.
+/// A tower service that lets only calls with a valid token through to the wrapped service. If the server has no tokens,
+/// all calls pass.
 #[derive(Clone)]
 pub struct AuthService<S> {
     service: S,
@@ -26,7 +27,7 @@ pub struct AuthService<S> {
     counters: ErrorCounters,
 }
 
-/// Puts [`AuthService`] around a service.
+/// The tower layer that wraps a service in [`AuthService`].
 #[derive(Clone)]
 pub struct AuthLayer {
     tokens: Option<Tokens>,
@@ -34,7 +35,8 @@ pub struct AuthLayer {
 }
 
 impl AuthLayer {
-    /// A layer that asks for one of these tokens, if there are some, and counts refused calls.
+    /// Makes a layer that requires one of these tokens; `None` lets all calls pass. Rejected calls are counted in
+    /// `counters`.
     pub fn new(tokens: Option<Tokens>, counters: ErrorCounters) -> Self {
         Self { tokens, counters }
     }

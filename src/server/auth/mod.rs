@@ -1,4 +1,4 @@
-//! Authentication: tokens with their names, digests, quotas and roles, from a file, and the layer that asks for them.
+//! Authentication: tokens from a file, each with its name, digest, quotas and role, and the layer that checks them.
 
 mod error;
 pub mod file_watcher;
@@ -31,20 +31,20 @@ use token_file::{ParsedToken, TokenEntry, listed};
 use tokio::sync::Notify;
 use tonic::{body::Body, codegen::http};
 
-/// A token that clients show, with its role and quotas.
+/// An entry of the token file: a client's token, with its role and quotas.
 pub struct Token {
     name: String,
-    /// SHA-256 of the token.
+    /// The SHA-256 digest of the secret text.
     digest: [u8; 32],
     role: Option<Arc<Role>>,
     revoked: AtomicBool,
-    /// Wakes the tasks that wait for the revocation.
+    /// Wakes the tasks that wait in [`Token::revoked`].
     revoked_notify: Notify,
-    /// The quotas of all tokens that have had this name.
+    /// Shared by all tokens that have had this name.
     quotas: Arc<Quotas>,
 }
 
-/// A token's quotas and counters.
+/// A token's quotas, rate limit and counters.
 #[derive(Default)]
 struct Quotas {
     sessions: Quota,
@@ -59,21 +59,21 @@ struct Quotas {
 pub struct TokenUsage {
     /// The token's name.
     pub name: String,
-    /// Sessions now.
+    /// The number of open sessions.
     pub sessions: usize,
-    /// Environments now.
+    /// The number of environments in use.
     pub envs: usize,
-    /// Bytes in flight now.
+    /// The number of bytes in flight.
     pub bytes: usize,
-    /// Steps of an environment so far.
+    /// The total number of steps so far, summed over all environments.
     pub steps: u64,
-    /// The time that its requests waited for its rate so far.
+    /// The total time that the token's requests have waited for its rate limit so far.
     pub waited: Duration,
-    /// The number of refusals so far.
+    /// The number of refused requests and sessions so far.
     pub refusals: u64,
 }
 
-/// The token of a call.
+/// The token with which a call was authenticated.
 pub type Bearer = Arc<Token>;
 
 impl Token {
@@ -82,13 +82,14 @@ impl Token {
         &self.name
     }
 
-    /// Charges steps after they ran, because their number is unknown before, and the price of other work, in steps.
+    /// Charges steps to the rate limit after they ran, because their number is unknown before. `price` is the price of
+    /// other work, in steps.
     pub fn charge(&self, steps: u64, price: u64) {
         self.quotas.steps.fetch_add(steps, Ordering::Relaxed);
         self.quotas.rate_limiter.charge(steps + price);
     }
 
-    /// Counts a refusal.
+    /// Counts a refused request or session.
     pub fn count_error(&self) {
         self.quotas.refusals.fetch_add(1, Ordering::Relaxed);
     }
@@ -106,23 +107,23 @@ impl Token {
         }
     }
 
-    /// The maximum number of steps per second of all the token's environments together; `None` for no limit.
+    /// The maximum number of steps per second, summed over the token's environments; `None` for no limit.
     pub fn rate(&self) -> Option<u32> {
         self.quotas.rate_limiter.rate()
     }
 
-    /// Waits until the token's environments may step again, at most 30 s.
+    /// Waits until the token's rate allows further steps, at most 30 s.
     ///
     /// # Errors
-    /// [`Error::TooFast`], without waiting, if it would take longer.
+    /// [`Error::TooFast`], immediately, if the wait would be longer.
     pub async fn acquire_steps(&self) -> Result<(), Error> {
         self.acquire_within(MAX_WAIT).await
     }
 
-    /// Waits until the token's rate has covered all steps that it was charged for.
+    /// Waits until the token's rate has allowed all steps that the token was charged for.
     ///
     /// # Errors
-    /// [`Error::TooFast`], without waiting, if it would take longer than `max_wait`.
+    /// [`Error::TooFast`], immediately, if the wait would be longer than `max_wait`.
     pub async fn acquire_within(&self, max_wait: Duration) -> Result<(), Error> {
         let acquired = self.quotas.rate_limiter.acquire(max_wait).await;
         acquired.map_err(|TooFast { rate, ahead }| Error::TooFast {
@@ -132,17 +133,17 @@ impl Token {
         })
     }
 
-    /// The role, which says what may be drawn from; `None` allows anything.
+    /// The role, which limits the distributions that the token's sessions may draw from; `None` for no limit.
     pub fn role(&self) -> Option<&Role> {
         self.role.as_deref()
     }
 
-    /// Whether the token is no longer in the file, or has another role there.
+    /// Whether the token was removed from the token file, or its role was changed there.
     fn is_revoked(&self) -> bool {
         self.revoked.load(Ordering::Acquire)
     }
 
-    /// Waits until the token is revoked. Returns the error for later requests.
+    /// Waits until the token is revoked. Returns the error for the token's further requests.
     pub async fn revoked(&self) -> Error {
         loop {
             let notified = self.revoked_notify.notified();
@@ -158,23 +159,23 @@ impl Token {
         self.revoked_notify.notify_waiters();
     }
 
-    /// Takes one session from the quota, until the guard is dropped.
+    /// Takes one session from the token's quota until the guard is dropped.
     ///
     /// # Errors
-    /// [`Error::QuotaExceeded`].
+    /// [`Error::QuotaExceeded`], if the quota of sessions is used up.
     pub fn session(self: &Arc<Self>) -> Result<QuotaGuard, Error> {
         self.take(1, QuotaKind::Sessions)
     }
 
-    /// Takes environments from the quota, until the guard is dropped.
+    /// Takes `count` environments from the token's quota until the guard is dropped.
     ///
     /// # Errors
-    /// [`Error::QuotaExceeded`].
+    /// [`Error::QuotaExceeded`], if the quota has fewer environments left.
     pub fn envs(self: &Arc<Self>, count: usize) -> Result<QuotaGuard, Error> {
         self.take(count, QuotaKind::Environments)
     }
 
-    /// An empty part of the quota of bytes in flight, to be grown.
+    /// Returns an empty guard of the quota of bytes in flight. [`QuotaGuard::grow`] takes bytes.
     pub fn reserve_bytes(self: &Arc<Self>) -> QuotaGuard {
         QuotaGuard::empty(Arc::clone(self), QuotaKind::Bytes)
     }
@@ -186,16 +187,16 @@ impl Token {
     }
 }
 
-/// The tokens that are valid now.
+/// The tokens that are currently valid.
 #[derive(Clone, Default)]
 pub struct Tokens {
     good: Arc<RwLock<Vec<Bearer>>>,
-    /// The environments that the sets of the file may name.
+    /// The environments that parameter sets of the token file may name.
     catalogue: Arc<Catalogue>,
 }
 
 impl Tokens {
-    /// An empty set of tokens, on a server of these environments.
+    /// Makes an empty collection of tokens. The token file may later refer to the environments of `catalogue`.
     pub fn new(catalogue: Catalogue) -> Self {
         Self { good: Arc::default(), catalogue: Arc::new(catalogue) }
     }
@@ -205,15 +206,16 @@ impl Tokens {
         self.good.read().unwrap_or_else(PoisonError::into_inner).len()
     }
 
-    /// The usage of each token.
+    /// Returns the present usage of each token.
     pub fn usage(&self) -> Vec<TokenUsage> {
         self.good.read().unwrap_or_else(PoisonError::into_inner).iter().map(|token| token.usage()).collect()
     }
 
-    /// Applies the file's new text. Tokens that stay with the same role keep their sessions; others are revoked.
+    /// Replaces the tokens by those of a new text of the token file. A token whose digest and role are unchanged keeps
+    /// its sessions; all other old tokens are revoked.
     ///
     /// # Errors
-    /// [`TokenFileError`]; the tokens are unchanged then.
+    /// [`TokenFileError`], if the text is invalid; the tokens are unchanged then.
     pub fn reload(&self, text: &str) -> Result<(), TokenFileError> {
         let listed = listed(&self.catalogue, text)?;
         let mut tokens = self.good.write().unwrap_or_else(PoisonError::into_inner);
@@ -245,7 +247,7 @@ impl Tokens {
         Ok(())
     }
 
-    /// The token whose digest matches that of the `shown` text. All are compared, each in constant time.
+    /// Returns the token whose digest matches the text `shown`. Compares all digests, each in constant time.
     fn find(&self, shown: &[u8]) -> Option<Bearer> {
         let digest: [u8; 32] = Sha256::digest(shown).into();
         let tokens = self.good.read().unwrap_or_else(PoisonError::into_inner);
@@ -253,10 +255,10 @@ impl Tokens {
         tokens.iter().fold(None, |found, token| if fits(token) { Some(token) } else { found }).cloned()
     }
 
-    /// Returns the token of a call, or `None` for a call by a Unix socket, which needs no token.
+    /// Returns the token of a call. Returns `None` for calls over a Unix socket, which need no token.
     ///
     /// # Errors
-    /// [`Error::NoToken`] or [`Error::WrongToken`].
+    /// [`Error::NoToken`] if the call has no token, [`Error::WrongToken`] if its token is unknown.
     fn authenticate(&self, request: &http::Request<Body>) -> Result<Option<Bearer>, Error> {
         let peer = request.extensions().get::<Connection>().map(|connection| connection.peer);
         if matches!(peer, Some(Peer::User(_))) {

@@ -1,9 +1,9 @@
-//! Limits on the sessions, environments and bytes that a token may hold at a time.
+//! Quotas: limits on the sessions, environments and bytes in flight that a token may use at the same time.
 
 use super::{Bearer, Error, Token};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// A count with a limit.
+/// The amount of a resource that is in use, and its limit.
 #[derive(Default)]
 pub(super) struct Quota {
     taken: AtomicUsize,
@@ -19,7 +19,7 @@ impl Quota {
         self.taken.load(Ordering::Relaxed)
     }
 
-    /// Takes `wanted`, or returns the limit.
+    /// Takes `wanted` units. If that would exceed the limit, takes nothing and returns the limit as the error.
     fn take(&self, wanted: usize) -> Result<(), usize> {
         let limit = self.limit.load(Ordering::Relaxed);
         let grown = |taken: usize| taken.checked_add(wanted).filter(|sum| *sum <= limit);
@@ -27,7 +27,7 @@ impl Quota {
     }
 }
 
-/// The resources that have quotas.
+/// The kinds of resources that have quotas.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum QuotaKind {
     Sessions,
@@ -53,7 +53,7 @@ impl QuotaKind {
     }
 }
 
-/// A part of a quota, until it is dropped.
+/// An amount taken from a token's quota. Dropping it returns the amount.
 pub struct QuotaGuard {
     token: Bearer,
     count: usize,
@@ -61,15 +61,15 @@ pub struct QuotaGuard {
 }
 
 impl QuotaGuard {
-    /// An empty part of a token's quota of this kind.
+    /// Makes a guard that holds nothing of the token's quota of this kind.
     pub(super) fn empty(token: Bearer, kind: QuotaKind) -> Self {
         Self { token, count: 0, kind }
     }
 
-    /// Takes `count` more.
+    /// Takes `count` more from the quota.
     ///
     /// # Errors
-    /// [`Error::QuotaExceeded`]; the count is unchanged then.
+    /// [`Error::QuotaExceeded`], if the quota has less left; the held amount is unchanged then.
     pub fn grow(&mut self, count: usize) -> Result<(), Error> {
         self.kind.quota(&self.token).take(count).map_err(|limit| Error::QuotaExceeded {
             name: self.token.name.clone(),
@@ -81,14 +81,14 @@ impl QuotaGuard {
         Ok(())
     }
 
-    /// Sets the count, even if it then exceeds the quota.
+    /// Sets the held amount, even if that exceeds the quota.
     pub fn set(&mut self, count: usize) {
         let taken = &self.kind.quota(&self.token).taken;
         taken.fetch_add(count, Ordering::Relaxed);
         taken.fetch_sub(std::mem::replace(&mut self.count, count), Ordering::Relaxed);
     }
 
-    /// Gives `count` back.
+    /// Returns `count` to the quota.
     pub fn release(&mut self, count: usize) {
         self.set(self.count.saturating_sub(count));
     }

@@ -1,6 +1,5 @@
-//! The rate limit for the steps of a token's environments. Steps are charged after they ran. A client that is ahead of
-//! the rate waits before its next request is handled, and only the request is kept in memory meanwhile. An idle client
-//! may catch up on the steps of one second.
+//! The rate limit for the steps of a token's environments. Steps are charged after they ran. A client that has exceeded
+//! the rate waits before its next request is handled. An idle client may make up for at most one second.
 
 use std::{
     sync::{Mutex, MutexGuard, PoisonError},
@@ -8,32 +7,33 @@ use std::{
 };
 use tokio::time::{Instant, sleep};
 
-/// A token that was idle may catch up on the steps of this time, in seconds.
+/// The time, in seconds, whose steps an idle client may make up for.
 const BURST_SECONDS: f64 = 1.0;
-/// A request that would wait longer is refused. Clients wait a minute for a reply.
+/// The maximum wait. A request that would wait longer is refused, because clients wait a minute for a reply.
 pub(super) const MAX_WAIT: Duration = Duration::from_secs(30);
-/// The minimum sleep; without it a wait that is rounded to zero would spin.
+/// The minimum sleep. Without it, a wait that is rounded to zero would spin.
 const MIN_WAIT: Duration = Duration::from_micros(1);
-/// The interval at which a waiting request checks whether the rate has changed.
+/// The maximum sleep before a waiting request checks whether the rate has changed.
 const RECHECK_INTERVAL: Duration = Duration::from_millis(500);
 
-/// A token's rate limit, with the numbers of steps that it has allowed and that were done.
+/// A token's rate limit: a token bucket that is charged after the fact.
 #[derive(Default)]
 pub(super) struct RateLimiter(Mutex<RateState>);
 
 #[derive(Default)]
 struct RateState {
-    /// The steps per second; `None` for no limit.
+    /// The maximum number of steps per second; `None` for no limit.
     rate: Option<u32>,
-    /// Steps so far.
+    /// The number of steps that were charged so far.
     done: f64,
-    /// The steps that the rate has allowed until `at`, at most those of [`BURST_SECONDS`] more than were done.
+    /// The number of steps that the rate has allowed until the time `at`. It exceeds `done` by at most the steps that
+    /// the rate allows in [`BURST_SECONDS`].
     allowed: f64,
     at: Option<Instant>,
     waited: Duration,
 }
 
-/// The error of a client that is so far ahead of the rate that it should not wait.
+/// The error of a request that would have to wait for too long. `ahead` is the wait that it would need.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct TooFast {
     pub(super) rate: u32,
@@ -41,31 +41,31 @@ pub(super) struct TooFast {
 }
 
 impl RateLimiter {
-    /// Sets the steps per second; `None` for no limit.
+    /// Sets the maximum number of steps per second; `None` for no limit.
     pub(super) fn set_rate(&self, rate: Option<u32>) {
         self.lock().set_rate(rate, Instant::now());
     }
 
-    /// The most steps a second.
+    /// The maximum number of steps per second; `None` for no limit.
     pub(super) fn rate(&self) -> Option<u32> {
         self.lock().rate
     }
 
-    /// The time that requests waited so far.
+    /// The total time that requests have waited so far.
     pub(super) fn waited(&self) -> Duration {
         self.lock().waited
     }
 
-    /// Counts steps that were done.
+    /// Charges steps that were done.
     pub(super) fn charge(&self, steps: u64) {
         self.lock().done += steps as f64;
     }
 
-    /// Waits until the rate has allowed all steps that were charged before this call. Later calls wait for the steps of
-    /// earlier ones, so callers proceed one after the other.
+    /// Waits until the rate has allowed all steps that were charged before this call. A later call also waits for the
+    /// steps of earlier calls, so callers proceed in order.
     ///
     /// # Errors
-    /// [`TooFast`], without waiting, if it would take longer than `max_wait`.
+    /// [`TooFast`], immediately, if the wait would be longer than `max_wait`.
     pub(super) async fn acquire(&self, max_wait: Duration) -> Result<(), TooFast> {
         let mut ticket = None;
         while let Some(wait) = self.wait(&mut ticket, max_wait)? {
@@ -89,7 +89,7 @@ impl RateState {
         self.rate = rate;
     }
 
-    /// Adds the steps that the rate allows for the time since the last call.
+    /// Updates `allowed` to the time `now`.
     fn refill(&mut self, now: Instant) {
         let elapsed = self.at.map_or(Duration::ZERO, |at| now.saturating_duration_since(at)).as_secs_f64();
         self.allowed = match self.rate.map(f64::from) {
@@ -99,8 +99,8 @@ impl RateState {
         self.at = Some(now);
     }
 
-    /// Returns how long to sleep before calling again, or `None` when the caller may proceed. Pass an empty `ticket` on
-    /// the first call.
+    /// Returns how long to sleep before calling again, or `None` if the caller may proceed. `ticket` must be `None` at
+    /// the first call, which stores the number of steps to wait for in it.
     fn wait(
         &mut self,
         ticket: &mut Option<f64>,
@@ -113,7 +113,7 @@ impl RateState {
         if steps <= 0.0 {
             return Ok(None);
         }
-        // A rate is at least 1, so this does not divide by 0.
+        // The rate is at least 1, so this does not divide by 0.
         let ahead = Duration::from_secs_f64(steps / f64::from(rate));
         if ahead > max_wait {
             return Err(TooFast { rate, ahead });
@@ -128,7 +128,7 @@ impl RateState {
 mod tests {
     use super::*;
 
-    /// A rate's state, and a clock that only waiting moves.
+    /// A rate limiter with a clock that only waiting advances.
     struct Clocked {
         state: RateState,
         now: Instant,
@@ -143,7 +143,7 @@ mod tests {
             self.state.set_rate(Some(rate), self.now);
         }
 
-        /// The duration of the next turn, s.
+        /// Waits as a request does. Returns the time that it waited, s.
         fn turn(&mut self) -> Result<f64, TooFast> {
             let (start, mut ticket) = (self.now, None);
             while let Some(wait) = self.state.wait(&mut ticket, MAX_WAIT, self.now)? {
@@ -154,7 +154,7 @@ mod tests {
     }
 
     fn is_about(seconds: f64, expected: f64) -> bool {
-        // A wait is of a microsecond at least.
+        // The tolerance covers the minimum sleep of a microsecond.
         (seconds - expected).abs() < 1e-5
     }
 
@@ -181,7 +181,7 @@ mod tests {
         let mut clocked = Clocked::new();
         clocked.set_rate(1000);
         let start = clocked.now;
-        // When each asks next, with which ticket, and how often it had its turn.
+        // For each session: the time of its next call, its ticket, and the number of its requests that proceeded.
         let mut sessions = [(start, None, 0); 4];
         while let Some((at, ticket, turns)) =
             sessions.iter_mut().filter(|session| session.2 < ROUNDS).min_by_key(|session| session.0)
@@ -194,11 +194,11 @@ mod tests {
                 }
             }
             clocked.now = *at;
-            // Of those who ask at the same moment any is the first.
+            // Sessions that call at the same time proceed in any order.
             let turns = sessions.map(|session| session.2);
             assert!(turns.iter().max().unwrap() - turns.iter().min().unwrap() <= 2, "{turns:?}");
         }
-        // 20 000 steps at 1000 a second, but that nobody waits for the last.
+        // 20 000 steps at 1000 a second take 20 s, but nobody waits for the last steps.
         let seconds = (clocked.now - start).as_secs_f64();
         assert!((19.5..20.0).contains(&seconds), "{seconds} s");
     }

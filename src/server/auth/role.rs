@@ -1,30 +1,31 @@
-//! Roles: the parameter values that a token may draw from.
+//! Roles: the parameter values that a token's sessions may draw.
 
 use crate::env::{EnvironmentSpec, Version, disturbance};
 use perturb_protocol::region::Region;
 use std::fmt;
 
-/// The parameter values that the sessions of the tokens with this role may draw from.
+/// A role of tokens. It limits the parameter values that their sessions may draw.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Role {
     pub(super) name: String,
-    /// A draw must lie within the union of these sets; `None` allows any draw.
+    /// A session may only draw from within the union of these sets; `None` for anywhere.
     pub(super) draws: Option<Vec<DrawSet>>,
-    /// A draw must not overlap any of these sets.
+    /// A session may not draw from a region that overlaps any of these sets.
     pub(super) never: Vec<DrawSet>,
 }
 
-/// Parameter values with a name.
+/// A named set of parameter values.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum DrawSet {
-    /// The parameter values of this version, in whichever environment.
+    /// The values of a version (D, R or E), in every environment.
     Version(Version),
-    /// A set that the file of tokens defines for one environment.
+    /// A set that the token file defines for one environment.
     Own { name: String, environment: &'static str, region: Region },
 }
 
 impl DrawSet {
-    /// The parameter values for an environment, if the set has some for it.
+    /// Returns the set's region in the parameter space of an environment, or `None` if the set is for another
+    /// environment.
     fn region(&self, spec: &EnvironmentSpec) -> Option<Region> {
         match self {
             Self::Version(version) => Some(spec.region(&spec.distributions(*version))),
@@ -48,13 +49,13 @@ impl Role {
         &self.name
     }
 
-    /// Checks that the role allows draws from a region of an environment.
+    /// Checks that sessions with this role may draw from a region of an environment's parameter space.
     ///
     /// # Errors
-    /// If it does not: the reason, as a part of a sentence.
+    /// The reason, as a part of a sentence, if they may not.
     pub fn check(&self, spec: &EnvironmentSpec, region: &Region) -> Result<(), String> {
-        // Versions are defined without disturbances. So a session with disturbances is compared with the same sets, and
-        // cannot bypass what a role may never draw.
+        // The sets are regions without disturbances. A session with disturbances is compared with the same sets, so it
+        // cannot circumvent `never`.
         let spec = disturbance::undisturbed(spec);
         let overlaps = |set: &&DrawSet| set.region(spec).is_some_and(|never| region.overlaps(&never));
         if let Some(never) = self.never.iter().find(overlaps) {

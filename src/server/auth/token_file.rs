@@ -1,4 +1,4 @@
-//! The file of tokens: its format, and the checks of its entries.
+//! Parses and checks the token file.
 
 use super::role::{DrawSet, Role};
 use crate::env::{Catalogue, Distribution, Version, disturbance, resolve};
@@ -11,15 +11,15 @@ use std::{
 };
 use toml::Spanned;
 
-/// The minimum length of a token; a shorter one could be guessed.
+/// The minimum length of a token. A shorter token could be guessed.
 const MIN_TOKEN_CHARS: usize = 16;
-/// The format of the file, as errors tell it.
+/// A description of the file's format for error messages.
 const EXPECTED_ENTRY: &str = "[[token]] with name = \"…\", sha256 = \"64 hexadecimal digits\" or token = \"…\", and if need be \
                      max_sessions = N, max_envs = N, \
                      max_steps_per_second = N, max_bytes = N and role = \"…\"; [[role]] with name, draws = [\"D\", \"R\", …] and \
                      never = […]; [[set]] with name, environment, version and parameters";
 
-/// Why a file of tokens is refused. The message never repeats a part of a token.
+/// Why a token file is invalid. The message never contains any part of a token.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}: {what}; expected {EXPECTED_ENTRY}")]
 pub struct TokenFileError {
@@ -70,19 +70,19 @@ struct SetEntry {
     parameters: BTreeMap<String, Distribution>,
 }
 
-/// A token of the file.
+/// A checked entry of the token file.
 pub(super) struct ParsedToken {
-    /// SHA-256 of the token.
+    /// The SHA-256 digest of the token.
     pub(super) digest: [u8; 32],
     pub(super) entry: TokenEntry,
     pub(super) role: Option<Arc<Role>>,
 }
 
-/// Parses a file of tokens. Its sets may name the environments of `catalogue`.
+/// Parses and checks a token file. Its parameter sets may refer to the environments of `catalogue`.
 pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToken>, TokenFileError> {
     let line = |byte: usize| 1 + text.bytes().take(byte).filter(|byte| *byte == b'\n').count();
     let TokenFile { token: entries, role: roles, set: sets } = toml::from_str(text).map_err(|error| {
-        // A parser's message may quote a token, except for messages about keys.
+        // The parser's message may quote a token, except for messages about keys.
         let words = error.message();
         let about_keys = ["unknown field", "missing field", "duplicate key"].iter().any(|kind| words.starts_with(kind));
         let what = if about_keys { words.lines().next().unwrap_or_default() } else { "this cannot be read" };
@@ -111,7 +111,8 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
             draws.map(find).transpose().and_then(|draws| Ok((draws, find(never)?)));
         let (draws, never) = sets.map_err(|what| TokenFileError { line, what })?;
         if draws.is_none() && !never.is_empty() {
-            // A draw just beside the forbidden set would be allowed, so `never` alone forbids nothing.
+            // With `never` alone, a session could draw from just outside the forbidden set, so `never` would forbid
+            // almost nothing.
             return Err(TokenFileError {
                 line,
                 what: format!(
@@ -145,13 +146,13 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
     Ok(listed)
 }
 
-/// The role or set of that name.
+/// Looks up the role or set with this name.
 fn found<T: Clone>(what: &str, name: &str, known: &BTreeMap<String, T>) -> Result<T, String> {
     let names = || known.keys().map(|name| format!("{name:?}")).collect::<Vec<_>>().join(", ");
     known.get(name).cloned().ok_or_else(|| format!("there is no {what} {name:?}; there are {}", names()))
 }
 
-/// Resolves a set that the file defines.
+/// Checks a parameter set of the file and computes its region.
 fn own_set(catalogue: &Catalogue, set: SetEntry) -> Result<DrawSet, String> {
     let SetEntry { name, environment, version, parameters } = set;
     let spec = catalogue.find(&environment).map_err(|error| error.to_string())?;
@@ -164,7 +165,7 @@ fn own_set(catalogue: &Catalogue, set: SetEntry) -> Result<DrawSet, String> {
     Ok(DrawSet::Own { name, environment: spec.name, region: spec.region(&distributions) })
 }
 
-/// Returns the digest of an entry's token, or the fault of the entry.
+/// Checks an entry and returns the digest of its token, or what is wrong with the entry.
 fn digest(entry: &TokenEntry) -> Result<[u8; 32], String> {
     let name = &entry.name;
     if name.is_empty() || name.chars().any(char::is_control) {
@@ -204,10 +205,10 @@ fn digest(entry: &TokenEntry) -> Result<[u8; 32], String> {
     }
 }
 
-/// A new token of 256 random bits, and its entry in the file of tokens.
+/// Makes a new token of 256 random bits. Returns the token, and the entry of the token file with its digest.
 ///
 /// # Errors
-/// If the name cannot be one, or the system has no random bits.
+/// If `name` is not a valid name, or the operating system has no random bits.
 pub fn new_token(name: &str) -> std::io::Result<(String, String)> {
     let mut bits = [0; 32];
     std::io::Read::read_exact(&mut std::fs::File::open("/dev/urandom")?, &mut bits)?;
@@ -220,7 +221,7 @@ pub fn new_token(name: &str) -> std::io::Result<(String, String)> {
 
 fn hex(bytes: &[u8]) -> String {
     bytes.iter().fold(String::new(), |mut text, byte| {
-        // A string takes it.
+        // Writing to a string cannot fail.
         let _ = write!(text, "{byte:02x}");
         text
     })

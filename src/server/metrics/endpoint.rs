@@ -1,4 +1,4 @@
-//! The HTTP endpoint for scrapers: one page, small requests, few connections at a time.
+//! The HTTP endpoint from which Prometheus reads the metrics. It serves one page, to few connections at a time.
 
 use super::{MetricsSources, format::TextFormat, page};
 use crate::server::net::listener::Listener;
@@ -19,19 +19,19 @@ use tokio::{
     time::{sleep, timeout},
 };
 
-/// The path of the page.
+/// The path of the metrics page.
 pub const PATH: &str = "/metrics";
-/// The maximum number of connections. A further one ends the oldest: a scrape takes milliseconds, so that the oldest is
-/// most likely one that does not send its request.
+/// The maximum number of connections. A further connection ends the oldest. A scrape takes milliseconds, so the oldest
+/// most likely belongs to a client that does not send its request.
 const MAX_CONNECTIONS: usize = 16;
-/// The time in which a connection must send its request and take the reply.
+/// The maximum time for a connection to send its request and receive the reply.
 const CONNECTION_TIMEOUT: Duration = Duration::from_secs(5);
-/// The pause after the system refuses to accept a connection.
+/// The pause after the operating system could not accept a connection.
 const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(200);
-/// The maximum length of a request's head.
+/// The maximum length of a request's headers, bytes.
 const MAX_HEAD_BYTES: usize = 16 << 10;
 
-/// Answers scrapers, for ever.
+/// Serves the metrics page. Never returns.
 pub async fn serve(listener: Listener, sources: Arc<MetricsSources>) {
     let mut connections = VecDeque::<AbortHandle>::new();
     loop {
@@ -64,7 +64,7 @@ async fn pause(error: &io::Error) {
     sleep(ACCEPT_RETRY_DELAY).await;
 }
 
-/// Answers the one request of a connection.
+/// Answers the only request of a connection.
 async fn converse(stream: impl AsyncRead + AsyncWrite + Unpin, sources: Arc<MetricsSources>) {
     let answer = service_fn(|request| {
         let response = answer(&request, &sources);
@@ -75,13 +75,13 @@ async fn converse(stream: impl AsyncRead + AsyncWrite + Unpin, sources: Arc<Metr
         .header_read_timeout(CONNECTION_TIMEOUT)
         .keep_alive(false)
         .max_buf_size(MAX_HEAD_BYTES);
-    // A client that leaves early or does not send HTTP gets nothing, and no other client is affected.
+    // Ignores errors: a client that disconnects early or does not speak HTTP gets no reply.
     let _ = timeout(CONNECTION_TIMEOUT, http.serve_connection(TokioIo::new(stream), answer)).await;
 }
 
 fn answer(request: &Request<Incoming>, sources: &Arc<MetricsSources>) -> Response<Full<Bytes>> {
     let (status, content_type, text) = match (request.uri().path(), request.method()) {
-        // The transport leaves the body of an answer to HEAD out.
+        // For HEAD, the HTTP library omits the body.
         (PATH, &Method::GET | &Method::HEAD) => match page::page(sources) {
             Ok(text) => {
                 let format = TextFormat::negotiated(accept(request).as_deref());
@@ -98,7 +98,7 @@ fn answer(request: &Request<Incoming>, sources: &Arc<MetricsSources>) -> Respons
     response
 }
 
-/// The media types that a request accepts, of all its headers; `None` if it has none.
+/// Joins the values of all `Accept` headers of a request. Returns `None` if it has none.
 fn accept(request: &Request<Incoming>) -> Option<String> {
     let values: Vec<_> = request.headers().get_all(ACCEPT).iter().filter_map(|value| value.to_str().ok()).collect();
     (!values.is_empty()).then(|| values.join(","))

@@ -1,6 +1,6 @@
 //! The two text formats of metrics: OpenMetrics 1.0, and Prometheus' older format 0.0.4.
 
-/// A text format.
+/// A text format of the metrics page.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TextFormat {
     /// OpenMetrics 1.0.
@@ -10,8 +10,8 @@ pub enum TextFormat {
 }
 
 impl TextFormat {
-    /// The format that the value of an `Accept` header asks for: OpenMetrics, unless plain text is preferred or neither
-    /// is accepted. A scraper that accepts neither more likely reads the older one.
+    /// Chooses the format according to a request's `Accept` header: OpenMetrics, unless the client prefers plain text
+    /// or accepts neither of the two. A client that accepts neither more likely understands the older format.
     pub fn negotiated(accept: Option<&str>) -> Self {
         let Some(accept) = accept else { return Self::OpenMetrics };
         let open_metrics = quality(accept, "application", "openmetrics-text");
@@ -19,7 +19,7 @@ impl TextFormat {
         if is_preferred { Self::OpenMetrics } else { Self::Prometheus }
     }
 
-    /// The value of the `Content-Type` header.
+    /// Returns the value of the `Content-Type` header.
     pub fn content_type(self) -> &'static str {
         match self {
             Self::OpenMetrics => "application/openmetrics-text; version=1.0.0; charset=utf-8",
@@ -27,7 +27,7 @@ impl TextFormat {
         }
     }
 
-    /// Converts a page of OpenMetrics to this format.
+    /// Converts a page from OpenMetrics to this format.
     pub fn convert(self, page: String) -> String {
         match self {
             Self::OpenMetrics => page,
@@ -36,7 +36,7 @@ impl TextFormat {
     }
 }
 
-/// The quality that an `Accept` header gives to a media type, 0 … 1, by its most specific range.
+/// Returns the quality, 0 … 1, that an `Accept` header gives to a media type. The most specific matching range decides.
 fn quality(accept: &str, kind: &str, subtype: &str) -> f32 {
     let mut best = (0, 0.0);
     for range in accept.split(',') {
@@ -50,7 +50,7 @@ fn quality(accept: &str, kind: &str, subtype: &str) -> f32 {
         };
         let given = parts.find_map(|part| part.strip_prefix("q=").or_else(|| part.strip_prefix("Q=")));
         let quality = given.map_or(1.0, |text| text.trim().parse::<f32>().unwrap_or(0.0).clamp(0.0, 1.0));
-        // Of equally specific ranges, such as two versions, the better one counts.
+        // If two ranges are equally specific, e.g. two versions of a format, the higher quality counts.
         if specificity > best.0 || (specificity == best.0 && quality > best.1) {
             best = (specificity, quality);
         }
@@ -58,7 +58,8 @@ fn quality(accept: &str, kind: &str, subtype: &str) -> f32 {
     best.1
 }
 
-/// The older format names a family of counters as its series, with `_total`, and has no mark at the end.
+/// Converts OpenMetrics to Prometheus' older format. There the name of a counter's family also ends in `_total`, and no
+/// `# EOF` line marks the end.
 fn to_prometheus(page: &str) -> String {
     let mut text = String::with_capacity(page.len());
     let mut help = "";

@@ -1,9 +1,9 @@
-//! The server's metrics, in the text format of OpenMetrics, which Prometheus scrapes.
+//! The server's metrics page for Prometheus, in the OpenMetrics text format.
 //!
-//! - [`endpoint`]: the HTTP endpoint for scrapers.
-//! - [`mod@format`]: the two text formats, and which one a scraper asks for.
-//! - [`page`]: the metrics, each with its name, labels and sentence.
-//! - [`process`]: resources of the process, as the system tells them.
+//! - [`endpoint`]: the HTTP endpoint that serves the page.
+//! - [`mod@format`]: the two text formats, and the choice between them for a request.
+//! - [`page`]: the metrics with their names, labels and descriptions.
+//! - [`process`]: CPU time, memory and file descriptors of the process.
 
 pub mod endpoint;
 pub mod format;
@@ -22,55 +22,56 @@ use crate::{meters::Histogram, pool::Pool};
 use std::{sync::Arc, time::Duration};
 use tokio::time::{Instant, sleep_until};
 
-/// The interval at which the wake-up delay of a transport thread is measured.
+/// The interval at which a transport thread's wake-up delay is measured.
 const LAG_CHECK_INTERVAL: Duration = Duration::from_millis(100);
 
-/// A protocol, and its requests by kind.
+/// The name of a protocol, and the counters of its requests.
 pub type RequestCounts = (&'static str, Arc<RequestCounters>);
 
-/// The counters of the other layers, which the page reads.
+/// The counters of all layers of the server, which the metrics page reads.
 pub struct MetricsSources {
     /// The pool, with the counters of environments.
     pub pool: Arc<Pool>,
-    /// The limiter of sessions.
+    /// The limiter of sessions, for their number and limit.
     pub sessions: PeerLimiter,
     /// The counters of leases.
     pub leases: LeaseCounters,
-    /// The limiter of connections.
+    /// The limiter of connections, for their number.
     pub connections: PeerLimiter,
-    /// Bytes in flight.
+    /// The memory budget, for the bytes in flight and their limit.
     pub budget: Budget,
-    /// Requests of each protocol.
+    /// The counters of requests, for each protocol.
     pub requests: [RequestCounts; 2],
-    /// Why requests were refused.
+    /// The counters of errors, by class.
     pub errors: ErrorCounters,
-    /// The counts of ended sessions.
+    /// The access log, for the counts of ended sessions.
     pub access: AccessLog,
-    /// The tokens, if the server requires one.
+    /// The tokens, if the server requires tokens.
     pub tokens: Option<Tokens>,
-    /// The ledger, if the server writes one.
+    /// The ledger, if the server has one.
     pub ledger: Option<Ledger>,
-    /// The drawing times of pictures.
+    /// The times that pictures took to draw.
     pub pictures: Arc<Histogram>,
-    /// The transport threads.
+    /// The measurements of each transport thread.
     pub threads: Vec<TransportMeter>,
 }
 
 /// The measurements of a transport thread.
 pub struct TransportMeter {
-    /// The connections of the thread.
+    /// The load of the thread, for its number of connections.
     pub load: Arc<ThreadLoad>,
-    /// The wake-up delays of the thread.
+    /// The delays with which the thread woke up.
     pub lag: Histogram,
 }
 
 impl TransportMeter {
-    /// Makes a meter without measurements of the wake-up delay.
+    /// Makes the meter of the thread with this load.
     pub fn new(load: Arc<ThreadLoad>) -> Self {
         Self { load, lag: Histogram::default() }
     }
 
-    /// Measures, for ever, how late the thread that runs this wakes up.
+    /// Repeatedly measures how late the current thread wakes up. Must run on the thread that is measured. Never
+    /// returns.
     pub async fn watch_lag(&self) {
         loop {
             let due = Instant::now() + LAG_CHECK_INTERVAL;

@@ -1,5 +1,5 @@
-//! The metrics. Labels contain only names that this program, its environments or the tokens file define, never text that
-//! a client sent.
+//! The metrics of the page. Labels contain only names that this program, its environments or the token file define,
+//! never text from a client.
 
 use super::{MetricsSources, process};
 use crate::{meters::Histogram, server::audit::ledger::Ledger};
@@ -17,13 +17,13 @@ use tonic::Code;
 
 type EncodeResult = Result<(), fmt::Error>;
 type MetricLabels<'a, const N: usize> = [(&'static str, &'a str); N];
-/// The labels of a metric without labels.
+/// The label set of metrics without labels.
 const NO_LABELS: MetricLabels<'static, 0> = [];
 
-/// Renders the page with the present values.
+/// Renders the metrics page with the present values, in OpenMetrics format.
 ///
 /// # Errors
-/// Only by a defect, since writing to memory cannot fail.
+/// Only if there is a defect, because writing to memory cannot fail.
 pub fn page(sources: &Arc<MetricsSources>) -> Result<String, fmt::Error> {
     let mut registry = Registry::default();
     registry.register_collector(Box::new(MetricsCollector(Arc::clone(sources))));
@@ -55,7 +55,7 @@ impl Collector for MetricsCollector {
 }
 
 impl MetricsCollector {
-    /// Writes the resources that are in use, and their limits.
+    /// Writes the amounts of resources in use, and their limits.
     fn capacity(&self, page: &mut Page<'_>) -> EncodeResult {
         let MetricsSources { pool, sessions, leases, connections, budget, ledger, .. } = &*self.0;
         if let Some(status) = ledger.as_ref().map(Ledger::status) {
@@ -141,7 +141,7 @@ impl MetricsCollector {
     }
 }
 
-/// Writes the resources of the process, if the system tells them.
+/// Writes the resources of the process, if the operating system reports them.
 fn resources(page: &mut Page<'_>) -> EncodeResult {
     let Ok(resources) = process::resources() else { return Ok(()) };
     page.counters("process_cpu_seconds", "Processor time", [(NO_LABELS, resources.cpu_seconds)])?;
@@ -157,7 +157,7 @@ fn resources(page: &mut Page<'_>) -> EncodeResult {
     Ok(())
 }
 
-/// The name of a code in the spelling of gRPC's documents.
+/// Returns the name of a gRPC code as in gRPC's documentation, e.g. `RESOURCE_EXHAUSTED`.
 fn written(code: Code) -> String {
     let mut text = String::new();
     for letter in format!("{code:?}").chars() {

@@ -1,4 +1,4 @@
-//! Resources of the process, as the system tells them.
+//! Reads the resources that the server's process uses.
 
 use rustix::{
     param::{clock_ticks_per_second, page_size},
@@ -6,35 +6,35 @@ use rustix::{
 };
 use std::{fs, io};
 
-/// Resources of this process, as Prometheus' own libraries name them.
+/// The resources that this process uses. The selection is the standard one of Prometheus' client libraries.
 pub struct Resources {
-    /// Processor time, s.
+    /// The CPU time used so far, s.
     pub cpu_seconds: f64,
-    /// Memory in use, bytes.
+    /// The resident memory, bytes.
     pub resident_bytes: u64,
-    /// The start of the process, s since 1970.
+    /// The start time of the process, s since 1970.
     pub start_seconds: f64,
     /// The number of threads.
     pub threads: i64,
-    /// File descriptors in use.
+    /// The number of open file descriptors.
     pub descriptors: usize,
     /// The maximum number of file descriptors; `None` for no limit.
     pub max_descriptors: Option<u64>,
 }
 
-/// Reads the resources of this process.
+/// Reads the resources that this process uses from `/proc`.
 ///
 /// # Errors
-/// If `/proc` is missing, or has not the expected format.
+/// If `/proc` is missing or does not have the expected format.
 pub fn resources() -> io::Result<Resources> {
     let stat = fs::read_to_string("/proc/self/stat")?;
     let system = fs::read_to_string("/proc/stat")?;
-    let descriptors = fs::read_dir("/proc/self/fd")?.count().saturating_sub(1); // without the folder's own
+    let descriptors = fs::read_dir("/proc/self/fd")?.count().saturating_sub(1); // excludes the descriptor of this directory itself
     parse(&stat, &system, descriptors)
         .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "/proc/self/stat or /proc/stat has another format"))
 }
 
-/// Reads the numbers from the texts of `/proc/self/stat` and `/proc/stat`; proc(5) numbers the fields from 1.
+/// Parses the contents of `/proc/self/stat` and `/proc/stat`. Field numbers start at 1, as in proc(5).
 fn parse(stat: &str, system: &str, descriptors: usize) -> Option<Resources> {
     // Field 2 is the program's name in parentheses, which may contain spaces and parentheses.
     let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();

@@ -1,5 +1,5 @@
-//! The access log has a line for each session that ended. The number of lines in a second is limited, so that clients
-//! that come and go do not fill the disk.
+//! The access log, which has a line for each ended session. The number of lines per second is limited, so clients that
+//! connect and disconnect in a loop cannot fill the disk.
 
 use super::peer_limiter::Peer;
 use std::{
@@ -9,50 +9,51 @@ use std::{
 };
 use tokio::{runtime::Handle, time::Instant};
 
-/// The access log has at most this many lines in a window. One more line says how many sessions were left out.
+/// The maximum number of lines in one window of time. One more line says how many sessions were omitted.
 const MAX_LINES_PER_WINDOW: u64 = 20;
-/// The length of a window.
+/// The length of the window of time to which the maximum applies.
 const WINDOW: Duration = Duration::from_secs(1);
 
-/// The ending of a session whose client or connection is gone.
+/// Logged ending of a session whose client or connection disappeared.
 pub const GONE: &str = "gone";
-/// The ending of a session that its client has closed.
+/// Logged ending of a session that its client closed.
 pub const CLOSED: &str = "closed";
-/// The ending of a session whose requests cannot be decoded.
+/// Logged ending of a session that sent requests which cannot be decoded.
 pub const BROKEN: &str = "broken";
-/// The ending of a session whose lease is over. All other endings are the reasons of errors.
+/// Logged ending of a session whose lease expired. All other endings are words of error classes
+/// ([`ErrorKind::reason`](crate::server::error::ErrorKind::reason)).
 pub const LEASE_OVER: &str = "lease_over";
 
-/// The environment of a session, and its steps.
+/// A session's environment, batch size and steps so far.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct SessionStats {
-    /// The environment that the session was opened with.
+    /// The name of the environment that the session was opened with; `None` if it was never opened.
     pub environment: Option<&'static str>,
-    /// The number of environments that it was opened with.
+    /// The number of environments that the session was opened with.
     pub envs: usize,
-    /// The number of steps, summed over its environments.
+    /// The number of steps, summed over the session's environments.
     pub steps: u64,
 }
 
-/// A session that ended.
+/// The facts about an ended session that the access log states.
 pub struct SessionRecord<'a> {
     /// The peer of the session, if it is known.
     pub peer: Option<Peer>,
-    /// The name of the session's token.
+    /// The name of the session's token, if it had one.
     pub token: Option<&'a str>,
     /// The protocol of the session.
     pub protocol: &'static str,
-    /// The environment, and the steps that were taken.
+    /// The environment, batch size and steps of the session.
     pub stats: SessionStats,
     /// The duration of the session.
     pub time: Duration,
-    /// The number of streams that resumed it; `None` if there were none.
+    /// The number of times that the session was resumed; `None` if it never was.
     pub resumed: Option<u32>,
-    /// The ending: one of a few words.
+    /// Why the session ended: one of a fixed set of words.
     pub ending: &'static str,
 }
 
-/// The log, and the number of ended sessions by ending.
+/// Writes the access log, and counts ended sessions by protocol and ending.
 #[derive(Clone, Default)]
 pub struct AccessLog(Arc<Mutex<LogState>>);
 
@@ -60,12 +61,12 @@ pub struct AccessLog(Arc<Mutex<LogState>>);
 struct LogState {
     /// The number of ended sessions by protocol and ending.
     endings: BTreeMap<(&'static str, &'static str), u64>,
-    /// The window's beginning, and the number of sessions that ended in it.
+    /// The start of the current window, and the number of sessions that have ended in it.
     window: Option<(Instant, u64)>,
 }
 
 impl AccessLog {
-    /// Makes [`endings`](Self::endings) list this protocol, with counts of 0, before its first session ends.
+    /// Makes [`endings`](Self::endings) list this protocol with counts of 0 before its first session ends.
     pub fn register_protocol(&self, protocol: &'static str) {
         let mut state = self.lock();
         for ending in [GONE, CLOSED, BROKEN, LEASE_OVER] {
@@ -73,7 +74,7 @@ impl AccessLog {
         }
     }
 
-    /// Adds a session's end.
+    /// Counts and logs an ended session.
     pub fn record(&self, ended: &SessionRecord<'_>) {
         if !self.count(ended.protocol, ended.ending) {
             return;
@@ -94,18 +95,18 @@ impl AccessLog {
         );
     }
 
-    /// The counts of ended sessions, by protocol and ending.
+    /// Returns the number of ended sessions for each protocol and ending.
     pub fn endings(&self) -> Vec<((&'static str, &'static str), u64)> {
         self.lock().endings.iter().map(|(key, count)| (*key, *count)).collect()
     }
 
-    /// Counts a session. Returns whether it gets a line.
+    /// Counts an ended session. Returns whether it gets a line in the log.
     fn count(&self, protocol: &'static str, ending: &'static str) -> bool {
         let mut state = self.lock();
         *state.endings.entry((protocol, ending)).or_default() += 1;
         let now = Instant::now();
         let (since, wanted) = state.window.get_or_insert((now, 0));
-        // A window that has left out lines ends with the line that tells their number.
+        // A window that exceeds the maximum is ended by the task below, which logs how many sessions were omitted.
         if *wanted <= MAX_LINES_PER_WINDOW && since.elapsed() >= WINDOW {
             (*since, *wanted) = (now, 0);
         }

@@ -1,13 +1,14 @@
-//! The health service tells load balancers whether there is room for another session.
+//! Reports to load balancers, through gRPC's health service, whether the server has room for another session.
 
 use super::peer_limiter::PeerLimiter;
 use crate::pool::Pool;
 use tonic_health::{ServingStatus, server::HealthReporter};
 
-/// The name for which health says NOT_SERVING while all sessions or all environments are taken, and in a drain.
+/// The service name whose health is NOT_SERVING while all sessions or all environments are in use, and during a
+/// shutdown.
 pub const NEW_SESSIONS: &str = "perturb.v1.Perturb.NewSessions";
 
-/// Updates the health of [`NEW_SESSIONS`], for ever.
+/// Keeps the health status of [`NEW_SESSIONS`] up to date. Never returns.
 pub async fn report_capacity(health: &HealthReporter, sessions: &PeerLimiter, pool: &Pool) {
     let mut reported = None;
     loop {

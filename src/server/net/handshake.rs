@@ -1,4 +1,4 @@
-//! Begins connections on the thread that serves them.
+//! Does the handshakes of accepted connections on the thread that will serve them.
 
 use super::{
     load::ConnectionLoad,
@@ -16,7 +16,7 @@ use tokio::{
     time::timeout,
 };
 
-/// A connection that was accepted, on its way to the thread that serves it.
+/// An accepted connection, to be passed to the thread that will serve it.
 pub struct Accepted {
     /// The socket of the connection.
     pub socket: AcceptedSocket,
@@ -24,37 +24,37 @@ pub struct Accepted {
     pub peer: Peer,
     /// The permit for the connection.
     pub permit: PeerPermit,
-    /// The work of the connection, which counts for its thread.
+    /// The counter of the connection's work, which is added to the load of its thread.
     pub load: ConnectionLoad,
 }
 
-/// The socket of a connection, which belongs to no runtime.
+/// The socket of an accepted connection. It is not registered with a tokio runtime, so any thread can serve it.
 pub enum AcceptedSocket {
     /// A TCP connection.
     Tcp(std::net::TcpStream),
-    /// A connection of a Unix socket.
+    /// A connection over a Unix socket.
     Unix(std::os::unix::net::UnixStream),
 }
 
-/// The bytes of a connection, whatever its transport.
+/// The byte stream of a connection over TCP, TLS or a Unix socket.
 pub trait ByteStream: AsyncRead + AsyncWrite + Unpin + Send {}
 
 impl<S: AsyncRead + AsyncWrite + Unpin + Send> ByteStream for S {}
 
-/// A connection that is served.
+/// The I/O of a connection whose handshake is complete.
 pub type ServedConnection = ManagedIo<Box<dyn ByteStream>>;
 
-/// The settings with which a transport thread begins connections.
+/// Settings for the handshakes of a transport thread's connections.
 #[derive(Clone)]
 pub struct Handshakes {
-    /// The time in which a client must begin.
+    /// The maximum time for the TLS handshake, and again for the start of HTTP/2.
     pub limit: Duration,
-    /// The TLS settings of TCP connections.
+    /// The TLS settings for TCP connections; `None` for connections without TLS.
     pub tls: Option<Tls>,
 }
 
 impl Handshakes {
-    /// The connection on this thread, if its client finishes the handshake in time.
+    /// Does the handshake. Returns the connection, or `None` if the handshake failed or took too long.
     async fn begin(self, accepted: Accepted) -> Option<ServedConnection> {
         let Accepted { socket, peer, permit, load } = accepted;
         let refused = |reason: &dyn ToString| {
@@ -76,8 +76,8 @@ impl Handshakes {
     }
 }
 
-/// The connections of a transport thread whose clients have finished the handshake, in the order in which they finish:
-/// none waits for another.
+/// Does the handshakes of a transport thread's `accepted` connections concurrently. Returns the connections in the
+/// order in which their handshakes finish.
 pub fn connections(
     accepted: mpsc::UnboundedReceiver<Accepted>,
     handshakes: Handshakes,

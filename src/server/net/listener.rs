@@ -1,4 +1,4 @@
-//! Binding addresses: TCP ports and Unix sockets.
+//! Listens at addresses: TCP ports and Unix sockets.
 
 use super::{handshake::AcceptedSocket, peer_limiter::Peer};
 use crate::config::{ListenAddress, SocketMode};
@@ -10,18 +10,18 @@ use std::{
 };
 use tokio::net::{TcpListener, UnixListener, UnixSocket, UnixStream};
 
-/// The length of the system's queue of connections that are not accepted yet.
+/// The length of the operating system's queue of connections that the server has not accepted yet.
 const MAX_PENDING_CONNECTIONS: u32 = 1024;
 
-/// A bound address.
+/// A socket that listens at an address.
 pub enum Listener {
     /// A TCP port.
     Tcp(TcpListener),
-    /// A Unix socket, whose file is removed when this is dropped.
+    /// A Unix socket. Its file is removed when this is dropped.
     Unix(UnixListener, SocketFile),
 }
 
-/// Why an address cannot be had, and what to do about the flag that gives it.
+/// Explains why an address cannot be bound, and what to do about `flag`, the option of the command line that gave it.
 fn explain(address: &ListenAddress, flag: &str, error: &io::Error) -> String {
     let text = address.written();
     match (address, error.kind()) {
@@ -42,14 +42,14 @@ fn explain(address: &ListenAddress, flag: &str, error: &io::Error) -> String {
     }
 }
 
-/// Removes a socket's file when it is dropped, unless another server's has taken its place.
+/// Removes a Unix socket's file when dropped, unless another server has replaced the file.
 pub struct SocketFile {
     path: PathBuf,
-    /// Device and number of the file.
+    /// Device and inode number of the file.
     identity: Option<(u64, u64)>,
 }
 
-/// The device and the number of the file at a path.
+/// Returns the device and inode number of the file at a path.
 fn identity(path: &Path) -> Option<(u64, u64)> {
     std::fs::symlink_metadata(path).ok().map(|file| (file.dev(), file.ino()))
 }
@@ -64,19 +64,20 @@ impl Drop for SocketFile {
 }
 
 impl Listener {
-    /// Binds an address; a Unix socket's file gets this mode before anybody can connect. One that a dead server left
-    /// behind is replaced.
+    /// Listens at an address. The file of a Unix socket gets the permissions `mode` before anybody can connect. A
+    /// socket file that a dead server left behind is replaced.
     ///
     /// # Errors
-    /// If the address is in use or may not be bound; the message names it.
+    /// If the address is in use or cannot be bound. The message names the address.
     pub async fn bind(address: &ListenAddress, mode: SocketMode) -> io::Result<Self> {
         Self::bind_as(address, "--listen", mode).await
     }
 
-    /// Binds an address that another flag gives.
+    /// Listens at an address like [`Listener::bind`]. Errors name `flag`, the command-line option that gave the
+    /// address.
     ///
     /// # Errors
-    /// The same as those of [`Listener::bind`].
+    /// See [`Listener::bind`].
     pub async fn bind_as(address: &ListenAddress, flag: &str, mode: SocketMode) -> io::Result<Self> {
         let explain = |error: io::Error| io::Error::new(error.kind(), explain(address, flag, &error));
         match address {
@@ -84,7 +85,8 @@ impl Listener {
             ListenAddress::Unix(path) => {
                 let is_socket = std::fs::symlink_metadata(path).is_ok_and(|m| m.file_type().is_socket());
                 let refused = |e: io::Error| e.kind() == ErrorKind::ConnectionRefused;
-                // The connection is not awaited further: a server that does not accept still holds the address.
+                // Only a refused connection shows that the server is dead: a server that does not accept still owns the
+                // address.
                 if is_socket && UnixStream::connect(path).await.is_err_and(refused) {
                     std::fs::remove_file(path).map_err(explain)?;
                 }
@@ -97,25 +99,26 @@ impl Listener {
         }
     }
 
-    /// The address that was bound, with the port that the system chose.
+    /// Returns the address at which this listens. If port 0 was given, it has the port that the system chose.
     ///
     /// # Errors
-    /// If the operating system does not tell the port.
+    /// If the operating system does not report the port.
     pub fn address(&self) -> io::Result<ListenAddress> {
         match self {
             Self::Tcp(listener) => listener.local_addr().map(ListenAddress::Tcp),
             Self::Unix(_, file) => Ok(ListenAddress::Unix(file.path.clone())),
         }
     }
-    /// Waits for the next connection. A TCP connection has no Nagle's delay: a step is one small message each way.
+    /// Waits for the next connection. Switches off Nagle's algorithm for TCP, because a step is one small message each
+    /// way.
     ///
     /// # Errors
-    /// If the operating system refuses, mostly because it is out of file descriptors.
+    /// If the operating system cannot accept a connection, usually because the process is out of file descriptors.
     pub async fn accept(&self) -> io::Result<(AcceptedSocket, Peer)> {
         match self {
             Self::Tcp(listener) => {
                 let (socket, address) = listener.accept().await?;
-                let _ = socket.set_nodelay(true); // it fails for connections that are gone already
+                let _ = socket.set_nodelay(true); // fails if the client has already disconnected
                 Ok((AcceptedSocket::Tcp(socket.into_std()?), Peer::at(address.ip())))
             }
             Self::Unix(listener, _) => {

@@ -1,4 +1,4 @@
-//! The load of the transport threads, and the choice of a thread for a connection.
+//! Measures the load of the transport threads, and chooses a thread for each new connection.
 
 use std::{
     sync::{
@@ -9,16 +9,17 @@ use std::{
 };
 use tokio::time::Instant;
 
-/// Work counts for about this long: as long as a learner may compute between two batches of steps.
+/// The time constant with which past work is forgotten. It is as long as a learner may compute between two batches of
+/// steps, so that the thread of a computing learner does not look idle.
 const WINDOW: Duration = Duration::from_secs(10);
-/// A read or write of so many bytes is as much work as another one.
+/// The number of bytes that cost as much work as a read or write itself.
 const BYTES_PER_UNIT: usize = 16 << 10;
-/// The work that is expected of a new connection at least: its handshake.
+/// The minimum work that is expected of a new connection, in units: its handshake.
 const HANDSHAKE_WORK: f64 = 16.0;
 
-/// The work of one thread, which alone adds to it. One unit is a read or a write that moved something. Steps that run
-/// on the thread itself, for up to 80 µs each, are not counted. Time would be a wrong measure, as sessions spin while
-/// they wait.
+/// The work of one transport thread, written by that thread only. One unit of work is a read or write that moved data,
+/// plus a unit for each 16 KiB. Steps that run on the thread itself, for up to 80 µs each, are not counted. CPU time
+/// would be a wrong measure, because sessions spin while they wait.
 #[derive(Default)]
 pub struct ThreadLoad {
     work: AtomicU64,
@@ -31,24 +32,24 @@ impl ThreadLoad {
         self.connections.load(Ordering::Relaxed)
     }
 
-    /// Counts a read or write of the thread, of so many bytes.
+    /// Counts a read or write of this many bytes. Must be called on the thread that this load belongs to.
     pub fn count(&self, bytes: usize) {
         let units = (1 + bytes / BYTES_PER_UNIT) as u64;
         self.work.store(self.work.load(Ordering::Relaxed) + units, Ordering::Relaxed); // by one thread only
     }
 }
 
-/// A connection of a thread, until it is dropped.
+/// Counts a connection as its thread's until it is dropped, and counts the connection's work.
 pub struct ConnectionLoad(Arc<ThreadLoad>);
 
 impl ConnectionLoad {
-    /// A connection of the thread with this load.
+    /// Counts a new connection of the thread with this load.
     fn new(thread: Arc<ThreadLoad>) -> Self {
         thread.connections.fetch_add(1, Ordering::Relaxed);
         Self(thread)
     }
 
-    /// Counts a read or write, of so many bytes.
+    /// Counts a read or write of this many bytes. Must be called on the connection's thread.
     pub fn count(&self, bytes: usize) {
         self.0.count(bytes);
     }
@@ -60,7 +61,7 @@ impl Drop for ConnectionLoad {
     }
 }
 
-/// Chooses threads for connections by the work that they did lately.
+/// Chooses the thread for each new connection according to the threads' recent work.
 pub struct Balance {
     threads: Vec<RecentWork>,
     /// The time of the last choice.
@@ -69,14 +70,14 @@ pub struct Balance {
 
 struct RecentWork {
     load: Arc<ThreadLoad>,
-    /// The work so far, at the last choice.
+    /// The total work of the thread at the time of the last choice.
     seen: u64,
-    /// The work of the last [`WINDOW`], in which older work counts less and less.
+    /// The work of about the last [`WINDOW`]. Older work counts exponentially less.
     recent: f64,
 }
 
 impl Balance {
-    /// A balance of so many threads without work, at this time.
+    /// Makes a balance of `threads` threads that have done no work yet. `now` is the present time.
     pub fn new(threads: usize, now: Instant) -> Self {
         let idle = || RecentWork { load: Arc::default(), seen: 0, recent: 0.0 };
         Self { threads: (0..threads).map(|_| idle()).collect(), at: now }
@@ -92,9 +93,9 @@ impl Balance {
         self.threads.iter().map(|thread| Arc::clone(&thread.load)).collect()
     }
 
-    /// The thread that did the least work lately; of equal ones that with the fewest connections. It gets a connection,
-    /// which is expected to be as much work as the average one until it has worked, so that connections that come at the
-    /// same moment are spread.
+    /// Chooses the thread with the least recent work, and of equal threads the one with the fewest connections. Returns
+    /// its index, and the counter of the new connection's work. The new connection counts as average recent work at
+    /// once, so simultaneous connections are spread over the threads.
     pub fn choose(&mut self, now: Instant) -> (usize, ConnectionLoad) {
         self.refresh(now);
         let connections: usize = self.threads.iter().map(|thread| thread.load.connections()).sum();
@@ -108,7 +109,7 @@ impl Balance {
         (chosen, ConnectionLoad::new(Arc::clone(&thread.load)))
     }
 
-    /// Takes in the work since the last choice, as if it had been done at an even rate.
+    /// Adds the work since the last choice to each thread's recent work, as if it had been done at a constant rate.
     fn refresh(&mut self, now: Instant) {
         let windows = (now - self.at).as_secs_f64() / WINDOW.as_secs_f64();
         self.at = now;
@@ -125,7 +126,7 @@ impl Balance {
 mod tests {
     use super::*;
 
-    /// A balance, a clock that only the test moves, and the connections so far.
+    /// A balance with a clock that only the test advances, and the connections so far.
     struct Clocked {
         balance: Balance,
         now: Instant,
@@ -138,14 +139,14 @@ mod tests {
             Self { balance: Balance::new(threads, now), now, connections: Vec::new() }
         }
 
-        /// Another connection; its thread.
+        /// Opens another connection. Returns the index of its thread.
         fn connect(&mut self) -> usize {
             let (thread, connection) = self.balance.choose(self.now);
             self.connections.push((thread, connection));
             thread
         }
 
-        /// Lets the threads that have connections do so much work a second for each.
+        /// Advances the clock. Each connection does `units` of work per second, as a function of its number.
         fn work(&mut self, seconds: u64, units: impl Fn(usize) -> usize) {
             for (place, (_, connection)) in self.connections.iter().enumerate() {
                 (0..units(place) * seconds as usize).for_each(|_| connection.count(1));

@@ -1,4 +1,5 @@
-//! The I/O of a connection, with a timeout for its first bytes and a switch that ends it.
+//! The I/O of a connection, with a timeout for the client's first bytes, and a switch to close the connection from
+//! outside.
 
 use super::{
     load::ConnectionLoad,
@@ -22,10 +23,10 @@ use tokio::{
 };
 use tonic::transport::server::Connected;
 
-/// The length of the preface that a client of HTTP/2 sends first.
+/// The length of the connection preface with which every HTTP/2 client begins, bytes.
 const PREFACE_BYTES: usize = 24;
 
-/// A connection, as its calls see it.
+/// A handle to a connection, for the calls that it carries.
 #[derive(Clone)]
 pub struct Connection {
     /// The peer of the connection.
@@ -40,25 +41,27 @@ struct KillSwitch {
 }
 
 impl Connection {
-    /// Ends the connection and all its calls.
+    /// Closes the connection, which ends all its calls.
     pub fn close(&self) {
         self.kill_switch.requested.store(true, Ordering::Release);
         self.kill_switch.waker.wake();
     }
 }
 
-/// The I/O of a connection. It fails if the client's preface does not come in time, and once the connection is ended.
+/// The I/O of a connection. It fails if the client's HTTP/2 preface does not arrive in time, and after
+/// [`Connection::close`].
 pub struct ManagedIo<S> {
     stream: S,
     connection: Connection,
-    /// The number of bytes of the preface that have not arrived, and the deadline for them.
+    /// The number of bytes of the preface that have not arrived yet, and the timer of their deadline. `None` once the
+    /// preface has arrived.
     preface: Option<(usize, Pin<Box<Sleep>>)>,
     _permit: PeerPermit,
     load: Option<ConnectionLoad>,
 }
 
 impl<S> ManagedIo<S> {
-    /// Wraps a connection whose client must send its preface within `limit`.
+    /// Wraps a connection whose client must send the HTTP/2 preface within `limit`.
     pub fn new(stream: S, peer: Peer, permit: PeerPermit, limit: Duration) -> Self {
         let preface = Some((PREFACE_BYTES, Box::pin(sleep(limit))));
         Self {
@@ -70,13 +73,13 @@ impl<S> ManagedIo<S> {
         }
     }
 
-    /// Counts its reads and writes as work of its thread.
+    /// Counts reads and writes of this connection as work of its thread.
     pub fn counted(mut self, load: ConnectionLoad) -> Self {
         self.load = Some(load);
         self
     }
 
-    /// Counts a read or a write that moved bytes.
+    /// Counts a read or write, if it moved bytes.
     fn count(&self, bytes: usize) {
         if let Some(load) = self.load.as_ref().filter(|_| bytes > 0) {
             load.count(bytes);
@@ -91,7 +94,7 @@ impl<S> ManagedIo<S> {
 }
 
 impl<S> Drop for ManagedIo<S> {
-    /// Drops the waker, which would keep the connection's memory as long as a call holds a [`Connection`].
+    /// Drops the waker. Otherwise every call's [`Connection`] would keep the memory of this connection alive.
     fn drop(&mut self) {
         self.connection.kill_switch.waker.take();
     }

@@ -1,4 +1,4 @@
-//! Connections: their peers, limits and encryption, and the access log of their sessions.
+//! Connections: listeners, TLS, limits for each peer, the threads that serve connections, and the access log.
 
 pub mod access_log;
 pub mod capacity_health;

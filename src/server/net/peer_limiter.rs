@@ -1,4 +1,4 @@
-//! Peers, and the limits of concurrent connections or sessions of each.
+//! Limits the number of concurrent connections or sessions, in total and for each peer.
 
 use std::{
     collections::BTreeMap,
@@ -8,18 +8,18 @@ use std::{
 };
 use tokio::sync::Notify;
 
-/// The other end of a connection.
+/// The other end of a connection, to which limits apply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Peer {
-    /// A machine, or a network that one machine may have for itself.
+    /// The machine with this IPv4 address, or the IPv6 network that one machine may own.
     Machine(IpAddr),
-    /// A user of this machine, by a Unix socket; `None` if the system does not tell the user.
+    /// The user ID of a client that connected over a Unix socket; `None` if the operating system does not report it.
     User(Option<u32>),
 }
 
 impl Peer {
-    /// The peer with this address. An IPv6 address stands for its network of 64 bits, the least that a machine is
-    /// given.
+    /// Returns the peer with this address. All IPv6 addresses of a /64 network are one peer, because a single machine
+    /// usually gets at least such a network.
     pub fn at(address: IpAddr) -> Self {
         Self::Machine(match address.to_canonical() {
             IpAddr::V6(address) => Ipv6Addr::from_bits(address.to_bits() & !u128::from(u64::MAX)).into(),
@@ -50,16 +50,16 @@ struct PermitCounts {
     changed: Notify,
 }
 
-/// Why there is no permit.
+/// The limit that prevents another permit, with its value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LimitReached {
-    /// All permits are in use.
+    /// The limit on all peers together.
     All(usize),
-    /// The peer has this many permits, as many as it may have.
+    /// The limit on the single peer.
     Peer(usize),
 }
 
-/// A permit, until it is dropped.
+/// A permit for one connection or session. Dropping it frees the permit.
 pub struct PeerPermit {
     limiter: PeerLimiter,
     peer: Option<Peer>,
@@ -71,10 +71,10 @@ impl PeerLimiter {
         Self(Arc::new(PermitCounts { max_total, max_per_peer, in_use: Mutex::default(), changed: Notify::new() }))
     }
 
-    /// Takes a permit for a peer. An unknown peer has no limit of its own.
+    /// Takes a permit for a peer. An unknown peer (`None`) is only subject to the total limit.
     ///
     /// # Errors
-    /// [`LimitReached`].
+    /// [`LimitReached`], if all permits are in use.
     pub fn acquire(&self, peer: Option<Peer>) -> Result<PeerPermit, LimitReached> {
         let mut in_use = self.lock();
         let (total, by_peer) = &mut *in_use;
@@ -93,17 +93,17 @@ impl PeerLimiter {
         Ok(PeerPermit { limiter: self.clone(), peer })
     }
 
-    /// The number of permits in use.
+    /// Returns the number of permits in use.
     pub fn in_use(&self) -> usize {
         self.lock().0
     }
 
-    /// The total limit.
+    /// Returns the limit on all peers together.
     pub fn limit(&self) -> usize {
         self.0.max_total
     }
 
-    /// Waits until the number in use has changed since the last call, for one caller.
+    /// Waits until the number of permits in use has changed since the last call. Only one task may wait.
     pub async fn changed(&self) {
         self.0.changed.notified().await;
     }

@@ -1,4 +1,4 @@
-//! Asks a running server for its health. Container engines start the server's program for this purpose.
+//! Checks the health of a running server. Container engines run the server program with an option for this.
 
 use crate::config::ListenAddress;
 use perturb_protocol::{Address, AddressError, ClientError, Connection, Timeouts, credentials::Credentials};
@@ -9,20 +9,20 @@ use std::{
     time::Duration,
 };
 
-/// The time in which a server must answer.
+/// The maximum time for the server's answer.
 const PROBE_TIMEOUT: Duration = Duration::from_secs(3);
 
-/// Why a server does not take sessions.
+/// Why the health check of a server failed.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The server cannot be reached by the address at which it listens.
+    /// No client can connect to the address at which the server listens.
     #[error(transparent)]
     Address(#[from] AddressError),
-    /// The working directory, which a socket's path begins with, is gone.
+    /// The path of the Unix socket is relative, and the working directory no longer exists.
     #[error("a relative path of a socket: {0}")]
     Directory(#[from] io::Error),
-    /// No answer came, or the server does not take sessions.
+    /// The server did not answer, or it does not accept sessions.
     #[error("no server answers at {address}: {reason}")]
     NoAnswer {
         /// The address.
@@ -32,11 +32,12 @@ pub enum Error {
     },
 }
 
-/// Asks the server that listens at `listen` whether it takes sessions. A server that listens on all interfaces is asked
-/// through the loopback interface. A server with TLS must show `certificate`, whatever names are in it.
+/// Checks that the server that listens at `listen` accepts sessions. If `listen` is the address of all interfaces,
+/// connects over the loopback interface. If `certificate` is given, uses TLS and requires the server to show exactly
+/// this certificate, for any host name.
 ///
 /// # Errors
-/// [`Error`], after at most 3 s.
+/// [`Error`], if the check fails; after at most 3 s.
 pub async fn probe(listen: &ListenAddress, certificate: Option<&Path>) -> Result<(), Error> {
     let mut address = reachable(listen)?;
     let mut credentials = Credentials::default();
@@ -57,7 +58,7 @@ pub async fn probe(listen: &ListenAddress, certificate: Option<&Path>) -> Result
     Err(Error::NoAnswer { address, reason })
 }
 
-/// The address by which a server can be reached that listens at `listen`.
+/// Returns an address at which clients on this machine reach a server that listens at `listen`.
 fn reachable(listen: &ListenAddress) -> Result<Address, Error> {
     match *listen {
         ListenAddress::Unix(ref path) => Ok(Address::Unix(path::absolute(path)?)),

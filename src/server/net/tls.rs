@@ -1,4 +1,4 @@
-//! TLS 1.3: the server's certificate, and the authorities that must have signed clients' certificates.
+//! TLS 1.3 for connections: the server's certificate, and the authorities that must have signed clients' certificates.
 
 use crate::config::TlsFiles;
 use std::{
@@ -21,7 +21,7 @@ use tokio_rustls::{
     server::TlsStream,
 };
 
-/// Builds the settings of connections from the contents of the files.
+/// Builds the TLS settings from the contents of the files, which are in the order of [`TlsFiles::paths`].
 fn configured(files: &TlsFiles, contents: &[Vec<u8>]) -> Result<ServerConfig, String> {
     let [cert, key, rest @ ..] = contents else { return Err("a certificate and a key are expected".into()) };
     let chain = certificates(&files.cert, cert)?;
@@ -52,7 +52,7 @@ fn configured(files: &TlsFiles, contents: &[Vec<u8>]) -> Result<ServerConfig, St
     Ok(config)
 }
 
-/// The certificates of a file, at least one.
+/// Parses the certificates of a PEM file. There must be at least one.
 fn certificates(path: &std::path::Path, pem: &[u8]) -> Result<Vec<CertificateDer<'static>>, String> {
     let all: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(pem).collect();
     let all = all.map_err(|error| format!("{}: {error}; expected certificates in PEM", path.display()))?;
@@ -70,36 +70,36 @@ pub struct Tls {
 }
 
 impl Tls {
-    /// Makes the settings from the contents of the files.
+    /// Makes the settings from the contents of the files, in the order of [`TlsFiles::paths`].
     ///
     /// # Errors
-    /// If a file is wrong: a text that names it and the fault.
+    /// If a file is invalid: a text that names the file and the fault.
     pub fn new(files: TlsFiles, contents: &[Vec<u8>]) -> Result<Self, String> {
         let config = Arc::new(configured(&files, contents)?);
         Ok(Self { files: Arc::new(files), config: Arc::new(RwLock::new(config)) })
     }
 
-    /// Applies the new contents of the files to new connections.
+    /// Applies new contents of the files to later connections.
     ///
     /// # Errors
-    /// If a file is wrong: a text that names it and the fault. The settings are unchanged then.
+    /// If a file is invalid: a text that names the file and the fault. The settings are unchanged then.
     pub fn reload(&self, contents: &[Vec<u8>]) -> Result<(), String> {
         let config = Arc::new(configured(&self.files, contents)?);
         *self.config.write().unwrap_or_else(PoisonError::into_inner) = config;
         Ok(())
     }
 
-    /// Does the handshake with a client. If it fails, the alert is sent and the rest of the client's data is read: a
-    /// connection that is closed while there is something to read is reset, and the alert may be lost.
+    /// Does the TLS handshake with a client. If it fails, sends the alert, and then reads until the client closes the
+    /// connection. If the connection were closed while data is unread, TCP would reset it, and the alert could be lost.
     ///
     /// # Errors
-    /// If the handshake fails.
+    /// If the TLS handshake fails.
     pub async fn accept(&self, connection: TcpStream) -> io::Result<TlsStream<TcpStream>> {
         let config = Arc::clone(&self.config.read().unwrap_or_else(PoisonError::into_inner));
         match TlsAcceptor::from(config).accept(connection).into_fallible().await {
             Ok(stream) => Ok(stream),
             Err((error, mut connection)) => {
-                let _ = connection.shutdown().await; // an error means that the client has gone
+                let _ = connection.shutdown().await; // fails if the client has disconnected
                 let mut rest = [0; 1024];
                 while connection.read(&mut rest).await.is_ok_and(|count| count > 0) {}
                 Err(error)

@@ -1,5 +1,5 @@
-//! The threads that talk to clients. Each has a runtime of its own. A connection is handed to one of them when it is
-//! accepted and stays there, with all its sessions, so that no request crosses threads.
+//! The transport threads, which serve the clients' connections. Each has a tokio runtime of its own. An accepted
+//! connection is passed to one thread and stays there with all its sessions, so no request crosses threads.
 
 use super::{
     handshake::{Accepted, AcceptedSocket},
@@ -22,34 +22,34 @@ use tokio::{
     time::Instant,
 };
 
-/// The pause after the system refuses to accept a connection.
+/// The pause after the operating system could not accept a connection.
 const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(200);
 
-/// Hands connections to the threads.
+/// Passes accepted connections to the transport threads.
 #[derive(Clone)]
 pub struct TransportThreads {
     threads: Arc<[mpsc::UnboundedSender<Accepted>]>,
-    /// It is locked for each connection, never for a request.
+    /// Locked once for each new connection, never for a request.
     balance: Arc<Mutex<Balance>>,
 }
 
 impl TransportThreads {
-    /// Threads with this balance of their load, and the connections that come to each of them.
+    /// Makes the channels to the threads of `balance`. Returns for each thread the receiver of its connections.
     pub fn new(balance: Balance) -> (Self, Vec<mpsc::UnboundedReceiver<Accepted>>) {
         let (threads, connections): (Vec<_>, _) = (0..balance.threads()).map(|_| mpsc::unbounded_channel()).unzip();
         (Self { threads: threads.into(), balance: Arc::new(Mutex::new(balance)) }, connections)
     }
 
-    /// Hands a connection to the thread that did the least work lately.
+    /// Passes a connection to the thread with the least recent work.
     fn hand_over(&self, socket: AcceptedSocket, peer: Peer, permit: PeerPermit) {
         let (thread, load) = self.balance.lock().unwrap_or_else(PoisonError::into_inner).choose(Instant::now());
-        // A thread that has ended takes no connections: the server shuts down, and the connection is closed.
+        // The send fails if the thread has ended. Then the server is shutting down, and the connection is closed.
         let _ = self.threads[thread].send(Accepted { socket, peer, permit, load });
     }
 }
 
-/// Accepts connections, for ever, and hands them to the threads. A Unix socket's file is removed when the future is
-/// dropped.
+/// Accepts connections and passes them to the transport threads. Never returns. When the future is dropped, a Unix
+/// socket's file is removed.
 pub async fn accept(listener: Listener, limiter: PeerLimiter, threads: TransportThreads) -> Infallible {
     loop {
         match listener.accept().await {
@@ -58,7 +58,8 @@ pub async fn accept(listener: Listener, limiter: PeerLimiter, threads: Transport
                 Err(full) => tracing::debug!(?peer, ?full, "closed a connection for which there is no place"),
             },
             Err(error) => {
-                // Out of file descriptors, most likely: trying again at once would keep the thread from those it serves.
+                // Most likely the process is out of file descriptors. Retrying at once would keep this thread from
+                // serving clients.
                 tracing::warn!(%error, "cannot accept a connection");
                 tokio::time::sleep(ACCEPT_RETRY_DELAY).await;
             }
@@ -66,11 +67,11 @@ pub async fn accept(listener: Listener, limiter: PeerLimiter, threads: Transport
     }
 }
 
-/// Runs a future on a thread of its own, with a runtime of its own. Both end with the future, or when what this returns
-/// is dropped.
+/// Runs `future` on a new thread with a new runtime. Returns a future of the result. If that is dropped, the thread
+/// ends.
 ///
 /// # Errors
-/// If the operating system starts no thread.
+/// If the operating system cannot start a thread.
 pub fn spawn<T: Send + 'static>(
     name: String,
     future: impl Future<Output = T> + Send + 'static,
@@ -84,10 +85,10 @@ pub fn spawn<T: Send + 'static>(
                 () = done.closed() => None,
             }
         });
-        // Connections that did not close by themselves must not delay the end.
+        // Does not wait for connections that are still open.
         runtime.shutdown_background();
         if let Some(output) = ended {
-            let _ = done.send(output); // nobody may wait for it any more
+            let _ = done.send(output); // fails if the result is no longer wanted
         }
     };
     thread::Builder::new().name(name).spawn(run).map_err(|error| explain_no_thread(&error))?;

@@ -1,4 +1,4 @@
-//! Admission of sessions: limits of the server, of a peer and of a token, and the shutdown.
+//! Admission of sessions: the limits of the server, of each peer and of each token, and the refusal during a shutdown.
 
 use super::{
     Error,
@@ -16,7 +16,7 @@ use crate::server::{
 };
 use std::time::Duration;
 
-/// The sessions of a server: their limits, and the shutdown.
+/// Admits sessions to the server, within the limits of the server, each peer and each token.
 #[derive(Clone)]
 pub struct Sessions {
     limiter: PeerLimiter,
@@ -31,16 +31,17 @@ pub struct Sessions {
 /// The limits of one session.
 #[derive(Debug, Clone, Copy)]
 pub struct SessionLimits {
-    /// The most bytes of a request.
+    /// The maximum length of a request, bytes.
     pub bytes: usize,
-    /// The time that the session may be silent before it is open.
+    /// The time within which the client must open the session.
     pub handshake: Duration,
-    /// The time that an open session may be silent; `None` for no limit.
+    /// The maximum time between the requests of an open session; `None` for no limit.
     pub idle: Option<Duration>,
 }
 
 impl Sessions {
-    /// The sessions that this limiter admits. Errors and endings are counted.
+    /// Makes the admission of sessions by `limiter`. Errors are counted in `counters`, and ended sessions are logged in
+    /// `access`.
     pub fn new(
         limiter: PeerLimiter,
         limits: SessionLimits,
@@ -52,7 +53,7 @@ impl Sessions {
         Self { limiter, limits, decoder: Decoder::default(), drain, counters, access, leases }
     }
 
-    /// The same sessions, with another view of the shutdown.
+    /// Returns a handle to the same sessions that observes the shutdown through `drain`.
     pub fn with_drain(&self, drain: Drain) -> Self {
         Self { drain, ..self.clone() }
     }
@@ -62,7 +63,7 @@ impl Sessions {
         self.drain.phase()
     }
 
-    /// Admits a stream. One that finds the server full may still resume a session if its protocol has leases.
+    /// Admits a stream. If the server is full and the protocol has leases, the stream may still resume a session.
     pub(super) fn admit(&self, requests: &MessageReader, has_leases: bool) -> Result<Admission, Error> {
         match self.acquire_permits(requests) {
             Err(refusal) if has_leases => self.admit_to_resume(refusal),
@@ -70,12 +71,12 @@ impl Sessions {
         }
     }
 
-    /// Returns a view for a new session, which counts as running as long as it holds the view.
+    /// Returns a handle for a new session. The shutdown counts the session as running until the handle is dropped.
     pub(super) fn enter(&self) -> Self {
         Self { drain: self.drain.enter(), ..self.clone() }
     }
 
-    /// Admits a stream above the session limits if it may be resuming a leased session, which already holds a permit.
+    /// Admits a stream above the session limits, for resuming only: a leased session already holds a permit.
     fn admit_to_resume(&self, refusal: Error) -> Result<Admission, Error> {
         let is_full = matches!(
             refusal,
@@ -87,7 +88,7 @@ impl Sessions {
         }
     }
 
-    /// Counts an error, and counts it also for the stream's token.
+    /// Counts an error, also for the stream's token if there is one.
     pub(super) fn count(&self, error: &impl RequestError, bearer: Option<&Bearer>) {
         self.counters.count(error.kind());
         if let Some(bearer) = bearer {
@@ -110,8 +111,9 @@ impl Sessions {
 
 /// The way in which a stream was admitted.
 pub(super) enum Admission {
-    /// Admitted with its own permit, and with a part of its token's quota.
+    /// Admitted as a new session, with a permit and a part of its token's quota of sessions.
     Own(#[expect(dead_code, reason = "held")] PeerPermit, #[expect(dead_code, reason = "held")] Option<QuotaGuard>),
-    /// Admitted although the server is full. If its first request does not resume a session, it ends with this error.
+    /// Admitted although the server is full. Unless its first request resumes a session, the stream ends with this
+    /// error.
     ResumeOnly(#[expect(dead_code, reason = "held")] CountGuard, Error),
 }

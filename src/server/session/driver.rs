@@ -1,6 +1,6 @@
-//! The task that runs a session. Streams attach to it and detach from it. Without a lease the session ends with its
-//! stream. With a lease it outlives the stream for a while: requests are carried out even if no stream waits for the
-//! reply, and the last replies are stored, to be sent again.
+//! The task that runs a session. A session without a lease ends with its stream. A session with a lease outlives its
+//! stream for a while, and another stream may attach to it: requests are carried out even while no stream waits for the
+//! reply, and the last replies are stored for sending them again.
 
 use super::{
     Error,
@@ -36,20 +36,20 @@ use tokio::{
 };
 use tonic::Status;
 
-/// The maximum length of a session's stored replies, bytes. The last reply is stored even if it is longer. A client
-/// that has missed more than this should continue from a snapshot.
+/// The maximum total length of a session's stored replies, bytes. The last reply is stored even if it is longer. A
+/// client that has missed more than this should continue from a snapshot.
 const MAX_STORED_BYTES: usize = 4 << 20;
-/// The memory of a stored reply in addition to its encoded length, bytes.
+/// The memory that a stored reply takes in addition to its encoded length, bytes.
 const REPLY_OVERHEAD_BYTES: usize = 512;
 
-/// Responses as they come, or the status that ends the stream.
+/// The responses of a session as a stream. An error is the status that ends it.
 pub type Responses<R> = Pin<Box<dyn Stream<Item = Result<R, Status>> + Send>>;
 
 impl Sessions {
-    /// Begins a session in a task of its own: the handler answers the requests of the stream.
+    /// Starts a session in a new task, in which `handler` answers the requests of the stream. Returns the responses.
     ///
     /// # Errors
-    /// If the server is shutting down or full, or the quota of the stream's token is used up.
+    /// A status, if the server is shutting down or full, or the quota of the stream's token is used up.
     pub fn begin<H: SessionHandler>(
         &self,
         requests: MessageReader,
@@ -85,25 +85,25 @@ struct SessionDriver<H: SessionHandler> {
 struct ActiveLease<R> {
     grant: LeaseGuard<R>,
     stored: ReplayBuffer<StoredReply<R>>,
-    /// The number of the last reply that was sent in the present stream.
+    /// The number of the last reply that was sent on the current stream.
     sent: u64,
 }
 
 struct StoredReply<R> {
     response: R,
-    /// The reservation while the reply is stored. Without one the reply is dropped when it is sent.
+    /// The memory reservation for storing the reply. If there is `None`, the reply is dropped as soon as it is sent.
     memory: Option<MemoryReservation>,
-    /// The reservation that the handler made for the response. It leaves with the response when that is first sent.
+    /// The memory reservation that the handler made for the response. It is passed on when the response is first sent.
     outgoing: Option<MemoryReservation>,
 }
 
-/// Whether a session has a stream.
+/// The relation of a session to its stream.
 enum Attachment<R> {
-    /// The session has the stream that takes these responses.
+    /// The session has a stream; its responses go to this sender.
     Attached(ResponseSender<R>),
-    /// The session has no stream, but a stream that was accepted may be about to attach.
+    /// The session has no stream. If there is a receiver, it will receive a stream whose resume request was accepted.
     Detached(Option<Resuming<R>>),
-    /// The session is resumed by the stream that takes these responses, on the runtime of that stream's thread.
+    /// A stream has resumed the session. It continues on this runtime, and its responses go to this sender.
     Resumed(Handle, ResponseSender<R>),
     /// The session has ended.
     Ended,
@@ -112,7 +112,7 @@ enum Attachment<R> {
 type Resuming<R> = oneshot::Receiver<ResumingStream<R>>;
 
 impl<H: SessionHandler> SessionDriver<H> {
-    /// Runs the session on this runtime, where its stream is.
+    /// Runs the session on `runtime`, on which its stream is served.
     fn spawn(self, runtime: &Handle, responses: ResponseSender<H::Response>) {
         runtime.spawn(self.run(responses));
     }
@@ -132,15 +132,15 @@ impl<H: SessionHandler> SessionDriver<H> {
         }
     }
 
-    /// Frees the session's resources before its client sees the stream's end, so that the client can open another
-    /// session at once.
+    /// Frees the session's resources before the client sees the end of the stream, so the client can open another
+    /// session immediately.
     async fn close(mut self, responses: ResponseSender<H::Response>) {
         self.exchange.close().await;
         drop(self);
         drop(responses);
     }
 
-    /// Answers a stream's requests, until it is lost or replaced, or the session ends.
+    /// Answers the requests of the current stream until the stream is lost or replaced, or the session ends.
     async fn attached(&mut self, responses: &ResponseSender<H::Response>) -> Attachment<H::Response> {
         let mut closed = pin!(responses.closed());
         loop {
@@ -155,7 +155,7 @@ impl<H: SessionHandler> SessionDriver<H> {
             }
             let Self { exchange, lease } = self;
             let message = tokio::select! {
-                biased; // a client's own end comes before that of its connection
+                biased; // if the client closed the stream and then its connection, the log says "closed", not "gone"
                 ask = resume_request(lease) => match self.accept_resume(ask) {
                     Some(resuming) => return self.supersede(responses, resuming),
                     None => continue,
@@ -176,7 +176,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         }
     }
 
-    /// Answers a request. Without a lease the request is abandoned when its stream is lost.
+    /// Answers a request. If the stream is lost meanwhile, a session without a lease abandons the request.
     async fn respond(
         &mut self,
         message: Message,
@@ -205,7 +205,8 @@ impl<H: SessionHandler> SessionDriver<H> {
         }
     }
 
-    /// Sends the reply of a session that had no lease so far. The reply may grant one.
+    /// Sends a reply of a session that has no lease yet. The reply may grant the session a lease, or move its stream to
+    /// a resumed session.
     async fn deliver(
         &mut self,
         reply: Reply<H::Response>,
@@ -214,7 +215,8 @@ impl<H: SessionHandler> SessionDriver<H> {
         let Reply { response, memory, handover } = reply;
         let resumed = match handover {
             Some(StreamHandover::Lease(grant)) => {
-                // Clients with a lease send unanswered requests again after a lost stream, so none may be read ahead.
+                // After the loss of a stream, a client with a lease resends its unanswered requests. So none may be
+                // read ahead.
                 self.exchange.reads_ahead = false;
                 self.lease = Some(ActiveLease { stored: ReplayBuffer::new(grant.max_unanswered), grant, sent: 0 });
                 None
@@ -229,7 +231,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         }
         let Some(ticket) = resumed else { return Ok(()) };
         self.exchange.ending = MOVED;
-        // If the session has ended by now, the stream ends at once.
+        // If the resumed session has ended meanwhile, the send fails, and the stream ends at once.
         let _ = ticket.stream.send(ResumingStream {
             requests: self.exchange.requests.detach(),
             responses: responses.clone(),
@@ -239,7 +241,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         Err(Attachment::Ended)
     }
 
-    /// Waits until the stream takes another response.
+    /// Waits until the stream can take another response.
     async fn slot<'r>(
         &mut self,
         responses: &'r ResponseSender<H::Response>,
@@ -261,7 +263,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         }
     }
 
-    /// Waits for another stream, until the lease is over.
+    /// Waits until another stream resumes the session or its lease expires.
     async fn detached(&mut self, mut resuming: Option<Resuming<H::Response>>) -> Attachment<H::Response> {
         let Self { exchange, lease } = self;
         let Some(lease) = lease else { return Attachment::Ended };
@@ -284,7 +286,7 @@ impl<H: SessionHandler> SessionDriver<H> {
                             lease.grant.counters().add_resumed();
                             return Attachment::Resumed(runtime, responses);
                         }
-                        Err(_) => continue, // that stream was lost, too
+                        Err(_) => continue, // the accepted stream was lost before it arrived
                     }
                 }
                 Some(ask) = lease.grant.resume_requests.recv() => {
@@ -305,7 +307,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         self.lease.as_mut().and_then(|lease| lease.accept_resume(ask))
     }
 
-    /// Ends the present stream, because another stream resumes the session.
+    /// Ends the current stream, because another stream resumes the session.
     fn supersede(
         &mut self,
         responses: &ResponseSender<H::Response>,
@@ -315,7 +317,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         self.detach(Some(resuming))
     }
 
-    /// Leaves the stream. Without a lease the session ends.
+    /// Separates the session from its stream. A session without a lease ends.
     fn detach(&mut self, resuming: Option<Resuming<H::Response>>) -> Attachment<H::Response> {
         let Some(lease) = &mut self.lease else { return Attachment::Ended };
         drop(self.exchange.requests.detach());
@@ -323,7 +325,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         Attachment::Detached(resuming)
     }
 
-    /// Ends a stream that cannot continue. A session with a lease ends only if the server ends it.
+    /// Handles a stream that cannot continue. A session with a lease ends only if the server itself stops it.
     fn stopped(
         &mut self,
         responses: &ResponseSender<H::Response>,
@@ -344,15 +346,15 @@ impl<H: SessionHandler> SessionDriver<H> {
         }
     }
 
-    /// Stores a reply for sending it, maybe again. If the memory budget is exhausted, the older stored replies are
-    /// dropped first.
+    /// Stores a reply to send it, and to send it again if its stream is lost. If the memory budget is exhausted, drops
+    /// the older stored replies.
     fn store_reply(&mut self, answer: Result<Reply<H::Response>, H::Error>) {
         let Self { exchange, lease: Some(lease) } = self else { return };
         let stored = &mut lease.stored;
         let wants_room =
             |kind| matches!(kind, ErrorKind::MemoryFull | ErrorKind::TokenQuota | ErrorKind::MoreThanTokenQuota);
         if answer.as_ref().is_err_and(|error| wants_room(error.kind())) {
-            stored.clear(); // they were received, and may be what is in the way
+            stored.clear(); // the client has received them, and they take memory that the request needs
         }
         let Reply { response, memory: outgoing, .. } = exchange.finish(answer);
         let (budget, bytes) = (exchange.requests.budget().clone(), response.encoded_len() + REPLY_OVERHEAD_BYTES);
@@ -367,7 +369,7 @@ impl<H: SessionHandler> SessionDriver<H> {
 }
 
 impl<R: Clone> ActiveLease<R> {
-    /// The next reply that the stream does not have.
+    /// Returns the next reply that was not yet sent on the current stream.
     fn next(&mut self) -> Option<OutgoingResponse<R>> {
         self.sent += 1;
         let reply = self.stored.get_mut(self.sent)?;
@@ -378,11 +380,11 @@ impl<R: Clone> ActiveLease<R> {
         Some(OutgoingResponse { response, memory })
     }
 
-    /// Answers a stream that asks to resume the session. Returns the channel by which the stream will arrive, or `None`
-    /// if it was refused.
+    /// Answers a stream's request to resume the session. Returns the channel through which the stream will arrive, or
+    /// `None` if the request is refused.
     fn accept_resume(&mut self, ResumeRequest { last_reply, answer }: ResumeRequest<R>) -> Option<Resuming<R>> {
         if let Err(error) = self.stored.check(last_reply) {
-            let _ = answer.send(Err(error)); // a stream that is gone does not hear it
+            let _ = answer.send(Err(error)); // fails if the stream has been lost, too
             return None;
         }
         let (arrival, resuming) = oneshot::channel();
@@ -392,7 +394,7 @@ impl<R: Clone> ActiveLease<R> {
     }
 }
 
-/// Ends a stream with this status, as soon as its channel has room.
+/// Ends a stream with this status as soon as its channel has room.
 fn end_stream<R: Send + 'static>(responses: &ResponseSender<R>, status: Status) {
     if let Err(TrySendError::Full(status)) = responses.try_send(Err(status)) {
         let responses = responses.clone();
@@ -400,7 +402,7 @@ fn end_stream<R: Send + 'static>(responses: &ResponseSender<R>, status: Status) 
     }
 }
 
-/// Waits for a stream that asks to resume the session. Never resolves without a lease.
+/// Waits for a stream's request to resume the session. Without a lease it never resolves.
 async fn resume_request<R>(lease: &mut Option<ActiveLease<R>>) -> ResumeRequest<R> {
     if let Some(lease) = lease
         && let Some(ask) = lease.grant.resume_requests.recv().await
@@ -410,7 +412,7 @@ async fn resume_request<R>(lease: &mut Option<ActiveLease<R>>) -> ResumeRequest<
     std::future::pending().await
 }
 
-/// Waits for the stream that was accepted. Never resolves if there is none.
+/// Waits for the stream whose resume request was accepted. Without such a stream it never resolves.
 async fn arrival<R>(resuming: &mut Option<Resuming<R>>) -> Result<ResumingStream<R>, oneshot::error::RecvError> {
     match resuming {
         Some(resuming) => resuming.await,

@@ -1,4 +1,4 @@
-//! Why a stream is not admitted, or ends.
+//! Reasons for not admitting a session's stream, or for ending it.
 
 use super::lease;
 use crate::server::{
@@ -8,44 +8,44 @@ use crate::server::{
     transport,
 };
 
-/// An error of a session's transport: the session's own, or one of the layers below.
+/// An error of a session: its own, or an error of a layer below.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The token was revoked, is at its quota, or steps too fast.
+    /// The token was revoked, its quota is used up, or its rate does not allow the request.
     #[error(transparent)]
     Auth(#[from] auth::Error),
-    /// The transport refuses a message.
+    /// The transport refused a message.
     #[error(transparent)]
     Transport(#[from] transport::Error),
     /// A session cannot be resumed, or another stream has resumed it.
     #[error(transparent)]
     Lease(#[from] lease::Error),
-    /// The system has no random bits for the name of a lease.
+    /// The operating system has no random bits for the name of a lease.
     #[error(transparent)]
     NoRandomness(#[from] NoRandomness),
-    /// The server is full of sessions.
+    /// The server has its maximum number of sessions.
     #[error("all of this server's {limit} sessions are in use; close one, or try again later")]
     SessionsFull {
         /// The maximum number of sessions.
         limit: usize,
     },
-    /// A peer has as many sessions as it may have.
+    /// The peer has its maximum number of sessions.
     #[error("all of the {limit} sessions that one machine or user may have here are in use; close one")]
     PeerFull {
         /// The maximum number of sessions of a peer.
         limit: usize,
     },
-    /// The session sent nothing for too long.
+    /// The client sent no request for too long, or did not open the session in time.
     #[error(
         "the session was idle for {seconds} s, or was not opened within this time, the limit of this server; start a new \
          one"
     )]
     Idle {
-        /// The limit.
+        /// The limit that was exceeded, s.
         seconds: u64,
     },
-    /// The server takes no new work.
+    /// The server is shutting down.
     #[error("this server is shutting down; use another, or try again later")]
     Draining,
 }

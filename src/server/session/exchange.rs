@@ -1,4 +1,4 @@
-//! The exchange of requests and replies between a stream and the handler of its session.
+//! Reads a session's requests from its stream and has its handler answer them, with timeouts, rates and charges.
 
 use super::{
     Error,
@@ -22,43 +22,43 @@ use std::{convert::Infallible, sync::Arc, time::Duration};
 use tokio::time::{Instant, timeout};
 use tonic::Status;
 
-/// The ending of the temporary session whose stream went over to a resumed one. It has no line in the access log.
+/// The ending of a session that existed only until its stream resumed another session. The access log omits it.
 pub(super) const MOVED: &str = "moved";
 
-/// The time in which a session's environments must be freed before the end of its stream is sent.
+/// The maximum time to wait for a session's environments to be freed before the end of its stream is sent.
 const MAX_CLOSE_TIME: Duration = Duration::from_secs(10);
-/// The price of a request that is refused before it is decoded, in steps.
+/// The charge for a request that is refused before it is decoded, in steps.
 const UNDECODED_PRICE: u64 = 1;
 
-/// A session's handler, and the requests of the stream that the session has now.
+/// A session's handler, and the reader of the requests of its current stream.
 pub(super) struct Exchange<H: SessionHandler> {
     pub(super) requests: MessageReader,
-    /// The request that was read ahead, while the previous one was being answered.
+    /// A request that was read while the previous request was being answered.
     ahead: Option<Result<Option<Message>, StreamStop>>,
-    /// Whether the present request was read ahead. Its step may have begun then.
+    /// Whether the current request was read ahead. If so, its step may already have started.
     came_ahead: bool,
-    /// Whether requests may be read before the previous one is answered.
+    /// Whether a request may be read before the previous request is answered.
     pub(super) reads_ahead: bool,
     handler: H,
     counts: Arc<RequestCounters>,
-    /// The server's sessions. The session counts as running as long as it holds this view.
+    /// A handle to the server's sessions. The shutdown counts this session as running until the handle is dropped.
     pub(super) sessions: Sessions,
     start: Instant,
-    /// Whether the session was open when it began to wait for the present request.
+    /// Whether the session was open when it began to wait for the current request.
     was_open: bool,
-    /// Last time the session was known to be open. The handshake timeout counts from here, so refused requests do not
-    /// extend it.
+    /// The last time at which the session was known to be open. The handshake timeout counts from here, so refused
+    /// requests do not extend it.
     known_open: Instant,
-    /// The session's steps that its token has been charged for.
+    /// The steps of the session for which its token has been charged so far.
     charged: u64,
-    /// The price of requests that its token has not been charged for, in steps.
+    /// The price of requests for which its token has not been charged yet, in steps.
     price: u64,
-    /// The statistics of the session, once it is closed.
+    /// The final statistics of the session; `None` until it is closed.
     final_stats: Option<SessionStats>,
     awake: AdaptiveSpin,
-    /// The ending that the access log will have, unless it changes before the session ends.
+    /// The reason for the session's end that the access log will state, unless it changes before the end.
     pub(super) ending: &'static str,
-    /// The number of streams that resumed the session.
+    /// The number of times that the session was resumed.
     pub(super) resumed: u32,
     admission: Admission,
 }
@@ -93,8 +93,8 @@ impl<H: SessionHandler> Exchange<H> {
         }
     }
 
-    /// Returns the next request, or `None` after the client has closed the stream. If the future is dropped, no data is
-    /// lost: the next call continues.
+    /// Returns the next request, or `None` after the client has closed the stream. Cancel safe: if the future is
+    /// dropped, the next call continues reading.
     pub(super) async fn request(&mut self) -> Result<Option<Message>, StreamStop<H::Error>> {
         let SessionLimits { handshake, idle, .. } = self.sessions.limits;
         let limits = self.request_limits();
@@ -119,7 +119,7 @@ impl<H: SessionHandler> Exchange<H> {
             return late();
         }
         tokio::select! {
-            biased; // the end comes first: a client that never pauses must not outlast it
+            biased; // the shutdown comes first, so a client that never pauses cannot delay it
             () = self.sessions.drain.closed() => Err(refused(Error::Draining)),
             error = revoked(bearer.as_ref()) => Err(refused(error)),
             request = next => request.map_err(|stop| stop.map(|error| Error::from(error).into())),
@@ -127,7 +127,7 @@ impl<H: SessionHandler> Exchange<H> {
         }
     }
 
-    /// Answers a request. A stream that was admitted only to resume a session ends with its first refusal.
+    /// Answers a request. A stream that was admitted only to resume a session ends at its first refused request.
     pub(super) async fn answer(
         &mut self,
         message: Message,
@@ -145,13 +145,13 @@ impl<H: SessionHandler> Exchange<H> {
         if self.sessions.phase() != ShutdownPhase::Running && !self.handler.is_open() {
             return Err(refused(Error::Draining));
         }
-        // The request's reservation is held until it is answered.
+        // Holds the request's memory reservation until the request is answered.
         let (request, _share) = match message {
             Message::Whole(bytes, share) => (bytes, share),
             Message::Refused(error) => return Ok(self.undecoded(error)),
         };
-        // A client that is ahead of its rate waits before its request is decoded. A request is read ahead only if its
-        // token has no rate, so it does not wait.
+        // A client that exceeds its token's rate waits before its request is decoded. Requests are read ahead only for
+        // tokens without a rate, so such a request need not wait.
         let bearer = self.requests.bearer.clone();
         let was_open = self.handler.is_open();
         if let Err(error) = self.pace(bearer.as_ref().filter(|_| was_open && !self.came_ahead)).await? {
@@ -181,14 +181,14 @@ impl<H: SessionHandler> Exchange<H> {
         let limits = self.request_limits();
         let Self { handler, counts, requests, ahead, .. } = self;
         tokio::select! {
-            biased; // the answer is mostly there at once
+            biased; // in most cases the answer is ready at the first poll
             answer = counts.answer(handler, request) => Ok(answer),
             error = revoked(bearer.as_ref()) => Err(refused(error)),
             never = read_ahead::<H>(requests, ahead, offer, limits) => match never {},
         }
     }
 
-    /// Waits until the token's rate, if it has one, has covered what it was charged for.
+    /// Waits until the token may make another request within its rate. Returns at once if the token has no rate.
     async fn pace(&mut self, bearer: Option<&Bearer>) -> Result<Result<(), auth::Error>, StreamStop<H::Error>> {
         tokio::select! {
             biased;
@@ -198,7 +198,7 @@ impl<H: SessionHandler> Exchange<H> {
         }
     }
 
-    /// Frees the resources of the handler.
+    /// Has the handler free its resources, and keeps the final statistics.
     pub(super) async fn close(&mut self) {
         self.charge();
         self.final_stats = Some(self.handler.stats());
@@ -207,7 +207,7 @@ impl<H: SessionHandler> Exchange<H> {
         }
     }
 
-    /// Counts and charges an answer, and turns an error into its in-band reply.
+    /// Completes a request: charges the token, counts an error, and turns it into its in-band reply.
     pub(super) fn finish(&mut self, answer: Result<Reply<H::Response>, H::Error>) -> Reply<H::Response> {
         self.charge();
         if self.was_open || self.handler.is_open() {
@@ -219,7 +219,7 @@ impl<H: SessionHandler> Exchange<H> {
         })
     }
 
-    /// Records why the session ends. Returns the status of its stream's end, or `None` if the client is gone.
+    /// Records why the session ends. Returns the status that ends its stream, or `None` if the client has gone.
     pub(super) fn end(&mut self, stop: StreamStop<H::Error>) -> Option<Status> {
         match stop {
             StreamStop::Refused(error) => {
@@ -249,7 +249,7 @@ impl<H: SessionHandler> Exchange<H> {
         self.sessions.count(error, self.requests.bearer.as_ref());
     }
 
-    /// Refuses a request that was not decoded.
+    /// Counts and charges a request that is refused before it is decoded. Returns its error.
     fn undecoded<R>(&mut self, error: impl Into<Error>) -> Result<R, H::Error> {
         self.price += UNDECODED_PRICE;
         let error = H::Error::from(error.into());
@@ -257,7 +257,7 @@ impl<H: SessionHandler> Exchange<H> {
         Err(error)
     }
 
-    /// Charges the token for the steps and requests since the last call.
+    /// Charges the token for the steps and requests since the last call of this function.
     fn charge(&mut self) {
         if let Some(bearer) = &self.requests.bearer {
             let steps = self.final_stats.unwrap_or_else(|| self.handler.stats()).steps;
@@ -285,8 +285,8 @@ impl<H: SessionHandler> Drop for Exchange<H> {
     }
 }
 
-/// Reads the next request while another is answered, and offers it to the pool. Never resolves, so that a `select!`
-/// always waits for the answer.
+/// Reads the next request while the current one is being answered, and offers it to the pool. Never resolves, so the
+/// surrounding `select!` ends only with the answer.
 async fn read_ahead<H: SessionHandler>(
     requests: &mut MessageReader,
     ahead: &mut Option<Result<Option<Message>, StreamStop>>,
@@ -305,12 +305,12 @@ async fn read_ahead<H: SessionHandler>(
     std::future::pending().await
 }
 
-/// Ends a session with this error.
+/// Returns a [`StreamStop`] that ends a session with this error.
 pub(super) fn refused<E: From<Error>>(error: impl Into<Error>) -> StreamStop<E> {
     StreamStop::Refused(error.into().into())
 }
 
-/// Resolves when the token is revoked. Never resolves without a token.
+/// Resolves when the token is revoked. If there is no token, never resolves.
 pub(super) async fn revoked(bearer: Option<&Bearer>) -> auth::Error {
     match bearer {
         Some(bearer) => bearer.revoked().await,
@@ -318,7 +318,7 @@ pub(super) async fn revoked(bearer: Option<&Bearer>) -> auth::Error {
     }
 }
 
-/// Resolves when the token's rate allows another step, at once without a token.
+/// Resolves when the token's rate allows another step; immediately if there is no token.
 async fn wait_for_rate(bearer: Option<&Bearer>) -> Result<(), auth::Error> {
     match bearer {
         Some(bearer) => bearer.acquire_steps().await,
@@ -326,7 +326,7 @@ async fn wait_for_rate(bearer: Option<&Bearer>) -> Result<(), auth::Error> {
     }
 }
 
-/// Resolves after `limit`. Never resolves without one.
+/// Resolves after `limit`. If there is no limit, never resolves.
 async fn sleep(limit: Option<Duration>) {
     match limit {
         Some(limit) => tokio::time::sleep(limit).await,

@@ -1,4 +1,4 @@
-//! The trait of handlers, which answer the requests of a session. It is the same for both protocols.
+//! The trait through which the session driver has a protocol answer its requests.
 
 use super::{
     Error,
@@ -12,11 +12,11 @@ use crate::server::{
 };
 use std::future::Future;
 
-/// The effect of a response on the stream that it is sent in.
+/// The effect of a response on the stream on which it is sent.
 pub enum StreamHandover<R> {
-    /// The session has a lease from now on, and outlives the stream.
+    /// Grants the session a lease, so it may outlive the stream.
     Lease(LeaseGuard<R>),
-    /// The stream continues with the session that it resumes.
+    /// Moves the stream to the session that it resumes.
     Resume(ResumeAccepted<R>),
 }
 
@@ -24,34 +24,35 @@ pub enum StreamHandover<R> {
 pub struct Reply<R> {
     /// The response.
     pub response: R,
-    /// The reservation for the response until it is sent; `None` if the session's own reservation covers it.
+    /// The memory reservation for the response, held until it is sent. `None` if memory that the session reserved when
+    /// it was opened covers it.
     pub memory: Option<MemoryReservation>,
     /// The effect of the response on its stream, if it has one.
     pub handover: Option<StreamHandover<R>>,
 }
 
 impl<R> Reply<R> {
-    /// A reply without a reservation and without an effect on its stream.
+    /// Makes a reply without a reservation and without an effect on its stream.
     pub fn new(response: R) -> Self {
         Self { response, memory: None, handover: None }
     }
 }
 
-/// The state of one session, in one protocol. Dropping it frees its resources.
+/// Answers the requests of one session, in one protocol. Dropping it frees the session's resources.
 pub trait SessionHandler: Send + 'static {
-    /// A message of the client.
+    /// The type of the client's messages.
     type Request: prost::Message + Default + 'static;
-    /// A message of the server.
+    /// The type of the server's messages.
     type Response: prost::Message + Clone + 'static;
-    /// Why a request is refused, by the handler or before it.
+    /// The reason for refusing a request, by the handler or before the request reaches it.
     type Error: RequestError + From<Error> + Send;
-    /// The fields of a request whose entries are counted before it is decoded.
+    /// The fields of a request whose entries are counted, and limited, before the request is decoded.
     const FIELDS: &'static [Field];
     /// The protocol's name in logs and metrics.
     const PROTOCOL: &'static str;
     /// The kinds of requests in logs and metrics. The last one is for requests that cannot be decoded.
     const KINDS: &'static [&'static str];
-    /// Whether a request resumes another session; `None` in a protocol without leases.
+    /// Tells whether a request resumes another session. `None` in a protocol without leases.
     const RESUMES: Option<fn(&Self::Request) -> bool>;
 
     /// The kind of a request, one of [`KINDS`](Self::KINDS).
@@ -60,31 +61,32 @@ pub trait SessionHandler: Send + 'static {
     /// The size limits of the next request.
     fn request_limits(&self) -> RequestLimits;
 
-    /// Whether a shutdown should wait for the session.
+    /// Whether the client has opened the session. Only an open session may continue during a shutdown.
     fn is_open(&self) -> bool;
 
-    /// The environment of the session, and its steps so far.
+    /// Returns the session's environment, its number of environments, and its steps so far.
     fn stats(&self) -> SessionStats;
 
-    /// The price of a request besides that of its steps, in steps of an environment. A token's rate counts both.
+    /// The price of a request, in steps of one environment, in addition to the steps that it runs. A token's rate
+    /// limits both.
     fn price(&self, request: &Self::Request) -> u64;
 
-    /// Frees the session's resources. Resolves when they are free, so that another session like it has room.
+    /// Frees the session's resources. Resolves when they are free for other sessions.
     fn close(&mut self) -> impl Future<Output = ()> + Send;
 
     /// Answers a request.
     ///
     /// # Errors
-    /// If the request is refused. The session stays open.
+    /// The reason, if the request is refused. The session stays open.
     fn answer(
         &mut self,
         request: Self::Request,
     ) -> impl Future<Output = Result<Reply<Self::Response>, Self::Error>> + Send;
 
     /// Returns a function that offers the next request to the pool while `request` runs, or `None` if the next request
-    /// must wait. If the caller offers a request, it must answer that request next.
+    /// must wait. A request that was passed to this function must be the next one that the handler answers.
     fn pipeline(&self, request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<Self>>;
 
-    /// The response to a request that is refused.
+    /// Makes the response to a refused request.
     fn error_response(error: Self::Error) -> Self::Response;
 }

@@ -1,4 +1,4 @@
-//! Spans and counts of requests.
+//! Counts the requests of each kind, and traces each request in a span.
 
 use super::handler::{Reply, SessionHandler};
 use crate::server::error::RequestError;
@@ -11,16 +11,16 @@ use std::{
 };
 use tracing::Instrument;
 
-/// Requests of one kind since the server began.
+/// The number of requests of one kind since the server started.
 #[derive(Default)]
 pub struct RequestCount {
-    /// Requests that were answered, the refused ones included.
+    /// The number of answered requests, including refused requests.
     pub answered: AtomicU64,
-    /// Requests that were refused.
+    /// The number of refused requests.
     pub refused: AtomicU64,
 }
 
-/// The requests of a protocol, by kind.
+/// Counts the requests of a protocol by kind.
 pub struct RequestCounters(Vec<(&'static str, RequestCount)>);
 
 impl RequestCounters {
@@ -34,7 +34,7 @@ impl RequestCounters {
         self.0.iter()
     }
 
-    /// Has a handler answer a request, in a span of its own, and counts it.
+    /// Has `handler` answer a request in a tracing span, and counts the request.
     pub(super) async fn answer<H: SessionHandler>(
         &self,
         handler: &mut H,

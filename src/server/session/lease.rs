@@ -1,8 +1,8 @@
-//! Leases: sessions that outlive the loss of their stream for a while, and continue in another.
+//! Leases: a session with a lease outlives the loss of its stream for a while, and continues on another stream.
 //!
-//! - This module: the leases of a server, and how a new stream asks for one.
-//! - [`replay_buffer`](super::replay_buffer): replies that may not have been received.
-//! - The `driver` module runs sessions with and without a lease, and waits for their streams.
+//! - This module: a server's leases, and the requests with which a new stream resumes a session.
+//! - [`replay_buffer`](super::replay_buffer): stores replies that the client may not have received.
+//! - The `driver` module runs sessions with and without a lease, and waits for new streams.
 
 use crate::server::{
     auth::Bearer,
@@ -25,7 +25,7 @@ use tokio::{
 };
 use tonic::Status;
 
-/// The maximum number of stored replies of a session with a lease. It also limits the unanswered requests.
+/// The maximum number of stored replies of a session with a lease. A client may not have more unanswered requests.
 pub const MAX_STORED_REPLIES: u32 = 64;
 
 /// Why a session cannot be resumed.
@@ -38,14 +38,14 @@ pub enum Error {
     /// The session belongs to another token.
     #[error("the session was opened with another token; show the one that it was opened with, or open another session")]
     OtherToken,
-    /// The client names a reply that was never sent.
+    /// The client claims to have received a reply that was never sent.
     #[error(
         "last_reply is {got}, but {last} is the last reply so far; opened is 0, and each response after it one more"
     )]
     NoReply {
-        /// The number that came.
+        /// The `last_reply` of the client.
         got: u64,
-        /// The last one.
+        /// The number of the session's last reply.
         last: u64,
     },
     /// Some replies after `got` are no longer stored.
@@ -54,7 +54,7 @@ pub enum Error {
          wait, or there was no memory for them; open another session"
     )]
     Forgotten {
-        /// The number that came.
+        /// The `last_reply` of the client.
         got: u64,
         /// The smallest `last_reply` from which the session can be resumed.
         first: u64,
@@ -76,18 +76,18 @@ impl RequestError for Error {
     }
 }
 
-/// A response on its way to a stream.
+/// A response with its memory reservation, to be sent on a stream.
 pub struct OutgoingResponse<R> {
     /// The response.
     pub response: R,
-    /// The reservation for the response until it is sent.
+    /// The memory reservation for the response, held until the response is sent.
     pub memory: Option<MemoryReservation>,
 }
 
-/// Sends responses to a stream, or the status that ends it.
+/// Sends responses, or the status that ends the stream, to a client's stream.
 pub type ResponseSender<R> = mpsc::Sender<Result<OutgoingResponse<R>, Status>>;
 
-/// The leases of a server's sessions of one protocol, whose responses are `R`.
+/// All leases of a server's sessions in one protocol. `R` is the protocol's response.
 pub struct Leases<R>(Arc<LeaseRegistry<R>>);
 
 impl<R> Clone for Leases<R> {
@@ -102,14 +102,14 @@ struct LeaseRegistry<R> {
     leases: Mutex<Vec<LeaseEntry<R>>>,
 }
 
-/// A lease that a session holds.
+/// A session's lease in the registry.
 struct LeaseEntry<R> {
     name: Id,
     bearer: Option<Bearer>,
     resume_requests: mpsc::Sender<ResumeRequest<R>>,
 }
 
-/// Counters of leases.
+/// Counts leases, sessions without a stream, and resumed sessions.
 #[derive(Clone, Default)]
 pub struct LeaseCounters(Arc<LeaseCounts>);
 
@@ -122,28 +122,29 @@ struct LeaseCounts {
 }
 
 impl LeaseCounters {
-    /// Sessions without a stream now.
+    /// The number of sessions that have no stream now.
     pub fn detached(&self) -> usize {
         self.0.detached.load(Ordering::Relaxed)
     }
 
-    /// The number of times that a session was resumed so far.
+    /// The number of times that sessions were resumed since the server started.
     pub fn resumed(&self) -> u64 {
         self.0.resumed.load(Ordering::Relaxed)
     }
 
-    /// Counts a session that was resumed.
+    /// Counts one more resumed session.
     pub fn add_resumed(&self) {
         self.0.resumed.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Counts a session that has no stream, until the guard is dropped.
+    /// Counts a session as having no stream until the guard is dropped.
     pub fn detach(&self) -> CountGuard {
         self.0.detached.fetch_add(1, Ordering::Relaxed);
         CountGuard { counters: self.clone(), counter: |counts| &counts.detached }
     }
 
-    /// Admits one stream over the limit for resuming only. There are at most as many as leases.
+    /// Admits one stream above the session limit, for resuming only. Returns `None` if there are already as many such
+    /// streams as leases.
     pub fn admit_resuming(&self) -> Option<CountGuard> {
         let held = self.0.held.load(Ordering::Relaxed);
         let taken = |spares: usize| (spares < held).then_some(spares + 1);
@@ -152,7 +153,7 @@ impl LeaseCounters {
     }
 }
 
-/// Counts one until it is dropped.
+/// Keeps one counter of [`LeaseCounters`] raised by one until it is dropped.
 pub struct CountGuard {
     counters: LeaseCounters,
     counter: fn(&LeaseCounts) -> &AtomicUsize,
@@ -164,71 +165,72 @@ impl Drop for CountGuard {
     }
 }
 
-/// A stream's request to resume a session.
+/// A new stream's request to resume a session.
 pub struct ResumeRequest<R> {
-    /// The number of the last reply that its client received.
+    /// The number of the last reply that the client received.
     pub last_reply: u64,
-    /// The sender for the answer of the session.
+    /// The channel for the session's answer.
     pub answer: oneshot::Sender<Result<ResumeAccepted<R>, Error>>,
 }
 
-/// The positive answer to a stream that resumes a session.
+/// A session's positive answer to a [`ResumeRequest`].
 pub struct ResumeAccepted<R> {
     /// The number of the session's last reply.
     pub last_reply: u64,
-    /// The sender by which the stream goes to the session.
+    /// The channel over which the new stream is passed to the session.
     pub stream: oneshot::Sender<ResumingStream<R>>,
 }
 
-/// A stream that resumes a session.
+/// A new stream, passed to the session that it resumes.
 pub struct ResumingStream<R> {
-    /// The requests of the stream.
+    /// The reader of the stream's requests.
     pub requests: MessageReader,
-    /// The sender of its responses.
+    /// The sender for responses to the stream.
     pub responses: ResponseSender<R>,
-    /// The view of the shutdown of the stream's thread.
+    /// The handle with which the stream's transport thread observes the shutdown.
     pub drain: Drain,
-    /// The runtime of the stream's thread, on which the session goes on.
+    /// The runtime of the stream's transport thread. The session continues on it.
     pub runtime: Handle,
 }
 
-/// A session's lease, until it is dropped.
+/// A session's lease. It ends when this is dropped.
 pub struct LeaseGuard<R> {
     leases: Leases<R>,
-    /// The name of the session.
+    /// The random name with which a client resumes the session.
     pub name: Id,
-    /// The maximum number of unanswered requests of its client.
+    /// The maximum number of unanswered requests of the session's client.
     pub max_unanswered: usize,
-    /// The streams that ask to resume the session.
+    /// The requests of new streams to resume the session.
     pub resume_requests: mpsc::Receiver<ResumeRequest<R>>,
 }
 
 impl<R> Leases<R> {
-    /// No leases yet. Each holds for `time` without a stream.
+    /// Makes an empty registry. A session without a stream keeps its lease for `time`.
     pub fn new(time: Duration, counters: LeaseCounters) -> Self {
         Self(Arc::new(LeaseRegistry { time, counters, leases: Mutex::default() }))
     }
 
-    /// Grants a session a lease, unless leases are switched off.
+    /// Grants a lease to the session of this token. Returns `None` if leases are switched off.
     ///
     /// # Errors
-    /// [`NoRandomness`].
+    /// [`NoRandomness`], if the operating system has no random bits for the lease's name.
     pub fn grant(&self, bearer: Option<Bearer>, max_unanswered: usize) -> Result<Option<LeaseGuard<R>>, NoRandomness> {
         if self.0.time.is_zero() {
             return Ok(None);
         }
         let name = random()?;
-        // The session answers one of them at a time.
+        // One place is enough: the session answers one resume request at a time.
         let (sender, resume_requests) = mpsc::channel(1);
         self.lock().push(LeaseEntry { name, bearer, resume_requests: sender });
         self.0.counters.0.held.fetch_add(1, Ordering::Relaxed);
         Ok(Some(LeaseGuard { leases: self.clone(), name, max_unanswered, resume_requests }))
     }
 
-    /// Asks to resume the session of this name, for a client that received replies up to a number.
+    /// Sends a resume request to the session whose lease has this name. `last_reply` is the number of the last reply
+    /// that the client received.
     ///
     /// # Errors
-    /// [`Error`].
+    /// [`Error`], if there is no such session, or it cannot be resumed from that reply.
     pub async fn resume(
         &self,
         name: &[u8],
@@ -243,12 +245,13 @@ impl<R> Leases<R> {
 
     fn find(&self, name: &[u8], bearer: Option<&Bearer>) -> Result<mpsc::Sender<ResumeRequest<R>>, Error> {
         let leases = self.lock();
-        // Every lease is compared, each in constant time, so that the time does not reveal a name.
+        // Compares all leases, each in constant time, so that response times do not help to guess a name.
         let found = leases
             .iter()
             .fold(None, |found, lease| if lease.name[..].ct_eq(name).into() { Some(lease) } else { found });
         let LeaseEntry { bearer: own, resume_requests, .. } = found.ok_or(Error::Unknown)?;
-        // The names are enough: a revoked token loses its sessions, so a new token of the same name finds none.
+        // Comparing the tokens' names is enough: a revoked token loses its sessions, so a new token of the same name
+        // cannot inherit any.
         if own.as_ref().map(|own| own.name()) != bearer.map(|bearer| bearer.name()) {
             return Err(Error::OtherToken);
         }
@@ -261,12 +264,12 @@ impl<R> Leases<R> {
 }
 
 impl<R> LeaseGuard<R> {
-    /// The time that the lease holds without a stream.
+    /// The time for which the session may be without a stream before the lease expires.
     pub fn time(&self) -> Duration {
         self.leases.0.time
     }
 
-    /// Counters of leases.
+    /// The counters that include this lease.
     pub fn counters(&self) -> &LeaseCounters {
         &self.leases.0.counters
     }

@@ -1,4 +1,4 @@
-//! Sessions: one response for each request, in order, and leases that outlive a stream.
+//! Sessions: each request gets one response, in order. A leased session survives the loss of its stream.
 
 pub mod admission;
 pub mod driver;

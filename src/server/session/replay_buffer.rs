@@ -1,9 +1,9 @@
-//! The last replies of a session, which are stored by number until its client must have received them.
+//! Stores a session's numbered replies until its client must have received them.
 
 use super::lease::Error;
 use std::collections::VecDeque;
 
-/// The last few replies of a session. Replies are numbered 1, 2, 3, …
+/// The last replies of a session, numbered 1, 2, 3, …
 pub struct ReplayBuffer<R> {
     last: u64,
     max_unanswered: usize,
@@ -11,7 +11,7 @@ pub struct ReplayBuffer<R> {
 }
 
 impl<R> ReplayBuffer<R> {
-    /// An empty buffer. The client has at most `max_unanswered` unanswered requests, at least 1.
+    /// Makes an empty buffer. `max_unanswered`, at least 1, is the maximum number of unanswered requests of the client.
     pub fn new(max_unanswered: usize) -> Self {
         Self { last: 0, max_unanswered, replies: VecDeque::new() }
     }
@@ -21,8 +21,8 @@ impl<R> ReplayBuffer<R> {
         self.last
     }
 
-    /// Records a request. At most `max_unanswered` are unanswered, so the client has received all earlier replies,
-    /// which are dropped.
+    /// Records that a request arrived, and drops replies that the client has received: with this request, at most
+    /// `max_unanswered` requests are unanswered.
     pub fn on_request(&mut self) {
         let received = (self.replies.len() + 1).saturating_sub(self.max_unanswered);
         self.replies.drain(..received);
@@ -34,12 +34,12 @@ impl<R> ReplayBuffer<R> {
         self.replies.push_back(reply);
     }
 
-    /// The stored replies.
+    /// Iterates over the stored replies, oldest first.
     pub fn replies(&self) -> impl Iterator<Item = &R> {
         self.replies.iter()
     }
 
-    /// Mutable access to the stored replies.
+    /// Iterates mutably over the stored replies, oldest first.
     pub fn replies_mut(&mut self) -> impl Iterator<Item = &mut R> {
         self.replies.iter_mut()
     }
@@ -49,10 +49,10 @@ impl<R> ReplayBuffer<R> {
         self.replies.clear();
     }
 
-    /// Checks that all replies after this number are stored.
+    /// Checks that all replies after number `number` are stored.
     ///
     /// # Errors
-    /// [`Error::NoReply`], [`Error::Forgotten`].
+    /// [`Error::NoReply`] if that reply was never sent, [`Error::Forgotten`] if a later reply has been dropped.
     pub fn check(&self, number: u64) -> Result<(), Error> {
         let (last, first) = (self.last, self.last - self.replies.len() as u64);
         if number > last {
@@ -64,7 +64,7 @@ impl<R> ReplayBuffer<R> {
         Ok(())
     }
 
-    /// The reply of this number, if it is stored.
+    /// Returns the reply with this number, if it is stored.
     pub fn get_mut(&mut self, number: u64) -> Option<&mut R> {
         let behind = usize::try_from(self.last.checked_sub(number)?).ok()?;
         let place = self.replies.len().checked_sub(behind + 1)?;
@@ -86,7 +86,11 @@ mod tests {
         assert_eq!(kept.check(2), Err(Error::NoReply { got: 2, last: 1 }));
         kept.on_request();
         assert_eq!(kept.check(0), Err(Error::Forgotten { got: 0, first: 1 }));
-        assert_eq!((kept.check(1), kept.get_mut(1)), (Ok(()), None), "that one was received, and is not wanted");
+        assert_eq!(
+            (kept.check(1), kept.get_mut(1)),
+            (Ok(()), None),
+            "the client has received reply 1, so it is not stored"
+        );
         kept.push_reply('b');
         assert_eq!([1, 2, 3].map(|number| kept.get_mut(number).copied()), [None, Some('b'), None]);
         kept.clear();

@@ -1,5 +1,5 @@
-//! The memory budget for bytes in flight: requests, replies, pictures and policies of all sessions. A token may have a
-//! quota of it.
+//! The memory budget for bytes in flight: the requests, replies, pictures and policies of all sessions. A token may
+//! have a quota of these bytes.
 
 use super::Error;
 use crate::server::auth::{Bearer, QuotaGuard, Token};
@@ -9,7 +9,8 @@ use std::sync::{
     atomic::{AtomicUsize, Ordering},
 };
 
-/// A handle to the memory budget. Reservations made through it also count against the token's quota.
+/// A handle to the server's memory budget. Reservations made through it also count against the quota of its token, if
+/// it has one.
 #[derive(Clone)]
 pub struct Budget {
     state: Arc<BudgetCounter>,
@@ -22,27 +23,27 @@ struct BudgetCounter {
 }
 
 impl Budget {
-    /// A budget of `limit` bytes, without a token.
+    /// Makes a budget of `limit` bytes, and a handle to it without a token.
     pub fn new(limit: usize) -> Self {
         Self { state: Arc::new(BudgetCounter { used: AtomicUsize::new(0), limit }), bearer: None }
     }
 
-    /// A handle to the same budget, whose reservations also count against this token's quota.
+    /// Returns a handle to the same budget whose reservations also count against this token's quota.
     pub fn for_token(&self, bearer: Option<Bearer>) -> Self {
         Self { state: Arc::clone(&self.state), bearer }
     }
 
-    /// Bytes in flight.
+    /// The number of reserved bytes.
     pub fn used(&self) -> usize {
         self.state.used.load(Ordering::Relaxed)
     }
 
-    /// The limit of bytes in flight.
+    /// The maximum number of reserved bytes.
     pub fn limit(&self) -> usize {
         self.state.limit
     }
 
-    /// Returns an empty reservation, which can grow.
+    /// Returns an empty reservation, which [`grow`](MemoryReservation::grow) can enlarge.
     pub fn empty(&self) -> MemoryReservation {
         MemoryReservation {
             state: Arc::clone(&self.state),
@@ -51,10 +52,10 @@ impl Budget {
         }
     }
 
-    /// Reserves bytes, until the reservation is dropped.
+    /// Reserves `bytes` until the returned reservation is dropped.
     ///
     /// # Errors
-    /// [`Error::MemoryFull`], [`Error::Auth`].
+    /// [`Error::MemoryFull`] if the budget has no room, [`Error::Auth`] if the token's quota has none.
     pub fn reserve(&self, bytes: usize) -> Result<MemoryReservation, Error> {
         let mut share = self.empty();
         share.grow(bytes)?;
@@ -62,24 +63,25 @@ impl Budget {
     }
 }
 
-/// A part of the memory budget.
+/// Reserved bytes of the memory budget. Dropping it releases them.
 pub struct MemoryReservation {
     state: Arc<BudgetCounter>,
     bytes: usize,
-    /// The same bytes as a part of the token's quota, if there is a token.
+    /// The part of the token's quota for these bytes, if there is a token.
     held: Option<QuotaGuard>,
 }
 
 impl MemoryReservation {
-    /// The reserved bytes.
+    /// The number of bytes that this reservation holds.
     pub fn bytes(&self) -> usize {
         self.bytes
     }
 
-    /// Reserves more bytes.
+    /// Reserves `bytes` more.
     ///
     /// # Errors
-    /// [`Error::MemoryFull`], [`Error::Auth`]; the reservation is unchanged then.
+    /// [`Error::MemoryFull`] if the budget has no room, [`Error::Auth`] if the token's quota has none. The reservation
+    /// is unchanged then.
     pub fn grow(&mut self, bytes: usize) -> Result<(), Error> {
         if bytes == 0 {
             return Ok(());
@@ -101,7 +103,8 @@ impl MemoryReservation {
         }
     }
 
-    /// Sets the reservation to the final length, even if it exceeds the budget.
+    /// Changes the reservation to `bytes`, even if that exceeds the budget. Call it when a reply's final length is
+    /// known.
     pub fn resize(&mut self, bytes: usize) {
         if let Some(held) = &mut self.held {
             held.set(bytes);
@@ -118,18 +121,19 @@ impl Drop for MemoryReservation {
     }
 }
 
-/// Reservations of replies that are about to be sent. The transport attaches them to the bytes of the replies.
+/// A queue of the reservations of replies that are about to be sent. The transport attaches them to the replies' bytes.
 #[derive(Clone, Default)]
 pub struct PendingReservations(Arc<Mutex<Vec<MemoryReservation>>>);
 
 impl PendingReservations {
-    /// Adds the reservation of a reply.
+    /// Queues the reservation of a reply.
     pub fn push(&self, share: MemoryReservation) {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).push(share);
     }
 
-    /// Attaches the queued reservations, and the value that `hold` returns, to the bytes of a reply. They are held
-    /// until the last of the bytes is written or dropped. Without reservations the bytes are returned unchanged.
+    /// Attaches all queued reservations, and the value that `hold` returns, to the bytes of a reply. They are released
+    /// when the last of the bytes has been written or dropped. If no reservation is queued, returns the bytes
+    /// unchanged.
     pub fn attach<H: Send + 'static>(&self, bytes: Bytes, hold: impl FnOnce() -> H) -> Bytes {
         let shares = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
         if shares.is_empty() { bytes } else { Bytes::from_owner(ReservedBytes { bytes, _held: (shares, hold()) }) }

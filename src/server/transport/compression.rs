@@ -1,4 +1,4 @@
-//! Messages that a client compresses, as gRPC allows.
+//! Decompression of messages that a client has compressed with gRPC's message compression.
 
 use flate2::bufread::{GzDecoder, ZlibDecoder};
 use std::{
@@ -7,24 +7,26 @@ use std::{
 };
 use tonic::codegen::http::HeaderMap;
 
-/// The header of a call that names the compression of its messages.
+/// The HTTP header of a call that names the compression of its messages.
 const ENCODING_HEADER: &str = "grpc-encoding";
-/// The maximum number of compressed bytes that a part reads, so that input without output takes little time too.
+/// The maximum number of compressed bytes that one call of `append_part` reads. It bounds the call's time even for
+/// input that decompresses to nothing.
 const COMPRESSED_PART_BYTES: usize = 4 << 10;
-/// The maximum number of decompressed bytes of a part.
+/// The maximum number of bytes that one call of `append_part` appends.
 const DECOMPRESSED_PART_BYTES: usize = 64 << 10;
 
-/// A compression that the server reads. Its replies are never compressed.
+/// A compression that the server accepts in requests. Replies are never compressed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Compression {
     /// `gzip`.
     Gzip,
-    /// `deflate`, which is zlib's format in gRPC.
+    /// `deflate`, which in gRPC means the zlib format.
     Deflate,
 }
 
 impl Compression {
-    /// Returns the compression of a call's messages, or `None` if they may not be compressed. tonic refuses other names.
+    /// Returns the compression that a call's headers announce, or `None` if its messages may not be compressed. tonic
+    /// refuses other compressions.
     pub(super) fn from_headers(headers: &HeaderMap) -> Option<Self> {
         match headers.get(ENCODING_HEADER)?.as_bytes() {
             b"gzip" => Some(Self::Gzip),
@@ -33,7 +35,7 @@ impl Compression {
         }
     }
 
-    /// Returns a decompressor of a compressed message.
+    /// Returns a decompressor for a compressed message.
     pub(super) fn decompressor(self, compressed: &[u8]) -> Decompressor<'_> {
         let input = PartialInput { bytes: compressed, left: 0 };
         match self {
@@ -52,17 +54,17 @@ impl fmt::Display for Compression {
     }
 }
 
-/// Decompresses a message in parts that take little time each.
+/// Decompresses a message in small parts, so that the caller can let other tasks run in between.
 pub(super) enum Decompressor<'a> {
     Gzip(GzDecoder<PartialInput<'a>>),
     Deflate(ZlibDecoder<PartialInput<'a>>),
 }
 
 impl Decompressor<'_> {
-    /// Appends the next part to `bytes`. Returns whether there may be more.
+    /// Decompresses the next part and appends it to `bytes`. Returns whether there may be more.
     ///
     /// # Errors
-    /// The message is not of the compression.
+    /// If the message is not valid in this compression.
     pub(super) fn append_part(&mut self, bytes: &mut Vec<u8>) -> io::Result<bool> {
         let limit = DECOMPRESSED_PART_BYTES as u64;
         let read = match self {
@@ -83,7 +85,7 @@ impl Decompressor<'_> {
     }
 }
 
-/// Bytes of which only the next `left` can be read.
+/// A reader of `bytes` that stops with `WouldBlock` after the next `left` bytes.
 pub(super) struct PartialInput<'a> {
     bytes: &'a [u8],
     left: usize,
@@ -117,7 +119,7 @@ mod tests {
     use flate2::{Compression as Level, write::GzEncoder};
     use std::io::Write;
 
-    /// Decompresses a message, and returns it with the number of its parts.
+    /// Decompresses a message. Returns it with the number of calls of `append_part`.
     fn parts(compression: Compression, compressed: &[u8]) -> io::Result<(Vec<u8>, usize)> {
         let (mut decoder, mut bytes, mut n) = (compression.decompressor(compressed), Vec::new(), 1);
         while decoder.append_part(&mut bytes)? {

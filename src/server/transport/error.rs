@@ -1,18 +1,18 @@
-//! Why a message is refused.
+//! Reasons for refusing a message.
 
 use crate::server::{
     auth,
     error::{ErrorKind, InvalidValue, RequestError},
 };
 
-/// An error of a message, or of the memory that it takes.
+/// A message is too large, incomplete or malformed, or there is no memory for it.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
     /// The token's quota of bytes in flight is used up.
     #[error(transparent)]
     Auth(#[from] auth::Error),
-    /// A field has too many entries, or an entry that cannot be decoded.
+    /// A field has too many entries, or cannot be decoded.
     #[error(transparent)]
     Value(#[from] InvalidValue),
     /// The budget of bytes in flight is used up.
@@ -23,12 +23,12 @@ pub enum Error {
     MemoryFull {
         /// The bytes that were requested.
         wanted: usize,
-        /// The bytes that are in use.
+        /// The bytes that were reserved already.
         used: usize,
         /// The limit of the budget, bytes.
         limit: usize,
     },
-    /// The rest of a message did not arrive in time.
+    /// The rest of a message did not arrive within the timeout.
     #[error(
         "a message is incomplete: no byte of it came for {seconds} s, or it came at less than {rate} bytes a second; send \
          each message without pauses"
@@ -39,20 +39,21 @@ pub enum Error {
         /// The minimum average rate of a message, bytes per second.
         rate: usize,
     },
-    /// A compressed message is larger than its stream may send now.
+    /// A compressed message has more bytes, when decompressed, than the limit that applies to its stream at this
+    /// moment.
     #[error(
         "a compressed message has more than {limit} bytes when it is decompressed; at most {limit} are read here now"
     )]
     DecompressedTooLarge {
-        /// The most there may be.
+        /// The maximum length after decompression, bytes.
         limit: usize,
     },
     /// A message is longer than the limit that applies to its stream at this moment.
     #[error("a message of {got} bytes came; at most {limit} are read here now")]
     TooLarge {
-        /// The length in bytes.
+        /// The length of the message, bytes.
         got: usize,
-        /// The maximum length in bytes.
+        /// The maximum length, bytes.
         limit: usize,
     },
 }

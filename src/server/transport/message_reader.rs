@@ -1,9 +1,8 @@
-//! Reads gRPC's frames. The length of each message is checked against its stream's present limit before any of its
-//! bytes are stored.
+//! Reads the length-prefixed messages of a gRPC stream. Each message's length is checked against the limit that applies
+//! to its stream at this moment, before any of its bytes are stored.
 //!
-//! tonic has one limit for all messages of a service, and decodes them on the transport's thread. So
-//! [`raw_body`](super::raw_body) withholds the request bodies of both protocols' streams from tonic, and they are read
-//! here.
+//! tonic has only one limit for all messages of a service, and decodes them on the transport thread. Therefore
+//! [`raw_body`](super::raw_body) withholds the request bodies of sessions from tonic, and this module reads them.
 
 use super::{
     Error,
@@ -21,15 +20,15 @@ use tokio::{
 };
 use tonic::{Code, Status, body::Body};
 
-/// The length of a message's header: a flag and a length.
+/// The length of the header of a gRPC message: a flag of one byte and a length of four bytes.
 const HEADER_BYTES: usize = 5;
-/// The number of a message's first bytes that do not count against the memory budget, so that every stream may send a
-/// small message.
+/// The number of bytes at the start of each message that do not count against the memory budget, so every stream may
+/// send a small message.
 const UNBUDGETED_BYTES: usize = 64 << 10;
-/// The minimum average rate of a message, bytes per second. A message may take [`StreamLimits::limit`] longer than at
-/// this rate.
+/// The minimum average rate at which a message must arrive, bytes per second. A message may take
+/// [`StreamLimits::limit`] longer than it takes at this rate.
 const MIN_BYTES_PER_SECOND: usize = 64 << 10;
-/// A message of at least this length gets an allocation of its own.
+/// A message of at least this length, in bytes, gets an allocation of its own.
 const OWN_BUFFER_MIN_BYTES: usize = 1 << 20;
 
 /// The memory budget and the timeouts of a stream.
@@ -37,63 +36,65 @@ const OWN_BUFFER_MIN_BYTES: usize = 1 << 20;
 pub struct StreamLimits {
     /// The memory budget of the stream.
     pub budget: Budget,
-    /// The time that a client may leave a message unfinished, or a reply unread.
+    /// The maximum pause within an incomplete message, and the maximum time that a client may leave a reply unread;
+    /// `None` for no limit.
     pub limit: Option<Duration>,
-    /// The time that a client may leave the first reply unread.
+    /// The maximum time that a client may leave the first reply unread.
     pub handshake: Duration,
 }
 
-/// Reads the messages of a request's body.
+/// Reads the gRPC messages of a stream from the body of its HTTP request.
 pub struct MessageReader {
     body: Body,
-    /// The compression of messages that say that they are compressed.
+    /// The compression of those messages whose header says that they are compressed.
     compression: Option<Compression>,
-    /// The bytes that have arrived and were not returned yet.
+    /// The bytes that have arrived and are not yet part of a returned message.
     buffer: BytesMut,
     message: Option<PartialMessage>,
-    /// The deadline of the partly read message.
+    /// The deadline for the end of the partly read message.
     due: Option<Instant>,
-    /// The reservation of the partly read message.
+    /// The memory reservation of the partly read message.
     share: MemoryReservation,
     transit: StreamLimits,
-    /// The connection of the stream.
+    /// The connection of the stream, if it is known.
     pub connection: Option<Connection>,
-    /// The token of the call.
+    /// The token of the call; `None` if the server requires none.
     pub bearer: Option<Bearer>,
-    /// The reservations of the stream's replies.
+    /// The queue for memory reservations of the stream's replies.
     pub outbox: PendingReservations,
 }
 
-/// A partly read message.
+/// The state of a message whose header has been read.
 enum PartialMessage {
-    /// The length of the message.
+    /// An uncompressed message of this length, bytes.
     Wanted(usize),
-    /// The length of the compressed message, and its compression.
+    /// A compressed message: its compressed length in bytes, and its compression.
     Compressed(usize, Compression),
-    /// The budget has no room for the message. Has the number of its bytes that are yet to arrive and to be discarded.
+    /// A message for which the memory budget has no room: the number of its bytes that are still to arrive and to be
+    /// discarded, and the error.
     Refused(usize, Error),
 }
 
-/// A message.
+/// A message that has arrived completely.
 pub enum Message {
-    /// The bytes of the message, with their reservation.
+    /// The bytes of the message, with their memory reservation.
     Whole(Bytes, MemoryReservation),
-    /// The budget has no room for the message, which was discarded.
+    /// The message was discarded, because the memory budget had no room for it.
     Refused(Error),
 }
 
-/// Why a stream ends before its client has closed it.
+/// Why the server stops reading a stream that its client has not closed.
 pub enum StreamStop<E = Error> {
-    /// The server refuses further requests, with this error.
+    /// The server ends the stream with this error.
     Refused(E),
-    /// The bytes cannot be decoded, the connection broke, or the server has a defect.
+    /// The bytes cannot be decoded, the connection failed, or the server has a defect.
     Broken(Status),
-    /// The client or a proxy has reset the stream, or its connection has gone silent.
+    /// The client or a proxy has cancelled the stream, or its connection did not answer keepalives.
     Cancelled,
 }
 
 impl<E> StreamStop<E> {
-    /// Converts the error.
+    /// Converts the error of [`StreamStop::Refused`], and leaves other variants unchanged.
     pub fn map<F>(self, error: impl FnOnce(E) -> F) -> StreamStop<F> {
         match self {
             Self::Refused(refused) => StreamStop::Refused(error(refused)),
@@ -110,7 +111,7 @@ impl<E> From<Status> for StreamStop<E> {
 }
 
 impl MessageReader {
-    /// The messages of this body.
+    /// Makes a reader of the messages of `body`.
     pub(super) fn new(
         body: Body,
         compression: Option<Compression>,
@@ -138,7 +139,7 @@ impl MessageReader {
         &self.transit.budget
     }
 
-    /// Moves the reader out and leaves an exhausted one behind.
+    /// Moves the reader out and leaves a reader without messages in its place.
     pub fn detach(&mut self) -> Self {
         let (connection, bearer) = (self.connection.clone(), self.bearer.clone());
         let outbox = PendingReservations::default();
@@ -146,11 +147,11 @@ impl MessageReader {
         std::mem::replace(self, left)
     }
 
-    /// Returns the next message, or `None` after the client has closed the stream. If the future is dropped, no data is
-    /// lost: the next call continues.
+    /// Returns the next message, or `None` after the client has closed the stream. Cancel safe: if the future is
+    /// dropped, the next call continues reading.
     ///
     /// # Errors
-    /// If the stream must end: the message is too long or stays incomplete, or the bytes are not gRPC.
+    /// If the stream must end: the message is too long, stays incomplete, or is not gRPC, or the connection is lost.
     pub async fn next(&mut self, limits: RequestLimits) -> Result<Option<Message>, StreamStop> {
         loop {
             if self.message.is_none() && self.buffer.len() >= HEADER_BYTES {
@@ -169,7 +170,8 @@ impl MessageReader {
                     }
                 }
                 Some(Err(status)) if status.code() == Code::Cancelled => return Err(StreamStop::Cancelled),
-                // The body of a connection that was silent for too long ends without an error before the stream's end.
+                // If a connection was closed for missing keepalives, its body ends without an error and without the end
+                // of the stream.
                 None if !self.body.is_end_stream() => return Err(StreamStop::Cancelled),
                 Some(Err(status)) => return Err(status.into()),
                 None if self.buffer.is_empty() && self.message.is_none() => return Ok(None),
@@ -178,7 +180,7 @@ impl MessageReader {
         }
     }
 
-    /// The next HTTP/2 frame. Within a message it must come in time, and the message must keep its minimum rate.
+    /// Returns the next HTTP/2 frame. Within a message, enforces the maximum pause and the message's deadline.
     async fn frame(&mut self) -> Result<Option<Result<http_body::Frame<Bytes>, Status>>, StreamStop> {
         let next = self.body.frame();
         match self.transit.limit.filter(|_| self.message.is_some()) {
@@ -192,7 +194,7 @@ impl MessageReader {
         }
     }
 
-    /// Reads a frame's header.
+    /// Reads the header of a message, checks its length, and sets its deadline.
     fn begin(&mut self, limits: RequestLimits) -> Result<PartialMessage, StreamStop> {
         let compression = match self.buffer.get_u8() {
             0 => None,
@@ -213,14 +215,15 @@ impl MessageReader {
             .map_or(PartialMessage::Wanted(length), |compression| PartialMessage::Compressed(length, compression)))
     }
 
-    /// Returns the partly read message, if it is complete.
+    /// Returns the partly read message if all of its bytes have arrived. A compressed message is left to `decompress`.
     fn complete(&mut self) -> Option<Message> {
         match &mut self.message {
             Some(PartialMessage::Wanted(length)) if self.buffer.len() >= *length => {
                 let bytes = if *length < OWN_BUFFER_MIN_BYTES {
                     self.buffer.split_to(*length).freeze()
                 } else {
-                    // The message takes the whole buffer with it. A slice of the buffer would keep all of its memory.
+                    // Returns the buffer itself as the message. A slice of the buffer would keep all of the buffer's
+                    // memory alive.
                     let rest = BytesMut::from(&self.buffer[*length..]);
                     let mut whole = std::mem::replace(&mut self.buffer, rest);
                     whole.truncate(*length);
@@ -241,7 +244,8 @@ impl MessageReader {
         }
     }
 
-    /// Decompresses the partly read message, if it is compressed and complete. Dropping the future loses nothing.
+    /// Returns the partly read message, decompressed, if it is compressed and all of its bytes have arrived. Cancel
+    /// safe.
     async fn decompress(&mut self, limits: RequestLimits) -> Result<Option<Message>, StreamStop> {
         let Some(PartialMessage::Compressed(length, compression)) = self.message else { return Ok(None) };
         let Some(compressed) = self.buffer.get(..length) else { return Ok(None) };
@@ -267,26 +271,26 @@ impl MessageReader {
         if length < OWN_BUFFER_MIN_BYTES {
             self.buffer.advance(length);
         } else {
-            self.buffer = BytesMut::from(&self.buffer[length..]); // the memory of the message goes with it
+            self.buffer = BytesMut::from(&self.buffer[length..]); // frees the memory of the message
         }
         self.share = self.transit.budget.empty();
         self.message = None;
         Ok(Some(message))
     }
 
-    /// Appends bytes that have arrived, and reserves memory for them.
+    /// Stores bytes that have arrived, and reserves memory for them.
     fn push_data(&mut self, data: &[u8], limits: RequestLimits) {
         if let Some(PartialMessage::Wanted(length) | PartialMessage::Compressed(length, _)) = self.message {
             let beyond = |bytes: usize| bytes.min(length).saturating_sub(unbudgeted(limits));
             let (before, after) = (beyond(self.buffer.len()), beyond(self.buffer.len() + data.len()));
             if let Err(refusal) = self.share.grow(after - before) {
                 self.share = self.transit.budget.empty();
-                // The bytes that have arrived are dropped with their reservation.
+                // Frees the bytes of the message that have already arrived, together with their reservation.
                 let come = std::mem::take(&mut self.buffer).len();
                 self.message = Some(PartialMessage::Refused(length - come, refusal));
             }
             if self.buffer.capacity() - self.buffer.len() < data.len() {
-                // The buffer doubles, whatever length is announced: a client may announce more than it sends.
+                // The buffer at most doubles, because a client may announce a longer message than it sends.
                 let rest = length.saturating_sub(self.buffer.len());
                 self.buffer.reserve(rest.min(self.buffer.len()).max(data.len()));
             }
@@ -295,7 +299,7 @@ impl MessageReader {
     }
 }
 
-/// Returns the bytes of a message that need no reservation.
+/// Returns how many bytes of a message need no reservation.
 fn unbudgeted(limits: RequestLimits) -> usize {
     limits.covered.max(UNBUDGETED_BYTES)
 }

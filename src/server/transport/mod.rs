@@ -1,4 +1,4 @@
-//! Messages between the wire and a session, and the memory that they take.
+//! Moves messages between the network and a session, within the memory budget.
 
 pub mod budget;
 mod compression;

@@ -1,5 +1,6 @@
-//! Decodes requests. An entry of two encoded bytes may take a hundred bytes in memory, so entries are counted before a
-//! request is decoded. Requests with many fields are decoded on other threads than the transport's.
+//! Decodes requests. An entry of a repeated field may take two encoded bytes but a hundred bytes in memory, so the
+//! number of entries is checked before a request is decoded. Requests with many fields are decoded outside the
+//! transport threads.
 
 use self::FieldKind::{Fields, Numbers};
 use crate::{
@@ -12,21 +13,21 @@ use std::sync::Arc;
 use tokio::sync::Semaphore;
 use tonic::Status;
 
-/// Requests with at most this many fields are decoded on the transport's thread: a hand-over would take longer.
+/// Requests with at most this many fields are decoded on the transport thread, since a hand-over would take longer.
 const INLINE_DECODE_MAX_FIELDS: usize = 1000;
-/// The maximum number of requests that other threads decode at a time.
+/// The maximum number of requests that are decoded at the same time outside the transport threads.
 const MAX_CONCURRENT_DECODES: usize = 2;
-/// The niceness of those threads: the transport and physics come first.
+/// The niceness of threads that decode requests, so that transport and physics take precedence.
 const DECODER_NICENESS: i32 = 5;
-/// Limit for repeated fields whose length does not depend on the batch size. Deliberately loose: validation enforces
-/// tighter limits with better messages.
+/// The maximum number of entries of repeated fields whose length does not depend on the batch size. It is loose on
+/// purpose: validation enforces tighter limits with better messages.
 pub const MAX_REPEATED: usize = 1024;
-/// The bytes of packed numbers that take as long to count as one field.
+/// The number of bytes of a packed field that take as long to count as one unpacked field.
 const PACKED_BYTES_PER_FIELD: usize = 64;
-/// The maximum number of counted fields of a message.
+/// The maximum number of [`Field`]s that a message type may have.
 const MAX_COUNTED_FIELDS: usize = 8;
 
-/// A field whose entries are counted.
+/// A field of a message whose entries are counted and limited before decoding.
 pub struct Field {
     number: u64,
     name: &'static str,
@@ -36,11 +37,11 @@ pub struct Field {
 
 /// The type of a field's entries.
 pub enum FieldKind {
-    /// Messages, whose own fields with these numbers are counted, too.
+    /// Messages. Their own fields in this list are counted, too.
     Fields(&'static [Field]),
-    /// Numbers, which may be packed.
+    /// Numbers, packed or unpacked.
     Numbers,
-    /// Anything else.
+    /// Any other type, whose content is not examined.
     Opaque,
 }
 
@@ -50,7 +51,7 @@ pub enum Cardinality {
     One,
     /// At most [`MAX_REPEATED`].
     Many,
-    /// At most the number of environments, or [`MAX_REPEATED`] if that is larger.
+    /// At most the batch size, or [`MAX_REPEATED`] if that is larger.
     Environments,
 }
 
@@ -64,12 +65,12 @@ impl Cardinality {
     }
 }
 
-/// A field that is counted.
+/// Makes a [`Field`] with its field number, its name in errors, its maximum number of entries, and their type.
 pub const fn field(number: u64, name: &'static str, most: Cardinality, inside: FieldKind) -> Field {
     Field { number, name, most, inside }
 }
 
-/// Decodes requests, large ones on other threads.
+/// Decodes requests, large requests outside the transport threads.
 #[derive(Clone)]
 pub struct Decoder(Arc<Semaphore>);
 
@@ -79,7 +80,8 @@ impl Default for Decoder {
     }
 }
 
-/// Decodes a request on the calling thread. Returns `None` if it is malformed, refused or too large for that.
+/// Decodes a request on the calling thread. Returns `None` if it is malformed, has too many entries, or is so large
+/// that it must be decoded on another thread.
 pub fn decoded_at_once<T: Message + Default>(
     bytes: Bytes,
     fields: &'static [Field],
@@ -90,10 +92,10 @@ pub fn decoded_at_once<T: Message + Default>(
 }
 
 impl Decoder {
-    /// Decodes a request, or returns why it is refused.
+    /// Decodes a request. The inner error is the reason for refusing it, e.g. too many entries.
     ///
     /// # Errors
-    /// A status that ends the stream, if the bytes are not a request.
+    /// A status that ends the stream, if the bytes are not a valid message.
     pub async fn decode<T: Message + Default + 'static>(
         &self,
         bytes: Bytes,
@@ -122,21 +124,21 @@ fn decoded<T: Message + Default>(bytes: Bytes) -> Result<T, Status> {
     T::decode(bytes).map_err(|error| Status::internal(error.to_string()))
 }
 
-/// Why the count of a message stopped.
+/// Why a count of a message's fields stopped early.
 #[derive(Debug, PartialEq)]
 enum PrecheckError {
-    /// The message has more fields than the caller allowed to count.
+    /// The message has more fields than the caller allows to be counted.
     Work,
     Refused(InvalidValue),
 }
 
-/// Counts a message's fields and entries, at most `work` of them. The count ends at malformed bytes, which the decoder
-/// then refuses.
+/// Checks the numbers of entries in a message. Stops after about `work` fields. Malformed bytes end the check without
+/// an error, since the decoder then refuses them.
 fn check(message: &[u8], fields: &[Field], limits: RequestLimits, mut work: usize) -> Result<(), PrecheckError> {
     count(message, fields, limits, &mut work).map(|_| ())
 }
 
-/// Counts the fields of a part of a message. Returns whether the part is well-formed.
+/// Checks the numbers of entries in a message or nested message. Returns whether it is well-formed.
 fn count(mut message: &[u8], fields: &[Field], limits: RequestLimits, work: &mut usize) -> Result<bool, PrecheckError> {
     let mut counts = [0; MAX_COUNTED_FIELDS];
     while !message.is_empty() {
@@ -147,7 +149,7 @@ fn count(mut message: &[u8], fields: &[Field], limits: RequestLimits, work: &mut
             1 => message.split_off(..8),
             2 => varint(&mut message).and_then(|length| message.split_off(..usize::try_from(length).ok()?)),
             5 => message.split_off(..4),
-            // Groups of fields, which are no part of this version of the encoding.
+            // Kinds 3 and 4 are groups, which proto3 does not have.
             kind => {
                 let got = format!("with a field of the encoding's kind {kind}");
                 return Err(PrecheckError::Refused(InvalidValue::new("request", got, "kinds 0, 1, 2 and 5")));
@@ -160,7 +162,7 @@ fn count(mut message: &[u8], fields: &[Field], limits: RequestLimits, work: &mut
         *counted += match field.inside {
             Numbers if tag & 7 == 2 => {
                 *work = work.checked_sub(part.len() / PACKED_BYTES_PER_FIELD).ok_or(PrecheckError::Work)?;
-                part.iter().filter(|byte| **byte < 0x80).count() // each number's last byte
+                part.iter().filter(|byte| **byte < 0x80).count() // counts the last byte of each number
             }
             _ => 1,
         };
@@ -178,7 +180,7 @@ fn count(mut message: &[u8], fields: &[Field], limits: RequestLimits, work: &mut
     Ok(true)
 }
 
-/// A number of variable length.
+/// Reads a number in protobuf's variable-length encoding from the front of `message`.
 fn varint(message: &mut &[u8]) -> Option<u64> {
     let mut value = 0;
     for shift in (0..64).step_by(7) {

@@ -1,4 +1,5 @@
-//! Withholds the request bodies of streams from tonic, which would decode their messages itself.
+//! Withholds the request bodies of sessions from tonic, which would decode their messages itself. [`MessageReader`]
+//! reads them instead.
 
 use super::{
     budget::PendingReservations,
@@ -22,7 +23,7 @@ use tonic::{
 };
 use tower::Layer;
 
-/// A service that withholds the request bodies of the method at `path` from tonic.
+/// A tower service that withholds the request bodies of calls to the method `path` from the wrapped tonic service.
 #[derive(Clone)]
 pub struct RawBodyService<S> {
     service: S,
@@ -30,7 +31,7 @@ pub struct RawBodyService<S> {
     transit: StreamLimits,
 }
 
-/// Wraps a service in [`RawBodyService`].
+/// The tower layer that wraps a service in [`RawBodyService`].
 #[derive(Clone)]
 pub struct RawBodyLayer {
     path: &'static str,
@@ -38,7 +39,7 @@ pub struct RawBodyLayer {
 }
 
 impl RawBodyLayer {
-    /// Withholds the request bodies of calls of this path.
+    /// Makes a layer for the method with this path. Its streams get the limits `transit`.
     pub fn new(path: &'static str, transit: StreamLimits) -> Self {
         Self { path, transit }
     }
@@ -53,7 +54,7 @@ impl<S> Layer<S> for RawBodyLayer {
 }
 
 impl<S> RawBodyService<S> {
-    /// Withholds the request bodies of calls of this path.
+    /// Wraps `service`. Streams of the method with this path get the limits `transit`.
     pub fn new(service: S, path: &'static str, transit: StreamLimits) -> Self {
         Self { service, path, transit }
     }
@@ -80,7 +81,7 @@ where
         let outbox = PendingReservations::default();
         let connection = request.extensions().get::<Connection>().cloned();
         let is_stream = request.uri().path() == self.path;
-        // Other calls have one small reply, which needs no timeout.
+        // Unary calls have one small reply, which needs no timeout.
         let timeouts = is_stream.then_some(ReadTimeouts { first: self.transit.handshake, rest: self.transit.limit });
         if is_stream {
             let bearer = request.extensions_mut().remove::<Bearer>();
@@ -97,11 +98,11 @@ where
     }
 }
 
-/// Carries the raw body as a request extension. Extensions must be `Clone`, hence the shared cell.
+/// Carries the reader of the raw body as a request extension. Extensions must be `Clone`, hence the shared cell.
 #[derive(Clone)]
 struct RawBody(Arc<Mutex<Option<MessageReader>>>);
 
-/// Takes the reader of a request whose body was withheld from tonic.
+/// Takes the message reader out of a request whose body was withheld from tonic.
 ///
 /// # Errors
 /// If the body was not withheld, which is a defect.

@@ -1,5 +1,5 @@
-//! Response bodies. The memory reservation of a reply is held until its bytes are sent, and the connection of a client
-//! that does not read is closed.
+//! A response body that holds the memory reservation of each reply until the reply's bytes are sent, and closes the
+//! connection of a client that does not read.
 
 use super::budget::PendingReservations;
 use crate::server::net::managed_io::Connection;
@@ -17,40 +17,40 @@ use tokio::{
 };
 use tonic::{Status, body::Body};
 
-/// The number of checks of an unread stream within its timeout.
+/// The number of checks for unread replies within their timeout.
 const CHECKS_PER_TIMEOUT: u32 = 4;
 
-/// The time that a stream's client may leave its replies unread.
+/// The maximum times for which a stream's client may leave replies unread.
 #[derive(Debug, Clone, Copy)]
 pub struct ReadTimeouts {
-    /// The first reply.
+    /// The limit for the first reply.
     pub first: Duration,
-    /// Any later reply; `None` for no limit.
+    /// The limit for each later reply; `None` for no limit.
     pub rest: Option<Duration>,
 }
 
-/// A response's body.
+/// The response body of a stream, whose reading by the client is watched.
 pub struct WatchedBody {
     body: Body,
     outbox: PendingReservations,
     progress: Arc<ReadProgress>,
 }
 
-/// The progress of the client with the replies.
+/// The client's progress in reading replies.
 struct ReadProgress {
     state: Mutex<ProgressState>,
-    /// The task that checks the timeouts. It is aborted with the body, because it holds on to the connection.
+    /// The task that checks the timeouts. It holds the connection, so it is aborted when the body is dropped.
     watch: OnceLock<AbortHandle>,
 }
 
 struct ProgressState {
-    /// Number of unread replies that hold reservations.
+    /// The number of unread replies that hold reservations.
     unread: usize,
     unread_since: Instant,
-    /// The time since which a reply waits for the flow control of the client. The session gets no further requests
-    /// meanwhile, so its own timeouts do not end it.
+    /// The time since which a reply waits for the client's flow-control window. Meanwhile the session reads no
+    /// requests, so its own timeouts cannot end it.
     held_since: Option<Instant>,
-    /// No reply has been taken yet.
+    /// Whether the client has read no reply yet.
     is_first: bool,
 }
 
@@ -59,7 +59,7 @@ impl ProgressState {
         Self { unread: 0, unread_since: Instant::now(), held_since: None, is_first: true }
     }
 
-    /// The timeout that the client has exceeded, if any.
+    /// Returns the timeout that the client has exceeded, if any.
     fn exceeded(&self, timeouts: ReadTimeouts) -> Option<Duration> {
         let held_since = self.held_since.map_or(Duration::ZERO, |unread_since| unread_since.elapsed());
         let unread = if self.unread == 0 { Duration::ZERO } else { self.unread_since.elapsed() };
@@ -73,7 +73,7 @@ impl ReadProgress {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Changes the number of unread replies.
+    /// Changes the number of unread replies, and restarts their timeout when the client has read one.
     fn change(&self, change: impl FnOnce(usize) -> usize) {
         let mut state = self.state();
         let (before, after) = (state.unread, change(state.unread));
@@ -83,7 +83,7 @@ impl ReadProgress {
         }
     }
 
-    /// Records that the transport asks for a reply, so that the previous one is no longer held.
+    /// Records that the transport asks for more data, so the previous reply no longer waits for the client's window.
     fn on_poll(&self) {
         let mut state = self.state();
         if state.held_since.take().is_some() {
@@ -91,7 +91,7 @@ impl ReadProgress {
         }
     }
 
-    /// Records that the transport has received a reply.
+    /// Records that the transport has received data, which may wait for the client's window.
     fn on_frame(&self) {
         self.state().held_since = Some(Instant::now());
     }
@@ -103,7 +103,7 @@ impl Drop for ReadProgress {
     }
 }
 
-/// An unread reply, until it is dropped.
+/// Counts a reply as unread until it is dropped.
 struct UnreadGuard(Arc<ReadProgress>);
 
 impl UnreadGuard {
@@ -120,8 +120,8 @@ impl Drop for UnreadGuard {
 }
 
 impl WatchedBody {
-    /// Wraps a response body and attaches queued reservations to its bytes. Closes the connection when the client
-    /// leaves data unread longer than `timeouts`.
+    /// Wraps a response body. Attaches the reservations in `outbox` to its bytes, and closes `connection` if the client
+    /// leaves replies unread for longer than `timeouts`.
     pub fn new(
         body: Body,
         outbox: PendingReservations,
@@ -137,7 +137,7 @@ impl WatchedBody {
     }
 }
 
-/// Ends the connection when its client has read nothing for too long.
+/// Closes the connection when its client has exceeded a read timeout.
 async fn watch(progress: Weak<ReadProgress>, connection: Connection, timeouts: ReadTimeouts) {
     let mut limit = Some(timeouts.rest.map_or(timeouts.first, |rest| rest.min(timeouts.first)));
     while let Some(looked_after) = limit {

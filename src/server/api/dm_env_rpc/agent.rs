@@ -1,4 +1,4 @@
-//! The handler of one stream: the legal order of its requests, each answered once.
+//! Answers the requests of one `dm_env_rpc.v1` stream, and enforces their legal order.
 
 use super::{
     Error,
@@ -28,16 +28,16 @@ use crate::{
 };
 use std::sync::Arc;
 
-/// The price of a world in steps, the same as of an `open` of one environment in `perturb.v1`.
+/// The price of `create_world`, in steps: the same as of an `open` of one environment in `perturb.v1`.
 const WORLD_PRICE: u64 = 17;
-/// The price of the trial that a reset begins, in steps.
+/// The price of a reset, which begins a new trial, in steps.
 const NEW_TRIAL_PRICE: u64 = 3;
-/// The maximum length of a request. A world is one environment and needs far less. The rest is room for wrong requests,
-/// which should get an error in-band.
+/// The maximum length of a request, bytes. Valid requests are far shorter, because a world has one environment. The
+/// limit is high so that a longer, invalid request still gets an error in-band.
 const MAX_REQUEST_BYTES: usize = 1 << 20;
 
-/// A client's stream. When it is dropped, its agent leaves the joined world, and the worlds that it made are freed
-/// unless they have an agent.
+/// The state of a client's stream. When it is dropped, its agent leaves the joined world, and the worlds that the
+/// stream made are freed unless they have an agent.
 pub(super) struct Agent {
     worlds: Arc<Worlds>,
     caller: Caller,
@@ -47,7 +47,7 @@ pub(super) struct Agent {
 }
 
 impl Agent {
-    /// A stream that has joined no world.
+    /// Makes the state of a new stream, which has joined no world.
     pub(super) fn new(worlds: Arc<Worlds>, bearer: Option<Bearer>, sessions: Sessions) -> Self {
         let caller = worlds.caller(bearer);
         Self { worlds, caller, sessions, joined: None, stats: SessionStats::default() }
@@ -70,7 +70,7 @@ impl Agent {
         }
         settings::check_none("join_world", &request.settings)?;
         let (world, runner) = self.worlds.join(&self.caller, &request.world_name)?;
-        // This comes before the first await. If the client disconnects there, dropping the agent returns the world.
+        // Stored before the first `await`: if the client disconnects there, dropping the agent returns the world.
         let joined = self.joined.insert(JoinedWorld { world, runner });
         self.stats = SessionStats { environment: Some(joined.world.spec().name), envs: 1, ..self.stats };
         joined.runner.finish_abandoned().await;
@@ -175,7 +175,7 @@ impl SessionHandler for Agent {
         }
     }
 
-    /// Whether the stream keeps a world alive.
+    /// Whether the stream has joined a world, or has made a world that still exists.
     fn is_open(&self) -> bool {
         self.joined.is_some() || self.worlds.are_made_by(&self.caller)
     }
@@ -193,7 +193,7 @@ impl SessionHandler for Agent {
         }
     }
 
-    /// Nothing is freed here: a world is one environment, which is freed with the agent.
+    /// Does nothing: the world is freed when the agent is dropped.
     async fn close(&mut self) {}
 
     async fn answer(&mut self, request: Self::Request) -> Result<Reply<Self::Response>, Error> {
@@ -219,7 +219,7 @@ impl SessionHandler for Agent {
         response.map(|payload| Reply::new(rpc::EnvironmentResponse { payload: Some(payload) }))
     }
 
-    /// Steps of a world run on the calling thread, so none is pipelined.
+    /// Returns `None`: a world's steps run on the calling thread, so pipelining would gain nothing.
     fn pipeline(&self, _request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<>> {
         None::<fn(Self::Request)>
     }

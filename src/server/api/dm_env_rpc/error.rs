@@ -1,4 +1,4 @@
-//! Why a request of `dm_env_rpc.v1` is refused.
+//! Reasons for refusing a request of `dm_env_rpc.v1`.
 
 use crate::{
     env, pool, proto,
@@ -11,95 +11,95 @@ use crate::{
 };
 use std::borrow::Cow;
 
-/// A refused request, which changed nothing.
+/// Why a request was refused. A refused request changes nothing.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The session layer refuses the request.
+    /// The session layer refused the request.
     #[error(transparent)]
     Session(#[from] session::Error),
     /// The token's role does not allow the draw, or the ledger cannot be written.
     #[error(transparent)]
     Audit(#[from] audit::Error),
-    /// An environment or a parameter is unknown or not valid.
+    /// An environment or a parameter is unknown or invalid.
     #[error(transparent)]
     Environment(#[from] env::Error),
-    /// The pool is full or has failed.
+    /// The pool has no room for the environment, or failed.
     #[error(transparent)]
     Pool(#[from] pool::Error),
-    /// A setting, an action or a property has a value that it cannot have.
+    /// A setting, an action or a property has a value that is not allowed.
     #[error(transparent)]
     Value(#[from] InvalidValue),
-    /// The system has no random bits for a world's name.
+    /// The operating system has no random bits for a world's name.
     #[error(transparent)]
     NoRandomness(#[from] NoRandomness),
-    /// Nothing has this name.
+    /// A world, a setting, an observation or the like is unknown.
     #[error("{what} {name} is unknown; {known}")]
     Unknown {
         /// The kind of thing: a world, a setting, an action, …
         what: &'static str,
         /// The unknown name or number.
         name: String,
-        /// The names that are known.
+        /// The known names, or how to find them, as a part of a sentence.
         known: String,
     },
-    /// A request that needs a joined world came from a stream that has joined none.
+    /// The request needs a joined world, but its stream has joined none.
     #[error("{request} came from a stream that has joined no world; send join_world first")]
     NotJoined {
-        /// The request.
+        /// The name of the request.
         request: &'static str,
     },
-    /// A second `join_world`.
+    /// The stream has already joined a world.
     #[error("join_world came from a stream that has joined {world:?}; leave that world first, or use another stream")]
     AlreadyJoined {
-        /// The world that the stream has joined.
+        /// The name of the joined world.
         world: String,
     },
     /// The request needs a world without an agent, but the world has one.
     #[error("world {world:?} has an agent; {request} can be done when the agent has left it")]
     Occupied {
-        /// The world.
+        /// The name of the world.
         world: String,
-        /// The request.
+        /// The name of the request.
         request: &'static str,
     },
-    /// The world belongs to another stream and is not shared.
+    /// The world belongs to another stream, and it is not shared.
     #[error(
         "{request} came from a stream that has neither made world {world:?} nor is its agent; join it first, or have it \
          made with the setting shared"
     )]
     NotYours {
-        /// The world.
+        /// The name of the world.
         world: String,
-        /// The request.
+        /// The name of the request.
         request: &'static str,
     },
-    /// The name that was asked for is another world's.
+    /// The requested name already belongs to another world.
     #[error("a world {world:?} is there already; ask for another name, or for none")]
     Taken {
-        /// The name.
+        /// The requested name.
         world: String,
     },
-    /// A property does not allow this.
+    /// The property does not allow this access, e.g. a write.
     #[error("property {key:?} cannot be {access}; list_property tells what each property allows")]
     Forbidden {
-        /// The property.
+        /// The key of the property.
         key: String,
-        /// The access that was requested, as a participle.
+        /// The requested access, as a participle, e.g. "written".
         access: &'static str,
     },
-    /// An extension that this server does not have.
+    /// The request uses a protocol extension that this server does not support.
     #[error("extension {name:?} is unknown; this server has {known}")]
     UnknownExtension {
-        /// The type of the message.
+        /// The type of the extension's message.
         name: String,
-        /// The extension that this server has.
+        /// The extension that this server supports.
         known: &'static str,
     },
 }
 
 impl Error {
-    /// A [`Value`](Self::Value).
+    /// Makes an [`Error::Value`].
     pub fn value(field: impl Into<Cow<'static, str>>, got: impl ToString, expected: impl ToString) -> Self {
         InvalidValue::new(field, got, expected).into()
     }
@@ -132,7 +132,7 @@ impl From<auth::Error> for Error {
     }
 }
 
-/// The error as an in-band response, after which the stream stays open.
+/// Converts the error to an in-band response. The stream stays open after it.
 impl From<Error> for proto::google::rpc::Status {
     fn from(error: Error) -> Self {
         Self { code: error.kind().code() as i32, message: error.to_string(), details: Vec::new() }

@@ -1,4 +1,4 @@
-//! The fields of requests whose entries are counted before the request is decoded.
+//! The fields of requests whose numbers of entries are checked before a request is decoded.
 
 use crate::server::transport::precheck::{
     Cardinality, Field,
@@ -12,7 +12,7 @@ const AGENT_STEP: &[Field] = &[
     field(1, "step.actions", Cardinality::Many, Opaque),
     field(2, "step.requested_observations", Cardinality::Many, Numbers),
 ];
-/// The counted fields of `dm_env_rpc.v1.EnvironmentRequest`.
+/// The checked fields of `dm_env_rpc.v1.EnvironmentRequest`.
 pub const ENVIRONMENT_REQUEST: &[Field] = &[
     field(1, "create_world", Cardinality::One, Fields(SETTINGS_FIRST)),
     field(2, "join_world", Cardinality::One, Fields(SETTINGS_SECOND)),

@@ -1,12 +1,12 @@
-//! `dm_env_rpc.v1`: the same environments for DeepMind's agents. A world is one environment.
+//! `dm_env_rpc.v1`, DeepMind's protocol, for the same environments. Its worlds are single environments with names.
 //!
-//! - `service`: the stream.
-//! - `agent`: the legal order of a stream's requests.
-//! - `worlds`: all worlds of the server, by name; how long each lives.
-//! - `world`: what requests of any stream may change about a world.
-//! - `runner`: a world's episodes, on the pool.
-//! - `settings`: conversion of settings to the domain, with the checks of `perturb.v1`.
-//! - `specs`: actions and observations, their uids, names and bounds.
+//! - `service`: the gRPC service.
+//! - `agent`: the requests of one stream, and their legal order.
+//! - `worlds`: the registry of all worlds of the server, by name, and their lifetimes.
+//! - `world`: the part of a world that the requests of several streams may change.
+//! - `runner`: runs the episodes of a world on the pool.
+//! - `settings`: checks and converts the settings of requests.
+//! - `specs`: actions and observations with their uids, names, types and bounds.
 //! - `tensors`: checks of a tensor's type, shape and bounds.
 //! - `properties`: values that clients read and write by name.
 

@@ -1,5 +1,5 @@
-//! Properties: named values besides actions and observations. A read returns the value of the episode that began last.
-//! A write takes effect when the next episode begins.
+//! Properties: named values that are neither actions nor observations. A read returns the value of the episode that
+//! began last. A write takes effect when the next episode begins.
 
 use super::{
     Error,
@@ -31,21 +31,21 @@ const APPLIED: &str = "applied";
 const VERSION: &str = "version";
 const SEED: &str = "seed";
 
-/// A property and its value.
+/// A property with its present value.
 struct Property {
     key: String,
     description: String,
-    /// The value; `None` if the property only groups others.
+    /// The value; `None` if the property only groups other properties.
     value: Option<Tensor>,
-    /// The range of values that can be written, if it is limited.
+    /// The range of values that may be written, if it is limited.
     range: Option<(f64, f64)>,
     is_writable: bool,
 }
 
-/// Answers an extension's message.
+/// Answers a request of a protocol extension. Only the extension for properties is supported.
 ///
 /// # Errors
-/// If the message belongs to another extension or cannot be decoded, or if the request is refused.
+/// If the request belongs to another extension, cannot be decoded, or is refused.
 pub(super) fn answer(catalogue: &Catalogue, joined: Option<&JoinedWorld>, request: &Any) -> Result<Any, Error> {
     let name = request.type_url.rsplit('/').next().unwrap_or_default();
     if name != REQUEST {
@@ -75,7 +75,7 @@ pub(super) fn answer(catalogue: &Catalogue, joined: Option<&JoinedWorld>, reques
     Ok(Any { type_url: RESPONSE_URL.into(), value })
 }
 
-/// All properties, in a fixed order: the server's, then those of the joined world.
+/// Returns all properties, in a fixed order: the properties of the server, then those of the joined world.
 fn properties(catalogue: &Catalogue, joined: Option<&JoinedWorld>) -> Vec<Property> {
     let names: Vec<_> = catalogue.names().map(String::from).collect();
     let n = names.len();
@@ -136,7 +136,7 @@ fn find<'a>(properties: &'a [Property], key: &str) -> Result<&'a Property, Error
     })
 }
 
-/// The properties that `key` groups, or those at the root if it is empty.
+/// Returns the properties that the property `key` groups. An empty `key` stands for the root.
 fn list<'a>(properties: &'a [Property], key: &'a str) -> Result<impl Iterator<Item = &'a Property>, Error> {
     if !key.is_empty() {
         let property = find(properties, key)?;
@@ -148,7 +148,7 @@ fn list<'a>(properties: &'a [Property], key: &'a str) -> Result<impl Iterator<It
 }
 
 fn write(joined: Option<&JoinedWorld>, property: &Property, request: &WritePropertyRequest) -> Result<(), Error> {
-    // Only properties of a joined world can be written.
+    // Only properties of the joined world are writable.
     let (Some(joined), true) = (joined, property.is_writable) else {
         return Err(property.forbidden("written"));
     };
@@ -182,7 +182,7 @@ impl Property {
         Self { is_writable: true, ..self }
     }
 
-    /// The key of the property that groups this one; empty at the root.
+    /// Returns the key of the property that groups this property; empty at the root.
     fn parent(&self) -> &str {
         self.key.rsplit_once('.').map_or("", |(parent, _)| parent)
     }

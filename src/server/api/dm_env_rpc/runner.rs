@@ -1,4 +1,4 @@
-//! A world's episodes, one after the other, on the pool: a batch of one environment.
+//! Runs a world's episodes on the pool, in a batch of one environment.
 
 use super::Error;
 use crate::{
@@ -10,61 +10,61 @@ use crate::{
 use bytes::Bytes;
 use std::sync::Arc;
 
-/// The environment of a world, with the state of its episode.
+/// A world's environment and the state of its current episode.
 pub(super) struct Runner {
     batch: Batch,
     draws: DrawAuditor,
     phase: EpisodePhase,
-    /// The first observation of the episode that was begun last, f32 `[O]`.
+    /// The first observation of the latest episode, f32 `[O]`.
     first: Bytes,
     start: Option<EpisodeStart>,
     seed: u64,
     version: Version,
 }
 
-/// The state of the episode.
+/// The state of the current episode.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum EpisodePhase {
-    /// The first episode of a new world has begun, and no agent has seen it.
+    /// The world is new: its first episode has begun, but no agent has seen it yet.
     Unseen,
-    /// The episode runs.
+    /// The episode is running.
     Running,
-    /// The episode has ended or was interrupted.
+    /// The episode ended or was interrupted.
     Over,
 }
 
-/// The outcome of a step, as an agent may observe it.
+/// The outcome of a step, with everything that an agent may request.
 pub(super) struct WorldStep {
-    /// The state of the agent's sequence.
+    /// The protocol's state: running, terminated or interrupted.
     pub(super) state: State,
-    /// f32 `[O]`, little-endian.
+    /// The observation after the step, f32 `[O]`, little-endian.
     pub(super) observation: Bytes,
-    /// The reward; 0 at the first observation of an episode.
+    /// The reward; 0 with the first observation of an episode.
     pub(super) reward: f32,
-    /// The step limit ended the episode.
+    /// Whether the step limit ended the episode.
     pub(super) truncated: bool,
-    /// The episode has ended and was a success.
+    /// Whether the episode has ended with success.
     pub(super) success: bool,
-    /// The physics diverged.
+    /// Whether the physics diverged in this step.
     pub(super) diverged: bool,
 }
 
-/// Changes that take effect with the next episode.
+/// Changes that take effect when the next episode begins.
 #[derive(Clone)]
 pub(super) struct Changes {
     /// The version of the next episode.
     pub(super) version: Version,
-    /// A new seed.
+    /// The new seed; `None` keeps the seed.
     pub(super) seed: Option<u64>,
-    /// New distributions, one for each parameter.
+    /// The new distributions, one for each parameter; `None` keeps the distributions.
     pub(super) distributions: Option<Arc<[Distribution]>>,
 }
 
 impl Runner {
-    /// Makes the environment.
+    /// Creates the environment of a new world.
     ///
     /// # Errors
-    /// If the pool is full or a model cannot be loaded, or the token may not draw from there.
+    /// If the pool is full, a model cannot be loaded, or the token may not draw from these distributions.
     pub(super) async fn open(
         pool: &Pool,
         settings: BatchSettings,
@@ -79,7 +79,7 @@ impl Runner {
         Ok(Self { batch, draws, phase: EpisodePhase::Unseen, first, start: only(started), seed, version })
     }
 
-    /// The settings of the episodes when the world was made.
+    /// The settings of episodes with which the world was created.
     pub(super) fn episodes(&self) -> &Settings {
         &self.batch.settings().groups[0].episodes
     }
@@ -89,55 +89,55 @@ impl Runner {
         &self.draws
     }
 
-    /// The environment.
+    /// The description of the environment.
     pub(super) fn spec(&self) -> &'static EnvironmentSpec {
         self.batch.settings().spec
     }
 
-    /// The episode that began last, with its receipt.
+    /// The start of the latest episode, with its receipt.
     pub(super) fn start(&self) -> Option<&EpisodeStart> {
         self.start.as_ref()
     }
 
-    /// The seed of the episode that began last.
+    /// The seed of the latest episode.
     pub(super) fn seed(&self) -> u64 {
         self.seed
     }
 
-    /// The version of the episode that began last.
+    /// The version of the latest episode.
     pub(super) fn version(&self) -> Version {
         self.version
     }
 
-    /// Whether an episode runs, so that the next step advances it.
+    /// Whether an episode is running. If so, the next step advances it; otherwise the next step begins an episode.
     pub(super) fn is_running(&self) -> bool {
         self.phase == EpisodePhase::Running
     }
 
-    /// Interrupts a running episode, so that the next step begins another.
+    /// Interrupts the running episode, if any. The next step then begins another episode.
     pub(super) fn stop(&mut self) {
         if self.is_running() {
             self.phase = EpisodePhase::Over;
         }
     }
 
-    /// Waits for a step whose stream ended before the step did.
+    /// Waits for a step that is still running although its stream has ended.
     pub(super) async fn finish_abandoned(&mut self) {
         self.batch.finish_abandoned().await;
     }
 
-    /// Begins the next episode, or returns the first one of a new world. With changes a new trial begins, as in
-    /// `perturb.v1`.
+    /// Begins the next episode, or shows the first episode of a new world. If there are changes, a new trial begins, as
+    /// in `perturb.v1`.
     ///
     /// # Errors
-    /// If the server has a defect.
+    /// If the token may not draw from the new distributions, the ledger cannot be written, or the server has a defect.
     pub(super) async fn begin(&mut self, changes: Changes) -> Result<WorldStep, Error> {
         let Changes { version, seed, distributions } = changes;
-        // The first episode of a new world has already begun. Without changes it is shown as it is.
+        // The first episode of a new world has already begun. Unless there are changes, it is used.
         if self.phase != EpisodePhase::Unseen || seed.is_some() || distributions.is_some() {
             let entries = vec![ResetEntry { slot: 0, seed, distributions, state: None }];
             self.draws.reset(&self.batch, &entries).await?;
-            // The phase is set first: if the reset fails, the next call resets again.
+            // Set before the reset: if the reset fails, the next call resets again.
             (self.phase, self.version, self.seed) = (EpisodePhase::Over, version, seed.unwrap_or(self.seed));
             let (first, started) = self.batch.reset(entries).await?;
             (self.first, self.start) = (first, only(started));
@@ -153,7 +153,7 @@ impl Runner {
         })
     }
 
-    /// Advances the running episode by a step, and ends it if it is to be interrupted.
+    /// Advances the running episode by a step. If `interrupted`, also ends it.
     ///
     /// # Errors
     /// If the server has a defect.
@@ -177,8 +177,8 @@ impl Runner {
     }
 }
 
-/// The state that an agent sees. If the task ends an episode in the step that interrupts it, the episode counts as
-/// terminated: its last state has no value, as in Gymnasium.
+/// Returns the protocol's state after a step. If the task ends an episode in the same step that interrupts it, the
+/// episode counts as terminated, as in Gymnasium, because its last state has no value.
 fn state(terminated: bool, interrupted: bool) -> State {
     match (terminated, interrupted) {
         (true, _) => State::Terminated,
@@ -187,7 +187,7 @@ fn state(terminated: bool, interrupted: bool) -> State {
     }
 }
 
-/// The start of the only environment's episode, if one began.
+/// Returns the start of the only environment's episode, if an episode began.
 fn only(started: Vec<(u32, EpisodeStart)>) -> Option<EpisodeStart> {
     started.into_iter().next().map(|(_, start)| start)
 }

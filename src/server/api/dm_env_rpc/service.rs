@@ -1,4 +1,4 @@
-//! The gRPC service of `dm_env_rpc.v1`: one stream for each agent.
+//! The gRPC service of `dm_env_rpc.v1`. Each agent has a stream of its own.
 
 use super::{agent::Agent, worlds::Worlds};
 use crate::{
@@ -15,10 +15,10 @@ use crate::{
 use std::sync::Arc;
 use tonic::{Request, Response, Status, Streaming};
 
-/// The path of calls that are streams of agents.
+/// The path of the gRPC method whose calls are streams of agents.
 pub const ENDPOINT: &str = "/dm_env_rpc.v1.Environment/Process";
 
-/// Serves worlds, which all streams share.
+/// The service of `dm_env_rpc.v1`. All its streams share the same worlds.
 #[derive(Clone)]
 pub struct DmEnvRpcService {
     worlds: Arc<Worlds>,
@@ -27,7 +27,7 @@ pub struct DmEnvRpcService {
 }
 
 impl DmEnvRpcService {
-    /// Makes a service without worlds. It records draws in the ledger, if there is one.
+    /// Makes the service. It has no worlds yet. It records draws in `ledger`, if there is one.
     pub fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>, sessions: Sessions, ledger: Option<Ledger>) -> Self {
         Self {
             worlds: Arc::new(Worlds::new(pool, catalogue, ledger)),
@@ -36,12 +36,12 @@ impl DmEnvRpcService {
         }
     }
 
-    /// The same service with another view of the shutdown.
+    /// Returns a handle to the same service that observes the shutdown through `drain`.
     pub fn with_drain(&self, drain: Drain) -> Self {
         Self { sessions: self.sessions.with_drain(drain), ..self.clone() }
     }
 
-    /// The requests so far.
+    /// Returns the counters of requests.
     pub fn counts(&self) -> Arc<RequestCounters> {
         Arc::clone(&self.counts)
     }

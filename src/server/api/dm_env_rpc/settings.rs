@@ -1,4 +1,5 @@
-//! Converts settings to the domain. Names and types are checked here, and values in the domain.
+//! Checks the names and types of settings in requests, and converts them to the types of [`env`] and the pool, which
+//! check the values.
 
 use super::{Error, tensors};
 use crate::{
@@ -16,35 +17,35 @@ const EPISODES_PER_TRIAL: &str = "episodes_per_trial";
 const WORLD_NAME: &str = "world_name";
 const SHARED: &str = "shared";
 
-/// The maximum length of a name that a client asks for.
+/// The maximum length of a world's name that a client chooses, bytes.
 const MAX_NAME_BYTES: usize = 64;
 
 type WorldSettings = BTreeMap<String, Tensor>;
 
-/// The name of a world, and who may reset and destroy it.
+/// The requested name of a world, and who may reset and destroy it.
 pub(super) struct Ownership {
-    /// The name that was asked for.
+    /// The requested name; `None` for a random name.
     pub(super) name: Option<String>,
     /// Whether every stream with the same token may reset and destroy the world.
     pub(super) shared: bool,
 }
 
-/// Changes that a reset or a written property makes from the next episode on.
+/// Changes that a reset or a write to a property makes. They take effect when the next episode begins.
 #[derive(Default)]
 pub(super) struct WorldChange {
-    /// The new version, which sets the distributions of all parameters before `parameters` overrides some.
+    /// The new version. It sets the distributions of all parameters; `parameters` then overrides some of them.
     pub(super) version: Option<Version>,
-    /// The new seed, which restarts the counts of episodes and trials at 0.
+    /// The new seed. It restarts the counts of episodes and trials at 0.
     pub(super) seed: Option<u64>,
-    /// New distributions, each with the name of its parameter.
+    /// New distributions of parameters, by name.
     pub(super) parameters: Vec<(&'static str, Distribution)>,
 }
 
-/// Checks the settings of `create_world`. Returns the version, the ownership of the world, and the settings of its
-/// batch.
+/// Checks the settings of `create_world`. Returns the settings of the world's batch, the version, and the world's name
+/// and ownership.
 ///
 /// # Errors
-/// For settings that are missing, unknown, of a wrong type or out of range.
+/// If a setting is missing, unknown, of a wrong type, or out of range.
 pub(super) fn create(
     catalogue: &Catalogue,
     settings: &WorldSettings,
@@ -74,7 +75,7 @@ pub(super) fn create(
         distributions,
         episodes_per_trial: small(EPISODES_PER_TRIAL, 1, 1)?,
     };
-    // The runner itself resets the environment at an agent's first step after an end.
+    // The runner itself resets the environment at the agent's first step after the end of an episode.
     let autoreset = Autoreset::Disabled;
     let batch = BatchSettings {
         spec,
@@ -101,11 +102,11 @@ fn ownership(settings: &WorldSettings) -> Result<Ownership, Error> {
     Ok(Ownership { name: name.map(String::from), shared: shared.unwrap_or(false) })
 }
 
-/// Checks the settings of a reset.
+/// Checks the settings of `reset` or `reset_world`.
 ///
 /// # Errors
-/// For settings that are unknown, of a wrong type or not finite. The bounds of parameters are checked when the change
-/// is applied.
+/// If a setting is unknown, of a wrong type, or not finite. [`World::change`](super::world::World::change) checks the
+/// bounds of parameters later.
 pub(super) fn change(
     spec: &'static EnvironmentSpec,
     request: &'static str,
@@ -121,10 +122,10 @@ pub(super) fn change(
     })
 }
 
-/// Checks that there are no settings.
+/// Checks that a request has no settings.
 ///
 /// # Errors
-/// If there is one.
+/// If there is a setting.
 pub(super) fn check_none(request: &'static str, settings: &WorldSettings) -> Result<(), Error> {
     match settings.keys().next() {
         Some(name) => Err(unknown(name, format!("{request} takes no settings; give them to create_world or reset"))),
@@ -132,10 +133,10 @@ pub(super) fn check_none(request: &'static str, settings: &WorldSettings) -> Res
     }
 }
 
-/// The version with this letter.
+/// Parses the letter of a version.
 ///
 /// # Errors
-/// If no version has this letter.
+/// If it is not D, R or E.
 pub(super) fn parse_version(field: String, letter: &str) -> Result<Version, Error> {
     let found = letter.parse().ok().filter(|version| Version::ALL.contains(version));
     found.ok_or_else(|| Error::value(field, format!("{:?}", shorten(letter)), "\"D\", \"R\" or \"E\""))
@@ -146,7 +147,7 @@ fn version(settings: &WorldSettings) -> Result<Option<Version>, Error> {
     settings.get(VERSION).map(read).transpose()
 }
 
-/// Returns the settings that are the environment's parameters.
+/// Returns the parameters of the environment that `settings` sets.
 fn parameters(spec: &EnvironmentSpec, settings: &WorldSettings) -> Result<Vec<(&'static str, Distribution)>, Error> {
     let given = spec.parameters.iter().filter_map(|p| Some((p.name, settings.get(p.name)?)));
     given.map(|(name, tensor)| Ok((name, Distribution::fixed(tensors::number(&field(name), tensor)?)))).collect()

@@ -1,4 +1,4 @@
-//! Actions and observations: uids, names, types and bounds.
+//! The specs (uid, name, type and bounds) of actions and observations, and their conversion.
 
 use super::{Error, runner::WorldStep, tensors};
 use crate::{
@@ -14,16 +14,17 @@ use std::collections::BTreeMap;
 /// The uid of the only action.
 const ACTION: u64 = 1;
 
-/// The uids of the observations, from 1: no observation has uid 0.
+/// The uids of the observations start at 1, because dm_env_rpc reserves 0.
 const OBSERVATION: u64 = 1;
 const REWARD: u64 = 2;
 const TRUNCATED: u64 = 3;
 const SUCCESS: u64 = 4;
 const DIVERGED: u64 = 5;
 
-/// The actions and observations of an environment.
+/// Returns the specs of an environment's actions and observations.
 ///
-/// There is no `discount`, because clients derive it from the state and must not get one with a first step.
+/// There is no `discount` among the observations. Clients derive it from the state, and would misread a `discount` with
+/// the first observation of an episode.
 pub(super) fn action_observation_specs(spec: &EnvironmentSpec) -> ActionObservationSpecs {
     let scalar = |name: &str, dtype: DataType| TensorSpec {
         name: name.into(),
@@ -58,10 +59,10 @@ pub(super) fn action_observation_specs(spec: &EnvironmentSpec) -> ActionObservat
     }
 }
 
-/// Checks that there are observations of these uids.
+/// Checks that all requested uids are uids of observations.
 ///
 /// # Errors
-/// [`Error::Unknown`].
+/// [`Error::Unknown`] with the first unknown uid.
 pub(super) fn check_requested(uids: &[u64]) -> Result<(), Error> {
     match uids.iter().find(|uid| !(OBSERVATION..=DIVERGED).contains(uid)) {
         Some(uid) => Err(unknown("observation", *uid, format!("observations are {OBSERVATION} … {DIVERGED}"))),
@@ -69,10 +70,10 @@ pub(super) fn check_requested(uids: &[u64]) -> Result<(), Error> {
     }
 }
 
-/// Checks a step's actions. Returns them as the pool takes them: i32, or f32 `[A]`, little-endian.
+/// Checks a step's actions. Returns them in the pool's format, little-endian: an i32, or f32 `[A]`.
 ///
 /// # Errors
-/// If the action is missing, does not fit its spec, or comes with an unknown one.
+/// If the action is missing or does not fit its spec, or if there is an action with an unknown uid.
 pub(super) fn actions(spec: &EnvironmentSpec, actions: &BTreeMap<u64, Tensor>) -> Result<Vec<u8>, Error> {
     if let Some(uid) = actions.keys().find(|uid| **uid != ACTION) {
         return Err(unknown("action", *uid, format!("the only action is {ACTION}")));
@@ -94,7 +95,7 @@ pub(super) fn actions(spec: &EnvironmentSpec, actions: &BTreeMap<u64, Tensor>) -
     })
 }
 
-/// The response to a step, with the observations that were requested.
+/// Makes the response to a step, with the requested observations only.
 pub(super) fn response(outcome: &WorldStep, requested: &[u64]) -> StepResponse {
     let bool = |x| tensors::tensor(Payload::Bools(BoolArray { array: vec![x] }), &[]);
     let floats = |array, shape: &[usize]| tensors::tensor(Payload::Floats(FloatArray { array }), shape);
@@ -106,13 +107,13 @@ pub(super) fn response(outcome: &WorldStep, requested: &[u64]) -> StepResponse {
         REWARD => floats(vec![outcome.reward], &[]),
         TRUNCATED => bool(outcome.truncated),
         SUCCESS => bool(outcome.success),
-        // The caller has checked that no other uids come.
+        // Only `DIVERGED` is left, because the caller has checked the uids.
         _ => bool(outcome.diverged),
     };
     StepResponse {
         state: outcome.state.into(),
-        // An observation is sent only once, however often it is requested, so that a small request cannot have a large
-        // reply.
+        // Each observation is sent only once, even if it is requested several times. Otherwise a small request could
+        // have a large reply.
         observations: (OBSERVATION..=DIVERGED)
             .filter(|uid| requested.contains(uid))
             .map(|uid| (uid, observation(uid)))
@@ -120,7 +121,7 @@ pub(super) fn response(outcome: &WorldStep, requested: &[u64]) -> StepResponse {
     }
 }
 
-/// The number of the last choice.
+/// Returns the index of the last choice of a discrete action.
 fn last(names: &[&str]) -> i32 {
     names.len() as i32 - 1
 }
@@ -129,7 +130,8 @@ fn length(channels: &[Channel]) -> Vec<i32> {
     vec![channels.len() as i32]
 }
 
-/// The minima and maxima, if every channel has finite ones: one pair if all are equal, otherwise one for each channel.
+/// Returns the minima and maxima of the channels, or `None` if any is infinite. If all channels have the same bounds,
+/// there is only one minimum and one maximum.
 fn bounds(channels: &[Channel]) -> (Option<Value>, Option<Value>) {
     if !channels.iter().all(|c| c.low.is_finite() && c.high.is_finite()) {
         return (None, None);

@@ -1,16 +1,16 @@
-//! Checks of tensors: type, shape, number of elements, bounds. Nothing is converted.
+//! Checks the type, shape, number of elements and bounds of tensors. Does not convert between types.
 
 use super::Error;
 use crate::proto::dm_env_rpc::v1::{DataType, Tensor, tensor::Payload};
 use std::fmt::Display;
 
-/// The maximum number of dimensions that an error repeats.
+/// The maximum number of dimensions of a shape that an error message shows.
 const MAX_SHOWN_DIMENSIONS: usize = 8;
 
-/// A STRING scalar.
+/// Returns the text of a STRING scalar.
 ///
 /// # Errors
-/// If it is something else.
+/// If `tensor` is not a STRING scalar.
 pub(super) fn text<'a>(field: &str, tensor: &'a Tensor) -> Result<&'a str, Error> {
     match (&tensor.payload, tensor.shape.as_slice()) {
         (Some(Payload::Strings(strings)), []) if strings.array.len() == 1 => Ok(&strings.array[0]),
@@ -18,10 +18,10 @@ pub(super) fn text<'a>(field: &str, tensor: &'a Tensor) -> Result<&'a str, Error
     }
 }
 
-/// A BOOL scalar.
+/// Returns the value of a BOOL scalar.
 ///
 /// # Errors
-/// If it is something else.
+/// If `tensor` is not a BOOL scalar.
 pub(super) fn boolean(field: &str, tensor: &Tensor) -> Result<bool, Error> {
     match (&tensor.payload, tensor.shape.as_slice()) {
         (Some(Payload::Bools(bools)), []) if bools.array.len() == 1 => Ok(bools.array[0]),
@@ -29,10 +29,10 @@ pub(super) fn boolean(field: &str, tensor: &Tensor) -> Result<bool, Error> {
     }
 }
 
-/// A DOUBLE scalar.
+/// Returns the value of a DOUBLE scalar.
 ///
 /// # Errors
-/// If it is something else, or not finite.
+/// If `tensor` is not a DOUBLE scalar, or not finite.
 pub(super) fn number(field: &str, tensor: &Tensor) -> Result<f64, Error> {
     match (&tensor.payload, tensor.shape.as_slice()) {
         (Some(Payload::Doubles(doubles)), []) if doubles.array.len() == 1 => match doubles.array[0] {
@@ -43,10 +43,10 @@ pub(super) fn number(field: &str, tensor: &Tensor) -> Result<f64, Error> {
     }
 }
 
-/// An integer scalar of any type with 32 or 64 bits, from `low` to `high`.
+/// Returns the value of an integer scalar, of any type with 32 or 64 bits.
 ///
 /// # Errors
-/// If it is something else, or not in this range.
+/// If `tensor` is not an integer scalar, or not in `low` … `high`.
 pub(super) fn integer(field: &str, tensor: &Tensor, low: u64, high: u64) -> Result<u64, Error> {
     let one = match (&tensor.payload, tensor.shape.as_slice()) {
         (Some(Payload::Int32s(i)), []) if i.array.len() == 1 => i128::from(i.array[0]),
@@ -59,10 +59,11 @@ pub(super) fn integer(field: &str, tensor: &Tensor, low: u64, high: u64) -> Resu
     within.ok_or_else(|| Error::value(field.to_owned(), one, format!("an integer from {low} to {high}")))
 }
 
-/// INT32 elements of exactly this shape, each within its bounds.
+/// Returns the elements of an INT32 tensor of this shape. A single element stands for all. `bounds` has one range for
+/// each element.
 ///
 /// # Errors
-/// If it is something else.
+/// If `tensor` has another type or shape, or an element is out of its bounds.
 pub(super) fn int32s(field: &str, tensor: &Tensor, shape: &[usize], bounds: &[(i32, i32)]) -> Result<Vec<i32>, Error> {
     match &tensor.payload {
         Some(Payload::Int32s(given)) => elements(field, tensor, &given.array, shape, DataType::Int32, bounds),
@@ -70,10 +71,11 @@ pub(super) fn int32s(field: &str, tensor: &Tensor, shape: &[usize], bounds: &[(i
     }
 }
 
-/// FLOAT elements of exactly this shape, each within its bounds.
+/// Returns the elements of a FLOAT tensor of this shape. A single element stands for all. `bounds` has one range for
+/// each element.
 ///
 /// # Errors
-/// If it is something else.
+/// If `tensor` has another type or shape, or an element is out of its bounds.
 pub(super) fn floats(field: &str, tensor: &Tensor, shape: &[usize], bounds: &[(f32, f32)]) -> Result<Vec<f32>, Error> {
     match &tensor.payload {
         Some(Payload::Floats(given)) => elements(field, tensor, &given.array, shape, DataType::Float, bounds),
@@ -81,9 +83,9 @@ pub(super) fn floats(field: &str, tensor: &Tensor, shape: &[usize], bounds: &[(f
     }
 }
 
-/// Returns the elements of a tensor of exactly this shape, whose product is the number of `bounds`. A single element
-/// is repeated for all. If a dimension is negative, it is inferred from the number of elements, and nothing is
-/// repeated.
+/// Checks the shape and bounds of a tensor with the elements `given`, and returns one element for each of `bounds`. As
+/// dm_env_rpc allows, a single element stands for all, and one dimension may be negative, to be inferred from the
+/// number of elements; but not both.
 fn elements<T: Copy + PartialOrd + Display>(
     field: &str,
     tensor: &Tensor,
@@ -103,7 +105,7 @@ fn elements<T: Copy + PartialOrd + Display>(
         many if many.len() == bounds.len() => many.to_vec(),
         _ => return Err(refuse()),
     };
-    // NaN is outside of every interval.
+    // NaN is outside every interval, so it is refused.
     match all.iter().zip(bounds).position(|(x, (low, high))| !(low..=high).contains(&x)) {
         Some(i) => {
             let (got, (low, high)) = (format!("{} in element {i}", all[i]), bounds[i]);
@@ -136,7 +138,7 @@ fn shape_of(shape: &[i32]) -> String {
     }
 }
 
-/// Returns the type and the number of the elements, or `None` without a payload.
+/// Returns the type and the number of a tensor's elements, or `None` if it has no payload.
 pub(super) fn dtype_and_count(tensor: &Tensor) -> Option<(DataType, usize)> {
     Some(match tensor.payload.as_ref()? {
         Payload::Floats(x) => (DataType::Float, x.array.len()),
@@ -153,9 +155,9 @@ pub(super) fn dtype_and_count(tensor: &Tensor) -> Option<(DataType, usize)> {
     })
 }
 
-/// A tensor of this shape, which is empty for a scalar.
+/// Makes a tensor of this shape. The shape of a scalar is empty.
 pub(super) fn tensor(payload: Payload, shape: &[usize]) -> Tensor {
-    // The shapes come from specs, which have at most a few dozen elements.
+    // The shapes come from specs, whose dimensions are at most a few dozen.
     let shape = shape.iter().map(|&length| i32::try_from(length).unwrap_or(i32::MAX)).collect();
     Tensor { payload: Some(payload), shape }
 }

@@ -1,4 +1,4 @@
-//! The state of a world that requests of several streams may change. Changes reach the physics when the next episode
+//! The part of a world's state that requests of several streams may change. Changes take effect when the next episode
 //! begins.
 
 use super::{
@@ -12,7 +12,7 @@ use crate::{
 };
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// A world, as all streams see it.
+/// A world, shared by all streams that know it.
 pub(super) struct World {
     name: String,
     spec: &'static EnvironmentSpec,
@@ -20,26 +20,26 @@ pub(super) struct World {
     wanted: Mutex<PendingChanges>,
 }
 
-/// The settings that the next episode begins with.
+/// The settings with which the next episode will begin.
 struct PendingChanges {
     version: Version,
     /// The distribution of each parameter.
     distributions: Vec<Distribution>,
-    /// Whether the distributions differ from those of the running episode.
+    /// Whether the distributions were set since the running episode began.
     new_distributions: bool,
     seed: Option<u64>,
-    /// Whether another stream has reset the world, so that the running episode ends with its next step.
+    /// Whether another stream has reset the world. If so, the running episode ends with its next step.
     interruption: bool,
 }
 
-/// A world and its agent's episodes in it.
+/// A world that a stream's agent has joined, and the runner of its episodes.
 pub(super) struct JoinedWorld {
     pub(super) world: Arc<World>,
     pub(super) runner: Runner,
 }
 
 impl World {
-    /// Makes the world of a new environment.
+    /// Makes a world with this name for a new environment.
     pub(super) fn new(name: String, runner: &Runner) -> Self {
         let wanted = PendingChanges {
             version: runner.version(),
@@ -51,12 +51,12 @@ impl World {
         Self { name, spec: runner.spec(), draws: runner.draws().clone(), wanted: Mutex::new(wanted) }
     }
 
-    /// The name, unique on the server among the worlds of one token.
+    /// The world's name, unique among the worlds of one token.
     pub(super) fn name(&self) -> &str {
         &self.name
     }
 
-    /// The environment.
+    /// The description of the world's environment.
     pub(super) fn spec(&self) -> &'static EnvironmentSpec {
         self.spec
     }
@@ -64,7 +64,7 @@ impl World {
     /// Stores a change for the next episode.
     ///
     /// # Errors
-    /// If a parameter is out of its bounds, or the token's role does not allow the draw. Nothing is changed then.
+    /// If a parameter is out of its bounds, or the token's role does not allow the draw. The change is not stored then.
     pub(super) fn change(&self, change: WorldChange) -> Result<(), Error> {
         let mut wanted = self.lock();
         let version = change.version.unwrap_or(wanted.version);
@@ -82,7 +82,7 @@ impl World {
         Ok(())
     }
 
-    /// Takes the settings for the episode that begins now.
+    /// Takes the stored changes, for an episode that is about to begin.
     pub(super) fn take_changes(&self) -> Changes {
         let mut wanted = self.lock();
         wanted.interruption = false;
@@ -94,19 +94,20 @@ impl World {
         }
     }
 
-    /// Stores the changes of an episode that could not begin again. Changes that came since take precedence.
+    /// Stores changes again, because the episode for which they were taken could not begin. Later changes take
+    /// precedence.
     pub(super) fn keep(&self, changes: Changes) {
         let mut wanted = self.lock();
         wanted.seed = wanted.seed.or(changes.seed);
         wanted.new_distributions |= changes.distributions.is_some();
     }
 
-    /// Marks the running episode to end with its next step.
+    /// Requests that the running episode ends with its next step.
     pub(super) fn interrupt(&self) {
         self.lock().interruption = true;
     }
 
-    /// Returns whether the running episode must end with the present step, and clears the mark.
+    /// Returns whether the running episode must end with the current step, and clears the request.
     pub(super) fn take_interruption(&self) -> bool {
         std::mem::take(&mut self.lock().interruption)
     }

@@ -1,6 +1,6 @@
-//! All worlds of the server, by name. A world lives as long as the stream that made it is open, or an agent has joined
-//! it. A client that knows the name and shows the token of the world's maker may join. Names are random, unless a
-//! client chose them.
+//! The registry of all worlds of the server, by name. A world lives while the stream that made it is open or an agent
+//! has joined it. A client may join a world if it knows the name and has the token of the world's maker. Names are
+//! random unless a client chose them.
 
 use super::{Error, runner::Runner, settings::Ownership, world::World};
 use crate::{
@@ -17,34 +17,34 @@ use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
 
-/// The number of a stream.
+/// The number by which the registry identifies a stream.
 type StreamId = u64;
 
-/// The stream that a request came from.
+/// The stream from which a request came, with its token.
 pub(super) struct Caller {
     stream: StreamId,
     bearer: Option<Bearer>,
 }
 
 impl Caller {
-    /// Takes environments out of the quota of the stream's token.
+    /// Takes `count` environments from the quota of the stream's token. Returns `None` if there is no token.
     ///
     /// # Errors
-    /// If the quota is exceeded.
+    /// If the quota has fewer environments left.
     pub(super) fn envs(&self, count: usize) -> Result<Option<QuotaGuard>, Error> {
         Ok(self.bearer.as_ref().map(|bearer| bearer.envs(count)).transpose()?)
     }
 
-    /// The key of the world that the stream calls by this name.
+    /// Returns the registry key of the world with this name among the worlds of the stream's token.
     fn key(&self, name: &str) -> Key {
         (self.bearer.as_ref().map(|bearer| bearer.name().to_owned()), name.to_owned())
     }
 }
 
-/// A world's name with the name of its maker's token, so that each token has names of its own.
+/// The name of the token of a world's maker, and the world's name. Each token has its own set of names.
 type Key = (Option<String>, String);
 
-/// The registry that all streams share.
+/// The worlds of a server, shared by all streams.
 pub(super) struct Worlds {
     pool: Arc<Pool>,
     catalogue: Arc<Catalogue>,
@@ -60,25 +60,25 @@ struct Registry {
 
 struct WorldEntry {
     world: Arc<World>,
-    /// The stream that made the world, as long as it is open.
+    /// The stream that made the world; `None` after its end.
     maker: Option<StreamId>,
-    /// The stream whose agent has joined the world.
+    /// The stream whose agent has joined the world, if any.
     agent: Option<StreamId>,
     /// Whether every stream with the same token may reset and destroy the world.
     shared: bool,
-    /// The episodes; `None` while an agent has them.
+    /// The runner of the world's episodes; `None` while an agent has it.
     runner: Option<Runner>,
-    /// The world's part of its maker's quota of environments.
+    /// The environment taken from the quota of the maker's token.
     _held: Option<QuotaGuard>,
 }
 
 impl Worlds {
-    /// No worlds yet.
+    /// Makes an empty registry. The environments of its worlds run on `pool`.
     pub(super) fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>, ledger: Option<Ledger>) -> Self {
         Self { pool, catalogue, ledger, registry: Mutex::default() }
     }
 
-    /// Makes the auditor of the draws of a stream's new world.
+    /// Makes the auditor of draws for a new world that `maker` makes.
     pub(super) fn draws(&self, maker: &Caller) -> DrawAuditor {
         DrawAuditor::new(maker.bearer.clone(), self.ledger.clone())
     }
@@ -88,22 +88,22 @@ impl Worlds {
         &self.pool
     }
 
-    /// The environments that a world can have.
+    /// The catalogue of environments that worlds can be made of.
     pub(super) fn catalogue(&self) -> &Catalogue {
         &self.catalogue
     }
 
-    /// A new stream.
+    /// Registers a new stream.
     pub(super) fn caller(&self, bearer: Option<Bearer>) -> Caller {
         let mut registry = self.lock();
         registry.streams += 1;
         Caller { stream: registry.streams, bearer }
     }
 
-    /// Checks that the requested name, if any, is free.
+    /// Checks that no world has the requested name, if there is one.
     ///
     /// # Errors
-    /// [`Error::Taken`].
+    /// [`Error::Taken`], if a world of the same token has the name.
     pub(super) fn is_free(&self, maker: &Caller, own: &Ownership) -> Result<(), Error> {
         match own.name.as_ref().filter(|name| self.lock().worlds.contains_key(&maker.key(name))) {
             Some(name) => Err(Error::Taken { world: name.clone() }),
@@ -111,10 +111,11 @@ impl Worlds {
         }
     }
 
-    /// Adds a world that a stream has made, with the part of its token's quota that it holds. Returns its name.
+    /// Adds a new world with its runner. It keeps `held`, its environment's part of the token's quota. Returns its
+    /// name.
     ///
     /// # Errors
-    /// [`Error::Taken`] if another world has the requested name, [`Error::NoRandomness`].
+    /// [`Error::Taken`] if another world has the requested name, [`Error::NoRandomness`] if no random name can be made.
     pub(super) fn add(
         &self,
         maker: &Caller,
@@ -143,18 +144,18 @@ impl Worlds {
         Ok(name)
     }
 
-    /// Returns the world of that name, if the stream may change it.
+    /// Returns the world with this name, if the stream may reset and destroy it.
     ///
     /// # Errors
-    /// [`Error::Unknown`], [`Error::NotYours`].
+    /// [`Error::Unknown`] if there is no such world, [`Error::NotYours`] if it belongs to another stream.
     pub(super) fn find_owned(&self, caller: &Caller, name: &str, request: &'static str) -> Result<Arc<World>, Error> {
         Ok(Arc::clone(&self.lock().find_owned(caller, name, request)?.world))
     }
 
-    /// Hands a world's runner to a stream's agent.
+    /// Lets a stream's agent join a world. Returns the world and its runner.
     ///
     /// # Errors
-    /// [`Error::Unknown`], [`Error::Occupied`].
+    /// [`Error::Unknown`] if there is no such world, [`Error::Occupied`] if it has an agent.
     pub(super) fn join(&self, caller: &Caller, name: &str) -> Result<(Arc<World>, Runner), Error> {
         let mut registry = self.lock();
         let entry = registry.find(caller, name)?;
@@ -164,7 +165,7 @@ impl Worlds {
         Ok((Arc::clone(&entry.world), runner))
     }
 
-    /// Takes the runner of a world back from the agent that leaves it.
+    /// Returns the runner of a world that the agent leaves.
     pub(super) fn leave(&self, agent: &Caller, world: &World, runner: Runner) {
         let mut registry = self.lock();
         if let Some(entry) = registry.worlds.get_mut(&agent.key(world.name())) {
@@ -173,10 +174,11 @@ impl Worlds {
         registry.reap();
     }
 
-    /// Frees a world.
+    /// Destroys a world and frees its environment.
     ///
     /// # Errors
-    /// [`Error::Unknown`], [`Error::NotYours`], [`Error::Occupied`].
+    /// [`Error::Unknown`] if there is no such world, [`Error::NotYours`] if it belongs to another stream,
+    /// [`Error::Occupied`] if it has an agent.
     pub(super) fn destroy(&self, caller: &Caller, name: &str) -> Result<(), Error> {
         let mut registry = self.lock();
         if registry.find_owned(caller, name, "destroy_world")?.runner.is_none() {
@@ -186,12 +188,12 @@ impl Worlds {
         Ok(())
     }
 
-    /// Whether a world of this stream exists.
+    /// Whether a world that this stream made still exists.
     pub(super) fn are_made_by(&self, caller: &Caller) -> bool {
         self.lock().worlds.values().any(|entry| entry.maker == Some(caller.stream))
     }
 
-    /// Frees the worlds of a stream that has ended, unless they have an agent.
+    /// Records the end of a stream, and frees the worlds that it made unless they have an agent.
     pub(super) fn stream_ended(&self, caller: &Caller) {
         let mut registry = self.lock();
         for entry in registry.worlds.values_mut().filter(|entry| entry.maker == Some(caller.stream)) {
@@ -206,25 +208,25 @@ impl Worlds {
 }
 
 impl Registry {
-    /// The world of that name, if the stream made it or has joined it, or if it is shared.
+    /// Returns the world with this name if the stream made it, the stream's agent has joined it, or it is shared.
     fn find_owned(&mut self, caller: &Caller, name: &str, request: &'static str) -> Result<&WorldEntry, Error> {
         let entry = self.find(caller, name)?;
         let is_its = entry.shared || [entry.maker, entry.agent].contains(&Some(caller.stream));
         if is_its { Ok(entry) } else { Err(Error::NotYours { world: name.into(), request }) }
     }
 
-    /// The world of that name among those of the stream's token.
+    /// Returns the world with this name among the worlds of the stream's token.
     fn find(&mut self, caller: &Caller, name: &str) -> Result<&mut WorldEntry, Error> {
         self.worlds.get_mut(&caller.key(name)).ok_or_else(|| unknown(name))
     }
 
-    /// Frees the worlds that have neither maker nor agent.
+    /// Frees all worlds that have neither a maker nor an agent.
     fn reap(&mut self) {
         self.worlds.retain(|_, entry| entry.maker.is_some() || entry.runner.is_none());
     }
 }
 
-/// Makes a name that cannot be guessed.
+/// Makes a name that nobody can guess.
 fn random_name(environment: &str) -> Result<String, Error> {
     Ok(format!("{environment}-{:032x}", u128::from_ne_bytes(id::random()?)))
 }

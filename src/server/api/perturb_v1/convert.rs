@@ -1,4 +1,5 @@
-//! Conversion between the protocol and the domain, with all validation of what clients send.
+//! Checks the contents of requests, and converts between messages of the protocol and the types of [`env`] and the
+//! pool.
 
 use super::Error;
 use crate::{
@@ -14,7 +15,7 @@ use bytes::Bytes;
 use perturb_protocol::limits::{DEFAULT_PICTURE_PIXELS, PICTURE_PIXELS};
 use std::{collections::HashMap, sync::Arc};
 
-/// Checks an `open` of at most `max_envs` environments.
+/// Checks an `open` request, and converts it to the settings of its batch. `max_envs` is the maximum number of groups.
 pub fn open(catalogue: &Catalogue, max_envs: usize, request: proto::Open) -> Result<BatchSettings, Error> {
     let spec = with_parameters(catalogue.find(&request.environment)?, &request)?;
     let autoreset = match request.autoreset_mode() {
@@ -31,7 +32,7 @@ pub fn open(catalogue: &Catalogue, max_envs: usize, request: proto::Open) -> Res
         vec![group(spec, "open", "open.batch_size", single(request))?]
     } else {
         check_no_single(&request)?;
-        // This is checked before groups are converted. Each has at least one environment.
+        // Checked before the groups are converted. Each group has at least one environment.
         if request.groups.len() > max_envs {
             let got = format!("{} groups", request.groups.len());
             return Err(Error::value(
@@ -47,25 +48,25 @@ pub fn open(catalogue: &Catalogue, max_envs: usize, request: proto::Open) -> Res
     Ok(BatchSettings { spec, groups, autoreset, receipts, receipt_arrays, reward_terms, observe_parameters })
 }
 
-/// Returns the environment that an `open` asks for. It has the disturbances as further parameters if the `open` names
-/// one of them.
+/// Returns the description of the environment that an `open` requests. If the `open` names a disturbance, all
+/// disturbances are added to the environment's parameters.
 fn with_parameters(spec: &'static EnvironmentSpec, open: &proto::Open) -> Result<&'static EnvironmentSpec, Error> {
     let groups = open.groups.iter().map(|group| &group.parameters);
     let mut names: Vec<&str> =
         groups.chain([&open.parameters]).flat_map(|named| named.keys().map(String::as_str)).collect();
-    // Names are sorted, so that the same request always gets the same error.
+    // Sorted, so that the same request always gets the same error.
     names.sort_unstable();
     Ok(disturbance::with_parameters(spec, names)?)
 }
 
-/// An `open` without groups as one group.
+/// Converts an `open` without groups to a single group.
 fn single(request: proto::Open) -> proto::SlotGroup {
     let proto::Open { version, parameters, batch_size, seed, first_environment_index, episodes_per_trial, .. } =
         request;
     proto::SlotGroup { size: batch_size, version, parameters, seed, first_environment_index, episodes_per_trial }
 }
 
-/// Refuses groups together with the fields that they replace.
+/// Checks that an `open` with groups does not also use the fields that groups replace.
 fn check_no_single(request: &proto::Open) -> Result<(), Error> {
     let given = [
         ("open.version", request.version != 0),
@@ -81,7 +82,7 @@ fn check_no_single(request: &proto::Open) -> Result<(), Error> {
     }
 }
 
-/// Checks a group. Errors name its fields after `path`.
+/// Checks and converts a group. `path` is the group's field path in errors, `size_field` the path of its size.
 fn group(
     spec: &'static EnvironmentSpec,
     path: &str,
@@ -112,13 +113,13 @@ fn group(
     Ok(SlotGroup { size: group.size as usize, episodes })
 }
 
-/// Replaces the distributions of the parameters that are named.
+/// Replaces the distributions in `base` of all parameters that `parameters` names.
 fn override_parameters(
     spec: &'static EnvironmentSpec,
     base: &mut [Distribution],
     parameters: &HashMap<String, proto::Distribution>,
 ) -> Result<(), Error> {
-    // Names are sorted, so that the same request always gets the same error.
+    // Sorted, so that the same request always gets the same error.
     let mut parameters: Vec<_> = parameters.iter().collect();
     parameters.sort_by_key(|(name, _)| *name);
     let mut overrides = Vec::with_capacity(parameters.len());
@@ -129,7 +130,8 @@ fn override_parameters(
     Ok(resolve(spec, base, overrides)?)
 }
 
-/// Checks a step's actions for a batch of `size` environments.
+/// Checks the actions of a step: little-endian i32 `[N]` or f32 `[N, A]`, where N is the batch size `size`. Choices
+/// must be in range, numbers finite.
 pub fn actions(spec: &EnvironmentSpec, size: usize, actions: &Bytes) -> Result<(), Error> {
     const FIELD: &str = "step.actions";
     let (element, width) = match spec.action {
@@ -159,7 +161,7 @@ pub fn actions(spec: &EnvironmentSpec, size: usize, actions: &Bytes) -> Result<(
     Ok(())
 }
 
-/// The slots that a mask selects.
+/// Returns the slots that a mask selects. An empty mask selects all `size` slots. `field` is the mask's name in errors.
 pub fn mask(field: &'static str, size: usize, mask: &[u8]) -> Result<Vec<usize>, Error> {
     if mask.is_empty() {
         return Ok((0..size).collect());
@@ -174,7 +176,7 @@ pub fn mask(field: &'static str, size: usize, mask: &[u8]) -> Result<Vec<usize>,
     Ok((0..size).filter(|&slot| mask[slot] == 1).collect())
 }
 
-/// Checks a `reset` of a batch.
+/// Checks a `reset` request, and converts it to one entry for each selected slot.
 pub fn reset(batch: &Batch, request: proto::Reset) -> Result<Vec<ResetEntry>, Error> {
     let spec = batch.settings().spec;
     let mut names: Vec<&str> = request.parameters.keys().map(String::as_str).collect();
@@ -186,7 +188,7 @@ pub fn reset(batch: &Batch, request: proto::Reset) -> Result<Vec<ResetEntry>, Er
         return Err(Error::value("reset.seeds", format!("{} seeds", request.seeds.len()), expected));
     }
     let mut states = states(spec, &request.states, slots.len())?.into_iter();
-    // Neighbouring environments mostly share their distributions, which are then overridden only once.
+    // Successive environments mostly have the same distributions, so the result of the last override is reused.
     let mut edited: (Vec<Distribution>, Arc<[Distribution]>) = (Vec::new(), Arc::new([]));
     let mut entries = Vec::with_capacity(slots.len());
     for (i, slot) in slots.into_iter().enumerate() {
@@ -226,7 +228,7 @@ fn states(spec: &EnvironmentSpec, bytes: &Bytes, selected: usize) -> Result<Vec<
     Ok(numbers.chunks_exact(n).map(<[f64]>::to_vec).collect())
 }
 
-/// The slots that a `release` frees.
+/// Checks a `release` request to a batch of `size` environments. Returns the slots to free: some, but not all.
 pub fn release(size: usize, request: &proto::Release) -> Result<Vec<usize>, Error> {
     const FIELD: &str = "release.mask";
     let slots = mask(FIELD, size, &request.mask)?;
@@ -238,7 +240,7 @@ pub fn release(size: usize, request: &proto::Release) -> Result<Vec<usize>, Erro
     }
 }
 
-/// Pairs a restore's snapshots with their slots.
+/// Checks a `restore` request to a batch of `size` environments. Returns each selected slot with its snapshot.
 pub fn restore(size: usize, request: proto::Restore) -> Result<Vec<(usize, Bytes)>, Error> {
     let slots = mask("restore.mask", size, &request.mask)?;
     if request.snapshots.len() != slots.len() {
@@ -249,7 +251,7 @@ pub fn restore(size: usize, request: proto::Restore) -> Result<Vec<(usize, Bytes
     Ok(slots.into_iter().zip(request.snapshots).collect())
 }
 
-/// The slot of a batch of `n` that a `render` asks for, and the picture's size.
+/// Checks a `render` request to a batch of `n` environments. Returns the slot to draw and the size of the picture.
 pub fn render(n: usize, request: proto::Render) -> Result<(usize, Size), Error> {
     let slot = request.slot as usize;
     if slot >= n {
@@ -268,7 +270,7 @@ pub fn render(n: usize, request: proto::Render) -> Result<(usize, Size), Error> 
     Ok((slot, Size { width, height }))
 }
 
-/// An environment's entry in the catalogue.
+/// Makes an environment's entry in the catalogue.
 pub fn environment(spec: &'static EnvironmentSpec, model_hash: &str) -> proto::Environment {
     let quantity = |q: &env::Quantity| proto::Quantity { name: q.name.into(), unit: q.unit.into() };
     let term = |t: &env::RewardTerm| proto::RewardTerm { name: t.name.into(), description: t.description.into() };
@@ -356,7 +358,7 @@ fn action_space(space: ActionSpace) -> proto::ActionSpace {
     proto::ActionSpace { kind: Some(kind) }
 }
 
-/// The response to a step.
+/// Converts the result of a step to its response.
 pub fn stepped(stepped: StepResult) -> proto::Stepped {
     proto::Stepped {
         observations: stepped.observations,
@@ -372,7 +374,7 @@ pub fn stepped(stepped: StepResult) -> proto::Stepped {
     }
 }
 
-/// Episodes that began.
+/// Converts the starts of episodes, each with its slot.
 pub fn started(episodes: Vec<(u32, EpisodeStart)>) -> Vec<proto::EpisodeStart> {
     let start = |(slot, start): (u32, EpisodeStart)| proto::EpisodeStart {
         slot,

@@ -1,4 +1,4 @@
-//! Why a request of `perturb.v1` is refused.
+//! Reasons for refusing a request of `perturb.v1`.
 
 use crate::{
     env, pool, proto, render,
@@ -12,57 +12,57 @@ use crate::{
 };
 use std::borrow::Cow;
 
-/// A refused request. It changed nothing, except an `act` that failed between its steps.
+/// Why a request was refused. A refused request changes nothing, except an `act` that fails between two of its steps.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The session layer refuses the request.
+    /// The session layer refused the request.
     #[error(transparent)]
     Session(#[from] session::Error),
     /// The token's role does not allow the draw, or the ledger cannot be written.
     #[error(transparent)]
     Audit(#[from] audit::Error),
-    /// An environment, a parameter or a snapshot is unknown or not valid.
+    /// An environment, a parameter or a snapshot is unknown or invalid.
     #[error(transparent)]
     Environment(#[from] env::Error),
-    /// The pool is full, or refuses or fails the request.
+    /// The pool has no room for the environments, refused the request, or failed.
     #[error(transparent)]
     Pool(#[from] pool::Error),
     /// The picture cannot be drawn.
     #[error(transparent)]
     Render(#[from] render::Error),
-    /// A field has a value that it cannot have.
+    /// A field has a value that is not allowed.
     #[error(transparent)]
     Value(#[from] InvalidValue),
-    /// The environment to be drawn has no state.
+    /// The environment cannot be drawn, because its physics diverged.
     #[error("the physics of slot {slot} diverged and left no state to draw; reset it first")]
     NothingToDraw {
-        /// The environment's place in the batch.
+        /// The environment's slot in the batch.
         slot: usize,
     },
-    /// A request other than `open` on a session that is not open.
+    /// The session is not open yet, and the request is not `open`.
     #[error("{request} came before open; send open first")]
     NotOpen {
-        /// The request.
+        /// The name of the request.
         request: &'static str,
     },
-    /// A second `open`.
+    /// The request is `open`, but the session is already open.
     #[error("open came on a session that is open already; use reset, or start another session")]
     AlreadyOpen,
-    /// A request that is not allowed in the session's present state.
+    /// The request is not allowed in the present state of the session.
     #[error("{request} came {when}; {advice}")]
     Order {
-        /// The request.
+        /// The name of the request.
         request: &'static str,
-        /// The state in which the request came.
+        /// The state of the session, as a part of a sentence.
         when: Cow<'static, str>,
-        /// The advice to the client.
+        /// The remedy for the client, as a part of a sentence.
         advice: &'static str,
     },
 }
 
 impl Error {
-    /// A [`Value`](Self::Value).
+    /// Makes an [`Error::Value`].
     pub fn value(field: impl Into<Cow<'static, str>>, got: impl ToString, expected: impl ToString) -> Self {
         InvalidValue::new(field, got, expected).into()
     }
@@ -109,7 +109,7 @@ impl From<NoRandomness> for Error {
     }
 }
 
-/// The error as an in-band response, after which the session stays open.
+/// Converts the error to an in-band response. The session stays open after it.
 impl From<Error> for proto::Error {
     fn from(error: Error) -> Self {
         Self { code: error.kind().code() as i32, message: error.to_string() }

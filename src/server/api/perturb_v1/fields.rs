@@ -1,4 +1,4 @@
-//! The fields of requests whose entries are counted before the request is decoded.
+//! The fields of requests whose numbers of entries are checked before a request is decoded.
 
 use crate::server::transport::precheck::{
     Cardinality, Field,
@@ -20,7 +20,7 @@ const RESET: &[Field] = &[
 const RESTORE: &[Field] = &[field(2, "restore.snapshots", Cardinality::Environments, Opaque)];
 const POLICY: &[Field] = &[field(1, "act.policy.hidden", Cardinality::Many, Numbers)];
 const ACT: &[Field] = &[field(1, "act.policy", Cardinality::One, Fields(POLICY))];
-/// The counted fields of `perturb.v1.SessionRequest`.
+/// The checked fields of `perturb.v1.SessionRequest`.
 pub const SESSION_REQUEST: &[Field] = &[
     field(1, "open", Cardinality::One, Fields(OPEN)),
     field(2, "step", Cardinality::One, Opaque),

@@ -1,10 +1,9 @@
-//! `perturb.v1`: batches of environments whose parameters clients choose.
+//! `perturb.v1`, the project's own protocol: batches of environments whose parameters the client chooses.
 //!
-//! - [`service`]: one short method for each call.
-//! - [`session`]: the legal order of a session's requests.
-//! - [`convert`]: conversion between the protocol and the domain, with all validation; [`policy`]: the same for
-//!   policies.
-//! - `price`: the price of each request, in steps that count against the token's rate limit.
+//! - [`service`]: the gRPC service.
+//! - [`session`]: the requests of one session, and their legal order.
+//! - [`convert`]: checks and converts the contents of requests and replies; [`policy`]: the same for policies.
+//! - `price`: the price of each request, in steps, for the rate limits of tokens.
 //! - [`sizes`]: upper bounds of the lengths of requests and replies.
 
 pub mod convert;

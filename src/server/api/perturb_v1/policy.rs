@@ -1,4 +1,4 @@
-//! Conversion of policies and rollouts between the protocol and the domain, with all validation.
+//! Checks and converts `act` requests, with their policies, and converts rollouts to replies.
 
 use super::{Error, convert};
 use crate::{
@@ -13,29 +13,29 @@ use rand_chacha::ChaCha8Rng;
 
 /// The maximum number of hidden layers of a policy.
 const MAX_HIDDEN_LAYERS: usize = 8;
-/// The maximum width of a hidden layer and of the LSTM.
+/// The maximum width of a hidden layer or of the LSTM.
 const MAX_LAYER_WIDTH: u32 = 1024;
-/// The maximum number of activations of a policy, in all environments together.
+/// The maximum number of activations of a policy, summed over all environments.
 const MAX_ACTIVATIONS: usize = 1 << 25;
-/// The maximum cost of the steps of one reply, µs, so that no client waits long for an answer.
+/// The maximum computing time of the steps in one reply, µs. It bounds how long clients wait for an answer.
 const MAX_REPLY_COST_US: f64 = 1e6;
-/// The estimated number of a policy's weights that are evaluated per microsecond.
+/// The estimated number of a policy's weights that a processor evaluates per microsecond.
 const WEIGHTS_PER_US: f64 = 5000.0;
 
-/// The sizes of a batch.
+/// The dimensions of a batch's arrays.
 #[derive(Clone, Copy)]
 struct Sizes {
-    /// N.
+    /// N, the number of environments.
     envs: usize,
-    /// O.
+    /// O, the number of entries of an observation.
     observation: usize,
-    /// The number of entries of an observation that are parameters.
+    /// The number of entries of an observation that are the episode's parameters.
     parameters: usize,
     action: ActionKind,
 }
 
-/// Checks an `act` against the batch and the policy that plays. `rate` limits the steps per second of the client's
-/// environments.
+/// Checks an `act` request against the batch and its current policy, and converts it. `rate` is the maximum number of
+/// steps per second that the client's token allows.
 pub fn rollout_request(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<RolloutRequest, Error> {
     let (settings, n_envs) = (batch.settings(), batch.size());
     let order = |when: &'static str, advice| Error::Order { request: "act", when: when.into(), advice };
@@ -90,7 +90,8 @@ pub fn rollout_request(batch: &Batch, rate: Option<u32>, request: proto::Act) ->
         return Err(Error::value("act.policy", got, "fewer, so that a step takes less than about a second"));
     }
     let affordable = (MAX_REPLY_COST_US / ((settings.spec.step_cost + computed) * n_envs as f64)).max(1.0) as usize;
-    // A reply has at most the steps that the rate allows in a second, so that no client waits long for the next one.
+    // Limits a reply to the steps that the rate allows in a second, so the client does not wait long for its next
+    // reply.
     let allowed = rate.map_or(usize::MAX, |rate| (rate as usize / n_envs.max(1)).max(1));
     let affordable = affordable.min(allowed);
     let max_steps = if most_steps == 0 { affordable } else { affordable.min(most_steps as usize) };
@@ -138,7 +139,7 @@ fn policy(policy: proto::Policy, given: &Bytes, sizes: Sizes, episodes_per_trial
     Ok(Policy { spec, inputs, normalisers, role, state, weights, episodes_per_trial })
 }
 
-/// Checks the shape of a policy whose input has `input_size` numbers.
+/// Checks the layer sizes of a policy whose input has `input_size` numbers.
 fn spec(policy: &proto::Policy, input_size: usize, sizes: Sizes) -> Result<PolicySpec, Error> {
     const FIELD: &str = "act.policy.hidden";
     if policy.hidden.len() > MAX_HIDDEN_LAYERS {
@@ -172,7 +173,7 @@ fn weights(given: &Bytes, spec: &PolicySpec) -> Result<Vec<f32>, Error> {
     read_floats("weights", given).map_err(in_message("act"))
 }
 
-/// Reads an optional message.
+/// Converts an optional message.
 fn read<'a, M, T: TryFrom<&'a M, Error = DecodeError>>(
     field: &'static str,
     given: &'a Option<M>,
@@ -180,7 +181,7 @@ fn read<'a, M, T: TryFrom<&'a M, Error = DecodeError>>(
     given.as_ref().map(T::try_from).transpose().map_err(in_message(field))
 }
 
-/// Returns a conversion of decoding errors, which names the message.
+/// Returns a function that converts errors of decoding, and prefixes their fields with `message`.
 fn in_message(message: &'static str) -> impl Fn(DecodeError) -> Error {
     move |wrong| {
         let DecodeError { field, got, expected } = wrong.within(message);
@@ -207,14 +208,14 @@ fn state(
     player_state(given, actions).map_err(in_message("act.policy.state"))
 }
 
-/// Checks that there are bytes for exactly `count` numbers.
+/// Checks that `bytes` has exactly `count` numbers of four bytes. `shape` describes the array in the error.
 fn check_length(field: &'static str, bytes: &Bytes, count: usize, shape: &str) -> Result<(), Error> {
     let expected = || format!("{} bytes: {shape}, {count} numbers", 4 * count);
     let got = || format!("{} bytes", bytes.len());
     if bytes.len() == 4 * count { Ok(()) } else { Err(Error::value(field, got(), expected())) }
 }
 
-/// The response of a rollout.
+/// Converts a rollout to the response to an `act`.
 pub fn rollout_response(rollout: Rollout) -> proto::Acted {
     proto::Acted {
         steps: rollout.steps as u32,
@@ -238,7 +239,7 @@ fn ended_at(EndedAt { step, slot, end, terminated, truncated }: EndedAt) -> prot
     proto::EndedAt { step: step as u32, end: Some(convert::ended((slot, end))), terminated, truncated }
 }
 
-/// The state of the playing policy, without its weights.
+/// Returns the state of the batch's current policy, without its weights.
 pub fn player_saved(batch: &Batch) -> Result<proto::PlayerSaved, Error> {
     let order = |when: &'static str, advice| Err(Error::Order { request: "save_player", when: when.into(), advice });
     let Some(runner) = batch.policy_runner() else {

@@ -1,8 +1,8 @@
-//! The price of each request in steps of an environment, for the rate of a token. The table is in docs/access.md.
+//! The price of each request, in steps of one environment, for the rate limits of tokens. docs/access.md has the table.
 
 use crate::{pool::Batch, proto::session_request::Request};
 
-/// The price of `open` without that of its environments. It covers the session's buffers and log line.
+/// The price of `open` without the price of its environments. It covers the session's buffers and its line in the log.
 const OPEN_PRICE: u64 = 16;
 /// The price of each restored environment.
 const RESTORED_PRICE: u64 = 4;
@@ -11,8 +11,8 @@ const PIXELS_PER_STEP: u64 = 1024;
 /// The fixed price of each request other than `open`, `step` and `act`.
 const REQUEST_PRICE: u64 = 1;
 
-/// The price of a request besides that of its steps. It is 0 for `step` and `act`. The environments of an `open` are
-/// charged separately when they are made.
+/// Returns the price of a request without the steps that it runs: 0 for `step` and `act`. The environments of an `open`
+/// are charged separately when they are created.
 pub fn price(request: Option<&Request>, batch: Option<&Batch>) -> u64 {
     let size = batch.map_or(0, Batch::size);
     let selected = |mask: &[u8]| if mask.is_empty() { size } else { mask.iter().filter(|&&entry| entry != 0).count() };
@@ -35,9 +35,9 @@ pub fn price(request: Option<&Request>, batch: Option<&Batch>) -> u64 {
     }
 }
 
-/// The default side of a picture, pixels.
+/// The default width and height of a picture, pixels.
 const DEFAULT_SIDE: u64 = 480;
-/// The largest side of a picture, pixels.
+/// The maximum width and height of a picture, pixels.
 const MAX_SIDE: u64 = 2048;
 
 #[cfg(test)]

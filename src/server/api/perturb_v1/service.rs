@@ -1,4 +1,4 @@
-//! The gRPC service of `perturb.v1`: one short method for each call.
+//! The gRPC service of `perturb.v1`.
 
 use super::session::{ServerContext, Session};
 use crate::{
@@ -14,15 +14,16 @@ use crate::{
 use std::{sync::Arc, time::Duration};
 use tonic::{Request, Response, Status, Streaming};
 
-/// The price of the catalogue in steps.
+/// The price of a call for the catalogue, in steps.
 const LISTING_PRICE: u64 = 16;
-/// The maximum time that a call for the catalogue waits for its token's rate. It is below the timeout of such calls.
+/// The maximum time that a call for the catalogue waits for its token's rate. It is shorter than the timeout of unary
+/// calls.
 const MAX_LISTING_WAIT: Duration = Duration::from_secs(5);
 
-/// The path of calls that are sessions.
+/// The path of the gRPC method whose calls are sessions.
 pub const ENDPOINT: &str = "/perturb.v1.Perturb/Session";
 
-/// Serves the catalogue and sessions.
+/// The service of `perturb.v1`: the catalogue, and sessions.
 #[derive(Clone)]
 pub struct PerturbService {
     shared: Arc<ServerContext>,
@@ -31,17 +32,17 @@ pub struct PerturbService {
 }
 
 impl PerturbService {
-    /// Makes a service whose sessions share `shared`.
+    /// Makes a service whose sessions use the parts `shared`, within the limits of `sessions`.
     pub fn new(shared: ServerContext, sessions: Sessions) -> Self {
         Self { shared: Arc::new(shared), sessions, counts: RequestCounters::new::<Session>() }
     }
 
-    /// The same service with another view of the shutdown.
+    /// Returns a handle to the same service that observes the shutdown through `drain`.
     pub fn with_drain(&self, drain: Drain) -> Self {
         Self { sessions: self.sessions.with_drain(drain), ..self.clone() }
     }
 
-    /// The requests so far.
+    /// Returns the counters of requests.
     pub fn counts(&self) -> Arc<RequestCounters> {
         Arc::clone(&self.counts)
     }

@@ -1,4 +1,4 @@
-//! The handler of one session: the legal order of its requests, each answered once.
+//! Answers the requests of one `perturb.v1` session, and enforces their legal order.
 
 use super::{Error, convert, fields::SESSION_REQUEST, policy, price::price, sizes};
 use crate::{
@@ -24,42 +24,42 @@ use crate::{
 use bytes::Bytes;
 use std::sync::Arc;
 
-/// An upper bound of the length of a step's request without its actions, bytes.
+/// An upper bound of the length of a `step` request without its actions, bytes.
 const STEP_OVERHEAD_BYTES: usize = 32;
 
-/// The parts of a server that all its sessions share.
+/// The parts of a server that all sessions of `perturb.v1` share.
 pub struct ServerContext {
     /// The pool that runs the environments.
     pub pool: Arc<Pool>,
-    /// The environments that can be opened.
+    /// The environments that sessions can open.
     pub catalogue: Arc<Catalogue>,
-    /// The catalogue as a message.
+    /// The reply to a call for the catalogue.
     pub listing: proto::ListEnvironmentsResponse,
-    /// The renderer of pictures.
+    /// The renderer that draws pictures of environments.
     pub renderer: Renderer,
     /// The ledger of all draws, if there is one.
     pub ledger: Option<Ledger>,
-    /// Sessions that outlive their streams.
+    /// The leases of sessions that may outlive their streams.
     pub leases: Leases<proto::SessionResponse>,
 }
 
-/// A client's session. Dropping it frees its environments.
+/// The state of a client's session. Dropping it frees its environments.
 pub struct Session {
     context: Arc<ServerContext>,
     batch: Option<Batch>,
     bearer: Option<Bearer>,
-    /// The session's part of its token's quota of environments.
+    /// The environments taken from the quota of the session's token.
     env_quota: Option<QuotaGuard>,
     draws: DrawAuditor,
     budget: Budget,
-    /// Memory for the requests and replies of steps.
+    /// The memory reserved for the requests and replies of steps.
     step_memory: Option<MemoryReservation>,
-    /// Memory for the policy that plays.
+    /// The memory reserved for the current policy.
     policy_memory: Option<MemoryReservation>,
 }
 
 impl Session {
-    /// Makes a session that is not open yet. Its replies are reserved in `budget`.
+    /// Makes a session that is not open yet. It reserves memory for its replies in `budget`.
     pub fn new(context: Arc<ServerContext>, bearer: Option<Bearer>, budget: Budget) -> Self {
         let draws = DrawAuditor::new(bearer.clone(), context.ledger.clone());
         Self { context, batch: None, bearer, env_quota: None, draws, budget, step_memory: None, policy_memory: None }
@@ -87,7 +87,7 @@ impl Session {
             opened.observed(observes_parameters)
         });
         let envs = settings.size();
-        // A batch above the pool's limit gets no reservation, because the pool refuses it with the better message.
+        // A batch larger than the pool gets no reservation: the pool then refuses it with a better message.
         let step_memory =
             (envs <= max_envs).then(|| self.budget.reserve(sizes::session(&settings, envs))).transpose()?;
         let env_quota = self.bearer.as_ref().map(|bearer| bearer.envs(envs)).transpose()?;
@@ -225,7 +225,7 @@ impl Session {
     }
 }
 
-/// A reply of this protocol.
+/// A reply in this protocol.
 type SessionReply = Reply<proto::SessionResponse>;
 
 fn reply(response: Response) -> SessionReply {
@@ -308,7 +308,8 @@ impl SessionHandler for Session {
     }
 
     async fn answer(&mut self, request: Self::Request) -> Result<SessionReply, Error> {
-        // This future is moved, and is as large as its largest branch. Boxing the other branches keeps a step cheap.
+        // This future is moved, and it is as large as its largest branch. Boxing all branches but `step` keeps steps
+        // cheap.
         match request.request {
             Some(Request::Open(open)) => Box::pin(self.open(open)).await,
             Some(Request::Step(step)) => self.step(step).await,
@@ -324,7 +325,7 @@ impl SessionHandler for Session {
         }
     }
 
-    /// A step may be pipelined behind another step, if the token has no rate.
+    /// A step may be pipelined behind another step, unless the token has a rate limit.
     fn pipeline(&self, request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<>> {
         let batch = self.batch.as_ref().filter(|_| matches!(request.request, Some(Request::Step(_))))?;
         let has_no_rate = self.bearer.as_ref().is_none_or(|bearer| bearer.rate().is_none());

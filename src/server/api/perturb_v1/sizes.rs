@@ -1,4 +1,5 @@
-//! Upper bounds of the lengths of requests and replies. The memory budget is asked for them before they are made.
+//! Upper bounds and estimates of the lengths of requests and replies. They are reserved in the memory budget
+//! beforehand.
 
 use crate::{
     env::{self, ActionSpace},
@@ -7,23 +8,23 @@ use crate::{
     render::Size,
 };
 
-/// The length of a request beyond its bytes for each environment. It has room for parameters, and for wrong requests,
-/// which should get an error in-band.
+/// The part of a request's maximum length that does not depend on the batch size, bytes. It has room for parameters,
+/// and for invalid requests, so that these get an error in-band.
 const REQUEST_OVERHEAD_BYTES: usize = 1 << 20;
-/// The maximum length of a number in the encoding, tag included.
+/// The maximum encoded length of an integer field with its tag, bytes.
 const MAX_VARINT_FIELD_BYTES: usize = 11;
-/// The estimated memory of an episode's end in the domain and in the encoded reply together, bytes.
+/// The estimated memory that an ended episode takes, as a value and encoded in the reply together, bytes.
 const EPISODE_END_BYTES: usize = 300;
-/// The estimated memory of a receipt.
+/// The estimated memory of a receipt, bytes.
 const RECEIPT_BYTES: usize = 500;
-/// The estimated length of a snapshot.
+/// The estimated length of an environment's snapshot, bytes.
 const SNAPSHOT_BYTES: usize = 2 << 10;
-/// An upper bound of the tags and lengths of all fields of a reply that are not repeated, bytes.
+/// An upper bound of the total length of a reply's tags, lengths and non-repeated fields, bytes.
 const FRAMING_BYTES: usize = 256;
 /// The number of integers in a row of `Stepped.receipt_episodes`.
 const RECEIPT_INDICES: usize = 5;
 
-/// The number of entries of an action.
+/// Returns A, the number of entries of an action.
 fn action_width(settings: &BatchSettings) -> usize {
     match settings.spec.action {
         ActionSpace::Discrete(_) => 1,
@@ -31,8 +32,8 @@ fn action_width(settings: &BatchSettings) -> usize {
     }
 }
 
-/// An upper bound of the length of a valid request to a batch, bytes. In [`Autoreset::SameStep`] there is no bound,
-/// because such a session may send a policy with any number of weights.
+/// Returns an upper bound of the length of a valid request to a batch, bytes. In [`Autoreset::SameStep`] there is no
+/// bound, because such a session may send a policy with any number of weights.
 pub fn max_request_bytes(batch: &Batch) -> usize {
     let settings = batch.settings();
     if settings.autoreset == Autoreset::SameStep {
@@ -43,13 +44,13 @@ pub fn max_request_bytes(batch: &Batch) -> usize {
     REQUEST_OVERHEAD_BYTES.saturating_add(batch.size().saturating_mul(reset.max(restore)))
 }
 
-/// The length of a step's request, bytes.
+/// Returns the length of a step's actions, bytes.
 pub fn step_request(settings: &BatchSettings, envs: usize) -> usize {
     envs.saturating_mul(4 * action_width(settings))
 }
 
-/// The memory that an open session reserves, bytes, so that no step is refused because of other sessions. It has room
-/// for the requests of two steps, and for three replies: one being computed, one waiting and one being sent.
+/// Returns the memory that a session reserves when it is opened, bytes: two step requests and three replies (one being
+/// computed, one waiting, one being sent). Thanks to it, no step is refused because of other sessions.
 pub fn session(settings: &BatchSettings, envs: usize) -> usize {
     let numbers = 2 * settings.observation_size() + 1 + settings.spec.reward_terms.len();
     let ends = if settings.receipts { 2 * RECEIPT_BYTES } else { EPISODE_END_BYTES };
@@ -57,23 +58,23 @@ pub fn session(settings: &BatchSettings, envs: usize) -> usize {
     step_request(settings, envs).saturating_mul(2).saturating_add(reply.saturating_mul(3))
 }
 
-/// The estimated length of the snapshots of `envs` environments.
+/// Returns the estimated length of the snapshots of `envs` environments, bytes.
 pub fn snapshots(envs: usize) -> usize {
     envs.saturating_mul(SNAPSHOT_BYTES)
 }
 
-/// The memory of snapshots, bytes.
+/// Returns the memory that these snapshots take, bytes.
 pub fn snapshot_bytes(snapshots: &[bytes::Bytes]) -> usize {
     snapshots.iter().map(|snapshot| snapshot.len() + size_of::<bytes::Bytes>()).sum()
 }
 
-/// The memory of a picture, bytes.
+/// Returns the memory of a picture of this size, bytes.
 pub fn picture(size: Size) -> usize {
     3 * usize::from(size.width) * usize::from(size.height)
 }
 
-/// The memory of a playing policy, bytes: its weights as received and as loaded, and its activations in each
-/// environment.
+/// Returns the memory that the policy of an `act` takes while it plays `envs` environments, bytes: its weights as
+/// received and as loaded, and its activations in each environment.
 pub fn policy(request: &proto::Act, envs: usize) -> usize {
     let widths = request.policy.as_ref().map_or(0, |policy| {
         policy.hidden.iter().chain([&policy.lstm]).map(|&width| width as usize).fold(0, usize::saturating_add)
@@ -81,20 +82,21 @@ pub fn policy(request: &proto::Act, envs: usize) -> usize {
     (2 * request.weights.len()).saturating_add(envs.saturating_mul(widths).saturating_mul(16))
 }
 
-/// An upper bound of the reply to an `act`, bytes.
+/// Returns an upper bound of the length of the reply to an `act`, bytes.
 pub fn max_rollout_bytes(request: &RolloutRequest, batch: &Batch) -> usize {
     let settings = batch.settings();
-    // The action counts twice, as sampled and as an input of the policy. The 10 are flags, values and the like.
+    // Actions count twice: as sampled, and as inputs of the policy. The 10 stands for flags, values and the like.
     let numbers = settings.observation_size() + 2 * action_width(settings) + 10;
     let step = batch.size().saturating_mul(4 * numbers + RECEIPT_BYTES);
     step.saturating_mul(request.max_steps).min(MAX_ROLLOUT_BYTES.saturating_add(step))
 }
 
-/// The approximate length at which a rollout's reply is cut.
+/// The approximate length at which a rollout is cut into several replies, bytes.
 const MAX_ROLLOUT_BYTES: usize = 4_000_000;
 
-/// Returns an upper bound of a reply to `step`, `reset` or `restore` of `size` environments, bytes. It is reached when
-/// all episodes end at once with the largest counters. `environment` is the entry of the catalogue.
+/// Returns an upper bound of the length of a reply to `step`, `reset` or `restore` of `size` environments, bytes. The
+/// bound is reached when all episodes end in the same step with the largest counters. `environment` is the entry of the
+/// catalogue.
 pub fn max_step_reply_bytes(settings: &BatchSettings, environment: &proto::Environment, size: usize) -> usize {
     let receipt = proto::Receipt {
         requested: vec![1.0; environment.parameters.len()],
@@ -129,22 +131,23 @@ pub fn max_step_reply_bytes(settings: &BatchSettings, environment: &proto::Envir
     let started = if has_messages { start_message } else { array_row };
     let events = match settings.autoreset {
         Autoreset::SameStep => ended + started,
-        Autoreset::NextStep => ended.max(started), // an episode that begins in a step does not end in it
+        Autoreset::NextStep => ended.max(started), // no episode both begins and ends in one step
         Autoreset::Disabled => ended,
     };
     let reward_terms = if settings.reward_terms { 4 * settings.spec.reward_terms.len() } else { 0 };
-    // The reward and two flags of a step have six bytes. A reply to `reset` has messages even if steps have arrays.
+    // The reward and the two flags of a step take six bytes. A reply to `reset` has receipts as messages even if steps
+    // have them as arrays.
     let row = observation + (6 + reward_terms + events).max(start_message);
     size.saturating_mul(row).saturating_add(FRAMING_BYTES)
 }
 
-/// Returns an upper bound of a reply to `snapshot` of `size` environments, bytes, if each snapshot has at most
-/// `snapshot` bytes.
+/// Returns an upper bound of the length of a reply to `snapshot` of `size` environments, bytes. `snapshot` is the
+/// maximum length of one snapshot.
 pub fn max_snapshot_reply_bytes(size: usize, snapshot: usize) -> usize {
     size.saturating_mul(1 + prost::length_delimiter_len(snapshot) + snapshot).saturating_add(FRAMING_BYTES)
 }
 
-/// The length of a message as an entry of a repeated field, bytes. The field's tag has one byte.
+/// Returns the encoded length of a message as an entry of a repeated field whose tag has one byte, bytes.
 fn entry(message: &impl prost::Message) -> usize {
     let length = message.encoded_len();
     1 + prost::length_delimiter_len(length) + length
