@@ -1,24 +1,24 @@
-//! The environments that a server has, by name.
+//! The environments of a server, found by name.
 
 use perturb_protocol::names::{EnvironmentName, is_spelled};
 
 use super::{EnvironmentSpec, Error, shorten};
 
-/// Environments in a fixed order. Each has a name of its own.
+/// The environments of a server, in a fixed order, with different names.
 #[derive(Debug, Clone, Default)]
 pub struct Catalogue(Vec<&'static EnvironmentSpec>);
 
 impl Catalogue {
-    /// Makes a catalogue of these environments, whose names must differ.
+    /// Creates a catalogue of these environments, which must have different names.
     pub(crate) fn new(specs: Vec<&'static EnvironmentSpec>) -> Self {
         Self(specs)
     }
 
-    /// Adds one more environment at the end.
+    /// Adds an environment at the end.
     ///
     /// # Errors
-    /// [`Error::NameTaken`] if another environment has the same name. Names that differ only in case, hyphens and
-    /// underscores are the same.
+    /// [`Error::NameTaken`] if an environment has the same name. Names that differ only in case, hyphens and
+    /// underscores count as equal.
     pub fn with(mut self, spec: &'static EnvironmentSpec) -> Result<Self, Error> {
         let taken = self.names().find(|name| is_spelled(spec.name, name));
         if let Some(taken) = taken {
@@ -28,20 +28,20 @@ impl Catalogue {
         Ok(self)
     }
 
-    /// Returns all environments.
+    /// Returns the descriptions of all environments, in order.
     pub fn specs(&self) -> impl Iterator<Item = &'static EnvironmentSpec> {
         self.0.iter().copied()
     }
 
-    /// Returns the names of all environments.
+    /// Returns the names of all environments, in order.
     pub fn names(&self) -> impl Iterator<Item = &'static str> {
         self.specs().map(|spec| spec.name)
     }
 
-    /// Returns the environment of a name or of an id in Gymnasium, in any [spelling](perturb_protocol::names).
+    /// Finds an environment by its name or its Gymnasium id, in any [spelling](perturb_protocol::names).
     ///
     /// # Errors
-    /// [`Error::UnknownEnvironment`].
+    /// [`Error::UnknownEnvironment`] if there is no such environment, or only one of another revision.
     pub fn find(&self, name: &str) -> Result<&'static EnvironmentSpec, Error> {
         let known = self.0.iter().map(|spec| (spec.name, spec.revision));
         Ok(self.0[EnvironmentName::new(&shorten(name)).find(known)?])

@@ -1,4 +1,4 @@
-//! The trait of environments, and the description that each gives of itself.
+//! The trait that every environment implements, and the description of an environment.
 
 use super::{
     Action, ActionSpace, Channel, Distribution, Draw, Error, Interval, Parameter, Quantity, RewardTerm, Stream,
@@ -8,56 +8,58 @@ use crate::scene::Scene;
 use perturb_protocol::region::Region;
 use std::fmt;
 
-/// Makes an environment with default parameters.
+/// A function that creates an environment with default parameters.
 pub type MakeEnvironment = dyn Fn() -> Result<Box<dyn Environment>, Error> + Send + Sync;
 
-/// The pushes that an environment can take.
+/// The pushes that the disturbance `push` can apply to an environment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PushSpec {
-    /// The description of the parameter that is their size, as in "impulse of a push on the torso".
+    /// The description of the parameter `push`, such as "impulse of a push on the torso".
     pub description: &'static str,
-    /// The unit of their size.
+    /// The unit of a push's size.
     pub unit: &'static str,
-    /// The axes along which they act, ascending: 0 to 2 for x, y and z. An analytic task has one, its coordinate.
+    /// The axes along which pushes act, ascending: 0, 1 and 2 for x, y and z. A task without MuJoCo has one axis, 0,
+    /// for its only coordinate.
     pub axes: &'static [usize],
 }
 
-/// The fixed description of an environment.
+/// The description of an environment, which never changes while the server runs.
 #[derive(Clone, Copy)]
 pub struct EnvironmentSpec {
-    /// The name to open it by.
+    /// The name by which clients open the environment.
     pub name: &'static str,
-    /// The revision, which is raised by every change of dynamics, reward or observation.
+    /// The revision. Every change of dynamics, reward or observation raises it.
     pub revision: u32,
     /// A description in one sentence.
     pub description: &'static str,
-    /// Makes an environment with default parameters; fails with [`Error::Model`] if its model cannot be loaded.
+    /// Creates an environment with default parameters. Fails with [`Error::Model`] if its model cannot be loaded.
     pub make: &'static MakeEnvironment,
     /// The parameters that can be changed.
     pub parameters: &'static [Parameter],
-    /// The entries of an observation, `[O]`.
+    /// The entries of an observation, in order.
     pub observation: &'static [Channel],
-    /// The actions.
+    /// The actions that the environment accepts.
     pub action: ActionSpace,
-    /// The entries of an exact initial state, `[S]`.
+    /// The entries of an exact initial state, which clients may set, in order.
     pub state: &'static [Channel],
     /// The terms of the reward, in order. The reward is their sum.
     pub reward_terms: &'static [RewardTerm],
-    /// The quantities that receipts read back from the physics.
+    /// The physical quantities that receipts report, in order. They are read back from the simulation.
     pub applied: &'static [Quantity],
     /// The number of steps after which an episode is truncated.
     pub step_limit: u32,
-    /// Simulated seconds in one step.
+    /// The simulated time of one step, in s.
     pub control_timestep: f64,
-    /// The approximate time of a step on one core, µs. The pool cuts batches by it; results do not depend on it.
+    /// The approximate computing time of a step on one core, in µs. The worker pool uses it to divide batches. Results
+    /// do not depend on it.
     pub step_cost: f64,
-    /// The pushes that the environment can take; `None` if it cannot be pushed.
+    /// The pushes that can be applied to the environment; `None` if it cannot be pushed.
     pub push: Option<PushSpec>,
     /// The success rule of the paper's text.
     pub success: Success,
-    /// The success rule of the paper's published code; `None` if it is the same.
+    /// The success rule of the paper's published code; `None` if it is the same as [`Self::success`].
     pub code_success: Option<Success>,
-    /// The two parameters that heat maps have along x and along y by default.
+    /// The two parameters that heat maps show along x and y by default.
     pub heatmap_axes: Option<[&'static str; 2]>,
 }
 
@@ -69,14 +71,15 @@ impl fmt::Debug for EnvironmentSpec {
 }
 
 impl EnvironmentSpec {
-    /// Returns the distributions of a version, one for each parameter. R+E has those of R, then those of E, as in
-    /// [`Settings::distributions`](super::Settings::distributions).
+    /// Returns the distributions of a version, one for each parameter. For R+E returns the distributions of R, then
+    /// those of E, in the layout of [`Settings::distributions`](super::Settings::distributions).
     pub fn distributions(&self, version: Version) -> Vec<Distribution> {
         let of = |&part: &Version| self.parameters.iter().map(move |parameter| parameter.distribution(part));
         version.parts().iter().flat_map(of).collect()
     }
 
-    /// Returns the parameter values that can be drawn from `distributions`, one for each parameter in each box.
+    /// Returns the region of parameter values that can be drawn from `distributions`, which has the layout of
+    /// [`Settings::distributions`](super::Settings::distributions).
     pub fn region(&self, distributions: &[Distribution]) -> Region {
         let names = || self.parameters.iter().map(|parameter| parameter.name.to_owned());
         let boxes = distributions.chunks(self.parameters.len().max(1));
@@ -84,10 +87,10 @@ impl EnvironmentSpec {
     }
 }
 
-/// Checks that values from `low` to `high` lie within the parameter's physical range. NaN does not.
+/// Checks that the interval from `low` to `high` is within the parameter's physical range.
 ///
 /// # Errors
-/// [`Error::OutOfRange`].
+/// [`Error::OutOfRange`] if it is not, or if an end is NaN.
 pub fn check_bounds(spec: &EnvironmentSpec, parameter: &Parameter, (low, high): (f64, f64)) -> Result<(), Error> {
     let bounds = parameter.bounds;
     if low >= bounds.low && high <= bounds.high {
@@ -103,8 +106,8 @@ pub fn check_bounds(spec: &EnvironmentSpec, parameter: &Parameter, (low, high): 
     })
 }
 
-/// Checks that a distribution lies within the parameter's physical range, and that each of its intervals has a whole
-/// number where the parameter needs one.
+/// Checks that a distribution is within the parameter's physical range. For a parameter of whole numbers, also checks
+/// that each interval contains one.
 ///
 /// # Errors
 /// [`Error::OutOfRange`], [`Error::NotWhole`].
@@ -123,11 +126,11 @@ pub fn check_distribution(
     }
 }
 
-/// Replaces in `base` (one distribution a parameter, in the spec's order, of one box or of several) those that
-/// `overrides` names, in every box.
+/// Replaces in `base` the distributions of the parameters that `overrides` names, in every box. `base` has the layout
+/// of [`Settings::distributions`](super::Settings::distributions).
 ///
 /// # Errors
-/// [`Error::UnknownParameter`] and [`Error::OutOfRange`]; `base` is unchanged then.
+/// [`Error::UnknownParameter`], [`Error::OutOfRange`], [`Error::NotWhole`]. `base` is then unchanged.
 pub fn resolve<'a>(
     spec: &'static EnvironmentSpec,
     base: &mut [Distribution],
@@ -150,50 +153,54 @@ pub fn resolve<'a>(
     Ok(())
 }
 
-/// The result of one step, besides the reward.
+/// The result of one step of an environment, apart from reward and observation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Transition {
-    /// Whether the task ended the episode. Step limits are applied by [`Episodes`](super::Episodes).
+    /// Whether the task ended the episode. The step limit is not included: [`Episodes`](super::Episodes) applies it.
     pub terminated: bool,
-    /// Whether the goal holds after this step, which [`Achievement::FirstGoal`](super::Achievement::FirstGoal) and
-    /// [`Achievement::LastGoals`](super::Achievement::LastGoals) count.
+    /// Whether the task's goal is met after this step. [`Achievement::FirstGoal`](super::Achievement::FirstGoal),
+    /// [`Achievement::LastGoals`](super::Achievement::LastGoals) and
+    /// [`Achievement::LongestGoals`](super::Achievement::LongestGoals) are computed from it.
     pub goal: bool,
-    /// Whether the physics diverged: the state is not finite. Implies `terminated`.
+    /// Whether the physics diverged, i.e. the state is not finite. Then `terminated` is true, too.
     pub diverged: bool,
 }
 
-/// The physics and the task of one environment, without episodes, limits or randomness of its own.
+/// The physics and the task of one environment. [`Episodes`](super::Episodes) adds episodes, the step limit and the
+/// drawing of parameters.
 ///
-/// After construction the parameters are the defaults and the state is some valid state; callers set parameters and
-/// reset before they step. Every method is deterministic: the same calls give the same bytes.
+/// A new environment has default parameters and an arbitrary valid state. Set parameters and reset before the first
+/// step. Every method is deterministic: the same calls give the same bytes.
 pub trait Environment: Send {
     /// Returns the environment's description.
     fn spec(&self) -> &'static EnvironmentSpec;
 
-    /// Applies parameters, in the spec's order, always starting from the unchanged model. The caller ensures that each
-    /// is within its bounds. The state is undefined until the next reset.
+    /// Applies the parameters `values`, in the order of [`EnvironmentSpec::parameters`], to the unmodified model. Each
+    /// must be within its bounds. The state is undefined until the next reset.
     fn set_parameters(&mut self, values: &[f64]);
 
-    /// Reads back from the physics the values of [`EnvironmentSpec::applied`], in order.
+    /// Reads the quantities of [`EnvironmentSpec::applied`] from the physics, and writes them to `out`, in order.
     fn applied(&self, out: &mut [f64]);
 
-    /// The SHA-256 of the model's files in hexadecimal, or `""` without a model.
+    /// Returns the SHA-256 of the model's files in hexadecimal; empty for an environment without a model.
     fn model_hash(&self) -> &str {
         ""
     }
 
-    /// Returns the value that the episode achieved so far, if the spec's [`Achievement`](super::Achievement) is the
-    /// environment's own.
+    /// Returns the value that the episode has achieved so far. Only used if the success rule compares
+    /// [`Achievement::Own`](super::Achievement::Own).
     fn achieved(&self) -> Option<f64> {
         None
     }
 
-    /// Sets the address of an episode's random numbers and the number of its past steps, before the episode begins or
-    /// is loaded. Environments that draw no numbers after a reset ignore it.
+    /// Sets the seed, environment index and episode index that determine the episode's random numbers, and the number
+    /// of steps that the episode has taken. Called before an episode begins or is loaded. Environments that draw no
+    /// random numbers during steps ignore it.
     fn set_address(&mut self, _draw: Draw, _steps: u32) {}
 
-    /// Writes the action with the least effect, `[A]`, or the number of the choice. By default each entry is 0, or the
-    /// end of its range that is nearest to 0. Of an odd number of choices it is the middle one, otherwise the first.
+    /// Writes the action with the least effect to `out`: a vector with an entry for each channel, or the index of a
+    /// choice. By default each entry is the number in its range that is nearest to 0. The default choice is the middle
+    /// one if there is one, otherwise the first.
     fn neutral_action(&self, out: &mut [f32]) {
         match self.spec().action {
             ActionSpace::Discrete(names) => out.fill(if names.len() % 2 == 1 { (names.len() / 2) as f32 } else { 0.0 }),
@@ -205,35 +212,38 @@ pub trait Environment: Send {
         }
     }
 
-    /// Pushes the physics during the next step, by an impulse along x, y and z in the unit of [`EnvironmentSpec::push`].
+    /// Applies an external impulse during the next step: its components along x, y and z, in the unit of
+    /// [`EnvironmentSpec::push`].
     fn push(&mut self, _impulse: [f64; 3]) {}
 
-    /// Draws an initial state.
+    /// Begins an episode in a random initial state, drawn from `stream`.
     fn reset(&mut self, stream: &mut Stream);
 
-    /// Starts from an exact state, `[S]`. The caller ensures that it is finite.
+    /// Begins an episode in the given state, which has the entries of [`EnvironmentSpec::state`]. They must be finite.
     fn reset_to(&mut self, state: &[f64]);
 
-    /// Writes the current observation, `[O]`.
+    /// Writes the current observation to `out`, which has the entries of [`EnvironmentSpec::observation`].
     fn observe(&self, out: &mut [f32]);
 
-    /// Returns the content of a picture of the current state; `None` after the physics diverged.
+    /// Returns the scene to draw for a picture of the current state; `None` after the physics diverged.
     fn scene(&self) -> Option<Scene>;
 
-    /// Advances by one control step and writes the reward's terms, in the spec's order.
+    /// Advances by one control step. Writes the terms of the reward to `reward_terms`, in the order of
+    /// [`EnvironmentSpec::reward_terms`].
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition;
 
-    /// Appends the complete dynamic state: all that the next step depends on besides the parameters.
+    /// Appends the complete dynamic state to `out`. Together with the parameters it determines all later steps.
     fn save(&self, out: &mut Vec<f64>);
 
-    /// Returns an upper bound of the additional numbers that [`Environment::save`] may append with other parameters.
+    /// Returns an upper bound of how many numbers more than now [`Environment::save`] would append with other
+    /// parameters.
     fn max_saved_growth(&self) -> usize {
         0
     }
 
-    /// Loads a state that [`Environment::save`] wrote, after the same parameters were set.
+    /// Loads a state that [`Environment::save`] appended. The same parameters must have been set before.
     ///
     /// # Errors
-    /// [`Error::Snapshot`] if the length or a value is impossible; the state is undefined then.
+    /// [`Error::Snapshot`] if the length or a value is impossible. The state is then undefined.
     fn load(&mut self, state: &[f64]) -> Result<(), Error>;
 }

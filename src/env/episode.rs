@@ -1,83 +1,84 @@
-//! Episodes of one environment: trials, step limit, success, receipts, snapshots.
+//! The episodes of one environment: drawing of parameters, step limit, success rules and receipts.
 
 use super::{
     Achievement, Action, Distribution, Draw, Environment, EnvironmentSpec, Purpose, Stream, seen::SeenParameters,
 };
 use crate::scene::Scene;
 
-/// The settings that determine an environment's episodes.
+/// The settings that determine the episodes of an environment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
     /// The seed.
     pub seed: u64,
-    /// The environment's index: with the seed and an episode's number it fixes all randomness.
+    /// The environment's index. Seed, index and episode number together determine all random numbers of an episode.
     pub environment_index: u32,
-    /// The distributions of one box or of two boxes, one box after the other. A box has a distribution for each
-    /// parameter, in the spec's order, within the parameters' bounds. Each trial is drawn from one of the boxes, with
-    /// equal probability.
+    /// The distributions of one or two boxes of the parameter space, one box after the other. A box has a distribution
+    /// for each parameter, in the order of [`EnvironmentSpec::parameters`], within the parameters' bounds. Each trial
+    /// draws all parameters from one of the boxes, chosen with equal probability.
     pub distributions: Vec<Distribution>,
-    /// Episodes in a trial, at least 1. Parameters are drawn when a trial begins.
+    /// Number of episodes in a trial, at least 1. Parameters are drawn when a trial begins, and kept for all its
+    /// episodes.
     pub episodes_per_trial: u32,
 }
 
-/// Maximum number of boxes, which R+E has.
+/// Maximal number of boxes in [`Settings::distributions`]. Version R+E has two.
 pub(super) const MAX_BOXES: usize = 2;
 
-/// The address of an episode within its seed.
+/// The numbers that identify an episode among all episodes of the same seed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct EpisodeId {
     /// The environment's index.
     pub environment_index: u32,
-    /// Counts the environment's trials from 0.
+    /// The number of the trial, counted from 0 for each environment.
     pub trial_index: u64,
-    /// Counts the environment's episodes from 0.
+    /// The number of the episode, counted from 0 for each environment.
     pub episode_index: u64,
-    /// Counts the trial's episodes from 0.
+    /// The number of the episode in its trial, from 0.
     pub episode_in_trial: u32,
 }
 
-/// The physics that an episode ran with.
+/// The physical parameters with which an episode ran.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Receipt {
-    /// The parameters that were drawn or given, in the spec's order.
+    /// The drawn or requested parameters, in the order of [`EnvironmentSpec::parameters`].
     pub requested: Vec<f64>,
     /// The values read back from the physics, in the order of [`EnvironmentSpec::applied`].
     pub applied: Vec<f64>,
-    /// The model's hash, or empty.
+    /// The hash of the model's files, see [`Environment::model_hash`].
     pub model_hash: String,
 }
 
-/// An episode that began.
+/// The start of an episode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EpisodeStart {
-    /// The episode's address.
+    /// The numbers that identify the episode.
     pub id: EpisodeId,
-    /// The episode's receipt, if requested.
+    /// The receipt with the episode's parameters, if requested.
     pub receipt: Option<Receipt>,
 }
 
-/// An episode that ended.
+/// The result of an episode that ended.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EpisodeEnd {
-    /// The episode's address.
+    /// The numbers that identify the episode.
     pub id: EpisodeId,
     /// The undiscounted sum of rewards.
     pub total_reward: f64,
     /// The number of steps.
     pub length: u32,
-    /// The value that the spec's success rule compares; `None` if the episode achieved none.
+    /// The value that the environment's success rule compares; `None` if the episode has no such value.
     pub achieved: Option<f64>,
-    /// The value that the rule of the paper's published code compares; `None` if the episode achieved none.
+    /// The value that the success rule of the paper's published code compares; `None` if the episode has no such value.
     pub code_achieved: Option<f64>,
-    /// Whether the spec's rule holds.
+    /// Whether the episode is a success by the environment's success rule.
     pub success: bool,
-    /// Whether the physics diverged.
+    /// Whether the physics diverged, i.e. the state is not finite.
     pub diverged: bool,
-    /// The episode's receipt, if requested.
+    /// The receipt with the episode's parameters, if requested.
     pub receipt: Option<Receipt>,
 }
 
-/// The outcome of one step of an episode.
+/// The result of one step of an episode.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Outcome {
     /// The sum of the reward's terms.
@@ -88,7 +89,7 @@ pub struct Outcome {
     pub truncated: bool,
 }
 
-/// The position of an environment in its episodes.
+/// The counters of an environment: the current trial and episode, and the progress of the episode.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize, serde::Deserialize)]
 pub(super) struct Progress {
     pub(super) trial: u64,
@@ -96,12 +97,12 @@ pub(super) struct Progress {
     pub(super) episode_in_trial: u32,
     pub(super) length: u32,
     pub(super) total_reward: f64,
-    /// The first step after which the goal held, counted from 1; 0 if none.
+    /// The number of the first step, from 1, after which the task's goal was met; 0 if it was not met yet.
     pub(super) reached_at: u32,
-    /// The length, in steps, of the run that ends with the last step and after each step of which the goal held.
+    /// The number of steps in a row, up to the last step, after each of which the task's goal was met.
     pub(super) held_for: u32,
-    /// The length, in steps, of the longest run of steps after each of which the goal held. Snapshots store it behind
-    /// the other fields, because older snapshots lack it.
+    /// The maximal number of steps in a row after each of which the task's goal was met. Snapshots store it after the
+    /// other fields, because older snapshots lack it.
     #[serde(skip)]
     pub(super) held_longest: u32,
     pub(super) ended: bool,
@@ -112,21 +113,24 @@ pub(super) struct Progress {
 pub struct Episodes {
     pub(super) environment: Box<dyn Environment>,
     pub(super) settings: Settings,
-    /// The parameters of the current trial, `[P]`.
+    /// The parameters of the current trial, in the order of [`EnvironmentSpec::parameters`].
     pub(super) values: Vec<f64>,
     pub(super) progress: Progress,
-    /// The parameters at the end of observations, if observations have them.
+    /// The parameters at the end of each observation; `None` if observations do not include them.
     pub(super) seen: Option<Box<SeenParameters>>,
 }
 
-/// Returns the number of boxes in a list of `distributions` distributions for `n` parameters, or `None` if it is not
-/// whole. Without parameters there is one box.
+/// Returns how many boxes `distributions` distributions for `n` parameters make: 1 or 2. Returns `None` if the numbers
+/// do not fit. Without parameters there is one box.
 pub(super) fn boxes(distributions: usize, n: usize) -> Option<usize> {
     (1..=MAX_BOXES).find(|boxes| boxes * n == distributions)
 }
 
 impl Episodes {
-    /// Makes the episodes of an environment, and begins the first one.
+    /// Takes an environment, and begins its first episode.
+    ///
+    /// # Panics
+    /// If `settings` does not have one distribution for each parameter in each box.
     pub fn new(environment: Box<dyn Environment>, settings: Settings) -> Self {
         let n = environment.spec().parameters.len();
         assert!(
@@ -139,7 +143,7 @@ impl Episodes {
         episodes
     }
 
-    /// Appends the parameters to observations, scaled by [`Parameter::observed`](super::Parameter::observed).
+    /// Makes every observation end with the parameters, scaled by [`Parameter::observed`](super::Parameter::observed).
     pub fn observing_parameters(mut self) -> Self {
         self.seen = Some(Box::new(SeenParameters::new(self.environment.as_ref())));
         self
@@ -155,7 +159,8 @@ impl Episodes {
         &self.settings
     }
 
-    /// Begins the next episode, from an exact state `[S]` if one is given.
+    /// Begins the next episode. If `state` is given, the episode begins in exactly this state, with the entries of
+    /// [`EnvironmentSpec::state`].
     pub fn begin(&mut self, state: Option<&[f64]>) {
         let Progress { trial, episode, episode_in_trial, .. } = self.progress;
         let same_trial = episode_in_trial + 1 < self.settings.episodes_per_trial;
@@ -168,7 +173,8 @@ impl Episodes {
         self.start(state);
     }
 
-    /// Begins a new trial: with new distributions, or with a new seed, which restarts the counts at 0, or both.
+    /// Begins a new trial. `distributions`, if given, replaces the distributions. `seed`, if given, replaces the seed
+    /// and restarts trial and episode numbers at 0. `state` is as in [`Episodes::begin`].
     pub fn begin_trial(&mut self, seed: Option<u64>, distributions: Option<&[Distribution]>, state: Option<&[f64]>) {
         if let Some(distributions) = distributions {
             self.settings.distributions.clone_from_slice(distributions);
@@ -191,7 +197,8 @@ impl Episodes {
             let mut stream = Stream::new(seed, environment_index.into(), Purpose::Parameters, self.progress.trial);
             let n = self.values.len();
             let boxes = boxes(distributions.len(), n).unwrap_or(1);
-            // A single box takes no random number, so that versions D, R and E draw only the parameters.
+            // No random number is drawn to choose a single box, so versions D, R and E draw one number for each
+            // parameter.
             let chosen = if boxes > 1 { (stream.unit() * boxes as f64) as usize } else { 0 };
             let parameters = self.environment.spec().parameters;
             for ((value, distribution), parameter) in
@@ -213,8 +220,8 @@ impl Episodes {
         }
     }
 
-    /// Advances the running episode by one step. Writes the reward's terms to `reward_terms`, which has the spec's number
-    /// of terms.
+    /// Advances the current episode by one step. Writes the terms of the reward to `reward_terms`, in the order of
+    /// [`EnvironmentSpec::reward_terms`].
     pub fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Outcome {
         let transition = self.environment.step(action, reward_terms);
         let reward = reward_terms.iter().sum();
@@ -236,14 +243,14 @@ impl Episodes {
         Outcome { reward, terminated: transition.terminated, truncated }
     }
 
-    /// Updates the observed parameters after parameters were set.
+    /// Updates the observed parameters, if there are any. Call it after parameters were set.
     pub(super) fn see_parameters(&mut self) {
         if let Some(seen) = &mut self.seen {
             seen.read(self.environment.as_ref());
         }
     }
 
-    /// Writes the current observation, `[O]`.
+    /// Writes the current observation to `out`, including the observed parameters.
     pub fn observe(&self, out: &mut [f32]) {
         let entries = self.seen.as_ref().map_or(&[][..], |seen| seen.entries());
         let (state, parameters) = out.split_at_mut(out.len() - entries.len());
@@ -251,7 +258,7 @@ impl Episodes {
         parameters.copy_from_slice(entries);
     }
 
-    /// Returns the content of a picture of the current state; `None` after the physics diverged.
+    /// Returns the scene to draw for a picture of the current state; `None` after the physics diverged.
     pub fn scene(&self) -> Option<Scene> {
         self.environment.scene()
     }
@@ -261,7 +268,7 @@ impl Episodes {
         self.progress.ended
     }
 
-    /// Returns the current episode's address.
+    /// Returns the numbers that identify the current episode.
     pub fn id(&self) -> EpisodeId {
         EpisodeId {
             environment_index: self.settings.environment_index,
@@ -271,7 +278,7 @@ impl Episodes {
         }
     }
 
-    /// Returns the address of the environment's random numbers now.
+    /// Returns the numbers that determine the random numbers of the current episode.
     pub fn draw(&self) -> Draw {
         let Settings { seed, environment_index, .. } = self.settings;
         Draw { seed, environment_index, episode_index: self.progress.episode }
@@ -284,7 +291,7 @@ impl Episodes {
         Receipt { requested: self.values.clone(), applied, model_hash: self.environment.model_hash().into() }
     }
 
-    /// Appends the values of the receipt: the requested ones, then the applied ones.
+    /// Appends the numbers of the current episode's receipt to `values`: the requested values, then the applied values.
     pub fn push_receipt(&self, values: &mut Vec<f64>) {
         values.extend_from_slice(&self.values);
         let requested = values.len();
@@ -292,12 +299,12 @@ impl Episodes {
         self.environment.applied(&mut values[requested..]);
     }
 
-    /// Returns the current episode as one that began, with its receipt if requested.
+    /// Returns the start of the current episode. `receipt` says whether to include the receipt.
     pub fn started(&self, receipt: bool) -> EpisodeStart {
         EpisodeStart { id: self.id(), receipt: receipt.then(|| self.receipt()) }
     }
 
-    /// Returns the current episode as one that ended, with its receipt if requested.
+    /// Returns the result of the current episode. `receipt` says whether to include the receipt.
     pub fn finished(&self, receipt: bool) -> EpisodeEnd {
         let (progress, spec) = (&self.progress, self.spec());
         let achieved = self.achieved(spec.success.achievement);

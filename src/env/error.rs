@@ -3,10 +3,10 @@
 use super::DistributionError;
 use perturb_protocol::names::UnknownEnvironment;
 
-/// Maximum number of characters of a client's text that an error repeats.
+/// Maximal number of characters that an error message quotes from a client's text.
 const MAX_SHOWN_CHARS: usize = 100;
 
-/// Shortens a client's text to [`MAX_SHOWN_CHARS`], for errors that repeat it.
+/// Shortens a client's text to [`MAX_SHOWN_CHARS`] characters, for error messages that quote it.
 pub(crate) fn shorten(text: &str) -> String {
     match text.char_indices().nth(MAX_SHOWN_CHARS) {
         Some((end, _)) => format!("{}…", &text[..end]),
@@ -14,19 +14,19 @@ pub(crate) fn shorten(text: &str) -> String {
     }
 }
 
-/// A refused request. Nothing was changed.
+/// The reason why a request about an environment is refused. The request changes nothing.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
     /// No environment has this name.
     #[error(transparent)]
     UnknownEnvironment(#[from] UnknownEnvironment),
-    /// The environment has no parameter of this name.
+    /// The environment has no parameter with this name.
     #[error("{environment} has no parameter {name:?}; it has {known}")]
     UnknownParameter {
-        /// The environment.
+        /// The environment's name.
         environment: &'static str,
-        /// The name that was requested.
+        /// The requested name.
         name: String,
         /// The names of the environment's parameters, separated by commas.
         known: String,
@@ -34,25 +34,25 @@ pub enum Error {
     /// A distribution is not a union of intervals.
     #[error("the distribution of {parameter:?} is {}; expected {}", source.got, source.expected)]
     Distribution {
-        /// The parameter.
+        /// The parameter's name.
         parameter: String,
-        /// The fault of the distribution.
+        /// The reason why it is not a distribution.
         source: DistributionError,
     },
-    /// A parameter's value or interval leaves its physical range.
+    /// A value or an interval is not within the parameter's physical range.
     #[error("parameter {parameter:?} of {environment} may reach {got} {unit}; give values within [{low}, {high}]")]
     OutOfRange {
-        /// The environment.
+        /// The environment's name.
         environment: &'static str,
-        /// The parameter.
+        /// The parameter's name.
         parameter: &'static str,
-        /// The offending end of an interval.
+        /// The value, or the end of the interval, that is out of range.
         got: f64,
         /// The parameter's unit.
         unit: &'static str,
-        /// The minimum that is accepted.
+        /// The accepted minimum.
         low: f64,
-        /// The maximum that is accepted.
+        /// The accepted maximum.
         high: f64,
     },
     /// A disturbance was requested in a session that was opened without disturbances.
@@ -61,25 +61,25 @@ pub enum Error {
          disturbance, such as {name:?} at its default"
     )]
     NotDisturbed {
-        /// The environment.
+        /// The environment's name.
         environment: &'static str,
-        /// The disturbance that was asked for.
+        /// The requested disturbance.
         name: String,
     },
     /// A parameter takes whole numbers, but an interval of its distribution contains none.
     #[error("parameter {parameter:?} of {environment} takes whole numbers, and {got} has none; give such as 2 or 0..4")]
     NotWhole {
-        /// The environment.
+        /// The environment's name.
         environment: &'static str,
-        /// The parameter.
+        /// The parameter's name.
         parameter: &'static str,
-        /// The interval.
+        /// The interval without whole numbers.
         got: String,
     },
     /// A snapshot cannot be restored.
     #[error("the snapshot cannot be restored: {reason}; take a new one from a session of the same environment")]
     Snapshot {
-        /// The fault of the snapshot.
+        /// The reason why it cannot be restored.
         reason: String,
     },
     /// Two environments of a server would have the same name.
@@ -92,10 +92,10 @@ pub enum Error {
         /// The name of the existing environment.
         taken: &'static str,
     },
-    /// The environment could not be built.
+    /// The environment could not be created.
     #[error("{environment} cannot be built: {reason}")]
     Model {
-        /// The environment.
+        /// The environment's name.
         environment: &'static str,
         /// The reason.
         reason: String,
@@ -103,7 +103,7 @@ pub enum Error {
 }
 
 impl Error {
-    /// Returns a conversion to the error of this parameter's distribution.
+    /// Returns a function for `map_err` that adds the parameter's name to the error of a distribution.
     pub(crate) fn in_distribution(parameter: &str) -> impl FnOnce(DistributionError) -> Self {
         move |source| Self::Distribution { parameter: shorten(parameter), source }
     }

@@ -1,4 +1,4 @@
-//! Environments: the trait that each implements, what they declare of themselves, and the episodes they run.
+//! Environments: the trait that each environment implements, its description, and the episodes that it runs.
 
 mod catalogue;
 pub mod disturbance;

@@ -1,29 +1,31 @@
-//! Normal numbers by the ziggurat (Marsaglia and Tsang, 2000) of 256 layers, as NumPy draws them from the same stream.
+//! Normally distributed random numbers by the ziggurat algorithm with 256 layers (Marsaglia and Tsang, 2000). NumPy
+//! draws the same numbers from the same stream, up to rounding.
 
 use super::Stream;
 use std::{array, sync::LazyLock};
 
 const N_LAYERS: usize = 256;
-/// The half-width of the lowest rectangle. Beyond it is the tail.
+/// Half the width of the ziggurat's lowest rectangle. The tail of the distribution begins here.
 const EDGE: f64 = 3.654_152_885_361_009;
-/// The area of each layer: of each rectangle, and of the lowest one with the tail.
+/// The area of each layer. That of the lowest layer includes the tail.
 const AREA: f64 = 0.004_928_673_233_974_655;
-/// The number of fractions that a layer is divided into.
+/// The number of equal parts into which half the width of a layer is divided: a random 52-bit number selects one.
 const N_FRACTIONS: f64 = (1u64 << 52) as f64;
 
-/// A layer of the ziggurat. Layer 1 is at the top of the curve, and layer 255 ends at [`EDGE`]. Layer 0 is the lowest
-/// rectangle together with the tail.
+/// A layer of the ziggurat. Layer 1 is at the top of the density curve, and layer 255 ends at [`EDGE`]. Layer 0 is the
+/// lowest rectangle together with the tail.
 #[derive(Debug, Clone, Copy)]
 struct ZigguratLayer {
-    /// Fractions below this are under the curve at every height of the layer.
+    /// Number of parts, from the middle, that are below the curve at every height of the layer.
     inside: u64,
-    /// The half-width of a fraction.
+    /// The width of one of the [`N_FRACTIONS`] parts.
     width: f64,
-    /// The curve exp(-x²/2) at the half-width.
+    /// The value of the curve exp(-x²/2) at the end of the layer.
     curve: f64,
 }
 
-/// NumPy's tables, but for roundings: they are computed here by libm, whose bytes are the same on every processor.
+/// The layers, equal to NumPy's tables up to rounding. They are computed by libm, which gives the same bytes on every
+/// processor.
 static LAYERS: LazyLock<[ZigguratLayer; N_LAYERS]> = LazyLock::new(|| {
     let curve = |x: f64| libm::exp(-0.5 * x * x);
     let mut half_widths = [0.0; N_LAYERS];
@@ -35,7 +37,7 @@ static LAYERS: LazyLock<[ZigguratLayer; N_LAYERS]> = LazyLock::new(|| {
     }
     array::from_fn(|layer| {
         let width = half_widths[layer];
-        // The rectangle above covers this part of the layer.
+        // The fraction of the layer's width that is below the layer above, and so below the curve.
         let covered = match layer {
             0 => EDGE / width,
             1 => 0.0,
@@ -50,17 +52,18 @@ static LAYERS: LazyLock<[ZigguratLayer; N_LAYERS]> = LazyLock::new(|| {
 });
 
 impl Stream {
-    /// A standard normal number. NumPy's `standard_normal` gives the same of the same stream, up to rounding.
+    /// Draws a standard normal number. NumPy's `standard_normal` draws the same number from the same stream, up to
+    /// rounding.
     pub fn normal(&mut self) -> f64 {
         loop {
             let bits = self.next_u64();
             let (number, fraction) = ((bits & 0xFF) as usize, (bits >> 9) & ((1 << 52) - 1));
             let layer = &LAYERS[number];
             let size = fraction as f64 * layer.width;
-            // The sign is a bit, because a branch on it would be predicted wrongly half of the time.
+            // The sign is set without a branch, since the processor would mispredict half of the branches.
             let x = f64::from_bits(size.to_bits() | ((bits & 0x100) << 55));
             if fraction < layer.inside {
-                return x; // 99 of 100
+                return x; // in 99 of 100 cases
             }
             if number == 0 {
                 let tail = self.tail();
@@ -73,7 +76,7 @@ impl Stream {
         }
     }
 
-    /// A normal number beyond the edge (Marsaglia, 1964).
+    /// Draws the absolute value of a normal number in the tail, beyond [`EDGE`] (Marsaglia, 1964).
     fn tail(&mut self) -> f64 {
         loop {
             let beyond = -libm::log1p(-self.unit()) / EDGE;

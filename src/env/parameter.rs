@@ -1,13 +1,14 @@
-//! The physical parameters of an environment: their bounds, and the sets of the versions.
+//! The physical parameters of an environment: their bounds, and the values that each version draws.
 
 use super::{Distribution, Interval, Version};
 
-/// A physical parameter with its bounds and the sets of its versions (the paper, table of parameter ranges).
+/// A physical parameter, with its bounds and the values that versions D, R and E draw. Source: the paper, table of
+/// parameter ranges.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Parameter {
-    /// Unique within its environment.
+    /// The name, unique within the environment.
     pub name: &'static str,
-    /// SI unit, `"1"` if dimensionless.
+    /// The SI unit, `"1"` if dimensionless.
     pub unit: &'static str,
     /// The meaning, in a few words.
     pub description: &'static str,
@@ -15,20 +16,20 @@ pub struct Parameter {
     pub default: f64,
     /// The interval of version R.
     pub random: Interval,
-    /// The intervals of version E, below and above that of R.
+    /// The intervals of version E: one below and one above the interval of R.
     pub extreme: [Interval; 2],
-    /// The physical range. Values outside are refused.
+    /// The physical range. Requests for values outside are refused.
     pub bounds: Interval,
-    /// The name in [`EnvironmentSpec::applied`](super::EnvironmentSpec::applied) of the quantity that reads this parameter
-    /// back, in the same unit.
+    /// The name of the quantity in [`EnvironmentSpec::applied`](super::EnvironmentSpec::applied) that reads this
+    /// parameter back from the physics, in the same unit.
     pub applied: &'static str,
-    /// Whether values are whole numbers: each whole number in a distribution's intervals is equally likely.
+    /// Whether values are whole numbers. Then each whole number in a distribution's intervals is equally likely.
     pub is_integer: bool,
 }
 
 impl Parameter {
-    /// A parameter with physical bounds, which the quantity of the same name reads back, and whose sets are given by
-    /// [`Parameter::versions`].
+    /// Creates a parameter with this physical range, which the quantity of the same name reads back. Set the values of
+    /// the versions by [`Parameter::versions`] or [`Parameter::off`].
     pub const fn new(name: &'static str, unit: &'static str, description: &'static str, bounds: (f64, f64)) -> Self {
         let (bounds, none) = (Interval::new(bounds.0, bounds.1), Interval::new(0.0, 0.0));
         Self {
@@ -44,7 +45,8 @@ impl Parameter {
         }
     }
 
-    /// Sets the versions: the value of D, the interval of R, and the interval whose part outside R is E.
+    /// Sets the values of the versions: D has the value `default`, R the interval `random`, and E the parts of the
+    /// interval `around` that are outside R.
     pub const fn versions(mut self, default: f64, random: (f64, f64), around: (f64, f64)) -> Self {
         self.default = default;
         self.random = Interval::new(random.0, random.1);
@@ -52,25 +54,27 @@ impl Parameter {
         self
     }
 
-    /// Sets one value for all versions, so that nothing is drawn unless a client gives a distribution.
+    /// Sets the same fixed value for all versions, so that the parameter varies only if a client requests a
+    /// distribution.
     pub const fn off(self, default: f64) -> Self {
         self.versions(default, (default, default), (default, default))
     }
 
-    /// Makes the values whole numbers.
+    /// Restricts the values to whole numbers.
     pub const fn integer(mut self) -> Self {
         self.is_integer = true;
         self
     }
 
-    /// Sets the quantity that reads the parameter back.
+    /// Sets the name of the quantity that reads the parameter back, see [`Parameter::applied`].
     pub const fn read_back_by(mut self, applied: &'static str) -> Self {
         self.applied = applied;
         self
     }
 
-    /// Returns the distribution of a version. For R+E, whose trials are drawn from R or from E for all parameters together,
-    /// returns the union of both. Intervals without length, as a task's folder may have on one side of R, are left out.
+    /// Returns the distribution of a version. For R+E, this is the union of the intervals of R and E, although a trial
+    /// draws all parameters from R or all from E. Intervals of length 0 are left out; a task folder may have one on one
+    /// side of R.
     pub fn distribution(&self, version: Version) -> Distribution {
         let [below, above] = self.extreme;
         let intervals: &[Interval] = match version {
@@ -86,20 +90,21 @@ impl Parameter {
         Distribution::union(&intervals).expect("the table holds valid sets; a test checks each")
     }
 
-    /// Returns the value at the fraction `u` in [0, 1) of a distribution, which was checked against the parameter.
+    /// Draws a value from `distribution` by the random number `u`, uniform in [0, 1). The caller must have checked the
+    /// distribution by [`check_distribution`](super::check_distribution).
     pub fn draw(&self, distribution: &Distribution, u: f64) -> f64 {
         let whole = if self.is_integer { distribution.whole_number_at(u) } else { None };
         whole.unwrap_or_else(|| distribution.at(u))
     }
 
-    /// Returns the interval from the minimum to the maximum of R and E.
+    /// Returns the smallest interval that contains the intervals of R and E.
     pub fn whole(&self) -> Interval {
         let [below, above] = self.extreme;
         Interval::new(self.random.low.min(below.low), self.random.high.max(above.high))
     }
 
-    /// Scales a value for observations: -1 … 1 within [`Parameter::whole`], and linearly beyond it. If that interval is a
-    /// single value, returns the distance from it.
+    /// Scales a value for observations. The scaling is linear: the ends of [`Parameter::whole`] become -1 and 1. If
+    /// that interval is a single value, returns the difference from it.
     pub fn observed(&self, value: f64) -> f32 {
         let Interval { low, high } = self.whole();
         let distance = value - low;

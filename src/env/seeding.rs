@@ -1,10 +1,11 @@
-//! Random streams that depend on nothing but their address.
+//! Random streams that are fully determined by the seed, the environment's index, a purpose, and the number of a trial,
+//! episode or step.
 //!
-//! Every draw comes from Philox 4×64-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", 2011), a
-//! function of a key and a counter with no other state. The key is `[seed, environment index]`, the counter
-//! `[block, index, purpose, 0]`, with `block` counting from 1. So numbers do not depend on what ran before, or on the
-//! thread or server. The layout is that of NumPy, so a few lines of Python repeat any stream (the arrays must be of type uint64:
-//! lists lose digits of words from 2^63 on):
+//! All random numbers come from Philox 4×64-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", 2011). It
+//! is a function of a key and a counter, without other state. The key is `[seed, environment index]`. The counter is
+//! `[block, index, purpose, 0]`, where `block` counts from 1. So numbers do not depend on earlier computations, the
+//! thread or the server. NumPy has the same layout, so a few lines of Python reproduce any stream. The arrays must have
+//! the type uint64, since lists lose digits of numbers from 2^63 on:
 //!
 //! ```python
 //! key = numpy.array([seed, environment_index], dtype=numpy.uint64)
@@ -14,50 +15,50 @@
 //!
 //! | purpose | index | draws, in order |
 //! |---|---|---|
-//! | 0 | trial | for R+E first a number, below ½ for R; then one number u in [0, 1) for each parameter, in the catalogue's order |
-//! | 1 | episode | the initial state's numbers, in the order of the environment's document |
+//! | 0 | trial | for R+E first a number that selects R if it is below ½; then a number u in [0, 1) for each parameter, in the catalogue's order |
+//! | 1 | episode | the numbers of the initial state, in the order of the environment's document |
 //!
-//! Disturbances draw at each step. Their streams have the number of steps that the episode has taken in the last word of
-//! the counter, `[block, episode, purpose, step]`, so that a step's numbers do not depend on those of the steps before:
+//! Disturbances draw at each step, each step from a stream of its own. Its counter is `[block, episode, purpose,
+//! step]`:
 //!
 //! | purpose | step | draws, in order |
 //! |---|---|---|
-//! | 2 | of the action, from 0 | one below `action_hold` to keep the last action |
+//! | 2 | of the action, from 0 | a number; if it is below `action_hold`, the last action acts again |
 //! | 3 | of the action, from 0 | a [normal](Stream::normal) number for each entry of the action |
 //! | 4 | of the observation, 0 after a reset | a [normal](Stream::normal) number for each entry of the observation |
-//! | 5 | of the observation, 0 after a reset | for each entry of the observation one below `sensor_dropout` to lose it |
-//! | 6 | of the action, from 0 | one below 1 / `push_interval` to push, then those of the [direction](Stream::direction) |
-//! | 7 | of the action, from 1 | one below `change_probability` to change the physics before it |
+//! | 5 | of the observation, 0 after a reset | a number for each entry of the observation; if it is below `sensor_dropout`, the entry is lost |
+//! | 6 | of the action, from 0 | a number; if it is below 1 / `push_interval`, there is a push, whose [direction](Stream::direction) is drawn next |
+//! | 7 | of the action, from 1 | a number; if it is below `change_probability`, the physics change before the step |
 
-/// The purpose of a stream: the third word of the counter.
+/// The purpose of a random stream. Its number is the third word of the Philox counter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Purpose {
-    /// A trial's parameters.
+    /// Drawing the parameters of a trial.
     Parameters = 0,
-    /// An episode's initial state.
+    /// Drawing the initial state of an episode.
     InitialState = 1,
-    /// The choice of steps at which an action is held.
+    /// Choosing the steps at which the last action acts again.
     ActionHold = 2,
-    /// Noise on an action.
+    /// Drawing the noise on an action.
     ActionNoise = 3,
-    /// Noise on an observation.
+    /// Drawing the noise on an observation.
     SensorNoise = 4,
-    /// The choice of an observation's entries that are lost.
+    /// Choosing the lost entries of an observation.
     SensorDropout = 5,
-    /// The steps with a push, and the directions of pushes.
+    /// Choosing the steps with a push, and drawing the directions of pushes.
     Push = 6,
-    /// The steps between which the physics change.
+    /// Choosing the steps before which the physics change.
     Change = 7,
 }
 
-/// The address of an episode's random numbers. With the distributions it determines all of them.
+/// The numbers that, together with the parameters' distributions, determine all random numbers of an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Draw {
     /// The seed.
     pub seed: u64,
     /// The environment's index.
     pub environment_index: u32,
-    /// The index of the current episode.
+    /// The number of the episode, counted from 0 for each environment.
     pub episode_index: u64,
 }
 
@@ -65,7 +66,7 @@ const MULTIPLIERS: [u64; 2] = [0xD2E7_470E_E14C_6C93, 0xCA5A_8263_9512_1157];
 const WEYL: [u64; 2] = [0x9E37_79B9_7F4A_7C15, 0xBB67_AE85_84CA_A73B];
 const ROUNDS: usize = 10;
 
-/// A stream of uniform numbers.
+/// A stream of random numbers from the Philox generator.
 #[derive(Debug, Clone)]
 pub struct Stream {
     key: [u64; 2],
@@ -75,22 +76,23 @@ pub struct Stream {
 }
 
 impl Stream {
-    /// The stream of environment `environment_index` for its trial or episode number `index`.
+    /// Creates the stream of an environment for one purpose. `index` is the number of the trial for
+    /// [`Purpose::Parameters`], and the number of the episode for all other purposes.
     pub fn new(seed: u64, environment_index: u64, purpose: Purpose, index: u64) -> Self {
         Self { key: [seed, environment_index], counter: [0, index, purpose as u64, 0], block: [0; 4], used: 4 }
     }
 
-    /// The stream of an episode for its step number `step`.
+    /// Creates the stream for step number `step` of an episode.
     pub fn at_step(draw: &Draw, purpose: Purpose, step: u32) -> Self {
         let mut stream = Self::new(draw.seed, draw.environment_index.into(), purpose, draw.episode_index);
         stream.counter[3] = step.into();
         stream
     }
 
-    /// The next 64 bits.
+    /// Draws 64 random bits.
     pub fn next_u64(&mut self) -> u64 {
         if self.used == self.block.len() {
-            self.counter[0] += 1; // 2^64 blocks: no episode gets there
+            self.counter[0] += 1; // no episode draws 2^64 blocks
             self.block = philox(self.counter, self.key);
             self.used = 0;
         }
@@ -98,14 +100,14 @@ impl Stream {
         self.block[self.used - 1]
     }
 
-    /// Uniform in [0, 1): the upper 53 bits over 2^53.
+    /// Draws a uniform number in [0, 1): the upper 53 of 64 random bits, divided by 2^53.
     pub fn unit(&mut self) -> f64 {
         (self.next_u64() >> 11) as f64 * (1.0 / (1u64 << 53) as f64)
     }
 
-    /// Returns a random unit vector along the first `n` axes; its other entries are 0. For one axis it is ±1. For two
-    /// it is uniform on the circle: the angle is drawn. For three it is uniform on the sphere: the last coordinate is
-    /// drawn, then the angle about the last axis.
+    /// Draws a uniformly distributed unit vector in the first `n` of three dimensions; its other entries are 0. With
+    /// one dimension it is ±1. With two dimensions the angle is drawn. With three dimensions the last coordinate is
+    /// drawn first, then the angle about the last axis.
     pub fn direction(&mut self, n: usize) -> [f64; 3] {
         let last = match n {
             1 => return [if self.unit() < 0.5 { -1.0 } else { 1.0 }, 0.0, 0.0],
@@ -117,7 +119,7 @@ impl Stream {
         [radius * cos, radius * sin, last]
     }
 
-    /// Uniform in [low, high).
+    /// Draws a uniform number in [low, high).
     pub fn uniform(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.unit()
     }
@@ -137,7 +139,8 @@ fn philox(mut counter: [u64; 4], mut key: [u64; 2]) -> [u64; 4] {
 mod tests {
     use super::*;
 
-    /// Random123 (Salmon et al.), `tests/kat_vectors`, the three lines `philox4x64 10`: counter, key, result.
+    /// Known answers (counter, key, result): the three lines `philox4x64 10` in `tests/kat_vectors` of Random123
+    /// (Salmon et al.).
     const KNOWN_ANSWERS: [([u64; 4], [u64; 2], [u64; 4]); 3] = [
         ([0; 4], [0; 2], [0x16554D9ECA36314C, 0xDB20FE9D672D0FDC, 0xD7E772CEE186176B, 0x7E68B68AEC7BA23B]),
         (

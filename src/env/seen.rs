@@ -1,19 +1,19 @@
-//! Parameters at the end of an observation, for policies that observe them.
+//! Observed parameters: the entries that a client may request at the end of each observation.
 
 use super::{Environment, EnvironmentSpec, Parameter};
 
-/// The parameters of one environment as they are observed.
+/// The current parameters of one environment, scaled for observations.
 pub(super) struct SeenParameters {
-    /// Each parameter with the position of its quantity in [`EnvironmentSpec::applied`].
+    /// Each parameter with the index in [`EnvironmentSpec::applied`] of the quantity that reads it back.
     parameters: Vec<(&'static Parameter, usize)>,
-    /// Buffer for the values of [`EnvironmentSpec::applied`].
+    /// A buffer for the values of [`EnvironmentSpec::applied`].
     applied: Vec<f64>,
-    /// The entries, one for each parameter.
+    /// The observed entries, one for each parameter.
     entries: Vec<f32>,
 }
 
 impl SeenParameters {
-    /// Reads the parameters that an environment has now.
+    /// Reads the current parameters of an environment.
     pub(super) fn new(environment: &dyn Environment) -> Self {
         let EnvironmentSpec { parameters, applied, .. } = environment.spec();
         let place = |parameter: &'static Parameter| {
@@ -29,7 +29,7 @@ impl SeenParameters {
         seen
     }
 
-    /// Reads the parameters back from the physics, after they were set.
+    /// Updates the entries from the physics. Call it after parameters were set.
     pub(super) fn read(&mut self, environment: &dyn Environment) {
         environment.applied(&mut self.applied);
         for (entry, (parameter, place)) in self.entries.iter_mut().zip(&self.parameters) {
@@ -37,7 +37,7 @@ impl SeenParameters {
         }
     }
 
-    /// Returns the entries, one for each parameter.
+    /// Returns the observed entries, one for each parameter.
     pub(super) fn entries(&self) -> &[f32] {
         &self.entries
     }

@@ -1,4 +1,4 @@
-//! Snapshots of environments, which can be restored in another session, process or server.
+//! Snapshots: the complete state of an environment as bytes, which can be restored in any session, process or server.
 
 use super::{
     Distribution, Draw, EnvironmentSpec, Episodes, Error, Interval, Settings, check_bounds, check_distribution,
@@ -7,26 +7,28 @@ use super::{
 };
 use serde::{Deserialize, Serialize};
 
-/// The layout of snapshots. It is raised by every change of [`Saved`] or of the bytes behind it.
+/// The version of the snapshot format. Every change of [`Saved`] or of the bytes after it raises it.
 const FORMAT: u32 = 3;
-/// The last layout without a checksum. Later snapshots end with one: CRC-32C, little-endian, of everything before it.
+/// The last format without a checksum. Later formats end with the little-endian CRC-32C of all bytes before it.
 const UNSEALED: u32 = 2;
-/// The first layout. Later snapshots have [`Progress::held_longest`] after [`Saved`].
+/// The first format. Later formats have [`Progress::held_longest`] after [`Saved`].
 const FIRST: u32 = 1;
 
-/// Limit of a snapshot in bytes. The largest has a distribution of 64 intervals for each of 32 parameters and 76
-/// disturbances, of R and of E, 216 KiB, the numbers of a state and an observation of 4096 entries, some 50 KiB, and late
-/// actions and observations, 80 KiB.
+/// Maximal size of a snapshot, in bytes. The largest possible snapshot consists of:
+///
+/// - the distributions of R and of E for 32 parameters and 76 disturbances, of 64 intervals each: 216 KiB;
+/// - a state and an observation of 4096 entries: some 50 KiB;
+/// - delayed actions and observations: 80 KiB.
 pub const MAX_SNAPSHOT_BYTES: usize = 384 << 10;
 
-/// An upper bound of the growth of a snapshot's counters, bytes. Small numbers have shorter encodings.
+/// An upper bound of how much a snapshot grows, in bytes, when its counters grow: small numbers have shorter encodings.
 const MAX_COUNTERS_GROWTH_BYTES: usize = 64;
 
-/// Maximum episode index that a snapshot may have, so that counts do not overflow.
+/// Maximal episode number in a snapshot. The limit keeps later episode numbers from overflowing.
 const MAX_EPISODE: u64 = 1 << 63;
 
-/// Everything that an environment's future depends on, besides the actions. Random streams need no state of their own:
-/// they follow from the seed, the index and the counts.
+/// The content of a snapshot: everything except actions that determines the future of an environment. Random streams
+/// have no state of their own, because they follow from the seed, the environment's index and the counters.
 #[derive(Serialize, Deserialize)]
 struct Saved {
     format: u32,
@@ -36,7 +38,7 @@ struct Saved {
     seed: u64,
     environment_index: u32,
     episodes_per_trial: u32,
-    /// (low, high) of every interval of every parameter's distribution, box after box.
+    /// For each distribution in [`Settings::distributions`], the ends (low, high) of its intervals.
     distributions: Vec<Vec<(f64, f64)>>,
     values: Vec<f64>,
     progress: Progress,
@@ -44,7 +46,7 @@ struct Saved {
 }
 
 impl Episodes {
-    /// Saves the environment: physics, parameters, counters and random streams.
+    /// Returns a snapshot of the environment: its physics, parameters, counters and random streams.
     pub fn snapshot(&self) -> Vec<u8> {
         let spec = self.spec();
         let mut state = Vec::new();
@@ -69,16 +71,19 @@ impl Episodes {
         snapshot
     }
 
-    /// Returns an upper bound of the length of a snapshot of this environment without its distributions, in bytes.
+    /// Returns an upper bound of the size of later snapshots of this environment, without their distributions, in
+    /// bytes.
     pub(crate) fn max_snapshot_bytes(&self) -> usize {
         let growth = size_of::<f64>() * self.environment.max_saved_growth() + MAX_COUNTERS_GROWTH_BYTES;
         self.snapshot().len() - distributions_bytes(&self.settings.distributions) + growth
     }
 
-    /// Restores a saved environment: it continues as it did after the snapshot, byte for byte.
+    /// Restores a snapshot. From there the environment gives the same bytes for the same actions as after the snapshot
+    /// was taken.
     ///
     /// # Errors
-    /// [`Error::Snapshot`]; nothing was changed then.
+    /// [`Error::Snapshot`] if the snapshot is damaged, or is of another environment, revision or model. Nothing is
+    /// changed then.
     pub fn restore(&mut self, snapshot: &[u8]) -> Result<(), Error> {
         let (saved, distributions) = self.check(snapshot)?;
         let (before, address) = (self.physics_state(), self.draw());
@@ -104,7 +109,7 @@ impl Episodes {
         Ok(())
     }
 
-    /// The physics' state as [`Environment::save`](super::Environment::save) writes it.
+    /// Returns the state of the physics, as [`Environment::save`](super::Environment::save) appends it.
     pub fn physics_state(&self) -> Vec<f64> {
         let mut state = Vec::new();
         self.environment.save(&mut state);
@@ -121,27 +126,28 @@ impl Episodes {
     }
 }
 
-/// Returns how many bytes distributions take in a snapshot. The count of distributions before them is not included.
+/// Returns the size of distributions in a snapshot, in bytes, without the number of distributions that precedes them.
 pub(crate) fn distributions_bytes(distributions: &[Distribution]) -> usize {
-    // A distribution has at most 64 intervals, whose number has one byte.
+    // A distribution has at most 64 intervals, so their number takes one byte.
     distributions.iter().map(|distribution| 1 + size_of::<(f64, f64)>() * distribution.intervals().len()).sum()
 }
 
-/// The draws of a saved environment.
+/// The random draws of the environment in a snapshot: from what it draws, and what it has drawn.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SavedDraw {
-    /// The address of its random numbers.
+    /// The numbers that determine its random numbers.
     pub draw: Draw,
     /// The distributions of its parameters, as in [`Settings::distributions`].
     pub distributions: Vec<Distribution>,
-    /// The parameters of the current trial, `[P]`. A client may have forged them.
+    /// The parameters of the current trial, in the order of [`EnvironmentSpec::parameters`]. A client may have forged
+    /// them.
     pub values: Vec<f64>,
 }
 
-/// Reads the draws of a snapshot without restoring it.
+/// Reads the random draws in a snapshot without restoring it.
 ///
 /// # Errors
-/// [`Error::Snapshot`].
+/// [`Error::Snapshot`] if the snapshot is damaged, or is not of the environment `spec`.
 pub fn saved_draw(spec: &'static EnvironmentSpec, snapshot: &[u8]) -> Result<SavedDraw, Error> {
     let (Saved { seed, environment_index, values, progress, .. }, distributions) = Saved::read(spec, snapshot)?;
     let draw = Draw { seed, environment_index, episode_index: progress.episode };
@@ -149,11 +155,12 @@ pub fn saved_draw(spec: &'static EnvironmentSpec, snapshot: &[u8]) -> Result<Sav
 }
 
 impl Saved {
-    /// Reads a snapshot and checks everything but its model's hash.
+    /// Decodes a snapshot. Checks everything except the model's hash and the state of the physics.
     fn read(spec: &'static EnvironmentSpec, snapshot: &[u8]) -> Result<(Self, Vec<Distribution>), Error> {
         let refuse = |reason: String| Err(Error::Snapshot { reason });
         let unreadable = || refuse(format!("its {} bytes are not a snapshot", snapshot.len()));
-        // An entry of a list may have one byte in a snapshot, but takes more than twenty in memory.
+        // The limit also bounds the memory for decoding: a list entry of one byte takes more than twenty bytes in
+        // memory.
         if snapshot.len() > MAX_SNAPSHOT_BYTES {
             return unreadable();
         }
@@ -169,7 +176,7 @@ impl Saved {
             (format, _) => return refuse(format!("its format is {format}, but this server reads 1 to {FORMAT}")),
         };
         saved.progress.held_longest = match (saved.format, rest) {
-            // The first layout stores only the last run. A longer run before it is lost.
+            // The first format has only the current number of steps in a row at the goal. An earlier maximum is lost.
             (FIRST, []) => saved.progress.held_for,
             (FIRST, _) => return unreadable(),
             (_, rest) => match postcard::take_from_bytes(rest) {

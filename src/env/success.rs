@@ -2,36 +2,36 @@
 
 use super::Quantity;
 
-/// A success rule (the paper, section "Experimental methodology"): the value that an episode achieved is compared with
-/// a threshold. An episode that achieved no value is no success.
+/// A success rule: it compares a value that the episode achieved with a threshold. An episode without such a value is
+/// not a success. Source: the paper, section "Experimental methodology".
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Success {
     /// The rule, as a sentence.
     pub description: &'static str,
-    /// The value that is compared.
+    /// The value that is compared with the threshold.
     pub achievement: Achievement,
-    /// The comparison.
+    /// The direction of the comparison.
     pub comparison: Comparison,
     /// The threshold, in the unit of [`Success::quantity`].
     pub threshold: f64,
 }
 
-/// A value that an episode can achieve.
+/// A value of an episode that a success rule can compare.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Achievement {
-    /// The number of steps.
+    /// The number of steps of the episode.
     Length,
-    /// The first step after which the goal held, counted from 1; no value if it never held.
+    /// The number of the first step, from 1, after which the task's goal was met. No value if it was never met.
     FirstGoal,
-    /// The length, in steps, of the run that ends with the last step and after each step of which the goal held.
+    /// The number of steps in a row, up to the last step of the episode, after each of which the task's goal was met.
     LastGoals,
-    /// The length, in steps, of the longest run of steps after each of which the goal held.
+    /// The maximal number of steps in a row after each of which the task's goal was met.
     LongestGoals,
-    /// The value of [`Environment::achieved`](super::Environment::achieved).
+    /// A quantity of the environment's own, which [`Environment::achieved`](super::Environment::achieved) returns.
     Own(Quantity),
 }
 
-/// The comparison of the achieved value with the threshold.
+/// The direction in which a success rule compares the achieved value with the threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Comparison {
     /// An episode succeeds if the achieved value is the threshold or more.
@@ -41,7 +41,7 @@ pub enum Comparison {
 }
 
 impl Success {
-    /// Returns the quantity that is compared.
+    /// Returns the name and unit of the compared value.
     pub const fn quantity(&self) -> Quantity {
         match self.achievement {
             Achievement::Own(quantity) => quantity,
@@ -50,7 +50,7 @@ impl Success {
         }
     }
 
-    /// Tells whether an episode that achieved this value is a success.
+    /// Whether an episode that achieved this value is a success; `None` is not.
     pub fn holds(&self, achieved: Option<f64>) -> bool {
         achieved.is_some_and(|achieved| match self.comparison {
             Comparison::AtLeast => achieved >= self.threshold,

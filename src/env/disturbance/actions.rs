@@ -1,31 +1,32 @@
-//! Applies the disturbances of actions: delay, hold, noise and scale.
+//! Disturbs actions: delay, repetition (`action_hold`), noise and scale.
 
 use super::{next_place, parameters::DisturbanceValues};
 use crate::env::{Action, ActionSpace, Draw, Error, Purpose, Stream};
 
-/// The disturbed actions of one environment. A choice is stored as one number.
+/// Disturbs the actions of one environment on their way to the physics. Actions are stored as numbers: A channels, or
+/// the index of a choice with A = 1.
 pub(super) struct ActionPath {
     space: ActionSpace,
-    /// The action that the physics gets before the first action arrives, `[A]`.
+    /// The action that acts until the client's first action arrives, `[A]`.
     neutral: Vec<f32>,
-    /// A ring buffer of the delayed actions, which the physics has not got yet, `[action_delay, A]`.
+    /// A ring buffer of the delayed actions, which have not acted yet, `[action_delay, A]`.
     late: Vec<f32>,
-    /// The offset of the oldest action in `late`, in numbers.
+    /// The index in `late` of the first number of the oldest action.
     oldest: usize,
-    /// The last action that the physics got, before noise and scale, `[A]`.
+    /// The last action that acted, before noise and scale, `[A]`.
     held: Vec<f32>,
-    /// The action that the physics gets, `[A]`.
+    /// The action that acts now, with noise and scale, `[A]`.
     acting: Vec<f32>,
 }
 
 impl ActionPath {
-    /// Makes the path of an environment's actions. `neutral` is its neutral action, `[A]`.
+    /// Creates the path for an action space. `neutral` is the environment's action with the least effect, `[A]`.
     pub(super) fn new(space: ActionSpace, neutral: Vec<f32>) -> Self {
         let (held, acting) = (neutral.clone(), neutral.clone());
         Self { space, neutral, late: Vec::new(), oldest: 0, held, acting }
     }
 
-    /// Begins an episode. The physics gets the neutral action until the first action arrives.
+    /// Begins an episode. The neutral action acts until the client's first action arrives.
     pub(super) fn begin(&mut self, values: &DisturbanceValues) {
         self.late.clear();
         for _ in 0..values.action_delay {
@@ -35,7 +36,7 @@ impl ActionPath {
         self.held.copy_from_slice(&self.neutral);
     }
 
-    /// Takes the client's action of step number `step`. Returns the action for the physics.
+    /// Takes the client's action in step number `step`. Returns the action that acts in this step.
     pub(super) fn pass(
         &mut self,
         values: &DisturbanceValues,
@@ -46,7 +47,7 @@ impl ActionPath {
         let choice;
         let action = match action {
             Action::Continuous(action) => action,
-            // There are so few choices that f32 represents each exactly.
+            // The index is exact in f32, because there are few choices.
             Action::Discrete(number) => {
                 choice = [number as f32];
                 &choice
@@ -90,21 +91,21 @@ impl ActionPath {
         }
     }
 
-    /// The number of numbers that [`ActionPath::save`] appends.
+    /// Returns how many numbers [`ActionPath::save`] appends.
     pub(super) fn n_saved(&self, values: &DisturbanceValues) -> usize {
         (1 + values.action_delay) * self.neutral.len()
     }
 
-    /// Appends the held action, then the delayed ones from the oldest on.
+    /// Appends the last action that acted, then the delayed actions, oldest first.
     pub(super) fn save(&self, out: &mut Vec<f64>) {
         let (newer, older) = self.late.split_at(self.oldest);
         out.extend([&self.held[..], older, newer].into_iter().flatten().map(|&number| f64::from(number)));
     }
 
-    /// Loads the numbers that [`ActionPath::save`] appended, [`ActionPath::n_saved`] of them.
+    /// Loads the numbers that [`ActionPath::save`] appended. Their count must be [`ActionPath::n_saved`].
     ///
     /// # Errors
-    /// [`Error::Snapshot`] for a number that no action can have. The path is undefined then.
+    /// [`Error::Snapshot`] if a number is not valid in an action. The path is then undefined.
     pub(super) fn load(&mut self, values: &DisturbanceValues, saved: &[f64]) -> Result<(), Error> {
         let is_legal = |&number: &f64| match self.space {
             ActionSpace::Discrete(names) => number.fract() == 0.0 && (0.0..names.len() as f64).contains(&number),
@@ -121,7 +122,7 @@ impl ActionPath {
     }
 }
 
-/// The nearest f32 that is finite.
+/// Returns the nearest finite f32.
 fn finite(number: f64) -> f32 {
     number.clamp(f32::MIN.into(), f32::MAX.into()) as f32
 }

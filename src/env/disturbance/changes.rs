@@ -1,27 +1,27 @@
-//! Physics that change within an episode: between the environment's parameters and those after a change.
+//! Physics that change within an episode, between two sets of parameters.
 
 use super::parameters::DisturbanceValues;
 use crate::env::{Draw, Environment, Error, Purpose, Stream};
 
-/// An environment whose physics have one of two sets of parameters.
+/// An environment whose physics may switch between two sets of parameters: the normal set and the changed set.
 pub(super) struct ChangingPhysics {
     pub(super) environment: Box<dyn Environment>,
-    /// Whether the physics can change.
+    /// Whether the physics can change within an episode.
     is_changing: bool,
-    /// Whether the second set is in force.
+    /// Whether the physics have the changed set now.
     is_changed: bool,
-    /// The parameters before and after a change, `[2, P]`.
+    /// The parameters of the normal set and of the changed set.
     sets: [Vec<f64>; 2],
-    /// The values that the physics have with each set, `[2, applied]`.
+    /// The quantities of `EnvironmentSpec::applied` with the normal set and with the changed set.
     applied: [Vec<f64>; 2],
-    /// The place among them of the quantity that reads each parameter back.
+    /// For each parameter, the index in `EnvironmentSpec::applied` of the quantity that reads it back.
     places: Vec<usize>,
-    /// The state that goes over from one set to the other.
+    /// A buffer for the state of the physics during a change.
     state: Vec<f64>,
 }
 
 impl ChangingPhysics {
-    /// The physics of an environment that has its default parameters.
+    /// Wraps an environment that has its default parameters.
     pub(super) fn new(environment: Box<dyn Environment>) -> Self {
         let spec = environment.spec();
         let place = |name: &str| spec.applied.iter().position(|quantity| quantity.name == name);
@@ -32,7 +32,8 @@ impl ChangingPhysics {
         Self { environment, is_changing: false, is_changed: false, sets, applied, places, state: Vec::new() }
     }
 
-    /// Takes the parameters before and after a change, and reads both back from the physics, if they can change.
+    /// Sets the normal parameters `own` and the changed ones in `values`. If the physics can change, reads both back
+    /// from the physics. The state is undefined until the next reset.
     pub(super) fn set_parameters(&mut self, own: &[f64], values: &DisturbanceValues) {
         self.is_changing = values.is_changing();
         self.is_changed = false;
@@ -48,17 +49,18 @@ impl ChangingPhysics {
         }
     }
 
-    /// Writes what the physics have before a change.
+    /// Writes the quantities of `EnvironmentSpec::applied` for the normal set to `out`.
     pub(super) fn applied(&self, out: &mut [f64]) {
         if self.is_changing { out.copy_from_slice(&self.applied[0]) } else { self.environment.applied(out) }
     }
 
-    /// Returns what the physics have of a parameter after a change; `None` if they cannot change.
+    /// Returns the changed value of a parameter, read back from the physics. `None` if the physics cannot change.
+    /// `parameter` is its index.
     pub(super) fn changed(&self, parameter: usize) -> Option<f64> {
         self.is_changing.then(|| self.applied[1][self.places[parameter]])
     }
 
-    /// Returns to the parameters before a change. The state is undefined afterwards.
+    /// Prepares a new episode: sets the normal parameters. If the physics were changed, the state is then undefined.
     pub(super) fn begin(&mut self) {
         if self.is_changed {
             self.is_changed = false;
@@ -66,10 +68,11 @@ impl ChangingPhysics {
         }
     }
 
-    /// Changes the physics if this step begins with a change. The state goes over.
+    /// Switches to the other set of parameters if there is a change before step number `step`. The state stays the
+    /// same.
     ///
     /// # Errors
-    /// [`Error::Snapshot`] if the changed physics refuse the state, which is undefined then.
+    /// [`Error::Snapshot`] if the state is not valid with the other parameters. It is then undefined.
     pub(super) fn pass(&mut self, values: &DisturbanceValues, draw: &Draw, step: u32) -> Result<(), Error> {
         if !(self.is_changing && begins_with_change(values, draw, step)) {
             return Ok(());
@@ -81,16 +84,16 @@ impl ChangingPhysics {
         self.environment.load(&self.state)
     }
 
-    /// Appends the state of the physics, then whether they are changed.
+    /// Appends the state of the physics, then 1 if they have the changed set, otherwise 0.
     pub(super) fn save(&self, out: &mut Vec<f64>) {
         self.environment.save(out);
         out.push(f64::from(u8::from(self.is_changed)));
     }
 
-    /// Restores the state that [`save`](Self::save) wrote.
+    /// Restores a state that [`save`](Self::save) appended.
     ///
     /// # Errors
-    /// [`Error::Snapshot`]; the state is undefined then.
+    /// [`Error::Snapshot`] if the state is not valid. It is then undefined.
     pub(super) fn load(&mut self, saved: &[f64]) -> Result<(), Error> {
         let (own, is_changed) = match saved {
             [own @ .., 0.0] => (own, false),
@@ -105,7 +108,7 @@ impl ChangingPhysics {
     }
 }
 
-/// Whether the physics change between step number `step` and the one before.
+/// Whether the physics change just before step number `step`, counted from 0. They never change before step 0.
 fn begins_with_change(values: &DisturbanceValues, draw: &Draw, step: u32) -> bool {
     let DisturbanceValues { change_at, change_every, change_probability, .. } = *values;
     let is_drawn =

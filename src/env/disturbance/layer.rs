@@ -1,4 +1,4 @@
-//! The layer between an episode and the physics.
+//! The disturbed twin of an environment: a wrapper that disturbs its actions, observations and physics.
 
 use super::{
     actions::ActionPath,
@@ -11,24 +11,25 @@ use crate::{
     scene::Scene,
 };
 
-/// An environment whose actions and observations are disturbed. Rewards, ends, success and pictures come from the
-/// undisturbed environment inside.
+/// An environment whose actions, observations and physics are disturbed. Rewards, ends of episodes, success and
+/// pictures come from the wrapped environment, so noise and delay of observations do not affect them.
 pub(super) struct Disturbed {
     physics: ChangingPhysics,
     spec: &'static EnvironmentSpec,
     set: &'static DisturbanceSet,
-    /// The values of the disturbances as they were set, in order.
+    /// The requested values of the disturbances, in order.
     numbers: Vec<f64>,
     values: DisturbanceValues,
     draw: Draw,
-    /// Steps of the episode so far.
+    /// Number of steps that the episode has taken.
     steps: u32,
     actions: ActionPath,
     sensors: SensorPath,
 }
 
 impl Disturbed {
-    /// Wraps `inner` as the disturbed twin with this spec. The disturbances have no effect until they are set.
+    /// Wraps `inner`. `spec` describes the disturbed twin, `set` its disturbances. They have no effect until
+    /// `set_parameters`.
     pub(super) fn new(
         inner: Box<dyn Environment>,
         spec: &'static EnvironmentSpec,
@@ -51,10 +52,10 @@ impl Disturbed {
         disturbed
     }
 
-    /// Begins an episode from the present state of the physics.
+    /// Begins an episode in the current state of the physics.
     fn begin(&mut self) {
         self.steps = 0;
-        self.physics.environment.push([0.0; 3]); // an episode that diverged may have left a push behind
+        self.physics.environment.push([0.0; 3]); // clears a push that remained if the last episode diverged
         self.actions.begin(&self.values);
         self.sensors.begin(&self.values, &self.draw, |out| self.physics.environment.observe(out));
     }
@@ -135,8 +136,8 @@ impl Environment for Disturbed {
         transition
     }
 
-    /// Appends the state of the physics, then the delayed actions and observations. The observation that the policy
-    /// sees is computed from these and from the address of the random numbers.
+    /// Appends the state of the physics, then the delayed actions, then the delayed observations. The observation that
+    /// the policy sees is not stored: `load` computes it again from these and the random stream.
     fn save(&self, out: &mut Vec<f64>) {
         self.physics.save(out);
         self.actions.save(out);
@@ -158,14 +159,14 @@ impl Environment for Disturbed {
         let (own, late) = state.split_at(own);
         let (late_actions, late_observations) = late.split_at(actions);
         self.physics.load(own)?;
-        self.physics.environment.push([0.0; 3]); // of the episode before
+        self.physics.environment.push([0.0; 3]); // clears a push of the replaced episode
         self.actions.load(&self.values, late_actions)?;
         let address = (&self.draw, self.steps);
         self.sensors.load(&self.values, address, late_observations, |out| self.physics.environment.observe(out))
     }
 }
 
-/// The impulse along x, y and z of this step's push, if there is one.
+/// Draws whether this step has a push. Returns its impulse along x, y and z, or `None`.
 fn impulse(values: &DisturbanceValues, draw: &Draw, step: u32, axes: &[usize]) -> Option<[f64; 3]> {
     let mut stream = Stream::at_step(draw, Purpose::Push, step);
     if stream.unit() * values.push_interval >= 1.0 {

@@ -1,13 +1,13 @@
-//! Disturbances: actions that arrive late, are held, noisy or weak, and observations that are late, noisy or lost.
-//! docs/disturbances.md has their laws.
+//! Disturbances: delayed, repeated, noisy or scaled actions, delayed, noisy or lost observations, pushes, and physics
+//! that change within an episode. docs/disturbances.md defines them.
 //!
-//! Every environment of a catalogue, built in or a folder, has a disturbed twin: the same environment with the
-//! disturbances as further parameters, behind its own. A session whose requests name one of them opens the twin; all other
-//! sessions are as if there were none. The twin is a layer between an episode and the physics:
+//! Every environment has a disturbed twin: the same environment with the disturbances appended to its parameters. A
+//! session opens the twin if its request names a disturbance. Other sessions open the environment itself, and are not
+//! affected. The twin wraps the environment:
 //!
-//! - `parameters` lists the disturbances of an environment.
-//! - `layer` is the twin's environment: it passes actions by `actions` to the physics, and observations by `sensors` back.
-//! - `changes` has the physics, which may change within an episode.
+//! - `parameters` defines the disturbances of an environment and their values.
+//! - `layer` is the twin. It passes actions through `actions` to the physics, and observations through `sensors` back.
+//! - `changes` holds the physics, which may change within an episode.
 
 mod actions;
 mod changes;
@@ -20,7 +20,8 @@ use layer::Disturbed;
 use parameters::DisturbanceSet;
 use std::sync::{Mutex, OnceLock, PoisonError};
 
-/// An environment and its disturbed twin. Both live as long as the process.
+/// An environment and its disturbed twin, which has the disturbances as additional parameters. Both live as long as the
+/// process.
 #[derive(Clone, Copy)]
 struct Twin {
     base: &'static EnvironmentSpec,
@@ -28,21 +29,23 @@ struct Twin {
     disturbances: &'static [Parameter],
 }
 
-/// The disturbed twins that were made so far, at most one of each environment.
+/// The disturbed twins that were created so far, at most one for each environment.
 static TWINS: Mutex<Vec<Twin>> = Mutex::new(Vec::new());
 
-/// Returns the disturbances that an environment can have besides its own parameters.
+/// Returns the disturbances that an environment can have in addition to its own parameters.
 pub fn disturbances(spec: &'static EnvironmentSpec) -> &'static [Parameter] {
     twin(spec).disturbances
 }
 
-/// The disturbances that an environment could have, as parameters: all but those whose names it uses itself.
+/// Returns all disturbances that suit an environment, as parameters. Leaves out names that the environment itself uses
+/// for a parameter or quantity.
 pub fn possible(spec: &EnvironmentSpec) -> Vec<Parameter> {
     DisturbanceSet::new(spec).parameters().collect()
 }
 
-/// The environment whose sessions all have the disturbances as further parameters, as a catalogue has it: with the sets of
-/// `declared` in versions R and E. It has no disturbances beside its parameters, and is its own twin.
+/// Makes an environment whose own parameters include all disturbances. `declared` replaces disturbances of the same
+/// name; so versions R and E may draw other values than the default. The environment has no further disturbances: it is
+/// its own disturbed twin.
 pub fn declare(spec: &'static EnvironmentSpec, declared: &[Parameter]) -> &'static EnvironmentSpec {
     let mut set = DisturbanceSet::new(spec);
     set.declare(declared);
@@ -52,19 +55,20 @@ pub fn declare(spec: &'static EnvironmentSpec, declared: &[Parameter]) -> &'stat
     disturbed
 }
 
-/// Returns the disturbed twin of an environment, which has the disturbances as further parameters.
+/// Returns the disturbed twin of an environment, which has the disturbances as additional parameters.
 pub fn disturbed(spec: &'static EnvironmentSpec) -> &'static EnvironmentSpec {
     twin(spec).disturbed
 }
 
-/// Returns the environment without disturbances: `spec` itself, or the environment whose disturbed twin it is.
+/// Returns the environment without disturbances: the environment of which `spec` is the disturbed twin, otherwise
+/// `spec` itself.
 pub fn undisturbed(spec: &EnvironmentSpec) -> &EnvironmentSpec {
     let twins = TWINS.lock().unwrap_or_else(PoisonError::into_inner);
     twins.iter().find(|twin| std::ptr::eq(twin.disturbed, spec)).map_or(spec, |twin| twin.base)
 }
 
-/// Returns the environment that has the parameters of these names: `spec` itself, or its disturbed twin if one of them
-/// names a disturbance.
+/// Returns the environment that has parameters with these names: the disturbed twin if one of them is a disturbance,
+/// otherwise `spec` itself.
 ///
 /// # Errors
 /// [`Error::UnknownParameter`] for a name that is neither a parameter nor a disturbance.
@@ -88,10 +92,11 @@ pub fn with_parameters<'a>(
     Ok(found)
 }
 
-/// Checks that the environment of an open session has the parameters of these names.
+/// Checks that `spec`, the environment of an open session, has parameters with these names.
 ///
 /// # Errors
-/// [`Error::UnknownParameter`], or [`Error::NotDisturbed`] for a disturbance that only the disturbed twin has.
+/// [`Error::NotDisturbed`] for a disturbance that only the disturbed twin has, [`Error::UnknownParameter`] for other
+/// names.
 pub fn check_open<'a>(spec: &'static EnvironmentSpec, names: impl IntoIterator<Item = &'a str>) -> Result<(), Error> {
     for name in names {
         if !std::ptr::eq(with_parameters(spec, [name])?, spec) {
@@ -101,7 +106,7 @@ pub fn check_open<'a>(spec: &'static EnvironmentSpec, names: impl IntoIterator<I
     Ok(())
 }
 
-/// Returns an environment with its disturbed twin, which is made at the first call. `spec` may be either of the two.
+/// Returns an environment and its disturbed twin, which is created at the first call. `spec` may be either of the two.
 fn twin(spec: &'static EnvironmentSpec) -> Twin {
     let mut twins = TWINS.lock().unwrap_or_else(PoisonError::into_inner);
     let is_known = |twin: &&Twin| std::ptr::eq(twin.base, spec) || std::ptr::eq(twin.disturbed, spec);
@@ -115,15 +120,15 @@ fn twin(spec: &'static EnvironmentSpec) -> Twin {
     twin
 }
 
-/// The environment with these disturbances behind its own parameters.
+/// Makes an environment with the disturbances in `set` appended to its own parameters.
 fn with_set(spec: &'static EnvironmentSpec, set: DisturbanceSet) -> &'static EnvironmentSpec {
     let set: &'static DisturbanceSet = Box::leak(Box::new(set));
     let quantities = set.parameters().map(|Parameter { name, unit, .. }| Quantity { name, unit });
     let mut disturbed = *spec;
     disturbed.parameters = Vec::leak(spec.parameters.iter().copied().chain(set.parameters()).collect());
     disturbed.applied = Vec::leak(spec.applied.iter().copied().chain(quantities).collect());
-    // Each environment refers to its spec, and the spec holds the closure that makes environments. The cell closes this
-    // circle: the closure reads the spec's address from it.
+    // An environment refers to its spec, and the spec holds the closure that creates the environment. The cell breaks
+    // this cycle: the closure reads the spec's address from it, which is set below.
     let address: &'static OnceLock<&'static EnvironmentSpec> = Box::leak(Box::default());
     disturbed.make = Box::leak(Box::new(move || {
         let disturbed = address.get().expect("nobody has the closure before the address is set");
@@ -132,7 +137,8 @@ fn with_set(spec: &'static EnvironmentSpec, set: DisturbanceSet) -> &'static Env
     address.get_or_init(|| Box::leak(Box::new(disturbed)))
 }
 
-/// The place after `place` in a ring of `length` numbers with entries of `width`. A remainder would cost a division a step.
+/// Returns the offset of the entry after the one at offset `place`, in a ring buffer of `length` numbers with entries
+/// of `width` numbers. A comparison is used, because the remainder would cost a division in each step.
 fn next_place(place: usize, width: usize, length: usize) -> usize {
     let next = place + width;
     if next < length { next } else { 0 }

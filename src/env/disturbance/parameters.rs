@@ -1,35 +1,35 @@
-//! The disturbances of an environment as parameters, and their present values.
+//! The disturbances of an environment as parameters, and their current values.
 
 use crate::env::{ActionSpace, EnvironmentSpec, Parameter};
 use perturb_protocol::disturbance::{CHANGED, DEFAULT_PUSH_INTERVAL};
 
-/// The longest delay, in steps.
+/// Maximal delay of actions or observations, in steps.
 const MAX_DELAY: usize = 100;
-/// Limit of the numbers of delayed actions, so that a snapshot has room for them.
+/// Maximal total of numbers in all delayed actions of an environment. It limits the size of snapshots.
 const MAX_LATE_ACTION_NUMBERS: usize = 2048;
-/// Limit of the numbers of delayed observations, so that a snapshot has room for them.
+/// Maximal total of numbers in all delayed observations of an environment. It limits the size of snapshots.
 const MAX_LATE_OBSERVATION_NUMBERS: usize = 8192;
-/// The maximum number of actuators that have their own scale.
+/// Maximal number of actuators with a scale of their own.
 const MAX_SCALED_ACTUATORS: usize = 32;
-/// The maximum of noise and of scales, without a unit.
+/// Maximal value of noise and of scales, dimensionless.
 const MAX_FACTOR: f64 = 10.0;
-/// The largest impulse of a push, in its unit.
+/// Maximal size of a push, in the unit of [`PushSpec::unit`](crate::env::PushSpec::unit).
 const MAX_PUSH: f64 = 1000.0;
-/// The longest mean interval of pushes, in steps.
+/// Maximal mean number of steps between two pushes.
 const MAX_PUSH_INTERVAL: f64 = 1e6;
-/// The most steps until a change of the physics.
+/// Maximal number of steps before or between changes of the physics.
 const MAX_CHANGE_STEPS: f64 = 1e6;
-/// The name of the scale of all actuators, and the prefix of the names of single actuators' scales.
+/// The name of the scale of all actuators, and the prefix of the names of the scales of single actuators.
 const ACTION_SCALE: &str = "action_scale";
 
-/// The kind of a disturbance. It decides how the value is applied.
+/// The kind of a disturbance, which determines how its value is applied.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum DisturbanceKind {
     ActionDelay,
     ActionHold,
     ActionNoise,
     ActionScale,
-    /// The scale of one actuator.
+    /// The scale of the actuator with this index.
     ActuatorScale(usize),
     Push,
     PushInterval,
@@ -39,38 +39,38 @@ pub(super) enum DisturbanceKind {
     ChangeAt,
     ChangeEvery,
     ChangeProbability,
-    /// The value of a parameter of the environment's own, by its place, after a change of the physics.
+    /// The value, after a change of the physics, of the environment's own parameter with this index.
     Changed(usize),
 }
 
 /// The disturbances of one environment.
 pub(super) struct DisturbanceSet {
     entries: Vec<(DisturbanceKind, Parameter)>,
-    /// A: the number of entries of an action, 1 if an action is a choice.
+    /// A, the number of entries of an action; 1 if an action is a choice.
     pub(super) action_width: usize,
 }
 
-/// The present values of the disturbances.
+/// The current values of the disturbances.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct DisturbanceValues {
     pub(super) action_delay: usize,
     pub(super) action_hold: f64,
     pub(super) action_noise: f64,
-    /// The scale of each actuator, `[A]`: the scale of all actuators times the actuator's own.
+    /// The scale of each actuator, `[A]`: the scale of all actuators times the actuator's own scale.
     pub(super) action_scales: Vec<f64>,
-    /// The size of pushes.
+    /// The size of pushes; 0 for none.
     pub(super) push: f64,
-    /// The mean number of steps between pushes: a step has one with the probability of its reciprocal.
+    /// The mean number of steps between two pushes. Each step has a push with the probability 1 / `push_interval`.
     pub(super) push_interval: f64,
     pub(super) sensor_delay: usize,
     pub(super) sensor_noise: f64,
     pub(super) sensor_dropout: f64,
     /// The number of steps after which the physics change; 0 for never.
     pub(super) change_at: u32,
-    /// The number of steps between changes of the physics; 0 for never.
+    /// The number of steps between two changes of the physics; 0 for never.
     pub(super) change_every: u32,
     pub(super) change_probability: f64,
-    /// The values of the environment's own parameters after a change, `[P]`.
+    /// The values of the environment's own parameters after a change, in the order of `EnvironmentSpec::parameters`.
     pub(super) changed: Vec<f64>,
 }
 
@@ -81,8 +81,8 @@ impl DisturbanceValues {
     }
 }
 
-/// The disturbances by which the physics change within an episode, with a parameter for each of the environment's own: its
-/// value after a change, which has the same sets.
+/// Returns the disturbances that change the physics within an episode. For each parameter of the environment there is
+/// one with the prefix `changed_`: its value after a change, which the versions draw from the same distributions.
 fn changes(spec: &EnvironmentSpec) -> Vec<(DisturbanceKind, Parameter)> {
     if spec.parameters.is_empty() {
         return Vec::new();
@@ -106,7 +106,8 @@ fn changes(spec: &EnvironmentSpec) -> Vec<(DisturbanceKind, Parameter)> {
 }
 
 impl DisturbanceSet {
-    /// The disturbances of an environment but those whose names it uses itself.
+    /// Returns the disturbances of an environment. Leaves out names that the environment itself uses for a parameter or
+    /// quantity.
     pub(super) fn new(spec: &EnvironmentSpec) -> Self {
         let share = |name, description, most| Parameter::new(name, "1", description, (0.0, most));
         let steps = |name, description, most: usize| share(name, description, most as f64).off(0.0).integer();
@@ -178,7 +179,7 @@ impl DisturbanceSet {
         Self { entries, action_width }
     }
 
-    /// Replaces disturbances by parameters of the same name, which have other sets of values.
+    /// Replaces disturbances by the parameters of the same name in `declared`, whose versions draw other values.
     pub(super) fn declare(&mut self, declared: &[Parameter]) {
         for (_, parameter) in &mut self.entries {
             if let Some(own) = declared.iter().find(|own| own.name == parameter.name) {
@@ -192,7 +193,8 @@ impl DisturbanceSet {
         self.entries.iter().map(|(_, parameter)| *parameter)
     }
 
-    /// Returns how many numbers delayed actions, and delayed observations of `observation_size` numbers, may have.
+    /// Returns the maximal total of numbers in delayed actions, and in delayed observations of `observation_size`
+    /// numbers each.
     pub(super) fn max_late_numbers(&self, observation_size: usize) -> (usize, usize) {
         let longest = |wanted: DisturbanceKind| {
             let entry = self.entries.iter().find(|(kind, _)| *kind == wanted);
@@ -222,7 +224,7 @@ impl DisturbanceSet {
         }
     }
 
-    /// Sets the value of each disturbance from `numbers`, in order. Each is within its bounds.
+    /// Sets the value of each disturbance from `numbers`, in order. Each number must be within its bounds.
     pub(super) fn set(&self, values: &mut DisturbanceValues, numbers: &[f64]) {
         values.action_scales.fill(1.0);
         for (&(kind, _), &number) in self.entries.iter().zip(numbers) {
@@ -245,9 +247,10 @@ impl DisturbanceSet {
         }
     }
 
-    /// Reads the values of the disturbances back, in order. Only the product of the scale of all actuators and an
-    /// actuator's own scale is stored, so both scales are taken from `numbers`, the values that were set.
-    /// `changed` returns the value that the physics has for a parameter after a change, if it can change.
+    /// Writes the values of the disturbances to `out`, in order, as read back from `values`. `numbers` are the values
+    /// that were set. Scales are copied from them, because `values` has only the product of the scale of all actuators
+    /// and an actuator's own scale. `changed` returns the value of the parameter with this index after a change, if the
+    /// physics can change.
     pub(super) fn read(
         &self,
         values: &DisturbanceValues,

@@ -1,27 +1,27 @@
-//! Applies the disturbances of observations: delay, noise and dropout.
+//! Disturbs observations: delay, noise and dropout.
 
 use super::{next_place, parameters::DisturbanceValues};
 use crate::env::{Channel, Draw, Error, Purpose, Stream};
 
-/// The disturbed observations of one environment.
+/// Disturbs the observations of one environment on their way to the policy. O is the length of an observation.
 pub(super) struct SensorPath {
     channels: &'static [Channel],
-    /// A ring buffer of exact observations, `[sensor_delay + 1, O]`: the one that the policy sees now, and those that
-    /// it has not seen yet.
+    /// A ring buffer of exact observations, `[sensor_delay + 1, O]`: the oldest is the basis of what the policy sees
+    /// now; the others are delayed.
     exact: Vec<f32>,
-    /// The offset of the newest observation in `exact`, in numbers.
+    /// The index in `exact` of the first number of the newest observation.
     newest: usize,
-    /// The disturbed observation, which the policy sees, `[O]`.
+    /// The disturbed observation that the policy sees, `[O]`.
     seen: Vec<f32>,
 }
 
 impl SensorPath {
-    /// Makes the path of an environment's observations, whose entries are `channels`.
+    /// Creates the path for observations whose entries are `channels`.
     pub(super) fn new(channels: &'static [Channel]) -> Self {
         Self { channels, exact: vec![0.0; channels.len()], newest: 0, seen: vec![0.0; channels.len()] }
     }
 
-    /// Begins an episode with its first exact observation, which `observe` writes. The policy sees it until the next
+    /// Begins an episode. `observe` writes the first exact observation. The policy sees it, disturbed, until the second
     /// one arrives.
     pub(super) fn begin(&mut self, values: &DisturbanceValues, draw: &Draw, observe: impl FnOnce(&mut [f32])) {
         let width = self.channels.len();
@@ -33,7 +33,7 @@ impl SensorPath {
         self.see(values, draw, 0);
     }
 
-    /// Takes the exact observation after `steps` steps of the episode, which `observe` writes.
+    /// Adds an exact observation, which `observe` writes, after `steps` steps of the episode.
     pub(super) fn pass(
         &mut self,
         values: &DisturbanceValues,
@@ -47,12 +47,13 @@ impl SensorPath {
         self.see(values, draw, steps);
     }
 
-    /// The disturbed observation, which the policy sees, `[O]`.
+    /// Returns the disturbed observation that the policy sees, `[O]`.
     pub(super) fn seen(&self) -> &[f32] {
         &self.seen
     }
 
-    /// Computes the observation that the policy sees: the oldest one of the ring buffer, with noise and dropout.
+    /// Computes the observation that the policy sees: the oldest observation in the ring buffer, with noise and
+    /// dropout.
     fn see(&mut self, values: &DisturbanceValues, draw: &Draw, steps: u32) {
         let width = self.channels.len();
         let oldest = next_place(self.newest, width, self.exact.len());
@@ -79,23 +80,23 @@ impl SensorPath {
         }
     }
 
-    /// The number of numbers that [`SensorPath::save`] appends.
+    /// Returns how many numbers [`SensorPath::save`] appends.
     pub(super) fn n_saved(&self, values: &DisturbanceValues) -> usize {
         values.sensor_delay * self.channels.len()
     }
 
-    /// Appends the exact observations from the oldest on, without the newest.
+    /// Appends the exact observations, oldest first, without the newest one.
     pub(super) fn save(&self, out: &mut Vec<f64>) {
         let (newer, older) = self.exact.split_at(self.newest);
         let older = &older[self.channels.len()..];
         out.extend(older.iter().chain(newer).map(|&number| f64::from(number)));
     }
 
-    /// Loads the numbers that [`SensorPath::save`] appended, [`SensorPath::n_saved`] of them. `observe` writes the
-    /// newest exact observation.
+    /// Loads the numbers that [`SensorPath::save`] appended. Their count must be [`SensorPath::n_saved`]. `observe`
+    /// writes the newest exact observation.
     ///
     /// # Errors
-    /// [`Error::Snapshot`] for a number that cannot be observed. The path is undefined then.
+    /// [`Error::Snapshot`] if a number is not finite as float32. The path is then undefined.
     pub(super) fn load(
         &mut self,
         values: &DisturbanceValues,
