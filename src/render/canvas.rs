@@ -1,38 +1,39 @@
-//! A picture of a drawing: paths in m, anti-aliased, by a library in Rust.
+//! Draws the shapes of a [`Drawing`], whose coordinates are in m, as anti-aliased pixels. Uses the library tiny-skia.
 
 use super::Size;
 use crate::scene::{Colour, Drawing, Graph, Point, Shape, colour};
 use tiny_skia::{Color, FillRule, LineCap, LineJoin, Paint, Path, PathBuilder, Pixmap, Stroke, StrokeDash, Transform};
 
-/// Number of segments of a drawn graph.
+/// Number of straight segments by which the graph of a function is drawn.
 const SMOOTH: usize = 64;
-/// Distance from the picture, in pixels, at which coordinates are clamped, so that large numbers do not overflow.
+/// Maximal absolute pixel coordinate. Larger coordinates are clamped, so that they do not overflow.
 const FAR: f64 = 1e5;
-/// Minimum thickness of lines, in pixels.
+/// Minimal width of lines and radius of discs, in pixels.
 const THINNEST: f64 = 1.0;
 
-/// The pixels of a drawing, `[height, width, 3]`.
+/// Draws a picture. Returns its pixels, `[height, width, 3]`: red, green and blue, top row first.
 pub(super) fn draw(drawing: &Drawing, size: Size) -> Vec<u8> {
     let mut canvas = Canvas::new(size, drawing.low, drawing.high);
     for shape in &drawing.shapes {
         canvas.add(shape);
     }
-    let rgb = |pixel: &[u8; 4]| [pixel[0], pixel[1], pixel[2]]; // all are opaque
+    let rgb = |pixel: &[u8; 4]| [pixel[0], pixel[1], pixel[2]]; // drops the opacity, which is always 255
     canvas.pixmap.data().as_chunks::<4>().0.iter().flat_map(rgb).collect()
 }
 
 /// A picture that is being drawn.
 struct Canvas {
     pixmap: Pixmap,
-    /// Pixels in a metre.
+    /// Number of pixels per metre.
     scale: f64,
-    /// The picture's lower left and upper right corner.
+    /// The lower left corner of the picture, in m.
     low: Point,
+    /// The upper right corner of the picture, in m.
     high: Point,
 }
 
 impl Canvas {
-    /// Makes a blank picture that shows at least the rectangle from `low` to `high`, in its middle, as large as possible.
+    /// Creates a blank picture. The rectangle from `low` to `high` is in its middle, and as large as fits.
     fn new(size: Size, low: Point, high: Point) -> Self {
         let (width, height) = (f64::from(size.width), f64::from(size.height));
         let mut pixmap = Pixmap::new(size.width.into(), size.height.into()).expect("sizes are at least 16");
@@ -96,13 +97,13 @@ impl Canvas {
         (clamp((x - self.low[0]) * self.scale), clamp((self.high[1] - y) * self.scale))
     }
 
-    /// A length in pixels.
+    /// Converts a length in m to pixels, clamped to a visible width.
     fn pixels(&self, length: f64) -> f32 {
         let pixels = length * self.scale;
-        if pixels > THINNEST { pixels.min(FAR) as f32 } else { THINNEST as f32 } // the latter also for NaN
+        if pixels > THINNEST { pixels.min(FAR) as f32 } else { THINNEST as f32 } // NaN becomes THINNEST, too
     }
 
-    /// The coordinate along an axis, or the picture's edge if it is infinite.
+    /// Replaces an infinite coordinate along an axis by the edge of the picture.
     fn within(&self, axis: usize, coordinate: f64) -> f64 {
         match coordinate {
             f64::INFINITY => self.high[axis],

@@ -1,11 +1,11 @@
-//! Pictures of environments.
+//! Draws pictures of environments.
 //!
-//! One thread of a server draws all pictures, so that neither the physics' workers nor the transport thread ever draws
-//! or waits for OpenGL. A session hands over a [`Scene`] and gets pixels back.
+//! A server has one thread that draws all pictures. So the threads for physics and connections never draw or wait for
+//! OpenGL. A session sends a [`Scene`] to the thread and receives pixels.
 //!
-//! - `turns` is the queue of pictures that wait.
-//! - `canvas` draws shapes in a plane: paths in metres, anti-aliased, by a library in Rust.
-//! - `model` draws MuJoCo's models, with colours, floor, light and sky.
+//! - `turns` is the fair queue of the pictures to draw.
+//! - `canvas` draws shapes in a plane.
+//! - `model` draws MuJoCo models, with colours, floor, light and sky.
 
 mod canvas;
 #[cfg(feature = "mujoco")]
@@ -23,12 +23,13 @@ use std::{
 use tokio::{sync::oneshot, time::Instant};
 use turns::Turns;
 
-/// Niceness of the drawing thread, which the driver's threads inherit. Physics has priority.
+/// Scheduling priority (niceness) of the drawing thread and of the graphics driver's threads. It is lower than that of
+/// the threads for physics.
 const NICENESS: i32 = 5;
-/// Time that the end of a server waits for the picture that is being drawn.
+/// Maximal time that a server that shuts down waits for the picture that is being drawn.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// A picture's size in pixels.
+/// The size of a picture in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Size {
     /// The width, within [`PICTURE_PIXELS`](perturb_protocol::limits::PICTURE_PIXELS).
@@ -37,14 +38,14 @@ pub struct Size {
     pub height: u16,
 }
 
-/// Why there is no picture.
+/// The reason why a picture cannot be drawn.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The machine lacks something to draw this environment with.
+    /// The server's machine lacks a library or device that is needed to draw this environment.
     #[error("this server cannot draw {environment}: {reason}")]
     Missing {
-        /// The environment.
+        /// The environment's name.
         environment: &'static str,
         /// The missing part, and how to install it.
         reason: String,
@@ -52,24 +53,24 @@ pub enum Error {
     /// The drawing failed.
     #[error("{environment} could not be drawn: {reason}")]
     Failed {
-        /// The environment.
+        /// The environment's name.
         environment: &'static str,
         /// The reason.
         reason: String,
     },
-    /// The operating system gives no thread to draw with.
+    /// The operating system refuses to start the drawing thread.
     #[error("no thread could be started to draw with ({reason}); try again when the machine is less busy")]
     NoThread {
         /// The system's error.
         reason: String,
     },
-    /// The drawing thread panicked: a defect of the server.
+    /// The drawing thread panicked, because of a bug of the server.
     #[error("drawing failed because of a bug of the server; report it with the server's log")]
     Defect,
 }
 
-/// Draws pictures on a thread of its own, which starts with the first picture. Dropping it ends the thread after the
-/// picture that is being drawn, and waits a second for that at most.
+/// Draws pictures on a separate thread, which starts with the first picture. Dropping the renderer ends the thread
+/// after the current picture, and waits for it at most one second.
 #[derive(Default)]
 pub struct Renderer {
     thread: Mutex<Option<DrawingThread>>,
@@ -89,26 +90,27 @@ struct PictureJob {
 }
 
 impl Renderer {
-    /// Makes a renderer without a thread yet.
+    /// Creates a renderer. Its thread starts with the first picture.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Returns the histogram of the time that drawing a picture took.
+    /// Returns the histogram of the time that each picture took to draw.
     pub fn times(&self) -> Arc<Histogram> {
         Arc::clone(&self.times)
     }
 
-    /// Draws a picture, `[height, width, 3]`: red, green, blue, the uppermost row first. Pictures are drawn one at a
-    /// time, in the fair order of `Turns`. The same scene and size give the same bytes.
+    /// Draws a picture. Returns its pixels, `[height, width, 3]`: red, green and blue, top row first. Pictures are
+    /// drawn one at a time; small ones may overtake large ones in the queue. The same scene and size give the same
+    /// bytes.
     ///
     /// # Errors
-    /// [`Error`].
+    /// [`Error`] if the picture cannot be drawn.
     pub async fn draw(&self, scene: Scene, size: Size) -> Result<Bytes, Error> {
         let (reply, picture) = oneshot::channel();
         let pixels = u64::from(size.width) * u64::from(size.height);
         self.jobs()?.push(pixels, PictureJob { scene, size, reply }, |job| !job.reply.is_closed());
-        // The thread ends only when the renderer is dropped.
+        // No reply means a bug: the thread replies to every picture, and ends only when the renderer is dropped.
         picture.await.map_err(|_| Error::Defect)?.map(Bytes::from)
     }
 
@@ -133,7 +135,7 @@ impl Drop for Renderer {
         let running = self.thread.get_mut().unwrap_or_else(PoisonError::into_inner);
         if let Some(DrawingThread { jobs, handle }) = running.take() {
             jobs.close();
-            // A driver should not be drawing while the process ends, but one that hangs must not block the end.
+            // The driver should not draw while the process ends. But a driver that hangs must not block the end.
             for _ in 0..SHUTDOWN_TIMEOUT.as_millis() {
                 if handle.is_finished() {
                     break;
@@ -144,13 +146,13 @@ impl Drop for Renderer {
     }
 }
 
-/// Runs on the drawing thread until the queue is closed.
+/// The drawing thread: draws the pictures in the queue until it is closed.
 fn work(jobs: &Turns<PictureJob>, times: &Histogram) {
     lower(NICENESS);
     let mut cache = Cache::default();
     while let Some(PictureJob { scene, size, reply }) = jobs.pop() {
         if reply.is_closed() {
-            continue; // its session is gone
+            continue; // the session no longer waits
         }
         let start = Instant::now();
         let drawn = catch_unwind(AssertUnwindSafe(|| cache.draw(&scene, size))).unwrap_or_else(|_| {
@@ -161,13 +163,13 @@ fn work(jobs: &Turns<PictureJob>, times: &Histogram) {
             times.observe(start.elapsed());
         }
         if matches!(drawn, Err(Error::Failed { .. } | Error::Defect)) {
-            cache = Cache::default(); // a failed drawing may have left it in any state
+            cache = Cache::default(); // the failure may have left the cached models in any state
         }
-        let _ = reply.send(drawn); // the session may be gone by now
+        let _ = reply.send(drawn); // fails if the session no longer waits
     }
 }
 
-/// The drawing thread's models, which are compiled once.
+/// The models that the drawing thread has compiled, reused for later pictures.
 #[derive(Default)]
 struct Cache {
     #[cfg(feature = "mujoco")]

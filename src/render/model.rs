@@ -1,8 +1,8 @@
-//! Pictures of MuJoCo's models, by MuJoCo and OpenGL.
+//! Draws pictures of MuJoCo models, by MuJoCo and OpenGL.
 //!
 //! The models that run the physics have no colours, textures and lights, which would make each simulation larger. So
-//! pictures show another model: the same MJCF with scenery. Positions are copied to it, and lengths if they are edited; the
-//! other parameters (power, density, friction) cannot be seen.
+//! pictures show a second model: the same MJCF with scenery added. It gets the positions of the physics, and its
+//! lengths if parameters edit them. Other parameters (power, density, friction) are not visible.
 
 use super::{Error, Size};
 use crate::scene::{Look, ModelView, PosedModel, Scenery};
@@ -10,25 +10,26 @@ use perturb_mujoco::{self as mujoco, Camera, Kind};
 use std::ptr;
 
 const END_OF_MODEL: &str = "</mujoco>";
-/// Height in m by which a model may rise or sink before the camera follows, so that a hop is visible.
+/// Height in m by which a robot may rise or sink before the camera follows. It makes hops visible.
 const FREE_RISE: f64 = 0.6;
 
-/// The models that were drawn so far.
+/// The models that were drawn so far, reused for later pictures.
 #[derive(Default)]
 pub(super) struct Models {
     drawn: Vec<ShownModel>,
-    /// The error of a missing OpenGL library, which stays missing while the server runs. Other failures, such as missing
-    /// file descriptors, may pass and are not stored.
+    /// The error if the OpenGL library is not installed, which does not change while the server runs. Other failures,
+    /// such as too few file descriptors, may be temporary and are not stored.
     missing: Option<String>,
 }
 
-/// A model with its scenery.
+/// A model with its scenery, ready to be drawn.
 struct ShownModel {
     look: &'static Look,
     renderer: mujoco::Renderer,
-    /// The MJCF with other lengths that is shown.
+    /// The MJCF with edited lengths that the renderer now shows; `None` for the lengths of `look`.
     edited: Option<String>,
-    /// The body that the camera follows, and its position at the initial positions, m.
+    /// The body that the camera follows, and its position in the model's initial pose, in m. `None` if the camera
+    /// follows no body.
     followed: Option<(usize, [f64; 3])>,
 }
 
@@ -67,7 +68,7 @@ impl Models {
     }
 }
 
-/// The files that a look's MJCF names.
+/// Returns the names and contents of the files that a look's MJCF uses.
 fn files(look: &Look) -> Vec<(&str, &[u8])> {
     look.files.iter().map(|(name, bytes)| (name.as_str(), bytes.as_slice())).collect()
 }

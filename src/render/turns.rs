@@ -1,38 +1,41 @@
-//! The queue of pictures: fair queueing by pixels (Demers, Keshav and Shenker, 1989). A picture is due when it would be
-//! finished if all waiting pictures were drawn at once, pixel by pixel in turn. So a small picture comes before any number
-//! of waiting large ones, and no picture waits for ever.
+//! A fair queue of pictures (fair queueing, Demers, Keshav and Shenker, 1989). Pictures are drawn in the order in which
+//! they would be finished if all waiting pictures were drawn simultaneously, one pixel of each in turn. So a small
+//! picture overtakes waiting large ones, but no picture waits for ever.
 
 use std::{
     collections::BTreeMap,
     sync::{Condvar, Mutex, MutexGuard, PoisonError},
 };
 
-/// Length of the queue from which entries that nobody waits for are removed.
+/// Length of the queue at which each `push` first removes abandoned entries.
 const MIN_CLEANUP_LENGTH: usize = 256;
 
-/// A fair queue.
+/// A fair queue of entries, each with a number of pixels as its cost. It may be used by several threads.
 pub(super) struct Turns<T> {
     queue: Mutex<Queue<T>>,
     ready: Condvar,
 }
 
 struct Queue<T> {
-    /// Each entry with its pixels, by the clock at which it is due, then by its number of arrival.
+    /// The entries with their numbers of pixels. The key is the value of `clock` at which the entry is due, then its
+    /// number of arrival.
     waiting: BTreeMap<(u64, u64), (u64, T)>,
-    /// The fair share of the drawn pixels that an entry which waits all the time would have had.
+    /// The virtual time of fair queueing: the number of pixels of each waiting entry that simultaneous drawing would
+    /// have finished by now.
     clock: u64,
     came: u64,
     closed: bool,
 }
 
 impl<T> Turns<T> {
-    /// Makes an empty queue.
+    /// Creates an empty queue.
     pub(super) fn new() -> Self {
         let queue = Queue { waiting: BTreeMap::new(), clock: 0, came: 0, closed: false };
         Self { queue: Mutex::new(queue), ready: Condvar::new() }
     }
 
-    /// Adds an entry of so many pixels. If the queue is long, removes entries that are not `wanted` any more.
+    /// Adds an entry that costs this number of pixels. If the queue is long, first removes the entries for which
+    /// `wanted` is false.
     pub(super) fn push(&self, pixels: u64, item: T, wanted: impl Fn(&T) -> bool) {
         let mut queue = self.lock();
         if queue.waiting.len() >= MIN_CLEANUP_LENGTH {
@@ -44,7 +47,7 @@ impl<T> Turns<T> {
         self.ready.notify_one();
     }
 
-    /// Waits for the next entry and returns it; `None` once the queue is closed.
+    /// Waits for the next entry and returns it. Returns `None` once the queue is closed.
     pub(super) fn pop(&self) -> Option<T> {
         let mut queue = self.lock();
         loop {
@@ -60,7 +63,7 @@ impl<T> Turns<T> {
         }
     }
 
-    /// Drops all entries and closes the queue.
+    /// Drops all entries, and makes later calls of `pop` return `None`.
     pub(super) fn close(&self) {
         let mut queue = self.lock();
         queue.closed = true;

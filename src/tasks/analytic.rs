@@ -1,9 +1,10 @@
-//! Functions of the analytic tasks. Their dynamics are those of Gymnasium 1.4 in f64, with the crate libm's sine and
-//! cosine: the C library's results differ in the last digits between processors.
+//! Functions that the analytic tasks share: those whose dynamics are formulas, not a MuJoCo model. The dynamics are
+//! those of Gymnasium 1.4 in f64. Sine and cosine come from the crate libm, because the C library's results differ in
+//! the last digits between processors.
 
 use crate::env::{Action, Error, Stream};
 
-/// Returns the choice of an action. The pool has already checked the action against the space.
+/// Returns the index of the choice in an action. The caller must have checked that the action is a valid choice.
 pub(super) fn choice(action: Action<'_>) -> u32 {
     match action {
         Action::Discrete(choice) => choice,
@@ -11,8 +12,8 @@ pub(super) fn choice(action: Action<'_>) -> u32 {
     }
 }
 
-/// Adopts the state that the dynamics computed. If it is not finite as f32, the dynamics diverged, as extreme
-/// parameters or states can cause, and the previous state is kept. Returns whether the dynamics diverged.
+/// Sets `state` to `next`, the result of the dynamics. If `next` is not finite as f32, keeps the previous state and
+/// returns true: the dynamics diverged. Extreme parameters or states can cause this.
 pub(super) fn advance<const N: usize>(state: &mut [f64; N], next: [f64; N]) -> bool {
     let diverged = !observable(&next);
     if !diverged {
@@ -25,7 +26,8 @@ fn observable(state: &[f64]) -> bool {
     state.iter().all(|&x| (x as f32).is_finite())
 }
 
-/// Loads a saved state of exactly `N` finite numbers, each within the limits of the dynamics.
+/// Checks a saved state: it must have exactly `N` finite numbers, each with an absolute value up to the limit in
+/// `most`.
 pub(super) fn load<const N: usize>(state: &[f64], most: [f64; N]) -> Result<[f64; N], Error> {
     match <[f64; N]>::try_from(state) {
         Ok(state) if !observable(&state) => Err(Error::Snapshot { reason: "its state is not finite".into() }),
@@ -35,7 +37,7 @@ pub(super) fn load<const N: usize>(state: &[f64], most: [f64; N]) -> Result<[f64
     }
 }
 
-/// Draws a state with every entry uniform in [low, high), in order.
+/// Draws a state whose entries are independent and uniform in [low, high).
 pub(super) fn draw<const N: usize>(stream: &mut Stream, low: f64, high: f64) -> [f64; N] {
     std::array::from_fn(|_| stream.uniform(low, high))
 }

@@ -1,8 +1,8 @@
-//! The built-in environments, each in a folder of its own, and their catalogue. The module `folder` reads environments
-//! that consist of an MJCF model and a TOML file.
+//! The built-in environments, each in a module of its own, and their catalogue. The module `folder` loads environments
+//! that users define by an MJCF model and a TOML file.
 //!
-//! The files of a folder have the same parts in the same order: specification with parameters, derived quantities, reset,
-//! dynamics, reward and termination; and the content of pictures.
+//! Each environment's file has the same parts in the same order: specification with parameters, derived quantities,
+//! reset, dynamics, reward and termination. `drawing.rs` has the content of its pictures.
 
 mod analytic;
 #[cfg(feature = "mujoco")]
@@ -25,7 +25,7 @@ use crate::env::Catalogue;
 #[cfg(feature = "mujoco")]
 use std::path::PathBuf;
 
-/// The built-in environments.
+/// Returns the catalogue of the built-in environments.
 pub fn catalogue() -> Catalogue {
     let analytic = [&cart_pole::SPEC, &mountain_car::SPEC, &acrobot::SPEC, &pendulum::SPEC];
     #[cfg(feature = "mujoco")]
@@ -35,10 +35,10 @@ pub fn catalogue() -> Catalogue {
     Catalogue::new(analytic.into_iter().chain(robots).collect())
 }
 
-/// Returns the catalogue of the built-in environments, then those of folders, in order.
+/// Returns the catalogue of the built-in environments, followed by the environments in `folders`, in order.
 ///
 /// # Errors
-/// [`folder::LoadError`] if a folder is refused, or has the name of an environment before it.
+/// [`folder::LoadError`] if a folder is not valid, or its environment has the same name as an earlier one.
 #[cfg(feature = "mujoco")]
 pub fn catalogue_with(folders: &[PathBuf]) -> Result<Catalogue, folder::LoadError> {
     let mut catalogue = catalogue();

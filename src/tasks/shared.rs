@@ -1,50 +1,53 @@
-//! The simulations that environments take turns in. Each thread has one simulation of each model.
+//! MuJoCo simulations that environments share. Each thread has one simulation of each model, and its environments use
+//! it in turn.
 //!
-//! A model with MuJoCo's data takes 129 kB to some megabytes, but the difference between two environments is some hundred
-//! bytes. Environments of so few bytes stay in the caches. An environment cannot see what another one did: its edit of the
-//! model and its whole state are written into the simulation before it runs.
+//! A model with MuJoCo's data takes 129 kB to some megabytes, but two environments differ only in some hundred bytes.
+//! So shared simulations keep the memory of an environment small enough for the processor's caches. Environments do not
+//! affect each other: before one runs, its edit of the model and its complete state are written into the simulation.
 
 use perturb_mujoco::{Error, Model, Simulation};
 use std::{any::Any, cell::RefCell, ptr, sync::Arc};
 
-/// A compiled model, which nothing changes, and the way in which edits change copies of it.
+/// A compiled model, which is never modified, and how an edit is applied to a simulation of it.
 pub(super) trait SharedModel: Sync + 'static {
-    /// A change of the model: parameters, and what comes of them.
+    /// An edit of the model: parameters, and the values in the model that follow from them.
     type Edit: Send + Sync + 'static;
 
-    /// The compiled model.
+    /// The compiled model, without edits.
     fn model(&self) -> &Model;
 
-    /// Tells whether two edits make the same model.
+    /// Whether two edits result in the same model.
     fn is_same(a: &Self::Edit, b: &Self::Edit) -> bool;
 
-    /// Writes the edited model into a simulation that has the model of the edit `before`, or none that is known.
+    /// Applies an edit to the model of a simulation. `before` is the edit that the simulation's model has now; `None`
+    /// if it is not known.
     ///
     /// # Errors
-    /// MuJoCo's fatal ones.
+    /// MuJoCo's fatal errors.
     fn write(&self, simulation: &mut Simulation, before: Option<&Self::Edit>, edit: &Self::Edit) -> Result<(), Error>;
 }
 
-/// A simulation, and the last edit of its model.
+/// A thread's simulation of a model, and the edit that its model has now.
 pub(super) struct Shared<T: SharedModel> {
     shared_model: &'static T,
     simulation: Simulation,
     edit: Option<Arc<T::Edit>>,
-    /// Scratch for readings.
+    /// A buffer for values that are read from the simulation.
     numbers: Vec<f64>,
 }
 
-/// A simulation that is not in use at the moment: its model's address, and a [`Shared`].
+/// A simulation that is not in use at the moment: the address of its [`SharedModel`], and its [`Shared`].
 type Idle = (*const (), Box<dyn Any>);
 
 thread_local! {
     static IDLE: RefCell<Vec<Idle>> = const { RefCell::new(Vec::new()) };
 }
 
-/// Runs `work` with this thread's simulation of the model, which is made when it is first needed and after a fatal error.
+/// Runs `work` with this thread's simulation of the model. Creates the simulation at the first call, and again after a
+/// fatal error.
 ///
 /// # Errors
-/// Those of `work`, and [`Error::Fatal`] without memory for a simulation.
+/// The errors of `work`, and [`Error::Fatal`] if there is not enough memory for a simulation.
 pub(super) fn with<T: SharedModel, R>(
     shared_model: &'static T,
     work: impl FnOnce(&mut Shared<T>) -> Result<R, Error>,
@@ -69,11 +72,11 @@ pub(super) fn with<T: SharedModel, R>(
 }
 
 impl<T: SharedModel> Shared<T> {
-    /// The last edit, if `is_wanted`, or else a new one, which `make` writes into the simulation. The state is undefined
-    /// afterwards.
+    /// Returns the edit that the simulation has now, if `is_wanted` returns true for it. Otherwise calls `make`, which
+    /// applies a new edit to the simulation and returns it. The state is undefined afterwards.
     ///
     /// # Errors
-    /// Those of `make`.
+    /// The errors of `make`.
     pub(super) fn edit(
         &mut self,
         is_wanted: impl FnOnce(&T::Edit) -> bool,
@@ -82,16 +85,16 @@ impl<T: SharedModel> Shared<T> {
         if let Some(edit) = self.edit.as_ref().filter(|edit| is_wanted(edit)) {
             return Ok(Arc::clone(edit));
         }
-        self.edit = None; // `make` may fail half-way
+        self.edit = None; // the model is in no known state if `make` fails
         let edit = Arc::new(make(self.shared_model, &mut self.simulation)?);
         self.edit = Some(Arc::clone(&edit));
         Ok(edit)
     }
 
-    /// The simulation with the edited model. Its state is undefined.
+    /// Applies an edit, and returns the simulation with the edited model. Its state is undefined.
     ///
     /// # Errors
-    /// MuJoCo's fatal ones.
+    /// MuJoCo's fatal errors.
     pub(super) fn edited(&mut self, edit: &Arc<T::Edit>) -> Result<&mut Simulation, Error> {
         let before = self.edit.as_ref();
         if !before.is_some_and(|before| Arc::ptr_eq(before, edit) || T::is_same(before, edit)) {
@@ -101,11 +104,11 @@ impl<T: SharedModel> Shared<T> {
         Ok(&mut self.simulation)
     }
 
-    /// The simulation with the edited model in this [state](Simulation::state), from which nothing is computed yet, and
-    /// the scratch for readings.
+    /// Applies an edit and sets this [state](Simulation::state). Returns the simulation and a buffer for values that
+    /// are read from it. Poses and contacts of the state are not computed yet.
     ///
     /// # Errors
-    /// MuJoCo's fatal ones.
+    /// MuJoCo's fatal errors.
     pub(super) fn at(&mut self, edit: &Arc<T::Edit>, state: &[f64]) -> Result<(&mut Simulation, &mut Vec<f64>), Error> {
         self.edited(edit)?.set_state(state)?;
         Ok((&mut self.simulation, &mut self.numbers))

@@ -1,4 +1,4 @@
-//! Two links below a pivot, and the height that the tip has to reach.
+//! The picture of Acrobot: two links below a pivot, and the height that the tip has to reach.
 
 use super::HEIGHT;
 use crate::scene::{Drawing, colour, polar};
@@ -6,12 +6,13 @@ use std::f64::consts::FRAC_PI_2;
 
 const LINK: f64 = 0.2;
 
-/// Draws the links. The first angle is measured from hanging, the second from the first link, both anticlockwise.
+/// Draws the links. `angles` are in rad, anticlockwise: of the first link from hanging down, of the second relative to
+/// the first. `link_length` is in m.
 pub(super) fn drawing(angles: [f64; 2], link_length: f64) -> Drawing {
-    let half = (2.2 * link_length).max(3.3); // the longest links of version E have room
+    let half = (2.2 * link_length).max(3.3); // the longest links of version E fit
     let mut drawing = Drawing::new([-half, -half], [half, half]);
 
-    // The task adds cosines, so its height is in lengths of a link.
+    // The task's goal is a sum of cosines, so its unit is the length of a link.
     let goal_height = HEIGHT * link_length;
     drawing.rectangle([f64::NEG_INFINITY, goal_height], [f64::INFINITY; 2], colour::PALE_GREEN);
     drawing.dashes(&[[f64::NEG_INFINITY, goal_height], [f64::INFINITY, goal_height]], 0.05, colour::GREEN);

@@ -1,7 +1,7 @@
-//! Acrobot: a two-link pendulum, driven at the elbow, swings its tip above a line.
+//! Acrobot: a two-link pendulum with a motor at the elbow must swing its tip above a line.
 //!
 //! Source: Sutton (1996); Gymnasium 1.4 `Acrobot-v1` ("book" equations, fourth-order Runge-Kutta). As in the paper's
-//! code the links' centres of mass stay at 0.5 m when `length` changes.
+//! code, the links' centres of mass stay at 0.5 m when the parameter `length` changes.
 
 mod drawing;
 
@@ -78,27 +78,28 @@ const MAX_VELOCITY_2: f64 = 9.0 * PI;
 const HEIGHT: f64 = 1.0;
 const RESET_RANGE: f64 = 0.1;
 
-/// The two links.
+/// An Acrobot: its parameters and state.
 #[derive(Debug, Clone)]
 pub struct Acrobot {
     link_length: f64,
     link_mass: f64,
     link_moi: f64,
-    /// Angle of link 1 from hanging, angle of link 2 relative to link 1, and their velocities.
+    /// The angle of link 1 from hanging down, the angle of link 2 relative to link 1, in rad, and their velocities in
+    /// rad/s.
     state: [f64; 4],
-    /// The impulse on the first joint in the next step, N m s.
+    /// The angular impulse on the first joint in the next step, in N m s.
     push: f64,
 }
 
 impl Acrobot {
-    /// Makes an Acrobot with default parameters, hanging.
+    /// Creates an Acrobot with default parameters, hanging down at rest.
     pub fn new() -> Self {
         let [link_length, link_mass, link_moi] = [0, 1, 2].map(|i: usize| SPEC.parameters[i].default);
         Self { link_length, link_mass, link_moi, state: [0.0; 4], push: 0.0 }
     }
 
-    /// Time derivative of the state under a torque on the second joint (Sutton and Barto, "book" version) and the torque of
-    /// a push on the first.
+    /// Returns the time derivative of a state (Sutton and Barto, "book" version). `torque` acts on the second joint,
+    /// `push` on the first, both in N m.
     fn derivative(&self, [theta1, theta2, dtheta1, dtheta2]: [f64; 4], torque: f64, push: f64) -> [f64; 4] {
         let (m1, m2) = (self.link_mass, self.link_mass);
         let (lc1, lc2) = (CENTRE_OF_MASS, CENTRE_OF_MASS);
@@ -135,8 +136,9 @@ impl Default for Acrobot {
     }
 }
 
-/// Brings an angle into [-π, π] by whole turns. A loop as in Gymnasium does this, because a remainder rounds differently.
-/// If extreme parameters turned a joint so far in one step that the loop would not end, a remainder is used.
+/// Wraps an angle in rad into [-π, π]. Like Gymnasium it adds or subtracts 2π in a loop, because a remainder would
+/// round differently. Angles so large that the loop could take too long, which extreme parameters can cause, are
+/// wrapped by a remainder.
 fn wrap(mut angle: f64) -> f64 {
     if angle.abs() > 1000.0 * PI {
         return (angle + PI).rem_euclid(2.0 * PI) - PI;

@@ -1,4 +1,5 @@
-//! A cart on its track between two posts, the pole, and the angles at which it counts as fallen.
+//! The picture of CartPole: a cart on its track between two posts, its pole, and the angles at which the pole counts as
+//! fallen.
 
 use super::{ANGLE_LIMIT, POSITION_LIMIT};
 use crate::scene::{Drawing, Point, colour, polar};
@@ -8,8 +9,8 @@ const CART: Point = [0.25, 0.22]; // half width, height
 const WHEEL: f64 = 0.07;
 const POLE: f64 = 0.09;
 
-/// Draws the cart and its pole, whose angle is measured from upright, clockwise. Lengths are true to scale, so a longer
-/// pole looks longer.
+/// Draws the cart and its pole. `position` and `half_pole_length` are in m, `angle` is in rad from upright, clockwise.
+/// The pole is drawn to scale.
 pub(super) fn drawing(position: f64, angle: f64, half_pole_length: f64) -> Drawing {
     let hinge = [position, WHEEL + CART[1] - 0.04];
     let pole = 2.0 * half_pole_length;

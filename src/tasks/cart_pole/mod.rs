@@ -13,8 +13,8 @@ use crate::{
     scene::Scene,
 };
 
-/// The specification of CartPole. The observation has no bounds, because the last one of an episode lies beyond the
-/// limits that ended it.
+/// The specification of CartPole. Observations have no bounds, because the last observation of an episode is beyond the
+/// limits that end the episode.
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "CartPole",
     revision: 1,
@@ -60,8 +60,8 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
         comparison: Comparison::AtLeast,
         threshold: 195.0,
     },
-    // The paper's code compares with 195 steps after each step, but an environment whose episode has ended is reset
-    // before the comparison.
+    // The paper's code compares the length with 195 after each step. It resets an ended environment before the
+    // comparison, so the step that ends the episode does not count.
     code_success: Some(Success {
         description: "the episode lasted at least 196 steps",
         achievement: Achievement::Length,
@@ -78,24 +78,25 @@ const ANGLE_LIMIT: f64 = 12.0 * 2.0 * std::f64::consts::PI / 360.0;
 const POSITION_LIMIT: f64 = 2.4;
 const RESET_RANGE: f64 = 0.05;
 
-/// The cart and its pole.
+/// A CartPole: its parameters and state.
 #[derive(Debug, Clone)]
 pub struct CartPole {
     force: f64,
     half_pole_length: f64,
     pole_mass: f64,
-    // Derived quantities, which only `set_parameters` sets. The reciprocal saves three divisions a step, half of its
-    // time, for a difference of some 1e-16 from Gymnasium.
+    // Quantities that `set_parameters` derives. The reciprocal saves three divisions, half of a step's time. Results
+    // differ from Gymnasium's by some 1e-16.
     pole_mass_length: f64,
     inverse_total_mass: f64,
-    /// Position, velocity, angle, angular velocity.
+    /// The cart's position in m and velocity in m/s, the pole's angle from upright in rad and angular velocity in
+    /// rad/s.
     state: [f64; 4],
-    /// The impulse on the cart in the next step, N s.
+    /// The impulse on the cart in the next step, in N s.
     push: f64,
 }
 
 impl CartPole {
-    /// Makes a CartPole with default parameters, at rest.
+    /// Creates a CartPole with default parameters, at rest and upright.
     pub fn new() -> Self {
         let mut cart_pole = Self {
             force: 0.0,

@@ -15,18 +15,18 @@ use std::sync::OnceLock;
 ///
 /// | observation | value, clipped to ±5 |
 /// |---|---|
-/// | 0 | height of the torso above that at the reset, m |
+/// | 0 | height of the torso minus its height at the reset, m |
 /// | 1, 2 | sine and cosine of the angle to the target: 0 and 1 |
 /// | 3 … 5 | 0.3 × the torso's velocity along x, y, z in m/s |
 /// | 6, 7 | roll (0) and pitch of the torso, rad |
-/// | 8 … 19 | bthigh, bshin, bfoot, fthigh, fshin, ffoot: position in the joint's range scaled to ±1, and 0.1 × speed in rad/s |
-/// | 20 … 25 | whether ffoot, fshin, fthigh, bfoot, bshin, bthigh touch the floor, one step late |
+/// | 8 … 19 | bthigh, bshin, bfoot, fthigh, fshin, ffoot: position, scaled so that the joint's range becomes ±1, and 0.1 × speed in rad/s |
+/// | 20 … 25 | whether ffoot, fshin, fthigh, bfoot, bshin, bthigh touched the floor in the previous step |
 ///
-/// Actions: the six motors' controls, clipped to ±1, times `power`, times 120, 90, 60, 140, 60 and 30 N m. Reward: see
-/// [`Walker`]. Start: joints uniform in ±0.1 rad within their range, at rest. The cheetah is alive while its pitch is
-/// within ±1 rad and no thigh or shin touches the floor.
+/// Actions: the controls of the six motors. Each is clipped to ±1, and multiplied by `power` and by 120, 90, 60, 140,
+/// 60 or 30 N m. Reward: see [`Walker`]. Start: joint positions uniform in ±0.1 rad, clipped to the joints' ranges, at
+/// rest. The cheetah is alive while its pitch is within ±1 rad and no thigh or shin touches the floor.
 ///
-/// Revision 0: Roboschool's `RoboschoolHalfCheetah-v1` on MuJoCo.
+/// Source: Roboschool's `RoboschoolHalfCheetah-v1`, here simulated by MuJoCo.
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "HalfCheetah",
     revision: 0,
@@ -76,10 +76,10 @@ static ROBOT: Robot = Robot {
     pristine: OnceLock::new(),
 };
 
-/// Makes a half cheetah with default parameters.
+/// Creates a half cheetah with default parameters.
 ///
 /// # Errors
-/// [`Error::Model`] if MuJoCo is of another version or has no memory.
+/// [`Error::Model`] if the MuJoCo library has the wrong version or there is not enough memory.
 pub fn half_cheetah() -> Result<Walker, Error> {
     Walker::new(&ROBOT)
 }

@@ -15,18 +15,18 @@ use std::sync::OnceLock;
 ///
 /// | observation | value, clipped to ±5 |
 /// |---|---|
-/// | 0 | height of the torso above that at the reset, m |
+/// | 0 | height of the torso minus its height at the reset, m |
 /// | 1, 2 | sine and cosine of the angle to the target: 0 and 1 |
 /// | 3 … 5 | 0.3 × the torso's velocity along x, y, z in m/s |
 /// | 6, 7 | roll (0) and pitch of the torso, rad |
-/// | 8 … 13 | thigh, leg, foot: position in the joint's range scaled to ±1, and 0.1 × speed in rad/s |
-/// | 14 | whether the foot touches the floor, one step late |
+/// | 8 … 13 | thigh, leg, foot: position, scaled so that the joint's range becomes ±1, and 0.1 × speed in rad/s |
+/// | 14 | whether the foot touched the floor in the previous step |
 ///
-/// Actions: the three motors' controls, clipped to ±1, times `power`, times 100 N m. Reward: see
-/// [`Walker`]. Start: joints uniform in ±0.1 rad within their range, at rest. The hopper is alive while its torso is
-/// above 0.8 m and its pitch within ±1 rad.
+/// Actions: the controls of the three motors. Each is clipped to ±1, and multiplied by `power` and by 100 N m. Reward:
+/// see [`Walker`]. Start: joint positions uniform in ±0.1 rad, clipped to the joints' ranges, at rest. The hopper is
+/// alive while its torso is above 0.8 m and its pitch is within ±1 rad.
 ///
-/// Revision 0: Roboschool's `RoboschoolHopper-v1` on MuJoCo.
+/// Source: Roboschool's `RoboschoolHopper-v1`, here simulated by MuJoCo.
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "Hopper",
     revision: 0,
@@ -67,10 +67,10 @@ static ROBOT: Robot = Robot {
     pristine: OnceLock::new(),
 };
 
-/// Makes a hopper with default parameters.
+/// Creates a hopper with default parameters.
 ///
 /// # Errors
-/// [`Error::Model`] if MuJoCo is of another version or has no memory.
+/// [`Error::Model`] if the MuJoCo library has the wrong version or there is not enough memory.
 pub fn hopper() -> Result<Walker, Error> {
     Walker::new(&ROBOT)
 }

@@ -1,27 +1,29 @@
-//! Channels, reward terms and quantities that the specifications of Hopper and HalfCheetah share.
+//! The parts that the specifications of Hopper and HalfCheetah share: channels, reward terms, parameters and
+//! quantities.
 
 use crate::env::{Achievement, Channel, Comparison, Parameter, PushSpec, Quantity, RewardTerm, Success};
 
-/// Limit of the numbers of an observation, which are clipped to ± this.
+/// Maximal absolute value of an observed number. Larger values are clipped.
 pub const CLIP: f64 = 5.0;
-/// Simulated seconds in one step.
+/// The simulated time of one step, in s.
 pub const CONTROL_TIMESTEP: f64 = 0.0165;
 
-/// The channels of a robot, by the names of its joints and geoms.
+/// The names of a robot's joints and geoms, and the channels that follow from them.
 pub struct Names {
-    /// Joints with motors, in the order of observations and actions.
+    /// The joints with motors, in the order of observations and actions.
     pub joints: &'static [&'static str],
-    /// Geoms whose contacts are observed, in order.
+    /// The geoms whose contacts are observed, in the order of the observation.
     pub contacts: &'static [&'static str],
-    /// The entries of an observation: torso, joints, contacts.
+    /// The entries of an observation: of the torso, the joints and the contacts.
     pub observation: &'static [Channel],
     /// The entries of an action.
     pub action: &'static [Channel],
-    /// The entries of an exact state. The bounds are far beyond any episode, and keep out numbers that would overflow.
+    /// The entries of an exact state. Their bounds are far beyond the values of any episode; they exclude numbers that
+    /// would overflow.
     pub state: &'static [Channel],
 }
 
-/// The [`Names`] of a robot with these joints and observed contacts.
+/// Makes the [`Names`] of a robot from the names of its joints and of the geoms whose contacts are observed.
 macro_rules! names {
     (joints: [$($joint:literal),*], contacts: [$($contact:literal),*]) => {{
         use crate::{env::Channel, tasks::locomotion::channels::{CLIP, Names}};
@@ -30,7 +32,7 @@ macro_rules! names {
             joints: &[$($joint),*],
             contacts: &[$($contact),*],
             observation: &[
-                // In the plane the angle to the target, the speed along y and the roll are constant.
+                // The robot moves in a plane, so the angle to the target, the speed along y and the roll are constant.
                 Channel::new("torso_height", "m", -CLIP, CLIP).scale(1.0),
                 Channel::new("target_sin", "1", -1.0, 1.0).scale(0.0),
                 Channel::new("target_cos", "1", -1.0, 1.0).scale(0.0),
@@ -61,7 +63,7 @@ macro_rules! names {
 }
 pub(in crate::tasks) use names;
 
-/// The reward's terms.
+/// The terms of the reward of both robots.
 pub const REWARD_TERMS: &[RewardTerm] = &[
     RewardTerm { name: "alive", description: "1 while alive, else -1" },
     RewardTerm {
@@ -73,21 +75,22 @@ pub const REWARD_TERMS: &[RewardTerm] = &[
     RewardTerm { name: "joint_limits", description: "-0.2 for each joint beyond 99 % of its range" },
 ];
 
-/// The power of the motors, with the sets of its versions: see [`Parameter::versions`].
+/// Returns the parameter `power`, a factor on the motors' controls, with the values of its versions as in
+/// [`Parameter::versions`].
 pub const fn power(default: f64, random: (f64, f64), around: (f64, f64)) -> Parameter {
     Parameter::new("power", "1", "factor on every motor's control", (0.0, 10.0))
         .versions(default, random, around)
         .read_back_by("control_factor")
 }
 
-/// The torso's density.
+/// The parameter `density` of both robots: the density of the torso.
 pub const DENSITY: Parameter = Parameter::new("density", "kg/m³", "density of the torso body", (10.0, 100_000.0))
     .versions(1000.0, (750.0, 1250.0), (500.0, 1500.0));
-/// The robot's friction.
+/// The parameter `friction` of both robots: the sliding friction of all geoms except the floor.
 pub const FRICTION: Parameter = Parameter::new("friction", "1", "sliding friction of the robot's geoms", (0.0, 10.0))
     .versions(0.8, (0.5, 1.1), (0.2, 1.4));
 
-/// The quantities that receipts read back.
+/// The physical quantities that receipts of both robots report.
 pub const APPLIED: &[Quantity] = &[
     Quantity { name: "torso_mass", unit: "kg" },
     Quantity { name: "friction", unit: "1" },
@@ -95,7 +98,7 @@ pub const APPLIED: &[Quantity] = &[
     Quantity { name: "density", unit: "kg/m³" },
 ];
 
-/// The pushes of both robots.
+/// The pushes that can be applied to both robots.
 pub const PUSH: Option<PushSpec> =
     Some(PushSpec { description: "impulse of a push on the torso along x", unit: "N s", axes: &[0] });
 

@@ -1,4 +1,4 @@
-//! The robots' colours: red, green, blue, in 0 … 1.
+//! The colours of the robots: red, green and blue, each 0 … 1.
 
 pub const GREY: [f32; 3] = [0.36, 0.40, 0.44];
 pub const BLUE: [f32; 3] = [0.0, 0.447, 0.698];

@@ -1,7 +1,8 @@
-//! The task that Hopper and HalfCheetah share, Roboschool's (Brockman et al., 2016; Schulman et al., 2017) on MuJoCo 2.2.2.
+//! The task that Hopper and HalfCheetah share: Roboschool's running task (Brockman et al., 2016; Schulman et al.,
+//! 2017), simulated by MuJoCo 2.2.2.
 //!
-//! [`Walker`] is the task. Environments take turns in a simulation of their thread (`tasks/shared.rs`). Each robot's folder
-//! has the robot's own numbers. The models are in `models/`, with the source of each number.
+//! [`Walker`] implements the task. All environments of a thread share one simulation (`tasks/shared.rs`). Each robot's
+//! module has the robot's specification. The models are in `models/`, with the source of each number.
 
 pub(super) mod channels;
 pub(super) mod colours;
@@ -19,27 +20,27 @@ use perturb_mujoco::Error;
 use pristine::Pristine;
 use std::sync::OnceLock;
 
-/// MJCF that pictures add to a robot's own elements. The drawn floor of the physics ends 40 m from the start, but this
-/// ground does not. The line marks the goal.
+/// MJCF elements that are added to a robot's model for pictures: an endless ground, because the floor of the physics is
+/// drawn only up to 40 m from the start, and a line that marks the goal.
 pub(super) const SCENERY: &str = include_str!("../../../models/scenery.xml");
 
-/// A robot: its specification, model, names of joints and geoms, and the rule whether it is alive.
+/// The description of a robot: its specification, model, names of joints and geoms, and the rule whether it is alive.
 pub(super) struct Robot {
     pub spec: &'static EnvironmentSpec,
-    /// The model and its look in pictures.
+    /// The model and how pictures show it.
     pub look: Look,
     pub names: Names,
     pub alive: fn(&Posture<'_>) -> bool,
-    /// The model, which is compiled once in the process.
+    /// The compiled model. It is compiled once in the process, when it is first needed.
     pub pristine: OnceLock<Result<Pristine, Error>>,
 }
 
-/// The values that decide whether a robot is alive.
+/// The quantities that decide whether a robot is alive.
 pub(super) struct Posture<'a> {
-    /// The torso's centre of mass above the floor, m.
+    /// The height of the torso's centre of mass above the floor, in m.
     pub height: f64,
-    /// The torso's turn about +y, rad.
+    /// The rotation of the torso about the y axis, in rad.
     pub pitch: f64,
-    /// The contact flags of the step before, in the task's order.
+    /// Whether each geom in [`Names::contacts`] touched anything in the previous step.
     pub contacts: &'a [bool],
 }

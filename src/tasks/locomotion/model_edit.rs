@@ -1,13 +1,14 @@
-//! Changes of the physics. Each starts from the unchanged compiled model, so changes do not accumulate.
+//! Edits of a robot's model by its parameters. Each edit starts from the compiled model, so edits do not accumulate.
 //!
-//! The result equals that of compiling an edited MJCF to 4e-13 in every array, at a hundredth of the cost.
+//! The arrays of an edited model equal those of a model compiled from edited MJCF up to 4e-13. An edit costs a
+//! hundredth of a compilation.
 
 use perturb_mujoco::{Error, Kind, Model, Simulation};
 
-/// The torso's density in the MJCF, kg/m³.
+/// The torso's density in the MJCF, in kg/m³.
 const COMPILED_DENSITY: f64 = 1000.0;
 
-/// The elements of a model that the parameters change.
+/// The indices of the model elements that the parameters change.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct EditedElements {
     torso_body: usize,
@@ -15,22 +16,22 @@ pub(super) struct EditedElements {
     floor: usize,
 }
 
-/// A change of the model: the parameters, and the [constants](Simulation::constants) that result from them.
+/// An edit of a robot's model: the parameters, and the [model constants](Simulation::constants) that follow from them.
 #[derive(Debug)]
 pub struct RobotEdit {
-    /// The torso's density, kg/m³.
+    /// The torso's density, in kg/m³.
     pub(super) density: f64,
-    /// The sliding friction of every geom but the floor.
+    /// The sliding friction of all geoms except the floor.
     pub(super) friction: f64,
     pub(super) constants: Box<[f64]>,
 }
 
 impl RobotEdit {
-    /// Edits a simulation of the compiled model, whose constants before any edit are `compiled_constants`. The state of the
-    /// simulation is undefined afterwards.
+    /// Applies the parameters to the model of `simulation`, and returns them as an edit. `compiled_constants` are the
+    /// constants of the compiled model. The state of the simulation is undefined afterwards.
     ///
     /// # Errors
-    /// MuJoCo's fatal ones.
+    /// MuJoCo's fatal errors.
     pub(super) fn new(
         targets: EditedElements,
         compiled_constants: &[f64],
@@ -50,14 +51,14 @@ impl RobotEdit {
                 coefficients[0] = friction;
             }
         }
-        // Masses enter many derived arrays: subtree masses, inverse weights, the solver's scale.
+        // Many arrays follow from masses: subtree masses, inverse weights, the scale of the solver.
         simulation.set_const()?;
         let mut constants: Box<[f64]> = compiled_constants.into();
         simulation.constants(&mut constants);
         Ok(Self { density, friction, constants })
     }
 
-    /// Tells whether this is the change to these parameters.
+    /// Whether this is the edit for these parameters.
     pub(super) fn is_of(&self, density: f64, friction: f64) -> bool {
         (self.density, self.friction) == (density, friction)
     }
@@ -72,17 +73,18 @@ impl EditedElements {
         })
     }
 
-    /// The torso's mass in kg.
+    /// Returns the torso's mass in a model, in kg.
     pub(super) fn torso_mass(self, model: &Model) -> f64 {
         model.body_mass()[self.torso_body]
     }
 
-    /// Returns the torso's density in kg/m³, computed from its mass.
+    /// Returns the torso's density in a model, in kg/m³. It is computed from the torso's masses in this and in the
+    /// compiled model, `pristine`.
     pub(super) fn density(self, model: &Model, pristine: &Model) -> f64 {
         self.torso_mass(model) / (self.torso_mass(pristine) / COMPILED_DENSITY)
     }
 
-    /// The robot's sliding friction, the same for all of its geoms.
+    /// Returns the robot's sliding friction in a model, which is equal for all its geoms.
     pub(super) fn friction(self, model: &Model) -> f64 {
         model.geom_friction()[3 * self.torso_geom]
     }

@@ -1,4 +1,4 @@
-//! A robot's compiled model, and the positions of its parts in MuJoCo's arrays.
+//! A robot's compiled model, and the indices of the robot's parts in MuJoCo's arrays.
 
 use super::{
     Robot,
@@ -10,14 +10,14 @@ use sha2::{Digest, Sha256};
 use std::{fmt::Write, sync::Arc};
 
 const TIMESTEP: f64 = 0.004125;
-/// Number of joints before those with motors: root_x, root_z, root_pitch.
+/// Number of joints without motors, which come first: root_x, root_z, root_pitch.
 const N_ROOT: usize = 3;
-/// Maximum number of joints with motors, that of HalfCheetah.
+/// Maximal number of joints with motors. HalfCheetah has this many.
 pub(super) const MAX_JOINTS: usize = 6;
-/// Maximum length of a robot's [state](Simulation::state).
+/// Maximal length of a robot's [state](Simulation::state).
 pub(super) const MAX_STATE: usize = 1 + 3 * (N_ROOT + MAX_JOINTS) + MAX_JOINTS;
 
-/// A compiled model, which nothing changes.
+/// A robot's compiled model, which is never modified, and facts about it.
 pub struct Pristine {
     pub(super) model: Model,
     pub(super) constants: Vec<f64>,
@@ -27,7 +27,7 @@ pub struct Pristine {
     pub(super) targets: EditedElements,
     pub(super) torso: usize,
     pub(super) joints: Vec<Joint>,
-    /// For each geom the contact flag that it sets, if any.
+    /// For each geom of the model, its index in the observed contacts; `None` if its contacts are not observed.
     flag_of_geom: Vec<Option<usize>>,
 }
 
@@ -80,19 +80,19 @@ impl Pristine {
         Ok(Self { model, constants, state, hash, targets, torso, joints, flag_of_geom })
     }
 
-    /// The torso's x and height, m.
+    /// Returns the x and z coordinates of the torso's centre of mass, in m.
     pub(super) fn torso(&self, simulation: &Simulation) -> (f64, f64) {
         let [x, _, z] = simulation.xipos(self.torso);
         (x, z)
     }
 
-    /// The mean over the robot's bodies of their centres' x, m.
+    /// Returns the mean of the x coordinates of all bodies' centres of mass, in m. The mean is not weighted by mass.
     pub(super) fn track_position(&self, simulation: &Simulation) -> f64 {
         let n_body = self.model.n_body();
         (1..n_body).map(|body| simulation.xipos(body)[0]).sum::<f64>() / (n_body - 1) as f64
     }
 
-    /// Returns for each of the observed geoms whether it touches anything, in the task's order.
+    /// Returns whether each geom in [`Names::contacts`](super::Names::contacts) touches anything.
     pub(super) fn touching(&self, simulation: &Simulation) -> [bool; MAX_JOINTS] {
         let mut touching = [false; MAX_JOINTS];
         for (a, b) in simulation.contacts() {
@@ -105,10 +105,10 @@ impl Pristine {
 }
 
 impl Pristine {
-    /// The edit to these parameters, by this thread's simulation.
+    /// Returns the edit for these parameters, computed by this thread's simulation.
     ///
     /// # Errors
-    /// MuJoCo's fatal ones.
+    /// MuJoCo's fatal errors.
     pub(super) fn edit(&'static self, density: f64, friction: f64) -> Result<Arc<RobotEdit>, Error> {
         shared::with(self, |shared| {
             shared.edit(

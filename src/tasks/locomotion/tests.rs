@@ -1,4 +1,4 @@
-//! Robots share simulations, also when MuJoCo raises a fatal error.
+//! Robots that share a simulation do not affect each other, even if MuJoCo raises a fatal error for one of them.
 
 use crate::{
     env::{Action, Environment},
@@ -15,7 +15,7 @@ use std::sync::OnceLock;
 
 const NAMES: Names = names!(joints: ["thigh", "leg", "foot"], contacts: ["foot"]);
 
-/// A hopper whose memory suffices in flight, where there is no constraint, and not on the floor.
+/// A hopper whose MuJoCo stack is large enough in the air, but too small for contacts with the floor.
 static WITH_A_SMALL_STACK: OnceLock<Robot> = OnceLock::new();
 
 fn walker() -> Walker {
@@ -35,7 +35,7 @@ fn walker() -> Walker {
     Walker::new(robot).unwrap()
 }
 
-/// In the air, with its joints within their limits.
+/// Puts the hopper in the air, with its joints within their limits.
 fn fly(walker: &mut Walker) {
     walker.reset_to(&[0.0, 5.0, 0.0, -0.5, -0.5, 0.1, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
 }

@@ -1,4 +1,4 @@
-//! The task that Hopper and HalfCheetah share: a planar robot runs along +x.
+//! The environment of Hopper and HalfCheetah: a robot in a vertical plane that must run along +x.
 
 use super::{
     Posture, Robot,
@@ -20,57 +20,58 @@ const ELECTRICITY_COST: f64 = 2.0;
 const STALL_TORQUE_COST: f64 = 0.1;
 const JOINT_LIMIT_COST: f64 = 0.2;
 const AT_LIMIT: f64 = 0.99;
-/// Limit of each cost. Actions may be as large as an f32 allows, and a reward with their squares must still fit one.
+/// Maximal value of each cost. An action may have any f32 value, and the reward, which contains its square, must still
+/// be finite as f32.
 const MAX_COST: f64 = 1e30;
 
-/// Number of an observation's entries before those of the joints.
+/// Number of entries about the torso, at the start of an observation.
 const N_TORSO: usize = 8;
-/// Maximum length of a robot's observation.
+/// Maximal length of a robot's observation.
 const MAX_OBSERVATION: usize = N_TORSO + 2 * MAX_JOINTS + MAX_JOINTS;
 
-/// A planar robot that is paid for running along +x.
+/// A robot in a vertical plane that is rewarded for running along +x.
 ///
-/// A step sets the controls to `power` × the action clipped to ±1 and holds them for four timesteps of 4.125 ms. Then,
-/// in this order: observation, alive, progress, contact flags, costs. So the observed flags, which also decide whether the
-/// robot is alive, are those of the step before. The reward is the sum of
+/// A step sets the controls to `power` × the action clipped to ±1, and simulates four timesteps of 4.125 ms. The
+/// observation has the contact flags of the previous step. These also decide whether the robot is alive. The reward is
+/// the sum of
 ///
 /// | term | value |
 /// |---|---|
 /// | alive | 1 while alive, else -1, and the episode terminates |
-/// | progress | Δx / 0.0165 s, x the mean over the robot's bodies of their centres of mass, m |
+/// | progress | Δx / 0.0165 s, where x is the mean x coordinate of all bodies' centres of mass, in m |
 /// | electricity | -2 × mean of abs(a × 0.1 q̇) |
 /// | stall_torque | -0.1 × mean of a² |
 /// | joint_limits | -0.2 × number of joints beyond 99 % of their range |
 ///
-/// with a the action as received, not clipped, and q̇ the joints' speeds after the step in rad/s.
+/// where a is the action as received, not clipped, and q̇ the joints' speeds after the step in rad/s.
 ///
-/// If the physics diverge (MuJoCo warns of a number, or of lost contacts, or fails), the step terminates with alive -1
-/// and no other term, and the observation stays that of the step before; after a reset to a state that diverges at
-/// once it is zeros.
+/// The physics diverge if MuJoCo raises a warning, for instance of a bad number or of dropped contacts, or a fatal
+/// error. Then the episode terminates, the term `alive` is -1 and the others are 0, and the observation of the previous
+/// step stays. If a reset sets a state that diverges at once, the observation is all zeros.
 ///
-/// A walker has no simulation of its own. It holds the parameters and the state that a shared simulation of its robot is
-/// given before it runs for this walker, and the results that are kept afterwards.
+/// A walker has no simulation of its own. It stores its parameters and state, which are written into a shared
+/// simulation before each step, and the results of the step.
 pub struct Walker {
     robot: &'static Robot,
     pristine: &'static Pristine,
-    /// The change of the model that the parameters make.
+    /// The edit of the model by the parameters.
     edit: Arc<RobotEdit>,
     power: f64,
-    /// The state as of [`Simulation::state`]. Undefined once the physics diverged.
+    /// The state in the layout of [`Simulation::state`]. It is undefined after the physics diverged.
     state: [f64; MAX_STATE],
-    /// The flags that the next step observes, in the task's order, if they differ from those of the state's contacts: at
-    /// the start of an episode all are 0.
+    /// The contact flags that the next step observes, in the order of [`Names::contacts`](super::Names::contacts).
+    /// `None` if they are to be computed from the state. At the start of an episode all are false.
     contacts: Option<[bool; MAX_JOINTS]>,
     observation: [f32; MAX_OBSERVATION],
-    /// The torso's height at the reset, m.
+    /// The torso's height at the reset, in m.
     initial_height: f64,
-    /// The robot's place along the track, m.
+    /// The mean x coordinate of all bodies' centres of mass after the last step, in m.
     x: f64,
-    /// The torso's greatest x in the episode, m.
+    /// The maximum of the torso's x coordinate in the episode, in m.
     greatest_x: f64,
-    /// The force on the torso in the next step, N.
+    /// The force on the torso in the next step, in N; `None` without a push.
     push: Option<[f64; 3]>,
-    /// Whether the physics diverged; until the next reset.
+    /// Whether the physics diverged since the last reset.
     diverged: bool,
 }
 
@@ -99,16 +100,16 @@ impl Walker {
         Ok(walker)
     }
 
-    /// Calls a function with a simulation that has the current parameters and state. Poses and contacts are not computed
+    /// Calls `look` with a simulation that has the current parameters and state. Poses and contacts are not computed
     /// yet.
     ///
     /// # Errors
-    /// MuJoCo's fatal ones.
+    /// MuJoCo's fatal errors.
     pub fn inspect<T>(&self, look: impl FnOnce(&Simulation) -> T) -> Result<T, SimulationError> {
         shared::with(self.pristine, |shared| Ok(look(shared.at(&self.edit, self.state())?.0)))
     }
 
-    /// The model's MJCF text, with default parameters.
+    /// The MJCF text of the model, with default parameters.
     pub fn mjcf(&self) -> &'static str {
         self.robot.look.mjcf
     }
@@ -123,20 +124,20 @@ impl Walker {
         &mut self.state[..self.pristine.state.len()]
     }
 
-    /// Returns positions and velocities, which follow the time in the state.
+    /// Returns the positions and the velocities in the state, for editing.
     fn positions_mut(&mut self) -> (&mut [f64], &mut [f64]) {
         let model = &self.pristine.model;
         let (qpos, rest) = self.state[1..].split_at_mut(model.n_q());
         (qpos, &mut rest[..model.n_v()])
     }
 
-    /// The model's initial state.
+    /// Sets the state to the model's initial state.
     fn clear(&mut self) {
         let initial = &self.pristine.state;
         self.state[..initial.len()].copy_from_slice(initial);
     }
 
-    /// Begins an episode at the state.
+    /// Begins an episode in the current state.
     fn start(&mut self) {
         let contacts = [false; MAX_JOINTS];
         self.contacts = Some(contacts);
@@ -155,7 +156,7 @@ impl Walker {
 
     // ---- dynamics
 
-    /// Advances by one step. Returns `None` if the new state cannot be observed.
+    /// Advances by one step. Returns `None` if the new state is not finite.
     fn advance(
         &mut self,
         simulation: &mut Simulation,
@@ -166,8 +167,8 @@ impl Walker {
             *ctrl = self.power * f64::from(a).clamp(-1.0, 1.0);
         }
         simulation.step_without_search()?;
-        // A timestep begins with the contacts of the state before it. So those after the last one are computed by the
-        // next step, which is the first to need them.
+        // A timestep first computes the contacts of the state before it. So after the first timestep, the simulation
+        // has the contacts at the end of the previous step.
         let contacts = self.contacts.unwrap_or_else(|| self.pristine.touching(simulation));
         for _ in 1..N_SUBSTEPS {
             simulation.step_without_search()?;
@@ -191,14 +192,15 @@ impl Walker {
 
     // ---- observation
 
-    /// Computes the observation and keeps it if it is finite. Returns height and pitch.
+    /// Computes the observation, and stores it if it is finite. Returns the torso's height in m and pitch in rad;
+    /// `None` if the observation is not finite.
     fn perceive(&mut self, simulation: &Simulation, contacts: &[bool; MAX_JOINTS]) -> Option<(f64, f64)> {
         let torso = self.pristine.torso;
         let height = simulation.xipos(torso)[2];
         let [_, _, _, vx, vy, vz] = simulation.body_velocity(torso);
         let pitch = (-simulation.xmat(torso)[6]).clamp(-1.0, 1.0).asin();
         let mut new = [0.0; MAX_OBSERVATION];
-        // In the plane the target lies straight ahead, and yaw and roll are 0.
+        // The robot moves in a plane, so the target is straight ahead, and yaw and roll are 0.
         new[..N_TORSO].copy_from_slice(&[
             height - self.initial_height,
             0.0,
@@ -226,7 +228,7 @@ impl Walker {
 
     // ---- reward
 
-    /// Electricity, stall torque and joint limits.
+    /// Returns the reward terms `electricity`, `stall_torque` and `joint_limits`.
     fn costs(&self, simulation: &Simulation, action: &[f32]) -> [f64; 3] {
         let (qpos, qvel) = (simulation.qpos(), simulation.qvel());
         let (mut power, mut torque, mut at_limit) = (0.0, 0.0, 0.0);
@@ -252,12 +254,12 @@ impl Walker {
         1 + self.pristine.state.len() + 1 + self.robot.names.contacts.len() + self.robot.spec.observation.len() + 1
     }
 
-    /// The flags that the next step observes.
+    /// Returns the contact flags that the next step observes.
     fn contacts(&self) -> [bool; MAX_JOINTS] {
         let computed = || {
             shared::with(self.pristine, |shared| {
                 let (simulation, _) = shared.at(&self.edit, self.state())?;
-                let _ = simulation.step1(); // the contacts are there; the next step repeats any warning
+                let _ = simulation.step1(); // contacts are computed even if it warns; the next step repeats the warning
                 Ok(self.pristine.touching(simulation))
             })
         };
@@ -265,7 +267,7 @@ impl Walker {
     }
 }
 
-/// Proof of an `expect`. A worker that panics loses its batch, not the server.
+/// The reason why an `expect` holds. If it does not, the worker's panic ends its batch, but not the server.
 const NO_MEMORY: &str = "there is memory for the one simulation of this thread";
 
 impl Environment for Walker {
@@ -360,11 +362,11 @@ impl Environment for Walker {
         out.extend_from_slice(self.state());
         out.push(self.initial_height);
         if self.diverged {
-            out[physics..].fill(0.0); // the state is not used any more, and may not be finite
+            out[physics..].fill(0.0); // a diverged state is not used any more, and may not be finite
         }
         let contacts = self.contacts();
         out.extend(contacts[..self.robot.names.contacts.len()].iter().map(|&flag| f64::from(u8::from(flag))));
-        // The observation has the flags of the step before, which are stored nowhere else.
+        // The observation is saved because its contact flags, of the previous step, cannot be computed from the state.
         out.extend(self.observation[..self.robot.spec.observation.len()].iter().map(|&value| f64::from(value)));
         out.push(self.greatest_x);
     }

@@ -1,4 +1,4 @@
-//! A car on the road between two hills, and the flag it has to reach.
+//! The picture of MountainCar: a car on the road between two hills, and the flag that it has to reach.
 
 use super::{GOAL_POSITION, MAX_POSITION, MIN_POSITION};
 use crate::scene::{Drawing, Graph, Point, colour, polar};
@@ -31,7 +31,7 @@ pub(super) fn drawing(position: f64) -> Drawing {
     drawing.line(&[[x, y], [x, y + 0.24]], 0.012, colour::DARK);
     drawing.polygon(&[[x, y + 0.24], [x + 0.1, y + 0.2], [x, y + 0.16]], colour::GREEN);
 
-    // The car's frame: along the road, and up from it.
+    // Converts coordinates in the car's frame: x along the road, y perpendicular to it.
     let along = slope(position).atan();
     let at = |x: f64, y: f64| polar(polar([position, road(position)], x, along), y, along + FRAC_PI_2);
     let [half, height] = CAR;

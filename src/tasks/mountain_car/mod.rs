@@ -1,4 +1,4 @@
-//! MountainCar: an engine too weak for the hill must swing the car up.
+//! MountainCar: a car whose engine is too weak for a hill must gain speed by swinging back and forth.
 //!
 //! Source: Moore (1990); Gymnasium 1.4 `MountainCar-v0`.
 
@@ -61,20 +61,20 @@ const MAX_SPEED: f64 = 0.07;
 const GOAL_POSITION: f64 = 0.5;
 const GOAL_VELOCITY: f64 = 0.0;
 
-/// The car.
+/// A MountainCar: its parameters and state.
 #[derive(Debug, Clone)]
 pub struct MountainCar {
     force: f64,
-    /// The factor of the gravity term, which the paper calls mass.
+    /// The factor of the gravity term, which the paper calls mass, in m/step².
     gravity: f64,
-    /// Position, velocity.
+    /// Position in m, and velocity in m/step.
     state: [f64; 2],
-    /// The change of velocity by a push in the next step.
+    /// The change of velocity by a push in the next step, in m/step.
     push: f64,
 }
 
 impl MountainCar {
-    /// Makes a MountainCar with default parameters, at the valley's bottom.
+    /// Creates a MountainCar with default parameters, at rest near the bottom of the valley.
     pub fn new() -> Self {
         let [force, gravity] = [0, 1].map(|i: usize| SPEC.parameters[i].default);
         Self { force, gravity, state: [-0.5, 0.0], push: 0.0 }

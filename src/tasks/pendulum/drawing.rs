@@ -1,4 +1,5 @@
-//! A rod on a pivot, the angles within which it counts as held, and an arrow for the torque of the last step.
+//! The picture of Pendulum: a rod on a pivot, the range of angles that counts as upright, and an arrow for the torque
+//! of the last step.
 
 use super::{MAX_TORQUE, UPRIGHT};
 use crate::scene::{Drawing, Point, colour, polar};
@@ -7,17 +8,17 @@ use std::f64::consts::{FRAC_PI_2, PI};
 const ROD: f64 = 0.16;
 const RADIUS: f64 = 0.36;
 const MAX_TURN: f64 = 0.75 * PI;
-/// Number of segments of an arc.
+/// Number of straight segments by which an arc is drawn.
 const SMOOTH: usize = 64;
 
 fn arc(centre: Point, radius: f64, from: f64, to: f64) -> Vec<Point> {
     (0..=SMOOTH).map(|i| polar(centre, radius, from + (to - from) * i as f64 / SMOOTH as f64)).collect()
 }
 
-/// Draws the rod. The angle is measured from upright, anticlockwise. `torque` is that of the last step, if a step led
-/// to this state.
+/// Draws the rod. `angle` is in rad from upright, anticlockwise, `length` in m. `torque` is the torque of the last step
+/// in N m; `None` after a reset.
 pub(super) fn drawing(angle: f64, length: f64, torque: Option<f64>) -> Drawing {
-    let half = (1.2 * length).max(1.8); // the longest rod of version E has room
+    let half = (1.2 * length).max(1.8); // the longest rod of version E fits
     let mut drawing = Drawing::new([-half, -half], [half, half]);
 
     let pivot = [0.0, 0.0];
@@ -29,7 +30,7 @@ pub(super) fn drawing(angle: f64, length: f64, torque: Option<f64>) -> Drawing {
     // A very small torque has no arrow, because the arrow's head has a fixed size.
     let share = torque.map(|torque| torque / MAX_TORQUE);
     if let Some(share) = share.filter(|share| share.abs() > 0.01) {
-        // The arrow starts below the pivot and follows the direction of the turn. Its length shows the torque.
+        // The arrow is an arc below the pivot, in the direction of the torque. Its length shows the torque's size.
         let turn = MAX_TURN * share;
         let (start, end) = (-FRAC_PI_2 - 0.5 * turn, -FRAC_PI_2 + 0.5 * turn);
         drawing.line(&arc(pivot, RADIUS, start, end), 0.035, colour::BLUE);

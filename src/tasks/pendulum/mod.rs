@@ -1,7 +1,7 @@
 //! Pendulum: swing a rod up with a weak torque and hold it there.
 //!
-//! Source: Gymnasium 1.4 `Pendulum-v1`, g = 10. The speed is clipped before it moves the angle; the Gym of 2018, which
-//! the paper used, clipped it after.
+//! Source: Gymnasium 1.4 `Pendulum-v1`, g = 10 m/s². The speed is clipped before the angle is updated. Gym of 2018,
+//! which the paper used, clipped it afterwards.
 
 mod drawing;
 
@@ -66,32 +66,33 @@ const MAX_SPEED: f64 = 8.0;
 const MAX_TORQUE: f64 = 2.0;
 const STEP_LIMIT: u32 = 200;
 const MAX_INITIAL_ANGLE: f64 = 10_000.0;
-/// Limit of the angle, rad, which is not wrapped: the angle after an episode at full speed, rounded up.
+/// Maximal absolute angle in a snapshot, in rad. Angles are not wrapped, so this is the angle after an episode at
+/// maximal speed, rounded up.
 const MAX_ANGLE: f64 = MAX_INITIAL_ANGLE + (STEP_LIMIT + 1) as f64 * MAX_SPEED * DT;
 const UPRIGHT: f64 = PI / 3.0;
 
-/// The rod.
+/// A Pendulum: its parameters and state.
 #[derive(Debug, Clone)]
 pub struct Pendulum {
     length: f64,
     mass: f64,
-    /// Angle from upright, not wrapped, and its velocity.
+    /// The angle from upright in rad, not wrapped, and its velocity in rad/s.
     state: [f64; 2],
-    /// The torque of the last step, if a step led to this state. Only pictures show it.
+    /// The torque of the last step in N m; `None` after a reset. Only pictures use it.
     torque: Option<f64>,
-    /// The impulse on the joint in the next step, N m s.
+    /// The angular impulse on the joint in the next step, in N m s.
     push: f64,
 }
 
 impl Pendulum {
-    /// Makes a Pendulum with default parameters, upright.
+    /// Creates a Pendulum with default parameters, upright at rest.
     pub fn new() -> Self {
         let [length, mass] = [0, 1].map(|i: usize| SPEC.parameters[i].default);
         Self { length, mass, state: [0.0; 2], torque: None, push: 0.0 }
     }
 
-    /// Advances by one step under a torque in N m, clipped to ±2, in full precision: actions arrive as f32, but the
-    /// reference trajectories were computed from f64 torques.
+    /// Advances by one step with a torque in N m, which is clipped to ±2. Unlike an action, which is f32, the torque is
+    /// f64, as in the reference trajectories that tests compare with.
     pub fn step_with_torque(&mut self, torque: f64, reward_terms: &mut [f64]) -> Transition {
         let [theta, velocity] = self.state;
         let (m, l) = (self.mass, self.length);
@@ -114,7 +115,7 @@ impl Default for Pendulum {
     }
 }
 
-/// The angle in [-π, π), by a floored remainder as Python's `%`.
+/// Wraps an angle in rad into [-π, π), by a remainder like Python's `%`.
 fn normalise(angle: f64) -> f64 {
     (angle + PI).rem_euclid(2.0 * PI) - PI
 }
