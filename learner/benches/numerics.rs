@@ -1,6 +1,7 @@
-//! Times of acting and of updates: `cargo bench -p perturb-learner --bench numerics [filter]`.
+//! Measures the time of choosing actions and of updates. Run it with `cargo bench -p perturb-learner --bench numerics
+//! [filter]`.
 //!
-//! Each line is the fastest and the median of the repetitions. Every timed answer is asserted.
+//! Each line of the output has the fastest and the median repetition. The result of each timed call is checked.
 
 use std::time::Instant;
 
@@ -14,7 +15,7 @@ use perturb_settings::{A2cConfig, PpoConfig};
 const TASKS: [(&str, usize, ActionKind); 2] =
     [("cart_pole", 4, ActionKind::Discrete { n: 2 }), ("half_cheetah", 26, ActionKind::Continuous { size: 6 })];
 
-/// Prints the time of one `run`.
+/// Measures `run` and prints its fastest and its median time, unless a filter on the command line excludes `id`.
 fn time(id: &str, repetitions: usize, mut run: impl FnMut()) {
     if std::env::args().skip(1).any(|filter| !filter.starts_with('-') && !id.contains(&filter)) {
         return;
@@ -41,7 +42,7 @@ fn observations(size: usize) -> Vec<f32> {
     (0..size).map(|_| normal(&mut rng) as f32).collect()
 }
 
-/// A rollout that the policy itself played on noise.
+/// Returns a rollout of actions that the policy chose for random observations.
 fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
     let spec = policy.spec();
     let mut actor = Actor::new(spec, n_envs);
@@ -69,7 +70,7 @@ fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
     rollout
 }
 
-/// Recurrent policies of the paper's size.
+/// Measures acting, loading and updates of a recurrent policy of the paper's size.
 fn recurrent(task: &str, observation_size: usize, action: ActionKind) {
     perturb_torch::register();
     let mut policy = Policy::new(PolicySpec::recurrent(observation_size, action), 1).expect("a policy");
@@ -104,7 +105,7 @@ fn time_a2c(id: &str, repetitions: usize, policy: &mut Policy, n_steps: usize, n
     });
 }
 
-/// Runs one epoch.
+/// Measures one epoch of PPO.
 fn time_ppo(id: &str, repetitions: usize, policy: &mut Policy, n_steps: usize, n_envs: usize) {
     let rollout = rollout(policy, n_steps, n_envs);
     let config = PpoConfig { n_steps, n_epochs: 1, learning_rate: 1e-6, ..PpoConfig::default() };

@@ -1,34 +1,34 @@
-//! Errors of the numerical half of the learner.
+//! Errors of policies, rollouts and updates.
 
 use perturb_settings::SettingError;
 
-/// A failure of a policy, a rollout or an update.
+/// An error of a policy, a rollout or an update.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
     /// A setting is outside its range.
     #[error(transparent)]
     Setting(#[from] SettingError),
-    /// A policy's arrays or numbers do not fit.
+    /// Arrays of a policy have wrong lengths, or numbers are not finite.
     #[error(transparent)]
     Policy(#[from] perturb_policy::Error),
-    /// A rollout was pushed to when full, or used before it was full.
+    /// A step was added to a full rollout, or a rollout was used before it was full.
     #[error("the rollout holds {got} of {expected} steps: {what}")]
     RolloutLength {
-        /// Steps that it holds.
+        /// Number of steps in the rollout.
         got: usize,
-        /// Steps that fit.
+        /// Number of steps for which the rollout has room.
         expected: usize,
         /// The operation that failed.
         what: &'static str,
     },
-    /// The program was asked to end, and the update would have taken long.
+    /// A signal asked the program to stop, and the rest of the update would have taken too long.
     #[error("stopped by signal {signal} during an update")]
     Stopped {
-        /// The signal.
+        /// The signal's number.
         signal: i32,
     },
-    /// An episode is not in a rollout.
+    /// The described episode does not lie within the rollout.
     #[error(
         "an episode of {length} steps that ends before step {end} of environment {environment} is not in a rollout of \
          {n_steps} steps of {n_envs} environments; one has at least one step"
@@ -36,13 +36,13 @@ pub enum Error {
     Episode {
         /// The environment, from 0.
         environment: usize,
-        /// The number of the step after the episode's last one.
+        /// The index of the step after the episode's last step.
         end: usize,
-        /// The number of steps.
+        /// The number of steps in the episode.
         length: usize,
         /// N, the number of environments.
         n_envs: usize,
-        /// Steps that the rollout holds.
+        /// Number of steps in the rollout.
         n_steps: usize,
     },
 }

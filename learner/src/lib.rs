@@ -1,5 +1,5 @@
-//! perturb's learner: trains policies over environment servers, and tests whether they still work when the physics
-//! changes.
+//! The learner of perturb. It trains policies in environments on simulation servers, and tests whether they still work
+//! when the physics changes.
 #![forbid(unsafe_code)]
 
 pub mod algorithm;

@@ -1,4 +1,4 @@
-//! Measures the duration of the steps of a group of cells.
+//! Measures the time per step of a group of cells, for estimates of an experiment's duration.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
@@ -15,56 +15,58 @@ use crate::client::{Address, ClientError, Servers};
 use crate::evaluation::{TestError, TestOptions, Tester};
 use crate::training::{RunDirectory, RunDirectoryError, TrainError, train};
 
-/// A budget that no measurement uses up.
+/// Episode budget of a measured training, so large that the training never ends by itself.
 const UNLIMITED_EPISODES: u64 = 1 << 40;
-/// Number of updates of another cell without one of the leader, after which the leader has failed.
+/// Number of reports by which another cell may be ahead of the leader. Beyond it, the leader counts as failed.
 const MAX_MISSED_UPDATES: u64 = 100;
-/// Test episodes, each in an environment of its own.
+/// Number of test episodes. Each is played in a separate environment.
 const TEST_EPISODES: u64 = 100;
 
-/// Why a group could not be measured.
+/// The reason why a group could not be measured.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum MeasureError {
     /// A temporary folder cannot be created.
     #[error(transparent)]
     File(#[from] FileError),
-    /// A server failed, or the connection to it.
+    /// A server or the connection to it failed.
     #[error(transparent)]
     Client(#[from] ClientError),
-    /// A training ended by itself.
+    /// The training of a cell failed or lost its server.
     #[error("measuring {id}: {reason}")]
     Ended {
-        /// The cell.
+        /// The id of the cell.
         id: String,
-        /// The reason.
+        /// The reason of the failure.
         reason: String,
     },
     /// The training failed.
     #[error(transparent)]
     Train(#[from] TrainError),
-    /// A directory cannot be trained in.
+    /// A training cannot use its directory.
     #[error(transparent)]
     Directory(#[from] RunDirectoryError),
-    /// The checkpoint cannot be read.
+    /// The checkpoint of the measured training cannot be read.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// The checkpoint cannot be tested.
+    /// The test of the checkpoint failed.
     #[error(transparent)]
     Test(#[from] TestError),
-    /// The program was asked to end.
+    /// A signal asked the program to stop.
     #[error("stopped by signal {signal} while measuring; the measurement is discarded")]
     Stopped {
-        /// The signal.
+        /// The signal's number.
         signal: i32,
     },
 }
 
-/// Trains the cells of `group`, at least one, together as an experiment does, in `jobs` threads at once, for about `limit`
-/// and at least two iterations. Then tests one policy. Deletes the policies.
+/// Measures the time per step of training and of tests. Trains the cells of `group`, at least one, together, as an
+/// experiment does, for about `limit` and at least two iterations; then tests one of the policies. Does this in `jobs`
+/// threads at the same time and averages over them, because parallel jobs slow each other down. Deletes the policies at
+/// the end.
 ///
 /// # Errors
-/// [`MeasureError`]; [`MeasureError::Stopped`] soon after `stop` is raised.
+/// [`MeasureError`] if a training or test fails, and [`MeasureError::Stopped`] soon after `stop` is raised.
 pub fn measure(
     servers: &Servers,
     group: &[&Cell],
@@ -130,18 +132,18 @@ fn measure_one(
     Ok(Speed { training, testing: measure_test(servers, cell, &checkpoint, stop)? })
 }
 
-/// Measures the time between two iterations of the leader, and counts the steps of all cells in this time. The leader
-/// is the cell that reports first. Where cells take turns, every other cell has one iteration between two of the
-/// leader's.
+/// Measures the time from the first to the last report of the leader, and counts the steps of all cells in this time.
+/// The leader is the cell that reports first. The cells of a group update in turn, so each other cell has one update
+/// between two reports of the leader.
 struct SpeedMeter {
     start: Instant,
     timesteps: HashMap<String, u64>,
-    /// Number of reports of each cell.
+    /// Number of reports by cell id.
     heard: HashMap<String, u64>,
     leader: Option<String>,
-    /// Time of the leader's first report, and the steps of all cells that had been reported before.
+    /// Time of the leader's first report, and the sum of all steps that were reported before it.
     first: Option<(Duration, u64)>,
-    /// Time of the leader's last report, and the steps of all cells that had been reported before.
+    /// Time of the leader's last report, and the sum of all steps that were reported before it.
     last: Option<(Duration, u64)>,
     ended: Option<MeasureError>,
 }
@@ -153,8 +155,8 @@ impl SpeedMeter {
         Self { start: Instant::now(), timesteps, heard, leader: None, first: None, last: None, ended: None }
     }
 
-    /// Counts an event. Returns the time since the meter started, or zero before the leader's second report. If the
-    /// leader stops reporting, the cell of this event takes its place.
+    /// Processes an event of the cell `id`. Returns the time since the meter started, or zero before the leader's
+    /// second report. If the leader has stopped reporting, this cell becomes the leader.
     fn on_event(&mut self, id: &str, event: CellEvent) -> Duration {
         let now = self.start.elapsed();
         match event {
@@ -163,10 +165,10 @@ impl SpeedMeter {
                 let silent =
                     |leader: &String| self.heard[id] > self.heard.get(leader).unwrap_or(&0) + MAX_MISSED_UPDATES;
                 if self.leader.as_ref().is_some_and(silent) {
-                    (self.leader, self.first, self.last) = (None, None, None); // it has failed, and says so at the end
+                    (self.leader, self.first, self.last) = (None, None, None); // the leader has failed; its error is reported at the end
                 }
                 let leads = self.leader.get_or_insert_with(|| id.to_owned()) == id;
-                // The last report is repeated at the end of the training.
+                // A training repeats its last report at its end. The repetition is ignored.
                 if leads && self.timesteps.get(id).is_none_or(|&known| known < timesteps) {
                     let told = (now, self.timesteps.values().sum());
                     self.first.get_or_insert(told);
@@ -185,13 +187,13 @@ impl SpeedMeter {
         if self.first == self.last { Duration::ZERO } else { now }
     }
 
-    /// Returns the leader and the seconds of a step.
+    /// Returns the id of the leader, and the seconds per step.
     fn end(self) -> Result<(String, f64), MeasureError> {
         let measured = self.leader.zip(self.first.zip(self.last));
         let seconds = measured.and_then(|(leader, ((begun, before), (ended, after)))| {
             (after > before).then(|| (leader, (ended - begun).as_secs_f64() / (after - before) as f64))
         });
-        // The failure of a cell is an error only if no other was measured.
+        // The failure of a cell is an error only if no other cell was measured.
         seconds.ok_or_else(|| {
             let nothing = || MeasureError::Ended { id: "a group".into(), reason: "it has made no step".into() };
             self.ended.unwrap_or_else(nothing)
@@ -199,7 +201,7 @@ impl SpeedMeter {
     }
 }
 
-/// Seconds of a step in tests. A test steps all environments until the last has finished its episode.
+/// Returns the seconds per step in tests.
 fn measure_test(servers: &Servers, cell: &Cell, checkpoint: &Checkpoint, stop: &StopFlag) -> Result<f64, MeasureError> {
     let episodes = cell.tests.episodes.min(TEST_EPISODES);
     let seed = cell.config.common.seed;
@@ -209,7 +211,7 @@ fn measure_test(servers: &Servers, cell: &Cell, checkpoint: &Checkpoint, stop: &
     let start = Instant::now();
     let records = Tester::new(servers, checkpoint, options)?.test(sets, stop, &mut |_, _| {})?;
     let seconds = start.elapsed().as_secs_f64();
-    // Each environment plays one episode, or trial, and all are stepped until the longest has ended.
+    // Each environment plays one episode (or trial), and all environments are stepped until the longest has ended.
     let mut lengths: BTreeMap<u32, u64> = BTreeMap::new();
     for episode in &records.episodes {
         *lengths.entry(episode.environment_index).or_default() += u64::from(episode.length);

@@ -1,4 +1,4 @@
-//! A policy that learns.
+//! A policy that can be trained.
 
 use perturb_files::interrupt::StopFlag;
 use perturb_policy::math::exp;
@@ -9,42 +9,45 @@ use perturb_policy::{
 
 use crate::error::Result;
 
-/// A policy of either architecture: its weights, and the backend that computes their gradient.
+/// A trainable policy of either architecture: its P weights, and the backend that computes gradients.
 pub struct Policy {
     spec: PolicySpec,
-    /// `[P]` in the order of [`PolicySpec::layout`]. After a change, [`GradientBackend::weights_changed`] must be called.
+    /// The weights `[P]`, in the order of [`PolicySpec::layout`]. After a change, [`GradientBackend::weights_changed`]
+    /// must be called.
     pub(crate) weights: Vec<f32>,
-    /// `[P]` of the last step.
+    /// The gradient `[P]` of the last gradient step.
     pub(crate) gradient: Vec<f32>,
     pub(crate) backend: Box<dyn GradientBackend>,
-    /// Raised when a long update shall be broken off.
+    /// Raised to interrupt long updates.
     pub(crate) stop: StopFlag,
 }
 
-/// Buffers in which gradients of feed-forward policies of one shape are computed.
+/// Buffers for computing gradients of feed-forward policies of one shape. Several policies can share them in turn.
 pub struct GradientWorkspace {
     spec: PolicySpec,
     backend: Box<dyn GradientBackend>,
-    /// `[P]`.
+    /// The gradient `[P]`.
     gradient: Vec<f32>,
 }
 
 impl Policy {
-    /// A policy with initial weights from the stream of `seed`: orthogonal with gain √2 in hidden layers, 0.01 in the
-    /// policy's last layer, 1 in the value's last layer and in the LSTM; biases and log_std 0. Same seed, same bytes.
+    /// Returns a policy with initial weights, which `seed` determines to the byte. Weights are orthogonal with gain √2
+    /// in hidden layers, 0.01 in the policy's last layer, and 1 in the value function's last layer and in the LSTM.
+    /// Biases and log standard deviations are 0.
     ///
     /// # Errors
-    /// A shape that is empty somewhere.
+    /// An error if a size in `spec` is 0, or for a recurrent policy without a registered backend.
     pub fn new(spec: PolicySpec, seed: u64) -> Result<Self> {
         spec.validate()?;
         let weights = initial_weights(&spec, &mut stream(seed, Purpose::Weights));
         Policy::from_weights(spec, &weights)
     }
 
-    /// A policy with the given weights, whose names and shapes must be those of [`PolicySpec::layout`].
+    /// Returns a policy with the given weights. Their names and shapes must be those of [`PolicySpec::layout`].
     ///
     /// # Errors
-    /// A shape that is empty somewhere, other weights, or a recurrent policy without a registered backend.
+    /// An error if a size in `spec` is 0, if the weights do not fit, or for a recurrent policy without a registered
+    /// backend.
     pub fn from_weights(spec: PolicySpec, weights: &Weights) -> Result<Self> {
         spec.validate()?;
         spec.check(weights)?;
@@ -53,15 +56,17 @@ impl Policy {
         Ok(Policy { spec, gradient: vec![0.0; weights.len()], weights, backend, stop: StopFlag::default() })
     }
 
-    /// From now on breaks off updates that would take long after `stop` is raised.
+    /// Sets the flag that interrupts updates: if `stop` is raised, an update that would still take long ends with an
+    /// error.
     pub fn set_stop(&mut self, stop: &StopFlag) {
         self.stop = stop.clone();
     }
 
-    /// Computes gradients of feed-forward policies with `threads` threads, at least 1. Their number changes no byte.
+    /// Sets the number of threads that compute gradients, at least 1. It does not affect the results. Ignored by
+    /// recurrent policies.
     ///
     /// # Errors
-    /// Threads that cannot be started.
+    /// An error if threads cannot be started.
     pub fn with_threads(mut self, threads: usize) -> Result<Self> {
         if self.spec.lstm.is_none() {
             self.backend = gradient_backend(&self.spec, threads)?;
@@ -69,7 +74,7 @@ impl Policy {
         Ok(self)
     }
 
-    /// A workspace like the one in which this policy computes gradients; `None` if it is recurrent.
+    /// Returns a new gradient workspace for policies of this shape; `None` for a recurrent policy.
     ///
     /// # Errors
     /// The errors of [`gradient_backend`].
@@ -81,8 +86,8 @@ impl Policy {
         Ok(Some(GradientWorkspace { spec: self.spec.clone(), backend, gradient: vec![0.0; self.weights.len()] }))
     }
 
-    /// Swaps in another gradient workspace, if it is of this policy's shape. Policies that share one find it in the processor's
-    /// caches.
+    /// Swaps this policy's gradient workspace with `other`. Does nothing if their shapes differ. If policies share a
+    /// workspace in turn, its memory stays in the processor's caches.
     pub fn swap_workspace(&mut self, other: &mut GradientWorkspace) {
         if other.spec != self.spec {
             return;
@@ -92,23 +97,23 @@ impl Policy {
         self.backend.weights_changed();
     }
 
-    /// Takes the networks of a player that acted with the present weights, with their cached activations, to skip a forward
-    /// pass. The player must load weights before it acts again.
+    /// Takes the networks of a player that acted with the current weights. Their cached activations save a forward pass
+    /// in the next update. The player must load weights before it acts again.
     pub fn reuse_activations(&mut self, player: &mut Player) {
         player.give_activations(self.backend.as_mut());
     }
 
-    /// The shape.
+    /// Returns the shape of the policy.
     pub fn spec(&self) -> &PolicySpec {
         &self.spec
     }
 
-    /// `[P]` the weights, in the order of [`PolicySpec::layout`].
+    /// Returns the weights `[P]`, in the order of [`PolicySpec::layout`].
     pub fn flat_weights(&self) -> &[f32] {
         &self.weights
     }
 
-    /// A copy of the weights.
+    /// Returns a copy of the weights as named arrays.
     pub fn weights(&self) -> Weights {
         let mut rest = &self.weights[..];
         let array = |(name, shape): (String, Vec<usize>)| {
@@ -119,7 +124,7 @@ impl Policy {
         self.spec.layout().into_iter().map(array).collect()
     }
 
-    /// Replaces the numbers of `weights`, which are those of a policy of this shape.
+    /// Copies this policy's weights into `weights`, which must have the same shapes.
     pub fn copy_weights(&self, weights: &mut Weights) {
         let mut rest = &self.weights[..];
         for array in weights {
@@ -129,7 +134,8 @@ impl Policy {
         }
     }
 
-    /// The log standard deviations of continuous actions, which come last.
+    /// Returns the log standard deviations of continuous actions, which are the last weights. Empty for discrete
+    /// actions.
     fn log_std(&self) -> &[f32] {
         match self.spec.action {
             ActionKind::Discrete { .. } => &[],
@@ -137,7 +143,8 @@ impl Policy {
         }
     }
 
-    /// Mean standard deviation of the actions; None for discrete ones.
+    /// Returns the standard deviation of the action distribution, averaged over action dimensions; `None` for discrete
+    /// actions.
     pub fn mean_std(&self) -> Option<f64> {
         let log_std = self.log_std();
         let sum = log_std.iter().map(|&x| f64::from(exp(x))).sum::<f64>();

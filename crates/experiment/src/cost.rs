@@ -1,9 +1,10 @@
-//! The cost of a plan, from short measurements.
+//! Estimates the time that a plan takes, from short measurements.
 //!
-//! A step costs what its environment costs plus what its method costs. So each environment is measured with one method, and
-//! each method in one environment, in groups as large as those of a run. The speeds of the other pairs are computed from
-//! these. The number of steps depends on what is learned, so only an upper bound is known beforehand. Durations of finished
-//! cells with the same environment and method are better estimates: [`CellDurations`](crate::CellDurations).
+//! The model: the time of a step is the sum of the environment's time and the method's time. So each environment is
+//! measured with one method, and each method in one environment. Measured groups are as large as the groups of the real
+//! run. The speeds of the other pairs of environment and method are computed from these. The number of steps depends on
+//! what the policy learns, so only an upper bound is known beforehand. Durations of finished cells with the same
+//! environment and method are better estimates: see [`CellDurations`](crate::CellDurations).
 
 use std::collections::HashMap;
 use std::iter::Sum;
@@ -12,16 +13,16 @@ use perturb_settings::{Method, TrainConfig, Wrapper};
 
 use crate::plan::{Cell, Grouping, Plan, distinct};
 
-/// Process time for one step of one environment, s. It includes the policy's share of that step.
+/// Process time per environment step, in seconds. It includes the time of the policy.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Speed {
-    /// The time in training, with rollouts and updates.
+    /// Time per step in training, with rollouts and updates.
     pub training: f64,
-    /// The time in tests, which have no updates.
+    /// Time per step in tests, which have no updates.
     pub testing: f64,
 }
 
-/// A group of trainings that was measured.
+/// The measured speed of a group of trainings that ran together in one process.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Measurement {
     /// The environment's name in the catalogue.
@@ -34,21 +35,22 @@ pub struct Measurement {
     pub speed: Speed,
 }
 
-/// Upper bound of the cost of cells: every episode is assumed to last until the step limit. Seconds are process time.
+/// Upper bound of the cost of one or more cells. It assumes that every episode lasts until the step limit. Seconds are
+/// process time.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Estimate {
-    /// Steps of training. With EPOpt, all generated episodes count.
+    /// Steps of training, including episodes that EPOpt generates but does not learn from.
     pub training_steps: f64,
-    /// Steps of tests. With RL², the steps of all episodes of a trial count.
+    /// Steps of tests. With RL², these are the steps of all episodes of each trial.
     pub testing_steps: f64,
-    /// Process time of trainings with rollouts and updates, s.
+    /// Process time of training, with rollouts and updates, in seconds.
     pub training_seconds: f64,
-    /// Process time of tests, s.
+    /// Process time of tests, in seconds.
     pub testing_seconds: f64,
 }
 
 impl Estimate {
-    /// Returns the seconds of trainings and tests.
+    /// Returns the seconds of training and tests together.
     pub fn seconds(&self) -> f64 {
         self.training_seconds + self.testing_seconds
     }
@@ -65,9 +67,9 @@ impl Sum for Estimate {
     }
 }
 
-/// Returns the groups of trainings to measure for `cells`, which are indices in the plan. Each environment has a group with
-/// its first method, and each method a group in its first environment. A group has as many cells as a group of the run,
-/// evenly spread over the grid. The cell in the middle of the grid is the first of its group.
+/// Chooses groups of cells to measure before `cells` run. `cells` are indices in the plan. Each environment is measured
+/// with its first method, and each method in its first environment. A measured group is as large as a group of the run
+/// would be, and its cells are evenly spread over the grid. The cell in the middle of the grid comes first.
 pub fn benchmark_cells<'a>(plan: &'a Plan, cells: &[usize], grouping: Grouping) -> Vec<Vec<&'a Cell>> {
     let groups = plan.groups(cells, grouping);
     let pair_at = |&cell: &usize| pair(&plan.cells[cell]);
@@ -93,8 +95,8 @@ fn pair(cell: &Cell) -> (&str, Method) {
     (&cell.config.common.environment, cell.method())
 }
 
-/// Returns the upper bound of each cell's cost in the plan's order, from measurements of its [`benchmark_cells`] and
-/// the step limit of each environment.
+/// Returns an upper bound of each cell's cost, in the plan's order. `measurements` are the measured speeds of the
+/// [`benchmark_cells`], and `step_limits` the maximum steps per episode by environment.
 pub fn estimates(plan: &Plan, measurements: &[Measurement], step_limits: &HashMap<&str, u32>) -> Vec<Estimate> {
     let mut speeds: HashMap<(&str, Method), Speed> = HashMap::new();
     let estimate = |cell| {
@@ -113,8 +115,9 @@ pub fn estimates(plan: &Plan, measurements: &[Measurement], step_limits: &HashMa
     plan.cells.iter().map(estimate).collect()
 }
 
-/// Returns the number of episodes that a training has generated when its budget counts `counted`. The number is higher
-/// if the algorithm learns from the worst episodes only, and 0 if nothing learns.
+/// Returns the number of episodes that a training generates until `counted` of them count towards its budget. EPOpt
+/// generates more episodes than it counts, because only the worst ones count. The random policy, which is not trained,
+/// generates 0.
 pub fn generated_episodes(config: &TrainConfig, counted: u64) -> f64 {
     if config.settings.is_random() {
         return 0.0;
@@ -125,15 +128,15 @@ pub fn generated_episodes(config: &TrainConfig, counted: u64) -> f64 {
     full + (budget - full) / epopt.epsilon
 }
 
-/// Returns the number of episodes in the tests of a cell. With RL², all episodes of a trial count.
+/// Returns the number of episodes in all tests of a cell. With RL², each episode of a trial counts.
 pub fn tested_episodes(cell: &Cell) -> f64 {
     let times = cell.tests.sets.len() as f64 * (1.0 + cell.tests.marks.len() as f64);
     let trials = cell.tests.episodes as f64 * times + cell.tests.selection.unwrap_or_default() as f64;
     trials * f64::from(cell.config.settings.episodes_per_trial())
 }
 
-/// Returns the speed of a pair. If it was not measured, it is the method's speed in another environment plus the additional
-/// time that this environment takes.
+/// Returns the speed of a pair of environment and method. For an unmeasured pair, it is the method's time per step in
+/// another environment plus the additional time that this environment takes.
 fn speed_of((environment, method): &(&str, Method), measurements: &[Measurement]) -> Speed {
     let find = |environment: &str, method: &Method| {
         measurements.iter().find(|known| known.environment == environment && known.method == *method)
@@ -185,7 +188,7 @@ mod tests {
         let names: Vec<String> = chosen(&all, 1).into_iter().map(|(name, _)| name).collect();
         assert_eq!(names, ["CartPole a2c ff", "CartPole a2c rc", "CartPole ppo ff", "Hopper a2c ff"]);
         assert_eq!(chosen(&all, 1)[0].1, [10], "the middle of the grid");
-        // Of CartPole with FF there are nine cells of A2C and three of PPO: groups of six.
+        // CartPole with FF has nine cells of A2C and three of PPO, which form two groups of six.
         assert_eq!(chosen(&all, 6)[0].1, [10, 15, 15, 5, 5, 10], "all over the grid");
         assert_eq!(chosen(&all, 6)[2].1.len(), 3, "there are no more");
         assert_eq!(chosen(&[18, 19], 36), [("CartPole ppo ff".to_owned(), vec![32, 32])], "those that are asked for");
@@ -214,7 +217,7 @@ mod tests {
         assert!((total.training_seconds - cart_pole - hopper).abs() < 1e-6 * total.training_seconds);
         assert!((total.testing_seconds - total.training_seconds * 0.3 / 4.0).abs() < 1e-6 * total.testing_seconds);
         let cells: Vec<f64> = estimates(&plan, &measurements, &limits).iter().map(Estimate::seconds).collect();
-        // The first is CartPole with A2C: 3 s a step, and a quarter of that in a test.
+        // The first cell is CartPole with A2C: 3 s per step in training, and a quarter of that in a test.
         assert!((cells[0] - 100.0 * 200.0 * (3.0 + 0.3 * 3.0 / 4.0)).abs() < 1e-6 * cells[0], "{}", cells[0]);
         let sum: f64 = cells.iter().sum();
         assert!(cells.len() == 2 * 21 && (sum - total.seconds()).abs() < 1e-6 * sum);
@@ -229,7 +232,7 @@ mod tests {
         let plan = Plan::parse("test", text.into()).unwrap();
         let estimates = estimates(&plan, &[], &[("CartPole", 1)].into());
         let steps = |cell: usize| (estimates[cell].training_steps, estimates[cell].testing_steps);
-        // 100 iterations of 100 episodes, and a tenth of each that follows.
+        // 100 iterations count all of their 100 episodes. Later iterations count a tenth of theirs.
         assert_eq!(steps(0), (10_000.0 + 50_000.0, 10.0));
         assert_eq!(steps(1), (15_000.0, 50.0));
     }

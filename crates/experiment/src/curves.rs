@@ -1,5 +1,4 @@
-//! Training curves: the selected trainings' returns and successes over their episodes and over their steps, averaged over
-//! runs.
+//! Training curves: return and success rate of the selected trainings over episodes and over steps, averaged over runs.
 
 use std::path::Path;
 
@@ -12,25 +11,25 @@ use perturb_settings::Method;
 use crate::folder::{Folder, FolderError};
 use crate::selection::MethodResults;
 
-/// Minimum number of episodes of the shortest run for each point.
+/// Minimum number of episodes that each point averages in the shortest run.
 const MIN_EPISODES_PER_POINT: usize = 20;
 /// Maximum number of points of a curve.
 const MAX_POINTS: usize = 100;
 
-/// Quantity by which the progress of trainings is compared: the horizontal axis of their curves.
+/// The horizontal axis of training curves: the quantity by which the progress of trainings is compared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BudgetAxis {
-    /// Episodes that ended, also those that EPOpt generates and does not learn from.
+    /// Finished episodes, including those that EPOpt generates but does not learn from.
     Episodes,
-    /// Steps of these episodes, added over all environments.
+    /// Steps of the finished episodes, summed over all environments.
     Steps,
 }
 
 impl BudgetAxis {
-    /// Episodes and steps.
+    /// Both axes: episodes, then steps.
     pub const ALL: [BudgetAxis; 2] = [BudgetAxis::Episodes, BudgetAxis::Steps];
 
-    /// Returns the share of the budget that an episode takes.
+    /// Returns how much an episode counts on this axis: 1, or its number of steps.
     fn weight(self, episode: &MonitorEpisode) -> f64 {
         match self {
             BudgetAxis::Episodes => 1.0,
@@ -57,42 +56,43 @@ pub struct EnvironmentCurves {
     pub curves: Vec<Curve>,
 }
 
-/// A method's curve on a training version.
+/// The curve of one method that was trained on one version.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Curve {
     /// The method.
     pub method: Method,
-    /// The version of the training.
+    /// The version (D, R, E or R+E) that the policies were trained on.
     pub version: Version,
     /// The curve over episodes and over steps.
     lines: [AxisCurve; 2],
 }
 
-/// A curve by one [`BudgetAxis`].
+/// The points of a curve over one [`BudgetAxis`].
 #[derive(Clone, Debug, Default, PartialEq)]
 struct AxisCurve {
     total: f64,
     points: Vec<CurvePoint>,
 }
 
-/// Averages over one part of each training.
+/// Averages over the same part, for example the third hundredth, of each run's training.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CurvePoint {
-    /// Number of episodes or steps at the middle of the part, as the mean over runs.
+    /// Number of episodes or steps at the middle of the part, averaged over runs.
     pub progress: f64,
-    /// The mean undiscounted return of the episodes whose middle is in this part, over runs.
+    /// The mean undiscounted return of the part's episodes, summarized over runs. An episode belongs to the part that
+    /// contains the episode's middle.
     pub episode_return: Summary,
-    /// The success rate of these episodes, %, over runs.
+    /// The success rate of the part's episodes, %, summarized over runs.
     pub success: Summary,
 }
 
-/// A line of `monitor.csv`.
+/// An episode, as in a line of `monitor.csv`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct MonitorEpisode {
     episode_return: f64,
-    /// Steps.
+    /// Length in steps.
     length: f64,
-    /// 0 or 1.
+    /// 1 for a success, otherwise 0.
     success: f64,
 }
 
@@ -101,21 +101,21 @@ impl Curve {
         Self { method: method.clone(), version, lines: BudgetAxis::ALL.map(|footing| line(runs, footing)) }
     }
 
-    /// Returns the points in order.
+    /// Returns the points of the curve over the axis `by`, in order of progress.
     pub fn points(&self, by: BudgetAxis) -> &[CurvePoint] {
         &self.lines[by as usize].points
     }
 
-    /// Returns the length of a training, episodes or steps, as the mean over runs.
+    /// Returns the length of a whole training in episodes or steps, averaged over runs.
     pub fn total(&self, by: BudgetAxis) -> f64 {
         self.lines[by as usize].total
     }
 }
 
-/// Reads the curves of all selected trainings. Trainings without a `monitor.csv` are left out.
+/// Reads the curves of all selected trainings from their files `monitor.csv`. Skips trainings without this file.
 ///
 /// # Errors
-/// [`FolderError`] if a file is there that cannot be read.
+/// [`FolderError`] if a file exists but cannot be read.
 pub fn read_curves(selections: &[MethodResults<'_>], folder: &Folder) -> Result<Vec<EnvironmentCurves>, FolderError> {
     let mut all = Vec::new();
     for of_environment in selections.chunk_by(|a, b| a.environment == b.environment) {
@@ -133,7 +133,7 @@ pub fn read_curves(selections: &[MethodResults<'_>], folder: &Folder) -> Result<
     Ok(all)
 }
 
-/// Returns the episodes of each run that has any.
+/// Returns the training episodes of each run. Skips runs without episodes.
 fn read_runs(
     selection: &MethodResults<'_>,
     version: Version,
@@ -149,19 +149,19 @@ fn read_runs(
     Ok(runs)
 }
 
-/// Reads the episodes in the order in which they ended. Returns none if there is no file.
+/// Reads the episodes in the order in which they ended. Returns an empty list if there is no file.
 fn read_monitor(path: &Path) -> Result<Vec<MonitorEpisode>, FolderError> {
     let Some(content) = read_if_there(path)? else { return Ok(Vec::new()) };
     let damaged = |error: AnyError| FolderError::Damaged { path: path.to_owned(), reason: error.to_string() };
     parse_monitor(&content).map_err(damaged)
 }
 
-/// Parses the three columns that the curves need.
+/// Parses the columns `r`, `l` and `success` of a `monitor.csv`.
 fn parse_monitor(content: &[u8]) -> Result<Vec<MonitorEpisode>, AnyError> {
-    // A training that runs, or was killed, may not have written the end of its last line.
+    // The last line may be incomplete if the training is still running or was killed.
     let whole = content.iter().rposition(|&byte| byte == b'\n').map_or(0, |end| end + 1);
     if whole == 0 {
-        return Ok(Vec::new()); // not even its header is there
+        return Ok(Vec::new()); // even the header is incomplete
     }
     let mut reader = csv::ReaderBuilder::new().comment(Some(b'#')).from_reader(&content[..whole]);
     let names = reader.headers()?.clone();
@@ -181,9 +181,9 @@ fn parse_monitor(content: &[u8]) -> Result<Vec<MonitorEpisode>, AnyError> {
     Ok(episodes)
 }
 
-/// Divides each run into equal parts by `footing`, and averages each part over runs. Parts are shares of a training, not
-/// absolute numbers, because trainings end some episodes after their budget. A part that contains no episode's middle has no
-/// point.
+/// Computes a curve: divides each run into equal parts along the axis `footing`, and averages each part over runs.
+/// Parts are fractions of a run's own length, because runs end a few episodes after their budget and so differ in
+/// length. A part that contains no episode's middle has no point.
 fn line(runs: &[Vec<MonitorEpisode>], footing: BudgetAxis) -> AxisCurve {
     let shortest = runs.iter().map(Vec::len).min().unwrap_or_default();
     let count = (shortest / MIN_EPISODES_PER_POINT).clamp(usize::from(shortest > 0), MAX_POINTS);
@@ -205,7 +205,8 @@ fn line(runs: &[Vec<MonitorEpisode>], footing: BudgetAxis) -> AxisCurve {
     AxisCurve { total, points: (0..count).filter_map(point).collect() }
 }
 
-/// Divides `run` into `count` parts. An episode belongs to the part that contains its middle.
+/// Divides the episodes of `run` into `count` parts of equal length along the axis `footing`. `total` is the length of
+/// the run on this axis. An episode belongs to the part that contains its middle.
 fn split(run: &[MonitorEpisode], count: usize, total: f64, footing: BudgetAxis) -> Vec<&[MonitorEpisode]> {
     let mut before = 0.0;
     let mut part_of = Vec::with_capacity(run.len());
@@ -234,7 +235,7 @@ mod tests {
 
     #[test]
     fn a_point_is_a_mean_over_a_part_of_each_run() {
-        // 40 and 43 episodes: two parts of 20 and 20, or 21 and 22.
+        // Both runs have two parts: 40 episodes are divided into 20 and 20, and 43 into 21 and 22.
         let first = episodes(40, |i| if i < 20 { (1.0, 1.0, 0.0) } else { (3.0, 1.0, 1.0) });
         let second = episodes(43, |i| if i < 21 { (5.0, 1.0, 1.0) } else { (5.0, 1.0, 0.0) });
         let point = |progress: f64, mean: f64, std: f64| CurvePoint {
@@ -248,8 +249,8 @@ mod tests {
 
     #[test]
     fn by_steps_long_episodes_weigh_more() {
-        // 30 episodes of 1 step that fail, then 10 of 27 steps that succeed: half of the 300 steps are in the sixth of
-        // these, which has its middle at 30 + 4.5 · 27 = 151.5.
+        // 30 episodes of 1 step fail, then 10 episodes of 27 steps succeed. The run has 300 steps, and the fifth long
+        // episode has its middle at 30 + 4.5 · 27 = 151.5, in the second half.
         let run = episodes(40, |i| if i < 30 { (0.0, 1.0, 0.0) } else { (1.0, 27.0, 1.0) });
         let rates =
             |by| line(std::slice::from_ref(&run), by).points.iter().map(|point| point.success.mean).collect::<Vec<_>>();
@@ -260,7 +261,7 @@ mod tests {
 
     #[test]
     fn a_part_without_an_episode_has_no_point() {
-        // Of 60 episodes the last has most of the steps: its middle is in the second part of three.
+        // The last of 60 episodes has most of the steps. Its middle is in the second of three parts.
         let run = episodes(60, |i| (0.0, if i < 59 { 1.0 } else { 121.0 }, 0.0));
         let method = Plan::parse("test", PLAN.into()).unwrap().methods().remove(0);
         let curve = Curve::from_runs(&method, Version::D, &[run]);

@@ -1,4 +1,4 @@
-//! The results in an experiment's folder as rows of a table.
+//! Exports the results in an experiment's folder as rows of a table.
 
 use std::collections::HashSet;
 
@@ -12,7 +12,7 @@ use crate::plan::{Cell, Plan};
 use crate::states::COMMIT_SEPARATOR;
 use crate::verify::{VerifyError, follows};
 
-/// Why an experiment's folder cannot be exported.
+/// The reason why an experiment's folder cannot be exported.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ExportError {
@@ -24,13 +24,14 @@ pub enum ExportError {
     Verify(#[from] VerifyError),
 }
 
-/// Returns the rows of all cells of `plan` that are done or failed in `folder`, in the plan's order. Selected cells follow
-/// the others. Results of cells that are not in the plan come last, ordered by id. Results are compared with their recorded
-/// episodes, if there are any. Calls `each` with the cell's id and the episodes of every final policy that has recorded
-/// episodes.
+/// Returns the table rows of all done or failed cells in `folder`.
+///
+/// The order is: cells of `plan` in the plan's order, then cells that were added by its selection, then done cells that
+/// are not in the plan, by id. Checks each result against its recorded episodes, if there are any. Calls `each` with a
+/// cell's id and the recorded episodes of its final policy.
 ///
 /// # Errors
-/// [`ExportError`].
+/// [`ExportError`] if a file cannot be read, or a result contradicts its recorded episodes.
 pub fn export(
     plan: &Plan,
     folder: &Folder,
@@ -56,7 +57,7 @@ pub fn export(
         Ok(())
     };
     let mut planned = HashSet::new();
-    // A candidate that was selected is also a cell.
+    // A selected candidate is in both lists.
     for cell in plan.cells.iter().chain(&plan.candidates) {
         if planned.insert(cell.id.as_str()) {
             add(&cell.id, Some(cell))?;
@@ -70,8 +71,8 @@ pub fn export(
     Ok(rows)
 }
 
-/// Adds the rows of a finished cell: those of intermediate policies, then those of the final one. Returns the recorded
-/// episodes of the final policy, if there are some.
+/// Adds the rows of a finished cell: first the tests of its intermediate policies, then the tests of its final policy.
+/// Returns the recorded episodes of the final policy, if there are any.
 fn add_done(
     study: &str,
     place: &CellFolder,
@@ -100,7 +101,7 @@ fn add_done(
         TableRow {
             tested_on: Some(name.clone()),
             episodes: Some(figures.episodes),
-            // This is exact, because the rate was computed from this number.
+            // Rounding gives the exact number, because the rate was computed from it.
             successes: Some((figures.success_percent * figures.episodes as f64 / 100.0).round() as u64),
             mean_return: Some(figures.mean_return),
             mean_length: Some(figures.mean_length),
@@ -128,14 +129,14 @@ fn add_done(
     Ok(records)
 }
 
-/// Returns a row of a failed cell without its failure.
+/// Returns the row of a failed cell, whose `failure` the caller fills in.
 fn failed_row(study: &str, cell: &Cell) -> TableRow {
     let common = &cell.config.common;
     let (trained_on, run) = (cell.trained_on().to_string(), (cell.run, common.seed));
     row_of(study, &cell.id, &common.environment, &cell.method(), trained_on, run, &cell.config.table())
 }
 
-/// Returns a row of a training without a test.
+/// Returns a row that describes a training. The columns of its tests are empty.
 fn row_of(
     study: &str,
     cell: &str,

@@ -1,4 +1,4 @@
-//! Agents that were not trained by a cell of the experiment. They are additional rows of its report.
+//! Agents that were trained elsewhere, not by a cell of the experiment. They are additional rows of its report.
 
 use std::collections::BTreeMap;
 
@@ -9,20 +9,21 @@ use perturb_settings::ValueError;
 use crate::plan::Plan;
 use crate::selection::{MethodResults, Reported, SelectedRun};
 
-/// Returns the assessment with its success judged by the rule that the plan's cells have in this environment. Without such
-/// cells it is unchanged.
+/// Judges the success of the assessed episodes again by the success rule of the plan's cells in the same environment.
+/// Returns the assessment unchanged if the plan has no cell in this environment.
 ///
 /// # Errors
-/// [`ValueError`] if the episodes cannot be judged by it.
+/// [`ValueError`] if the recorded episodes do not have what the rule needs.
 pub fn judged_as_in(plan: &Plan, assessed: ExternalEvaluation) -> Result<ExternalEvaluation, ValueError> {
     let in_environment = |cell: &&crate::plan::Cell| cell.config.common.environment == assessed.environment();
     let Some(cell) = plan.cells.iter().find(in_environment) else { return Ok(assessed) };
     assessed.judged_by(&cell.tests.success.clone().unwrap_or(Rule::Text))
 }
 
-/// Adds the agents of `assessed` to the rows of a report, after the other rows of their environment. Assessments of the same
-/// agent become its runs. Assessments share a run if they have no training distribution in common. An assessment is never
-/// split over two runs.
+/// Adds the agents of `assessed` to the rows of a report, after the other rows of their environment.
+///
+/// Assessments of the same agent become numbered runs of this agent. Two assessments are put into the same run only if
+/// no training distribution occurs in both. All policies of one assessment are in one run.
 pub fn add_assessed<'a>(selections: &mut Vec<MethodResults<'a>>, assessed: &'a [ExternalEvaluation]) {
     for one in assessed {
         let (environment, method) = (one.environment(), one.method());
@@ -42,7 +43,8 @@ pub fn add_assessed<'a>(selections: &mut Vec<MethodResults<'a>>, assessed: &'a [
     }
 }
 
-/// Returns the externally trained agents of `selections`, with their policies and run numbers, in order.
+/// Returns the policies in `selections` that were trained elsewhere, in order: each with its assessment and its run
+/// number.
 pub fn elsewhere<'a>(selections: &[MethodResults<'a>]) -> Vec<(&'a ExternalEvaluation, &'a ExternalPolicy, u32)> {
     let runs = selections.iter().flat_map(|row| &row.runs);
     let policies = runs.flat_map(|(run, of)| of.selected.values().flatten().map(|reported| (*run, reported)));

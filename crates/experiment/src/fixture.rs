@@ -1,4 +1,4 @@
-//! Made-up results of cells for tests. It re-exports the fixture of the crate of records.
+//! Made-up results of cells for tests. It re-exports the test fixtures of `perturb-records`.
 #![allow(dead_code, unused_imports, reason = "each crate that includes it needs a part")]
 
 use perturb_checkpoint::Counters;
@@ -10,7 +10,8 @@ mod records;
 
 pub use self::records::{assessed, episode, heatmap};
 
-/// A result with success rates, %, on D, R and E, and the same mean return on all.
+/// Returns a result of `cell` with the success rates `[d, r, e]` (%) on the test sets D, R and E, and one mean return
+/// for all.
 pub fn result(cell: &Cell, [d, r, e]: [f64; 3], mean_return: f64) -> CellResult {
     let common = &cell.config.common;
     let test = |success_percent: f64| TestResult {
@@ -45,7 +46,8 @@ pub fn result(cell: &Cell, [d, r, e]: [f64; 3], mean_return: f64) -> CellResult 
     }
 }
 
-/// Returns results of the cells for which `known` gives success rates and a mean return. All other cells are missing.
+/// Returns the results of a plan. A cell is done if `known` returns its success rates and mean return, and missing
+/// otherwise.
 pub fn results(plan: &Plan, known: impl Fn(&Cell) -> Option<([f64; 3], f64)>) -> Results<'_> {
     let state = |cell: &Cell| match known(cell) {
         Some((rates, mean_return)) => CellState::Done(Box::new(result(cell, rates, mean_return))),

@@ -32,12 +32,12 @@ use serde_json::Value;
 
 use crate::plan::Plan;
 
-/// Format of `result.json`. It is raised when older programs could misread the file.
+/// Format version of `result.json`. It is raised when older programs could misread the file.
 const FORMAT_VERSION: u32 = 1;
-/// Maximum size of a cell's record, in bytes.
+/// Maximum size of a JSON file of a cell, in bytes.
 const MAX_BYTES: u64 = 64 << 20;
 
-/// The folder of an experiment.
+/// The folder of an experiment: its plan and the folders of its cells.
 #[derive(Clone, Debug)]
 pub struct Folder {
     path: PathBuf,
@@ -45,18 +45,18 @@ pub struct Folder {
     new_heatmaps: Option<PathBuf>,
 }
 
-/// The folder of a cell.
+/// The folder of a cell: its result or failure, its training and its recorded episodes.
 #[derive(Clone, Debug)]
 pub struct CellFolder {
     path: PathBuf,
 }
 
-/// Identity of a failure record. A later record has another identity, even with the same content.
+/// Identity of a file `failure.json`. A file that replaces it has another identity, even with the same content.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FailureId {
-    /// The inode. Another file may get it after this one is deleted.
+    /// The inode of the file. Another file may get this number after the file is deleted, so the time is compared too.
     inode: u64,
-    /// The time of the last write, s and ns.
+    /// The time of the last write: seconds and nanoseconds since 1970.
     written: (i64, i64),
 }
 
@@ -71,57 +71,60 @@ pub enum CellState {
     Missing,
 }
 
-/// `result.json`: depends on the plan and the program alone.
+/// The content of `result.json`. It depends only on the plan and the program, so running the cell again gives the same
+/// bytes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellResult {
-    /// The format of the document.
+    /// The format version of the file.
     pub format_version: u32,
-    /// The cell.
+    /// The id of the cell.
     pub id: String,
     /// The training.
     pub training: Training,
-    /// Success, return and length for each test set, by its name: "D", "R", "E", "R+E" or a set of the plan.
+    /// Success rate, mean return and mean length by test set: "D", "R", "E", "R+E" or the name of one of the plan's
+    /// parameter sets.
     pub results: BTreeMap<String, TestResult>,
-    /// Tests of intermediate policies, by the episodes of the budget after which they were stored.
+    /// Tests of intermediate policies. The key is the number of training episodes after which the policy was stored.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub marks: BTreeMap<u64, IntermediateEvaluation>,
-    /// Check of requested and applied parameters in the tests; `None` in results of earlier programs.
+    /// Comparison of requested and applied parameters in the tests; `None` in results of earlier programs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub agreement: Option<ParameterCheck>,
     /// The program's version and the commit that it was built from.
     pub commit: String,
-    /// Versions of earlier programs that did a part of the training before an interruption, in order.
+    /// Versions of other programs that did a part of the training before it was interrupted and resumed, in order.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub earlier_commits: Vec<String>,
-    /// The command that gives the same numbers without the plan.
+    /// The shell command that reproduces the result without the plan.
     pub command: String,
 }
 
-/// Tests of the policy of an earlier moment.
+/// Tests of an intermediate policy, which was stored during the training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct IntermediateEvaluation {
-    /// The progress of the training at the end of the iteration that passed the mark.
+    /// The progress of the training when the policy was stored: at the end of the iteration that reached the required
+    /// number of episodes.
     pub counters: Counters,
-    /// The results by test set, as in the cell's result.
+    /// Results by test set, as in [`CellResult::results`].
     pub results: BTreeMap<String, TestResult>,
-    /// Check of requested and applied parameters.
+    /// Comparison of requested and applied parameters in these tests.
     pub agreement: ParameterCheck,
 }
 
-/// A training in a result.
+/// The description of a training in a result.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Training {
     /// The environment's name in the catalogue.
     pub environment: String,
-    /// The environment's revision on the server. Changes of dynamics raise it.
+    /// The environment's revision on the server. Every change of dynamics, reward or observation raises it.
     pub environment_revision: u32,
-    /// SHA-256 of the environment's model; empty if it has none.
+    /// SHA-256 of the environment's MJCF model, in hexadecimal; empty if it has none.
     pub model_hash: String,
-    /// The distribution of parameters that the settings do not list.
+    /// The version that all parameters without an entry in the settings are drawn from.
     pub version: Version,
-    /// The name of the plan's set of parameters on which it was trained; `None` if it was trained on a version.
+    /// The name of the plan's parameter set that the policy was trained on; `None` if it was trained on a version.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub set: Option<String>,
     /// The method.
@@ -129,17 +132,17 @@ pub struct Training {
     pub method: Method,
     /// Hash of the settings, see [`Cell::configuration`](crate::plan::Cell::configuration).
     pub configuration: String,
-    /// The run, from 1.
+    /// The number of the run, from 1.
     pub run: u32,
     /// The seed of the training and of the tests.
     pub seed: u64,
-    /// The length of the training.
+    /// The final counters of the training: iterations, timesteps, episodes.
     pub counters: Counters,
-    /// All settings, as in `config.toml`.
+    /// All settings of the training, as in `config.toml`.
     pub settings: toml::Table,
 }
 
-/// `failure.json`.
+/// The content of `failure.json`: why a cell failed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Failure {
@@ -149,27 +152,27 @@ pub struct Failure {
     pub reason: String,
     /// The program's version and the commit that it was built from.
     pub commit: String,
-    /// Whether another attempt must restart the training, since resuming from the last checkpoint would fail the same
-    /// way.
+    /// Whether another attempt must restart the training, because resuming from the last checkpoint would fail in the
+    /// same way.
     #[serde(rename = "begins_anew", default = "yes")]
     pub requires_restart: bool,
 }
 
-/// Default value for documents of earlier programs, which do not have the field.
+/// The default for files of earlier programs, which do not have the field.
 fn yes() -> bool {
     true
 }
 
-/// `timing.json`.
+/// The content of `timing.json`: how long a cell took.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Timing {
-    /// Seconds from the beginning to the result, without interrupted attempts. If a process runs several cells together,
-    /// they share its time, so the seconds of all cells add up to the process's time.
+    /// Seconds from start to result, without interrupted attempts. Cells that share a process share its time: the
+    /// seconds of all its cells add up to the time of the process.
     pub seconds: f64,
 }
 
-/// Why an experiment's folder cannot be read or written.
+/// The reason why an experiment's folder cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
@@ -184,13 +187,13 @@ pub enum FolderError {
         /// The fault.
         reason: String,
     },
-    /// The model of a result differs from that of the servers.
+    /// The server's model of the environment differs from the model of a stored result.
     #[error(
         "cell {cell} was trained in {environment} with the model {trained}, but the server has {served}: serve the \
          task's original files, or give another --out"
     )]
     OtherModel { cell: String, environment: String, trained: String, served: String },
-    /// Results of one environment are of different models.
+    /// Two results in one environment were trained with different models.
     #[error(
         "cells {cells:?} were trained in {environment} with different models, {hashes:?}, so their results cannot be \
          compared: delete the results of one model, and run these cells again"
@@ -203,7 +206,7 @@ pub enum FolderError {
         /// The fault.
         reason: String,
     },
-    /// There is no experiment.
+    /// The folder has no `plan.toml`, so it holds no experiment.
     #[error("{} holds no experiment: expected plan.toml in it; give the --out of `perturb run`", path.display())]
     NoPlan { path: PathBuf },
 }
@@ -216,22 +219,23 @@ impl Folder {
         Self { path: path.to_owned(), new_heatmaps: None }
     }
 
-    /// Writes new heatmaps to `path` in place of the folder `heatmaps`, which is still read.
+    /// Sets the folder that new heatmaps are written to. Existing heatmaps are still read from the experiment's own
+    /// folder `heatmaps`.
     pub fn with_new_heatmaps(self, path: PathBuf) -> Self {
         Self { new_heatmaps: Some(path), ..self }
     }
 
-    /// Returns the path.
+    /// Returns the path of the experiment's folder.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Returns the folders of heatmaps. New heatmaps are written to the first one.
+    /// Returns the folders that heatmaps are read from. New heatmaps are written to the first of them.
     pub fn heatmaps(&self) -> Vec<PathBuf> {
         self.new_heatmaps.iter().cloned().chain([self.path.join("heatmaps")]).collect()
     }
 
-    /// Returns the folder of a cell.
+    /// Returns the folder of the cell with this id.
     pub fn cell(&self, id: &str) -> CellFolder {
         CellFolder { path: self.path.join("cells").join(id) }
     }
@@ -241,17 +245,17 @@ impl Folder {
         self.path.join("plan.toml")
     }
 
-    /// Returns the path of the copy of the experiment file, which must exist.
+    /// Returns the path of the copy of the experiment file if it exists.
     ///
     /// # Errors
-    /// [`FolderError::NoPlan`].
+    /// [`FolderError::NoPlan`] if the file does not exist.
     pub fn require_plan(&self) -> Result<PathBuf> {
         let plan = self.plan_path();
         if plan.is_file() { Ok(plan) } else { Err(FolderError::NoPlan { path: self.path.clone() }) }
     }
 
-    /// Copies the experiment file and the files that it names into the folder. Returns whether this replaced a different
-    /// one.
+    /// Copies the experiment file and the CSV files that it names into the folder. Returns whether this replaced a
+    /// different experiment file.
     ///
     /// # Errors
     /// [`FileError`].
@@ -267,11 +271,12 @@ impl Folder {
         Ok(earlier.is_some() && !same)
     }
 
-    /// Compares the environment's model with that of the plan's first result in this environment. The first result is
-    /// enough, because [`Results::read`](crate::Results::read) refuses results with different models.
+    /// Checks that the server's `environment` has the same model as the stored results. Only the plan's first result in
+    /// this environment is read, because [`Results::read`](crate::Results::read) already refuses results with different
+    /// models.
     ///
     /// # Errors
-    /// [`FolderError::OtherModel`], and those of [`CellFolder::state`].
+    /// [`FolderError::OtherModel`] if the models differ, and the errors of [`CellFolder::state`].
     pub fn check_model(&self, plan: &Plan, environment: &proto::Environment) -> Result<()> {
         for cell in plan.cells.iter().filter(|cell| cell.config.common.environment == environment.name) {
             let place = self.cell(&cell.id);
@@ -294,7 +299,7 @@ impl Folder {
         Ok(())
     }
 
-    /// Returns the failure records by the cells' ids, also of cells that are in no plan.
+    /// Returns the identity of every failure record in the folder by cell id, including cells that are in no plan.
     ///
     /// # Errors
     /// [`FileError`].
@@ -309,7 +314,7 @@ impl Folder {
 }
 
 impl CellFolder {
-    /// Returns the path.
+    /// Returns the path of the cell's folder.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -319,7 +324,8 @@ impl CellFolder {
         self.path.join("training")
     }
 
-    /// Returns the folder of the recorded episodes of an intermediate policy.
+    /// Returns the folder with the recorded episodes of the intermediate policy that was stored after `mark` training
+    /// episodes.
     pub fn mark(&self, mark: u64) -> PathBuf {
         self.path.join("marks").join(mark.to_string())
     }
@@ -329,7 +335,7 @@ impl CellFolder {
         self.path.join("log.txt")
     }
 
-    /// Reads the state of the cell.
+    /// Reads whether the cell is done, failed or neither, with its result or failure.
     ///
     /// # Errors
     /// [`FolderError`] if a file is there that cannot be read.
@@ -344,7 +350,8 @@ impl CellFolder {
         Ok(read(&self.path.join("failure.json"))?.map_or(CellState::Missing, CellState::Failed))
     }
 
-    /// Returns whether there is a result, or with `failed_too` a failure. Reads neither file.
+    /// Returns whether the cell has a result or, if `failed_too` is set, a failure. Only looks whether the files exist,
+    /// and does not read them.
     pub fn is_settled(&self, failed_too: bool) -> bool {
         self.path.join("result.json").exists() || (failed_too && self.path.join("failure.json").exists())
     }
@@ -355,7 +362,7 @@ impl CellFolder {
         Some(FailureId { inode: file.ino(), written: (file.mtime(), file.mtime_nsec()) })
     }
 
-    /// Tries to lock the cell. Returns `None` while another process holds the lock.
+    /// Tries to lock the cell for this process. Returns `None` if another process holds the lock.
     ///
     /// # Errors
     /// [`FileError`].
@@ -380,11 +387,11 @@ impl CellFolder {
         write(&self.path.join("failure.json"), failure)
     }
 
-    /// Deletes the failure record. Also deletes the training that led to it if another attempt [must restart
+    /// Deletes the failure record. Also deletes the training that failed if another attempt [must restart
     /// it](Failure::requires_restart).
     ///
     /// # Errors
-    /// [`FileError`]; nothing was deleted then.
+    /// [`FileError`] if the failure record cannot be read; nothing is deleted then.
     pub fn clear_failure(&self) -> files::Result<()> {
         let path = self.path.join("failure.json");
         match read::<Failure>(&path) {
@@ -396,7 +403,8 @@ impl CellFolder {
         files::delete(&path)
     }
 
-    /// Deletes the failure record if it is still `mark`. Returns false if another process works on the cell.
+    /// Deletes the failure record if it is still the one identified by `mark`. Returns false, and deletes nothing, if
+    /// another process has locked the cell.
     ///
     /// # Errors
     /// [`FileError`].
@@ -416,14 +424,14 @@ impl CellFolder {
         files::write_json(&self.path.join("timing.json"), timing)
     }
 
-    /// Returns the duration of the cell; `None` if it is not known.
+    /// Returns the recorded duration of the cell; `None` if there is none.
     pub fn timing(&self) -> Option<Timing> {
         read(&self.path.join("timing.json")).ok().flatten()
     }
 }
 
 impl CellResult {
-    /// The layout that this program writes.
+    /// The format version that this program reads and writes.
     pub const FORMAT_VERSION: u32 = FORMAT_VERSION;
 
     /// Returns the versions of all programs that contributed to the result, in order.
@@ -442,7 +450,7 @@ pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
     serde_json::from_value(value).map(Some).map_err(not_understood)
 }
 
-/// Writes a record with its checksum.
+/// Writes a JSON file that contains its own checksum.
 fn write(path: &Path, record: &impl Serialize) -> files::Result<()> {
     let sealed = WithChecksum::new(record).map_err(|error| files::io("write", path)(error.into()))?;
     files::write_json(path, &sealed)

@@ -1,13 +1,15 @@
-//! The heatmaps of an experiment: the success of each selected policy over any two parameters.
+//! The heatmaps of an experiment: each shows the success rate of a selected policy over two parameters.
 //!
 //! ```text
-//! DIR/heatmaps/ID-X-Y.csv .parquet  of the cell ID, over the parameters X and Y: figures and episodes
-//! DIR/heatmaps/ID-X-Y.json          how they were made; written last
-//! DIR/heatmaps/ID-X-Y-R.…           the same with the other parameters drawn from R
+//! DIR/heatmaps/ID-X-Y.csv      success rates of the policy of cell ID over the parameters X and Y
+//! DIR/heatmaps/ID-X-Y.parquet  the episodes behind these rates
+//! DIR/heatmaps/ID-X-Y.json     the record: options and checksums; written last
+//! DIR/heatmaps/ID-X-Y-R.…      the same files, with the other parameters drawn from R
 //! ```
 //!
-//! The record holds checksums of the figures and of the cell's result. Figures of two records, or of a result that has been
-//! replaced since, are therefore never taken for current ones. Pictures are drawn from the figures when they are needed.
+//! The record contains checksums of the CSV file and of the cell's `result.json`. So a heatmap counts as current only
+//! if its CSV file belongs to the record, and the result has not been replaced since. Pictures are drawn from the CSV
+//! file when they are needed.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -21,10 +23,11 @@ use crate::folder::{Folder, FolderError};
 use crate::plan::Cell;
 use crate::selection::{MethodResults, Selected};
 
-/// Format of the records. It is raised when older programs could misread them.
+/// Format version of the records. It is raised when older programs could misread them.
 const FORMAT_VERSION: u32 = 2;
 
-/// A policy that an experiment has heatmaps of, or could have.
+/// A position in the report for the heatmaps of one policy: environment, method, training distribution and run. It
+/// exists even while there is no heatmap or no policy.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeatmapPlace<'a> {
     /// The environment's name.
@@ -35,62 +38,63 @@ pub struct HeatmapPlace<'a> {
     pub trained_on: TrainedOn<'a>,
     /// The run, from 1.
     pub run: u32,
-    /// The selected policy; `None` if no cell has a result.
+    /// The selected policy; `None` while no cell of this run has a result.
     pub selected: Option<Selected<'a>>,
 }
 
 /// `ID-X-Y.json`: describes a heatmap. It depends only on the results, the program and the settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct HeatmapRecord {
-    /// The format of the document.
+    /// The format version of the file.
     format_version: u32,
-    /// The cell.
+    /// The id of the cell.
     pub cell: String,
-    /// CRC-32C of its `result.json`.
+    /// CRC-32C of the cell's `result.json`, in hexadecimal.
     result: String,
-    /// The name of the checkpoint's weights, see the learner's `Checkpoint::id`.
+    /// The identifier of the policy's weights, see the learner's `Checkpoint::id`.
     pub checkpoint: String,
     /// The seed of the training.
     pub train_seed: u64,
-    /// The options of the test.
+    /// The options of the test that made the heatmap.
     #[serde(flatten)]
     pub options: HeatmapOptions,
     /// The x and y axes.
     pub axes: [Axis; 2],
     /// The program's version and the commit that it was built from.
     pub commit: String,
-    /// CRC-32C of `ID-X-Y.csv`.
+    /// CRC-32C of `ID-X-Y.csv`, in hexadecimal.
     figures: String,
 }
 
-/// A heatmap that belongs to the current results.
+/// A heatmap read from an experiment's folder. It belongs to the current result of its cell.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StoredHeatmap {
-    /// The record of the heatmap.
+    /// The description of the heatmap: options, checkpoint and program version.
     pub record: HeatmapRecord,
-    /// The heatmap.
+    /// The success rates of the heatmap, with their axes.
     pub heatmap: Heatmap,
 }
 
-/// Why there is no heatmap at a place.
+/// The reason why a [`HeatmapPlace`] has no heatmap.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub enum NoHeatmap {
-    /// The training was not done yet.
+    /// The training has no result yet.
     #[error("no heatmap, since this training has no result yet")]
     NoResult,
-    /// No heatmap was completed.
+    /// No complete heatmap was found.
     #[error("the heatmap has not been made")]
     NotMade,
-    /// The result has been replaced.
+    /// The result of the cell was replaced after the heatmap was made.
     #[error("the heatmap is of an earlier result")]
     Outdated,
-    /// The heatmap differs from that of an earlier run in its points or in its number of episodes, so no mean over both is
-    /// possible.
+    /// The grid or the number of episodes differs from the heatmap of an earlier run, so the two heatmaps cannot be
+    /// averaged.
     #[error("the heatmap has another grid or other episodes than that of an earlier run")]
     NotAlike,
 }
 
-/// Returns the places of a plan's heatmaps, ordered by `selections`, training distribution and run.
+/// Returns a place for the heatmaps of each policy in `selections`, ordered by method, training distribution and run. A
+/// run without a policy has a place too.
 pub fn heatmap_places<'a>(selections: &'a [MethodResults<'a>]) -> Vec<HeatmapPlace<'a>> {
     let mut places = Vec::new();
     for MethodResults { environment, method, runs, .. } in selections.iter().filter(|row| !row.method.external) {
@@ -105,7 +109,8 @@ pub fn heatmap_places<'a>(selections: &'a [MethodResults<'a>]) -> Vec<HeatmapPla
     places
 }
 
-/// Returns the kinds of heatmaps in `folder` by environment, including heatmaps of results that have been replaced.
+/// Lists the kinds of heatmaps in `folder` by environment. A kind consists of the two parameters and the version that
+/// other parameters are drawn from. Outdated heatmaps are included.
 ///
 /// # Errors
 /// Errors of the operating system.
@@ -130,17 +135,18 @@ pub fn heatmap_kinds<'a>(
 }
 
 impl HeatmapRecord {
-    /// Parses a record. `None` for an unknown record, whose heatmap is then made again.
+    /// Parses a record. Returns `None` if it is damaged or of another format version, so that its heatmap is made
+    /// again.
     fn parse(text: &[u8]) -> Option<Self> {
         serde_json::from_slice(text).ok().filter(|record: &Self| record.format_version == FORMAT_VERSION)
     }
 }
 
 impl HeatmapPlace<'_> {
-    /// Reads the heatmap of `kind`, or returns the reason why there is none.
+    /// Reads the heatmap of `kind` at this place. The inner error is the reason why there is none.
     ///
     /// # Errors
-    /// [`FolderError`] if a file is there that cannot be read.
+    /// [`FolderError`] if a file exists but cannot be read.
     pub fn read(&self, folder: &Folder, kind: &HeatmapKind) -> Result<Result<StoredHeatmap, NoHeatmap>, FolderError> {
         let Some(Selected { cell, .. }) = self.selected else { return Ok(Err(NoHeatmap::NoResult)) };
         let mut missing = NoHeatmap::NotMade;
@@ -177,7 +183,7 @@ impl HeatmapPlace<'_> {
 }
 
 impl HeatmapRecord {
-    /// Returns a heatmap without points.
+    /// Returns a heatmap with the options of this record, and no points yet.
     fn blank(&self, environment: &str) -> Heatmap {
         let HeatmapOptions { base, grid, episodes, fixed, .. } = self.options.clone();
         let (environment, axes) = (environment.to_owned(), self.axes.clone());
@@ -191,7 +197,7 @@ impl std::fmt::Display for HeatmapPlace<'_> {
     }
 }
 
-/// Returns the path of a cell's new heatmap without its extension.
+/// Returns the path, without extension, to which a new heatmap of `cell` is written.
 pub fn heatmap_path(folder: &Folder, cell: &Cell, kind: &HeatmapKind) -> PathBuf {
     folder.heatmaps().swap_remove(0).join(heatmap_name(cell, kind))
 }
@@ -200,10 +206,10 @@ fn heatmap_name(cell: &Cell, kind: &HeatmapKind) -> String {
     format!("{}-{kind}", cell.id)
 }
 
-/// Stores `heatmap`, which shows the policy `checkpoint`, for `cell`.
+/// Writes the CSV file and the record of `heatmap` for `cell`. `checkpoint` identifies the tested policy.
 ///
 /// # Errors
-/// Errors of the operating system. There is no heatmap then.
+/// Errors of the operating system. The folder then has no heatmap of this kind for the cell.
 pub fn store_heatmap(
     folder: &Folder,
     cell: &Cell,
@@ -231,7 +237,7 @@ pub fn store_heatmap(
     write_json(&record_path, &record)
 }
 
-/// Returns the checksum of a cell's result file.
+/// Returns the checksum of a cell's `result.json`; `None` if there is no such file.
 fn result_checksum(folder: &Folder, cell: &Cell) -> files::Result<Option<String>> {
     Ok(read_if_there(&folder.cell(&cell.id).path().join("result.json"))?.map(|content| checksum(&content)))
 }
@@ -351,14 +357,14 @@ mod tests {
             let stored = places[0].read(&folder, &options.kind()).unwrap().unwrap();
             assert_eq!((stored.record.options, stored.heatmap), (options, heatmap));
         }
-        // Of another kind than its name says.
+        // A record whose kind differs from the kind in its file name is ignored.
         let of = |base| heatmap_path(&folder, cell, &options(base).kind());
         for ending in ["csv", "json"] {
             let [from, to] = [Version::R, Version::E].map(|base| of(base).with_added_extension(ending));
             std::fs::copy(from, to).unwrap();
         }
         assert_eq!(places[0].read(&folder, &options(Version::E).kind()).unwrap(), Err(NoHeatmap::NotMade));
-        // Of a cell that was not selected.
+        // A heatmap of a cell that was not selected is not listed.
         let mut elsewhere = plan.cells[1].clone();
         elsewhere.id = "elsewhere".into();
         store_heatmap(&folder, &elsewhere, "1".into(), length_first(Version::E).0, &heatmap()).unwrap();

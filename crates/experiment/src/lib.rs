@@ -1,13 +1,14 @@
-//! Experiments: their plans, their execution and their results, as plain data.
+//! Experiments: plans, execution and results.
 //!
-//! - [`Plan`] expands an experiment file to cells, [`Folder`] stores them, and [`scheduler`] runs them in processes or on a
-//!   cluster.
+//! - [`Plan`] expands an experiment file to cells: one training with its tests each. [`Folder`] stores the results of
+//!   cells, and [`scheduler`] runs cells in local processes or on a Slurm cluster.
 //! - [`runs`] finds trainings and experiments, and reports their progress.
-//! - [`Results`] reads the cells' results and selects configurations; [`export`](export()) turns them into rows of a table.
+//! - [`Results`] reads the results of cells and selects the best configurations. [`export`](export()) turns results
+//!   into rows of a table.
 #![forbid(unsafe_code)]
 
 #[cfg(test)]
-extern crate self as perturb_experiment; // by this name fixtures call it in every crate
+extern crate self as perturb_experiment; // fixtures that several crates include use this name
 
 mod cost;
 mod curves;
@@ -51,6 +52,6 @@ pub use states::{CellStates, DoneCells, LayeredStates, StudyResults};
 pub use tuning::{Chosen, Tuned, tuned};
 pub use verify::VerifyError;
 
-/// The version, and the commit that was built, e.g. "0.1.0 (1a2b3c4d5e6f)"; "-dirty" follows a commit whose files were
-/// changed.
+/// The program's version and the commit that it was built from, e.g. "0.1.0 (1a2b3c4d5e6f)". The commit has the suffix
+/// "-dirty" if files differed from it.
 pub const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", env!("PERTURB_COMMIT"), ")");

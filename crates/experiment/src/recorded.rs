@@ -8,7 +8,7 @@ use perturb_records::outcomes::PolicyOutcomes;
 use crate::folder::CellResult;
 use crate::selection::{MethodResults, Reported};
 
-/// The recorded episodes of selected policies, by their cells' ids.
+/// The recorded episodes of selected policies, by cell id.
 #[derive(Clone, Debug, Default)]
 pub struct Recorded {
     wanted: BTreeSet<String>,
@@ -16,19 +16,19 @@ pub struct Recorded {
 }
 
 impl Recorded {
-    /// Returns an empty collection for the cells in `selections`.
+    /// Returns an empty collection, which accepts records of the selected cells in `selections`.
     pub fn new(selections: &[MethodResults<'_>]) -> Self {
         let runs = selections.iter().flat_map(|selection| selection.runs.values());
         let selected = runs.flat_map(|run| run.selected.values().flatten()).filter_map(Reported::cell);
         Self { wanted: selected.map(|selected| selected.cell.id.clone()).collect(), policies: BTreeMap::new() }
     }
 
-    /// Returns whether a cell was selected.
+    /// Returns whether the cell with this id was selected.
     pub fn wants(&self, cell: &str) -> bool {
         self.wanted.contains(cell)
     }
 
-    /// Keeps the required part of a cell's `records`, if the cell was selected.
+    /// Stores the outcomes of a cell's `records` if the cell was selected. Ignores other cells.
     pub fn add(&mut self, result: &CellResult, records: &Records) {
         if self.wants(&result.id) {
             let names = result.results.keys().map(String::as_str);
@@ -36,12 +36,12 @@ impl Recorded {
         }
     }
 
-    /// Returns the number of selected cells that have recorded episodes, and the number of selected cells.
+    /// Returns two numbers: selected cells with recorded episodes, and all selected cells.
     pub fn count(&self) -> (usize, usize) {
         (self.policies.len(), self.wanted.len())
     }
 
-    /// Returns the recorded episodes of the reported policy; `None` if there are none.
+    /// Returns the recorded episodes of a reported policy; `None` if there are none.
     pub fn policy<'a>(&'a self, reported: &Reported<'a>) -> Option<&'a PolicyOutcomes> {
         match reported {
             Reported::Cell(selected) => self.policies.get(&selected.cell.id),

@@ -1,13 +1,16 @@
-//! Selection inside the bootstrap: how a number varies because chance influences the selected configuration.
+//! A bootstrap that repeats the selection of configurations in each resample. Its intervals therefore include the
+//! effect of chance on which configuration was selected.
 //!
-//! Each resample draws runs within each environment, like a bootstrap without selection. It also repeats every selection by
-//! the plan's rule: it draws tuning seeds, and the number of successes of each selecting test from a binomial distribution
-//! with the measured rate. The measured results of the configuration with the highest rank are reported, not its redrawn
-//! rate, because the maximum of several redrawn rates is biased upwards. So the numbers that select are not the reported
-//! ones, as in Tsamardinos, Greasidou and Borboudakis (2018, <https://doi.org/10.1007/s10994-018-5714-4>).
+//! Each resample draws runs within each environment, as a bootstrap without selection does. It also repeats every
+//! selection by the plan's rule: it draws tuning seeds, and draws the number of successes of each selection test from a
+//! binomial distribution with the measured rate. The configuration with the highest redrawn rate wins. The statistic
+//! then uses the winner's measured results, not its redrawn rate, because the maximum of several redrawn rates is
+//! biased upwards. Separating the two follows Tsamardinos, Greasidou and Borboudakis (2018,
+//! <https://doi.org/10.1007/s10994-018-5714-4>).
 //!
-//! With the paper's rule every configuration has been tested in every run. With the clean rule a configuration that was not
-//! selected has no reported runs. Each of them is replaced by the tests of a drawn tuning cell of this configuration.
+//! With the paper's rule, every configuration was tested in every run. With the clean rule, a configuration that was
+//! not selected has no reported runs. If such a configuration wins in a resample, the tests of one of its tuning cells,
+//! drawn at random, stand in for each run.
 
 use std::collections::HashMap;
 
@@ -21,18 +24,18 @@ use crate::folder::{CellResult, CellState};
 use crate::plan::{Cell, SELECTION_TEST, Selection};
 use crate::selection::{MethodResults, Results, Selected, common_runs};
 
-/// The seed for drawing runs, which is that of the interval without selection.
+/// The seed for drawing runs. It is also the seed of the interval without selection.
 const RUNS_SEED: u64 = 1;
-/// The seed for drawing selections. It is a separate stream, so the same runs are drawn with and without selection.
+/// The seed for repeating selections. It is separate, so that the same runs are drawn with and without selection.
 const SELECTION_SEED: u64 = 2;
 
-/// All selections of a plan, with their candidates.
+/// A bootstrap over the results of a plan that repeats all selections in each resample.
 pub struct SelectionBootstrap<'a> {
     contests: HashMap<(&'a str, Method, TrainedOn<'a>, Option<u32>), Candidates<'a>>,
     rule: Selection,
 }
 
-/// A selection, whose candidates are in the plan's order.
+/// The candidates of one selection, in the plan's order.
 #[derive(Default)]
 struct Candidates<'a> {
     seeds: Vec<u64>,
@@ -44,23 +47,24 @@ struct SelectableCell<'a> {
     tests: Vec<SelectionTest>,
 }
 
-/// A cell's selecting test.
+/// The result of the test by which a cell takes part in a selection.
 struct SelectionTest {
     seed: u64,
     successes: Binomial,
     mean_return: f64,
-    /// Success rates on D, R and E, %, that may be reported.
+    /// The cell's success rates on D, R and E, %; `None` for a version that it was not tested on.
     rates: [Option<f64>; 3],
 }
 
-/// A reported run, with the indices of the selections of its policies by training distribution.
+/// A reported run of a method. `score` is its metric, %. For the training versions D, R and E, `selected` has the index
+/// of the selection and the selected cell.
 struct DrawnPolicy<'a> {
     score: f64,
     selected: [Option<(usize, Selected<'a>)>; 3],
 }
 
 impl<'a> SelectionBootstrap<'a> {
-    /// Returns the bootstrap over all results.
+    /// Collects the selection tests of all finished cells.
     pub fn new(results: &'a Results<'a>) -> Self {
         let rule = results.plan.selection;
         let mut contests = HashMap::new();
@@ -68,7 +72,7 @@ impl<'a> SelectionBootstrap<'a> {
             let CellState::Done(result) = state else { continue };
             let name = match rule {
                 Selection::Paper => cell.trained_on().to_string(),
-                Selection::Clean => SELECTION_TEST.into(), // which cells that are trained anew do not have
+                Selection::Clean => SELECTION_TEST.into(), // only tuning cells have this test
             };
             if let Some(test) = result.results.get(&name) {
                 let contest: &mut Candidates<'a> = contests.entry(key(cell, rule, cell.run)).or_default();
@@ -78,9 +82,12 @@ impl<'a> SelectionBootstrap<'a> {
         Self { contests, rule }
     }
 
-    /// Returns `statistic` of a metric's scores, %, for each of the `resamples`. Scores are ordered by `selections`, then by
-    /// the runs that all of them have. It works like [`bootstrap`](perturb_records::statistics::bootstrap), but repeats
-    /// every selection in each resample.
+    /// Computes the numbers that `statistic` returns, each with its 95 % bootstrap interval from `resamples` resamples.
+    /// Repeats every selection in each resample; otherwise works like
+    /// [`bootstrap`](perturb_records::statistics::bootstrap).
+    ///
+    /// `statistic` gets the scores of `metric`, %: a list for each of `selections`, with one score for each run that
+    /// all of them have. Returns `None` if there is no such run. There are no intervals if there are too few runs.
     pub fn bootstrap(
         &self,
         selections: &[&MethodResults<'a>],
@@ -113,7 +120,8 @@ impl<'a> SelectionBootstrap<'a> {
         Some(points.into_iter().zip(estimates).map(with_interval).collect())
     }
 
-    /// Returns the reported policies by `selections`, then by run, and the tests that selected them.
+    /// Returns the selections that the reported policies are from, and for each of `selections` its reported runs. Only
+    /// runs that all selections have are included.
     fn reported(
         &self,
         selections: &[&MethodResults<'a>],
@@ -142,7 +150,8 @@ impl<'a> SelectionBootstrap<'a> {
     }
 }
 
-/// With the paper's rule each run has its own selection. With the clean rule all tuning cells select for all runs.
+/// Returns the key of the selection that a cell takes part in. With the paper's rule, each run has its own selection.
+/// With the clean rule, all tuning cells together select for all runs.
 fn key(cell: &Cell, rule: Selection, run: u32) -> (&str, Method, TrainedOn<'_>, Option<u32>) {
     let run = (rule == Selection::Paper).then_some(run);
     (&cell.config.common.environment, cell.method(), cell.trained_on(), run)
@@ -159,8 +168,8 @@ impl<'a> Candidates<'a> {
         }
     }
 
-    /// Draws episodes and seeds, and returns the candidate with the highest rank. Ties are broken at random. Returns `None`
-    /// if no candidate has a drawn seed.
+    /// Repeats the selection with redrawn seeds and numbers of successes, and returns the winner. Breaks ties at
+    /// random. Returns `None` if no candidate was tested with a drawn seed.
     fn decide(&self, uniform: &mut impl FnMut() -> f64) -> Option<&SelectableCell<'a>> {
         if let [only] = &self.candidates[..] {
             return Some(only);
@@ -190,7 +199,8 @@ impl<'a> Candidates<'a> {
 }
 
 impl SelectableCell<'_> {
-    /// Returns the redrawn success rate and the mean return over those of `seeds` for which it has a test.
+    /// Returns the redrawn success rate, %, and the mean return, averaged over the tests with these `seeds`. Returns
+    /// `None` if there is no such test.
     fn rank(&self, seeds: &[u64], uniform: &mut impl FnMut() -> f64) -> Option<(f64, f64)> {
         let found = seeds.iter().filter_map(|seed| self.tests.iter().find(|test| test.seed == *seed));
         let tests: Vec<(f64, f64)> =
@@ -211,7 +221,8 @@ impl SelectionTest {
 }
 
 impl DrawnPolicy<'_> {
-    /// Returns the metric of this run as if `winners` had been selected. Returns the reported score if a test is missing.
+    /// Returns the metric of this run, %, as if `winners` had been selected. `winners` is indexed like the selections.
+    /// Returns the reported score if a needed test is missing.
     fn score_of(
         &self,
         metric: Metric,
@@ -236,10 +247,10 @@ fn draw<'t, T>(all: &'t [T], uniform: &mut impl FnMut() -> f64) -> &'t T {
     &all[(uniform() * all.len() as f64) as usize]
 }
 
-/// Distribution of the number of successes among n episodes that are drawn with replacement from n episodes with k
-/// successes.
+/// Binomial distribution of the number of successes in n new episodes, if each succeeds with the measured rate of a
+/// test of n episodes.
 struct Binomial {
-    /// Cumulative weights of 0, 1 … n successes, not normalised.
+    /// Cumulative, unnormalised probabilities of 0, 1 … n successes.
     cumulative: Vec<f64>,
 }
 
@@ -249,7 +260,7 @@ impl Binomial {
         let k = ((test.success_percent * n as f64 / 100.0).round() as usize).min(n);
         let odds = k as f64 / (n - k) as f64;
         let mut weights = vec![0.0; n + 1];
-        weights[k] = 1.0; // the most likely number, from which the others follow
+        weights[k] = 1.0; // the most likely number; the loops compute the other weights from it
         for i in k..n {
             weights[i + 1] = weights[i] * (n - i) as f64 / (i + 1) as f64 * odds;
         }
@@ -263,7 +274,8 @@ impl Binomial {
         Self { cumulative: weights.into_iter().scan(0.0, sum).collect() }
     }
 
-    /// Returns the share of successes, %, at the quantile `place` of the distribution, 0 … 1.
+    /// Returns the success rate, %, at the quantile `place` (0 … 1) of the distribution. A uniformly random `place`
+    /// gives a random draw.
     fn draw_percent(&self, place: f64) -> f64 {
         let n = self.cumulative.len() - 1;
         let successes = self.cumulative.partition_point(|below| *below <= place * self.cumulative[n]).min(n);

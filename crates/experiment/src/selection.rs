@@ -1,12 +1,13 @@
-//! Computes the paper's numbers from the results of cells.
+//! Selects configurations, and computes the paper's metrics from the results of cells.
 //!
-//! With the clean rule, the cells that were trained after the selection are reported; see [`tuned`](super::tuned). With the
-//! paper's rule, one configuration is selected per environment, method, training version and run: the one with the highest
-//! success rate on its training version. Ties go to the higher mean return in the same test. Configurations that still tie
-//! are all reported: numbers are means over them, since the rule cannot choose among them. Where one cell is needed, as in
-//! `selected.csv` and heatmaps, it is the first of them in the plan's order. The first configuration is also selected if the
-//! training version was not tested. As in the paper, the selecting test is also the reported one. With a large grid that
-//! makes Default and Interpolation a little optimistic.
+//! With the clean rule, the cells that were trained after the selection are reported; see [`tuned`](super::tuned).
+//!
+//! With the paper's rule, one configuration is selected for each environment, method, training version and run: the
+//! configuration with the highest success rate on its training version. Ties go to the higher mean return in the same
+//! test. If configurations still tie, the rule cannot choose among them, so reported numbers are means over all of
+//! them. `selected.csv` and heatmaps need a single cell, and use the first tied one in the plan's order. The first
+//! configuration is also selected if the training version was not tested. As in the paper, the test that selects is
+//! also reported. With a large grid, this makes Default and Interpolation a little too high.
 
 use std::collections::BTreeMap;
 
@@ -20,29 +21,29 @@ use crate::plan::{Cell, Plan, Selection};
 use crate::states::CellStates;
 use crate::tuning::{Tuned, tuned};
 
-/// The states of a plan's cells.
+/// The states of all cells of a plan, with their results.
 #[derive(Debug)]
 pub struct Results<'a> {
     /// The plan.
     pub plan: &'a Plan,
-    /// The state of each cell, by its index.
+    /// The state of each cell, by its index in the plan.
     pub states: Vec<CellState>,
 }
 
-/// The selected policies of a method in an environment, which is a row of the paper's tables.
+/// The selected policies of one method in one environment. They correspond to a row of the paper's tables.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MethodResults<'a> {
     /// The environment's name.
     pub environment: &'a str,
     /// The method.
     pub method: Method,
-    /// Number of cells that the plan has or will have for this row. Cells that are trained on the plan's own sets do
-    /// not count.
+    /// Number of cells of this method and environment, including cells that will be trained after the selection. Cells
+    /// that are trained on parameter sets of the plan do not count.
     pub cells: usize,
-    /// Number of these cells with a result. If some are missing, the selection was among fewer configurations than the
-    /// plan has.
+    /// Number of cells, counted in the same way, that have a result. If it is below `cells`, the selection is among
+    /// fewer configurations than the plan has.
     pub done: usize,
-    /// The runs by their numbers, from 1.
+    /// The selected policies of each run, by the run's number, from 1.
     pub runs: BTreeMap<u32, SelectedRun<'a>>,
 }
 
@@ -51,31 +52,33 @@ pub struct MethodResults<'a> {
 pub struct SelectedRun<'a> {
     /// The selected policy for each training version or set; `None` while there is no result.
     pub selected: BTreeMap<TrainedOn<'a>, Option<Reported<'a>>>,
-    /// Other cells whose selecting test equals that of the selected one, in the plan's order.
+    /// Other cells that tie with the selected one: the same success rate and mean return in the selection test. They
+    /// are in the plan's order.
     pub tied: BTreeMap<TrainedOn<'a>, Vec<Selected<'a>>>,
 }
 
-/// The range of a metric over the choices among tied configurations.
+/// The lowest and the highest value that a metric can have, depending on which of the tied configurations are chosen.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TieRange {
-    /// The largest number of choices in any run: of tied configurations, or of pairs of these.
+    /// The largest number of different choices in any run. If configurations tie on several training versions, each
+    /// combination is a choice.
     pub choices: usize,
-    /// The metric with the lowest choice in every run, averaged over runs, %.
+    /// The metric if each run made its lowest choice, averaged over runs, %.
     pub low: f64,
-    /// The metric with the highest choice in every run, averaged over runs, %.
+    /// The metric if each run made its highest choice, averaged over runs, %.
     pub high: f64,
 }
 
 /// A policy whose tests are reported.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Reported<'a> {
-    /// A selected cell.
+    /// The policy of a selected cell.
     Cell(Selected<'a>),
-    /// An externally trained agent.
+    /// A policy that was trained elsewhere, with its assessment.
     External(&'a ExternalEvaluation, &'a ExternalPolicy),
 }
 
-/// A cell that was selected.
+/// A selected cell with its result.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Selected<'a> {
     /// The cell in the plan.
@@ -85,10 +88,11 @@ pub struct Selected<'a> {
 }
 
 impl<'a> Results<'a> {
-    /// Reads all cells of `plan`, see [`Plan::with_selected_cells`].
+    /// Reads the states of all cells of `plan`. To include the cells that are trained after a selection, pass the plan
+    /// that [`Plan::with_selected_cells`] returns.
     ///
     /// # Errors
-    /// [`FolderError`] for a state that cannot be read, or if results of an environment are of different models.
+    /// [`FolderError`] if a state cannot be read, or if results in one environment were trained with different models.
     pub fn read(plan: &'a Plan, states: &dyn CellStates) -> Result<Self, FolderError> {
         let states = plan.cells.iter().map(|cell| states.state(cell)).collect::<Result<_, _>>()?;
         let results = Self { plan, states };
@@ -96,7 +100,7 @@ impl<'a> Results<'a> {
         Ok(results)
     }
 
-    /// Refuses results of one environment with different models.
+    /// Returns an error if results in one environment were trained with different models.
     fn check_models(&self) -> Result<(), FolderError> {
         let mut first: BTreeMap<&str, &CellResult> = BTreeMap::new();
         for result in self.done() {
@@ -113,7 +117,7 @@ impl<'a> Results<'a> {
         Ok(())
     }
 
-    /// Returns the results in the plan's order.
+    /// Returns the results of finished cells in the plan's order.
     pub fn done(&self) -> impl Iterator<Item = &CellResult> {
         self.states.iter().filter_map(|state| match state {
             CellState::Done(result) => Some(&**result),
@@ -121,7 +125,7 @@ impl<'a> Results<'a> {
         })
     }
 
-    /// The failures, in the plan's order.
+    /// Returns the failures of cells in the plan's order.
     pub fn failures(&self) -> impl Iterator<Item = &Failure> {
         self.states.iter().filter_map(|state| match state {
             CellState::Failed(failure) => Some(failure),
@@ -134,7 +138,7 @@ impl<'a> Results<'a> {
         tuned(self.plan, &self.states)
     }
 
-    /// Selects for each environment and method of the plan, in its order.
+    /// Returns the selected policies of each environment and method, in the plan's order.
     pub fn select(&self) -> Vec<MethodResults<'_>> {
         let mut selections: Vec<MethodResults<'_>> = Vec::new();
         for (cell, state) in self.plan.cells.iter().zip(&self.states) {
@@ -158,8 +162,8 @@ impl<'a> Results<'a> {
 }
 
 impl<'a> MethodResults<'a> {
-    /// Counts a tuning cell. For the first one of a training distribution, also counts the `runs` cells that are trained
-    /// after the selection.
+    /// Counts a tuning cell. The first tuning cell of a training distribution also adds the `runs` cells that will be
+    /// trained after the selection.
     fn tune(&mut self, cell: &'a Cell, state: &'a CellState, runs: u32) {
         let is_papers = usize::from(cell.set.is_none());
         self.cells += is_papers;
@@ -172,7 +176,7 @@ impl<'a> MethodResults<'a> {
         }
     }
 
-    /// Adds `cell` to the selection. Cells must be added in the plan's order.
+    /// Lets `cell` take part in the selection of its run. Must be called in the plan's order.
     fn consider(&mut self, cell: &'a Cell, state: &'a CellState) {
         let is_papers = usize::from(cell.set.is_none());
         let run = self.runs.entry(cell.run).or_default();
@@ -189,7 +193,8 @@ impl<'a> MethodResults<'a> {
         }
     }
 
-    /// Returns a metric of each run that has it, %, by the run's number. It is the mean over tied configurations.
+    /// Returns a metric, %, by number of the run. Tied configurations are averaged. Runs that lack a needed test are
+    /// left out.
     pub fn metric(&self, metric: Metric) -> BTreeMap<u32, f64> {
         let of_run = |(&number, run): (&u32, &SelectedRun<'_>)| {
             let values = run.metric_by_choice(metric);
@@ -198,8 +203,8 @@ impl<'a> MethodResults<'a> {
         self.runs.iter().filter_map(of_run).collect()
     }
 
-    /// Returns the range of a metric over the choices among tied configurations; `None` if no run with the metric has a
-    /// tie.
+    /// Returns the range of a metric over all choices among tied configurations. Returns `None` if no run with this
+    /// metric has a tie.
     pub fn tie_range(&self, metric: Metric) -> Option<TieRange> {
         let by_run = self.runs.values().map(|run| run.metric_by_choice(metric));
         let by_run: Vec<Vec<f64>> = by_run.filter(|values| !values.is_empty()).collect();
@@ -209,12 +214,14 @@ impl<'a> MethodResults<'a> {
         Some(TieRange { choices, low, high })
     }
 
-    /// Returns a metric's mean and deviation over runs, %.
+    /// Returns a metric's mean and standard deviation over runs, %. Returns `None` if no run has the metric.
     pub fn summary(&self, metric: Metric) -> Option<Summary> {
         Summary::from_values(&self.metric(metric).into_values().collect::<Vec<_>>())
     }
 
-    /// Returns a figure of the tests on a set or version over runs. In each run it is the mean over tied configurations.
+    /// Summarizes a number of a test, for example its mean return, over runs. The policies were trained on `trained_on`
+    /// and tested on the set or version `tested_on`. Tied configurations of a run are averaged. Returns `None` if no
+    /// run has the test.
     pub fn test(&self, trained_on: TrainedOn<'_>, tested_on: &str, figure: fn(&TestResult) -> f64) -> Option<Summary> {
         let of_run = |run: &SelectedRun<'_>| run.mean_over_ties(trained_on, tested_on, figure);
         Summary::from_values(&self.runs.values().filter_map(of_run).collect::<Vec<_>>())
@@ -222,18 +229,20 @@ impl<'a> MethodResults<'a> {
 }
 
 impl<'a> SelectedRun<'a> {
-    /// Returns the selected policy of this training distribution, the first one of tied policies.
+    /// Returns the selected policy that was trained on this distribution; the first one if several tie.
     pub fn trained_on(&self, trained_on: TrainedOn<'_>) -> Option<Reported<'a>> {
         self.selected.get(&trained_on).copied().flatten()
     }
 
-    /// Returns the selected policy of this training distribution and those that tie with it, in the plan's order.
+    /// Returns the selected policy that was trained on this distribution, and the policies that tie with it, in the
+    /// plan's order.
     pub fn tied_on(&self, trained_on: TrainedOn<'_>) -> Vec<Reported<'a>> {
         let tied = self.tied.get(&trained_on).into_iter().flatten().copied().map(Reported::Cell);
         self.trained_on(trained_on).into_iter().chain(tied).collect()
     }
 
-    /// The mean of a figure over tied configurations; `None` if one of them was not tested there.
+    /// Returns a number of a test, averaged over tied configurations. Returns `None` if one of them has no test on
+    /// `tested_on`.
     fn mean_over_ties(
         &self,
         trained_on: TrainedOn<'_>,
@@ -245,10 +254,12 @@ impl<'a> SelectedRun<'a> {
         figures.filter(|figures| !figures.is_empty()).map(|figures| mean(figures.into_iter()))
     }
 
-    /// A metric for each choice among tied configurations, %; empty if the run does not have it.
+    /// Returns the values of a metric, %, one for each choice among tied configurations. Returns an empty list if the
+    /// run lacks a needed test.
     fn metric_by_choice(&self, metric: Metric) -> Vec<f64> {
         let choices = Version::ALL.map(|train| {
-            // If the metric is known without a policy's scenarios, it does not depend on this policy.
+            // If the metric can be computed without the scenarios of this training version, it does not depend on the
+            // choice.
             let matters = metric.value(|scenario| (scenario.train != train).then_some(0.0)).is_none();
             let tied = self.tied_on(TrainedOn::Version(train)).into_iter().map(Some).take(if matters {
                 usize::MAX
@@ -272,19 +283,21 @@ impl<'a> SelectedRun<'a> {
         values
     }
 
-    /// Returns the selected cell of this training distribution; `None` for an externally trained agent.
+    /// Returns the selected cell that was trained on this distribution. Returns `None` if there is none, or if the
+    /// policy was trained elsewhere.
     pub fn cell_trained_on(&self, trained_on: TrainedOn<'_>) -> Option<Selected<'a>> {
         self.trained_on(trained_on)?.cell()
     }
 
-    /// Returns the success rate of a scenario, %, as the mean over tied configurations; `None` without a test.
+    /// Returns the success rate in a scenario, %, averaged over tied configurations. Returns `None` if one of them has
+    /// no test.
     pub fn rate(&self, Scenario { train, test }: Scenario) -> Option<f64> {
         self.mean_over_ties(TrainedOn::Version(train), &test.to_string(), |test| test.success_percent)
     }
 }
 
 impl<'a> Reported<'a> {
-    /// Returns the cell; `None` for an externally trained agent.
+    /// Returns the cell; `None` for a policy that was trained elsewhere.
     pub fn cell(&self) -> Option<Selected<'a>> {
         match self {
             Self::Cell(selected) => Some(*selected),
@@ -292,7 +305,7 @@ impl<'a> Reported<'a> {
         }
     }
 
-    /// The figures of its test on a set or version; `None` if it was not tested there.
+    /// Returns the test of the policy on a set or version; `None` if there is none.
     pub fn test(&self, tested_on: &str) -> Option<&'a TestResult> {
         match self {
             Self::Cell(selected) => selected.test(tested_on),
@@ -300,41 +313,43 @@ impl<'a> Reported<'a> {
         }
     }
 
-    /// The success rate on `version`, %; `None` if it was not tested there.
+    /// Returns the success rate on `version`, %; `None` if there is no such test.
     pub fn rate(&self, version: Version) -> Option<f64> {
         Some(self.test(&version.to_string())?.success_percent)
     }
 }
 
 impl<'a> Selected<'a> {
-    /// The figures of its test on a set or version; `None` if it was not tested there.
+    /// Returns the test of the policy on a set or version; `None` if there is none.
     pub fn test(&self, tested_on: &str) -> Option<&'a TestResult> {
         self.result.results.get(tested_on)
     }
 
-    /// The success rate on `version`, %; `None` if it was not tested there.
+    /// Returns the success rate on `version`, %; `None` if there is no such test.
     pub fn rate(&self, version: Version) -> Option<f64> {
         Some(self.test(&version.to_string())?.success_percent)
     }
 
-    /// Returns the figures of the selecting test.
+    /// Returns the test that selects by the paper's rule: the test on the training distribution.
     fn own_test(&self) -> Option<&'a TestResult> {
         self.test(&self.cell.trained_on().to_string())
     }
 
-    /// Returns success rate and mean return in the selecting test. The cell with the highest rank is selected.
+    /// Returns success rate (%) and mean return in the test that selects. The cell with the highest rank is selected.
+    /// Cells without this test have rank `None`.
     fn rank(&self) -> Option<(f64, f64)> {
         self.own_test().map(|test| (test.success_percent, test.mean_return))
     }
 }
 
-/// Returns mean and deviation, over the runs that all `selections` have, of a metric averaged over their environments.
+/// Averages a metric over the environments of `selections`, and returns mean and standard deviation over runs, %. Uses
+/// only runs that all `selections` have; returns `None` if there are none.
 pub fn average(selections: &[&MethodResults<'_>], metric: Metric) -> Option<Summary> {
     let runs = common_runs(selections, metric);
     Summary::from_values(&runs.into_iter().map(|(_, numbers)| mean(numbers.into_iter())).collect::<Vec<_>>())
 }
 
-/// Returns the range of [`average`] over the choices among tied configurations; `None` without a tie.
+/// Returns the range of [`average`] over all choices among tied configurations; `None` if there are no ties.
 pub fn average_tie_range(selections: &[&MethodResults<'_>], metric: Metric) -> Option<TieRange> {
     let ranges: Vec<Option<TieRange>> = selections.iter().map(|selection| selection.tie_range(metric)).collect();
     let choices = ranges.iter().flatten().map(|range| range.choices).max()?;
@@ -347,19 +362,21 @@ pub fn average_tie_range(selections: &[&MethodResults<'_>], metric: Metric) -> O
     Some(TieRange { choices, low: ends[0], high: ends[1] })
 }
 
-/// Returns the interquartile mean of a metric over the environments of `selections` and the runs that all of them have, with
-/// its bootstrap interval.
+/// Returns the interquartile mean of a metric, %, with its bootstrap interval. The mean is over all environments of
+/// `selections`, and over the runs that all of them have.
 pub fn interquartile(selections: &[&MethodResults<'_>], metric: Metric, resamples: usize) -> Option<Bootstrapped> {
     Bootstrapped::new(&scores(selections, metric), resamples, 1, interquartile_mean)
 }
 
-/// Returns a metric by `selections`, then by the runs that all of them have.
+/// Returns the values of a metric, %: for each of `selections` a list, with one value for each run that all of them
+/// have.
 pub fn scores(selections: &[&MethodResults<'_>], metric: Metric) -> Vec<Vec<f64>> {
     let runs = common_runs(selections, metric);
     (0..selections.len()).map(|i| runs.iter().map(|(_, numbers)| numbers[i]).collect()).collect()
 }
 
-/// Returns each run that all `selections` have, with the metric in each of them.
+/// Returns the runs that all `selections` have: the run's number, and its value of the metric, %, in each of
+/// `selections`.
 pub(crate) fn common_runs(selections: &[&MethodResults<'_>], metric: Metric) -> Vec<(u32, Vec<f64>)> {
     let by_environment: Vec<BTreeMap<u32, f64>> = selections.iter().map(|selection| selection.metric(metric)).collect();
     let of_run = |run: &u32| {

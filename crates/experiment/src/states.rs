@@ -1,4 +1,4 @@
-//! Sources of the states of cells: an experiment's folder, a table of results, or both.
+//! Sources that provide the states of cells: an experiment's folder, a results table, or both.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
@@ -9,15 +9,15 @@ use perturb_records::{ParameterCheck, ResultsTable, StudyPlan, TableRow, TestRes
 use crate::folder::{CellResult, CellState, Failure, Folder, FolderError, IntermediateEvaluation, Training};
 use crate::plan::{Cell, Plan, PlanError};
 
-/// Separates the programs of a result in a table.
+/// Separator between the program versions in the column `commit` of a results table.
 pub(crate) const COMMIT_SEPARATOR: &str = "; ";
 
-/// A source of the states of cells.
+/// A source that provides the states of cells.
 pub trait CellStates {
     /// Reads the state of `cell`.
     ///
     /// # Errors
-    /// [`FolderError`] for a state that cannot be read.
+    /// [`FolderError`] if the state cannot be read.
     fn state(&self, cell: &Cell) -> Result<CellState, FolderError>;
 }
 
@@ -25,7 +25,7 @@ impl Folder {
     /// Reads the state of `cell`.
     ///
     /// # Errors
-    /// [`FolderError`] if a file is there that cannot be read.
+    /// [`FolderError`] if a file exists but cannot be read.
     pub fn state(&self, cell: &Cell) -> Result<CellState, FolderError> {
         self.cell(&cell.id).state()
     }
@@ -37,19 +37,19 @@ impl CellStates for Folder {
     }
 }
 
-/// The results of a study in a table.
+/// The results of one study in a results table. A study is an experiment whose results a table contains.
 #[derive(Clone, Debug)]
 pub struct StudyResults<'a> {
     rows: HashMap<&'a str, Vec<&'a TableRow>>,
 }
 
 impl<'a> StudyResults<'a> {
-    /// Returns the results of `study`; none if the table does not have it.
+    /// Returns the results of `study`. They are empty if the table does not contain this study.
     pub fn new(table: &'a ResultsTable, study: &str) -> Self {
         Self { rows: table.of_study(study) }
     }
 
-    /// Returns the rows of a cell.
+    /// Returns the rows of the cell with this id; an empty slice if it has none.
     pub fn rows(&self, cell: &str) -> &[&'a TableRow] {
         self.rows.get(cell).map_or(&[], Vec::as_slice)
     }
@@ -62,17 +62,18 @@ impl CellStates for StudyResults<'_> {
     }
 }
 
-/// Cells that are done in any study of a table. A cell counts if the study's plan has it with the same settings and tests.
+/// The finished cells of all studies in a results table. Used to reuse results: a cell is found if a study's plan has a
+/// cell with the same id, settings and tests.
 #[derive(Debug)]
 pub struct DoneCells<'a> {
     studies: Vec<(Plan, StudyResults<'a>)>,
 }
 
 impl<'a> DoneCells<'a> {
-    /// Returns the finished cells of `table`.
+    /// Collects the finished cells of all studies in `table`.
     ///
     /// # Errors
-    /// [`PlanError`] for a study whose plan this program does not understand.
+    /// [`PlanError`] if the plan of a study cannot be parsed.
     pub fn new(table: &'a ResultsTable) -> Result<Self, PlanError> {
         let mut studies = Vec::new();
         for (name, plan) in &table.studies {
@@ -97,11 +98,11 @@ impl CellStates for DoneCells<'_> {
     }
 }
 
-/// The states in `first`. Cells that are missing there have the state in `then`.
+/// Two sources, of which the second provides the states of cells that are missing in the first.
 pub struct LayeredStates<'a> {
     /// The first source.
     pub first: &'a dyn CellStates,
-    /// The source for cells that are missing in the first one.
+    /// The source for cells that are missing in the first one; `None` for no second source.
     pub then: Option<&'a dyn CellStates>,
 }
 
@@ -115,7 +116,7 @@ impl CellStates for LayeredStates<'_> {
 }
 
 impl Plan {
-    /// Reads and expands the plan of a study that a table has.
+    /// Expands the plan of a study from a results table. `name` is the study's name.
     ///
     /// # Errors
     /// [`PlanError`], which names the study.
@@ -127,7 +128,7 @@ impl Plan {
         Self::parse_with(&format!("the study {name}"), study.plan.clone(), Path::new(""), &beside)
     }
 
-    /// Returns the plan with its files, as a table keeps it.
+    /// Returns the plan with its CSV files, as a results table stores it.
     pub fn for_table(&self) -> StudyPlan {
         let text = |content: &Vec<u8>| String::from_utf8_lossy(content).into_owned();
         let beside = self.beside.iter().map(|(name, content)| (name.clone(), text(content)));
@@ -135,7 +136,8 @@ impl Plan {
     }
 }
 
-/// Returns the state of a cell from its rows. They are in the order of the export: those of the final policy come last.
+/// Reconstructs the state of a cell from its rows in a results table. Rows must be in the order of the export:
+/// intermediate policies first, then the final policy.
 fn state_of(cell: &Cell, rows: &[&TableRow]) -> Result<CellState, String> {
     let Some(last) = rows.last() else { return Ok(CellState::Missing) };
     let commits: Vec<String> = last.commit.split(COMMIT_SEPARATOR).map(str::to_owned).collect();

@@ -1,10 +1,10 @@
-//! The clean rule of selection: tuning cells, selected configurations, and the cells that are trained after the selection.
+//! The clean rule of selection: tuning cells select configurations, which are then trained again with other seeds.
 //!
-//! One configuration is selected per environment, method and training version: the one with the highest mean success rate
-//! over tuning seeds, in selection episodes on its training version. Ties go to the higher mean return in the same test,
-//! then to the plan's order. Nothing is selected before every tuning cell has a result or has failed. A configuration with
-//! some failed cells is ranked by its other cells, whose number is [`Chosen::seeds`]. A configuration without any result is
-//! not selected.
+//! One configuration is selected for each environment, method and training version: the configuration with the highest
+//! success rate in its selection tests, averaged over tuning seeds. Ties go to the higher mean return in the same
+//! tests, then to the plan's order. Selection starts when every tuning cell has a result or has failed. A configuration
+//! with some failed cells is ranked by its other cells, whose number is [`Chosen::seeds`]. A configuration without any
+//! result cannot be selected.
 
 use std::collections::HashMap;
 
@@ -16,37 +16,37 @@ use crate::folder::{CellState, FolderError};
 use crate::plan::{Cell, Plan, SELECTION_TEST};
 use crate::states::CellStates;
 
-/// Configurations from which one is selected.
+/// The state of the selection among the configurations of one environment, method and training distribution.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tuned<'a> {
     /// The environment's name.
     pub environment: &'a str,
     /// The method.
     pub method: Method,
-    /// The training distribution, which is also that of the selection episodes.
+    /// The training distribution. The selection tests use it too.
     pub trained_on: TrainedOn<'a>,
     /// Number of tuning cells.
     pub cells: usize,
-    /// Number of these cells with a result.
+    /// Number of tuning cells with a result.
     pub done: usize,
-    /// Number of these cells that failed.
+    /// Number of tuning cells that failed.
     pub failed: usize,
     /// Number of tuning seeds.
     pub seeds: usize,
-    /// The selected configuration; `None` while tuning cells are unfinished, or if all of them failed.
+    /// The selected configuration; `None` while tuning cells are unfinished, or if all tuning cells failed.
     pub chosen: Option<Chosen<'a>>,
 }
 
-/// A configuration that was selected.
+/// A selected configuration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Chosen<'a> {
     /// The configuration's first tuning cell with a result.
     pub cell: &'a Cell,
-    /// The mean success rate in selection episodes, %.
+    /// The success rate in the selection tests, averaged over tuning seeds, %.
     pub success_percent: f64,
-    /// Their mean return.
+    /// The mean return in the selection tests, averaged over tuning seeds.
     pub mean_return: f64,
-    /// Number of tuning seeds for which it has results.
+    /// Number of tuning seeds with a result of this configuration.
     pub seeds: usize,
 }
 
@@ -57,7 +57,7 @@ impl Tuned<'_> {
     }
 }
 
-/// Returns the configurations that the tuning cells of `plan` with these `states` select, in the plan's order.
+/// Returns the state of each selection of `plan`, in the plan's order. `states` are the states of the plan's cells.
 pub fn tuned<'a>(plan: &'a Plan, states: &'a [CellState]) -> Vec<Tuned<'a>> {
     let mut groups: Vec<(Tuned<'a>, Vec<Vec<Candidate<'a>>>)> = Vec::new();
     let mut places = HashMap::new();
@@ -89,11 +89,11 @@ pub fn tuned<'a>(plan: &'a Plan, states: &'a [CellState]) -> Vec<Tuned<'a>> {
     groups.into_iter().map(select).collect()
 }
 
-/// A tuning cell and its test.
+/// A tuning cell and its selection test.
 type Candidate<'a> = (&'a Cell, &'a TestResult);
 
 impl<'a> Chosen<'a> {
-    /// A configuration with its tests, at least one.
+    /// Averages the selection tests of a configuration's tuning cells, of which there must be at least one.
     fn new(tests: &[Candidate<'a>]) -> Self {
         let over_seeds = |figure: fn(&TestResult) -> f64| mean(tests.iter().map(|(_, test)| figure(test)));
         Self {
@@ -104,32 +104,33 @@ impl<'a> Chosen<'a> {
         }
     }
 
-    /// Returns the better of two configurations, of which `self` is listed first.
+    /// Returns the better of two configurations, or `self` if they tie. `self` must come first in the plan.
     fn better(self, other: Self) -> Self {
         let rank = |chosen: &Self| (chosen.success_percent, chosen.mean_return);
         if rank(&other) > rank(&self) { other } else { self }
     }
 }
 
-/// Returns environment, method and training distribution. One configuration is selected for each such key.
+/// Returns the key of the selection that a cell takes part in: environment, method and training distribution.
 fn kind(cell: &Cell) -> (&str, Method, TrainedOn<'_>) {
     (&cell.config.common.environment, cell.method(), cell.trained_on())
 }
 
 impl Plan {
-    /// Returns the plan with all cells that are known from `states`: its own cells, then those of the selected
-    /// configurations.
+    /// Returns the plan with its tuning cells followed by the cells of the configurations that they have selected so
+    /// far. `states` provides the results of the tuning cells. A plan without tuning cells is returned unchanged.
     ///
     /// # Errors
-    /// [`FolderError`] for a state that cannot be read.
+    /// [`FolderError`] if a state cannot be read.
     pub fn with_selected_cells(&self, states: &dyn CellStates) -> Result<Self, FolderError> {
         self.with_chosen(Some(states), false)
     }
 
-    /// Returns the plan with its final number of cells. Placeholders stand for cells that are not selected yet.
+    /// Returns the plan with as many cells as it will finally have. Where nothing is selected yet, the first candidates
+    /// stand in for the cells to come.
     ///
     /// # Errors
-    /// [`FolderError`] for a state that cannot be read.
+    /// [`FolderError`] if a state cannot be read.
     pub fn with_expected_cells(&self, states: Option<&dyn CellStates>) -> Result<Self, FolderError> {
         self.with_chosen(states, true)
     }

@@ -1,4 +1,4 @@
-//! Checks that results follow from their recorded episodes.
+//! Checks that stored results agree with their recorded episodes.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -7,7 +7,7 @@ use perturb_records::{ParameterCheck, Records, RecordsError, TestResult};
 
 use crate::folder::CellResult;
 
-/// Errors of the check.
+/// The reason why a result is not confirmed by its recorded episodes.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
@@ -15,7 +15,7 @@ pub enum VerifyError {
     /// Recorded episodes cannot be read.
     #[error(transparent)]
     Records(#[from] RecordsError),
-    /// A test's figures differ from those of its recorded episodes.
+    /// A test in the result differs from the numbers computed from its recorded episodes.
     #[error(
         "the result of cell {cell} does not follow from its recorded episodes: its test on {test} has {kept} in \
          result.json, but {recorded} in {file}; delete result.json to run the tests again",
@@ -23,13 +23,14 @@ pub enum VerifyError {
     )]
     Test {
         cell: String,
-        /// The name of the set or version.
+        /// The name of the tested set or version.
         test: String,
         kept: Box<TestResult>,
-        /// The figures of the episodes.
+        /// The test computed from the recorded episodes.
         recorded: Box<TestResult>,
     },
-    /// The comparison of requested and applied parameters in the result differs from that of the recorded episodes.
+    /// The result's comparison of requested and applied parameters differs from the comparison computed from the
+    /// recorded episodes.
     #[error(
         "the result of cell {cell} does not follow from its recorded episodes: its check of requested and applied \
          parameters has another outcome; delete result.json to run the tests again"
@@ -37,8 +38,8 @@ pub enum VerifyError {
     ParameterCheck { cell: String },
 }
 
-/// Reads the episodes in `path` and checks that these figures of a result follow from them. Returns `None` if there are
-/// none.
+/// Reads the recorded episodes in the folder `path`, and checks that they give the same `results` and `agreement`,
+/// which are parts of `result`. Returns the episodes, or `None` if none were recorded.
 pub(crate) fn follows(
     result: &CellResult,
     path: &Path,

@@ -1,4 +1,4 @@
-//! Heatmaps of policies of any origin, side by side.
+//! Draws the heatmaps of several policies side by side.
 
 use perturb_experiment::distinct;
 use perturb_records::{Heatmap, HeatmapPoint, heatmap_table};
@@ -6,12 +6,12 @@ use perturb_text::{Table, count};
 
 use crate::plot::{HeatmapColumn, HeatmapPanels, common_returns};
 
-/// A policy's heatmap.
+/// The heatmap of a policy, with the policy's description for captions.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PolicyHeatmap {
-    /// E.g. "ppo ff".
+    /// The method, e.g. "ppo ff".
     pub method: String,
-    /// E.g. "D".
+    /// The training distribution, e.g. "D".
     pub trained_on: String,
     /// The seed of the training.
     pub seed: u64,
@@ -19,8 +19,9 @@ pub struct PolicyHeatmap {
     pub heatmap: Heatmap,
 }
 
-/// A picture with a column for each method and each thing that it was trained on, the mean over such policies, and its
-/// figures; `None` of nothing, or if they are not over the same points.
+/// Returns a picture of heatmaps side by side, and a table of its numbers. Each combination of method and training
+/// distribution is a column, which shows the mean over its policies. Returns `None` if there are no policies, or if
+/// their heatmaps have different grids.
 pub fn policies_side_by_side(policies: &[PolicyHeatmap]) -> Option<(HeatmapPanels, Table)> {
     let heatmaps: Vec<Heatmap> = policies.iter().map(|policy| policy.heatmap.clone()).collect();
     let all = Heatmap::mean(&heatmaps)?;
@@ -50,7 +51,7 @@ pub fn policies_side_by_side(policies: &[PolicyHeatmap]) -> Option<(HeatmapPanel
     Some((panels, table(&columns)))
 }
 
-/// A line for each column and point; of a single column without saying which.
+/// Returns a table with a row for each column and grid point. For a single column, the table leaves out the caption.
 fn table(columns: &[(String, usize, Heatmap)]) -> Table {
     if let [(.., mean)] = columns {
         return heatmap_table(mean);
@@ -63,8 +64,9 @@ fn table(columns: &[(String, usize, Heatmap)]) -> Table {
     points_table(["trained", "policies"], axes, &lines)
 }
 
-/// A line for each point of several heatmaps: which it is of, the number of policies, and its figures. `names` are those
-/// of the first two columns.
+/// Returns a table with a row for each point of several heatmaps. Each of `lines` has the heatmap's caption, the number
+/// of averaged policies and the point. `names` are the headers of the first two columns; `x` and `y` are the names of
+/// the axes.
 pub(crate) fn points_table(names: [&str; 2], [x, y]: [String; 2], lines: &[(String, usize, HeatmapPoint)]) -> Table {
     Table::builder("", lines)
         .text(names[0], |(which, ..)| which)

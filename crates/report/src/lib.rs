@@ -1,6 +1,6 @@
 //! Reports of experiments: tables, pictures and pages.
 //!
-//! - [`Report`] compares results, in tables and on a page; [`plot`] draws.
+//! - [`Report`] compares results in tables and on an HTML page. [`plot`] draws the pictures.
 #![forbid(unsafe_code)]
 
 #[cfg(test)]

@@ -1,12 +1,13 @@
-//! Training throughput, env steps/s:
+//! Measures training throughput, in environment steps per second:
 //!
-//! - `alone`: PPO FF on CartPole D, 8 environments × 128 steps, 10 epochs, one minibatch, over a private server on a Unix
-//!   socket, with actions chosen at the server and at the client; and with the server behind a line that takes 5 ms each
-//!   way.
-//! - `together`: 36 A2C FF CartPoles with the paper's one environment of 5 steps, and 9 PPO FF ones with one of 128, in two
-//!   groups of this process with a private server each, as `perturb run --jobs 2` has them.
+//! - `alone`: one PPO training with FF on CartPole D: 8 environments × 128 steps, 10 epochs, one minibatch. It uses a
+//!   private server on a Unix socket. Actions are chosen in the server, then in the client. A third measurement adds a
+//!   network delay of 5 ms each way.
+//! - `together`: 36 trainings of A2C with FF on CartPole, with the paper's one environment and 5 steps per rollout;
+//!   then 9 trainings of PPO with 128 steps per rollout. They run in two groups in this process. Each group has a
+//!   private server, as with `perturb run --jobs 2`.
 //!
-//! An argument that is part of a measurement's name restricts what is measured.
+//! Arguments select measurements: those whose name contains an argument are run.
 
 use std::time::{Duration, Instant};
 
@@ -23,7 +24,7 @@ const ALONE: &str = "algorithm = 'ppo'\nnum_envs = 8\nn_steps = 128\nn_epochs = 
 const ITERATIONS: u64 = 100;
 const SIGNAL: i32 = 15;
 const GROUPS: usize = 2;
-/// Time for which groups are measured, after a warm-up of the same length.
+/// Duration of a measurement of groups, after a warm-up of the same duration.
 const MEASURED: Duration = Duration::from_secs(5);
 const DELAY: Duration = Duration::from_millis(5);
 
@@ -67,7 +68,7 @@ fn alone(name: &str, servers: &Servers) -> Result<()> {
         }
     })?;
 
-    // Checks that the timed work was done: the steps, the updates, and learning.
+    // Checks that the timed work was done: steps, updates, and some learning.
     let progress = outcome.progress;
     assert_eq!(progress.timesteps, ITERATIONS * 8 * 128);
     assert_eq!(progress.update.n_updates, ITERATIONS * 10);
@@ -85,7 +86,8 @@ fn alone(name: &str, servers: &Servers) -> Result<()> {
     Ok(())
 }
 
-/// Steps of all cells between two moments, over the time between. Each group has a server, as in `perturb run`.
+/// Measures `cells` trainings in [`GROUPS`] groups and prints their steps per second. Each group has its own server, as
+/// in `perturb run`.
 fn together(name: &str, settings: &str, cells: usize) -> Result<()> {
     let stop = StopFlag::default();
     let start = Instant::now();
@@ -103,7 +105,8 @@ fn together(name: &str, settings: &str, cells: usize) -> Result<()> {
     Ok(())
 }
 
-/// Env steps/s of the cells with these seeds.
+/// Runs a group of trainings with these seeds, and returns its environment steps per second. The time starts at
+/// `start`, which all groups share.
 fn group_of(
     address: &Address,
     settings: &str,

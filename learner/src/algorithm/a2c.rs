@@ -9,20 +9,21 @@ use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{Estimates, Rollout, Trajectories};
 
-/// Synchronous advantage actor-critic, Mnih et al. (2016), arXiv:1602.01783, without asynchrony: one gradient step a
-/// rollout on all its T·N samples,
+/// Advantage actor-critic (A2C), the synchronous variant of the algorithm of Mnih et al. (2016), arXiv:1602.01783. It
+/// takes one gradient step per rollout, on all its T·N samples, with
 ///
 /// loss = policy gradient - ent_coef · mean entropy + vf_coef · mean (V - R)²,
 ///
-/// with [`n_step_returns`] R and advantages R - V(s_t), where V(s_t) is the rollout's. RMSProp is TensorFlow's form:
-/// averages start at 1 and ε is inside the root.
+/// where R are the [`n_step_returns`], and the policy gradient uses the advantages R - V(s_t). V(s_t) in the advantages
+/// is the value that the rollout recorded. The optimiser is RMSProp in TensorFlow's form: its averages start at 1, and
+/// ε is inside the square root.
 pub struct A2c {
     config: A2cConfig,
     optimiser: Optimiser,
 }
 
 impl A2c {
-    /// Checks the settings and starts with fresh optimiser state for `policy`.
+    /// Returns the algorithm with a new optimiser for the weights of `policy`. Returns an error for an invalid setting.
     pub fn new(config: A2cConfig, policy: &Policy) -> Result<Self> {
         config.validate()?;
         let n_weights = policy.flat_weights().len();
@@ -110,12 +111,12 @@ impl BaseAlgorithm for A2c {
 ///
 /// R_t = r_t + γ V' if step t ended an episode or t = T-1, else r_t + γ R_{t+1}.
 ///
-/// Every return thus looks as far as the rollout or the episode goes. The advantages are R_t - V(s_t), which is [`gae`](super::gae)
-/// with λ = 1.
+/// V' is the value of the observation after step t, see [`Trajectories`]. So each return sums rewards until the end of
+/// the episode or the rollout. The advantages are R_t - V(s_t), the same as [`gae`](super::gae) with λ = 1.
 ///
 /// # Panics
 ///
-/// If arrays have different lengths.
+/// Panics if arrays have different lengths.
 pub fn n_step_returns(trajectories: &Trajectories<'_>, gamma: f64, bootstrap_truncation: bool) -> Estimates {
     trajectories.backward(bootstrap_truncation, |step| {
         let next = if step.ended || step.last { step.next_value } else { step.next_return };

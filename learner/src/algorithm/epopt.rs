@@ -1,4 +1,4 @@
-//! EPOpt: learning from the worst episodes.
+//! EPOpt: learns from the worst of many episodes.
 
 use perturb_policy::CollectUntil;
 use perturb_settings::{EpoptConfig, Ranking};
@@ -8,35 +8,37 @@ use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{EpisodeSlice, Rollout};
 
-/// EPOpt-ε, Rajeswaran et al. (2017), arXiv:1610.01283, around another algorithm: an iteration generates L complete
-/// episodes, each in a freshly drawn environment, and the other algorithm learns from those whose undiscounted return is
-/// at most the ε-percentile of all L. That percentile interpolates linearly between order statistics, as numpy's; where
-/// returns are equal to it more than the share ε is kept. After Packer et al. (2018), ε is 1 at first. Episodes may also be
-/// ranked by the sums of their normalised rewards ([`Ranking`]).
+/// EPOpt-ε, Rajeswaran et al. (2017), arXiv:1610.01283, which wraps another algorithm.
+///
+/// Each iteration generates L complete episodes, each with newly drawn parameters. The wrapped algorithm learns only
+/// from the worst: the episodes whose undiscounted return is at most the ε-percentile of all L returns. The percentile
+/// interpolates linearly between neighbouring returns, as numpy's does. If several returns equal the percentile, more
+/// than the share ε is kept. As in Packer et al. (2018), ε is 1 in the first iterations. Episodes can also be ranked by
+/// the sum of their normalised rewards, see [`Ranking`].
 pub struct Epopt {
     config: EpoptConfig,
     base: Box<dyn BaseAlgorithm>,
     iterations: u64,
 }
 
-/// The episodes that EPOpt chose in an iteration.
+/// Statistics of the episodes that EPOpt selected in an iteration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EpisodeSelection {
-    /// ε of this iteration.
+    /// The share ε of this iteration: 1 in the first iterations, later the configured share.
     pub epsilon: f64,
-    /// Number of episodes that were learned from.
+    /// Number of selected episodes, from which the wrapped algorithm learned.
     pub kept: u64,
-    /// Number of steps in these episodes.
+    /// Number of steps in the selected episodes.
     pub kept_steps: u64,
     /// Mean return of all L episodes.
     pub mean_return: f64,
-    /// Conditional value at risk: the mean return of the ⌈εL⌉ worst episodes. Here ε is the configured share, even while
-    /// the iteration's ε is still 1.
+    /// Conditional value at risk: the mean return of the ⌈εL⌉ worst episodes, where ε is the configured share even in
+    /// the first iterations.
     pub cvar: f64,
 }
 
 impl Epopt {
-    /// Checks the settings. `base` must not have made an update yet.
+    /// Wraps `base`, which must not have made an update yet. Returns an error for an invalid setting.
     pub fn new(config: EpoptConfig, base: Box<dyn BaseAlgorithm>) -> Result<Self> {
         config.validate()?;
         Ok(Epopt { config, base, iterations: 0 })
@@ -48,7 +50,7 @@ impl Algorithm for Epopt {
         CollectUntil::Episodes(self.config.episodes_per_iteration)
     }
 
-    /// `rollout` holds L complete episodes, see [`Rollout::episodes`].
+    /// Learns from the worst episodes of `rollout`, which must contain L complete episodes, see [`Rollout::episodes`].
     fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats> {
         let full = self.iterations < self.config.full_iterations;
         let epsilon = if full { 1.0 } else { self.config.epsilon };
@@ -84,7 +86,8 @@ impl Algorithm for Epopt {
     }
 }
 
-/// The episodes whose rank is at most the `epsilon`-percentile of `ranks`, in their order.
+/// Returns the episodes whose rank is at most the `epsilon`-percentile of all `ranks`, in their original order. A rank
+/// is a return; lower is worse.
 fn worst(episodes: &[EpisodeSlice], ranks: &[f64], epsilon: f64) -> Vec<EpisodeSlice> {
     let mut sorted = ranks.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -96,7 +99,8 @@ fn returns(episodes: &[EpisodeSlice]) -> Vec<f64> {
     episodes.iter().map(|episode| episode.episode_return).collect()
 }
 
-/// The `share`-percentile of `sorted`, linear between order statistics; never below the minimum.
+/// Returns the `share`-percentile (0 to 1) of `sorted`, linearly interpolated between neighbours. It is never below the
+/// minimum. Returns NaN for an empty list.
 fn percentile(sorted: &[f64], share: f64) -> f64 {
     let Some(last) = sorted.len().checked_sub(1) else { return f64::NAN };
     let position = share * last as f64;
@@ -105,7 +109,7 @@ fn percentile(sorted: &[f64], share: f64) -> f64 {
     if fraction == 0.0 { sorted[low] } else { sorted[low] + fraction * (sorted[low + 1] - sorted[low]) }
 }
 
-/// The mean return of the ⌈share · L⌉ worst of L episodes. Ties do not add further episodes.
+/// Returns the mean return of the ⌈share · L⌉ worst of L episodes. Unlike [`worst`], ties add no further episodes.
 fn conditional_value_at_risk(episodes: &[EpisodeSlice], share: f64) -> f64 {
     let mut returns = returns(episodes);
     returns.sort_by(f64::total_cmp);

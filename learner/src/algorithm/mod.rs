@@ -1,4 +1,4 @@
-//! Algorithms: they turn a rollout into better weights.
+//! Reinforcement-learning algorithms, which improve a policy's weights from rollouts.
 
 mod a2c;
 mod epopt;
@@ -18,28 +18,28 @@ use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{self, Estimates, Rollout};
 
-/// Learns from rollouts.
+/// An algorithm that improves a policy from rollouts.
 pub trait Algorithm: Send {
-    /// The amount of experience to collect between two updates.
+    /// Returns the amount of experience to collect between two updates.
     fn collect_until(&self) -> CollectUntil;
 
-    /// Improves `policy` by a finished rollout. `progress_remaining` falls from 1 at the start of training to 0 at its
-    /// end. A loss or gradient that is not finite is an error, after which the policy is as it was before that gradient
-    /// step.
+    /// Improves `policy` from a finished rollout. `progress_remaining` falls from 1 at the start of training to 0 at
+    /// its end. Returns an error if a loss or gradient is not finite; the policy then has the weights from before that
+    /// gradient step.
     fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats>;
 
-    /// Everything that later updates depend on, except the policy's weights.
+    /// Returns everything that later updates depend on, except the policy's weights.
     fn state(&self) -> AlgorithmState;
 
-    /// Restores a saved state. Later updates give the same bytes as without the break.
+    /// Restores a saved state. Later updates then give the same bytes as without the interruption.
     fn load_state(&mut self, state: &AlgorithmState) -> Result<()>;
 }
 
-/// An algorithm that EPOpt can wrap: it can learn from several rollouts at once.
+/// An algorithm that EPOpt can wrap: it can learn from several rollouts in one update.
 pub trait BaseAlgorithm: Algorithm {
-    /// Improves `policy` by one or more `rollouts`, with as many passes over each as if it were the only one: A2C takes a
-    /// step on each, PPO makes `n_epochs` passes over all. All advantages are estimated before the first step. Figures are
-    /// means over all steps.
+    /// Improves `policy` from one or more rollouts in one update. A2C takes a gradient step on each rollout, and PPO
+    /// makes `n_epochs` passes over all of them. The advantages use the values that the rollouts recorded. The returned
+    /// statistics are means over all gradient steps.
     ///
     /// # Errors
     /// The errors of [`Algorithm::update`].
@@ -51,12 +51,12 @@ pub trait BaseAlgorithm: Algorithm {
     ) -> Result<UpdateStats>;
 }
 
-/// The state of an algorithm, for exact resumption.
+/// The state of an algorithm, from which training resumes exactly.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AlgorithmState {
-    /// Gradient steps so far.
+    /// Number of gradient steps so far.
     pub n_updates: u64,
-    /// Iterations so far; EPOpt only.
+    /// Number of iterations so far; 0 except with EPOpt.
     #[serde(default)]
     pub iterations: u64,
     /// The optimiser's running averages.
@@ -65,40 +65,45 @@ pub struct AlgorithmState {
     pub rng: Option<ChaCha8Rng>,
 }
 
-/// Figures of an update, with stable-baselines3's names. Averages are over the update's gradient steps.
+/// Statistics of an update. Names are those of stable-baselines3. Losses and other means are over the gradient steps of
+/// the update.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct UpdateStats {
-    /// The optimiser's step size.
+    /// The optimiser's step size in this update.
     pub learning_rate: f64,
-    /// The policy's part of the loss.
+    /// The policy's term of the loss.
     pub policy_gradient_loss: f64,
-    /// The value network's part of the loss, before `vf_coef`.
+    /// The value loss, before it is multiplied by `vf_coef`.
     pub value_loss: f64,
-    /// Minus the mean entropy, before `ent_coef`, in nats.
+    /// The negative mean entropy, in nats, before it is multiplied by `ent_coef`.
     pub entropy_loss: f64,
-    /// The sum that was minimised.
+    /// The total loss, which is minimised.
     pub loss: f64,
-    /// Estimate of the KL divergence of the new from the acting policy, in nats; PPO only.
+    /// Estimate, from sampled actions, of the KL divergence of the new policy from the policy that acted, in nats;
+    /// `None` except with PPO.
     pub approx_kl: Option<f64>,
-    /// KL divergence of the new from the acting policy, in nats, before `kl_coef`; PPO with `kl_coef` above 0 only.
+    /// KL divergence of the new policy from the policy that acted, in nats, from their distributions, before it is
+    /// multiplied by `kl_coef`. `None` except with PPO and a `kl_coef` above 0.
     pub kl_divergence: Option<f64>,
-    /// Share of samples whose ratio was outside `1 ± clip_range`; PPO only.
+    /// Share of samples (0 to 1) whose probability ratio was outside `1 ± clip_range`; `None` except with PPO.
     pub clip_fraction: Option<f64>,
-    /// `clip_range`; PPO only.
+    /// The configured `clip_range`; `None` except with PPO.
     pub clip_range: Option<f64>,
-    /// Share of the variance of the returns that the rollout's values explain; None if the returns are constant.
+    /// Share of the variance of the returns that the predicted values explain: at most 1, and negative for poor
+    /// predictions. `None` if the returns are constant.
     pub explained_variance: Option<f64>,
-    /// Global norm of the gradient, before clipping.
+    /// Global norm of the gradient before clipping.
     pub grad_norm: f64,
-    /// Gradient steps so far, this update's included.
+    /// Number of gradient steps so far, including this update's.
     pub n_updates: u64,
-    /// Mean standard deviation of the actions; continuous actions only.
+    /// Standard deviation of the action distribution, averaged over action dimensions; `None` for discrete actions.
     pub std: Option<f64>,
-    /// The episodes that were learned from; EPOpt only.
+    /// Statistics of the selected episodes; `None` except with EPOpt.
     pub selection: Option<EpisodeSelection>,
 }
 
-/// Checks that a rollout's axes fit the algorithm and the policy. The length of a rollout of complete episodes is free.
+/// Checks that the shape of a rollout fits the algorithm and the policy. A rollout of complete episodes may have any
+/// length.
 fn check_rollout(rollout: &Rollout, policy: &Policy, n_steps: usize) -> Result<()> {
     if rollout.lengths().is_none() {
         check_length("the rollout's axis T", rollout.n_steps(), n_steps)?;
@@ -109,10 +114,10 @@ fn check_rollout(rollout: &Rollout, policy: &Policy, n_steps: usize) -> Result<(
     Ok(check_length("the rollout's memory [N, S]", rollout.memory().len(), memory)?)
 }
 
-/// The algorithm of `settings` with fresh state for `policy`; `seed` fixes its randomness.
+/// Returns the algorithm of `settings` with a new state for `policy`. `seed` determines its random numbers.
 ///
 /// # Errors
-/// A setting out of its range.
+/// An error if a setting is out of its range.
 pub fn build(settings: &Settings, policy: &Policy, seed: u64) -> Result<Box<dyn Algorithm>> {
     let base: Box<dyn BaseAlgorithm> = match &settings.base {
         Base::A2c(settings) => Box::new(A2c::new(settings.clone(), policy)?),
@@ -125,7 +130,8 @@ pub fn build(settings: &Settings, policy: &Policy, seed: u64) -> Result<Box<dyn 
     })
 }
 
-/// The share of the variance of the returns that the rollouts' values explain.
+/// Returns the share of the variance of the returns that the rollouts' values explain. `estimates` has the returns of
+/// each rollout. Returns `None` if the returns are constant.
 fn explained_variance(rollouts: &[&Rollout], estimates: &[Estimates]) -> Option<f64> {
     let mut values = Vec::new();
     let mut returns = Vec::new();

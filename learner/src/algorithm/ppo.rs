@@ -11,13 +11,15 @@ use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{Estimates, Rollout, Trajectories};
 
-/// Proximal policy optimisation with a clipped ratio, Schulman et al. (2017), arXiv:1707.06347. An update makes `n_epochs`
-/// passes over a rollout's T·N samples. Each pass cuts them at random into `n_minibatches` parts and takes one gradient
-/// step on each; for a recurrent policy a part consists of whole environments. The loss is
+/// Proximal policy optimisation (PPO) with a clipped ratio, Schulman et al. (2017), arXiv:1707.06347. An update makes
+/// `n_epochs` passes over a rollout's T·N samples. Each pass divides them at random into `n_minibatches` minibatches,
+/// and takes one gradient step on each. For a recurrent policy, a minibatch consists of complete sequences, for example
+/// all T steps of some environments. The loss is
 ///
 /// loss = clipped surrogate - ent_coef · mean entropy + vf_coef · clipped value loss + kl_coef · mean KL(π_old ‖ π),
 ///
-/// with [`gae`]'s advantages and returns, computed once from the rollout's values. π_old is the policy that acted.
+/// where advantages and returns are those of [`gae`], computed once per update from the values that the rollout
+/// recorded. π_old is the policy that acted.
 pub struct Ppo {
     config: PpoConfig,
     optimiser: Optimiser,
@@ -25,7 +27,8 @@ pub struct Ppo {
 }
 
 impl Ppo {
-    /// Checks the settings and starts with fresh optimiser state for `policy`; `seed` fixes the order of minibatches.
+    /// Returns the algorithm with a new optimiser for the weights of `policy`. `seed` determines how minibatches are
+    /// drawn. Returns an error for an invalid setting.
     pub fn new(config: PpoConfig, policy: &Policy, seed: u64) -> Result<Self> {
         config.validate()?;
         let n_weights = policy.flat_weights().len();
@@ -103,7 +106,7 @@ impl BaseAlgorithm for Ppo {
         for _ in 0..n_epochs {
             for (batch, sequences) in &mut batches {
                 if n_minibatches > 1 {
-                    shuffle(sequences, &mut self.rng); // the order of one mean's samples does not matter
+                    shuffle(sequences, &mut self.rng); // a single minibatch needs no random order
                 }
                 for minibatch in sequences.chunks_exact(sequences.len() / n_minibatches) {
                     let Policy { weights, gradient, backend, .. } = &mut *policy;
@@ -140,11 +143,12 @@ impl BaseAlgorithm for Ppo {
 /// δ_t = r_t + γ V' - V(s_t),
 /// A_t = δ_t + γ λ c_t A_{t+1},
 ///
-/// where c_t = 0 if step t ended an episode, else 1, and A_T = 0. The returns are A_t + V(s_t).
+/// where V' is the value of the observation after step t (see [`Trajectories`]), c_t = 0 if step t ended an episode,
+/// else 1, and A_T = 0. The returns are A_t + V(s_t).
 ///
 /// # Panics
 ///
-/// If arrays have different lengths.
+/// Panics if arrays have different lengths.
 pub fn gae(trajectories: &Trajectories<'_>, gamma: f64, gae_lambda: f64, bootstrap_truncation: bool) -> Estimates {
     trajectories.backward(bootstrap_truncation, |step| {
         let delta = step.reward + gamma * step.next_value - step.value;
@@ -153,7 +157,7 @@ pub fn gae(trajectories: &Trajectories<'_>, gamma: f64, gae_lambda: f64, bootstr
     })
 }
 
-/// Refuses minibatches that do not part a rollout evenly.
+/// Returns an error if a rollout's sequences cannot be divided into equal minibatches.
 fn check_minibatches(n_minibatches: usize, n_sequences: usize) -> Result<()> {
     if n_sequences.is_multiple_of(n_minibatches) {
         return Ok(());
@@ -163,7 +167,7 @@ fn check_minibatches(n_minibatches: usize, n_sequences: usize) -> Result<()> {
     Err(SettingError { name: "n_minibatches", got, expected }.into())
 }
 
-/// Puts `indices` in random order (Fisher and Yates).
+/// Shuffles `indices` (Fisher and Yates).
 fn shuffle(indices: &mut [u32], rng: &mut ChaCha8Rng) {
     for last in (1..indices.len()).rev() {
         indices.swap(last, (uniform(rng) * (last + 1) as f64) as usize);

@@ -1,4 +1,4 @@
-//! The end of an update when the program was asked to end.
+//! Interrupts a long update when a signal asks the program to stop.
 
 use std::time::{Duration, Instant};
 
@@ -6,11 +6,11 @@ use perturb_files::interrupt::StopFlag;
 
 use crate::error::{Error, Result};
 
-/// Longest time that the rest of an update may take after the program was asked to end. A longer update is broken off, and
-/// its run can be resumed from its last checkpoint, to the same bytes.
+/// Maximum time that the rest of an update may take after a signal. A longer update is interrupted. The training can
+/// then be resumed from its last checkpoint, with the same bytes as without the interruption.
 const MAX_REMAINING: Duration = Duration::from_secs(5);
 
-/// Counts the gradient steps of an update.
+/// Counts the gradient steps of an update and estimates the time of the remaining ones.
 pub(super) struct UpdateWatch {
     stop: StopFlag,
     begun: Instant,
@@ -19,15 +19,16 @@ pub(super) struct UpdateWatch {
 }
 
 impl UpdateWatch {
-    /// Begins to watch an update of `total` gradient steps.
+    /// Starts the clock for an update of `total` gradient steps.
     pub(super) fn new(stop: &StopFlag, total: usize) -> Self {
         Self { stop: stop.clone(), begun: Instant::now(), done: 0, total }
     }
 
-    /// Counts a gradient step.
+    /// Counts one finished gradient step.
     ///
     /// # Errors
-    /// [`Error::Stopped`] if the program was asked to end and the update would take longer than [`MAX_REMAINING`].
+    /// [`Error::Stopped`] if the stop flag is raised and the rest of the update would take longer than
+    /// [`MAX_REMAINING`].
     pub(super) fn step(&mut self) -> Result<()> {
         self.done += 1;
         let Some(signal) = self.stop.signal() else { return Ok(()) };

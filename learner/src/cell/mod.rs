@@ -1,4 +1,4 @@
-//! Runs cells of an experiment: train, test, write the result.
+//! Runs cells of an experiment: trains, tests, and writes the results.
 
 mod result;
 
@@ -20,10 +20,10 @@ use crate::training::{
     RunDirectory, RunDirectoryError, Start, TrainError, TrainOutcome, TrainRequest, is_over, train_together,
 };
 
-/// The signal that a stop without a signal counts as.
+/// The signal number to report if a cell was stopped without a signal.
 const SIGTERM: i32 = 15;
 
-/// Why a cell has no result.
+/// The reason why a cell has no result.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CellError {
@@ -33,13 +33,13 @@ pub enum CellError {
     /// The test failed.
     #[error(transparent)]
     Test(#[from] TestError),
-    /// The episodes cannot be recorded.
+    /// The test episodes cannot be recorded.
     #[error(transparent)]
     Records(#[from] RecordsError),
 }
 
 impl CellError {
-    /// The cause of the failure.
+    /// Classifies the cause of the failure.
     fn fault(&self) -> Fault {
         match self {
             Self::Train(error) if error.is_server_full() => Fault::Room,
@@ -54,56 +54,58 @@ impl CellError {
     }
 }
 
-/// The cause of a failure. It decides whether the cell may have a result later.
+/// The class of a failure's cause. It decides whether the failure is recorded, and how the cell is tried again.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Fault {
-    /// A server, or the connection to it.
+    /// The server, or the connection to it.
     Server,
-    /// A server that has no room for so many environments.
+    /// The server has no room for this many environments.
     Room,
-    /// The disk.
+    /// A file could not be read or written.
     Files,
-    /// The trained policy: another attempt would fail in the same way.
+    /// The numbers of the training, for example NaN: resuming from its checkpoint would fail in the same way.
     Training,
     /// Anything else.
     Other,
 }
 
-/// A cell to run.
+/// A cell to run, with its folder.
 #[derive(Clone, Debug)]
 pub struct CellJob<'a> {
     /// The cell.
     pub cell: &'a Cell,
-    /// The folder of the cell's files.
+    /// The folder of the cell's files in the experiment's folder.
     pub folder: CellFolder,
-    /// The earlier failure that may be cleared; any other failure stays.
+    /// The recorded failure that may be deleted to try again. Any other failure stays.
     pub retry: Option<FailureId>,
 }
 
-/// A cell that is being run.
+/// A cell that this process has locked and is running.
 struct RunningCell<'a> {
     job: &'a CellJob<'a>,
     _lock: Lock,
-    /// The directory and the start of the training; `None` if the cell is trained already.
+    /// The directory of the training, and where it starts; `None` if the cell is already trained.
     training: Option<(RunDirectory, Start)>,
-    /// The result of the training; `None` if it was stopped, or has not ended.
+    /// The result of the training; `None` if it has not ended or was stopped.
     trained: Option<Result<Checkpoint, CellFailure>>,
 }
 
-/// Why a cell has no result.
+/// The reason why a cell has no result, as text, with its class.
 #[derive(Clone, Debug)]
 struct CellFailure {
     reason: String,
     fault: Fault,
 }
 
-/// Trains and tests the cells of `jobs`, which have the same environment and architecture: trains all together, and then
-/// tests one after the other. Skips cells that are done, that have another failure than the one to retry, or that another
-/// process runs. Calls `tell` with the progress of each cell, and once with its end: an event that is
-/// [last](CellEvent::is_last).
+/// Runs the cells of `jobs`, which must have the same environment and architecture: trains all of them together, and
+/// then tests one after the other.
 ///
-/// The failure of a cell is recorded in its folder, and the others go on. If one cell loses its server, the rest end with
-/// [`CellEvent::LostServer`]; `stop` interrupts all.
+/// Skips cells that are done, that another process is running, or that have a failure other than `retry`. Calls `tell`
+/// with progress events of each cell. The last call for a cell is its final event, for which [`CellEvent::is_last`] is
+/// true.
+///
+/// A failure of a cell is recorded in its folder, and the other cells continue. If one cell loses its server, the
+/// remaining cells end with [`CellEvent::LostServer`]. `stop` interrupts all cells.
 pub fn run_cells(servers: &Servers, jobs: &[CellJob<'_>], stop: &StopFlag, tell: &mut dyn FnMut(&Cell, CellEvent)) {
     let mut all = Vec::new();
     for job in jobs {
@@ -117,7 +119,8 @@ pub fn run_cells(servers: &Servers, jobs: &[CellJob<'_>], stop: &StopFlag, tell:
     if let Err(failure) = train(servers, &mut all, &places, stop, tell) {
         let left: Vec<usize> = places.iter().copied().filter(|&place| all[place].trained.is_none()).collect();
         for place in left.into_iter().take_while(|_| stop.signal().is_none()) {
-            // A cell that is refused must not stop the others, nor must a server that has no room for all at once.
+            // One faulty cell, or a server without room for all cells at once, must not stop the others. So each cell
+            // is trained alone.
             let alone = if places.len() == 1 || failure.fault == Fault::Server {
                 Err(failure.clone())
             } else {
@@ -128,7 +131,7 @@ pub fn run_cells(servers: &Servers, jobs: &[CellJob<'_>], stop: &StopFlag, tell:
             }
         }
     }
-    // Seconds per cell: all were trained at the same time.
+    // The cells share the training time equally, because they were trained together.
     let share = begun.elapsed().as_secs_f64() / places.len().max(1) as f64;
     let mut lost = None;
     for work in all {
@@ -145,10 +148,10 @@ pub fn run_cells(servers: &Servers, jobs: &[CellJob<'_>], stop: &StopFlag, tell:
     }
 }
 
-/// Trains the cells in `places` together.
+/// Trains the cells with the indices `places` in `all` together, and stores each result in its cell.
 ///
 /// # Errors
-/// The failure that ended all cells that had not ended.
+/// A failure that interrupted the training of all cells that had not ended.
 fn train(
     servers: &Servers,
     all: &mut [RunningCell<'_>],
@@ -188,8 +191,8 @@ fn train(
 }
 
 impl<'a> RunningCell<'a> {
-    /// Locks the cell. The error is the cell's last event, if it is not to be run: it is done, failed earlier, or is locked
-    /// by another process.
+    /// Locks the cell and prepares its training. The error is the final event of a cell that must not be run: it is
+    /// done, has failed earlier, or is locked by another process.
     fn lock(job: &'a CellJob<'a>, tell: &mut dyn FnMut(&Cell, CellEvent)) -> Result<Self, CellEvent> {
         let CellJob { folder, retry, .. } = job;
         let Some(lock) = folder.try_lock().map_err(failed)? else { return Err(CellEvent::Busy) };
@@ -209,10 +212,10 @@ impl<'a> RunningCell<'a> {
         Ok(work)
     }
 
-    /// Recovers a training that was interrupted. The policy of a finished training is only tested. An unfinished
-    /// training is resumed from its last checkpoint, to the same bytes as without the break. A training begins again if
-    /// it has no usable checkpoint, if the plan's settings changed, or if an intermediate policy that the tests need is
-    /// missing.
+    /// Finds out how to continue the cell's training. If the training has finished, its policy only needs tests. An
+    /// unfinished training resumes from its last checkpoint, with the same bytes as without the interruption. The
+    /// training restarts if it has no usable checkpoint, if the plan's settings have changed, or if an intermediate
+    /// policy that the tests need is missing.
     fn recover(&mut self, tell: &mut dyn FnMut(&Cell, CellEvent)) -> Result<(), RunDirectoryError> {
         let Cell { config, tests, .. } = self.job.cell;
         let path = self.job.folder.training();
@@ -240,16 +243,17 @@ impl<'a> RunningCell<'a> {
         Ok(())
     }
 
-    /// Recovers the training after an attempt that may have left a checkpoint.
+    /// Prepares another attempt at the training after a failed one, which may have left a checkpoint.
     fn recover_after_failure(&mut self, tell: &mut dyn FnMut(&Cell, CellEvent)) -> Result<(), CellFailure> {
-        self.training = None; // it holds the directory's lock, which `recover` needs
+        self.training = None; // releases the directory's lock, which `recover` takes again
         self.recover(tell).map_err(|error| CellError::from(TrainError::from(error)).into())
     }
 
-    /// Tests the policy, whose training took `seconds`, and writes the result. Returns the cell's last event.
+    /// Tests the trained policy and writes the result of the cell. `seconds` is the duration of the training. Returns
+    /// the cell's final event.
     ///
     /// # Errors
-    /// [`FolderError`]: the folder cannot be read or written. Other failures are recorded in the folder.
+    /// [`FolderError`] if the cell's folder cannot be read or written. Other failures are recorded in the folder.
     fn end(
         self,
         servers: &Servers,
@@ -270,7 +274,7 @@ impl<'a> RunningCell<'a> {
         match (tested, stop.signal()) {
             (Ok(Some(result)), _) => {
                 folder.write_timing(&Timing { seconds })?;
-                folder.write_result(&result)?; // last: a reader who sees it may read everything else
+                folder.write_result(&result)?; // last, because its presence means that all other files are complete
                 Ok(CellEvent::Done)
             }
             (Ok(None), signal) => Ok(CellEvent::Stopped { signal: signal.unwrap_or(SIGTERM) }),
@@ -281,7 +285,7 @@ impl<'a> RunningCell<'a> {
             }
             (Err(CellFailure { reason, fault: Fault::Files }), None) => Ok(CellEvent::FileFault { reason }),
             (Err(CellFailure { reason, fault }), None) => {
-                // Without the folder's path, so that equal failures have equal texts.
+                // Removes the folder's path, so that the same failure has the same text in every folder.
                 let reason = reason.replace(&format!("{}/", folder.path().display()), "");
                 let commit = perturb_experiment::VERSION.into();
                 let requires_restart = fault == Fault::Training;
@@ -299,7 +303,7 @@ impl From<CellError> for CellFailure {
     }
 }
 
-/// The last event of a cell whose folder cannot be read or written.
+/// Returns the final event of a cell whose folder cannot be read or written.
 fn failed(error: impl Into<FolderError>) -> CellEvent {
     let error = error.into();
     let reason = error.to_string();
@@ -309,10 +313,11 @@ fn failed(error: impl Into<FolderError>) -> CellEvent {
     }
 }
 
-/// The last checkpoint of a training that was interrupted; `None` if nothing can be resumed.
+/// Reads the last checkpoint of an earlier attempt at the training. Returns `None` if there is nothing to resume.
 ///
 /// # Errors
-/// A failure that may pass, e.g. a lock of another process. The training may be resumed later, so nothing is changed.
+/// A failure that may be temporary, for example the lock of another process. The training may be resumable later, so
+/// nothing is changed.
 fn earlier(directory: &Path) -> Result<Option<(RunDirectory, Checkpoint, ResumeState)>, RunDirectoryError> {
     match RunDirectory::resume(directory) {
         Ok(earlier) => Ok(Some(earlier)),

@@ -1,4 +1,4 @@
-//! The result of a cell: tests of its policy, and the description of the training.
+//! Makes the result of a cell: tests its policies, and describes its training.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -17,10 +17,11 @@ use crate::client::Servers;
 use crate::evaluation::{TestError, TestOptions, Tester};
 use crate::training::{TrainError, mark_in};
 
-/// The commit of a training whose checkpoint does not name one.
+/// The program version to record if a checkpoint does not name one.
 const UNKNOWN: &str = "unknown";
 
-/// Tests the policy that was trained for `cell`, and records the episodes in `folder`; `None` if the stop flag was raised.
+/// Tests the final and the intermediate policies of `cell`, and records the test episodes in `folder`. Returns the
+/// cell's result, or `None` if the stop flag was raised.
 pub(super) fn tested(
     servers: &Servers,
     cell: &Cell,
@@ -88,13 +89,13 @@ pub(super) fn tested(
     }))
 }
 
-/// The figures of each test, by the name of its set.
+/// Returns the result of each test, by the name of its set.
 fn results(records: &Records) -> BTreeMap<String, TestResult> {
     let result = |test: &RecordedTest| (test.set.name.clone(), records.result(&test.set.name, None));
     records.about.tests.iter().map(result).collect()
 }
 
-/// The commits of the programs that trained before this one.
+/// Returns the versions of all other programs that did a part of the training.
 fn earlier_commits(mut commits: Vec<String>) -> Vec<String> {
     if commits.is_empty() {
         return vec![UNKNOWN.into()];
@@ -103,7 +104,7 @@ fn earlier_commits(mut commits: Vec<String>) -> Vec<String> {
     commits
 }
 
-/// Parameters as arguments of `--parameters`.
+/// Formats parameters as arguments of the option `--parameters`.
 fn parameters(parameters: &Parameters) -> String {
     let written = |values: &Distribution| match serde_json::to_value(values) {
         Ok(serde_json::Value::String(text)) => text,
@@ -113,8 +114,8 @@ fn parameters(parameters: &Parameters) -> String {
     texts.collect::<Vec<_>>().join(" ")
 }
 
-/// The command that reproduces a cell's numbers without the plan. RUN stands for the folder of the run. TASK stands for
-/// the folder of the task; a built-in environment needs none.
+/// Returns the shell command that reproduces a cell's result without the plan. RUN stands for the output folder, and
+/// TASK for the folder of a task that is not built in.
 fn command(cell: &Cell) -> String {
     let common = &cell.config.common;
     let mut text = format!(
@@ -145,7 +146,7 @@ fn command(cell: &Cell) -> String {
     if !versions.is_empty() {
         evaluate(format!("--versions {}", versions.join(",")), *episodes);
     }
-    // A set of listed contexts has no command: only the recorded episodes hold them.
+    // Sets of listed contexts have no command, because the command line cannot list contexts.
     let own = |set: &TestSet| format!("--parameters {} --base-version {}", parameters(&set.drawn()), set.version);
     for set in sets.iter().filter(|set| set.plain().is_none() && !set.drawn().is_empty()) {
         evaluate(own(set), *episodes);

@@ -1,7 +1,8 @@
-//! [Checkpoints](perturb_checkpoint) with everything that a training needs, in addition to its policy, to be resumed
-//! exactly.
+//! Saves and loads the state from which a training resumes exactly. It is stored together with the policy's
+//! [checkpoint](perturb_checkpoint).
 //!
-//! Large arrays are in a file of their own, which a test does not read; the rest is `resume` in `checkpoint.json`.
+//! Large arrays are in a separate file, so that tests of the policy need not read them. The rest is the field `resume`
+//! in `checkpoint.json`.
 
 #[cfg(test)]
 mod tests;
@@ -19,49 +20,52 @@ use crate::logging::{EpisodeFigures, LogLengths, TimeShares};
 use crate::rollout::CollectorState;
 pub use perturb_checkpoint::{Changed, Checkpoint, CheckpointError, EnvironmentSummary, State, find_policy};
 
-/// The state of a training between two iterations, without the parts that a [`Checkpoint`] holds.
+/// The state of a training between two iterations, apart from the policy and the counters, which are in the
+/// [`Checkpoint`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct ResumeState {
-    /// Snapshots of the environments, and the player's state: observations, recurrent memory and the random stream of
-    /// actions.
+    /// Snapshots of the environments, and the player's state: observations, recurrent memory, and the random stream
+    /// that draws actions.
     pub collector: CollectorState,
-    /// The optimiser's averages and the random stream of minibatch orders.
+    /// The algorithm's state: the optimiser's averages, and the random stream that draws minibatches.
     pub algorithm: AlgorithmState,
-    /// The figures of the run so far.
+    /// Statistics of the whole run so far.
     pub history: History,
 }
 
-/// Figures of the whole run so far, which the last iteration alone does not have.
+/// Statistics of the whole run so far, which the logs and the stopping rule need.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct History {
-    /// The last episodes, oldest first.
+    /// Figures of the most recent episodes, oldest first.
     pub recent: Vec<EpisodeFigures>,
-    /// Seconds of training.
+    /// Seconds of training so far.
     pub elapsed: f64,
-    /// Seconds by activity. Format 1 has no names here, nor in `recent`.
+    /// Seconds by activity. In format 1 of checkpoints, this and the entries of `recent` were JSON arrays without field
+    /// names, and are still read.
     pub shares: TimeShares,
-    /// The lengths of the logs.
+    /// The lengths of the log files, to which a resumed training cuts them.
     pub logs: LogLengths,
 }
 
-/// `resume` in `checkpoint.json`.
+/// The content of the field `resume` in `checkpoint.json`.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ResumeDocument {
     arrays: ArraysFile,
-    /// The algorithm's state; the data of its arrays are in the file of arrays.
+    /// The algorithm's state, without the data of its arrays, which are in the separate file.
     algorithm: AlgorithmState,
-    /// The random stream of actions.
+    /// The random stream that draws actions.
     actions: ChaCha8Rng,
     history: History,
 }
 
 impl ResumeState {
-    /// Saves `checkpoint` together with this state. Replaces the checkpoint in `directory`, see [`Checkpoint::save`].
+    /// Saves `checkpoint` together with this state. Replaces an earlier checkpoint in `directory`, see
+    /// [`Checkpoint::save`].
     ///
     /// # Errors
-    /// [`CheckpointError::File`]; the earlier checkpoint, if any, is then still there.
+    /// [`CheckpointError::File`] if a file cannot be written. An earlier checkpoint then stays intact.
     pub fn save(&self, checkpoint: &Checkpoint, directory: &Path) -> Result<()> {
         let content = self.encode().map_err(|reason| damaged(directory, reason))?;
         let arrays = ArraysFile::write(directory, RESUME_PREFIX, checkpoint.state.counters.iterations, &content)?;
@@ -74,10 +78,10 @@ impl ResumeState {
         checkpoint.save(directory, Some(Resume { arrays, document }))
     }
 
-    /// Reads the checkpoint in `path`, or in its folder `checkpoint`, with the state of its training.
+    /// Reads the checkpoint in the folder `path`, or in its subfolder `checkpoint`, with the state of its training.
     ///
     /// # Errors
-    /// [`CheckpointError`], which names the file.
+    /// [`CheckpointError`], which names the faulty file.
     pub fn load(path: &Path) -> Result<(Checkpoint, Self)> {
         let (checkpoint, directory, document) = Checkpoint::load_resumable(path)?;
         let not_understood =
@@ -110,7 +114,8 @@ impl ResumeState {
 }
 
 impl ResumeDocument {
-    /// Adds the arrays, read from `content`, the bytes of the file of arrays.
+    /// Combines the document with the arrays in `content`, the bytes of the separate file. The error is the fault of
+    /// that file.
     fn complete(mut self, content: &[u8]) -> std::result::Result<ResumeState, String> {
         let arrays = Arrays::decode(content)?;
         for array in &mut self.algorithm.optimiser {
@@ -129,12 +134,12 @@ impl ResumeDocument {
     }
 }
 
-/// The name of an optimiser's array in the file.
+/// Returns the name, in the file of arrays, of one of the optimiser's arrays.
 fn optimiser(name: &str) -> String {
     format!("optimiser.{name}")
 }
 
-/// Cuts `bytes` into pieces of these `lengths`.
+/// Divides `bytes` into successive pieces with these `lengths`, which must add up to its length.
 fn cut(bytes: &[u8], lengths: &[u64]) -> std::result::Result<Vec<Bytes>, String> {
     let mut rest = Bytes::copy_from_slice(bytes);
     let mut pieces = Vec::with_capacity(lengths.len());

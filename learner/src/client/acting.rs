@@ -1,4 +1,4 @@
-//! Requests by which servers choose the actions of a policy themselves, and the rollouts that they return.
+//! Lets servers play a policy: they choose the actions themselves and return whole rollouts.
 
 use std::io::ErrorKind;
 use std::ops::Range;
@@ -11,22 +11,24 @@ use super::session::Session;
 use super::shard::ServerShard;
 use crate::proto;
 
-/// A reply with steps that one server played in all its environments, and the episodes that ended in them.
+/// A server's reply with the T steps that it played in each of its N environments, and the episodes that ended
+/// meanwhile.
 #[derive(Clone, Debug, Default)]
 pub struct RolloutReply {
-    /// The steps as the protocol encodes them, `[T, N, …]`.
+    /// The steps in the protocol's encoding, as arrays `[T, N, …]`.
     pub acted: proto::Acted,
-    /// The ended episodes with their steps, 0 … T-1, in order of steps and slots.
+    /// The ended episodes, each with the index of its last step (0 … T-1), ordered by step, then by slot.
     pub ended: Vec<(usize, EndedEpisode)>,
 }
 
 impl Session<'_> {
-    /// Lets servers play at the same time. `request` makes the request for the slots of a server, if there is one. `take` gets
-    /// the slots and the reply.
+    /// Lets all servers of the session play at the same time. `request` returns the request for a server's range of
+    /// slots, or `None` to skip this server. `take` receives the range and the server's reply. An error of `take` says
+    /// what is wrong with the reply.
     ///
     /// # Errors
-    /// [`ClientError::Refused`] with the server's sentence; [`ClientError::Protocol`] if the reply does not fit; the
-    /// failures of a connection.
+    /// [`ClientError::Refused`] with the server's message, [`ClientError::Protocol`] for a malformed reply, and
+    /// connection failures.
     pub fn play(
         &mut self,
         mut request: impl FnMut(Range<usize>) -> Option<proto::Act>,
@@ -41,23 +43,23 @@ impl Session<'_> {
         )
     }
 
-    /// Asks the one server of a batch that is [played as a whole](Session::plays_together) to play. Does not wait for the
-    /// reply; [`Session::played`] does.
+    /// Asks the only server of the session to play, and returns without waiting for the reply. [`Session::played`]
+    /// receives the reply. Must be called only if [`Session::plays_together`] is true.
     ///
     /// # Errors
-    /// The failures of a connection.
+    /// Connection failures, and [`ClientError::System`] if the session has several servers.
     pub fn ask_to_play(&mut self, act: proto::Act) -> Result<(), ClientError> {
         let Self { servers, parts, .. } = self;
         let [part] = parts.as_mut_slice() else { return Err(not_played_together()) };
         servers.wait_for(async {
             part.stream.send(act).await?;
-            // Lets the task that drives the connection run before the caller computes for long.
+            // Lets the task that drives the connection send the request before the caller computes for a long time.
             tokio::task::yield_now().await;
             Ok(())
         })
     }
 
-    /// Waits for the reply to [`Session::ask_to_play`].
+    /// Receives the reply to [`Session::ask_to_play`].
     ///
     /// # Errors
     /// The errors of [`Session::play`].
@@ -68,12 +70,13 @@ impl Session<'_> {
         part.played(acted)
     }
 
-    /// The error for a reply to [`Session::played`] that does not fit.
+    /// Returns the error for a malformed reply that [`Session::played`] received. `got` says what is wrong.
     pub fn malformed_rollout(&self, got: String) -> ClientError {
         self.parts.first().map_or_else(not_played_together, |part| part.malformed_rollout(got))
     }
 
-    /// The player's state and statistics at the server; `None` if the batch is not on one server.
+    /// Asks the server for its player's state and normalisers. Returns `None` if the session is spread over several
+    /// servers.
     ///
     /// # Errors
     /// The errors of [`Session::play`].
@@ -104,7 +107,7 @@ impl ServerShard {
         self.stream.mismatch::<proto::Act>(got, "arrays as the protocol describes them".into())
     }
 
-    /// Converts the episodes that ended in a reply, with their slots counted over the whole batch.
+    /// Converts the ended episodes of a reply. Their slots become slots of the whole batch.
     fn played(&self, mut acted: proto::Acted) -> Result<RolloutReply, ClientError> {
         let mut ended = Vec::with_capacity(acted.ended.len());
         for proto::EndedAt { step, end, terminated, .. } in std::mem::take(&mut acted.ended) {
@@ -122,7 +125,8 @@ impl ServerShard {
     }
 }
 
-/// The message by which a server starts to play from the state of `player`.
+/// Returns the message that lets a server continue from the state of `player`: shape of the policy, normalisers, random
+/// streams, observations and memory. It has no weights.
 pub fn policy(spec: &PolicySpec, player: &Player) -> proto::Policy {
     let Normalisers { observations, rewards } = player.normalisers();
     proto::Policy {
@@ -139,7 +143,7 @@ pub fn policy(spec: &PolicySpec, player: &Player) -> proto::Policy {
     }
 }
 
-/// The policy of a test as one of several servers gets it, for its own `n_envs` environments.
+/// Returns a test's `policy` message for one of several servers, which has `n_envs` environments of the batch.
 pub fn for_server(policy: &proto::Policy, n_envs: usize) -> proto::Policy {
     let mut policy = policy.clone();
     if let Some(rewards) = &mut policy.rewards {
@@ -148,9 +152,8 @@ pub fn for_server(policy: &proto::Policy, n_envs: usize) -> proto::Policy {
     policy
 }
 
-/// Reads a player that a server saved. `observation_size` is the session's O; statistics of fewer entries leave the last
-/// ones as they are.
-/// The error names the field that is wrong.
+/// Parses the state of a server's player. `observation_size` is the session's O. If the normaliser has fewer entries,
+/// the last entries of observations are not normalised. The error names the invalid field.
 fn saved_player(saved: &proto::PlayerSaved, observation_size: usize) -> Result<(PlayerState, Normalisers), String> {
     let (Some(actions), Some(state)) = (&saved.actions, &saved.state) else {
         return Err("state or stream of actions is missing".into());

@@ -1,4 +1,4 @@
-//! Reconnects to servers that were lost.
+//! Reconnects to lost servers, with growing pauses between attempts.
 
 use std::time::{Duration, Instant};
 
@@ -10,44 +10,44 @@ use tokio::time::sleep;
 use super::options::ServerWait;
 use super::servers::Servers;
 
-/// Pause between the first attempt, which is immediate, and the second. The pause doubles with each attempt.
+/// Pause before the second attempt; the first one is immediate. The pause doubles with each further attempt.
 const MIN_PAUSE: Duration = Duration::from_millis(100);
-/// Upper limit of the pause between two attempts.
+/// Maximum pause between two attempts.
 const MAX_PAUSE: Duration = Duration::from_secs(10);
-/// Time after which the servers that answer go on without the others.
+/// Time after which the run continues with the servers that answer, without the others.
 const PARTIAL_RECONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Reconnects with growing pauses, and counts the time that was waited without progress.
+/// Reconnects to lost servers with growing pauses, and counts the time spent waiting since the last progress.
 #[derive(Debug, Default)]
 pub struct Backoff {
     waited: Duration,
     attempts: u32,
-    /// Whether any progress was made. Then the servers had room at least once, so that a full server may have room again.
+    /// Whether the run has made any progress. The servers then had room once, so a full server may have room again.
     has_begun: bool,
 }
 
 /// The result of [`Backoff::reconnect`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reconnect {
-    /// Servers answer again.
+    /// At least one server answers again.
     Connected,
-    /// The error is not one that passes, or the time is up.
+    /// The error is permanent, or the time limit is reached.
     TimedOut,
-    /// The program was asked to end.
+    /// A signal asked the program to stop.
     Stopped {
-        /// The signal.
+        /// The signal's number.
         signal: i32,
     },
 }
 
 impl Backoff {
-    /// Progress was made: the next loss gets the whole wait again.
+    /// Records that the run made progress: the next loss of a server gets the full time limit again.
     pub fn reset(&mut self) {
         *self = Self { has_begun: true, ..Self::default() };
     }
 
-    /// Waits for the servers after `error`, as long as [`ServerWait`] says: for all of them for some seconds, then for any.
-    /// Also waits for a server that is full if the run had already started.
+    /// Reconnects after `error`, within the time limit of [`ServerWait`]. First waits some seconds for all servers,
+    /// then continues with those that answer. A full server counts as lost only if the run had already started.
     pub fn reconnect(&mut self, servers: &Servers, error: &ClientError, stop: &StopFlag) -> Reconnect {
         let ServerWait { limit, tell } = servers.wait();
         if let Some(signal) = stop.signal() {
@@ -68,7 +68,8 @@ impl Backoff {
         })
     }
 
-    /// Whether the error may pass: a server that does not answer, or one that is full although it had room before.
+    /// Returns whether the error may be temporary: the server does not answer, or it is full although it had room
+    /// before.
     fn is_passing(&self, error: &ClientError) -> bool {
         error.is_absence() || ((self.attempts > 0 || self.has_begun) && is_full(error))
     }
@@ -100,13 +101,13 @@ impl Backoff {
     }
 }
 
-/// The pause before the next attempt.
+/// Returns the pause before the next attempt, after this number of `attempts`.
 fn pause(attempts: u32) -> Duration {
     let doubled = |times: u32| MIN_PAUSE * (1 << times.min(16));
     attempts.checked_sub(1).map_or(Duration::ZERO, doubled).min(MAX_PAUSE)
 }
 
-/// Whether the error says that a server has no room.
+/// Returns whether the error is that a server has no room for more environments.
 fn is_full(error: &ClientError) -> bool {
     let (ClientError::Refused { code, .. } | ClientError::Lost { code, .. }) = error else { return false };
     *code == tonic::Code::ResourceExhausted

@@ -1,9 +1,10 @@
-//! Environments over gRPC.
+//! The client of the simulation servers: environments over gRPC.
 //!
-//! [`Servers`] holds the connections, [`Session`] a batch of environments that may be spread over them, [`PrivateServer`]
-//! a server of the learner's own, [`RenderSession`] one environment to be rendered. The interface is blocking: a
-//! single-threaded tokio runtime inside [`Servers`] runs on the caller's thread while a call waits. Another thread would
-//! double a step's latency. Wrap long computations between two calls in [`Servers::keep_alive_during`].
+//! [`Servers`] holds the connections. [`Session`] is a batch of environments that may be spread over several servers.
+//! [`PrivateServer`] is a server process that the learner starts for itself. [`RenderSession`] is a single environment
+//! to be rendered. All calls block: a single-threaded tokio runtime inside [`Servers`] runs on the caller's thread
+//! while a call waits. A separate thread would double the latency of a step. Wrap long computations between two calls
+//! in [`Servers::keep_alive_during`].
 
 pub mod acting;
 mod backoff;

@@ -1,4 +1,4 @@
-//! Options of sessions: the environments to open, the place where actions are chosen, and the wait for lost servers.
+//! Options of sessions: the environments to open, where actions are chosen, and how long to wait for lost servers.
 
 use std::ops::Range;
 use std::time::Duration;
@@ -9,43 +9,44 @@ use perturb_settings::sets::Parameters;
 
 use crate::proto::AutoresetMode;
 
-/// The environments of one training or test.
+/// Describes the environments of one training or test.
 #[derive(Clone, Debug)]
 pub struct OpenOptions {
-    /// A name from the catalogue.
+    /// The environment's name in the catalogue.
     pub environment: String,
-    /// The version whose distributions parameters are drawn from.
+    /// The version whose distributions the parameters are drawn from.
     pub version: Version,
-    /// Distributions that replace the version's, by parameter.
+    /// Distributions that replace the version's, by parameter name.
     pub parameters: Parameters,
     /// N, the number of environments, at least 1.
     pub num_envs: usize,
-    /// Fixes all randomness of the environments.
+    /// The seed of the environments. With the environment's index it determines all their random numbers.
     pub seed: u64,
-    /// Episodes in a trial.
+    /// Number of episodes in a trial. Parameters are drawn once per trial.
     pub episodes_per_trial: u32,
-    /// The content of observations; the same in all options of a session.
+    /// The content of observations: the state, or also the parameters. Must be the same in all options of a session.
     pub observe: Observe,
 }
 
-/// The place where actions of trainings and tests are chosen. It changes no byte.
+/// The place where the actions of trainings and tests are chosen. It affects only speed: all results are the same to
+/// the byte.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ActorLocation {
-    /// At the server if it can: the network's delay is then paid once a rollout, not at each step. Trainings over
-    /// several servers, groups of trainings with [short](perturb_settings::CollectionMode) rollouts, and trainings with
-    /// observation noise choose their actions at the client in any case.
+    /// In the server, if it supports this. The network's latency then occurs once per rollout, not at each step. Some
+    /// trainings always choose actions in the client: trainings over several servers, groups of trainings with
+    /// [short](perturb_settings::CollectionMode) rollouts, and trainings with observation noise.
     #[default]
     Server,
-    /// At the client.
+    /// In the client.
     Client,
 }
 
-/// The wait for lost servers.
+/// Settings for waiting for lost servers.
 #[derive(Clone, Copy, Debug)]
 pub struct ServerWait {
-    /// The longest wait without progress; zero does not wait at all.
+    /// Maximum time to wait without progress of the run; zero for no waiting.
     pub limit: Duration,
-    /// Gets a sentence on each wait.
+    /// Receives a sentence for the user at the start of each wait.
     pub tell: fn(&str),
 }
 
@@ -55,9 +56,10 @@ impl Default for ServerWait {
     }
 }
 
-/// The request for the slots of `range`, counted over all `options`; `None` if an index is beyond what the protocol can
-/// number. The slots of a single option are requested in the form that older servers understand, too. `lease` is the
-/// protocol's field.
+/// Returns the request that opens the slots of `range`. Slots are numbered over all `options` together. Slots of a
+/// single option are requested in the form that older servers also understand. `lease` is the protocol's field: the
+/// maximum number of unanswered requests of a leased session, or 0. Returns `None` if an index exceeds the protocol's
+/// 32 bits.
 pub(super) fn open_request(
     options: &[OpenOptions],
     range: Range<usize>,
@@ -93,7 +95,7 @@ pub(super) fn open_request(
 }
 
 impl OpenOptions {
-    /// `size` slots from `first` on.
+    /// Returns the group of `size` environments of this option, starting with environment `first`.
     fn group(&self, first: usize, size: usize) -> Option<proto::SlotGroup> {
         Some(proto::SlotGroup {
             size: u32::try_from(size).ok()?,

@@ -1,4 +1,4 @@
-//! A session of one environment that is rendered.
+//! A session with a single environment, for rendering pictures.
 
 use tonic::Code;
 
@@ -10,34 +10,35 @@ use super::servers::Servers;
 use super::shard::ServerShard;
 use crate::proto::{self, AutoresetMode};
 
-/// The start of an episode.
+/// Describes an episode that has just started.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct BegunEpisode {
-    /// Counts the environment's episodes from 0.
+    /// The index of the episode in its environment, from 0.
     pub episode_index: u64,
-    /// Counts the environment's trials from 0.
+    /// The index of the trial in its environment, from 0.
     pub trial_index: u64,
-    /// Counts the trial's episodes from 0.
+    /// The index of the episode in its trial, from 0.
     pub episode_in_trial: u32,
-    /// The parameters, in the catalogue's order.
+    /// The values of all parameters, in the catalogue's order.
     pub parameters: Vec<f64>,
 }
 
 /// A rendered picture of an environment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RenderedPicture {
-    /// Pixels.
+    /// Width in pixels.
     pub width: u32,
-    /// Pixels.
+    /// Height in pixels.
     pub height: u32,
-    /// `[height, width, 3]`: red, green, blue; the first row is the uppermost.
+    /// The pixels `[height, width, 3]`, with one byte each for red, green and blue. The first row is the top row.
     pub pixels: bytes::Bytes,
 }
 
-/// A session of one environment that waits at the end of an episode, so that its last state can be rendered.
+/// A session with a single environment, for rendering pictures. After the end of an episode the environment waits for a
+/// reset, so that the last state can be rendered.
 ///
-/// Requests and replies are separate calls: a server renders while the learner computes. Replies must be taken in the order
-/// of their requests, and at most three requests may wait for theirs.
+/// Requests and replies are separate calls, so that the server can render while the learner computes. Receive replies
+/// in the order of their requests. At most three requests may be unanswered at a time.
 #[derive(Debug)]
 pub struct RenderSession<'a> {
     servers: &'a Servers,
@@ -47,10 +48,10 @@ pub struct RenderSession<'a> {
 }
 
 impl<'a> RenderSession<'a> {
-    /// Opens one environment on the first server, whatever `options.num_envs` is, and writes its first observation `[O]`.
+    /// Opens one environment on the first server, and writes its first observation `[O]`. Ignores `options.num_envs`.
     ///
     /// # Errors
-    /// [`ClientError::Refused`] with the server's sentence, and the failures of a connection.
+    /// [`ClientError::Refused`] with the server's message, and connection failures.
     pub fn open(
         servers: &'a Servers,
         options: &OpenOptions,
@@ -71,42 +72,42 @@ impl<'a> RenderSession<'a> {
         Ok((single, begun))
     }
 
-    /// The environment, as the server describes it.
+    /// Returns the environment's description from the server.
     pub fn environment(&self) -> &proto::Environment {
         &self.environment
     }
 
-    /// Asks for a step with an action, encoded for the protocol: i32, or f32 `[A]`.
+    /// Requests a step. `action` is encoded as in the protocol: an i32, or f32 `[A]`.
     ///
     /// # Errors
-    /// The failures of a connection, as of all requests.
+    /// Connection failures.
     pub fn request_step(&mut self, action: &[u8]) -> Result<(), ClientError> {
         let actions = bytes::Bytes::copy_from_slice(action);
         self.request(proto::Step { actions })
     }
 
-    /// Asks for the next episode. It belongs to the same trial, unless the trial has ended.
+    /// Requests the next episode. It belongs to the same trial unless the trial has ended.
     ///
     /// # Errors
-    /// The failures of a connection.
+    /// Connection failures.
     pub fn request_reset(&mut self) -> Result<(), ClientError> {
         self.request(proto::Reset::default())
     }
 
-    /// Asks for a picture of `width` × `height` pixels of the state after all earlier requests.
+    /// Requests a picture, `width` × `height` pixels large, of the state after all earlier requests.
     ///
     /// # Errors
-    /// The failures of a connection.
+    /// Connection failures.
     pub fn request_picture(&mut self, width: u32, height: u32) -> Result<(), ClientError> {
         self.size = (width, height);
         self.request(proto::Render { slot: 0, width, height })
     }
 
-    /// Takes the answer to [`Self::request_step`] and replaces the content of `reply`, whose N is 1. After the end of an
-    /// episode, `observations` is the episode's last one.
+    /// Receives the reply to [`Self::request_step`] into `reply`, whose N is 1. If the episode ended, `observations` is
+    /// its last observation.
     ///
     /// # Errors
-    /// [`ClientError::Refused`] if the action is wrong, and the failures of a connection.
+    /// [`ClientError::Refused`] if the action is invalid, and connection failures.
     pub fn stepped(&mut self, reply: &mut StepReply) -> Result<(), ClientError> {
         let size = self.environment.observation.len();
         reply.resize(1, size);
@@ -114,26 +115,26 @@ impl<'a> RenderSession<'a> {
         self.part.store(stepped, size, reply)
     }
 
-    /// Takes the answer to [`Self::request_reset`], and writes the first observation `[O]`.
+    /// Receives the reply to [`Self::request_reset`], and writes the first observation `[O]` of the episode.
     ///
     /// # Errors
-    /// The failures of a connection.
+    /// Connection failures.
     pub fn begun(&mut self, observation: &mut [f32]) -> Result<BegunEpisode, ClientError> {
         let done = self.reply::<proto::Reset>()?;
         self.part.stream.decode::<proto::Reset>("observations", &done.observations, observation)?;
         self.begun_of::<proto::Reset>(done.started)
     }
 
-    /// Takes the answer to [`Self::request_picture`].
+    /// Receives the reply to [`Self::request_picture`].
     ///
     /// # Errors
-    /// [`ClientError::Refused`] with the server's sentence if it cannot draw, and the failures of a connection.
+    /// [`ClientError::Refused`] with the server's message if it cannot render, and connection failures.
     pub fn picture(&mut self) -> Result<RenderedPicture, ClientError> {
         let (width, height) = self.size;
         let rendered = match self.reply::<proto::Render>() {
             Ok(rendered) => rendered,
-            // Sizes were checked before they were sent, so a server that refuses the request does not know this kind of
-            // request.
+            // The size was checked before it was sent. A server that still refuses the request probably does not know
+            // this kind of request.
             Err(ClientError::Refused { address, request, code, message }) if code == Code::InvalidArgument => {
                 let message = format!("{message}; is the server older than this program?");
                 return Err(ClientError::Refused { address, request, code, message });

@@ -1,53 +1,53 @@
-//! The reply to a step.
+//! The reply to a step of a batch.
 
 use std::ops::Range;
 
 use perturb_policy::{SlotEnd, StepOutcome};
 use perturb_protocol::EndedEpisode;
 
-/// The reply to a step. Its buffers are reused.
+/// The reply to a step of N environments. Reuse the same value for all steps, so that its buffers are allocated once.
 #[derive(Clone, Debug, Default)]
 pub struct StepReply {
-    /// `[N, O]` observations; where an episode ended, the first one of the next.
+    /// Observations `[N, O]`. For an environment whose episode ended, the first observation of its next episode.
     pub observations: Vec<f32>,
-    /// `[N]` rewards.
+    /// Rewards `[N]`.
     pub rewards: Vec<f32>,
-    /// `[N]` whether the task ended the episode.
+    /// Whether the task ended the episode, `[N]`.
     pub terminated: Vec<bool>,
-    /// `[N]` whether the step limit ended the episode.
+    /// Whether the step limit ended the episode, `[N]`.
     pub truncated: Vec<bool>,
-    /// `[K, O]` last observations of the episodes that ended, in the order of `ended`.
+    /// Last observations `[K, O]` of the K ended episodes, in the order of `ended`.
     pub final_observations: Vec<f32>,
-    /// The K episodes that ended, in order of slots.
+    /// The K ended episodes, ordered by slot.
     pub ended: Vec<EndedEpisode>,
 }
 
-/// The reply to a step for successive slots: the fields of [`StepReply`].
+/// The part of a [`StepReply`] for n successive slots.
 #[derive(Clone, Copy, Debug)]
 pub struct StepSlice<'a> {
-    /// The first of the slots.
+    /// The number of the first slot in the whole batch.
     pub first_slot: usize,
-    /// `[n, O]` observations of the n slots.
+    /// Observations `[n, O]`.
     pub observations: &'a [f32],
-    /// `[n]` rewards.
+    /// Rewards `[n]`.
     pub rewards: &'a [f32],
-    /// `[n]` whether the task ended the episode.
+    /// Whether the task ended the episode, `[n]`.
     pub terminated: &'a [bool],
-    /// `[n]` whether the step limit ended the episode.
+    /// Whether the step limit ended the episode, `[n]`.
     pub truncated: &'a [bool],
-    /// `[k, O]` last observations of the k episodes that ended, in the order of `ended`.
+    /// Last observations `[k, O]` of the k ended episodes, in the order of `ended`.
     pub final_observations: &'a [f32],
-    /// The k episodes that ended. Their slots count over the whole batch.
+    /// The k ended episodes. Their slot numbers are those of the whole batch.
     pub ended: &'a [EndedEpisode],
 }
 
 impl StepReply {
-    /// The whole reply.
+    /// Returns the whole reply as a slice.
     pub fn all(&self) -> StepSlice<'_> {
         self.slice(0..self.rewards.len())
     }
 
-    /// The part of the reply for the slots of `range`.
+    /// Returns the part of the reply for the slots of `range`.
     pub fn slice(&self, range: Range<usize>) -> StepSlice<'_> {
         let size = self.observations.len() / self.rewards.len().max(1);
         let place = |slot| self.ended.partition_point(|end| end.slot < slot);
@@ -74,7 +74,8 @@ impl StepReply {
 }
 
 impl<'a> StepSlice<'a> {
-    /// The outcome for a player of these slots. `ended` is a buffer for the ends of episodes.
+    /// Converts the slice to the input of a player that plays these slots. Writes the ended episodes into the buffer
+    /// `ended`.
     pub fn outcome(&self, ended: &'a mut Vec<SlotEnd>) -> StepOutcome<'a> {
         ended.clear();
         ended.extend(self.ended.iter().map(|end| SlotEnd {

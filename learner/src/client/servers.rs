@@ -1,4 +1,4 @@
-//! Connections to one or several servers.
+//! Connections to one or more servers.
 
 use std::io::ErrorKind;
 use std::path::PathBuf;
@@ -19,61 +19,61 @@ use perturb_settings::Common;
 use super::options::{ActorLocation, ServerWait};
 use crate::proto;
 
-/// Time in which a server must show that it is alive after this program was asked to end. As long as a server is alive, its
-/// reply is waited for.
+/// After a stop signal, time within which a server must answer a sign-of-life request. While it does, its reply is
+/// still awaited.
 const LIFE_SIGN_TIMEOUT: Duration = Duration::from_secs(1);
-/// Time for which a reply is waited for before its server must show that it is alive.
+/// After a stop signal, time to wait for a reply before each sign-of-life request.
 const LIFE_SIGN_INTERVAL: Duration = Duration::from_millis(500);
 
-/// Connections to servers, all of which serve the same environments.
+/// Connections to one or more servers that serve the same environments.
 #[derive(Debug)]
 pub struct Servers {
-    // Dropped in this order: connections, the runtime that drives them, the server.
+    // Fields are dropped in this order: the connections, the runtime that drives them, the private server.
     connections: Mutex<Vec<Connection>>,
     runtime: Runtime,
     local: Option<Mutex<PrivateServer>>,
-    /// Addresses at which lost servers are looked for.
+    /// Addresses to which lost connections are reopened.
     named: Vec<Address>,
     act: ActorLocation,
     wait: ServerWait,
     stop: StopFlag,
-    /// Set when the program was asked to end and a server did not answer: nothing is waited for any more.
+    /// Set when a server gave no sign of life after a stop signal. No call waits for servers any more.
     has_given_up: AtomicBool,
 }
 
 impl Servers {
-    /// Sets the place where actions are chosen.
+    /// Sets where actions are chosen.
     pub fn with_act(self, act: ActorLocation) -> Self {
         Self { act, ..self }
     }
 
-    /// Sets the wait for servers that are lost.
+    /// Sets how long to wait for lost servers.
     pub fn with_wait(self, wait: ServerWait) -> Self {
         Self { wait, ..self }
     }
 
-    /// The wait for servers that are lost.
+    /// Returns how long to wait for lost servers.
     pub(super) fn wait(&self) -> ServerWait {
         self.wait
     }
 
-    /// The flag that is raised when the program is asked to end.
+    /// Returns the flag that a stop signal raises.
     pub(crate) fn stop(&self) -> &StopFlag {
         &self.stop
     }
 
-    /// Whether the server is a private one of this process, which [`Servers::reconnect`] starts again.
+    /// Returns whether the server is a private one, which this process has started. [`Servers::reconnect`] restarts it.
     pub(super) fn is_private(&self) -> bool {
         self.local.is_some()
     }
 
-    /// The place where actions are chosen.
+    /// Returns where actions are chosen.
     pub(super) fn act(&self) -> ActorLocation {
         self.act
     }
 
-    /// Starts a private server with `workers` physics threads (`None`: one a core) that also serves the tasks in the folders
-    /// `tasks`, and connects to it.
+    /// Starts a private server with `workers` physics threads (`None` for one per core) and connects to it. The server
+    /// also serves the tasks in the folders `tasks`.
     ///
     /// # Errors
     /// The errors of [`PrivateServer::start_unless`] and of [`Servers::connect`].
@@ -82,10 +82,10 @@ impl Servers {
         match Self::connect_until(std::slice::from_ref(server.address()), stop) {
             Ok(servers) => Ok(Self { local: Some(Mutex::new(server)), ..servers }),
             Err(error @ ClientError::Stopped { .. }) => {
-                server.kill(); // it does not answer
+                server.kill(); // the server does not answer
                 Err(error)
             }
-            // The user gave no address, so an error that names the address would not help.
+            // The user gave no address, so the error does not name the address.
             Err(error) => Err(server.unusable(&match error {
                 ClientError::Connect { reason, .. } => reason,
                 ClientError::NotPerturb { .. } => "it is no perturb-server".into(),
@@ -94,20 +94,20 @@ impl Servers {
         }
     }
 
-    /// Connects to every server of `addresses`, at least one. The servers share each batch. A name that resolves to several
-    /// machines counts as one server: any of them. Proxy settings are ignored.
+    /// Connects to all servers in `addresses`, which must not be empty. Each batch is divided among the servers. A host
+    /// name that resolves to several machines counts as one server: any of them. Proxy settings are ignored.
     ///
     /// # Errors
-    /// [`ClientError::Connect`] if one does not answer within some seconds, or is shutting down.
+    /// [`ClientError::Connect`] if a server does not answer within some seconds, or is shutting down.
     pub fn connect(addresses: &[Address]) -> Result<Self, ClientError> {
         Self::connect_until(addresses, &StopFlag::default())
     }
 
-    /// Connects as [`Servers::connect`] does, unless `stop` is raised first. When it is raised later, a request to a server
-    /// that gives no sign of life ends within about a second.
+    /// Connects like [`Servers::connect`], unless `stop` is raised first. If `stop` is raised later, a request to a
+    /// server that gives no sign of life ends within about a second.
     ///
     /// # Errors
-    /// The errors of [`Servers::connect`], and [`ClientError::Stopped`].
+    /// The errors of [`Servers::connect`], and [`ClientError::Stopped`] if `stop` is raised first.
     pub fn connect_until(addresses: &[Address], stop: &StopFlag) -> Result<Self, ClientError> {
         let runtime = runtime()?;
         let connections = runtime.block_on(unless_stopped(stop, async {
@@ -134,11 +134,10 @@ impl Servers {
         }
     }
 
-    /// Connects again to the servers that answer, at least one. Returns the errors of the others. A private server is started
-    /// again.
+    /// Reconnects to all servers that answer, and returns the errors of the others. Restarts a private server.
     ///
     /// # Errors
-    /// The errors of all servers, if none answers.
+    /// The errors of all servers if none answers.
     pub(super) async fn reconnect(&self) -> Result<Vec<ClientError>, ClientError> {
         if let Some(local) = &self.local {
             local.lock().unwrap_or_else(PoisonError::into_inner).restart(&|| self.stop.signal())?;
@@ -158,13 +157,13 @@ impl Servers {
         Ok(errors)
     }
 
-    /// Connects to one server of `addresses`. Every machine that a name resolves to counts as a server. Tries number
-    /// `turn`, modulo the number of servers, first, then the next ones until one takes sessions. Callers with successive
-    /// turns are spread evenly.
+    /// Connects to one of the servers in `addresses`. If a host name resolves to several machines, each counts as a
+    /// server. Tries the server with the index `turn` (modulo the number of servers) first, then the next ones until
+    /// one accepts sessions. Callers with successive values of `turn` are spread evenly over the servers.
     ///
     /// # Errors
-    /// [`ClientError::Connect`] if there is only one and it does not take sessions, [`ClientError::NoneConnects`] if none
-    /// of several does, [`ClientError::Stopped`] if `stop` is raised first.
+    /// [`ClientError::Connect`] if the only server does not accept sessions, [`ClientError::NoneConnects`] if none of
+    /// several does, and [`ClientError::Stopped`] if `stop` is raised first.
     pub fn connect_to_one(addresses: &[Address], turn: usize, stop: &StopFlag) -> Result<Self, ClientError> {
         let runtime = runtime()?;
         let connection = runtime.block_on(unless_stopped(stop, async {
@@ -180,8 +179,8 @@ impl Servers {
         Ok(Self::new(vec![connection], runtime, stop))
     }
 
-    /// Connects to all servers of `addresses` that take sessions. Every machine that a name resolves to counts as a server.
-    /// Returns the errors of the others.
+    /// Connects to all servers in `addresses` that accept sessions, and returns the errors of the others. If a host
+    /// name resolves to several machines, each counts as a server.
     ///
     /// # Errors
     /// The errors of [`Servers::connect_to_one`].
@@ -210,12 +209,12 @@ impl Servers {
         Ok((Self::new(connections, runtime, stop), errors))
     }
 
-    /// The addresses of the servers, one for each connection.
+    /// Returns the address of each connected server.
     pub fn addresses(&self) -> Vec<Address> {
         self.locked().iter().map(|connection| connection.address().clone()).collect()
     }
 
-    /// The connections, in the order of their addresses.
+    /// Returns all connections, in the order of the addresses.
     pub(super) fn connections(&self) -> Vec<Connection> {
         self.locked().clone()
     }
@@ -224,16 +223,16 @@ impl Servers {
         self.connections.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Runs `future` on the runtime that drives the connections, and waits for it.
+    /// Runs `future` to completion on the runtime that drives the connections.
     pub(crate) fn block_on<T>(&self, future: impl Future<Output = T>) -> T {
         self.runtime.block_on(future)
     }
 
-    /// Waits for a request. After the program was asked to end, it waits only for servers that give signs of life.
+    /// Waits for the reply to a request. After a stop signal, waits only as long as all servers give signs of life.
     ///
     /// # Errors
-    /// Those of the request, [explained](Servers::explain); [`ClientError::Stopped`] if a server then gives no sign of
-    /// life.
+    /// The errors of the request, as changed by [`Servers::explain`], and [`ClientError::Stopped`] if a server gives no
+    /// sign of life after a stop signal.
     pub(crate) fn wait_for<T>(&self, request: impl Future<Output = Result<T, ClientError>>) -> Result<T, ClientError> {
         let done = self.block_on(async {
             tokio::select! {
@@ -245,11 +244,12 @@ impl Servers {
         done.map_err(|error| self.explain(error))
     }
 
-    /// Waits until the program was asked to end and a server gives no sign of life.
+    /// Waits for a stop signal, and then until a server gives no sign of life. Returns the error to report.
     async fn silent_after_stop(&self) -> ClientError {
         let signal = self.stop.raised().await;
         loop {
-            // Most requests are answered sooner, and servers mistrust clients that cancel many calls.
+            // The pause comes first, because most requests are answered sooner, and servers limit clients that cancel
+            // many calls.
             if !self.has_given_up() {
                 tokio::time::sleep(LIFE_SIGN_INTERVAL).await;
             }
@@ -266,19 +266,19 @@ impl Servers {
         }
     }
 
-    /// Whether the program was asked to end and a server was silent: nothing more is waited for then.
+    /// Returns whether a server gave no sign of life after a stop signal, so that no call should wait any more.
     pub(super) fn has_given_up(&self) -> bool {
         self.has_given_up.load(Ordering::Relaxed)
     }
 
-    /// Runs `work`, which may take long, on this thread. Meanwhile another thread answers the servers' keepalive pings.
-    /// Otherwise the connections are driven only while a request waits, and a server drops its sessions after its
+    /// Runs a long computation `work` on this thread, while another thread answers the servers' keepalive pings.
+    /// Without this, connections are active only while a request waits, and a server drops its sessions after
     /// `--keepalive-seconds`.
     pub fn keep_alive_during<T>(&self, work: impl FnOnce() -> T) -> T {
         let (done, end) = oneshot::channel::<()>();
         let runtime = &self.runtime;
         std::thread::scope(|scope| {
-            // Ends when `done` is dropped, by the line below or by a panic in `work`.
+            // The thread ends when `done` is dropped, by the line below or by a panic in `work`.
             let keep_alive = move || drop(runtime.block_on(end));
             if let Err(error) = std::thread::Builder::new().name("keepalive".into()).spawn_scoped(scope, keep_alive) {
                 tracing::warn!("connections are not kept alive during an update, because no thread starts: {error}");
@@ -289,10 +289,10 @@ impl Servers {
         })
     }
 
-    /// The catalogue of the first server.
+    /// Returns the catalogue of the first server.
     ///
     /// # Errors
-    /// [`ClientError::Lost`] or [`ClientError::TimedOut`].
+    /// [`ClientError::Lost`] or [`ClientError::TimedOut`] if the server does not answer.
     pub fn catalogue(&self) -> Result<proto::ListEnvironmentsResponse, ClientError> {
         self.connections()
             .first()
@@ -303,11 +303,12 @@ impl Servers {
         self.wait_for(connection.catalogue())
     }
 
-    /// The entry `name` of the catalogues, in any [spelling](perturb_protocol::names). It must be the same in all of them.
+    /// Returns the entry `name`, in any accepted [spelling](perturb_protocol::names), of the servers' catalogues. The
+    /// entry must be the same in all catalogues.
     ///
     /// # Errors
-    /// [`ClientError::NoEnvironment`] with the names that there are, [`ClientError::Models`], [`ClientError::Disagreement`],
-    /// and those of [`Servers::catalogue`].
+    /// [`ClientError::NoEnvironment`] with the known names, [`ClientError::Models`] or [`ClientError::Disagreement`] if
+    /// servers differ, and the errors of [`Servers::catalogue`].
     pub fn environment(&self, name: &str) -> Result<proto::Environment, ClientError> {
         let connections = self.connections();
         let Some((first, others)) = connections.split_first() else {
@@ -334,18 +335,18 @@ impl Servers {
         Ok(environment)
     }
 
-    /// The environment as a training's policy sees it: with the parameters in its observations, if the policy sees
-    /// parameters.
+    /// Returns the environment of a training as its policy sees it: if the policy observes parameters, they are part of
+    /// the environment's observations.
     ///
     /// # Errors
-    /// The errors of [`Servers::environment`]; [`ClientError::NoParameters`] if it sees parameters and the servers
-    /// cannot tell them.
+    /// The errors of [`Servers::environment`], and [`ClientError::NoParameters`] if the policy observes parameters but
+    /// the servers do not support this.
     pub fn environment_seen(&self, common: &Common) -> Result<proto::Environment, ClientError> {
         self.environment_seen_with(common, std::iter::empty())
     }
 
-    /// The environment as [`Servers::environment_seen`] gives it. It has its disturbances, too, if one of `names` is a
-    /// disturbance.
+    /// Returns the environment like [`Servers::environment_seen`]. If one of the parameters in `names` is a
+    /// disturbance, the result also lists the disturbances as parameters.
     ///
     /// # Errors
     /// The errors of [`Servers::environment_seen`].
@@ -373,12 +374,13 @@ impl Servers {
         Ok(catalogue[place].clone())
     }
 
-    /// Adds the exit status of the private server to an error, if the server ended and a stream was lost with it.
+    /// If `error` is a lost stream because the private server has ended, replaces its reason by the server's exit
+    /// status.
     pub(super) fn explain(&self, error: ClientError) -> ClientError {
         let (ClientError::Lost { address, request, code, .. }, Some(server)) = (&error, &self.local) else {
             return error;
         };
-        // The connection may break a moment before the process can be waited for.
+        // The connection may break shortly before the exit status is available.
         std::thread::sleep(Duration::from_millis(50));
         let Some(status) = server.lock().ok().and_then(|mut server| server.exit_status()) else { return error };
         let reason = format!("the private server ended with {status}");
@@ -393,7 +395,7 @@ fn runtime() -> Result<Runtime, ClientError> {
         .map_err(|source| ClientError::System { action: "start the network runtime", source })
 }
 
-/// The machines of all addresses, and the errors of names that do not resolve.
+/// Resolves all addresses. Returns the machines, and the errors of host names that do not resolve.
 async fn all_machines(addresses: &[Address]) -> (ResolvedAddresses, Vec<ClientError>) {
     let mut all = ResolvedAddresses::default();
     let mut errors = Vec::new();
@@ -406,7 +408,7 @@ async fn all_machines(addresses: &[Address]) -> (ResolvedAddresses, Vec<ClientEr
     (all, errors)
 }
 
-/// Waits for `connecting` until `stop` is raised.
+/// Runs `connecting` until it completes or `stop` is raised.
 async fn unless_stopped<T>(
     stop: &StopFlag,
     connecting: impl Future<Output = Result<T, ClientError>>,

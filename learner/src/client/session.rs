@@ -1,4 +1,4 @@
-//! A batch of environments, spread over one or several servers.
+//! A batch of environments, spread over one or more servers.
 
 use std::ops::Range;
 
@@ -12,15 +12,19 @@ use super::servers::Servers;
 use super::shard::ServerShard;
 use crate::proto::{self, AutoresetMode};
 
-/// Snapshots that one request restores. Those of HalfCheetah are some 600 kB, far below a server's limit.
+/// Maximum number of snapshots in a restore request. This many snapshots of HalfCheetah are some 600 kB, far below a
+/// server's limit.
 const SNAPSHOTS_PER_RESTORE: usize = 1024;
 
-/// Requests to one server that may wait for their replies: none is sent before the last is answered.
+/// Maximum number of unanswered requests to one server: each request is sent after the previous one was answered.
 const MAX_IN_FLIGHT: u32 = 1;
 
-/// N environments in same-step autoreset mode, of one training or of several. Environment i of a training has index i and
-/// gives the same bytes whatever the number of servers and whatever else is in the batch. Each server owns a contiguous range
-/// of slots. If a TCP connection is lost, but not the server, its part is [resumed](perturb_protocol::Stream).
+/// A batch of N environments of one or more trainings, in same-step autoreset mode: an environment whose episode ends
+/// starts the next one in the same step.
+///
+/// Each server owns a contiguous range of slots. Environment i of a training has index i, and gives the same bytes with
+/// any number of servers and with any other environments in the batch. If a TCP connection is lost but its server still
+/// runs, the server's part of the session is [resumed](perturb_protocol::Stream).
 #[derive(Debug)]
 pub struct Session<'a> {
     pub(super) servers: &'a Servers,
@@ -32,17 +36,17 @@ pub struct Session<'a> {
 }
 
 impl<'a> Session<'a> {
-    /// Opens the environments and writes their first observations `[N, O]` to `observations`.
+    /// Opens environments on all servers, and writes their first observations `[N, O]` to `observations`.
     ///
     /// # Errors
-    /// [`ClientError::Refused`] with the server's sentence, [`ClientError::Disagreement`] between servers, and the
-    /// failures of a connection.
+    /// [`ClientError::Refused`] with the server's message, [`ClientError::Disagreement`] if servers describe the
+    /// environment differently, and connection failures.
     pub fn open(servers: &'a Servers, options: &OpenOptions, observations: &mut Vec<f32>) -> Result<Self, ClientError> {
         Self::open_together(servers, std::slice::from_ref(options), observations)
     }
 
-    /// Opens the environments of several `options`, one after the other. All options must name the same environment and the
-    /// same observation.
+    /// Opens the environments of several trainings in one batch, in the order of `options`. All options must have the
+    /// same environment and the same kind of observation.
     ///
     /// # Errors
     /// The errors of [`Session::open`].
@@ -62,12 +66,12 @@ impl<'a> Session<'a> {
             if range.is_empty() {
                 continue; // more servers than environments
             }
-            // A Unix socket is lost only with its server.
+            // A lease is useless on a Unix socket, which is lost only if its server ends.
             let lease = if matches!(connection.address(), Address::Tcp { .. }) { MAX_IN_FLIGHT } else { 0 };
             let opening = ServerShard::open(connection, options, range, AutoresetMode::SameStep, lease);
             let (mut part, opened) = servers.wait_for(opening)?;
             if let [_, _, ..] = options {
-                part.stream.back_off_when_contended(); // groups often run beside others
+                part.stream.back_off_when_contended(); // other groups often run on the same cores
             }
             let described = opened.environment.unwrap_or_default();
             session.acts &= opened.acts;
@@ -89,37 +93,39 @@ impl<'a> Session<'a> {
         Ok(session)
     }
 
-    /// The environment, as the servers describe it.
+    /// Returns the environment's description from the servers.
     pub fn environment(&self) -> &proto::Environment {
         &self.environment
     }
 
-    /// N, the number of environments.
+    /// Returns N, the number of environments.
     pub fn num_envs(&self) -> usize {
         self.num_envs
     }
 
-    /// Whether servers shall act, and all of them can, see [`Session::play`].
+    /// Returns whether the servers choose actions: this is the configured place, and all servers support it. See
+    /// [`Session::play`].
     pub fn acts(&self) -> bool {
         self.acts
     }
 
-    /// Whether one server can play the whole batch, with statistics and a stream of actions for all of it.
+    /// Returns whether a single server plays the whole batch. Only then can the server keep the batch's normalisers and
+    /// its random stream of actions.
     pub fn plays_together(&self) -> bool {
         self.acts && self.parts.len() == 1
     }
 
-    /// O, the length of an observation.
+    /// Returns O, the length of an observation.
     pub fn observation_size(&self) -> usize {
         self.observation_size
     }
 
-    /// Advances every environment. `actions` are those of all N environments as the protocol wants them, i32 `[N]` or
-    /// f32 `[N, A]`. All servers compute at the same time. Replaces what is in `reply`.
+    /// Steps all environments, on all servers at the same time. `actions` are encoded as in the protocol: i32 `[N]` or
+    /// f32 `[N, A]`. Replaces the content of `reply`.
     ///
     /// # Errors
-    /// [`ClientError::Refused`] if the actions are wrong: then no environment of that server has moved. The failures of
-    /// a connection, after which the environments are gone.
+    /// [`ClientError::Refused`] if actions are invalid; no environment of that server has then moved. Connection
+    /// failures; the environments are then lost.
     pub fn step(&mut self, actions: &[u8], reply: &mut StepReply) -> Result<(), ClientError> {
         let width = actions.len() / self.num_envs.max(1);
         reply.resize(self.num_envs, self.observation_size);
@@ -132,13 +138,12 @@ impl<'a> Session<'a> {
         self.exchange(request, |part, stepped| part.store(stepped, size, reply))
     }
 
-    /// Begins a new trial in the environment of `slot`, whose named parameters have the given values from now on; the
-    /// others keep the version's distributions. `seed` replaces its seed, and its episodes count from 0 again. Writes the
-    /// first observation `[O]`.
+    /// Starts a new trial in the environment of `slot`, and writes its first observation `[O]`. From now on, the named
+    /// parameters have the given values, and all others keep the version's distributions. `seed` replaces the
+    /// environment's seed, and its episodes are counted from 0 again.
     ///
     /// # Errors
-    /// [`ClientError::Refused`] if there is no such parameter, or if a value is out of its bounds; the failures of a
-    /// connection.
+    /// [`ClientError::Refused`] for an unknown parameter or a value out of its bounds, and connection failures.
     pub fn reset_with(
         &mut self,
         slot: usize,
@@ -155,11 +160,11 @@ impl<'a> Session<'a> {
         self.reset_slot(slot, request, observation)
     }
 
-    /// Begins the next episode in the environment of `slot`, whether or not the present one has ended, and writes its first
+    /// Starts the next episode in the environment of `slot`, even if the current one has not ended. Writes the first
     /// observation `[O]`.
     ///
     /// # Errors
-    /// The failures of a connection.
+    /// Connection failures.
     pub fn reset_one(&mut self, slot: usize, observation: &mut [f32]) -> Result<(), ClientError> {
         self.reset_slot(slot, proto::Reset::default(), observation)
     }
@@ -173,11 +178,11 @@ impl<'a> Session<'a> {
         part.stream.decode::<proto::Reset>("observations", &done.observations, observation)
     }
 
-    /// Saves the environments of `slots`: opaque snapshots, in order of slots. Changes nothing. All servers work at the same
-    /// time.
+    /// Returns an opaque snapshot of each environment in `slots`, in order. Does not change the environments. All
+    /// servers work at the same time.
     ///
     /// # Errors
-    /// The failures of a connection.
+    /// Connection failures.
     pub fn snapshot(&mut self, slots: Range<usize>) -> Result<Vec<Bytes>, ClientError> {
         let mut snapshots = Vec::with_capacity(slots.len());
         self.exchange(
@@ -195,13 +200,13 @@ impl<'a> Session<'a> {
         Ok(snapshots)
     }
 
-    /// Restores the environments of `slots` from as many snapshots in their order, taken of this environment on any number
-    /// of servers. Returns the observations `[n, O]` at which they were saved. The environments continue as they did after the
-    /// snapshots.
+    /// Restores the n environments of `slots` from n `snapshots`, in order. Returns the observations `[n, O]` at the
+    /// time of the snapshots. The environments then continue exactly as they did after the snapshots. The snapshots may
+    /// be from any number of servers, but must be of the same environment.
     ///
     /// # Errors
-    /// [`ClientError::Snapshots`] if there are not n snapshots, [`ClientError::Refused`] if one is of something else, and
-    /// the failures of a connection. After the latter two some environments may have been restored.
+    /// [`ClientError::Snapshots`] if there are not n snapshots, [`ClientError::Refused`] for a snapshot of something
+    /// else, and connection failures. After the last two, some environments may already have been restored.
     pub fn restore(&mut self, slots: Range<usize>, snapshots: &[Bytes]) -> Result<Vec<f32>, ClientError> {
         if snapshots.len() != slots.len() {
             return Err(ClientError::Snapshots { got: snapshots.len(), expected: slots.len() });
@@ -224,10 +229,10 @@ impl<'a> Session<'a> {
         Ok(observations)
     }
 
-    /// Begins a new episode in the environments of `slots` and writes their first observations `[n, O]`.
+    /// Starts a new episode in each of the n environments of `slots`, and writes their first observations `[n, O]`.
     ///
     /// # Errors
-    /// The failures of a connection.
+    /// Connection failures.
     pub fn reset(&mut self, slots: Range<usize>, observations: &mut [f32]) -> Result<(), ClientError> {
         let size = self.observation_size;
         self.exchange(
@@ -240,12 +245,12 @@ impl<'a> Session<'a> {
         )
     }
 
-    /// Frees the environments of `slots`. The slots behind them move down.
+    /// Frees the environments of `slots` on the servers. The environments behind them move down to lower slots.
     ///
     /// # Errors
-    /// The failures of a connection.
+    /// Connection failures.
     pub fn release(&mut self, slots: Range<usize>) -> Result<(), ClientError> {
-        // A part that would be left without environments is closed.
+        // Closes the stream of a server that would have no environments left.
         self.close(|part| part.overlap(&slots) == part.range);
         self.exchange(|part| part.mask(&slots).map(|mask| proto::Release { mask }), |_, _| Ok(()))?;
         let mut first = 0;
@@ -258,18 +263,20 @@ impl<'a> Session<'a> {
         Ok(())
     }
 
-    /// Closes the parts that are `over`, so that no server keeps them until their lease ends.
+    /// Closes the streams of the servers for which `over` is true, so that these servers do not keep the environments
+    /// until a lease expires.
     fn close(&mut self, over: impl Fn(&ServerShard) -> bool) {
         let closing = self.parts.extract_if(.., |part| over(part)).map(|part| part.stream.close());
         let closing = futures_util::future::join_all(closing);
-        // A thread that runs a runtime cannot block until a request is answered.
+        // A thread that is already inside a tokio runtime must not block.
         if Handle::try_current().is_err() && !self.servers.has_given_up() {
             self.servers.block_on(closing);
         }
     }
 
-    /// Sends every server its request, if it has one, and takes its reply. All replies are received before the first failure is
-    /// returned, so that none is left for a later request.
+    /// Sends each server its request, then receives all replies. `request` returns `None` for a server that gets no
+    /// request, and `take` handles the reply of a server. Receives all replies even if one fails, so that none is
+    /// mistaken for the reply to a later request. Returns the first failure.
     pub(super) fn exchange<A: TypedRequest>(
         &mut self,
         mut request: impl FnMut(&mut ServerShard) -> Option<A>,
@@ -300,12 +307,12 @@ impl Drop for Session<'_> {
     }
 }
 
-/// Cuts 0 … `num_envs` into `parts` contiguous ranges, whose lengths differ by at most 1.
+/// Divides `0..num_envs` into `parts` contiguous ranges whose lengths differ by at most 1.
 fn split(num_envs: usize, parts: usize) -> Vec<Range<usize>> {
     (0..parts).map(|part| part * num_envs / parts..(part + 1) * num_envs / parts).collect()
 }
 
-/// Cuts `slots` into ranges that one request restores.
+/// Divides `slots` into ranges of at most [`SNAPSHOTS_PER_RESTORE`] slots.
 fn chunks(slots: Range<usize>) -> impl Iterator<Item = Range<usize>> {
     let end = slots.end;
     slots.step_by(SNAPSHOTS_PER_RESTORE).map(move |first| first..end.min(first + SNAPSHOTS_PER_RESTORE))

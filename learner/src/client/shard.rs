@@ -1,4 +1,4 @@
-//! The share of a batch that one server owns.
+//! The part of a batch that is on one server.
 
 use std::ops::Range;
 
@@ -9,20 +9,21 @@ use super::options::{OpenOptions, open_request};
 use super::reply::StepReply;
 use crate::proto::{self, AutoresetMode};
 
-/// The share of a batch that one server owns.
+/// The part of a batch that is on one server, with the stream to that server.
 #[derive(Debug)]
 pub(super) struct ServerShard {
     pub(super) stream: Stream,
-    /// The slots of the server.
+    /// The server's slots in the whole batch.
     pub(super) range: Range<usize>,
-    /// Encoded actions. The buffer's memory is free again when a request has been sent.
+    /// Buffer for encoded actions. Its memory is reused after a request has been sent.
     pub(super) actions: BytesMut,
-    /// Whether a request waits for its reply.
+    /// Whether the last request to this server still needs its reply.
     pub(super) asked: bool,
 }
 
 impl ServerShard {
-    /// Opens the slots of `range`, counted over all `options`. A `lease` above 0 is the number of requests that may wait.
+    /// Opens the slots of `range` on a server. Slots are numbered over all `options` together. `lease` is the maximum
+    /// number of unanswered requests in a leased session; 0 opens a session without a lease.
     pub(super) async fn open(
         connection: &Connection,
         options: &[OpenOptions],
@@ -42,19 +43,20 @@ impl ServerShard {
         Ok((Self { stream, range, actions: BytesMut::new(), asked: false }, opened))
     }
 
-    /// The part of `slots` that this server owns.
+    /// Returns the part of `slots` that is on this server.
     pub(super) fn overlap(&self, slots: &Range<usize>) -> Range<usize> {
         let start = slots.start.clamp(self.range.start, self.range.end);
         start..slots.end.clamp(start, self.range.end)
     }
 
-    /// A mask of the `slots` that this server owns; `None` if it owns none.
+    /// Returns a mask, one byte per environment of this server, of those in `slots`; `None` if none is.
     pub(super) fn mask(&self, slots: &Range<usize>) -> Option<Bytes> {
         let own = self.overlap(slots);
         (!own.is_empty()).then(|| self.range.clone().map(|slot| u8::from(own.contains(&slot))).collect())
     }
 
-    /// Copies this server's reply to the places of its slots in the batch's `reply`.
+    /// Decodes this server's reply `stepped` into the parts of `reply` for its slots. `size` is O, the length of an
+    /// observation.
     pub(super) fn store(&self, stepped: proto::Stepped, size: usize, reply: &mut StepReply) -> Result<(), ClientError> {
         let Range { start, end } = self.range;
         check_step(&stepped, self.range.len(), size).map_err(|it| self.mismatch(it.got, it.expected))?;
@@ -87,12 +89,13 @@ impl ServerShard {
     }
 }
 
-/// Copies flags that were checked.
+/// Converts flags from bytes to booleans. The lengths were checked before.
 fn set_flags(bytes: &[u8], out: &mut [bool]) {
     out.iter_mut().zip(bytes).for_each(|(out, byte)| *out = *byte != 0);
 }
 
-/// Checks that the server observes parameters if that was asked for. An older server leaves them out without an error.
+/// Checks that observations contain parameters if and only if this was requested. An older server leaves them out
+/// without an error.
 fn check_observed(address: &Address, asked: bool, opened: &proto::Opened) -> Result<(), ClientError> {
     if opened.observes_parameters == asked {
         Ok(())

@@ -1,4 +1,4 @@
-//! Replays recorded episodes.
+//! Replays recorded episodes and compares them with their records.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -13,39 +13,40 @@ use super::trials::Trials;
 use crate::checkpoint::Checkpoint;
 use crate::client::{OpenOptions, Servers, Session};
 
-/// The result of a replay.
+/// The result of replaying recorded episodes.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Audit {
-    /// Number of episodes that were replayed.
+    /// Number of replayed episodes.
     pub episodes: u64,
-    /// A sentence for each episode that differs from its record.
+    /// A sentence for each replayed episode that differs from its record.
     pub different: Vec<String>,
 }
 
-/// Why recorded episodes could not be replayed.
+/// The reason why recorded episodes could not be replayed.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum AuditError {
-    /// The episodes were recorded from another policy.
+    /// The episodes were recorded with another policy.
     #[error(
         "the episodes were recorded of the policy {recorded}, the checkpoint is {got}: give the checkpoint that was tested"
     )]
     Policy {
-        /// The recorded policy.
+        /// The identifier of the recorded policy.
         recorded: String,
-        /// The checkpoint's policy.
+        /// The identifier of the checkpoint's policy.
         got: String,
     },
-    /// The episodes cannot be played.
+    /// Playing the episodes failed.
     #[error(transparent)]
     Test(#[from] TestError),
 }
 
-/// Replays at most `max_episodes` of the recorded episodes, evenly spread over them, each from its address alone: its seed,
-/// its indices and the requested parameters. Calls `report` with the number of episodes done.
+/// Replays at most `max_episodes` of the recorded episodes, evenly spread over all of them, and compares each with its
+/// record. An episode is replayed from its seed, its environment and episode indices and its requested parameters
+/// alone. Calls `report` with the number of episodes done so far.
 ///
 /// # Errors
-/// [`AuditError`].
+/// [`AuditError`] if `checkpoint` is not the recorded policy, or if playing fails.
 pub fn audit(
     servers: &Servers,
     checkpoint: &Checkpoint,
@@ -102,9 +103,9 @@ fn replay(
     }
 }
 
-/// Chooses at most `max_episodes` of `episodes`. Cuts them into as many equal parts and takes one episode from each: the
-/// first of the first part, the second of the second, and so on. So both early and late episodes of environments are
-/// chosen.
+/// Chooses at most `max_episodes` of `episodes`. Divides them into this many equal parts and takes one episode from
+/// each: the first of the first part, the second of the second part, and so on. So both early and late episodes of
+/// environments are chosen.
 fn spread(episodes: &[EpisodeRecord], max_episodes: usize) -> impl Iterator<Item = &EpisodeRecord> {
     let count = max_episodes.min(episodes.len());
     (0..count).map(move |i| {
@@ -114,7 +115,7 @@ fn spread(episodes: &[EpisodeRecord], max_episodes: usize) -> impl Iterator<Item
     })
 }
 
-/// The environments in which recorded episodes are replayed.
+/// The environments and the policy that replay recorded episodes.
 struct Replay<'a> {
     trials: Trials<'a>,
     names: Vec<String>,
@@ -151,7 +152,8 @@ impl<'a> Replay<'a> {
         })
     }
 
-    /// Brings the environment of `slot` to the start of the trial whose last episode is `episode`.
+    /// Starts the trial of `episode` in the environment of `slot`. The record is of the last episode of the trial, so
+    /// the whole trial is replayed.
     fn begin(&mut self, slot: usize, episode: &EpisodeRecord) -> Result<(), TestError> {
         let Trials { session, player, .. } = &mut self.trials;
         let mut observation = vec![0.0; session.observation_size()];

@@ -11,53 +11,55 @@ use super::test::{TestOptions, Tester};
 use crate::checkpoint::Checkpoint;
 use crate::client::Servers;
 
-/// Why a heatmap cannot be made.
+/// The reason why a heatmap cannot be made.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum HeatmapError {
-    /// The environment has no such parameter, or both axes have the same.
+    /// The environment has no such parameter, or both axes name the same one.
     #[error("`{name}` cannot be an axis: expected two of {}'s parameters {}", environment, parameters.join(", "))]
     Parameter {
-        /// The name that was given.
+        /// The given name.
         name: String,
-        /// The environment.
+        /// The environment's name.
         environment: String,
-        /// The environment's parameters.
+        /// The names of the parameters that can be axes.
         parameters: Vec<String>,
     },
-    /// The episodes were recorded from another policy.
+    /// The episodes were recorded with another policy.
     #[error(
         "the episodes were recorded of the policy {recorded}, the checkpoint is {got}: pass the checkpoint these episodes \
          were recorded with"
     )]
     Policy {
-        /// The recorded policy.
+        /// The identifier of the recorded policy.
         recorded: String,
-        /// The checkpoint's policy.
+        /// The identifier of the checkpoint's policy.
         got: String,
     },
-    /// An axis has a fixed value, too.
+    /// A parameter is an axis and also has a fixed value.
     #[error("{name} is an axis and has a value, too: leave it out of --parameters")]
     Fixed {
-        /// The parameter.
+        /// The parameter's name.
         name: String,
     },
-    /// Recorded episodes are not those of a heatmap over these parameters.
+    /// The recorded episodes are not from a heatmap over these two parameters.
     #[error(
         "the recorded episodes are not those of a heatmap over these two parameters: pass the original --x and --y"
     )]
     NotOfAxes,
-    /// The policy cannot be tested.
+    /// The test of the policy failed.
     #[error(transparent)]
     Test(#[from] TestError),
 }
 
-/// Tests `checkpoint` at every point of a grid over two parameters. The range of an axis is that of R and E together; the other
-/// parameters come from the options' base. Each point is an environment with its own random numbers, so that points differ by
-/// their parameters and by chance. Calls `report` with the number of episodes. Returns the recorded episodes, too.
+/// Tests `checkpoint` at every point of a grid over two parameters. Returns the heatmap and the recorded episodes.
+///
+/// An axis covers the ranges of R and E. All other parameters are fixed by `options`, or drawn from its base version.
+/// Each point of the grid is an environment with its own random numbers. Calls `report` with the number of episodes
+/// done so far.
 ///
 /// # Errors
-/// [`HeatmapError`].
+/// [`HeatmapError`] for invalid options, or if the test fails.
 pub fn heatmap(
     servers: &Servers,
     checkpoint: &Checkpoint,
@@ -80,10 +82,10 @@ pub fn heatmap(
     Ok((heatmap, records))
 }
 
-/// The heatmap of a recorded test. `environment` gives the ranges of the axes.
+/// Computes the heatmap of a recorded test again, without playing. `environment` provides the ranges of the axes.
 ///
 /// # Errors
-/// [`HeatmapError`] if the episodes are not those of a heatmap over these parameters.
+/// [`HeatmapError`] if the episodes are not of this policy, or not from a heatmap over these parameters.
 pub fn heatmap_again(
     environment: &proto::Environment,
     checkpoint: &Checkpoint,
@@ -100,7 +102,7 @@ pub fn heatmap_again(
 }
 
 fn axes(environment: &proto::Environment, names: &[String; 2]) -> Result<[Axis; 2], HeatmapError> {
-    // Disturbances have no range in R and E.
+    // Disturbances cannot be axes, because they have no range in R and E.
     let ranged = environment.parameters.iter().filter(|parameter| !is_disturbance(&parameter.name));
     let find = |name: &String| ranged.clone().find(|parameter| parameter.name == *name);
     let refuse = |name: &String| HeatmapError::Parameter {

@@ -1,4 +1,4 @@
-//! Tests of trained policies: does a policy still work when the physics changes?
+//! Tests of trained policies, in particular with changed physics.
 
 mod audit;
 mod error;

@@ -1,4 +1,4 @@
-//! Plays trials of a policy in the environments of a session.
+//! Plays test trials of a policy in the environments of a session.
 
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -11,10 +11,11 @@ use crate::checkpoint::Checkpoint;
 use crate::client::{EndedEpisode, RolloutReply, Session, StepReply, acting};
 use crate::proto;
 
-/// Steps of a request to a server: few compared with a test's, but enough to hide the network's delay.
+/// Number of steps that a request asks a server to play: few compared with a whole test, but enough to hide network
+/// latency.
 const STEPS_PER_REQUEST: u32 = 64;
 
-/// A policy that plays trials, with actions chosen in this process.
+/// Plays trials with actions that this process chooses.
 pub(super) struct Trials<'a> {
     pub(super) session: Session<'a>,
     pub(super) player: Player,
@@ -22,22 +23,23 @@ pub(super) struct Trials<'a> {
     ended: Vec<SlotEnd>,
 }
 
-/// A policy that plays trials, with actions chosen by the servers.
+/// Plays trials with actions that the servers choose.
 pub(super) struct RemoteTrials<'a> {
     session: Session<'a>,
-    /// The policy and its weights, until the servers have them.
+    /// The policy's message and weights, until the first request has sent them to the servers.
     policy: Option<(proto::Policy, bytes::Bytes)>,
     episodes_per_trial: u32,
 }
 
 impl<'a> Trials<'a> {
-    /// Begins trials of `player` in the environments of `session`, whose observations `[N, O]` are given.
+    /// Starts trials of `player` in the environments of `session`. `observations` `[N, O]` are the environments' first
+    /// observations.
     pub(super) fn begin(session: Session<'a>, mut player: Player, observations: &[f32]) -> PolicyResult<Self> {
         player.begin(observations, None)?;
         Ok(Self { session, player, reply: StepReply::default(), ended: Vec::new() })
     }
 
-    /// Steps all environments. Returns the episodes that ended a trial.
+    /// Steps all environments once. Returns the episodes that ended, if they are the last of their trial.
     pub(super) fn step(&mut self) -> Result<Vec<EndedEpisode>, TestError> {
         let Self { session, player, reply, ended } = self;
         session.step(player.act()?, reply)?;
@@ -48,13 +50,14 @@ impl<'a> Trials<'a> {
 }
 
 impl<'a> RemoteTrials<'a> {
-    /// Begins trials of `player`, which has the policy of `checkpoint`, in the environments of `session`.
+    /// Prepares trials in the environments of `session`. `player` must have the policy of `checkpoint`.
     pub(super) fn new(session: Session<'a>, player: &Player, checkpoint: &Checkpoint) -> Self {
         let policy = (acting::policy(&checkpoint.policy, player), floats(&checkpoint.flat_weights()));
         Self { session, policy: Some(policy), episodes_per_trial: player.episodes_per_trial() }
     }
 
-    /// Makes some steps in all environments. Returns the episodes that ended a trial.
+    /// Steps all environments [`STEPS_PER_REQUEST`] times. Returns the episodes that ended, if they are the last of
+    /// their trial.
     pub(super) fn play(&mut self) -> Result<Vec<EndedEpisode>, TestError> {
         let policy = self.policy.take();
         let episodes_per_trial = self.episodes_per_trial;
@@ -78,7 +81,8 @@ impl<'a> RemoteTrials<'a> {
         Ok(ended)
     }
 
-    /// Sends a request to each server. Adds the first slots of the servers that have not finished to `unfinished`.
+    /// Sends a request to each server and receives the replies. Adds ended episodes to `ended`. If a server has not yet
+    /// played all requested steps, adds its first slot to `unfinished`.
     fn play_part(
         &mut self,
         request: impl FnMut(Range<usize>) -> Option<proto::Act>,

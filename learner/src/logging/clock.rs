@@ -1,8 +1,8 @@
-//! Seconds of training, over all the processes of a run.
+//! Counts the seconds of a training over all processes that take part in it.
 
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
-/// Counts seconds of training. A break does not count.
+/// Counts seconds of training. Time between an interruption and the resumption does not count.
 #[derive(Clone, Copy, Debug)]
 pub struct Clock {
     t_start: f64,
@@ -11,23 +11,24 @@ pub struct Clock {
 }
 
 impl Clock {
-    /// Starts now, at `elapsed` seconds: 0 for a new training.
+    /// Starts the clock now, with `elapsed` seconds of earlier training: 0 for a new training.
     pub fn start(elapsed: f64) -> Self {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64();
         Self::new(now - elapsed, elapsed)
     }
 
-    /// Starts now, at `elapsed` seconds. `t_start` is the time of second 0, in seconds since 1970.
+    /// Starts the clock now, with `elapsed` seconds of earlier training. `t_start` is the time of second 0, in seconds
+    /// since 1970.
     pub fn new(t_start: f64, elapsed: f64) -> Self {
         Self { t_start, before: elapsed, since: Instant::now() }
     }
 
-    /// Seconds of training so far.
+    /// Returns the seconds of training so far.
     pub fn elapsed(&self) -> f64 {
         self.before + self.since.elapsed().as_secs_f64()
     }
 
-    /// The time of second 0, in seconds since 1970.
+    /// Returns the time of second 0, in seconds since 1970.
     pub fn t_start(&self) -> f64 {
         self.t_start
     }

@@ -1,4 +1,5 @@
-//! The logs of a run. A new run creates them. A resumed run cuts them back to its checkpoint and continues them.
+//! The log files of a training. A new training creates them. A resumed training truncates them to their lengths at its
+//! checkpoint, and continues them.
 
 use std::fs::{File, OpenOptions};
 use std::io::ErrorKind;
@@ -15,7 +16,7 @@ use crate::client::EndedEpisode;
 const MONITOR: &str = "monitor.csv";
 const PROGRESS: &str = "progress.csv";
 
-/// The log files of a run.
+/// The log files of a training.
 #[derive(Debug)]
 pub struct Logs {
     directory: PathBuf,
@@ -23,7 +24,7 @@ pub struct Logs {
     progress: ProgressLog,
 }
 
-/// Lengths of the logs, in bytes.
+/// The lengths of the log files in bytes.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LogLengths {
@@ -31,35 +32,35 @@ pub struct LogLengths {
     pub monitor: u64,
     /// Length of `progress.csv`.
     pub progress: u64,
-    /// Length of the file of TensorBoard events.
+    /// Length of the TensorBoard events file.
     pub events: u64,
-    /// Name of the file of TensorBoard events.
+    /// Name of the TensorBoard events file.
     pub events_file: String,
 }
 
-/// Why a log cannot be continued.
+/// The reason why a log cannot be continued.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum LogError {
     /// The operating system could not read or write a file.
     #[error(transparent)]
     File(#[from] FileError),
-    /// A log does not hold what it held when the checkpoint was written.
+    /// A log file has changed since the checkpoint was written.
     #[error(
         "{} has changed since the checkpoint was written: {reason}; put the file back as perturb wrote it, or train \
          again with --overwrite",
         path.display()
     )]
     Changed {
-        /// The log.
+        /// The path of the log file.
         path: PathBuf,
-        /// The change.
+        /// A description of the change.
         reason: String,
     },
 }
 
 impl Logs {
-    /// Creates the files in `directory`.
+    /// Creates the log files in `directory`.
     ///
     /// # Errors
     /// [`FileError`].
@@ -67,15 +68,15 @@ impl Logs {
         let path = directory.join(MONITOR);
         let monitor = Monitor::create(&path, environment, spec, clock).map_err(io("create", &path))?;
         let progress = ProgressLog::create(directory, clock.t_start()).map_err(io("create the logs in", directory))?;
-        sync_folder(directory)?; // names must be on the disk before a checkpoint counts on them
+        sync_folder(directory)?; // the names must be on the disk before a checkpoint refers to them
         Ok(Self { directory: directory.to_owned(), monitor, progress })
     }
 
-    /// Continues the files in `directory` at these `lengths`. Later lines are deleted.
+    /// Opens the log files in `directory`, and truncates them to these `lengths`. New lines are appended there.
     ///
     /// # Errors
-    /// [`LogError::Changed`] if a file is shorter than its length, or does not end a line there; no file was changed then.
-    /// [`LogError::File`].
+    /// [`LogError::Changed`] if a file is missing, shorter, or has no end of a line at its length; no file is changed
+    /// then. [`LogError::File`] if a file cannot be read or written.
     pub fn resume(
         directory: &Path,
         lengths: &LogLengths,
@@ -103,8 +104,8 @@ impl Logs {
         self.monitor.write(episode).map_err(io("write", &self.directory.join(MONITOR)))
     }
 
-    /// Adds a line to `progress.csv` and an event. First passes all earlier episodes of `monitor.csv` to the operating
-    /// system.
+    /// Adds a line to `progress.csv`, and an event for TensorBoard. Before that, writes all buffered lines of
+    /// `monitor.csv`.
     ///
     /// # Errors
     /// [`FileError`].
@@ -113,7 +114,7 @@ impl Logs {
         self.progress.write(progress).map_err(io("write", &self.directory.join(PROGRESS)))
     }
 
-    /// Flushes the logs to the disk, and returns their lengths.
+    /// Flushes all logs to the disk, and returns their lengths.
     ///
     /// # Errors
     /// [`FileError`].
@@ -124,7 +125,7 @@ impl Logs {
     }
 }
 
-/// Opens a log for appending. It must have at least `length` bytes and, if it consists of `lines`, end a line there.
+/// Opens a log for appending. It must have at least `length` bytes. If `lines` is set, a line must end at this length.
 fn open(path: &Path, length: u64, lines: bool) -> Result<File, LogError> {
     let changed = |reason| Err(LogError::Changed { path: path.to_owned(), reason });
     match open_plain(path) {

@@ -1,5 +1,5 @@
-//! Logs of a training: `monitor.csv`, `progress.csv` and TensorBoard events, all with stable-baselines3's names, so that
-//! existing tools read them.
+//! The logs of a training: `monitor.csv`, `progress.csv` and TensorBoard events. Formats and names are those of
+//! stable-baselines3, so that existing tools can read them.
 
 mod clock;
 mod disk;

@@ -1,4 +1,4 @@
-//! The log `monitor.csv`: a line for every episode.
+//! Writes the log `monitor.csv`, with a line for each training episode.
 
 use std::fs::File;
 use std::io::Write;
@@ -10,28 +10,31 @@ use super::Clock;
 use super::disk::sync;
 use crate::client::EndedEpisode;
 
-/// Number of buffered bytes at which lines are passed to the operating system without a flush.
+/// Number of buffered bytes above which lines are written without waiting for a flush.
 const MAX_BUFFERED_BYTES: usize = 64 * 1024;
 
-/// Writes stable-baselines3's Monitor format: a line of JSON after `#`, a header, and a line an episode with its return
-/// `r`, its length `l` and the seconds `t` since the start; then `success`, `terminated` (0 or 1), `episode_index`,
-/// `environment_index`, `trial_index`, `episode_in_trial`, a column for each parameter as it was requested, and
-/// `applied_…` for each quantity that was read back from the physics.
+/// Writes `monitor.csv` in the format of stable-baselines3's Monitor: a line with `#` and JSON, a header, and a line
+/// for each episode.
 ///
-/// Only whole lines are passed to the operating system, so a program that reads the file while a training runs, or after the
-/// training was killed, never sees a part of a line.
+/// The columns of Monitor are `r` (return), `l` (length in steps) and `t` (seconds since the start of training).
+/// Further columns are `success` and `terminated` (0 or 1), `episode_index`, `environment_index`, `trial_index`,
+/// `episode_in_trial`, the requested value of each parameter, and `applied_…` for each value that was read back from
+/// the physics.
+///
+/// Only complete lines are written to the file. A program that reads it during the training, or after the training was
+/// killed, therefore never sees a partial line.
 #[derive(Debug)]
 pub struct Monitor {
     file: File,
-    /// Whole lines that were not yet passed to the operating system.
+    /// Buffer of complete lines that have not been written yet.
     lines: csv::Writer<Vec<u8>>,
     clock: Clock,
-    /// Number of columns of applied values. Files of earlier programs have none.
+    /// Number of columns of applied values; 0 if an earlier program created the file without them.
     applied: usize,
 }
 
 impl Monitor {
-    /// Creates the file.
+    /// Creates the file with its JSON line and its header.
     ///
     /// # Errors
     /// Errors of the operating system.
@@ -59,12 +62,12 @@ impl Monitor {
         Ok(monitor)
     }
 
-    /// Continues at the end of `file`.
+    /// Returns a writer that continues at the end of `file`.
     pub(super) fn resume(file: File, spec: &EnvironmentSummary, clock: Clock) -> Self {
         Self { file, lines: csv::Writer::from_writer(Vec::new()), clock, applied: spec.applied.len() }
     }
 
-    /// Adds an episode.
+    /// Adds the line of an episode.
     ///
     /// # Errors
     /// Errors of the operating system.
@@ -91,7 +94,7 @@ impl Monitor {
         if self.lines.get_ref().len() >= MAX_BUFFERED_BYTES { self.flush() } else { Ok(()) }
     }
 
-    /// Passes buffered lines to the operating system.
+    /// Writes all buffered lines to the file.
     ///
     /// # Errors
     /// Errors of the operating system.

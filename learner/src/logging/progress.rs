@@ -1,4 +1,4 @@
-//! `progress.csv` and the TensorBoard events: the same scalars in two forms.
+//! Writes `progress.csv` and the TensorBoard events, which have the same scalars.
 
 use std::fs::File;
 use std::path::Path;
@@ -10,48 +10,48 @@ use super::disk::sync;
 use crate::algorithm::UpdateStats;
 use crate::client::EndedEpisode;
 
-/// Figures of an episode, or means over several episodes.
+/// Return, length and success of an episode, or their means over several episodes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EpisodeFigures {
     /// The undiscounted return.
     pub episode_return: f64,
-    /// Steps.
+    /// The length in steps.
     pub length: f64,
-    /// 1 for a success, 0 for none.
+    /// 1 for a success, otherwise 0; as a mean, the success rate (0 to 1).
     pub success: f64,
 }
 
-/// Seconds of a training by activity.
+/// Seconds, or percentages, of a training's time by activity.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct TimeShares {
-    /// Choosing actions.
+    /// Time spent on choosing actions.
     pub acting: f64,
-    /// Waiting for servers.
+    /// Time spent on waiting for servers.
     pub waiting: f64,
-    /// Updating the policy.
+    /// Time spent on updating the policy.
     pub updating: f64,
 }
 
-/// A line of `progress.csv`.
+/// The state of a training after an iteration: a line of `progress.csv`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Progress {
-    /// Rollouts and updates so far.
+    /// Number of iterations so far: a rollout and an update each.
     pub iterations: u64,
-    /// Steps of all environments so far.
+    /// Number of steps so far, summed over all environments.
     pub timesteps: u64,
-    /// Seconds since the start.
+    /// Seconds of training so far.
     pub elapsed: f64,
-    /// Seconds by activity.
+    /// Seconds of training so far by activity.
     pub shares: TimeShares,
-    /// Episodes that the budget counts.
+    /// Number of episodes so far that count towards the budget.
     pub episodes: u64,
-    /// Episodes that have ended; EPOpt generates more than it learns from.
+    /// Number of finished episodes so far, including those that EPOpt generates but does not learn from.
     pub generated_episodes: u64,
-    /// Steps that the last checkpoint on disk counts.
+    /// Number of steps at the last checkpoint on disk.
     pub saved_timesteps: u64,
-    /// Means over the last 100 episodes; `None` before the first has ended.
+    /// Means over the last 100 episodes; `None` before the first episode has ended.
     pub recent: Option<EpisodeFigures>,
-    /// The last update.
+    /// Statistics of the last update.
     pub update: UpdateStats,
 }
 
@@ -66,7 +66,7 @@ impl From<&EndedEpisode> for EpisodeFigures {
 }
 
 impl EpisodeFigures {
-    /// Means over `episodes`; `None` if there are none.
+    /// Returns the means over `episodes`; `None` if there are none.
     pub fn mean<'a>(episodes: impl ExactSizeIterator<Item = &'a Self> + Clone) -> Option<Self> {
         let count = episodes.len() as f64;
         let mean = |figure: fn(&Self) -> f64| episodes.clone().map(figure).sum::<f64>() / count;
@@ -79,25 +79,26 @@ impl EpisodeFigures {
 }
 
 impl Progress {
-    /// Steps of all environments in a second.
+    /// Returns the steps of all environments per second of training.
     pub fn fps(&self) -> f64 {
         self.timesteps as f64 / self.elapsed.max(1e-9)
     }
 
-    /// Percentages of the time by activity.
+    /// Returns the time by activity as percentages of the whole training time.
     pub fn percent(&self) -> TimeShares {
         let percent = |seconds: f64| 100.0 * seconds / self.elapsed.max(1e-9);
         let TimeShares { acting, waiting, updating } = self.shares;
         TimeShares { acting: percent(acting), waiting: percent(waiting), updating: percent(updating) }
     }
 
-    /// The columns with their values, `None` where there is no value. They have stable-baselines3's names, except:
+    /// Returns the columns of `progress.csv` with their values; `None` for an empty field. Names are those of
+    /// stable-baselines3, except:
     ///
-    /// - `time/acting`, `time/waiting` and `time/updating`: seconds since the start spent on choosing actions, on waiting
-    ///   for servers, and on updates;
+    /// - `time/acting`, `time/waiting` and `time/updating`: seconds so far spent on choosing actions, on waiting for
+    ///   servers, and on updates;
     /// - `epopt/episodes_generated`: episodes that EPOpt has generated so far;
-    /// - the other `epopt/…`: the last iteration's intended share ε, number of episodes kept, mean return of all episodes,
-    ///   and mean return of the worst (conditional value at risk).
+    /// - the other `epopt/…` columns: the last iteration's share ε, its number of selected episodes, the mean return of
+    ///   all its episodes, and the mean return of its worst episodes (conditional value at risk).
     fn columns(&self) -> [(&'static str, Option<f64>); 29] {
         let Self { shares, recent, update, .. } = self;
         let selection = update.selection;
@@ -135,7 +136,7 @@ impl Progress {
     }
 }
 
-/// Writes the scalars of an iteration to `progress.csv` and to the TensorBoard events.
+/// Writes the scalars of each iteration to `progress.csv` and to a TensorBoard events file.
 #[derive(Debug)]
 pub struct ProgressLog {
     csv: csv::Writer<File>,
@@ -143,7 +144,8 @@ pub struct ProgressLog {
 }
 
 impl ProgressLog {
-    /// Creates `progress.csv` and an events file in `directory`. `t_start` is the time of day in seconds since 1970.
+    /// Creates `progress.csv` and an events file in `directory`. `t_start` is the start of the training in seconds
+    /// since 1970.
     ///
     /// # Errors
     /// Errors of the operating system.
@@ -154,23 +156,24 @@ impl ProgressLog {
         Ok(Self { csv, events: EventWriter::create(directory, t_start)? })
     }
 
-    /// Continues at the ends of `csv` and of `events`, whose name is `events_file`.
+    /// Returns a writer that continues at the ends of `csv` and `events`. `events_file` is the name of `events`.
     pub(super) fn resume(csv: File, events: File, events_file: String, t_start: f64) -> Self {
         Self { csv: csv::Writer::from_writer(csv), events: EventWriter::resume(events, events_file, t_start) }
     }
 
-    /// The name of the events file.
+    /// Returns the name of the events file.
     pub(super) fn events_file(&self) -> &str {
         self.events.file_name()
     }
 
-    /// Flushes both files to the disk. Returns the lengths of `progress.csv` and of the events.
+    /// Flushes both files to the disk. Returns the lengths of `progress.csv` and of the events file, in bytes.
     pub(super) fn sync(&mut self) -> std::io::Result<[u64; 2]> {
         self.csv.flush()?;
         Ok([sync(self.csv.get_ref(), "progress.csv")?, self.events.sync()?])
     }
 
-    /// Adds a line and an event, and passes them to the operating system. A missing value is an empty cell.
+    /// Writes a line to `progress.csv`, and an event. A missing value is an empty field in the line, and left out of
+    /// the event.
     ///
     /// # Errors
     /// Errors of the operating system.

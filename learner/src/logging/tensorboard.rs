@@ -1,7 +1,7 @@
-//! TensorBoard event files, without TensorFlow.
+//! Writes TensorBoard event files, without TensorFlow.
 //!
-//! A file is a sequence of TFRecords: the length of the data as u64, a checksum of the length, the data, and a checksum
-//! of the data, all little-endian. The data is a protobuf `Event`.
+//! A file is a sequence of TFRecords. A TFRecord consists of the length of its data as u64, a checksum of the length,
+//! the data, and a checksum of the data, all little-endian. The data is a protobuf message `Event`.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -11,7 +11,7 @@ use prost::Message;
 
 use super::disk::sync;
 
-/// The fields of tensorflow/core/util/event.proto that scalars need.
+/// The message `Event` of tensorflow/core/util/event.proto, with only the fields that scalars need.
 #[derive(Clone, PartialEq, Message)]
 struct EventMessage {
     /// Seconds since 1970.
@@ -25,7 +25,7 @@ struct EventMessage {
     summary: Option<SummaryMessage>,
 }
 
-/// The fields of tensorflow/core/framework/summary.proto that scalars need.
+/// The message `Summary` of tensorflow/core/framework/summary.proto, with only the fields that scalars need.
 #[derive(Clone, PartialEq, Message)]
 struct SummaryMessage {
     #[prost(message, repeated, tag = "1")]
@@ -37,12 +37,12 @@ struct SummaryMessage {
 struct ValueMessage {
     #[prost(string, tag = "1")]
     tag: String,
-    // In a oneof, so present even if 0.
+    // The field is part of a oneof, so it is sent even if it is 0.
     #[prost(float, optional, tag = "2")]
     simple_value: Option<f32>,
 }
 
-/// Writes scalars for TensorBoard.
+/// Writes scalars to an events file for TensorBoard.
 #[derive(Debug)]
 pub struct EventWriter {
     file: BufWriter<File>,
@@ -51,7 +51,7 @@ pub struct EventWriter {
 }
 
 impl EventWriter {
-    /// Creates an events file in `directory`. `t_start` is the time of day in seconds since 1970.
+    /// Creates an events file in `directory`. `t_start` is the start of the training in seconds since 1970.
     ///
     /// # Errors
     /// Errors of the operating system.
@@ -65,12 +65,12 @@ impl EventWriter {
         Ok(writer)
     }
 
-    /// Continues at the end of `file`, whose name is `file_name`.
+    /// Returns a writer that continues at the end of `file`, whose name is `file_name`.
     pub(super) fn resume(file: File, file_name: String, t_start: f64) -> Self {
         Self { file: BufWriter::new(file), file_name, t_start }
     }
 
-    /// The name of the file.
+    /// Returns the name of the file.
     pub(super) fn file_name(&self) -> &str {
         &self.file_name
     }
@@ -81,7 +81,7 @@ impl EventWriter {
         sync(self.file.get_ref(), "events.out.tfevents")
     }
 
-    /// Adds scalars at `step`, `elapsed` seconds after the start, and passes them to the operating system.
+    /// Writes an event with the values of `scalars` at `step`, `elapsed` seconds after the start of the training.
     ///
     /// # Errors
     /// Errors of the operating system.
@@ -108,7 +108,7 @@ impl EventWriter {
     }
 }
 
-/// A TFRecord.
+/// Returns a TFRecord with this data.
 fn frame(data: &[u8]) -> Vec<u8> {
     let length = (data.len() as u64).to_le_bytes();
     let mut record = Vec::with_capacity(data.len() + 16);
@@ -119,7 +119,8 @@ fn frame(data: &[u8]) -> Vec<u8> {
     record
 }
 
-/// CRC-32C, rotated and shifted. The plain checksum would be weak for data that contain checksums.
+/// Returns the masked CRC-32C that TFRecords use. The plain checksum would be weak for data that itself contains
+/// checksums.
 fn masked_crc(data: &[u8]) -> u32 {
     crc32c::crc32c(data).rotate_right(15).wrapping_add(0xa282_ead8)
 }
@@ -128,7 +129,7 @@ fn masked_crc(data: &[u8]) -> u32 {
 mod tests {
     use super::*;
 
-    /// The records of a file, with their checksums verified.
+    /// Parses the events of a file and verifies their checksums.
     fn read(mut bytes: &[u8]) -> Vec<EventMessage> {
         let mut events = Vec::new();
         while !bytes.is_empty() {
@@ -159,7 +160,7 @@ mod tests {
 
     #[test]
     fn record_equals_that_of_tensorboard() {
-        // What tensorboard 2.21's RecordWriter makes of b"abc".
+        // The output of tensorboard 2.21's RecordWriter for b"abc".
         let expected = "0300000000000000b099490e6162636e57f121";
         let hexadecimal: String = frame(b"abc").iter().map(|byte| format!("{byte:02x}")).collect();
         assert_eq!(hexadecimal, expected);

@@ -1,52 +1,53 @@
-//! Returns and advantages: what their estimators have in common.
+//! The common part of the estimators of returns and advantages: how they handle the ends of episodes.
 //!
-//! PPO estimates advantages by [`gae`](crate::algorithm::gae), A2C returns by
-//! [`n_step_returns`](crate::algorithm::n_step_returns). Both treat the end of an episode alike. Let V' be what is expected after step t, t = 0 … T-1:
+//! PPO estimates advantages by [`gae`](crate::algorithm::gae), and A2C estimates returns by
+//! [`n_step_returns`](crate::algorithm::n_step_returns). Both handle the end of an episode in the same way. Let V' be
+//! the expected return after step t, t = 0 … T-1:
 //!
 //! - terminated: V' = 0;
-//! - else truncated: V' = V(final observation), or 0 without `bootstrap_truncation`;
-//! - else V' = V(s_{t+1}), where V(s_T) is `last_values`.
+//! - otherwise, truncated: V' = V(final observation), or 0 without `bootstrap_truncation`;
+//! - otherwise: V' = V(s_{t+1}), where V(s_T) is in `last_values`.
 //!
-//! After a termination or a truncation the trace is cut: nothing of step t+1, which belongs to the next episode, flows
-//! back. If both flags are set, termination wins. The reference treats a truncation as a termination, which is
-//! `bootstrap_truncation = false`; why that biases values: Pardo et al. (2018), arXiv:1712.00378.
+//! If step t ends an episode, the estimates of step t do not depend on step t+1, which belongs to the next episode. If
+//! both flags are set, termination takes precedence. `bootstrap_truncation = false` treats a truncation as a
+//! termination, as the paper's published code does. Pardo et al. (2018), arXiv:1712.00378, explain why this biases
+//! values.
 //!
-//! With trials of several episodes (RL²) a trial is the episode that is meant here: its flags are those of the trial's
-//! end.
+//! With RL², a whole trial of several episodes takes the place of an episode here: the flags mark the end of a trial.
 //!
-//! Sums are in f64 and rounded once, at the end.
+//! Sums are computed in f64, and rounded to f32 once, at the end.
 
-/// T steps of N environments; arrays are row-major.
+/// The input of the estimators: T steps of N environments. Arrays are row-major.
 #[derive(Clone, Copy, Debug)]
 pub struct Trajectories<'a> {
-    /// N.
+    /// N, the number of environments.
     pub n_envs: usize,
-    /// `[T, N]` rewards r_t, received after the action at s_t.
+    /// Rewards r_t `[T, N]`, received after the action in state s_t.
     pub rewards: &'a [f32],
-    /// `[T, N]` values V(s_t).
+    /// Values V(s_t) `[T, N]`.
     pub values: &'a [f32],
-    /// `[T, N]` whether the task ended the episode in step t.
+    /// Whether the task ended the episode in step t, `[T, N]`.
     pub terminated: &'a [bool],
-    /// `[T, N]` whether the time limit ended the episode in step t.
+    /// Whether the step limit ended the episode in step t, `[T, N]`.
     pub truncated: &'a [bool],
-    /// `[T, N]` V(final observation) where truncated; ignored elsewhere.
+    /// V(final observation) of truncated episodes, `[T, N]`; ignored for other steps.
     pub truncation_values: &'a [f32],
-    /// `[N]` V(s_T); ignored where step T-1 ended an episode.
+    /// V(s_T) `[N]`; ignored if step T-1 ended an episode.
     pub last_values: &'a [f32],
 }
 
-/// Step t of an environment, as an estimator sees it.
+/// Step t of an environment: the input of an estimator.
 #[derive(Clone, Copy, Debug)]
 pub struct EstimatorStep {
-    /// r_t.
+    /// The reward r_t.
     pub reward: f64,
-    /// V(s_t).
+    /// The value V(s_t).
     pub value: f64,
-    /// V'.
+    /// The value V' of the observation after the step, see the module's description.
     pub next_value: f64,
     /// Whether step t ended an episode.
     pub ended: bool,
-    /// Whether t = T-1.
+    /// Whether this is the last step of the rollout: t = T-1.
     pub last: bool,
     /// The advantage of step t+1; 0 for t = T-1.
     pub next_advantage: f64,
@@ -54,22 +55,23 @@ pub struct EstimatorStep {
     pub next_return: f64,
 }
 
-/// Advantages and value targets.
+/// The output of an estimator: advantages and returns.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Estimates {
-    /// `[T, N]` how much better the action was than expected.
+    /// Advantages `[T, N]`: estimates of how much better an action was than the policy's average action.
     pub advantages: Vec<f32>,
-    /// `[T, N]` what V(s_t) should have been.
+    /// Returns `[T, N]`: the targets of the value function at s_t.
     pub returns: Vec<f32>,
 }
 
 impl Trajectories<'_> {
-    /// Walks every environment from its last step to its first; `estimate` returns a step's advantage and return. Truncated
-    /// episodes are bootstrapped if `bootstrap_truncation` is set.
+    /// Calls `estimate` for the steps of every environment, from the last to the first. It returns the advantage and
+    /// the return of the step. `bootstrap_truncation` decides about V' after truncated episodes, see the module's
+    /// description.
     ///
     /// # Panics
     ///
-    /// If arrays have different lengths.
+    /// Panics if arrays have different lengths.
     pub fn backward(&self, bootstrap_truncation: bool, estimate: impl Fn(EstimatorStep) -> (f64, f64)) -> Estimates {
         let Trajectories { n_envs, rewards, values, terminated, truncated, truncation_values, last_values } = *self;
         let size = rewards.len();
@@ -108,8 +110,9 @@ impl Trajectories<'_> {
     }
 }
 
-/// 1 - Var(return - value)/Var(return) over all samples: 1 = values are perfect, 0 = no better than a constant, below
-/// 0 = worse. None if the returns are constant, for which it is not defined.
+/// Returns the share of the variance of the returns that the values explain: 1 - Var(return - value) / Var(return) over
+/// all samples. 1 means perfect values, 0 no better than a constant, and negative numbers worse than a constant.
+/// Returns `None` if the returns are constant.
 pub fn explained_variance(values: &[f32], returns: &[f32]) -> Option<f64> {
     let variance = |numbers: &mut dyn Iterator<Item = f64>| {
         let numbers: Vec<f64> = numbers.collect();

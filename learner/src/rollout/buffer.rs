@@ -1,29 +1,30 @@
-//! The rollout buffer.
+//! The buffer of a rollout.
 
 use super::advantage::{Estimates, Trajectories};
 use crate::error::{Error, Result};
 use perturb_policy::{RolloutStep, Samples, SequenceSamples, check_length};
 
-/// A complete episode in a rollout.
+/// The position of a complete episode in a rollout, and its return.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EpisodeSlice {
-    /// The environment, 0 … N-1.
+    /// The index of the environment, 0 … N-1.
     pub environment: usize,
-    /// The first step, 0 … T-1.
+    /// The index of the first step, 0 … T-1.
     pub start: usize,
     /// The number of steps.
     pub length: usize,
-    /// The undiscounted sum of its rewards, before they were normalised.
+    /// The undiscounted sum of the episode's rewards before normalisation.
     pub episode_return: f64,
 }
 
-/// T steps of N environments. Arrays are row-major [T, N, …], so that a step is pushed as one piece; flattened to
-/// T·N samples, sample t·N + n is step t of environment n.
+/// The collected experience of T steps in N environments. Arrays are row-major [T, N, …], so that a step is appended as
+/// one piece. Flattened to T·N samples, sample t·N + n is step t of environment n.
 ///
-/// A rollout of complete episodes takes steps until it is finished, and lists the episodes.
+/// A rollout of complete episodes (for EPOpt) has no fixed T: it grows until it is finished, and also lists its
+/// episodes.
 #[derive(Clone, Debug)]
 pub struct Rollout {
-    /// T, if it is fixed beforehand.
+    /// T, or `None` for a rollout of complete episodes, whose length is not fixed.
     fixed_steps: Option<usize>,
     n_envs: usize,
     observation_size: usize,
@@ -46,13 +47,13 @@ pub struct Rollout {
 }
 
 impl Rollout {
-    /// An empty rollout for T = `n_steps`, N = `n_envs`, O = `observation_size` and A = `action_width` (see
-    /// [`ActionKind::width`](perturb_policy::ActionKind::width)). Allocates everything that it will need.
+    /// Returns an empty rollout for T = `n_steps`, N = `n_envs`, O = `observation_size` and A = `action_width` (see
+    /// [`ActionKind::width`](perturb_policy::ActionKind::width)). Allocates all memory in advance.
     pub fn new(n_steps: usize, n_envs: usize, observation_size: usize, action_width: usize) -> Self {
         Self::with_capacity(Some(n_steps), n_steps, n_envs, observation_size, action_width)
     }
 
-    /// An empty rollout for complete episodes. It grows with every step until [`Rollout::finish`].
+    /// Returns an empty rollout for complete episodes. It grows with every step until [`Rollout::finish`].
     pub fn of_episodes(n_envs: usize, observation_size: usize, action_width: usize) -> Self {
         Self::with_capacity(None, 0, n_envs, observation_size, action_width)
     }
@@ -88,14 +89,14 @@ impl Rollout {
         }
     }
 
-    /// Clears the rollout, and stores the policy's memory before the first step: `memory` `[N, S]`, empty for a feed-forward
-    /// policy. Allocated capacity is kept.
+    /// Starts a new rollout: removes all steps, and stores the policy's recurrent memory before the first step,
+    /// `memory` `[N, S]`. It is empty for a feed-forward policy. Keeps the allocated capacity.
     pub fn begin(&mut self, memory: &[f32]) {
         self.clear();
         self.memory.extend_from_slice(memory);
     }
 
-    /// Removes all steps. Allocated capacity is kept.
+    /// Removes all steps. Keeps the allocated capacity.
     pub fn clear(&mut self) {
         self.len = 0;
         self.finished = false;
@@ -114,7 +115,8 @@ impl Rollout {
         self.lengths = None;
     }
 
-    /// Appends a step, or several, whose arrays are `[T, N, …]`. A wrong length, or a step too many, changes nothing.
+    /// Appends one step, or several steps whose arrays are `[T, N, …]`. Returns an error, and changes nothing, if an
+    /// array has a wrong length or there are too many steps.
     pub fn push(&mut self, step: RolloutStep<'_>) -> Result<()> {
         let steps = (step.rewards.len() / self.n_envs).max(1);
         if self.fixed_steps.is_some_and(|fixed_steps| self.len + steps > fixed_steps) {
@@ -143,8 +145,8 @@ impl Rollout {
         Ok(())
     }
 
-    /// Sets `last_values` `[N]` = V(s_T), where s_T are the observations after the last step. Comes after the last
-    /// [`Rollout::push`] and before an update.
+    /// Finishes the rollout. `last_values` `[N]` are V(s_T), the values of the observations after the last step. Must
+    /// be called after the last [`Rollout::push`] and before an update.
     pub fn finish(&mut self, last_values: &[f32]) -> Result<()> {
         if !self.is_full() && self.fixed_steps.is_some() {
             return Err(Error::RolloutLength { got: self.len, expected: self.n_steps(), what: "it was finished" });
@@ -156,7 +158,7 @@ impl Rollout {
         Ok(())
     }
 
-    /// The arrays that advantages are estimated from.
+    /// Returns the arrays from which advantages are estimated.
     ///
     /// # Errors
     /// [`Error::RolloutLength`] before [`Rollout::finish`].
@@ -176,7 +178,7 @@ impl Rollout {
         })
     }
 
-    /// The rollout as a policy learns from it, with what was estimated from it.
+    /// Returns the training samples of the rollout, with the `estimates` of its advantages and returns.
     pub fn sequences<'a>(&'a self, estimates: &'a Estimates) -> SequenceSamples<'a> {
         let samples = Samples {
             observations: &self.observations,
@@ -191,39 +193,40 @@ impl Rollout {
         SequenceSamples { samples, n_steps, starts: &self.starts, memory: &self.memory, lengths: self.lengths() }
     }
 
-    /// Steps pushed since the last `clear`.
+    /// Returns the number of steps since the rollout was last cleared.
     pub fn len(&self) -> usize {
         self.len
     }
 
-    /// Whether no step was pushed yet.
+    /// Returns whether the rollout has no steps.
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }
 
-    /// Whether T steps were pushed, if T is fixed beforehand.
+    /// Returns whether the rollout has all its T steps. Always false for a rollout of complete episodes.
     pub fn is_full(&self) -> bool {
         self.fixed_steps == Some(self.len)
     }
 
-    /// T.
+    /// Returns T, the number of steps: the fixed number, or the steps so far in a rollout of complete episodes.
     pub fn n_steps(&self) -> usize {
         self.fixed_steps.unwrap_or(self.len)
     }
 
-    /// Adds an episode of `length` steps that ended before step `end`, counted from 0. All its steps must be in the
-    /// rollout.
+    /// Records that an episode of `length` steps ended before step `end`, which is an index from 0. All steps of the
+    /// episode must be in the rollout.
     ///
     /// # Errors
-    /// [`Error::Episode`] if the episode has no steps, starts before the rollout, ends after it, or if there is no such
-    /// environment.
+    /// [`Error::Episode`] if the episode has no steps, starts before the rollout or ends after it, or if there is no
+    /// such environment.
     pub fn note_episode(&mut self, environment: usize, end: usize, length: usize, episode_return: f64) -> Result<()> {
         self.check_episode(environment, end, length)?;
         self.episodes.push(EpisodeSlice { environment, start: end - length, length, episode_return });
         Ok(())
     }
 
-    /// Whether the `length` steps before step `end` of `environment` are in the rollout, and at least one.
+    /// Returns an error unless `length` is at least 1 and the `length` steps of `environment` before step `end` are in
+    /// the rollout.
     fn check_episode(&self, environment: usize, end: usize, length: usize) -> Result<()> {
         let n_envs = self.n_envs;
         let n_steps = self.len;
@@ -233,13 +236,13 @@ impl Rollout {
         Err(Error::Episode { environment, end, length, n_envs, n_steps })
     }
 
-    /// The complete episodes, in the order in which they ended.
+    /// Returns the complete episodes, in the order in which they ended.
     pub fn episodes(&self) -> &[EpisodeSlice] {
         &self.episodes
     }
 
-    /// The sums of the complete episodes' rewards as stored, normalised if rewards are, in the order of
-    /// [`Rollout::episodes`].
+    /// Returns the sum of stored rewards of each complete episode, in the order of [`Rollout::episodes`]. Stored
+    /// rewards are normalised if reward normalisation is on.
     pub fn normalized_returns(&self) -> Vec<f64> {
         let reward = |step: usize, environment: usize| f64::from(self.rewards[step * self.n_envs + environment]);
         let sum = |span: &EpisodeSlice| {
@@ -248,12 +251,12 @@ impl Rollout {
         self.episodes.iter().map(sum).collect()
     }
 
-    /// A rollout of only the given episodes of this one. T is the length of the longest episode. Shorter ones share a
-    /// column, one after another, where they fit. The rest of a column is padding, which is not sampled. Every episode
-    /// begins with an empty memory.
+    /// Returns a new rollout with only the given episodes. Its T is the length of the longest episode. A column (an
+    /// environment of the new rollout) may have several short episodes one after another. The rest of a column is
+    /// padding, which is not sampled. Every episode starts with an empty recurrent memory.
     ///
     /// # Errors
-    /// There is no episode, or the rollout does not hold one of them.
+    /// An error if `episodes` is empty, or one of them is not in this rollout.
     pub fn select(&self, episodes: &[EpisodeSlice]) -> Result<Rollout> {
         let longest = episodes.iter().map(|episode| episode.length).max().unwrap_or(0);
         if longest == 0 {
@@ -292,7 +295,7 @@ impl Rollout {
         Ok(selected)
     }
 
-    /// A finished rollout of nothing but padding.
+    /// Returns a finished rollout that has only padding.
     fn padding(&self, n_steps: usize, n_envs: usize) -> Rollout {
         let size = n_steps * n_envs;
         let memory_size = self.memory.len() / self.n_envs;
@@ -305,7 +308,7 @@ impl Rollout {
             log_probs: vec![0.0; size],
             values: vec![0.0; size],
             rewards: vec![0.0; size],
-            terminated: vec![true; size], // nothing flows from padding into an episode
+            terminated: vec![true; size], // so the estimates of an episode do not depend on padding
             truncated: vec![false; size],
             truncation_values: vec![0.0; size],
             last_values: vec![0.0; n_envs],
@@ -314,68 +317,70 @@ impl Rollout {
         }
     }
 
-    /// `[N]` the number of first steps of each environment that are samples; None if all steps are.
+    /// Returns for each environment `[N]` how many of its first steps are samples; the others are padding. Returns
+    /// `None` if all steps are samples.
     pub fn lengths(&self) -> Option<&[usize]> {
         self.lengths.as_deref()
     }
 
-    /// Indices t·N + n of the samples, in order; None if every step is a sample.
+    /// Returns the indices t·N + n of all samples, in ascending order. Returns `None` if all steps are samples.
     pub fn samples(&self) -> Option<Vec<u32>> {
         let lengths = self.lengths.as_ref()?;
         let places = (0..self.len).flat_map(|t| (0..self.n_envs).map(move |n| (t, n)));
         Some(places.filter(|&(t, n)| t < lengths[n]).map(|(t, n)| (t * self.n_envs + n) as u32).collect())
     }
 
-    /// N.
+    /// Returns N, the number of environments.
     pub fn n_envs(&self) -> usize {
         self.n_envs
     }
 
-    /// O.
+    /// Returns O, the length of an observation.
     pub fn observation_size(&self) -> usize {
         self.observation_size
     }
 
-    /// A.
+    /// Returns A, the width of an action.
     pub fn action_width(&self) -> usize {
         self.action_width
     }
 
-    /// `[T, N, O]`.
+    /// Returns the observations `[T, N, O]`.
     pub fn observations(&self) -> &[f32] {
         &self.observations
     }
 
-    /// `[T, N]` whether the policy's memory was emptied before the step.
+    /// Returns whether the policy's recurrent memory was reset before the step, `[T, N]`.
     pub fn starts(&self) -> &[bool] {
         &self.starts
     }
 
-    /// `[N, S]` the policy's memory before the first step.
+    /// Returns the policy's recurrent memory before the first step, `[N, S]`.
     pub fn memory(&self) -> &[f32] {
         &self.memory
     }
 
-    /// `[T, N, A]`.
+    /// Returns the actions `[T, N, A]`.
     pub fn actions(&self) -> &[f32] {
         &self.actions
     }
 
-    /// `[T, N]`.
+    /// Returns the log probabilities of the actions under the policy that acted, `[T, N]`.
     pub fn log_probs(&self) -> &[f32] {
         &self.log_probs
     }
 
-    /// `[T, N]`.
+    /// Returns the values that the policy predicted when it acted, `[T, N]`.
     pub fn values(&self) -> &[f32] {
         &self.values
     }
 }
 
-/// Puts episodes into columns of `height` steps, the longest first, each into the first column in which it fits.
+/// Distributes episodes over columns of `height` steps: takes the longest first, and puts each into the first column
+/// with enough room.
 fn pack(episodes: &[EpisodeSlice], height: usize) -> Vec<Vec<EpisodeSlice>> {
     let mut sorted = episodes.to_vec();
-    sorted.sort_by_key(|episode| std::cmp::Reverse(episode.length)); // keeps the order of equally long ones
+    sorted.sort_by_key(|episode| std::cmp::Reverse(episode.length)); // a stable sort, so episodes of equal length keep their order
     let mut columns: Vec<(usize, Vec<EpisodeSlice>)> = Vec::new();
     for episode in sorted {
         match columns.iter_mut().find(|(used, _)| used + episode.length <= height) {

@@ -1,4 +1,4 @@
-//! Collects rollouts with actions chosen in this process.
+//! Collects rollouts whose actions are chosen in this process.
 
 use bytes::Bytes;
 
@@ -6,7 +6,7 @@ use super::Rollout;
 use crate::client::{ClientError, EndedEpisode, Session, StepReply, StepSlice};
 use perturb_policy::{CollectUntil, Player, PlayerState, RemainingRollout, SlotEnd};
 
-/// Why a rollout could not be collected.
+/// The reason why a rollout could not be collected.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CollectError {
@@ -25,55 +25,58 @@ impl From<perturb_policy::Error> for CollectError {
 }
 
 impl CollectError {
-    /// Whether collecting may succeed later or with another server, see [`ClientError::can_be_retried`].
+    /// Returns whether collecting may succeed later or with another server, see [`ClientError::can_be_retried`].
     pub fn can_be_retried(&self) -> bool {
         matches!(self, Self::Client(error) if error.can_be_retried())
     }
 }
 
-/// Fills a rollout with the steps of a player: T steps of each of N environments, where episodes and a recurrent policy's
-/// memory continue from one rollout to the next; or complete episodes.
+/// Fills rollouts with the steps of a player in N environments.
 ///
-/// Call [`Collector::begin`], then [`Collector::act`] and [`Collector::take`] by turns until [`Collector::is_done`], then
-/// [`Collector::finish`].
+/// A rollout has either T steps of each environment, or complete episodes. With T steps, episodes and a recurrent
+/// policy's memory continue from one rollout to the next.
+///
+/// For each rollout, call [`Collector::begin`], then alternate [`Collector::act`] and [`Collector::take`] until
+/// [`Collector::is_done`] returns true, then call [`Collector::finish`].
 #[derive(Debug)]
 pub struct Collector {
     player: Player,
     remaining: RemainingRollout,
-    /// Buffer for the ends of episodes in a step.
+    /// Buffer for the episodes that end in a step.
     ended: Vec<SlotEnd>,
 }
 
-/// The state of a training's environments and player, without statistics, for exact resumption.
+/// The state of a training's environments and of its player, from which it resumes exactly. Normalisers are stored
+/// elsewhere.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CollectorState {
-    /// `[N]` snapshots of the environments.
+    /// Snapshots of the N environments.
     pub snapshots: Vec<Bytes>,
     /// The player's state.
     pub player: PlayerState,
 }
 
 impl Collector {
-    /// A collector of the steps of `player`.
+    /// Returns a collector for the steps of `player`.
     pub fn new(player: Player) -> Self {
         Self { player, remaining: RemainingRollout::Steps(0), ended: Vec::new() }
     }
 
-    /// The player.
+    /// Returns the player.
     pub fn player(&self) -> &Player {
         &self.player
     }
 
-    /// The player, to be changed.
+    /// Returns the player mutably.
     pub fn player_mut(&mut self) -> &mut Player {
         &mut self.player
     }
 
-    /// Begins a rollout with the weights that the player has loaded. For complete episodes `reset` ends the running
-    /// episodes: it resets all environments and writes their observations `[N, O]`.
+    /// Starts a rollout with the weights that the player has loaded. `until` is the amount to collect. For complete
+    /// episodes, `reset` is called: it must reset all environments, and write their first observations `[N, O]`.
     ///
     /// # Errors
-    /// [`CollectError`].
+    /// [`CollectError`] if the reset fails or an observation is not finite.
     pub fn begin(
         &mut self,
         until: CollectUntil,
@@ -90,23 +93,24 @@ impl Collector {
         Ok(())
     }
 
-    /// Whether nothing is left to collect.
+    /// Returns whether the rollout has all its steps.
     pub fn is_done(&self) -> bool {
         self.remaining.is_done()
     }
 
-    /// Chooses the next actions, encoded for the protocol.
+    /// Chooses the next actions, and returns them in the protocol's encoding.
     ///
     /// # Errors
-    /// [`CollectError::Numbers`].
+    /// [`CollectError::Numbers`] if the policy's output is not finite.
     pub fn act(&mut self) -> Result<&[u8], CollectError> {
         Ok(self.player.act()?)
     }
 
-    /// Appends the reply to the last actions. Passes the episodes that ended, and were to be collected, to `on_episode`.
+    /// Appends a step to the rollout: the last actions with the environments' `reply`. Calls `on_episode` for each
+    /// ended episode that belongs to the rollout.
     ///
     /// # Errors
-    /// [`CollectError::Numbers`]; the steps of this rollout are lost.
+    /// [`CollectError::Numbers`] if a number is not finite; the steps of this rollout are then lost.
     pub fn take(
         &mut self,
         reply: &StepSlice<'_>,
@@ -127,18 +131,18 @@ impl Collector {
         Ok(())
     }
 
-    /// Finishes the rollout.
+    /// Finishes the rollout with the values of the last observations.
     ///
     /// # Errors
-    /// [`CollectError::Numbers`].
+    /// [`CollectError::Numbers`] if a value is not finite.
     pub fn finish(&mut self, rollout: &mut Rollout) -> Result<(), CollectError> {
         Ok(rollout.finish(self.player.last_values(&self.remaining)?)?)
     }
 
-    /// Collects a whole rollout under the policy of `weights`, from a session with only this collector's environments.
+    /// Collects a complete rollout with the policy `weights`, in a session that has only this collector's environments.
     ///
     /// # Errors
-    /// [`CollectError`]; the steps of this rollout are lost.
+    /// [`CollectError`] if the session fails or a number is not finite; the steps of this rollout are then lost.
     pub fn collect(
         &mut self,
         session: &mut Session<'_>,

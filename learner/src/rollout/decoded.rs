@@ -1,9 +1,9 @@
-//! A rollout that a server played, decoded from its bytes.
+//! Decodes rollouts that a server played.
 
 use crate::proto;
 use perturb_policy::{ActionKind, PolicySpec, RolloutStep};
 
-/// The arrays of a reply, decoded. Their memory is used again for the next reply.
+/// The decoded arrays of a reply. Reuse the same value for all replies, so that its memory is allocated once.
 #[derive(Debug, Default)]
 pub struct DecodedRollout {
     observations: Vec<f32>,
@@ -19,10 +19,10 @@ pub struct DecodedRollout {
 }
 
 impl DecodedRollout {
-    /// Replaces all arrays by those of a reply to a policy of `spec`.
+    /// Decodes the reply `acted`, which a policy of shape `spec` played. Replaces all arrays.
     ///
     /// # Errors
-    /// The name and size of an array that does not fit.
+    /// A text with the name and the fault of an invalid array.
     pub fn decode(&mut self, acted: &proto::Acted, spec: &PolicySpec) -> Result<(), String> {
         read(&mut self.observations, "observations", &acted.observations, f32::from_le_bytes)?;
         if let ActionKind::Discrete { n } = spec.action {
@@ -44,7 +44,7 @@ impl DecodedRollout {
         Ok(())
     }
 
-    /// The steps `[T, N, …]`.
+    /// Returns the steps as arrays `[T, N, …]`.
     pub fn steps(&self) -> RolloutStep<'_> {
         RolloutStep {
             observations: &self.observations,
@@ -59,7 +59,7 @@ impl DecodedRollout {
         }
     }
 
-    /// `[N]` V of the observations after the last step; empty unless the rollout is finished.
+    /// Returns the values `[N]` of the observations after the last step. Empty unless the rollout is finished.
     pub fn last_values(&self) -> &[f32] {
         &self.last_values
     }

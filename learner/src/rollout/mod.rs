@@ -1,4 +1,4 @@
-//! Rollouts: T steps of N environments, how they are collected, and the advantages that follow from them.
+//! Rollouts (T steps of N environments): their collection, storage and advantages.
 
 mod advantage;
 mod buffer;

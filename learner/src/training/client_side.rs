@@ -1,7 +1,8 @@
-//! Rollouts of runs whose actions are chosen in this process, in lockstep over one session.
+//! Collects rollouts of several runs whose actions are chosen in this process. All runs share a session and step
+//! together.
 //!
-//! Each run has its own weights, randomness, logs and checkpoint, and its own slots of the session. So it gives the same
-//! bytes as a run that is trained alone.
+//! Each run has its own weights, random streams, logs and checkpoint, and its own slots of the session. So it gives the
+//! same bytes as if it were trained alone.
 
 use std::ops::Range;
 use std::time::{Duration, Instant};
@@ -18,40 +19,40 @@ use crate::rollout::Collector;
 /// Collects the rollouts of runs that share a session: every step is one request for the environments of all runs.
 pub(super) struct ClientSide<'a> {
     session: Session<'a>,
-    /// The lanes of the runs, in the order of their slots.
+    /// The state of each run, in the order of slots.
     lanes: Vec<ClientLane>,
-    /// Whether runs act and are updated in reverse order. The order is reversed after updates, so that the run that was
-    /// updated last comes first: its weights are still in the processor's caches, which are too small for all runs.
+    /// Whether runs act and are updated in reverse order. The order alternates at every update, so that the run that
+    /// was updated last comes first. Its weights are still in the processor's caches, which are too small for all runs.
     is_reversed: bool,
-    /// The actions of all runs, in order of slots.
+    /// The encoded actions of all runs, in the order of slots.
     actions: Vec<u8>,
     reply: StepReply,
     times: StepTimes,
 }
 
-/// Time spent since the session was opened.
+/// Time spent since the session was opened, by activity.
 #[derive(Clone, Copy, Debug, Default)]
 struct StepTimes {
     acting: Duration,
     waiting: Duration,
 }
 
-/// The part of a run in the session.
+/// The state of a run in the shared session.
 struct ClientLane {
-    /// The run's index.
+    /// The index of the run.
     index: usize,
     slots: Range<usize>,
     collector: Collector,
-    /// The times at which the present rollout began; `None` between rollouts.
+    /// The times spent before the current rollout began; `None` between rollouts.
     begun: Option<StepTimes>,
 }
 
 impl<'a> ClientSide<'a> {
-    /// Opens a session for all `entries`, at least one, and begins or resumes their runs. A run that cannot start is passed
-    /// to `ended`.
+    /// Opens a session for all `entries`, at least one, and starts or resumes their runs. If a run cannot start, calls
+    /// `ended` with its index and the error.
     ///
     /// # Errors
-    /// A session that cannot be opened.
+    /// An error if the session cannot be opened.
     pub(super) fn open<'d>(
         servers: &'a Servers,
         entries: Vec<(usize, TrainRequest<'d>)>,
@@ -97,7 +98,7 @@ impl<'a> ClientSide<'a> {
             run.store_error(acted, true)?;
         }
         actions.clear();
-        // A run that has just failed is stepped once more, and its reply is ignored.
+        // A run that has just failed is stepped with its old actions, and the reply is ignored.
         lanes.iter().for_each(|lane| actions.extend_from_slice(lane.collector.player().actions()));
         let sent = Instant::now();
         session.step(actions, reply)?;
@@ -115,10 +116,10 @@ impl<'a> ClientSide<'a> {
         self.lanes.iter_mut().find(|lane| lane.index == index)
     }
 
-    /// Frees slots that belong to no run any more.
+    /// Frees the slots of a run that has ended or failed, and renumbers the slots behind them.
     fn release_slots(&mut self, slots: Range<usize>) -> Result<()> {
         if self.lanes.is_empty() {
-            return Ok(()); // the session is closed as a whole
+            return Ok(()); // the whole session is closed soon
         }
         self.session.release(slots.clone())?;
         for lane in self.lanes.iter_mut().filter(|lane| lane.slots.start >= slots.end) {
@@ -172,7 +173,7 @@ impl CollectRollouts for ClientSide<'_> {
 }
 
 impl ClientLane {
-    /// Chooses actions, and begins a rollout if none is being collected.
+    /// Chooses the next actions. Starts a rollout first if none is in progress.
     fn act(&mut self, session: &mut Session<'_>, trainer: &mut Trainer<'_>, now: StepTimes) -> Result<()> {
         if self.begun.is_none() {
             self.begun = Some(now);
@@ -186,7 +187,7 @@ impl ClientLane {
         Ok(())
     }
 
-    /// Appends a step to the rollout.
+    /// Appends this run's part of `reply` to its rollout. Finishes the rollout after its last step.
     fn take(&mut self, reply: &StepReply, trainer: &mut Trainer<'_>) -> Result<()> {
         let (rollout, tally) = trainer.collecting();
         let slice = reply.slice(self.slots.clone());
@@ -197,7 +198,7 @@ impl ClientLane {
         Ok(())
     }
 
-    /// Ends the collection of a rollout that is whole.
+    /// Ends the collection of a complete rollout, and returns the times that it took.
     fn collected(&mut self, now: StepTimes) -> Collected {
         let begun = self.begun.take().unwrap_or(now);
         Collected { index: self.index, acting: now.acting - begun.acting, waiting: now.waiting - begun.waiting }

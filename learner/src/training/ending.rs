@@ -1,15 +1,15 @@
-//! The end of a training: by its budget, or by its success.
+//! Decides when a training ends: at its budget, or at a success rate.
 
 use perturb_checkpoint::Counters;
 use perturb_settings::Common;
 
 use crate::logging::EpisodeFigures;
 
-/// Number of last episodes that means are taken over, as in stable-baselines3.
+/// Number of recent episodes over which means are taken, as in stable-baselines3.
 pub(super) const RECENT: usize = 100;
 
-/// Whether a training has used up its budget, or its last 100 episodes, `recent`, reached the success rate
-/// `stop_at_success`.
+/// Returns whether a training has used up its budget, or has reached the success rate `stop_at_success` in its last 100
+/// episodes. `recent` are these episodes; with fewer than 100, only the budget counts.
 pub fn is_over<'a>(
     common: &Common,
     counters: &Counters,

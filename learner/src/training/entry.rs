@@ -6,40 +6,40 @@ use super::{Result, RunDirectory};
 use crate::checkpoint::{Checkpoint, ResumeState};
 use crate::logging::Progress;
 
-/// Result of a training.
+/// The result of a training.
 #[derive(Debug)]
 pub struct TrainOutcome {
-    /// The last checkpoint, as written.
+    /// The last checkpoint, as written to the disk.
     pub checkpoint: Checkpoint,
-    /// Figures of the last iteration.
+    /// Statistics of the last iteration.
     pub progress: Progress,
-    /// The signal that ended the training before its budget; `None` if it ran to its end.
+    /// The signal that stopped the training; `None` if it ran to its end.
     pub signal: Option<i32>,
 }
 
-/// A training to begin or to resume.
+/// A request to start or resume a training.
 #[derive(Debug)]
 pub struct TrainRequest<'a> {
     /// The directory for logs and checkpoints.
     pub directory: &'a RunDirectory,
-    /// The point at which the training starts.
+    /// The start of the training: initial weights or a checkpoint.
     pub start: Start,
-    /// Numbers of episodes, ascending, after which the policy is kept for an intermediate evaluation, see
+    /// Numbers of episodes, ascending, after which the intermediate policy is saved for later tests, see
     /// [`RunDirectory::mark`].
     pub marks: &'a [u64],
 }
 
-/// The point at which a training starts.
+/// The start of a training: initial weights or a checkpoint.
 #[derive(Clone, Debug)]
 pub enum Start {
-    /// Initial weights.
+    /// From initial weights, with this configuration.
     Fresh(Box<TrainConfig>),
-    /// The last checkpoint.
+    /// From this checkpoint.
     Checkpoint(Box<(Checkpoint, ResumeState)>),
 }
 
 impl Start {
-    /// The configuration to train with.
+    /// Returns the configuration of the training.
     pub(super) fn config(&self) -> &TrainConfig {
         match self {
             Self::Fresh(config) => config,
@@ -47,7 +47,7 @@ impl Start {
         }
     }
 
-    /// Steps that were trained before.
+    /// Returns the number of steps before the start: 0 without a checkpoint.
     pub(super) fn timesteps(&self) -> u64 {
         match self {
             Self::Fresh(_) => 0,
@@ -55,7 +55,8 @@ impl Start {
         }
     }
 
-    /// The point at which an interrupted training of `config` in `directory` is resumed.
+    /// Returns where an interrupted training of `config` in `directory` resumes: at its last checkpoint, or at initial
+    /// weights if there is none.
     pub(super) fn resume_point(directory: &RunDirectory, config: &TrainConfig) -> Result<Self> {
         Ok(match directory.last_checkpoint()? {
             Some((mut checkpoint, state)) => {

@@ -13,11 +13,11 @@ use crate::error::Error;
 use crate::logging::LogError;
 use crate::rollout::CollectError;
 
-/// Why a training cannot begin, continue, or be saved.
+/// The reason why a training cannot start, continue or be saved.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum TrainError {
-    /// The directory cannot be trained in.
+    /// The training cannot use its directory.
     #[error(transparent)]
     Directory(#[from] RunDirectoryError),
     /// A server or the connection to it failed.
@@ -29,12 +29,12 @@ pub enum TrainError {
     /// The checkpoint cannot be written.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// An action's interval is empty or infinite.
+    /// The interval of an action is empty or infinite, so a random policy cannot draw from it.
     #[error(
         "a random policy draws actions from their bounds, but `{name}` is in [{low}, {high}]; train another algorithm"
     )]
     Unbounded {
-        /// The action's entry.
+        /// The name of the action's entry.
         name: String,
         /// The lower bound.
         low: f64,
@@ -50,27 +50,27 @@ pub enum TrainError {
     /// The served environment has no action space.
     #[error("the server does not say what actions the environment takes: are both of one version?")]
     NoActions,
-    /// An episode did not run with the requested parameters.
+    /// An episode ran with other parameters than requested.
     #[error(
         "an episode of environment {environment_index}, number {episode_index}: {difference}; this is a server bug, please \
          report it"
     )]
     NotApplied {
-        /// The environment's index.
+        /// The index of the environment.
         environment_index: u32,
-        /// The episode's number in it.
+        /// The index of the episode in its environment.
         episode_index: u64,
-        /// The largest difference.
+        /// The largest difference between requested and applied parameters.
         difference: Difference,
     },
-    /// The environment has changed since the run began.
+    /// The environment has changed since the start of the training.
     #[error(
         "the run was trained in {environment} with {what} {trained}, but the server has {served}; {}resume with the \
          version of perturb-server that it began with, or train again",
         task_remedy(what)
     )]
     Changed {
-        /// The environment.
+        /// The environment's name.
         environment: String,
         /// The property that differs.
         what: &'static str,
@@ -79,7 +79,7 @@ pub enum TrainError {
         /// The property's value on the server.
         served: String,
     },
-    /// A part of a checkpoint does not fit.
+    /// A part of a checkpoint cannot be restored.
     #[error("cannot restore the {what}: {source}")]
     Restore {
         /// The name of the part.
@@ -87,41 +87,41 @@ pub enum TrainError {
         /// The reason.
         source: Box<TrainError>,
     },
-    /// The program was asked to end while a lost server was waited for.
+    /// A signal stopped the program while it waited for a lost server.
     #[error("stopped by signal {signal}, waiting for a server: {source}")]
     Stopped {
-        /// The signal.
+        /// The signal's number.
         signal: i32,
         /// The error of the lost server.
         source: Box<TrainError>,
     },
-    /// The program was asked to end during a long update.
+    /// A signal stopped the program during a long update.
     #[error("stopped by signal {signal} during an update, which was interrupted")]
     UpdateStopped {
-        /// The signal.
+        /// The signal's number.
         signal: i32,
     },
-    /// A training that had begun ended.
+    /// A training failed after it had started.
     #[error("{source}; {}", what_is_left(last.as_ref(), source))]
     Failed {
-        /// The last checkpoint, if there is one.
+        /// The last checkpoint; `None` if there is none.
         last: Option<LastCheckpoint>,
         /// The reason.
         source: Box<TrainError>,
     },
 }
 
-/// The checkpoint that a failed training leaves.
+/// The last checkpoint of a failed training.
 #[derive(Debug)]
 pub struct LastCheckpoint {
-    /// Episodes that it was trained for.
+    /// Number of training episodes at the checkpoint.
     pub episodes: u64,
     /// The directory of the run.
     pub run: PathBuf,
 }
 
 impl TrainError {
-    /// The error of a server, if a server failed.
+    /// Returns the error of a server; `None` if no server failed.
     pub fn of_server(&self) -> Option<&ClientError> {
         match self {
             Self::Client(error) => Some(error),
@@ -132,7 +132,7 @@ impl TrainError {
         }
     }
 
-    /// The signal by which the program was asked to end, if that ended the training.
+    /// Returns the signal that stopped the training; `None` if another error ended it.
     pub fn signal(&self) -> Option<i32> {
         match self {
             Self::Stopped { signal, .. } | Self::UpdateStopped { signal } => Some(*signal),
@@ -142,13 +142,13 @@ impl TrainError {
         }
     }
 
-    /// Whether a server had no room for the environments.
+    /// Returns whether a server had no room for the environments.
     pub fn is_server_full(&self) -> bool {
         let full = tonic::Code::ResourceExhausted;
         matches!(self.of_server(), Some(ClientError::Refused { code, .. }) if *code == full)
     }
 
-    /// Whether the disk or the machine that has the files is at fault, see [`FileError::is_fault`].
+    /// Returns whether the file system is at fault, see [`FileError::is_fault`].
     pub fn is_file_fault(&self) -> bool {
         match self {
             Self::File(error)
@@ -161,8 +161,8 @@ impl TrainError {
         }
     }
 
-    /// Whether the training would fail in the same way if it were resumed from its last checkpoint, e.g. with numbers that are
-    /// not finite.
+    /// Returns whether the training would fail in the same way if it were resumed from its last checkpoint, for example
+    /// because numbers are not finite.
     pub fn requires_restart(&self) -> bool {
         match self {
             Self::Numbers(_) | Self::Log(LogError::Changed { .. }) => true,
@@ -172,7 +172,7 @@ impl TrainError {
         }
     }
 
-    /// Whether the training may succeed later or with another server, see [`ClientError::can_be_retried`].
+    /// Returns whether the training may succeed later or with another server, see [`ClientError::can_be_retried`].
     pub fn can_be_retried(&self) -> bool {
         self.of_server().is_some_and(ClientError::can_be_retried)
     }

@@ -1,14 +1,15 @@
 //! The training loop: collect rollouts, update policies, log, write checkpoints.
 //!
-//! [`train`] and [`resume`] train one run, [`train_together`] several. All end in one loop, `train_loop`. Runs differ in
-//! who chooses actions: this process, for all runs of one session in lockstep (`ClientSide`; a run alone is a lockstep of
-//! one), or the server, in a session for each run (`ServerSide`). Both implement `CollectRollouts`. A `Trainer` holds
-//! everything else of a run. docs/reading-ppo.md follows PPO from the command line through this file to the weights.
+//! [`train`] and [`resume`] train one run, and [`train_together`] trains several. All of them use the same loop,
+//! `train_loop`. There are two ways to collect rollouts, which both implement `CollectRollouts`: `ClientSide` chooses
+//! actions in this process, for all runs of a shared session together; `ServerSide` lets the server choose actions, in
+//! a separate session for each run. A `Trainer` holds everything else of a run. docs/reading-ppo.md follows PPO from
+//! the command line through this file to the weights.
 //!
-//! Randomness: the environments' seed is the training's seed; initial weights, minibatch order and sampled actions have
-//! streams of their own (see [`perturb_policy::random`]). Every sum has one order, so that equal configurations give equal
-//! weights, byte for byte, whatever the number of servers, of their workers and of threads, wherever actions are chosen,
-//! and whichever trainings run together.
+//! Determinism: the environments have the training's seed. Initial weights, minibatches and sampled actions have
+//! separate random streams (see [`perturb_policy::random`]). Every sum is computed in a fixed order. So equal
+//! configurations give equal weights, byte for byte. The numbers of servers, workers and threads make no difference,
+//! nor does the place where actions are chosen or which trainings run together.
 
 mod client_side;
 mod ending;
@@ -41,17 +42,20 @@ use crate::policy::GradientWorkspace;
 
 type Result<T> = std::result::Result<T, TrainError>;
 
-/// Expected duration of an update above which connections are kept alive meanwhile. Servers drop a silent connection only
-/// after some seconds.
+/// If updates are expected to take longer than this, a thread keeps the connections alive during them. Servers drop a
+/// silent connection after some seconds.
 const LONG_UPDATE: Duration = Duration::from_millis(100);
 
-/// Trains as `config` says and writes logs and checkpoints to `directory`. Updates use `threads` threads, whose number
-/// changes no byte. Calls `report` after every iteration. When `stop` is raised, the iteration is finished and the
-/// checkpoint written. A lost server is [waited for](crate::client::ServerWait), and the training is resumed from its last
-/// checkpoint, to the same bytes.
+/// Trains a policy with the settings of `config`, and writes logs and checkpoints to `directory`. Updates use `threads`
+/// threads; the number does not affect the results. Calls `report` after every iteration. If `stop` is raised, finishes
+/// the iteration, writes a checkpoint and returns.
+///
+/// After the loss of a server, [waits for it](crate::client::ServerWait) and resumes from the last checkpoint, with the
+/// same bytes as without the loss.
 ///
 /// # Errors
-/// A server that is lost for good, numbers that are not finite, a full disk. The last checkpoint in the directory stays as it is.
+/// [`TrainError`] if a server stays lost, if numbers are not finite, or if files cannot be written. The last checkpoint
+/// in the directory is kept.
 pub fn train(
     servers: &Servers,
     config: &TrainConfig,
@@ -64,12 +68,13 @@ pub fn train(
     train_with_retry(servers, TrainRequest { directory, start, marks: &[] }, threads, stop, report)
 }
 
-/// Resumes the run in `directory` from its last `checkpoint`, to the same bytes as without the break except times.
-/// Otherwise as [`train`]. `servers` may be others than before. Lines of the logs beyond the checkpoint are deleted.
+/// Resumes the run in `directory` from its last `checkpoint`. Otherwise works like [`train`]. The results have the same
+/// bytes as without the interruption, except for times. `servers` may be different from before. Deletes log lines after
+/// the checkpoint.
 ///
 /// # Errors
-/// The errors of [`train`]; an environment, a state or a log that does not fit the checkpoint, before anything is
-/// changed.
+/// The errors of [`train`]. Also an error, before anything is changed, if the environment, the state or a log does not
+/// fit the checkpoint.
 pub fn resume(
     servers: &Servers,
     directory: &RunDirectory,
@@ -82,7 +87,7 @@ pub fn resume(
     train_with_retry(servers, TrainRequest { directory, start, marks: &[] }, threads, stop, report)
 }
 
-/// Trains one run, and resumes it from its last checkpoint each time that servers were lost and have come back.
+/// Trains one run. Each time that servers are lost and come back, resumes the run from its last checkpoint.
 fn train_with_retry(
     servers: &Servers,
     entry: TrainRequest<'_>,
@@ -124,14 +129,16 @@ fn train_with_retry(
     }
 }
 
-/// Trains several runs in one environment as [`train`] and [`resume`] do each alone, to the same bytes. Runs with short
-/// rollouts share one session in lockstep. Runs with long rollouts get a session each, and the server acts. Runs with
-/// observation noise always act in this process. `report` and `ended` get the run's place among `entries`. If a run fails,
-/// the others go on.
+/// Trains several runs in the same environment. Each run gives the same bytes as with [`train`] or [`resume`] alone.
+///
+/// Runs with short rollouts share one session and step together. Runs with long rollouts get a separate session each,
+/// and the server chooses their actions. For runs with observation noise, this process always chooses the actions.
+/// Calls `report` after every iteration of a run, and `ended` at the end of a run, with the run's index in `entries`.
+/// If a run fails, the others continue.
 ///
 /// # Errors
-/// A session that cannot be opened, or a failure of the shared session, which ends all runs that have not ended yet. Their
-/// last checkpoints stay as they are.
+/// [`TrainError`] if a session cannot be opened, or if the shared session fails, which ends all its runs. Their last
+/// checkpoints are kept.
 pub fn train_together(
     servers: &Servers,
     entries: Vec<TrainRequest<'_>>,
@@ -156,18 +163,18 @@ pub fn train_together(
 
 /// A run in the training loop.
 struct Run<'a> {
-    /// The place among the runs that were begun together.
+    /// The index among the runs that were started together.
     index: usize,
     trainer: Trainer<'a>,
-    /// Set when the run has ended.
+    /// The outcome of the run; `None` until it has ended.
     end: Option<Result<TrainOutcome>>,
 }
 
 impl Run<'_> {
-    /// Ends the run if `result` is an error, and returns the value otherwise.
+    /// Returns the value of `result`. If it is an error, ends the run with it and returns `None`.
     ///
     /// # Errors
-    /// An error of a server if the run's session `is_shared` with other runs, which it ends too.
+    /// An error of a server if the run's session `is_shared`, because it ends the other runs too.
     fn store_error<T>(&mut self, result: Result<T>, is_shared: bool) -> Result<Option<T>> {
         match result {
             Ok(value) => Ok(Some(value)),
@@ -180,9 +187,9 @@ impl Run<'_> {
     }
 }
 
-/// A run whose rollout is whole.
+/// A run with a complete rollout, and the time that collecting it took.
 struct Collected {
-    /// The run's index.
+    /// The index of the run.
     index: usize,
     /// Time spent on choosing actions in this process.
     acting: Duration,
@@ -190,44 +197,44 @@ struct Collected {
     waiting: Duration,
 }
 
-/// A way to collect the rollouts of the runs of a loop. Runs are named by their index.
+/// A way to collect the rollouts of all runs of a training loop. Methods identify a run by its index.
 trait CollectRollouts {
-    /// Collects until the rollout of at least one run is whole, or until a run has failed. Returns the runs with whole
+    /// Collects until at least one run has a complete rollout, or a run has failed. Returns the runs with complete
     /// rollouts, in the order in which they should be updated.
     ///
     /// # Errors
-    /// A failure that ends all runs. The failure of one run is stored in the run.
+    /// A failure that ends all runs. A failure of a single run is stored in the run.
     fn collect(&mut self, runs: &mut [Run<'_>]) -> Result<Vec<Collected>>;
 
-    /// The player of a run that acts in this process, to be given the new weights; `None` if the server acts.
+    /// Returns the player of a run, which must load new weights after an update. Returns `None` if the server acts.
     fn player(&mut self, index: usize) -> Option<&mut Player>;
 
-    /// State and statistics of a run's player between two rollouts; `None` before the first.
+    /// Returns the state and the normalisers of a run's player between two rollouts; `None` before the first rollout.
     ///
     /// # Errors
-    /// The failures of a connection.
+    /// Connection failures.
     fn player_state(&mut self, index: usize) -> Result<Option<(PlayerState, Normalisers)>>;
 
-    /// Snapshots of a run's environments between two rollouts.
+    /// Returns snapshots of a run's environments between two rollouts.
     ///
     /// # Errors
-    /// The failures of a connection.
+    /// Connection failures.
     fn snapshots(&mut self, index: usize) -> Result<Vec<Bytes>>;
 
     /// Frees the environments of a run that has ended.
     ///
     /// # Errors
-    /// The failures of a shared connection.
+    /// Failures of a shared connection.
     fn release(&mut self, index: usize) -> Result<()>;
 
-    /// Whether all runs share a session, so that the failure of its connection ends all of them.
+    /// Returns whether all runs share a session, so that a failure of its connection ends all of them.
     fn is_shared(&self) -> bool;
 }
 
-/// Trains `runs` until each has ended, and passes each run's outcome to `ended`.
+/// Trains `runs` until all have ended. Calls `ended` with the index and the outcome of each run.
 ///
 /// # Errors
-/// A failure of a shared session. Runs that have not ended by then can be resumed from their checkpoints.
+/// A failure of a shared session. Runs that have not ended can be resumed from their checkpoints.
 fn train_loop(
     servers: &Servers,
     collector: &mut dyn CollectRollouts,
@@ -254,12 +261,12 @@ fn train_loop(
         }
         if !runs.is_empty() {
             released.into_iter().try_for_each(|index| collector.release(index))?;
-        } // the last run's session is closed as a whole
+        } // after the last run, the whole session is closed
     }
     Ok(())
 }
 
-/// Runs one iteration of the runs whose rollouts are whole first: collect, update, then log and save.
+/// Collects until some runs have complete rollouts; then updates these runs, logs, and saves checkpoints.
 fn train_iteration(
     servers: &Servers,
     collector: &mut dyn CollectRollouts,
@@ -280,7 +287,7 @@ fn train_iteration(
         }
         Ok::<(), TrainError>(())
     })?;
-    updated.sort_by_key(|(index, _)| *index); // reports come in the order of runs, in whatever order these were updated
+    updated.sort_by_key(|(index, _)| *index); // reports are in the order of runs, regardless of the order of updates
     for (index, progress) in updated {
         let Some(run) = find(runs, index) else { continue };
         report(index, &progress);
@@ -290,7 +297,7 @@ fn train_iteration(
     Ok(())
 }
 
-/// Logs an iteration of a run, and writes a checkpoint if one is due.
+/// Logs an iteration of a run, saves the policy or a checkpoint if due, and ends the run if it is over.
 fn finish_iteration(
     collector: &mut dyn CollectRollouts,
     run: &mut Run<'_>,
@@ -317,7 +324,7 @@ fn find<'r, 'a>(runs: &'r mut [Run<'a>], index: usize) -> Option<&'r mut Run<'a>
     runs.iter_mut().find(|run| run.index == index)
 }
 
-/// Runs `work` and keeps the connections alive meanwhile if it is `expected` to take long.
+/// Runs `work`. If it is `expected` to take long, keeps the connections alive meanwhile.
 fn keep_alive<T>(servers: &Servers, expected: Duration, work: impl FnOnce() -> T) -> T {
     if expected < LONG_UPDATE { work() } else { servers.keep_alive_during(work) }
 }

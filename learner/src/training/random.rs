@@ -1,8 +1,8 @@
-//! The random policy: a checkpoint to test like any other, without a training.
+//! Makes the random policy: a checkpoint that can be tested like any other, but needs no training.
 //!
-//! The policy acts as Gymnasium's `action_space.sample()`: discrete actions are equally likely, and continuous actions are
-//! uniform in the box of the action space, whatever is observed. The weights encode this: those of observations are 0, the
-//! biases are the middles of the box, and `log_std` has the logarithms of half its widths.
+//! The policy acts like Gymnasium's `action_space.sample()` and ignores observations: discrete actions are equally
+//! likely, and continuous actions are uniform within their bounds. The weights encode this: weights of observations are
+//! 0, biases are the middles of the bounds, and `log_std` is the logarithm of half the distance between the bounds.
 
 use perturb_checkpoint::Counters;
 use perturb_files::write_atomically;
@@ -16,16 +16,16 @@ use crate::client::Servers;
 use crate::logging::Progress;
 use crate::proto::{Channel, Environment, action_space::Kind};
 
-/// Writes the random policy to the directory of `entry`, as the last checkpoint and as that of every mark.
+/// Writes the random policy to the directory of `entry`: as the last checkpoint, and as the policy of every mark.
 ///
 /// # Errors
-/// A server that does not know the environment, actions without bounds, a full disk.
+/// An error if the server does not know the environment, if actions have no bounds, or if files cannot be written.
 pub(super) fn make(servers: &Servers, entry: &TrainRequest<'_>) -> Result<TrainOutcome> {
     let TrainRequest { directory, ref start, marks } = *entry;
     let config = start.config();
     let environment = servers.environment_seen(&config.common)?;
     let checkpoint = checkpoint(config, &environment)?;
-    directory.prepare()?; // from here on an earlier run is gone
+    directory.prepare()?; // this deletes an earlier run
     write_atomically(&directory.path().join("config.toml"), config.to_toml().as_bytes())?;
     marks.iter().try_for_each(|&mark| checkpoint.save(&directory.mark(mark), None))?;
     checkpoint.save(&directory.checkpoint(), None)?;
@@ -94,7 +94,7 @@ mod tests {
         Kind::Continuous(Continuous { channels: bounds.iter().map(channel).collect() })
     }
 
-    /// The actions of the first step in `n` environments with different observations.
+    /// Returns the actions of the first step in `n` environments with different observations.
     fn actions(checkpoint: &Checkpoint, n: usize) -> Vec<[u8; 4]> {
         let mut player = checkpoint.player(n, 7, 0).unwrap();
         let observations: Vec<f32> = (0..3 * n).map(|i| i as f32 - 100.0).collect();
@@ -108,7 +108,7 @@ mod tests {
         let checkpoint = checkpoint_for(Kind::Discrete(Discrete { names })).unwrap();
         let mut counts = [0u32; 3];
         actions(&checkpoint, 9000).iter().for_each(|action| counts[i32::from_le_bytes(*action) as usize] += 1);
-        // Four standard deviations: √(9000 · ⅓ · ⅔).
+        // The tolerance is four standard deviations √(9000 · ⅓ · ⅔).
         assert!(counts.iter().all(|count| (f64::from(*count) - 3000.0).abs() < 179.0), "{counts:?}");
     }
 
@@ -122,7 +122,7 @@ mod tests {
                 assert!((low - 1e-6..=high + 1e-6).contains(action), "{action}");
                 quarters[((4.0 * (action - low) / (high - low)) as usize).min(3)] += 1;
             }
-            // Four standard deviations: √(9000 · ¼ · ¾).
+            // The tolerance is four standard deviations √(9000 · ¼ · ¾).
             assert!(quarters.iter().all(|count| (f64::from(*count) - 2250.0).abs() < 165.0), "{quarters:?}");
         }
     }
@@ -131,7 +131,7 @@ mod tests {
     fn reward_statistics_follow_the_preset() {
         let choices = || Kind::Discrete(Discrete { names: vec![String::new(); 3] });
         assert!(checkpoint_with("preset = 'paper'", choices()).unwrap().state.reward_normaliser.is_none());
-        // Whether the discounted return of the statistics runs on past the end of an episode.
+        // `runs_on` tells whether the discounted return of the reward statistics continues over the end of an episode.
         for (preset, num_envs, runs_on) in [("perturb", 1, false), ("paper", 1, true)] {
             let settings = format!("preset = '{preset}'\nnormalize_rewards = true");
             let made = checkpoint_with(&settings, choices()).unwrap();

@@ -1,4 +1,4 @@
-//! The directory of a run, locked for one process at a time.
+//! The directory of a training run, which one process at a time can lock.
 
 use std::cell::{Cell, OnceCell};
 use std::path::{Path, PathBuf};
@@ -9,35 +9,36 @@ use perturb_text::quoted;
 
 use crate::checkpoint::{Checkpoint, CheckpointError, ResumeState};
 
-/// The directory of a run. As long as this value and its process live, no other process can train in the directory.
+/// The directory of a training run. While this value exists and holds the lock, no other process can train in the
+/// directory.
 #[derive(Debug)]
 pub struct RunDirectory {
     path: PathBuf,
     overwrite: bool,
-    /// The lock of the directory, taken as soon as the directory exists.
+    /// The lock of the directory. It is taken as soon as the directory exists.
     lock: OnceCell<Lock>,
-    /// Whether the files in the directory are of this run. Files of an earlier run are there until
-    /// [`RunDirectory::prepare`].
+    /// Whether the files in the directory belong to this run. Before [`RunDirectory::prepare`] they may belong to an
+    /// earlier run.
     is_own: Cell<bool>,
 }
 
-/// Why a directory cannot be trained in.
+/// The reason why a directory cannot be used for a training.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum RunDirectoryError {
-    /// A new run cannot have the name of a file.
+    /// The path of a new run is a file.
     #[error("--out {} is a file; give a directory", path.display())]
     IsFile {
-        /// The path that was given.
+        /// The given path.
         path: PathBuf,
     },
-    /// Another process trains in the directory.
+    /// Another process is training in the directory.
     #[error("another process trains in {}; wait until it ends, or choose another directory", path.display())]
     Locked {
-        /// The directory.
+        /// The path of the directory.
         path: PathBuf,
     },
-    /// A new run would delete an earlier one.
+    /// The directory contains an earlier run, and `overwrite` is off.
     #[error(
         "{path} already holds a run ({file}): choose another --out, give --overwrite to delete that run, or go on with \
          it: perturb train --resume {}",
@@ -45,27 +46,27 @@ pub enum RunDirectoryError {
         path = path.display()
     )]
     HoldsRun {
-        /// The directory.
+        /// The path of the directory.
         path: PathBuf,
-        /// A file of the run.
+        /// The name of a file of the earlier run.
         file: String,
     },
     /// There is no such directory.
     #[error("--resume {}: there is no such directory; give the --out of a training", path.display())]
     Missing {
-        /// The path that was given.
+        /// The given path.
         path: PathBuf,
     },
-    /// A checkpoint was given instead of its run.
+    /// The path is a checkpoint inside a run, not the run's directory.
     #[error("{} is the checkpoint in a run; give the run's directory, which holds it", path.display())]
     IsCheckpoint {
-        /// The path that was given.
+        /// The given path.
         path: PathBuf,
     },
-    /// The directory holds no run.
+    /// The directory contains no run.
     #[error("{} holds no run; give the --out of a training", path.display())]
     NoRun {
-        /// The path that was given.
+        /// The given path.
         path: PathBuf,
     },
     /// The run ended before its first checkpoint.
@@ -76,7 +77,7 @@ pub enum RunDirectoryError {
         path = path.display()
     )]
     NoCheckpoint {
-        /// The directory.
+        /// The path of the directory.
         path: PathBuf,
     },
     /// The checkpoint cannot be read or resumed.
@@ -90,7 +91,7 @@ pub enum RunDirectoryError {
 type Result<T> = std::result::Result<T, RunDirectoryError>;
 
 impl RunDirectoryError {
-    /// Whether nothing can be resumed, now or later.
+    /// Returns whether the directory contains nothing that could ever be resumed.
     pub fn is_unrecoverable(&self) -> bool {
         match self {
             Self::Checkpoint(CheckpointError::Damaged { .. } | CheckpointError::NotResumable { .. })
@@ -108,12 +109,13 @@ impl RunDirectoryError {
 }
 
 impl RunDirectory {
-    /// Chooses `path` for a new run; if it holds an earlier run, `overwrite` allows its deletion. Changes nothing yet:
-    /// [`train`](crate::training::train) empties the directory when the environments are open and all settings have
-    /// proved to work.
+    /// Chooses `path` as the directory of a new run. `overwrite` permits the deletion of an earlier run in it. Changes
+    /// nothing yet: [`train`](crate::training::train) deletes the earlier run once the environments are open and all
+    /// settings have been checked.
     ///
     /// # Errors
-    /// If it holds a run and `overwrite` is off; if another process trains in it; the operating system's.
+    /// [`RunDirectoryError`] if `path` is a file, if it contains a run and `overwrite` is off, or if another process is
+    /// training in it.
     pub fn choose(path: &Path, overwrite: bool) -> Result<Self> {
         if path.exists() && !path.is_dir() {
             return Err(RunDirectoryError::IsFile { path: path.to_owned() });
@@ -121,22 +123,22 @@ impl RunDirectory {
         let directory = Self::new(path, overwrite, false);
         if Lock::is_there(path) {
             directory.lock()?;
-        } // otherwise it is locked when it is prepared: nothing may be created yet
+        } // a directory without a lock file is locked in `prepare`, because nothing may be created yet
         directory.earlier_run()?;
         Ok(directory)
     }
 
-    /// Opens the run in `path` to resume it. Returns the policy and the state of its last checkpoint, too.
+    /// Opens the run in `path` for resuming. Returns the locked directory, the last checkpoint and its resume state.
     ///
     /// # Errors
-    /// If there is no run, no checkpoint, or one that cannot be resumed; if another process trains in it; the operating
-    /// system's.
+    /// [`RunDirectoryError`] if there is no run, no checkpoint, or a checkpoint that cannot be resumed, or if another
+    /// process is training there.
     pub fn resume(path: &Path) -> Result<(Self, Checkpoint, ResumeState)> {
         if !files::look(path)?.is_some_and(|metadata| metadata.is_dir()) {
             return Err(RunDirectoryError::Missing { path: path.to_owned() });
         }
         let directory = Self::new(path, false, true);
-        // Locking creates a file, and this may be any folder.
+        // Locking would create a file, so the folder must first be recognised as a run.
         if !Lock::is_there(path) && !files::has_file(&directory.checkpoint().join("checkpoint.json"))? {
             return Err(directory.nothing_to_resume()?);
         }
@@ -151,10 +153,10 @@ impl RunDirectory {
         Self { path: path.to_owned(), overwrite, lock: OnceCell::new(), is_own: Cell::new(is_own) }
     }
 
-    /// The last checkpoint of this value's run; `None` if there is none yet.
+    /// Returns the last checkpoint of this run; `None` if there is none yet.
     ///
     /// # Errors
-    /// A checkpoint that cannot be read.
+    /// An error if the checkpoint cannot be read.
     pub(crate) fn last_checkpoint(&self) -> Result<Option<(Checkpoint, ResumeState)>> {
         if !self.is_own.get() {
             return Ok(None);
@@ -165,7 +167,7 @@ impl RunDirectory {
         }
     }
 
-    /// The reason why there is no checkpoint.
+    /// Finds out why there is no checkpoint, and returns the error to report.
     fn nothing_to_resume(&self) -> Result<RunDirectoryError> {
         let path = self.path.clone();
         Ok(if files::has_file(&path.join("checkpoint.json"))? {
@@ -182,7 +184,7 @@ impl RunDirectory {
         let lock = match Lock::try_take(&self.path)? {
             Some(lock) => Some(lock),
             None => {
-                // Another process may have locked it only to look.
+                // Another process may have taken the lock for a moment, only to check it.
                 std::thread::sleep(Duration::from_millis(20));
                 Lock::try_take(&self.path)?
             }
@@ -192,7 +194,7 @@ impl RunDirectory {
         Ok(())
     }
 
-    /// The files of an earlier run, which may be deleted.
+    /// Returns the files of an earlier run. Returns an error if there are any and they must not be deleted.
     fn earlier_run(&self) -> Result<Vec<PathBuf>> {
         let files = files_of_a_run(&self.path)?;
         match files.first() {
@@ -204,7 +206,7 @@ impl RunDirectory {
         }
     }
 
-    /// Creates the directory, or deletes the earlier run in it.
+    /// Creates and locks the directory, and deletes an earlier run in it.
     pub(crate) fn prepare(&self) -> Result<()> {
         files::create_folder(&self.path)?;
         if self.lock.get().is_none() {
@@ -215,22 +217,22 @@ impl RunDirectory {
         Ok(())
     }
 
-    /// The path of the directory.
+    /// Returns the path of the directory.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// The path of the last checkpoint.
+    /// Returns the path of the last checkpoint.
     pub fn checkpoint(&self) -> PathBuf {
         self.path.join("checkpoint")
     }
 
-    /// The path of the checkpoint that a run kept for an intermediate evaluation after `mark` episodes of its budget.
+    /// Returns the path of the intermediate policy that is saved after `mark` training episodes.
     pub fn mark(&self, mark: u64) -> PathBuf {
         mark_in(&self.path, mark)
     }
 
-    /// Whether the checkpoints of all `marks` exist.
+    /// Returns whether the intermediate policies of all `marks` exist.
     ///
     /// # Errors
     /// Errors of the operating system.
@@ -244,12 +246,13 @@ impl RunDirectory {
     }
 }
 
-/// [`RunDirectory::mark`] of the run in `path`.
+/// Returns [`RunDirectory::mark`] of the run in `path`.
 pub fn mark_in(path: &Path, mark: u64) -> PathBuf {
     path.join("marks").join(mark.to_string())
 }
 
-/// The files in `path` that a run has written; others are left alone.
+/// Returns the files in `path` that a training has written. Files with other names are not listed, so they are never
+/// deleted.
 fn files_of_a_run(path: &Path) -> files::Result<Vec<PathBuf>> {
     let mut paths = files::list(path)?;
     paths.retain(|path| {

@@ -1,7 +1,8 @@
-//! Rollouts that servers play: each run has a session of its own, and this process gets whole rollouts.
+//! Collects rollouts that the server plays. Each run has a separate session, and this process receives complete
+//! rollouts.
 //!
-//! While one run is updated, the rollouts of the others are played. No run waits for another, and runs share nothing but
-//! this thread and the gradient workspace. So each run gives the same bytes as if it were trained alone.
+//! While one run is updated, the server plays the rollouts of the others. Runs share only this thread and the gradient
+//! workspace. So each run gives the same bytes as if it were trained alone.
 
 use std::pin::Pin;
 use std::time::{Duration, Instant};
@@ -20,51 +21,52 @@ use crate::client::{ClientError, RolloutReply, Servers, Session, acting};
 use crate::proto;
 use crate::rollout::{CollectError, DecodedRollout};
 
-/// Environment steps of one reply where several runs wait for the server: some milliseconds of a classic task, a tenth of
-/// a second of a robot. So no run waits for long, however many there are.
+/// Maximum number of environment steps in one reply if several runs use the server. They take some milliseconds in a
+/// classic task, and a tenth of a second with a robot. So no run waits long for the server.
 const PIECE_ENV_STEPS: usize = 4096;
 
-/// A reply that is awaited, with the run's session.
+/// A future that receives a reply, and returns it with the run's session.
 type PendingReply<'a> =
     Pin<Box<dyn Future<Output = (Box<ServerLane<'a>>, std::result::Result<RolloutReply, ClientError>)> + 'a>>;
 
-/// Collects the rollouts of runs whose policies the server plays.
+/// Collects the rollouts of runs whose actions the server chooses.
 pub(super) struct ServerSide<'a> {
     servers: &'a Servers,
-    /// Runs between two rollouts, for which no server plays.
+    /// Runs between two rollouts, for which the server is not playing.
     #[expect(clippy::vec_box, reason = "a lane moves into its pending reply and back, as a pointer")]
     idle: Vec<Box<ServerLane<'a>>>,
-    /// Runs for which a server plays a rollout.
+    /// Runs for which the server is playing a rollout.
     playing: FuturesUnordered<PendingReply<'a>>,
-    /// Time in which no run had a rollout to learn from.
+    /// Total time that this thread has waited because no run had a complete rollout.
     waited: Duration,
 }
 
-/// The session of a run.
+/// The session and the state of a run.
 struct ServerLane<'a> {
-    /// The run's index.
+    /// The index of the run.
     index: usize,
     session: Session<'a>,
     spec: PolicySpec,
-    /// The player, until the server has it.
+    /// The initial player, until the first request has sent its state to the server.
     player: Option<Player>,
-    /// Steps of one reply at most; 0 leaves the number to the server.
+    /// Maximum number of steps in one reply; 0 lets the server decide.
     max_steps: u32,
-    /// Whether the next reply is the rollout's first.
+    /// Whether the next reply is the first one of its rollout.
     begins: bool,
     decoded: DecodedRollout,
-    /// [`ServerSide::waited`] when the rollout was asked for.
+    /// The value of [`ServerSide::waited`] when the rollout was requested.
     waited: Duration,
 }
 
 impl<'a> ServerSide<'a> {
-    /// Opens a session for each of `entries` whose policy a server can play, and begins or resumes its run. Returns the
-    /// runs, and the entries whose actions must be chosen in this process: those that see noise, those with several
-    /// servers, and those with short rollouts unless there is only one entry. A run that cannot start is passed to `ended`.
+    /// Opens a session for each of `entries` whose policy the server can play, and starts or resumes its run. Returns
+    /// these runs, and the other entries, whose actions must be chosen in this process. These are entries with
+    /// observation noise, entries with several servers and, if there is more than one entry, entries with short
+    /// rollouts. If a run cannot start, calls `ended` with its index and the error.
     ///
     /// # Errors
-    /// A session that cannot be opened.
-    #[allow(clippy::type_complexity)] // two lists of which each is used once
+    /// An error if a session cannot be opened.
+    #[allow(clippy::type_complexity)] // both list types are used only here
     pub(super) fn open<'d>(
         servers: &'a Servers,
         entries: Vec<(usize, TrainRequest<'d>)>,
@@ -170,7 +172,7 @@ impl CollectRollouts for ServerSide<'_> {
 }
 
 impl<'a> ServerLane<'a> {
-    /// Asks the server for a rollout under the trainer's policy.
+    /// Requests a rollout of the trainer's current policy from the server.
     fn request_rollout(&mut self, trainer: &Trainer<'_>, waited: Duration) -> Result<()> {
         (self.begins, self.waited) = (true, waited);
         let act = proto::Act {
@@ -183,16 +185,17 @@ impl<'a> ServerLane<'a> {
         Ok(self.session.ask_to_play(act)?)
     }
 
-    /// Waits for the reply.
+    /// Receives the reply. Takes the lane by value, because the future must own it.
     async fn played(mut self: Box<Self>) -> (Box<Self>, std::result::Result<RolloutReply, ClientError>) {
         let played = self.session.played().await;
         (self, played)
     }
 
-    /// Appends the steps of a reply to the rollout. Returns whether the rollout is whole; if not, the rest was asked for.
+    /// Appends the steps of a reply to the rollout. Returns whether the rollout is complete. If not, requests the
+    /// remaining steps.
     ///
     /// # Errors
-    /// A reply that does not fit, or a failure of the connection. The steps of this rollout are lost then.
+    /// An error for a malformed reply or a connection failure. The steps of this rollout are then lost.
     fn take(
         &mut self,
         played: std::result::Result<RolloutReply, ClientError>,

@@ -19,7 +19,7 @@ use crate::policy::Policy;
 use crate::rollout::Rollout;
 use crate::{algorithm, proto};
 
-/// The environments that `config` trains in.
+/// Returns the options of the environments that `config` trains in.
 pub(super) fn options(config: &TrainConfig) -> OpenOptions {
     let common = &config.common;
     OpenOptions {
@@ -33,8 +33,8 @@ pub(super) fn options(config: &TrainConfig) -> OpenOptions {
     }
 }
 
-/// Brings a run and its player to the point at which it starts, in `slots` of the session, whose first `observations`
-/// `[N, O]` are given.
+/// Prepares a run to start or resume in the `slots` of a session. Returns its trainer and its player. `observations`
+/// `[N, O]` are the first observations of these environments.
 pub(super) fn start_or_resume<'a>(
     entry: TrainRequest<'a>,
     session: &mut Session<'_>,
@@ -55,13 +55,14 @@ pub(super) fn start_or_resume<'a>(
             resume((checkpoint, &state), directory, &environment, threads, restore)?
         }
     };
-    // Policies for earlier marks were kept when these were passed.
+    // The policies of earlier marks were saved when the training reached them.
     let episodes = trainer.checkpoint.state.counters.episodes;
     trainer.marks = marks.iter().copied().filter(|mark| *mark > episodes).collect();
     Ok((trainer, player))
 }
 
-/// Begins a run in `environment`, whose first `observations` `[N, O]` are given. Deletes an earlier run in the directory.
+/// Starts a run from initial weights. `observations` `[N, O]` are the first observations of its environments. Deletes
+/// an earlier run in the directory.
 fn begin<'a>(
     config: &TrainConfig,
     directory: &'a RunDirectory,
@@ -93,7 +94,7 @@ fn begin<'a>(
     player.load(policy.flat_weights()).map_err(crate::error::Error::from)?;
     let weights = policy.weights();
     let checkpoint = Checkpoint { state, policy: spec, weights };
-    directory.prepare()?; // from here on an earlier run is gone
+    directory.prepare()?; // this deletes an earlier run
     tracing::debug!(directory = %directory.path().display(), "training begins");
     let path = directory.path();
     let clock = Clock::start(0.0);
@@ -102,8 +103,8 @@ fn begin<'a>(
     Ok((new_trainer(directory, policy, environment, checkpoint, logs, clock)?, player))
 }
 
-/// Resumes a run from a checkpoint; `restore` restores its environments. Deletes the lines of the logs beyond the checkpoint,
-/// as the last step.
+/// Resumes a run from a checkpoint. `restore` restores its environments. As the last step, deletes log lines after the
+/// checkpoint.
 fn resume<'a>(
     (checkpoint, resume): (Checkpoint, &ResumeState),
     directory: &'a RunDirectory,
@@ -139,7 +140,7 @@ fn resume<'a>(
     Ok((trainer, player))
 }
 
-/// A trainer with a fresh algorithm, and without episodes so far.
+/// Returns a trainer with a new algorithm state and no episodes.
 fn new_trainer<'a>(
     directory: &'a RunDirectory,
     policy: Policy,
@@ -181,12 +182,12 @@ fn new_trainer<'a>(
     })
 }
 
-/// The error of a part of a checkpoint that does not fit.
+/// Returns the error for a part of a checkpoint that cannot be restored.
 fn not_restored(what: &'static str, source: TrainError) -> TrainError {
     TrainError::Restore { what, source: Box::new(source) }
 }
 
-/// The player of a run.
+/// Returns the player of a run, with these normalisers.
 fn player(state: &State, normalisers: Normalisers) -> Player {
     let Common { num_envs, seed, observation_noise, .. } = state.config.common;
     let spec = state.policy();
@@ -195,7 +196,7 @@ fn player(state: &State, normalisers: Normalisers) -> Player {
     let player = Player::new(&spec, inputs, num_envs, episodes_per_trial, normalisers, Role::training(seed));
     let player = player.with_noise(observation_noise);
     match &state.config.settings {
-        // A2C updates once a rollout, and needs just the activations that acting has computed.
+        // A2C makes one gradient step per rollout. It can use the activations that acting has already computed.
         Settings { base: Base::A2c(a2c), wrapper: Wrapper::Plain | Wrapper::Rl2(_) } => {
             player.keeping_activations(a2c.n_steps)
         }

@@ -1,4 +1,5 @@
-//! The environment-independent half of a run: policy, algorithm, counters, logs and checkpoints.
+//! The part of a run that does not depend on how rollouts are collected: policy, algorithm, counters, logs and
+//! checkpoints.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -27,80 +28,83 @@ pub(super) struct Trainer<'a> {
     pub(super) rollout: Rollout,
     pub(super) tally: EpisodeTally,
     pub(super) logs: Logs,
-    /// The checkpoint after the last whole iteration. Weights and statistics are put in when it is saved.
+    /// The checkpoint after the last complete iteration. Its weights and normalisers are updated only when it is saved.
     pub(super) checkpoint: Checkpoint,
     pub(super) clock: Clock,
-    /// Seconds by activity, earlier processes included.
+    /// Seconds by activity, including earlier processes.
     pub(super) shares: TimeShares,
-    /// Duration of the last update.
+    /// Duration of the last update; `None` before the first.
     pub(super) last_update: Option<Duration>,
-    /// Counters of the last checkpoint on disk.
+    /// Counters of the last checkpoint on disk; `None` before the first.
     pub(super) saved: Option<Counters>,
-    /// Future numbers of episodes after which the policy is kept for an intermediate evaluation, ascending.
+    /// Remaining marks, ascending: numbers of episodes after which the intermediate policy is saved.
     pub(super) marks: VecDeque<u64>,
 }
 
-/// The episodes that ended while a rollout was collected.
+/// Collects the episodes that end while a rollout is collected.
 pub(super) struct EpisodeTally {
-    /// Compares the parameters that episodes ran with to those that were requested.
+    /// Compares the requested parameters of episodes with the parameters applied by the physics.
     pub(super) comparison: ParameterComparison,
-    /// The last episodes, at most [`RECENT`].
+    /// Figures of the last episodes, at most [`RECENT`], oldest first.
     pub(super) recent: VecDeque<EpisodeFigures>,
-    /// Episodes that are still to be written to the log.
+    /// Ended episodes that have not been written to the log yet.
     pub(super) ended: Vec<EndedEpisode>,
 }
 
-/// Decisions after an iteration.
+/// Decisions after an iteration: what to save, and whether the run ends.
 pub(super) struct IterationOutcome {
     progress: Progress,
     /// Whether a checkpoint is due.
     pub(super) save: bool,
-    /// The marks that were passed.
+    /// The marks that this iteration has reached.
     pub(super) marks: Vec<u64>,
-    /// Whether the run ends: the budget is used up, or a signal came.
+    /// Whether the run ends: it has reached its budget or its success rate, or there was a signal.
     pub(super) ends: bool,
     signal: Option<i32>,
     logged: bool,
 }
 
 impl Trainer<'_> {
-    /// The policy's shape.
+    /// Returns the policy's shape.
     pub(super) fn spec(&self) -> &PolicySpec {
         self.policy.spec()
     }
 
-    /// The amount of experience to collect between two updates.
+    /// Returns the amount of experience to collect between two updates.
     pub(super) fn collect_until(&self) -> CollectUntil {
         self.algorithm.collect_until()
     }
 
-    /// `[P]` the policy's weights.
+    /// Returns the policy's weights `[P]`.
     pub(super) fn weights(&self) -> &[f32] {
         self.policy.flat_weights()
     }
 
-    /// The buffers for a rollout and its episodes.
+    /// Returns the buffers for a rollout and its episodes.
     pub(super) fn collecting(&mut self) -> (&mut Rollout, &mut EpisodeTally) {
         (&mut self.rollout, &mut self.tally)
     }
 
-    /// Duration of the last update, or [`LONG_UPDATE`] before the first. The next update takes about as long. With EPOpt it
-    /// takes up to some ten times as long, which is still less than servers wait. Keeping connections alive takes a thread,
-    /// which would cost more than the shortest updates.
+    /// Returns the duration of the last update, or [`LONG_UPDATE`] before the first. It predicts the next update, for
+    /// the decision whether to keep connections alive during it: the thread for this would cost more than the shortest
+    /// updates. With EPOpt, the next update can take some ten times as long. Even then, an update below [`LONG_UPDATE`]
+    /// ends before a server drops the connection.
     pub(super) fn last_update(&self) -> Duration {
         self.last_update.unwrap_or(LONG_UPDATE)
     }
 
-    /// A workspace for [`Trainer::update`], see [`Policy::workspace`].
+    /// Returns a workspace for [`Trainer::update`], see [`Policy::workspace`].
     pub(super) fn workspace(&self) -> Result<Option<GradientWorkspace>> {
         Ok(self.policy.workspace()?)
     }
 
-    /// Updates the policy from the rollout, which took these times to collect. Gradients are computed in `workspace` if there
-    /// is one. A `player` that acted in this process gets the new weights.
+    /// Updates the policy from the collected rollout. `acting` and `waiting` are the times that collecting took.
+    /// Gradients are computed in `workspace` if it is given. Loads the new weights into `player`, which is given if
+    /// actions are chosen in this process.
     ///
     /// # Errors
-    /// A number that is not finite, an episode that did not run with the requested parameters, a full disk.
+    /// An error if a number is not finite, if an episode ran with other parameters than requested, or if a log cannot
+    /// be written.
     pub(super) fn update(
         &mut self,
         player: Option<&mut Player>,
@@ -133,7 +137,7 @@ impl Trainer<'_> {
                 error => error.into(),
             })?;
         if let Some(player) = player {
-            // At once, while the weights are in the processor's caches.
+            // Loading is fast now, because the weights are in the processor's caches.
             player.load(self.policy.flat_weights()).map_err(Error::from)?;
         }
         let elapsed = start.elapsed();
@@ -155,7 +159,8 @@ impl Trainer<'_> {
         Ok(self.progress(update))
     }
 
-    /// Logs the rollout's episodes. Returns their number, and the number of steps that the rollout counts.
+    /// Logs the episodes of the rollout. Returns the number of episodes and the number of steps that the rollout adds
+    /// to the counters.
     fn log_episodes(&mut self) -> Result<(u64, u64)> {
         let EpisodeTally { comparison, ended, .. } = &mut self.tally;
         for episode in &*ended {
@@ -173,9 +178,9 @@ impl Trainer<'_> {
         Ok((count, steps))
     }
 
-    /// The remaining share of the training: 1 at the start, 0 when the policy has learned from as many steps as the budget's
-    /// episodes can have at most. With an update for each episode, every episode counts with the maximal number of steps, as
-    /// in the reference, which pads episodes to it.
+    /// Returns the remaining share of the training, which falls from 1 to 0. It reaches 0 when the policy has learned
+    /// from the maximum number of steps: the budget's episodes times the step limit. With an update for each episode,
+    /// every episode counts with the full step limit, because the paper's published code pads episodes to this length.
     fn progress_remaining(&self) -> f64 {
         let State { config, environment_spec, counters, .. } = &self.checkpoint.state;
         if let Wrapper::Epopt(EpoptConfig { update_per_episode: true, .. }) = config.settings.wrapper {
@@ -185,10 +190,11 @@ impl Trainer<'_> {
         (1.0 - counters.learned_timesteps as f64 / most).max(0.0)
     }
 
-    /// Logs the iteration if a log line is due, and decides about checkpoints and the end of the run.
+    /// Logs the iteration if a log line is due. Decides whether to save a checkpoint or intermediate policies, and
+    /// whether the run ends.
     ///
     /// # Errors
-    /// A full disk.
+    /// An error if a log cannot be written.
     pub(super) fn finish_iteration(&mut self, progress: Progress, stop: &StopFlag) -> Result<IterationOutcome> {
         let State { config: TrainConfig { common, .. }, counters, .. } = &self.checkpoint.state;
         let Common { log_interval, checkpoint_interval, .. } = *common;
@@ -200,13 +206,13 @@ impl Trainer<'_> {
         }
         let due = |saved: Counters| progress.episodes / checkpoint_interval > saved.episodes / checkpoint_interval;
         let save = finished || self.saved.is_none_or(due) || signal.is_some();
-        let passed = |mark: &u64| finished || *mark <= progress.episodes; // after its end a policy no longer changes
+        let passed = |mark: &u64| finished || *mark <= progress.episodes; // the final policy also serves for marks beyond the end
         let passed = self.marks.partition_point(passed);
         let marks = self.marks.drain(..passed).collect();
         Ok(IterationOutcome { progress, save, marks, ends: finished || signal.is_some(), signal, logged })
     }
 
-    /// Copies the current policy into the checkpoint.
+    /// Copies the current weights and `normalisers` into the checkpoint.
     fn copy_policy(&mut self, normalisers: Normalisers) {
         let Self { policy, checkpoint, .. } = self;
         policy.copy_weights(&mut checkpoint.weights);
@@ -214,11 +220,11 @@ impl Trainer<'_> {
         checkpoint.state.reward_normaliser = normalisers.rewards;
     }
 
-    /// Keeps the current policy for the marks that were passed. Call it before the next checkpoint is saved: a run that is
-    /// resumed from that checkpoint does not pass these marks again.
+    /// Saves the current policy for the marks that this iteration has reached. Must be called before the next
+    /// checkpoint is saved, because a run that resumes from that checkpoint does not reach these marks again.
     ///
     /// # Errors
-    /// A full disk.
+    /// An error if a file cannot be written.
     pub(super) fn keep(&mut self, iteration: &IterationOutcome, normalisers: &Normalisers) -> Result<()> {
         if !iteration.marks.is_empty() {
             self.copy_policy(normalisers.clone());
@@ -226,10 +232,10 @@ impl Trainer<'_> {
         iteration.marks.iter().try_for_each(|&mark| Ok(self.checkpoint.save(&self.directory.mark(mark), None)?))
     }
 
-    /// Replaces the checkpoint on disk. Environments and player are those after the last iteration.
+    /// Replaces the checkpoint on disk. `snapshots`, `player` and `normalisers` must be from after the last iteration.
     ///
     /// # Errors
-    /// A full disk; the earlier checkpoint, if any, is then still there.
+    /// An error if a file cannot be written. An earlier checkpoint is then kept.
     pub(super) fn save(
         &mut self,
         snapshots: Vec<bytes::Bytes>,
@@ -251,18 +257,18 @@ impl Trainer<'_> {
         Ok(())
     }
 
-    /// The run's outcome, after the last iteration was saved.
+    /// Returns the outcome of the run. Must be called after the last iteration was saved.
     ///
     /// # Errors
-    /// A full disk.
+    /// An error if a log cannot be written.
     pub(super) fn end(&mut self, iteration: &IterationOutcome) -> Result<TrainOutcome> {
         if !iteration.logged {
-            self.logs.progress(&iteration.progress)?; // a line beyond the checkpoint, which a resumed run deletes
+            self.logs.progress(&iteration.progress)?; // this line comes after the checkpoint, so a resumed run deletes it
         }
         Ok(TrainOutcome { checkpoint: self.checkpoint.clone(), progress: iteration.progress, signal: iteration.signal })
     }
 
-    /// Wraps an `error` that ended the run, and adds the last checkpoint that is left, if any.
+    /// Wraps the `error` that ended the run, together with the last checkpoint on disk, if there is one.
     pub(super) fn failed(&self, error: TrainError) -> TrainError {
         let run = || self.directory.path().to_owned();
         let last = self.saved.map(|Counters { episodes, .. }| LastCheckpoint { episodes, run: run() });
@@ -286,7 +292,7 @@ impl Trainer<'_> {
 }
 
 impl EpisodeTally {
-    /// Notes an episode that ended.
+    /// Adds an episode that ended.
     pub(super) fn note(&mut self, episode: &EndedEpisode) {
         while self.recent.len() >= RECENT {
             self.recent.pop_front();
@@ -296,7 +302,7 @@ impl EpisodeTally {
     }
 }
 
-/// The error of an episode that did not run with the requested parameters.
+/// Returns the error for an episode that ran with other parameters than requested; `None` if they agree up to rounding.
 fn difference(comparison: &mut ParameterComparison, episode: &EndedEpisode) -> Option<TrainError> {
     let receipt = &episode.receipt;
     let difference = comparison.difference_beyond_rounding(&receipt.requested, &receipt.applied)?;

@@ -7,7 +7,7 @@ use perturb_settings::Method;
 use crate::folder::Folder;
 use crate::plan::{Cell, Plan};
 
-/// Durations of finished cells, by environment and method.
+/// The process times of finished cells, by environment and method. They predict the durations of the remaining cells.
 #[derive(Debug, Default)]
 pub struct CellDurations<'a> {
     by_kind: HashMap<(&'a str, Method), Sum>,
@@ -41,8 +41,8 @@ impl<'a> CellDurations<'a> {
         self.count += 1;
     }
 
-    /// Returns the mean process time of cells with the environment and method of `cell`, s. Returns `None` if there are
-    /// none.
+    /// Returns the mean process time, in seconds, of finished cells with the environment and method of `cell`. Returns
+    /// `None` if there are none.
     pub fn seconds(&self, cell: &Cell) -> Option<f64> {
         let sum = self.by_kind.get(&(cell.config.common.environment.as_str(), cell.method()))?;
         Some(sum.seconds / sum.count)

@@ -1,7 +1,7 @@
 //! Estimates of the remaining time of trainings and experiments.
 //!
-//! [`TrainingProgress`] is the progress of one training, [`CellDurations`] has the durations of finished cells, and
-//! [`remaining_time`] combines both with measurements to the remaining time of an experiment.
+//! [`TrainingProgress`] estimates the rest of one training. [`CellDurations`] has the durations of finished cells.
+//! [`remaining_time`] combines both with measured speeds into the remaining time of an experiment.
 
 mod durations;
 mod progress;

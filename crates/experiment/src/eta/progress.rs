@@ -1,30 +1,33 @@
-//! The progress of one training.
+//! The progress of one training, and an estimate of its remaining work.
 //!
-//! The time of a training is proportional to its steps. The length of an episode changes while the policy learns, so the
-//! remaining steps follow from the length of the last episodes.
+//! The time of a training is proportional to its number of steps, but its budget is a number of episodes. Episodes
+//! become longer or shorter while the policy learns, so the remaining steps are estimated from the length of recent
+//! episodes.
 
-/// Number of the last episodes over which their length is averaged. Fewer episodes vary too much.
+/// Number of recent episodes over which the episode length is averaged. An average over fewer episodes would vary too
+/// much.
 const RECENT_EPISODES: f64 = 100.0;
-/// Share of all steps that must be done before there is an estimate.
+/// Share of all steps that must be done before there is an estimate (0 to 1).
 const MIN_SHARE: f64 = 0.01;
-/// Episodes count as growing if the recent ones are longer than the mean of all by this factor.
+/// Episodes count as growing if the mean length of recent episodes exceeds the mean length of all by this factor.
 const GROWTH_FACTOR: f64 = 1.3;
-/// Share of the budget after which growing episodes no longer make the estimate a lower bound.
+/// Share of the budget (0 to 1) up to which growing episodes make the estimate a lower bound.
 const EARLY_SHARE: f64 = 0.25;
 
-/// The progress of one training in one process.
+/// The progress of one training, as far as this process has run it.
 #[derive(Clone, Debug, Default)]
 pub struct TrainingProgress {
-    /// Numbers of episodes and steps before this process started; `None` before the first update.
+    /// Numbers of episodes and steps when this process started; `None` before the first update.
     first: Option<(f64, f64)>,
-    /// Episodes and steps until now.
+    /// Numbers of episodes and steps at the last update that added an episode.
     last: (f64, f64),
-    /// Mean length of recent episodes, steps.
+    /// Mean length of recent episodes, in steps; `None` before the first episode.
     length: Option<f64>,
 }
 
 impl TrainingProgress {
-    /// Sets the number of episodes and steps so far. The first call must give the numbers from before this process started.
+    /// Sets the total numbers of episodes and steps so far. The first call must pass the numbers at the start of this
+    /// process.
     pub fn update(&mut self, episodes: f64, steps: u64) {
         let steps = steps as f64;
         if self.first.is_none() {
@@ -40,21 +43,21 @@ impl TrainingProgress {
         self.last = (episodes, steps);
     }
 
-    /// Returns the number of episodes from before this process started.
+    /// Returns the number of episodes that earlier processes did before this process started.
     pub fn first_episodes(&self) -> f64 {
         self.first.map_or(0.0, |(episodes, _)| episodes)
     }
 
-    /// Returns the remaining steps of a training of `episodes`, divided by the steps of this process. Returns `None` before
-    /// there is enough progress.
+    /// Returns the estimated remaining steps divided by the steps that this process has done. `episodes` is the budget
+    /// of the training. Returns `None` before there is enough progress.
     pub fn remaining_ratio(&self, episodes: f64) -> Option<f64> {
         let done = self.last.1 - self.first?.1;
         let left = (episodes - self.last.0).max(0.0) * self.length?;
         (done > MIN_SHARE * (done + left)).then(|| left / done)
     }
 
-    /// Tells whether [`TrainingProgress::remaining_ratio`] is probably too low, because episodes grow and few of them are
-    /// done.
+    /// Returns whether [`TrainingProgress::remaining_ratio`] is probably too low. This is so early in a training whose
+    /// episodes are becoming longer.
     pub fn is_lower_bound(&self, episodes: f64) -> bool {
         let (Some((_, first)), Some(length)) = (self.first, self.length) else { return false };
         let mean = (self.last.1 - first) / (self.last.0 - self.first_episodes());
@@ -76,7 +79,8 @@ mod tests {
         assert_eq!(progress.remaining_ratio(100.0), Some(9.0));
         (2..=5).for_each(|i| progress.update(10.0 * f64::from(i), 100 + 1000 * u64::from(i as u32 - 1)));
         let left = progress.remaining_ratio(100.0).unwrap();
-        // 4100 steps were done. At the last length, which the average has reached only in part, the other half takes 5000.
+        // 4100 steps are done. The other half would take 5000 steps at the last length, but the average has not fully
+        // reached this length.
         assert!((0.9..1.22).contains(&left), "{left}");
         progress.update(100.0, 9100);
         assert_eq!(progress.remaining_ratio(100.0), Some(0.0));
@@ -104,7 +108,7 @@ mod tests {
         progress.update(502.0, 50_000 + 2 * 1000);
         let after = progress.remaining_ratio(2000.0).unwrap();
         assert!((before - 3.0).abs() < 1e-9 && (1.0..1.2).contains(&(after / before)), "{before}, then {after}");
-        // The average follows episodes that stay twice as long, whatever the distance between updates.
+        // If episodes stay twice as long, the average reaches their length, also with frequent updates.
         (1..=200).for_each(|i| progress.update(502.0 + 2.0 * f64::from(i), 52_000 + 400 * i as u64));
         let length = progress.remaining_ratio(2000.0).unwrap() * 132_000.0 / (2000.0 - 902.0);
         assert!((190.0..=210.0).contains(&length), "{length}");

@@ -11,33 +11,33 @@ use crate::plan::Cell;
 /// The remaining time of an experiment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RemainingTime {
-    /// The estimate.
+    /// The estimated time.
     pub time: Duration,
-    /// Whether a part of the estimate is an upper bound.
+    /// Whether the estimate is an upper bound, because it uses the measured upper bound of at least one cell.
     pub at_most: bool,
 }
 
-/// A cell that is not done.
+/// A cell that is running or waiting.
 pub(crate) struct UnfinishedCell<'a> {
     pub(crate) cell: &'a Cell,
-    /// Time since the cell began, s; `None` if it waits.
+    /// Seconds since the cell started; `None` if it is waiting.
     pub(crate) elapsed_seconds: Option<f64>,
-    /// Remaining work divided by the work since the cell began; `None` if it is not known.
+    /// Remaining work divided by the work since the cell started; `None` if it is not known.
     pub(crate) remaining_ratio: Option<f64>,
-    /// Measured upper bound of the whole cell's process time, s; `None` without a measurement.
+    /// Upper bound of the whole cell's process time from a measurement, in seconds; `None` without a measurement.
     pub(crate) max_seconds: Option<f64>,
 }
 
-/// Estimates the remaining time of `cells`, of which `at_a_time` run together. The duration of a waiting cell is the mean
-/// of finished cells of its kind, of running ones, or its measured upper bound, in this order. Returns `None` if nothing
-/// is known of a cell.
+/// Estimates the remaining time of `cells` when `at_a_time` processes run in parallel. The duration of a waiting cell
+/// is the first known of these: the mean of finished cells with its environment and method, the mean of running ones,
+/// the measured upper bound. Returns `None` if none of these is known for some cell.
 pub(crate) fn remaining_time(
     durations: &CellDurations<'_>,
     cells: &[UnfinishedCell<'_>],
     at_a_time: usize,
 ) -> Option<RemainingTime> {
     let under_way = cells.iter().filter(|cell| cell.elapsed_seconds.is_some()).count();
-    // Cells in one process share its time.
+    // Cells of one group share the time of their process.
     let share = (at_a_time as f64 / under_way.max(1) as f64).min(1.0);
     let kind = |cell: &'_ Cell| (cell.config.common.environment.clone(), cell.method());
     let mut running: HashMap<(String, Method), (f64, f64)> = HashMap::new();
@@ -75,7 +75,7 @@ mod tests {
     const PLAN: &str = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 2
         [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
 
-    /// A cell, and if it is running its elapsed seconds and its remaining ratio.
+    /// A cell; if it is running, also its elapsed seconds and its remaining ratio.
     type OfCell<'a> = (&'a Cell, Option<(f64, Option<f64>)>);
 
     fn seconds(durations: &CellDurations<'_>, cells: &[OfCell<'_>], at_a_time: usize) -> Option<f64> {
@@ -113,7 +113,7 @@ mod tests {
         let a_third = Some((20.0, Some(2.0)));
         assert_eq!(seconds(&times, &[(hopper, a_third)], 1), Some(40.0));
         assert_eq!(seconds(&times, &[(hopper, a_third), (hopper_2, None)], 1), Some(100.0));
-        // Two cells in one process had half of its time each, so 10 s, and need 20 s more each.
+        // Two cells shared one process for 20 s, so each took 10 s and needs 20 s more.
         assert_eq!(seconds(&times, &[(cart_pole, a_third), (cart_pole_2, a_third)], 1), Some(40.0));
         assert_eq!(seconds(&times, &[(cart_pole, a_third), (cart_pole_2, None), (hopper, None)], 1), None);
     }

@@ -12,8 +12,8 @@ use super::{AnyError, Cell, SELECTION_TEST, Tests};
 
 type Result<T, E = AnyError> = std::result::Result<T, E>;
 
-/// Expands `file`, whose versions and sets are `sets`, to its cells and to the cells that a selection may add. Cells
-/// are ordered by environment, then as in the tables.
+/// Expands `file` to two lists: its cells, and the candidates that its selection may add. `sets` are the versions and
+/// the parameter sets of the file by name. Cells are ordered by environment, then as in the tables `[[algorithm]]`.
 pub(super) fn expand(file: &File, sets: &BTreeMap<String, TestSet>) -> Result<(Vec<Cell>, Vec<Cell>)> {
     let mut expansion = Expansion { file, sets, cells: Vec::new(), tables: HashMap::new() };
     for (index, block) in file.algorithm.iter().enumerate() {
@@ -32,7 +32,7 @@ struct Expansion<'a> {
     file: &'a File,
     sets: &'a BTreeMap<String, TestSet>,
     cells: Vec<Cell>,
-    /// The table that asked for a cell, by the cell's id.
+    /// The name of the table `[[algorithm]]` that each cell is from, by cell id.
     tables: HashMap<String, String>,
 }
 
@@ -94,7 +94,7 @@ impl Expansion<'_> {
         })
     }
 
-    /// Adds the cells of every run of a configuration. With `selection = "clean"` its tuning runs come first.
+    /// Adds the cells of all runs of one configuration. With `selection = "clean"`, adds its tuning runs first.
     fn add_runs(&mut self, name: &str, config: TrainConfig, trained_on: &str) -> Result<()> {
         let file = self.file;
         let sets = file.test_versions.iter().map(|name| self.set(name).cloned());
@@ -149,7 +149,7 @@ impl Expansion<'_> {
     }
 }
 
-/// Returns all combinations of a grid's values, the last key varying fastest. An empty grid has one empty combination.
+/// Returns all combinations of a grid's values. The last key varies fastest. An empty grid has one empty combination.
 fn grid_points(name: &str, grid: &Table) -> Result<Vec<Table>, ValueError> {
     let mut points = vec![Table::new()];
     for (key, values) in grid {
@@ -167,7 +167,7 @@ fn grid_points(name: &str, grid: &Table) -> Result<Vec<Table>, ValueError> {
     Ok(points)
 }
 
-/// Returns the table of a refused key.
+/// Returns the name of the table in the experiment file that contains the invalid setting of `error`.
 fn place_of(error: &ConfigError, name: &str, block: &Block, common: &Table) -> String {
     let key = match error {
         ConfigError::UnknownKey { key, .. } | ConfigError::Value(ValueError { what: key, .. }) => key.as_str(),
@@ -185,16 +185,18 @@ fn place_of(error: &ConfigError, name: &str, block: &Block, common: &Table) -> S
     }
 }
 
-/// Returns a hash of settings and tests, without environment, version and seed, as eight hexadecimal digits.
+/// Returns a hash of settings and tests as eight hexadecimal digits. Environment, version and seed are left out of the
+/// hash.
 fn fingerprint(config: &TrainConfig, tests: &Tests) -> String {
     let mut table = config.table();
     table.remove("environment");
     table.remove("seed");
-    // The id contains the version, or only the name of the plan's set. Parameters of a set therefore belong to the hash.
+    // A cell's id contains the version, or only the name of a parameter set. The parameters of a set must therefore be
+    // in the hash.
     if config.common.parameters.is_empty() {
         table.remove("version");
     }
-    // Sorted keys, and numbers in one form only: toml's table is a sorted map, whatever the order of the file.
+    // The hash does not depend on the order of keys in the file, because `toml::Table` is a sorted map.
     let shown = |set: &TestSet| match set.plain() {
         Some(version) => version.to_string(),
         None => serde_json::to_string(set).unwrap_or_default(),

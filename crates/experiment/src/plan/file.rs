@@ -15,12 +15,12 @@ use toml::{Spanned, Table};
 use super::SELECTION_TEST;
 use super::{Selection, distinct};
 
-/// Settings that the plan itself decides for each cell.
+/// Settings that `[settings]` and grids must not contain, because other keys of the plan determine them.
 const OWN_KEYS: [&str; 7] = ["preset", "environment", "version", "parameters", "algorithm", "architecture", "seed"];
 /// Maximum number of cells of a plan.
 const MAX_CELLS: usize = 1_000_000;
 
-/// The file's keys.
+/// The keys of an experiment file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct File {
@@ -28,14 +28,14 @@ pub(super) struct File {
     pub(super) title: Option<String>,
     /// Date of reports, e.g. `2026-11-23`; reports read no clock (default: none).
     pub(super) date: Option<toml::value::Datetime>,
-    /// Preset, which decides about default settings: "perturb" or "paper" (default: `"perturb"`).
+    /// Preset that provides default settings: "perturb" or "paper" (default: `"perturb"`).
     #[serde(default, deserialize_with = "preset")]
     preset: Option<Preset>,
-    /// Folders of tasks that private servers also serve, relative to this file's folder (default: none). Servers of
-    /// `--server` must serve them already.
+    /// Task folders that locally started servers also serve, relative to this file's folder (default: none). Servers
+    /// named by `--server` must already serve these tasks.
     #[serde(default)]
     pub(super) tasks: Vec<Spanned<String>>,
-    /// Names of the catalogue.
+    /// Names of environments in the server's catalogue.
     pub(super) environments: Vec<String>,
     /// Training distributions: "D", "R", "E", "R+E", or names of `sets` (default: `["D", "R", "E"]`).
     #[serde(default = "all_versions")]
@@ -44,31 +44,31 @@ pub(super) struct File {
     /// (default: `"paper"`).
     #[serde(default, deserialize_with = "selection")]
     pub(super) selection: Selection,
-    /// With "clean" alone: seeds that select, from `seed` on (default: `1`).
+    /// Only with `selection = "clean"`: number of tuning seeds, which start at `seed` and only select (default: `1`).
     tuning_runs: Option<u32>,
-    /// With "clean" alone: episodes of each test that selects (default: `test_episodes`).
+    /// Only with `selection = "clean"`: episodes of each test that selects a configuration (default: `test_episodes`).
     selection_episodes: Option<u64>,
-    /// Repetitions of the whole, each with a seed of its own, at least 1 (default: `1`).
+    /// Number of repetitions of the whole experiment with different seeds, at least 1 (default: `1`).
     #[serde(default = "one")]
     pub(super) runs: u32,
-    /// The seed of run 1; each further run has the next (default: `1`).
+    /// The seed of run 1; each later run has the next seed (default: `1`).
     #[serde(default = "one")]
     pub(super) seed: u64,
     /// Episodes of each test (default: `1000`).
     #[serde(default = "a_thousand")]
     pub(super) test_episodes: u64,
-    /// Test sets of every policy: versions, or names of `sets` (default: `["D", "R", "E"]`).
+    /// Distributions that every policy is tested on: versions, or names of `sets` (default: `["D", "R", "E"]`).
     #[serde(default = "all_versions")]
     pub(super) test_versions: Vec<String>,
-    /// Episodes of the budget after which the policy is tested, too, ascending (default: none).
+    /// Numbers of training episodes after which the policy is also tested, ascending (default: none).
     #[serde(default)]
     pub(super) evaluate_at: Vec<u64>,
-    /// Sets of parameters by name, `[sets.NAME]`: `version`, where other parameters come from (default: `"D"`), and by
-    /// parameter its values, or `file`, a CSV file of contexts beside this file.
+    /// Parameter sets by name: tables `[sets.NAME]`. Each has the values of some parameters, or `file`, a CSV file of
+    /// contexts in this file's folder. `version` is the distribution of all other parameters (default: `"D"`).
     #[serde(default)]
     pub(super) sets: BTreeMap<String, Table>,
-    /// Success rule: "text", "code", or for each environment one of these or a threshold such as "steps=90" (default:
-    /// `"text"`, of the preset "paper" `"code"`).
+    /// Success rule: "text" or "code", or a table with "text", "code" or a threshold such as "steps=90" for each
+    /// environment (default: `"code"` for the preset "paper", otherwise `"text"`).
     #[serde(default)]
     success: SuccessRules,
     /// Settings of every training.
@@ -82,9 +82,9 @@ pub(super) struct File {
 #[derive(Deserialize)]
 #[serde(untagged, expecting = "\"text\", \"code\", or a table of environments with \"text\", \"code\" or thresholds")]
 enum SuccessRules {
-    /// One rule for every environment.
+    /// A single rule for every environment.
     All(Rule),
-    /// Rules by environment. Other environments have the preset's rule.
+    /// Rules by environment. Environments that are not listed have the default rule of the preset.
     Some(BTreeMap<String, Rule>),
 }
 
@@ -101,18 +101,18 @@ pub(super) struct Block {
     /// Replaces the file's preset.
     #[serde(default, deserialize_with = "preset")]
     preset: Option<Preset>,
-    /// An algorithm, as of `perturb train --algorithm`.
+    /// The algorithm's name, as in `perturb train --algorithm`.
     pub(super) name: String,
-    /// "ff", "rc" or both; of RL² "rc" alone.
+    /// Architectures: "ff", "rc" or both. RL² allows only "rc".
     pub(super) architectures: Vec<String>,
     /// Replaces the file's environments.
     environments: Option<Vec<String>>,
     /// Replaces the file's versions.
     versions: Option<Vec<String>>,
-    /// Settings of these trainings, over those of the file.
+    /// Settings of these trainings. They override the file's `[settings]`.
     #[serde(default)]
     pub(super) settings: Table,
-    /// Lists of values by setting; every combination is a configuration (default: one, of the defaults).
+    /// Lists of values by setting. Every combination is one configuration (default: a single configuration).
     #[serde(default)]
     pub(super) grid: Table,
 }
@@ -125,7 +125,7 @@ fn selection<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Selection, D:
     one_of(deserializer, &Selection::NAMES)
 }
 
-/// Reads one of the `known` names, in any spelling, and returns its value.
+/// Reads one of the `known` names, in any accepted spelling, and returns its value.
 fn one_of<'de, T: DeserializeOwned, D: Deserializer<'de>>(
     deserializer: D,
     known: &'static [&'static str],
@@ -148,8 +148,9 @@ fn a_thousand() -> u64 {
 }
 
 impl File {
-    /// Replaces names by their canonical spelling, and returns the requested revisions of environments. Names of
-    /// environments that are not in the paper are kept as written, because only servers know them.
+    /// Replaces names by their canonical spelling. Returns the revisions that names such as `perturb/CartPole-v1`
+    /// request, by environment. Keeps names of environments that are not in the paper as written, because only servers
+    /// know them.
     pub(super) fn spell(&mut self) -> Result<BTreeMap<String, u32>, AnyError> {
         self.settings = spelled("[settings]", std::mem::take(&mut self.settings))?;
         for (index, block) in self.algorithm.iter_mut().enumerate() {
@@ -191,7 +192,7 @@ impl File {
         Ok(revisions)
     }
 
-    /// Returns the environments of the file, then those that only its tables name.
+    /// Returns the environments of the key `environments`, then environments that only tables `[[algorithm]]` name.
     pub(super) fn all_environments(&self) -> Vec<&str> {
         let own = self.algorithm.iter().flat_map(|block| block.environments.iter().flatten());
         distinct(self.environments.iter().chain(own).map(String::as_str))
@@ -205,12 +206,13 @@ impl File {
         block.versions.as_ref().unwrap_or(&self.versions)
     }
 
-    /// Returns the preset of the settings in `block`.
+    /// Returns the preset of `block`: its own, or else the file's.
     pub(super) fn preset_of(&self, block: &Block) -> Preset {
         block.preset.or(self.preset).unwrap_or_default()
     }
 
-    /// Returns the success rule in tests of `environment` with a preset; `None` for the environment's own rule.
+    /// Returns the success rule for tests in `environment` of trainings with `preset`. Returns `None` for the
+    /// environment's own rule (`text`).
     pub(super) fn success_in(&self, environment: &str, preset: Preset) -> Option<Rule> {
         let given = match &self.success {
             SuccessRules::All(rule) => Some(rule),
@@ -220,17 +222,19 @@ impl File {
         Some(given.cloned().unwrap_or(usual)).filter(|rule| *rule != Rule::Text)
     }
 
-    /// Returns the number of runs whose tests only select a configuration and are not reported.
+    /// Returns the number of tuning runs: their tests only select a configuration, and are not reported. 0 unless
+    /// `selection` is "clean".
     pub(super) fn tuning_runs(&self) -> u32 {
         if self.selection == Selection::Clean { self.tuning_runs.unwrap_or(1) } else { 0 }
     }
 
-    /// Returns the number of episodes of the separate selecting test; `None` if the reported tests select.
+    /// Returns the number of episodes of the separate test that selects configurations. Returns `None` if the reported
+    /// tests select them.
     pub(super) fn selection_episodes(&self) -> Option<u64> {
         (self.selection == Selection::Clean).then(|| self.selection_episodes.unwrap_or(self.test_episodes))
     }
 
-    /// Checks all keys outside of the tables `[[algorithm]]`.
+    /// Checks all keys except the tables `[[algorithm]]`.
     pub(super) fn check(&self) -> Result<(), ValueError> {
         let most = i64::MAX as u64 - 2 * u64::from(u32::MAX);
         require(self.runs > 0, "runs", self.runs, "at least 1")?;
@@ -272,7 +276,8 @@ impl File {
         require(is_free, key, format!("`{SELECTION_TEST}`"), "another name: the test that selects has this one")
     }
 
-    /// Checks all keys of `block` other than its grid. Errors call it `name`. The plan has `before` cells of earlier tables.
+    /// Checks all keys of `block` except the values of its grid. Errors refer to the block as `name`. `before` is the
+    /// number of cells from earlier blocks.
     pub(super) fn check_block(&self, name: &str, block: &Block, before: usize) -> Result<(), ValueError> {
         let environments = self.environments_of(block);
         let key = format!("{name}: environments");
@@ -286,7 +291,7 @@ impl File {
         self.check_size(name, block, before)
     }
 
-    /// Refuses settings that the plan decides itself, and settings that are given twice.
+    /// Refuses settings that other keys of the plan determine, and settings that are in both `settings` and `grid`.
     fn check_keys(&self, name: &str, block: &Block) -> Result<(), ValueError> {
         let expected =
             "left out: the plan's own keys decide it (preset, environments, versions, sets, name, architectures, seed)";
@@ -305,7 +310,7 @@ impl File {
         })
     }
 
-    /// Refuses more than [`MAX_CELLS`] cells before they are expanded in memory.
+    /// Refuses plans of more than [`MAX_CELLS`] cells, before the cells are created in memory.
     fn check_size(&self, name: &str, block: &Block, before: usize) -> Result<(), ValueError> {
         let lists = [self.environments_of(block), self.versions_of(block), &block.architectures].map(<[_]>::len);
         let runs = self.runs as usize + self.tuning_runs() as usize;
@@ -318,20 +323,20 @@ impl File {
     }
 }
 
-/// Returns the name of an environment and the requested revision.
+/// Splits a written name such as `perturb/CartPole-v1` into the environment's name and the requested revision, if any.
 fn environment(written: &str) -> (String, Option<u32>) {
     let EnvironmentName { name, revision } = EnvironmentName::new(written);
     let known = names::find(&name, ENVIRONMENTS.into_iter());
     (known.map_or(name, |place| ENVIRONMENTS[place].to_owned()), revision)
 }
 
-/// Refuses an empty list, and a list that has an element twice.
+/// Refuses empty lists and repeated elements.
 fn check_list(key: &str, list: &[String]) -> Result<(), ValueError> {
     require(!list.is_empty(), key, "empty", "a list of at least one name")?;
     require(distinct(list.iter()).len() == list.len(), key, list.join(", "), "a list without repetitions")
 }
 
-/// Returns whether a name may be a part of a cell's id.
+/// Returns whether a name has only letters, digits and `_`, so that it may be a part of a cell's id.
 pub(super) fn is_plain(name: &str) -> bool {
     name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
 }

@@ -1,8 +1,8 @@
-//! Groups of cells that one process trains together.
+//! Divides cells into groups, which one process each trains together.
 //!
-//! A group's cells have the same environment, architecture and kind of observation, so that their steps can be one batch.
-//! Only cells with short rollouts share batches, because all cells of a group wait for the slowest one. A random policy
-//! makes no rollouts, so its time says nothing about the time of others. A cell's result does not depend on its group.
+//! The cells of a group have the same environment, architecture and kind of observation, so their steps can be one
+//! batch. All cells that share a batch wait for the slowest one, so cells with short, long and no rollouts are in
+//! separate groups. A cell's result does not depend on its group.
 
 use std::ops::Range;
 
@@ -11,24 +11,24 @@ use perturb_settings::{Architecture, CollectionMode, Observe, TrainConfig};
 
 use super::{Cell, Plan, distinct};
 
-/// The size of groups.
+/// Limits on the size and number of groups.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Grouping {
     /// Maximum number of cells in a group, at least 1.
     pub max_cells: usize,
-    /// Number of groups that run at the same time, at least 1. Each kind of cells is divided into a multiple of this number
-    /// of groups, if it has enough cells, so that all processes have work.
+    /// Number of processes that run groups in parallel, at least 1. Cells of one [kind](Cell::kind) are divided into a
+    /// multiple of this number of groups if there are enough of them, so that all processes are busy until the end.
     pub at_a_time: usize,
 }
 
 impl Grouping {
-    /// Default maximum number of cells in a group. Larger groups save little, because the fixed cost of a step is already
-    /// small compared with the rest.
+    /// Default maximum number of cells in a group. Larger groups save little time, because a step's fixed cost is
+    /// already shared by many cells.
     pub const USUAL: usize = 36;
-    /// A group for each kind of cells.
+    /// A single group for each [kind](Cell::kind) of cells, without a limit on its size.
     pub const BY_KIND: Self = Self { max_cells: usize::MAX, at_a_time: 1 };
 
-    /// Cuts `cells` cells of one kind into groups whose sizes differ by at most one.
+    /// Divides `cells` cells of one kind into groups whose sizes differ by at most one. Returns their ranges.
     fn cut(self, cells: usize) -> impl Iterator<Item = Range<usize>> {
         let groups = cells.div_ceil(self.max_cells.max(1)).next_multiple_of(self.at_a_time.max(1)).min(cells);
         (0..groups).map(move |group| group * cells / groups..(group + 1) * cells / groups)
@@ -36,8 +36,8 @@ impl Grouping {
 }
 
 impl Cell {
-    /// Returns environment, architecture, kind of observation, kind of rollouts, and whether there are disturbances. Cells
-    /// may be in one group if they have all of these in common.
+    /// Returns the kind of the cell: environment, architecture, kind of observation, collection mode, and whether it
+    /// has disturbances. Only cells of the same kind can be in one group.
     pub fn kind(&self) -> (&str, Architecture, Observe, CollectionMode, bool) {
         let TrainConfig { common, .. } = &self.config;
         let is_disturbed = common.parameters.keys().any(|name| is_disturbance(name));
@@ -46,8 +46,8 @@ impl Cell {
 }
 
 impl Plan {
-    /// Divides `cells`, ascending indices in the plan, into groups of neighbours, which have the most in common. Groups are
-    /// in the plan's order and depend only on the arguments.
+    /// Divides `cells`, ascending indices in the plan, into groups. Each group has successive cells of one kind. Groups
+    /// are ordered by kind in the plan's order, and depend only on the plan and the arguments.
     pub fn groups(&self, cells: &[usize], grouping: Grouping) -> Vec<Vec<usize>> {
         let mut groups: Vec<Vec<usize>> = Vec::new();
         for kind in distinct(cells.iter().map(|&cell| self.cells[cell].kind())) {
@@ -91,7 +91,7 @@ mod tests {
             settings = { n_steps = 63, n_minibatches = 1 }";
         let plan = Plan::parse("test", text.into()).unwrap();
         let all: Vec<usize> = (0..plan.cells.len()).collect();
-        // Of each environment two cells of A2C with FF, two with RC, and two of PPO with FF.
+        // Each environment has two cells of A2C with FF, two of A2C with RC, and two of PPO with FF.
         let groups = plan.groups(&all, Grouping { max_cells: 3, at_a_time: 1 });
         assert_eq!(groups, [vec![0, 1], vec![4, 5], vec![2, 3], vec![6, 7], vec![10, 11], vec![8, 9]]);
         assert_eq!(

@@ -1,9 +1,9 @@
 //! Experiment files and their expansion to cells.
 //!
-//! A cell is one training and its tests. Cells are the product of environments, algorithms, architectures, grid, training
-//! versions and runs, in this order, the last one varying fastest. All cells of a run have the same seed, so that two of
-//! them differ in nothing but what the file says. With `selection = "clean"` these are tuning cells. The configurations that
-//! they select are trained again with other seeds.
+//! A cell is one training and its tests. An experiment file has a cell for every combination of environment, algorithm,
+//! architecture, point of the grid, training version and run. The last of these varies fastest. All cells of a run have
+//! the same seed, so that they differ only in what the file varies. With `selection = "clean"`, these cells are tuning
+//! cells: they only select configurations, which are then trained again with other seeds.
 
 mod expansion;
 mod file;
@@ -26,49 +26,50 @@ use perturb_settings::sets::{Contexts, TestSet, check as check_parameters};
 use perturb_settings::{Method, TrainConfig, ValueError, require};
 use sets::ReadBeside;
 
-/// The content of an experiment file, with its cells.
+/// An experiment file, expanded to cells.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// The text of the file. Paths of `tasks` were made absolute, so that a copy elsewhere names the same folders.
+    /// The text of the file, with absolute paths in `tasks`, so that a copy of the file in another folder names the
+    /// same tasks.
     pub text: String,
     /// The heading of reports; empty if the file has none.
     pub title: String,
     /// The date as written in the file; empty if the file has none.
     pub date: String,
-    /// The files in the same folder that its sets name, with their content.
+    /// The CSV files that the parameter sets name: content by file name. They are in the folder of the experiment file.
     pub beside: BTreeMap<String, Vec<u8>>,
-    /// The folders of tasks that private servers also serve, absolute.
+    /// Absolute paths of task folders that locally started servers also serve.
     pub tasks: Vec<PathBuf>,
-    /// The requested revisions of environments, as in `perturb/CartPole-v1`. Environments that are not listed may have any
-    /// revision.
+    /// The requested revisions of environments, as in `perturb/CartPole-v1`. Environments that are not listed may have
+    /// any revision.
     pub revisions: BTreeMap<String, u32>,
-    /// The rule that selects configurations.
+    /// The rule that selects the reported configurations.
     pub selection: Selection,
     /// Number of reported repetitions, each with another seed.
     pub runs: u32,
-    /// Number of earlier repetitions, with separate seeds, that select configurations; 0 if the reported tests select.
+    /// Number of tuning runs, which have separate seeds and only select configurations; 0 if the reported tests select.
     pub tuning_runs: u32,
-    /// All cells that are known before the run: the tuning cells, if there are any. A cell's index is its position in this
-    /// list.
+    /// The cells to run. With `selection = "clean"` these are the tuning cells, until [`Plan::with_selected_cells`]
+    /// appends the selected ones. A cell's index is its position in this list.
     pub cells: Vec<Cell>,
-    /// Cells that are appended to `cells` when their configuration is selected, see [`Plan::with_selected_cells`].
+    /// Cells that [`Plan::with_selected_cells`] appends to `cells` if their configuration is selected.
     pub candidates: Vec<Cell>,
 }
 
-/// The rule that selects one of several configurations for a report.
+/// The rule by which a report selects one of several configurations of a method.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Selection {
-    /// The paper's rule: the reported tests select.
+    /// The paper's rule: the tests that are reported also select. This biases the reported results upwards.
     #[default]
     Paper,
-    /// Separate selection episodes of trainings on tuning seeds select. The selected configurations are trained again on
-    /// other seeds, and tested on other episodes.
+    /// Separate test episodes of trainings with tuning seeds select. The selected configurations are trained again with
+    /// other seeds and tested on other episodes.
     Clean,
 }
 
 impl Selection {
-    /// The names in files and options.
+    /// The names of the rules in files and options.
     pub const NAMES: [&'static str; 2] = ["paper", "clean"];
 }
 
@@ -88,7 +89,7 @@ impl std::str::FromStr for Selection {
     }
 }
 
-/// The name of the selecting test in results and records. It is used for nothing else.
+/// The name, in results and records, of the test that selects configurations. No parameter set may have this name.
 pub const SELECTION_TEST: &str = "selection";
 
 /// A training and its tests.
@@ -97,16 +98,16 @@ pub struct Cell {
     /// The index in the plan, from 0.
     pub index: usize,
     /// The cell's name: environment, algorithm, architecture, training version, configuration and seed. It depends on
-    /// nothing else in the plan, so a cell keeps its results when others are added.
+    /// nothing else in the plan, so the cell's results stay valid when other cells are added.
     pub id: String,
-    /// A hash of the settings without environment, version and seed, in eight hexadecimal digits.
+    /// A hash of settings and tests in eight hexadecimal digits. Environment, version and seed are left out.
     pub configuration: String,
-    /// The run, from 1. Tuning cells have separate runs.
+    /// The number of the run, from 1. Tuning runs are numbered separately.
     pub run: u32,
-    /// For a cell that is trained after the selection, the configuration of the tuning cells that select it. `None` for a
-    /// cell of the grid.
+    /// For a cell that is trained after the selection: the [`configuration`](Cell::configuration) of the tuning cells
+    /// that select it. `None` for all other cells.
     pub tuned_as: Option<String>,
-    /// The name of the plan's set of parameters on which it is trained; `None` if it is trained on a version.
+    /// The name of the plan's parameter set that the policy is trained on; `None` if it is trained on a version.
     pub set: Option<String>,
     /// The configuration of the training.
     pub config: TrainConfig,
@@ -119,12 +120,13 @@ pub struct Cell {
 pub struct Tests {
     /// Episodes of each test.
     pub episodes: u64,
-    /// The test sets: versions in the order D, R, E, R+E, then the plan's own sets in the plan's order.
+    /// The test sets: versions in the order D, R, E, R+E, then the plan's parameter sets in the plan's order.
     pub sets: Vec<TestSet>,
-    /// Episodes of the separate selecting test on the training distribution; `None` if the reported tests select.
+    /// Episodes of the separate selection test on the training distribution; `None` if the reported tests select.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub selection: Option<u64>,
-    /// Numbers of training episodes after which the intermediate policy is tested too, ascending and below the budget.
+    /// Marks: numbers of training episodes after which the intermediate policy is also tested, ascending and below the
+    /// budget.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub marks: Vec<u64>,
     /// The success rule; `None` for the environment's own rule.
@@ -132,22 +134,22 @@ pub struct Tests {
     pub success: Option<Rule>,
 }
 
-/// The amounts of work in a plan.
+/// The numbers of trainings and tests in a plan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Counts {
-    /// Algorithms with their architectures and settings, whatever the environment.
+    /// Number of different combinations of method and settings. The environment does not matter.
     pub configurations: usize,
-    /// Trainings of one run.
+    /// Number of trainings in one run.
     pub trainings: usize,
-    /// Pairs of a training and a test in one run.
+    /// Number of train/test pairs in one run: each training counts once for each of its test sets.
     pub pairs: usize,
-    /// Train/test pairs of all runs.
+    /// Number of train/test pairs in all runs.
     pub all_pairs: usize,
-    /// The number of repetitions.
+    /// Number of runs, or of tuning runs with `selection = "clean"`.
     pub runs: u32,
 }
 
-/// Why an experiment file was refused.
+/// The reason why an experiment file was refused.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum PlanError {
@@ -159,7 +161,7 @@ pub enum PlanError {
     Refused {
         /// The path as it was given.
         path: String,
-        /// The table, the key and the accepted values.
+        /// The invalid table and key, and the accepted values.
         reason: AnyError,
     },
 }
@@ -181,7 +183,7 @@ impl Plan {
         Self::parse(&path.display().to_string(), files::read_toml(path)?)
     }
 
-    /// Returns the sets of the file at `path`.
+    /// Reads the parameter sets of the experiment file at `path`, without expanding its cells.
     ///
     /// # Errors
     /// [`PlanError`], which names the table and the key.
@@ -195,13 +197,14 @@ impl Plan {
         Ok(sets.into_values().filter(|set| set.plain().is_none()).collect())
     }
 
-    /// Returns the names and contents of the plan's files: `plan.toml` and the files that its sets name.
+    /// Returns the names and contents of the plan's files: the CSV files that its sets name, then `plan.toml`.
     pub fn files(&self) -> impl Iterator<Item = (&str, &[u8])> {
         let beside = self.beside.iter().map(|(name, content)| (name.as_str(), content.as_slice()));
-        beside.chain([("plan.toml", self.text.as_bytes())]) // last: it names the others
+        beside.chain([("plan.toml", self.text.as_bytes())]) // last, because it names the others
     }
 
-    /// Expands `text`, which `path` names in errors.
+    /// Expands `text`, the content of the experiment file at `path`. Files that it names are read from the folder of
+    /// `path`.
     ///
     /// # Errors
     /// [`PlanError`], which names the table and the key.
@@ -210,8 +213,8 @@ impl Plan {
         Self::parse_with(path, text, folder, &|name| sets::content(name, folder))
     }
 
-    /// Expands `text`, which `path` names in errors. Folders of tasks are relative to `folder`, and `beside` reads the
-    /// files that the plan names.
+    /// Expands `text`, the content of an experiment file. Errors name it `path`. Task folders are relative to `folder`,
+    /// and `beside` reads the CSV files that the plan names.
     ///
     /// # Errors
     /// [`PlanError`], which names the table and the key.
@@ -238,11 +241,11 @@ impl Plan {
         Ok(Self { selection, runs, tuning_runs, cells, candidates, title, date, beside, tasks, text, revisions })
     }
 
-    /// Checks that `environment` has the revision, the parameters and the quantities of success rules that the plan's cells
-    /// name for it.
+    /// Checks that a server's `environment` has everything that the plan's cells need of it: revision, parameters, and
+    /// the quantities of success rules.
     ///
     /// # Errors
-    /// [`ValueError`] for the first of these that it does not have.
+    /// [`ValueError`] for the first mismatch.
     pub fn check(&self, environment: &proto::Environment) -> Result<(), ValueError> {
         if let Some(asked) = self.revisions.get(&environment.name) {
             let (name, served) = (&environment.name, environment.revision);
@@ -266,7 +269,7 @@ impl Plan {
         Ok(())
     }
 
-    /// Returns the amounts of work, without the cells that are trained after the selection.
+    /// Counts trainings and tests, without the cells that are trained after the selection.
     pub fn counts(&self) -> Counts {
         let of_grid = || self.cells.iter().filter(|cell| cell.tuned_as.is_none());
         let first = of_grid().filter(|cell| cell.run == 1);
@@ -280,8 +283,8 @@ impl Plan {
         }
     }
 
-    /// Returns the plan with another selection rule for the same results. With the paper's rule, its tuning cells are
-    /// reported.
+    /// Returns the plan with another selection rule for the same results. If the paper's rule replaces `clean`, the
+    /// tests of the tuning cells are reported.
     ///
     /// # Errors
     /// [`ValueError`] for `clean` if the plan has no tuning cells.
@@ -298,25 +301,25 @@ impl Plan {
         }
     }
 
-    /// Returns the cell or candidate with this id or index.
+    /// Returns the cell or candidate whose id or index is `name`.
     pub fn find(&self, name: &str) -> Option<&Cell> {
         let all = || self.cells.iter().chain(&self.candidates);
         let by_index = |index: usize| all().find(|cell| cell.index == index);
         all().find(|cell| cell.id == name).or_else(|| name.parse().ok().and_then(by_index))
     }
 
-    /// Returns the environments in the plan's order.
+    /// Returns the environments of all cells in the plan's order, without repetitions.
     pub fn environments(&self) -> Vec<&str> {
         distinct(self.cells.iter().map(|cell| cell.config.common.environment.as_str()))
     }
 
-    /// Returns the methods in the plan's order.
+    /// Returns the methods of all cells in the plan's order, without repetitions.
     pub fn methods(&self) -> Vec<Method> {
         distinct(self.cells.iter().map(Cell::method))
     }
 
-    /// Returns whether a selection is needed: whether a method has several configurations with the same training
-    /// distribution.
+    /// Returns whether configurations must be selected: whether some method has several configurations in the same
+    /// environment on the same training version.
     pub fn selects(&self) -> bool {
         let place = |cell: &&Cell| (cell.config.common.environment.clone(), cell.method(), cell.config.common.version);
         let places = distinct(self.cells.iter().map(|cell| place(&cell))).len();
@@ -325,17 +328,18 @@ impl Plan {
 }
 
 impl Cell {
-    /// Returns the training distribution.
+    /// Returns the training distribution: a version or a parameter set of the plan.
     pub fn trained_on(&self) -> TrainedOn<'_> {
         self.set.as_deref().map_or(TrainedOn::Version(self.config.common.version), TrainedOn::Set)
     }
 
-    /// Describes the cell without settings and run: "CartPole ppo ff, trained on R".
+    /// Returns a description without settings and run, e.g. "CartPole ppo ff, trained on R".
     pub fn described(&self) -> String {
         format!("{} {}, trained on {}", self.config.common.environment, self.method(), self.trained_on())
     }
 
-    /// Returns the separate selecting test and its number of episodes; `None` if the reported tests select.
+    /// Returns the set and the number of episodes of the separate selection test. Returns `None` if the reported tests
+    /// select.
     pub fn selection_test(&self) -> Option<(TestSet, u64)> {
         let parameters = Contexts::Drawn(self.config.common.parameters.clone());
         let set = TestSet { name: SELECTION_TEST.into(), version: self.config.common.version, contexts: parameters };
@@ -348,13 +352,13 @@ impl Cell {
     }
 }
 
-/// Returns the elements of `items` without repetitions, in order.
+/// Returns the distinct elements of `items` in order of their first occurrence.
 pub fn distinct<T: Eq + std::hash::Hash + Clone>(items: impl Iterator<Item = T>) -> Vec<T> {
     let mut seen = HashSet::new();
     items.filter(|item| seen.insert(item.clone())).collect()
 }
 
-/// Describes an error in a file in words for users, with the key that was probably meant.
+/// Returns the message of a TOML error in words for users. Suggests the key that was probably meant.
 fn words(error: &toml::de::Error) -> String {
     let whole = "expected a whole number that is not negative, in digits";
     let text = ["expected u32", "expected u64"]
@@ -363,7 +367,7 @@ fn words(error: &toml::de::Error) -> String {
     const UNKNOWN_KEY: &str = "unknown field `";
     let Some((before, names)) = text.split_once(UNKNOWN_KEY) else { return text };
     let Some((key, known)) = names.split_once('`') else { return text };
-    let hint = names::did_you_mean(key, known.split('`').skip(1).step_by(2)); // between them stand commas
+    let hint = names::did_you_mean(key, known.split('`').skip(1).step_by(2)); // skips the commas between the names
     format!("{before}{UNKNOWN_KEY}{key}`{hint}{known}")
 }
 

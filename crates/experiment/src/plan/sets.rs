@@ -11,14 +11,16 @@ use toml::{Table, Value};
 
 use super::file::is_plain;
 
-/// A key of a set's table that is no parameter.
+/// Key of a set's table: the version that parameters without an entry in the table are drawn from.
 const VERSION: &str = "version";
+/// Key of a set's table: the name of a CSV file of contexts.
 const FILE: &str = "file";
 
-/// Reads a file by its name. The error says what was found instead.
+/// A function that reads a file by name. Its error is a phrase that describes what was found instead of the file.
 pub(super) type ReadBeside<'a> = dyn Fn(&str) -> Result<Vec<u8>, String> + 'a;
 
-/// Returns the versions and the sets of `tables` by name. Adds the files that the sets name to `beside`.
+/// Returns all versions and the parameter sets in `tables`, by name. Inserts the CSV files that the sets name into
+/// `beside`.
 pub(super) fn read(
     tables: &BTreeMap<String, Table>,
     read_beside: &ReadBeside<'_>,
@@ -72,7 +74,7 @@ fn read_set(
     Ok(set)
 }
 
-/// Reads the CSV file called `file` in `folder`.
+/// Reads the CSV file `file` in `folder`. The error is a phrase for [`ReadBeside`].
 pub(super) fn content(file: &str, folder: &Path) -> Result<Vec<u8>, String> {
     if Path::new(file).components().count() != 1 || file.starts_with('.') || !file.ends_with(".csv") {
         return Err(format!("`{file}`, which is not the name of a file .csv"));

@@ -5,14 +5,15 @@ use std::path::{Path, PathBuf};
 use perturb_settings::{ValueError, require};
 use toml::{Spanned, Value};
 
-/// Key of the experiment file.
+/// Key of the experiment file that lists task folders.
 const KEY: &str = "tasks";
 
-/// Returns `text` with absolute paths in place of `written`, which it contains, and these paths. Relative paths begin in
-/// `folder`. Copies of the text then name the same folders, wherever they are.
+/// Replaces the task folders in `text`, the content of an experiment file, by absolute paths. Returns the new text and
+/// the paths. `written` are the folders as written in the file, relative to `folder`. Copies of the new text in other
+/// folders name the same tasks.
 ///
 /// # Errors
-/// [`ValueError`] for a folder that is named twice or cannot be named.
+/// [`ValueError`] for a folder that is listed twice, or whose path is empty or not UTF-8.
 pub(super) fn resolve(
     mut text: String,
     written: &[Spanned<String>],
@@ -43,7 +44,7 @@ pub(super) fn resolve(
 mod tests {
     use crate::plan::Plan;
 
-    /// Returns a plan with these tasks.
+    /// Returns the text of a plan with these tasks.
     fn plan(tasks: &str) -> String {
         format!(
             "tasks = {tasks} # two\nenvironments = ['Walker', 'Arm']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']"

@@ -1,4 +1,4 @@
-//! The status of a saved assessment.
+//! The status of a saved assessment: the recorded tests of policies that were trained elsewhere.
 
 use std::path::{Path, PathBuf};
 
@@ -8,7 +8,7 @@ use perturb_records::{ExternalEvaluation, TestResult};
 
 use super::RunSummary;
 
-/// A saved assessment, as its folder has it.
+/// A saved assessment, as read from its folder.
 #[derive(Clone, Debug)]
 pub struct AssessmentStatus {
     /// The folder of the assessment.
@@ -28,7 +28,7 @@ pub struct AssessedTest {
     pub trained_on: String,
     /// The version or set of the test.
     pub tested_on: String,
-    /// The figures of the test.
+    /// Success rate, mean return and mean length in the test.
     pub result: TestResult,
 }
 
@@ -36,7 +36,7 @@ impl AssessmentStatus {
     /// Reads the assessment in `path`.
     ///
     /// # Errors
-    /// If its files are damaged, or do not belong together.
+    /// An error if the files are damaged or do not belong together.
     pub fn read(path: &Path) -> Result<Self, AnyError> {
         let evaluation = ExternalEvaluation::read(path)?;
         let tests = evaluation.policies().iter().flat_map(|policy| {
@@ -54,7 +54,7 @@ impl AssessmentStatus {
         })
     }
 
-    /// Summarises the assessment for a list of runs.
+    /// Returns the summary of the assessment for a list of runs.
     pub fn summary(&self) -> RunSummary {
         let episodes = self.tests.iter().map(|test| test.result.episodes).sum();
         RunSummary {

@@ -1,4 +1,4 @@
-//! The status of an experiment.
+//! The status of an experiment: its plan, and the state of each cell.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -13,9 +13,9 @@ use crate::folder::{CellResult, CellState, Folder, FolderError};
 use crate::plan::{Cell, Plan};
 use crate::scheduler::{Rate, Rates};
 
-/// Maximum number of cells whose progress is followed.
+/// Maximum number of cells of an experiment that is shown to others.
 const MAX_FOLLOWED_CELLS: usize = 50_000;
-/// The text for files behind a link that leads out of the shown folder.
+/// The error text for a symbolic link to a file outside the shown folder.
 pub const LEADS_OUT: &str = "a link that leads out of the folder";
 
 /// The status of an experiment, as read from its folder.
@@ -23,15 +23,15 @@ pub const LEADS_OUT: &str = "a link that leads out of the folder";
 pub struct ExperimentStatus {
     /// The folder of the experiment.
     pub folder: Folder,
-    /// The plan with all cells that are known so far.
+    /// The plan, including the cells that its selection has added so far.
     pub plan: Plan,
     /// The status of each cell, in the plan's order.
     pub cells: Vec<CellStatus>,
-    /// The stamp of plan.toml when it was read.
+    /// The stamp of `plan.toml` when it was read, for noticing changes.
     stamp: Option<Stamp>,
-    /// The stamps of each cell's result and failure when they were read.
+    /// The stamps of each cell's result and failure files when they were read, in the plan's order.
     records: Vec<RecordStamps>,
-    /// The folder that links may not leave.
+    /// The folder that symbolic links must not lead out of; `None` if links may lead anywhere.
     within: Option<PathBuf>,
 }
 
@@ -44,11 +44,11 @@ pub enum CellStatus {
     Failed(String),
     /// The cell's files cannot be read.
     NotUnderstood(String),
-    /// A process works on the cell.
+    /// A process is working on the cell: its folder is locked.
     InWork,
-    /// The cell waits.
+    /// No process is working on the cell, and it has neither a result nor a failure.
     Waiting {
-        /// Whether the cell has a folder.
+        /// Whether the cell was started before: it has a folder.
         begun: bool,
     },
 }
@@ -61,16 +61,16 @@ impl ExperimentStatus {
     /// Reads the status of the experiment in `path`.
     ///
     /// # Errors
-    /// If the plan cannot be read.
+    /// An error if the plan cannot be read.
     pub fn read(path: &Path) -> Result<Self, AnyError> {
         Self::with(path, None)
     }
 
-    /// Reads the status of an experiment that is shown to others. Nothing behind a link that leads out of `root` is
-    /// read. `path` is in `root` and has no links.
+    /// Reads the status of an experiment that is shown to others. Does not read files outside `root`, even if symbolic
+    /// links lead there. `path` must be in `root` and contain no links.
     ///
     /// # Errors
-    /// If the plan cannot be read, leads out, or has too many cells.
+    /// An error if the plan cannot be read, is behind a link that leads out of `root`, or has too many cells.
     pub fn read_within(path: &Path, root: &Path) -> Result<Self, AnyError> {
         Self::with(path, Some(root.to_owned()))
     }
@@ -83,10 +83,10 @@ impl ExperimentStatus {
         Ok(Self { folder, plan, cells, stamp, records, within })
     }
 
-    /// Reads the plan and the records of results and failures again where they have changed.
+    /// Reads the plan, results and failures again if their files have changed.
     ///
     /// # Errors
-    /// If the plan cannot be read.
+    /// An error if the plan cannot be read.
     pub fn refresh(&mut self) -> Result<(), AnyError> {
         if Stamp::read(&self.folder.plan_path()) != self.stamp {
             *self = Self::with(self.folder.path(), self.within.clone())?;
@@ -100,14 +100,14 @@ impl ExperimentStatus {
                 self.records[place] = records;
             }
         }
-        // The tuning cells may have selected a configuration meanwhile.
+        // The tuning cells may have selected a configuration since the last call.
         if !self.plan.candidates.is_empty() && self.count(CellStatus::is_settled) != before {
             self.replan()?;
         }
         Ok(())
     }
 
-    /// Reads the plan again. Cells that it had before keep their status.
+    /// Reads the plan again. Cells that were already in the plan keep their status.
     fn replan(&mut self) -> Result<(), AnyError> {
         let within = self.within.as_deref();
         let plan = read_plan(&self.folder, within)?;
@@ -121,18 +121,18 @@ impl ExperimentStatus {
         Ok(())
     }
 
-    /// Returns the time of the last change of the plan, a result or a failure, s since 1970.
+    /// Returns the time of the last change of the plan, a result or a failure, in seconds since 1970.
     pub fn changed(&self) -> i64 {
         let stamps = self.records.iter().flatten().chain([&self.stamp]).flatten();
         stamps.map(Stamp::seconds).max().unwrap_or_default()
     }
 
-    /// Returns the number of cells with a status for which `is` holds.
+    /// Returns the number of cells whose status satisfies `is`.
     pub fn count(&self, is: impl Fn(&CellStatus) -> bool) -> usize {
         self.cells.iter().filter(|cell| is(cell)).count()
     }
 
-    /// Returns the cells that are done, with their results.
+    /// Returns the finished cells with their results.
     pub fn done(&self) -> impl Iterator<Item = (&Cell, &CellResult)> {
         self.plan.cells.iter().zip(&self.cells).filter_map(|(cell, status)| match status {
             CellStatus::Done(result) => Some((cell, &**result)),
@@ -140,7 +140,7 @@ impl ExperimentStatus {
         })
     }
 
-    /// Returns the success of the cells that are done, by kind of cell.
+    /// Returns the mean success rates of finished cells by environment, method and training distribution.
     pub fn rates(&self) -> Vec<Rate> {
         let mut rates = Rates::default();
         self.done().for_each(|(cell, result)| rates.add(cell, result));
@@ -171,7 +171,7 @@ impl ExperimentStatus {
             path: self.folder.path().to_owned(),
             what: match &self.plan.environments()[..] {
                 few @ ([_] | [_, _]) => few.join(", "),
-                many => format!("{} environments", many.len()), // a line must fit
+                many => format!("{} environments", many.len()), // all names would not fit in a line
             },
             done: self.done().count() as u64,
             budget: self.cells.len() as u64,
@@ -212,13 +212,13 @@ fn read_plan(folder: &Folder, within: Option<&Path>) -> Result<Plan, AnyError> {
     }
     if let Some(root) = within.filter(|_| !plan.candidates.is_empty()) {
         for cell in &plan.cells {
-            require_within(folder, cell, root)?; // results say which candidates become cells
+            require_within(folder, cell, root)?; // results determine which candidates become cells
         }
     }
     Ok(plan.with_selected_cells(folder)?)
 }
 
-/// Refuses a cell whose records are behind a link that leads out.
+/// Returns an error if the result or failure of a cell is behind a link that leads out of `root`.
 fn require_within(folder: &Folder, cell: &Cell, root: &Path) -> Result<(), String> {
     let place = Path::new("cells").join(&cell.id);
     let out = RECORDS.into_iter().find(|name| leads_out(root, folder.path(), place.join(name)));
@@ -235,7 +235,7 @@ fn known(folder: &Folder, cell: &Cell, within: Option<&Path>) -> (RecordStamps, 
     (records, status(folder, cell, records, within))
 }
 
-/// Returns the status of a cell with these records.
+/// Reads the status of a cell. `records` are the current stamps of its files.
 fn status(folder: &Folder, cell: &Cell, records: RecordStamps, within: Option<&Path>) -> CellStatus {
     let place = folder.cell(&cell.id);
     if records == [None; 2] {
@@ -251,7 +251,7 @@ fn status(folder: &Folder, cell: &Cell, records: RecordStamps, within: Option<&P
     match place.state() {
         Ok(CellState::Done(result)) => CellStatus::Done(result),
         Ok(CellState::Failed(failure)) => CellStatus::Failed(shortened(failure.reason)),
-        Ok(CellState::Missing) => CellStatus::Waiting { begun: true }, // deleted in this moment
+        Ok(CellState::Missing) => CellStatus::Waiting { begun: true }, // deleted since the stamp was read
         Err(FolderError::Damaged { path, reason }) => {
             let reason = shortened(reason);
             CellStatus::NotUnderstood(FolderError::Damaged { path, reason }.to_string())

@@ -1,4 +1,4 @@
-//! The trainings, experiments and saved assessments below a folder, with their kind, progress and success.
+//! Finds the trainings, experiments and saved assessments below a folder, and reads their progress and success.
 
 mod assessment;
 mod experiment;
@@ -18,10 +18,10 @@ pub use self::training::TrainingStatus;
 use perturb_files::{self as files, AnyError, leads_out};
 use perturb_records::ExternalEvaluation;
 
-/// Maximum number of folders that are searched behind symbolic links, since a link may lead to a whole disk.
+/// Maximum number of folders that are searched behind symbolic links, because a link may lead to a whole disk.
 const MAX_FOLDERS_BEHIND_LINKS: usize = 10_000;
 
-/// A folder that holds a run.
+/// A folder that contains a run.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct RunFolder {
     /// The path of the folder.
@@ -30,7 +30,7 @@ pub struct RunFolder {
     pub kind: RunKind,
 }
 
-/// The kind of a run.
+/// A kind of run. Its folder has its own layout.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum RunKind {
     /// A training, as `perturb train --out` writes it.
@@ -42,7 +42,7 @@ pub enum RunKind {
 }
 
 impl RunKind {
-    /// Detects the kind of the folder at `path`; `None` if it holds no run.
+    /// Detects the kind of run in the folder at `path`; `None` if the folder contains no run.
     pub fn detect(path: &Path) -> Option<Self> {
         if path.join("plan.toml").is_file() {
             Some(RunKind::Experiment)
@@ -54,30 +54,30 @@ impl RunKind {
     }
 }
 
-/// Returns the error message for a `path` that should be a folder and is none.
+/// Returns the error message for a `path` that is not a folder.
 pub fn no_folder(path: &Path) -> String {
     format!("there is no folder {}: give the one that your runs are in", path.display())
 }
 
-/// The runs below a folder.
+/// The result of a search for runs below a folder.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RunFolders {
-    /// The runs, in the order of their paths. Folders inside of a run are not searched.
+    /// The runs, ordered by path. Folders inside a run are not searched.
     pub runs: Vec<RunFolder>,
-    /// All other searched folders, including the first one.
+    /// All other searched folders, including the one where the search starts if it is no run itself.
     pub others: Vec<PathBuf>,
-    /// Links to folders outside of the folder in which the search must stay.
+    /// Symbolic links that were not followed because they lead out of the folder `within`.
     pub links_out: Vec<PathBuf>,
-    /// Whether there are more folders than were searched.
+    /// Whether the search stopped at its maximum number of folders, so that runs may be missing.
     pub more: bool,
 }
 
-/// Looks for runs in `folder` and below, in at most `most` folders. Symbolic links are followed after all other folders, and
-/// each folder is searched once. With `within`, an absolute path without links, links that lead out of it are not followed.
+/// Finds runs in `folder` and its subfolders. Searches at most `most` folders, each once. Follows symbolic links after
+/// it has searched all other folders. If `within` is given, an absolute path without links, does not follow links that
+/// lead out of it.
 ///
 /// # Errors
-/// Errors of the operating system, if `folder` itself cannot be listed. Other folders that cannot be listed are
-/// skipped.
+/// Errors of the operating system if `folder` itself cannot be listed. Skips other folders that cannot be listed.
 pub fn places(folder: &Path, most: usize, within: Option<&Path>) -> files::Result<RunFolders> {
     let mut found = RunFolders::default();
     let mut search = FolderSearch::default();
@@ -123,15 +123,15 @@ pub fn places(folder: &Path, most: usize, within: Option<&Path>) -> files::Resul
     Ok(found)
 }
 
-/// The state of a search for runs.
+/// The state of a search for runs, see [`places`].
 #[derive(Default)]
 struct FolderSearch {
-    /// Links to folders, which are followed last.
+    /// Symbolic links to folders that have not been followed yet.
     links: VecDeque<PathBuf>,
-    /// Device and inode of the searched folders.
+    /// Device and inode of each searched folder, so that no folder is searched twice.
     seen: HashSet<(u64, u64)>,
     is_behind_link: bool,
-    /// Number of folders that were found behind links.
+    /// Number of folders that were searched behind links.
     followed: usize,
 }
 
@@ -145,33 +145,37 @@ impl FolderSearch {
     }
 }
 
-/// A training, an experiment or an assessment in a few figures.
+/// The progress and success of a training, an experiment or an assessment, for a list of runs.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RunSummary {
-    /// The path of the folder. JSON has U+FFFD where it is not UTF-8.
+    /// The path of the folder. In JSON, U+FFFD replaces bytes that are not UTF-8.
     #[serde(serialize_with = "as_text")]
     pub path: PathBuf,
-    /// The trained method, the environments of an experiment, or what an assessment tested.
+    /// A description: environment and method of a training, environments of an experiment, or environment and agent of
+    /// an assessment.
     pub what: String,
     /// Number of finished episodes of a training or an assessment, or finished cells of an experiment.
     pub done: u64,
-    /// Total number of these episodes or cells.
+    /// Total number of episodes or cells, in the unit of `done`.
     pub budget: u64,
-    /// The unit of `budget`: "episodes" or "cells".
+    /// The unit of `done` and `budget`: "episodes" or "cells".
     pub unit: &'static str,
-    /// Success: of the last 100 episodes of a training, or over the tests of an assessment or of the cells that are done.
+    /// Success rate, %: of the last 100 episodes of a training, or the mean over all tests of an assessment or of the
+    /// finished cells of an experiment. `None` if there is none yet.
     pub success_percent: Option<f64>,
-    /// "in work", "finished", "broken off", …
+    /// The state: "in work", "finished", "broken off", "with failures", "without a checkpoint", "assessed" or "not
+    /// understood".
     pub state: &'static str,
 }
 
-/// Writes a path as text. serde refuses a path that is not UTF-8, and with it the whole document.
+/// Serializes a path as text, with replacement characters if it is not UTF-8. serde's own way would fail, and with it
+/// the whole document.
 fn as_text<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_str(&path.to_string_lossy())
 }
 
 impl RunSummary {
-    /// Reads the summary of the run in `place`. A run that cannot be read is "not understood".
+    /// Reads the summary of the run in `place`. If the run cannot be read, its state is "not understood".
     pub fn read(place: &RunFolder) -> Self {
         let read = || -> Result<Self, AnyError> {
             Ok(match place.kind {

@@ -1,4 +1,4 @@
-//! The last line of a training's `progress.csv`.
+//! Reads the last line of a training's `progress.csv`.
 
 use std::collections::HashMap;
 use std::io::{Read, Seek, SeekFrom};
@@ -6,32 +6,32 @@ use std::path::Path;
 
 use perturb_files::open_plain;
 
-/// Maximum size in bytes of a line, and of the header.
+/// Maximum size of a line, including the header, in bytes.
 const MAX_LINE_BYTES: u64 = 16 * 1024;
 
-/// The progress of a training and the figures of its last update.
+/// The last line of a `progress.csv`: the progress of a training and the statistics of its last update.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LastProgress(HashMap<String, f64>);
 
 impl LastProgress {
-    /// Returns the value of a column, e.g. `rollout/episodes`; `None` if it is empty.
+    /// Returns the value of a column, e.g. `rollout/episodes`; `None` if the column is empty or missing.
     pub fn get(&self, column: &str) -> Option<f64> {
         self.0.get(column).copied()
     }
 
-    /// Returns the success of the last 100 episodes, %.
+    /// Returns the success rate of the last 100 training episodes, %.
     pub fn success_percent(&self) -> Option<f64> {
         self.get("rollout/success_rate").map(|rate| 100.0 * rate)
     }
 
-    /// Returns the number of episodes that the budget counts.
+    /// Returns the number of training episodes so far that count towards the budget.
     pub fn episodes(&self) -> Option<u64> {
         self.get("rollout/episodes").map(|episodes| episodes as u64)
     }
 }
 
-/// Returns the last whole line of the file at `path`; `None` if there is none. Only the beginning and the end of the
-/// file are read.
+/// Reads the last complete line of the file at `path`. Returns `None` if there is none. Only the beginning and the end
+/// of the file are read, so large files are fast too.
 pub fn last_progress(path: &Path) -> Option<LastProgress> {
     let (mut file, metadata) = open_plain(path).ok()?;
     let length = metadata.len();

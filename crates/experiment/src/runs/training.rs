@@ -1,4 +1,4 @@
-//! The status of a training.
+//! The status of a training: its progress and whether it is running, finished or interrupted.
 
 use std::path::{Path, PathBuf};
 
@@ -9,7 +9,8 @@ use perturb_text::shortened;
 
 use super::{LastProgress, RunSummary, last_progress};
 
-/// Number of episodes over which the success rate that may end a training is averaged, and the minimum number of episodes.
+/// Number of recent episodes whose success rate may end a training. A training must have at least this many episodes
+/// before its success rate can end it.
 const RECENT: u64 = 100;
 
 /// The status of a training, as read from its folder.
@@ -17,21 +18,21 @@ const RECENT: u64 = 100;
 pub struct TrainingStatus {
     /// The folder of the training.
     pub path: PathBuf,
-    /// The settings.
+    /// The settings of the training.
     pub config: TrainConfig,
-    /// Number of finished episodes of the budget. It is read from the log's last line while the training runs, otherwise
-    /// from the last checkpoint, from which it would be resumed.
+    /// Number of finished episodes that count towards the budget. While the training runs, it comes from the last line
+    /// of `progress.csv`, otherwise from the last checkpoint, where the training would resume.
     pub episodes: u64,
-    /// The last line of the log; `None` before the first line.
+    /// The last line of `progress.csv`; `None` before the first line.
     pub progress: Option<LastProgress>,
-    /// Episodes of the last checkpoint; `None` if there is none.
+    /// Number of episodes at the last checkpoint; `None` if there is none.
     pub saved: Option<u64>,
-    /// The fault of the checkpoint, if it is damaged.
+    /// The error of reading the checkpoint; `None` if it is intact or missing.
     pub damaged: Option<String>,
     /// The state: "in work", "finished", "broken off" or "without a checkpoint".
     pub state: &'static str,
-    /// Whether the training has ended by its budget or by its success rate. A cell may still be in work then, because
-    /// its policy is tested.
+    /// Whether the training has reached its budget or its target success rate. Its `state` may still be "in work",
+    /// because a cell tests the policy after the training.
     pub over: bool,
 }
 
@@ -39,7 +40,7 @@ impl TrainingStatus {
     /// Reads the status of the training in `path`.
     ///
     /// # Errors
-    /// If `config.toml` is not that of a training.
+    /// An error if `config.toml` cannot be read or is not the configuration of a training.
     pub fn read(path: &Path) -> Result<Self, AnyError> {
         let config = read_config(&path.join("config.toml"))?;
         let progress = last_progress(&path.join("progress.csv"));
@@ -65,7 +66,7 @@ impl TrainingStatus {
         Ok(Self { path: path.to_owned(), config, episodes, progress, saved, damaged, state, over })
     }
 
-    /// Describes the training.
+    /// Returns a description of the training, e.g. "CartPole D a2c ff".
     pub fn what(&self) -> String {
         self.config.to_string()
     }

@@ -1,4 +1,5 @@
-//! Messages between a run and its workers: one JSON object a line on the worker's standard input and output.
+//! Messages between a run and its worker processes: JSON objects, one per line, on the worker's standard input and
+//! output.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -13,33 +14,33 @@ use serde::{Deserialize, Serialize};
 use super::count;
 use crate::folder::FailureId;
 
-/// Interval of a worker's progress messages for one cell.
+/// Interval between progress messages of a worker that has one cell.
 const INTERVAL: Duration = Duration::from_secs(1);
-/// Maximum factor by which the interval grows with the number of the worker's cells.
+/// The interval is multiplied by the number of the worker's cells, but at most by this factor.
 const MAX_INTERVALS: u32 = 10;
-/// Maximum number of bytes at the end of a log that are searched for its last line with words.
+/// Maximum number of bytes at the end of a log that are searched for its last non-empty line.
 const MAX_LAST_WORDS_BYTES: u64 = 64 << 10;
 
-/// The only line that a worker reads. It stops when its standard input is closed, which also happens when the process
-/// that started it dies, however it dies.
+/// The job of a worker process: the only line that it reads from its standard input. A worker stops when its standard
+/// input is closed. This also happens when the process that started the worker dies.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WorkerJob {
-    /// The cells of a group, at least one.
+    /// The cells that the worker runs together, at least one.
     pub cells: Vec<JobCell>,
-    /// The index of the server to use, modulo the number of servers.
+    /// Selects the server: its index is `turn` modulo the number of servers.
     pub turn: usize,
 }
 
-/// A cell of an [`WorkerJob`].
+/// A cell of a [`WorkerJob`].
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct JobCell {
     /// The cell's id.
     pub cell: String,
-    /// The failure that may be forgotten, and no other.
+    /// The recorded failure that the worker may delete to run the cell again; `None` if the worker must keep failures.
     pub retry: Option<FailureId>,
 }
 
-/// A line that a worker writes, `{"cell": "…", "event": "training", …}`.
+/// A line that a worker writes to its standard output: `{"cell": "…", "event": "training", …}`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EventLine {
     /// The cell's id.
@@ -49,40 +50,42 @@ pub struct EventLine {
     pub event: CellEvent,
 }
 
-/// An event of a cell. All but the first three end an attempt and are the worker's last line about the cell.
+/// An event of a cell. `Server`, `Training` and `Testing` report progress. Every other event ends the worker's attempt
+/// at the cell and is the worker's last line about it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 #[expect(missing_docs, reason = "the variants say what their fields are")]
 pub enum CellEvent {
-    /// The cell has a server, at this address.
+    /// The cell uses the server at this address.
     Server { address: String },
-    /// The training has had so many episodes and steps. `saved` steps are in a checkpoint, from which another attempt
-    /// would resume. The first such line of an attempt says where the attempt begins.
+    /// The training has done this many episodes and steps. Of these, `saved` steps are in a checkpoint, where another
+    /// attempt would resume. The first such event of an attempt reports where the attempt starts.
     Training { episodes: u64, timesteps: u64, saved: u64 },
-    /// The policy is tested on this set and has had so many episodes.
+    /// The test of the policy on this set has done this many episodes.
     Testing { set: String, episodes: u64 },
-    /// The cell has a result, which may be from an earlier attempt.
+    /// The cell has a result, from this attempt or an earlier one.
     Done,
-    /// The cell failed with this reason, now or earlier.
+    /// The cell failed with this reason, in this attempt or an earlier one.
     Failed { reason: String },
-    /// Another process works on the cell.
+    /// Another process is working on the cell.
     Busy,
-    /// The cell found no server or lost it. This is not the cell's failure.
+    /// No server was found, or the connection to it was lost. This does not count as a failure of the cell.
     LostServer { reason: String },
-    /// A file could not be read or written, for example because the disk is full. This is not the cell's failure. The
-    /// training so far is kept.
+    /// A file could not be read or written, for example because the disk is full. This does not count as a failure of
+    /// the cell. The training so far is kept.
     FileFault { reason: String },
-    /// A signal asked the worker to end. The training so far is kept.
+    /// A signal stopped the worker. The training so far is kept.
     Stopped { signal: i32 },
-    /// The worker does not know a cell of its job.
+    /// The job contains a cell that is not in the worker's plan.
     Refused { reason: String },
-    /// The worker ended without a last line about the cell. The process that started the worker says how.
+    /// The worker ended without a last line about the cell. The process that started the worker writes this event;
+    /// `reason` tells how the worker ended.
     Killed { reason: String },
 }
 
 impl CellEvent {
-    /// Returns whether the event shows that the worker has started with the cell. A server is no such event, because a whole
-    /// group gets its server at the beginning.
+    /// Returns whether the event shows that the worker has started work on the cell. `Server` does not show this,
+    /// because all cells of a group get their server at the start.
     pub(super) fn is_a_turn(&self) -> bool {
         !matches!(self, Self::Server { .. })
     }
@@ -92,7 +95,8 @@ impl CellEvent {
         !matches!(self, Self::Server { .. } | Self::Training { .. } | Self::Testing { .. })
     }
 
-    /// Returns the part of the event that is constant during a stage.
+    /// Returns a value that identifies the stage of a progress event: a test set, or the training up to the next
+    /// checkpoint. Returns `None` for other events.
     fn stage(&self) -> Option<(&str, u64)> {
         match self {
             Self::Training { saved, .. } => Some(("", *saved)),
@@ -120,22 +124,23 @@ impl std::fmt::Display for CellEvent {
     }
 }
 
-/// Writes the lines of a group's cells.
+/// Writes the events of a group's cells as [`EventLine`]s, and limits the rate of progress events.
 pub struct EventLineWriter<W> {
     out: W,
     interval: Duration,
-    /// The last line about each cell.
+    /// The last written event of each cell, and when it was written.
     last: HashMap<String, (CellEvent, Instant)>,
 }
 
 impl<W: Write> EventLineWriter<W> {
-    /// Returns a writer for `cells` cells.
+    /// Returns a writer to `out` for a worker with `cells` cells.
     pub fn new(cells: usize, out: W) -> Self {
         let intervals = cells.clamp(1, MAX_INTERVALS as usize) as u32;
         Self { out, interval: INTERVAL * intervals, last: HashMap::new() }
     }
 
-    /// Writes a line about the cell with this id. Skips it if a line of the same stage was written within the interval.
+    /// Writes an event of the cell with this id. Skips a progress event if an event of the same stage was written
+    /// within the interval.
     pub fn write(&mut self, cell: &str, event: CellEvent) {
         let said =
             |(last, time): &(CellEvent, Instant)| time.elapsed() < self.interval && last.stage() == event.stage();
@@ -147,7 +152,7 @@ impl<W: Write> EventLineWriter<W> {
     }
 }
 
-/// Writes `line`. A failed write is ignored, because the folder has the results.
+/// Writes `line` as JSON. Ignores write errors, because the results are in the experiment's folder.
 pub fn write_line(out: &mut impl Write, line: &impl Serialize) {
     let Ok(mut text) = serde_json::to_vec(line) else { return };
     text.push(b'\n');
@@ -156,8 +161,8 @@ pub fn write_line(out: &mut impl Write, line: &impl Serialize) {
     }
 }
 
-/// Reads the lines that were completed in `file` since `offset`, and moves `offset` behind them. Skips all other text,
-/// because for example a cluster's prologue may write to the same file.
+/// Reads the complete lines in `file` from byte `offset` on, and moves `offset` behind them. Skips all text that is not
+/// an event, because for example the prologue of a cluster's job may write to the same file.
 pub(super) fn read_lines(file: &File, offset: &mut u64) -> std::io::Result<Vec<EventLine>> {
     let mut new = Vec::new();
     let mut piece = [0; 1 << 14];
@@ -172,7 +177,7 @@ pub(super) fn read_lines(file: &File, offset: &mut u64) -> std::io::Result<Vec<E
     Ok(new[..end].split(|&byte| byte == b'\n').filter_map(|line| serde_json::from_slice(line).ok()).collect())
 }
 
-/// Returns the last line with words in `log` after byte `start`. It may contain the reason why a process ended.
+/// Returns the last non-empty line of `log` after byte `start`. It may contain the reason why a process ended.
 pub(super) fn last_words(log: &Path, start: u64) -> Option<String> {
     let (mut file, metadata) = open_plain(log).ok()?;
     let mut text = Vec::new();

@@ -1,4 +1,4 @@
-//! Runs cells in worker processes on this machine, a group of cells in each process.
+//! The backend that runs cells in worker processes on this machine, one group of cells in each process.
 
 use std::collections::{BTreeMap, HashSet};
 use std::fs::File;
@@ -15,7 +15,7 @@ use super::{Backend, BackendEvent, CellEvent, JobCell, PendingCell, Result, Work
 use crate::folder::Folder;
 use crate::plan::{Grouping, Plan};
 
-/// Worker processes on this machine. Each worker locks its cells itself.
+/// A [`Backend`] that runs worker processes on this machine. Each worker locks its own cells.
 pub struct Local<'a> {
     plan: &'a Plan,
     folder: &'a Folder,
@@ -23,30 +23,30 @@ pub struct Local<'a> {
     command: &'a dyn Fn(usize) -> Command,
     server: &'a dyn Fn() -> Option<BackendEvent>,
     workers: Vec<Worker>,
-    /// Measured upper bounds of the cells' durations by index, s of process time.
+    /// Measured upper bounds of the cells' durations by index in the plan, in seconds of process time.
     max_seconds: Vec<Option<f64>>,
 }
 
 struct Worker {
-    /// The unfinished cells: the index in the plan by the cell's id.
+    /// The unfinished cells: index in the plan by cell id.
     cells: BTreeMap<String, usize>,
-    /// The cells that have begun.
+    /// Indices of the cells that the worker has started.
     begun: HashSet<usize>,
-    /// The lowest number that no other worker had at the start.
+    /// The lowest number, from 0, that no other worker had when this one was started.
     slot: usize,
     child: Child,
     events: File,
-    /// Number of bytes of `events` that were read.
+    /// Number of bytes of `events` that have been read.
     offset: u64,
     log: PathBuf,
-    /// The start of the worker's output in the log, bytes.
+    /// Size of the log in bytes when the worker started: its own output begins here.
     log_start: u64,
 }
 
 impl<'a> Local<'a> {
-    /// Returns a backend of `grouping.at_a_time` workers. `command` starts a worker for its slot, the lowest free
-    /// number from 0. Each worker reads a [`WorkerJob`] and writes [`EventLine`](super::EventLine)s. `server` reports
-    /// events of the servers.
+    /// Returns a backend with up to `grouping.at_a_time` workers at a time. `command` returns the command that starts a
+    /// worker, given the worker's slot: the lowest free number from 0. Each worker must read a [`WorkerJob`] and write
+    /// [`EventLine`](super::EventLine)s. The backend calls `server` at every poll for events of the servers.
     pub fn new(
         plan: &'a Plan,
         folder: &'a Folder,
@@ -57,7 +57,7 @@ impl<'a> Local<'a> {
         Self { plan, folder, grouping, command, server, workers: Vec::new(), max_seconds: Vec::new() }
     }
 
-    /// Sets the measured upper bounds of the cells' durations by index, s of process time.
+    /// Sets the measured upper bounds of the cells' durations by index in the plan, in seconds of process time.
     pub fn with_max_seconds(self, max_seconds: Vec<Option<f64>>) -> Self {
         Self { max_seconds, ..self }
     }
@@ -88,7 +88,8 @@ impl<'a> Local<'a> {
         Ok(Some(Worker { cells, begun: HashSet::new(), slot, child, events, offset: 0, log: path, log_start }))
     }
 
-    /// Opens the log of a group, which is the log of its first cell. The logs of the other cells refer to it.
+    /// Opens the log of a group: the log file of its first cell. Appends a reference to it to the logs of the other
+    /// cells.
     fn open_logs(&self, group: &[PendingCell]) -> Result<(File, PathBuf), FileError> {
         let open = |offer: &PendingCell| {
             let place = self.folder.cell(self.id(offer.cell));
@@ -106,8 +107,8 @@ impl<'a> Local<'a> {
         Ok(first)
     }
 
-    /// Returns the index of the first server to use. It depends on the cell, so that separate runs of single cells, such as
-    /// a cluster's jobs, do not all begin with the same server.
+    /// Returns a pseudo-random index of the server for the first group. It depends on the plan's first cell. Otherwise
+    /// separate runs of single cells, such as jobs of a cluster, would all start with the same server.
     fn first_turn(&self) -> usize {
         self.plan.cells.first().map_or(0, |cell| crc32c::crc32c(cell.id.as_bytes()) as usize)
     }
@@ -118,9 +119,9 @@ impl<'a> Local<'a> {
 }
 
 impl Worker {
-    /// Returns the events since the last call, and whether the worker has ended.
+    /// Returns the worker's events since the last call, and whether the worker has ended.
     fn news(&mut self) -> std::io::Result<(Vec<BackendEvent>, bool)> {
-        let status = self.child.try_wait()?; // before its words are read, so that they are the last
+        let status = self.child.try_wait()?; // before reading its events, so that none is missed after its end
         let mut news = Vec::new();
         for line in read_lines(&self.events, &mut self.offset)? {
             let Some(&cell) = self.cells.get(&line.cell) else { continue };
@@ -139,7 +140,7 @@ impl Worker {
             killed.sort_unstable();
             news.extend(killed.into_iter().map(|cell| match self.begun.is_empty() || self.begun.contains(&cell) {
                 true => BackendEvent::Event(cell, CellEvent::Killed { reason: reason.clone() }),
-                // The end of the process does not count against a cell that it had not started.
+                // The process had not started this cell, so its end does not count as a failed attempt.
                 false => BackendEvent::Returned(cell),
             }));
         }
@@ -196,13 +197,13 @@ impl Backend for Local<'_> {
         (format!("{cells} in {shown}"), processes.max(1))
     }
 
-    /// Asks all workers to stop, and waits for them. They finish their iterations first.
+    /// Asks all workers to stop, and waits until they have ended. Workers finish their current iteration first.
     fn stop(&mut self) -> Vec<String> {
         for worker in &mut self.workers {
             drop(worker.child.stdin.take());
         }
         for mut worker in self.workers.drain(..) {
-            let _ = worker.child.wait(); // an error means that it has been waited for
+            let _ = worker.child.wait(); // an error means that the process has already been waited for
         }
         Vec::new()
     }
@@ -217,10 +218,11 @@ mod tests {
     use super::*;
     use perturb_files::interrupt::StopFlag;
 
-    /// Two cells.
+    /// A plan with two cells.
     const PLAN: &str = "environments = ['CartPole']\nversions = ['D']\nruns = 2
         [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
-    /// Start of the script of every worker in these tests. It reads its job and changes to its cell's folder.
+    /// Start of the shell script that replaces workers in these tests. It reads its job and changes to the folder of
+    /// its cell.
     const BEGIN: &str = r#"read -r order; id=${order#*:\"}; id=${id%%\"*}; cd "cells/$id"; echo "$order" >>orders
         echo "$SEAT" >>seats
         say() { echo "{\"cell\":\"$id\",\"event\":$1}"; };"#;
@@ -230,7 +232,7 @@ mod tests {
         lines: Vec<EventLine>,
     }
 
-    /// Runs with a shell script as a worker of one cell.
+    /// Runs the plan with a shell script in place of each worker, which gets one cell.
     fn run_script(folder: &Folder, script: &str, stop: &StopFlag, server: &dyn Fn() -> Option<BackendEvent>) -> Ran {
         run_grouped(Grouping { max_cells: 1, at_a_time: 2 }, folder, script, stop, server)
     }

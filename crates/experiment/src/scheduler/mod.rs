@@ -1,8 +1,9 @@
 //! Runs the cells of a plan on this machine or on a cluster.
 //!
-//! [`run()`] is a state machine over a [`Backend`], which starts groups of cells and reports events of each cell: [`Local`]
-//! in processes of this machine, [`slurm`] in jobs. The folder alone decides whether a cell is settled: it has a result
-//! there, or a failure that counts. So several runs, of both kinds, may share a folder.
+//! [`run()`] repeatedly polls a [`Backend`], which starts groups of cells and reports events of each cell. There are
+//! two backends: [`Local`] uses processes of this machine, [`slurm`] uses jobs of a cluster. A cell is settled when the
+//! experiment's folder has its result, or a failure that is not retried. Only the folder decides this, so several runs
+//! with different backends may share a folder.
 
 mod event;
 mod local;
@@ -29,120 +30,125 @@ use running::Running;
 pub use running::RunningGroup;
 use slurm::SlurmError;
 
-/// Maximum number of attempts in a row without progress.
+/// Maximum number of attempts at a cell that end in a row without progress.
 pub const MAX_ATTEMPTS: u32 = 3;
-/// Maximum number of disk failures in a row, about fifteen seconds, before the run ends.
+/// Number of file faults in a row, over some fifteen seconds, after which the run ends.
 const MAX_FAULTS: u32 = 5;
-/// Minimum time that a cell waits for a server before the run ends, since a server may be restarted.
+/// Minimum time that a cell waits for a lost server before the run ends, because a server may be restarting.
 const MIN_SERVER_WAIT: Duration = Duration::from_secs(15);
-/// Time with a server after which a cell counts as having made progress. A later loss of the server starts a new row of
-/// losses.
+/// Time on a server after which the count of successive losses is reset at the next loss.
 const STABLE_CONNECTION: Duration = Duration::from_secs(60);
-/// First pause after a cell lost its server or could not use the disk. Every further failure in a row doubles the pause.
+/// Pause after the first lost server or file fault. It doubles with every further one in a row.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// Maximum pause.
+/// Maximum pause after a lost server or a file fault.
 const MAX_PAUSE: Duration = Duration::from_secs(30);
-/// Interval of reading the folder and of progress messages.
+/// Interval between reads of the folder, and between progress messages.
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
-/// Time of a test episode relative to a training episode: there are no updates, and many environments run together.
+/// Duration of a test episode divided by that of a training episode. Tests have no updates and run many environments
+/// together.
 const TEST_SHARE: f64 = 0.25;
-/// Sleep between two steps of the scheduler.
+/// Pause between two steps of the scheduler.
 const TICK: Duration = Duration::from_millis(50);
 
-/// A backend that runs cells.
+/// A way to run groups of cells, for example in local processes. The scheduler decides which cells start, and the
+/// backend runs them.
 pub trait Backend {
-    /// Returns the size of groups.
+    /// Returns how cells are divided into groups.
     fn grouping(&self) -> Grouping;
-    /// Returns whether a cell that was interrupted too often is recorded as failed. If not, machines may be the cause, so
-    /// nothing is recorded and the next run tries again.
+    /// Returns whether a cell whose process died too often is recorded as failed. Backends return false if faulty
+    /// machines may be the cause; then the next run tries the cell again.
     fn records_crashes_as_failures(&self) -> bool;
-    /// Returns whether the backend reports the end of every started cell, so that a run can wait for it.
+    /// Returns whether the backend reports the end of every started cell. If not, the scheduler looks for results in
+    /// the folder.
     fn tells_ends(&self) -> bool;
     /// Returns the events since the last call.
     ///
     /// # Errors
-    /// The run cannot go on.
+    /// [`RunError`] if the run cannot continue.
     fn poll(&mut self, now: Instant) -> Result<Vec<BackendEvent>>;
-    /// Returns the number of groups that can begin now.
+    /// Returns the number of groups that can start now.
     fn free_slots(&self) -> usize;
-    /// Starts some of `groups`, none of which is empty. Returns the cells that are now in work: the started ones, and those
-    /// that were already in work.
+    /// Starts some of `groups`, whose lists must not be empty. Returns the indices of the cells that are now running or
+    /// queued, including cells that already were.
     ///
     /// # Errors
-    /// The run cannot go on.
+    /// [`RunError`] if the run cannot continue.
     fn begin(&mut self, groups: &[Vec<PendingCell>]) -> Result<Vec<usize>>;
-    /// Describes the backend's activity, and returns the number of groups at a time.
+    /// Returns a description of the backend's activity for users, and the number of groups that run in parallel.
     fn load(&self) -> (String, usize);
-    /// Returns the measured upper bound of a cell's duration, s of process time.
+    /// Returns a measured upper bound of a cell's duration in seconds of process time; `None` if there is no
+    /// measurement.
     fn max_seconds(&self, _cell: usize) -> Option<f64> {
         None
     }
-    /// Ends all work that needs this process. Returns names of the work that continues without it.
+    /// Ends all work that needs this process. Returns the names of work that continues without this process, such as
+    /// jobs of a cluster.
     fn stop(&mut self) -> Vec<String>;
 }
 
-/// A cell that waits to be done.
+/// A cell that is waiting to be started.
 #[derive(Clone, Copy, Debug)]
 pub struct PendingCell {
     /// The index in the plan.
     pub cell: usize,
-    /// The recorded failure that this attempt may replace; `None` if there is none.
+    /// The recorded failure that this attempt may delete; `None` if there is none.
     pub retry: Option<FailureId>,
-    /// The number of the cell's group in this run. A cell that runs alone keeps it.
+    /// The number of the cell's group in this run. It stays the same when the cell is started again alone.
     pub group: usize,
-    /// The number of servers that were lost.
+    /// The number of times that the cell lost its server in this run.
     pub lost_servers: usize,
-    /// The mean duration of finished cells with the same environment and method, s; `None` before the first.
+    /// The mean process time of finished cells with the same environment and method, in seconds; `None` if none has
+    /// finished.
     pub seconds: Option<f64>,
 }
 
 /// An event of a backend. Cells are indices in the plan.
 #[derive(Clone, Debug, PartialEq)]
 pub enum BackendEvent {
-    /// Something happened to a cell.
+    /// An event of the cell with this index.
     Event(usize, CellEvent),
-    /// A cell was given back before it was started.
+    /// The backend did not start this cell, and hands it back to the scheduler.
     Returned(usize),
-    /// The servers are gone, for this reason.
+    /// The servers have ended, for this reason.
     NoServer(String),
-    /// A sentence for the user.
+    /// A sentence to show to the user.
     Note(String),
 }
 
 /// A progress message of a run.
 #[derive(Clone, Debug)]
 pub enum ProgressEvent<'a> {
-    /// The status of the run.
+    /// The current status of the run.
     Status(&'a RunStatus),
-    /// A sentence about what happened.
+    /// A sentence to show to the user.
     Note(&'a str),
     /// An event of a cell.
     Line(&'a EventLine),
 }
 
-/// The status of a run.
+/// The status of a run, for display.
 #[derive(Clone, Debug)]
 pub struct RunStatus {
-    /// Cells of the plan.
+    /// Number of cells in the plan.
     pub cells: usize,
-    /// Cells with a result.
+    /// Number of cells with a result.
     pub done: usize,
-    /// Cells with a failure that counts.
+    /// Number of cells with a failure that is not retried.
     pub failed: usize,
-    /// The groups that run.
+    /// The groups that are running.
     pub running: Vec<RunningGroup>,
     /// A description of the backend's activity.
     pub doing: String,
-    /// The remaining time; `None` if nothing is known of a kind of cells.
+    /// The estimated remaining time; `None` if the duration of some cell cannot be estimated yet.
     pub remaining: Option<RemainingTime>,
-    /// Success of the cells that are done.
+    /// Mean success rates of finished cells.
     pub rates: Vec<Rate>,
 }
 
-/// The end of a run.
+/// The end of a run without an error.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum RunEnd {
-    /// All cells have a result or have failed; these have failed.
+    /// All cells have a result or have failed.
     Finished {
         /// The ids of the failed cells.
         failed: Vec<String>,
@@ -151,22 +157,22 @@ pub enum RunEnd {
     Stopped {
         /// The signal's number.
         signal: i32,
-        /// Work that continues without this process, i.e. jobs of a cluster.
+        /// Names of work that continues without this process: jobs of a cluster.
         left: Vec<String>,
     },
 }
 
-/// Why a run cannot go on.
+/// The reason why a run cannot continue.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum RunError {
     /// The folder cannot be read or written, or a worker cannot be started.
     #[error(transparent)]
     File(#[from] FileError),
-    /// A worker does not know the plan's cells.
+    /// A worker's copy of the plan does not have the requested cells.
     #[error("a worker refused its job: {0}; did another run replace the folder's plan.toml meanwhile?")]
     Refused(String),
-    /// The servers are gone.
+    /// The servers have ended.
     #[error("the run cannot go on without a server: {0}; finished work is kept")]
     NoServer(String),
     /// Files of a cell cannot be read or written.
@@ -180,24 +186,27 @@ pub enum RunError {
         ids[0]
     )]
     GaveUp {
-        /// The ids of these cells, at least one.
+        /// The ids of the cells that were given up, at least one.
         ids: Vec<String>,
-        /// The end of the last attempt at the first cell.
+        /// A description of how the last attempt at the first of these cells ended.
         words: String,
     },
-    /// Slurm cannot do the cells.
+    /// Slurm cannot run the cells.
     #[error(transparent)]
     Slurm(#[from] SlurmError),
 }
 
 type Result<T, E = RunError> = std::result::Result<T, E>;
 
-/// Runs every cell of `plan` that has no result in `folder`. Failed cells are run again if their failure is in `retryable`,
-/// by id. Returns when all cells are settled, including those that another run works on. A cell that has lost its server
-/// waits for one for at most `server_wait`, or fifteen seconds if that is longer, and then resumes from its last checkpoint.
+/// Runs every cell of `plan` that has no result in `folder`, and returns when all cells are settled.
+///
+/// A failed cell is run again if `retryable` has its failure, by cell id. If another run is working on a cell, waits
+/// for its result. A cell that loses its server waits for a server and then resumes from its last checkpoint. After
+/// `server_wait`, but at least 15 s, without a server the run ends with an error. `report` receives progress messages.
+/// `stop` interrupts the run.
 ///
 /// # Errors
-/// [`RunError`]; the backend has then been stopped.
+/// [`RunError`] if the run cannot continue. The backend is stopped first.
 pub fn run(
     plan: &Plan,
     folder: &Folder,
@@ -213,7 +222,7 @@ pub fn run(
             (Ok(None), None) => std::thread::sleep(TICK),
             (Ok(Some(failed)), _) => break Ok(RunEnd::Finished { failed }),
             (Err(error), None) => break Err(error),
-            // The signal may have ended servers and commands too, so their errors do not count.
+            // The signal may have ended servers and commands too, so an error is ignored.
             (_, Some(signal)) => break Ok(RunEnd::Stopped { signal, left: scheduler.backend.stop() }),
         }
     };
@@ -221,36 +230,37 @@ pub fn run(
     end
 }
 
-/// The scheduler's state of a cell.
+/// The scheduler's state for one cell.
 #[derive(Debug, Default)]
 struct Tracked {
     phase: CellPhase,
     /// The number of the cell's group.
     group: usize,
-    /// Whether the cell runs alone, because an attempt ended without progress. Alone, it cannot end the attempts of
-    /// other cells.
+    /// Whether the cell runs alone because an earlier attempt ended without progress. A cell that crashes alone does
+    /// not interrupt other cells.
     alone: bool,
-    /// A failure from before this run, which is retried. Failures that are recorded later count, whoever recorded them.
+    /// A failure recorded before this run, which this run retries. Any later failure makes the cell failed.
     retryable: Option<FailureId>,
-    /// Attempts in a row without progress.
+    /// Number of attempts in a row that ended without progress.
     attempts: u32,
-    /// Number of training steps in the last checkpoint. `saved_before` is its value when the last attempt began its
-    /// training.
+    /// Number of training steps in the last checkpoint.
     saved: u64,
+    /// Value of `saved` when the current attempt started its training.
     saved_before: Option<u64>,
-    /// The progress of this attempt.
+    /// The progress of the current attempt.
     progress: TrainingProgress,
     lost_servers: usize,
-    /// Losses of servers in a row, and the time that was waited for them.
+    /// Number of lost servers in a row.
     lost_in_a_row: u32,
+    /// Time spent waiting after these losses.
     waited: Duration,
-    /// Disk failures in a row.
+    /// Number of file faults in a row.
     faults_in_a_row: u32,
-    /// The time of the attempt's first event. A cell that waits in a job takes no time.
+    /// The time of the first event of the current attempt. Time in a cluster's queue therefore does not count.
     begun: Option<Instant>,
-    /// The time at which the attempt first had a server. Searching for a server does not count.
+    /// The time at which the current attempt first had a server.
     served: Option<Instant>,
-    /// The last event of the attempt.
+    /// The last event of the current attempt.
     last: Option<CellEvent>,
 }
 
@@ -259,11 +269,11 @@ enum CellPhase {
     #[default]
     Waiting,
     Running,
-    /// Another process works on the cell.
+    /// A process of another run is working on the cell.
     LockedByOther,
     Done,
     Failed,
-    /// The cell had too many attempts.
+    /// Too many attempts ended without progress, and no failure is recorded.
     GivenUp,
 }
 
@@ -315,7 +325,8 @@ impl<'a> Scheduler<'a> {
         scheduler
     }
 
-    /// Handles new events and starts the cells that can start. At the end of the run returns the ids of the failed cells.
+    /// Handles new events and starts the cells that can start. Returns the ids of the failed cells when all cells are
+    /// settled, otherwise `None`.
     fn step(&mut self, now: Instant) -> Result<Option<Vec<String>>> {
         for news in self.backend.poll(now)? {
             match news {
@@ -360,7 +371,8 @@ impl<'a> Scheduler<'a> {
         Ok(())
     }
 
-    /// Decides whether a cell whose attempt ended without a result waits, fails or ends the run.
+    /// Handles an attempt at a cell that ended without a result: the cell waits for another attempt, fails, or ends the
+    /// run.
     fn on_exit(&mut self, cell: usize, end: CellEvent, now: Instant) -> Result<()> {
         let tracked = &mut self.cells[cell];
         match end {
@@ -415,15 +427,15 @@ impl<'a> Scheduler<'a> {
         Ok(())
     }
 
-    /// Starts no cell before `until`, and then this cell first. So a run whose first cell cannot continue ends soon, even if
-    /// it has many cells.
+    /// Stops starting cells until the time `until`, and puts this cell first in the queue. The same cell is then tried
+    /// until it succeeds or ends the run, so a persistent fault ends the run soon, even with many cells.
     fn pause(&mut self, cell: usize, until: Instant) {
         self.paused_until = self.paused_until.max(Some(until));
         self.cells[cell].phase = CellPhase::Waiting;
         self.queue.push_front(cell);
     }
 
-    /// Records a cell's failure for a worker that could not do so itself.
+    /// Records a cell's failure, because its worker ended without doing so.
     fn record_failure(&mut self, cell: usize, reason: String) -> Result<()> {
         let place = self.folder.cell(self.id(cell));
         let Some(_lock) = place.try_lock()? else {
@@ -442,7 +454,7 @@ impl<'a> Scheduler<'a> {
         Ok(())
     }
 
-    /// Returns whether a cell has a result, or a failure that is not retried.
+    /// Returns whether a cell has a result, or a failure that is not retried. Updates the cell's phase.
     fn settled(&mut self, cell: usize) -> bool {
         let Tracked { phase, retryable, .. } = &mut self.cells[cell];
         let place = self.folder.cell(&self.plan.cells[cell].id);
@@ -453,7 +465,7 @@ impl<'a> Scheduler<'a> {
             if let Some(timing) = place.timing() {
                 self.durations.add(&self.plan.cells[cell], timing.seconds);
             }
-            // A result that cannot be read is left out here. The report names its fault.
+            // A result that cannot be read is skipped here. `perturb report` shows the error.
             if let Ok(CellState::Done(result)) = place.state() {
                 self.rates.add(&self.plan.cells[cell], &result);
             }
@@ -463,13 +475,14 @@ impl<'a> Scheduler<'a> {
         matches!(phase, CellPhase::Done | CellPhase::Failed)
     }
 
-    /// Reads the results in the folder, and takes over cells that other processes have given up.
+    /// Looks for results in the folder. Cells that another process was working on, but no longer is, wait for a new
+    /// attempt.
     fn poll_results(&mut self, now: Instant) -> Result<()> {
         let begun = Instant::now();
         let waits = self.backend.tells_ends();
         for cell in 0..self.cells.len() {
             let Tracked { phase, begun, .. } = self.cells[cell];
-            // The worker of this run writes the result first and reports it later, so wait for its report.
+            // A worker of this run writes the result first and reports it later, so its report is awaited.
             let is_to_be_told = waits && phase == CellPhase::Running && begun.is_some();
             if !is_to_be_told
                 && !self.settled(cell)
@@ -479,7 +492,7 @@ impl<'a> Scheduler<'a> {
                 self.wait(cell);
             }
         }
-        // Reading takes at most a twentieth of the time, also for many cells on a slow file system.
+        // Reads at most a twentieth of the time, even with many cells on a slow file system.
         self.next_poll = Some(now + POLL_INTERVAL.max(begun.elapsed() * 20));
         Ok(())
     }
@@ -494,7 +507,7 @@ impl<'a> Scheduler<'a> {
         for cell in self.queue.clone() {
             let Tracked { retryable: retry, group, alone, lost_servers, .. } = self.cells[cell];
             let place = places.get(&group).copied().filter(|_| !alone);
-            // Another run may have finished the cell meanwhile.
+            // Another run may have finished the cell since it was queued.
             if (place.is_none() && offers.len() >= room) || self.settled(cell) {
                 continue;
             }
@@ -528,7 +541,8 @@ impl<'a> Scheduler<'a> {
         self.queue.push_back(cell);
     }
 
-    /// Returns the ids of the failed cells; `None` while some cells are not settled.
+    /// Returns the ids of the failed cells if all cells are settled, otherwise `None`. The error is
+    /// [`RunError::GaveUp`].
     fn end(&self) -> Result<Option<Vec<String>>> {
         let in_phase = |phase| (0..self.cells.len()).filter(move |&cell| self.cells[cell].phase == phase);
         let left = [CellPhase::Waiting, CellPhase::Running, CellPhase::LockedByOther];
@@ -576,12 +590,13 @@ impl<'a> Scheduler<'a> {
     }
 }
 
-/// Returns the pause after `in_a_row` losses in a row.
+/// Returns the pause after `in_a_row` lost servers or file faults in a row.
 fn pause(in_a_row: u32) -> Duration {
     MAX_PAUSE.min(FIRST_PAUSE * (1 << (in_a_row - 1).min(16)))
 }
 
-/// Returns the remaining work of a running cell, divided by its finished work.
+/// Returns the remaining work of a running cell divided by the work of the current attempt. `event` is the cell's last
+/// event. Returns `None` if there is no estimate yet.
 fn rest(cell: &Cell, event: &CellEvent, progress: &TrainingProgress) -> Option<f64> {
     let training = generated_episodes(&cell.config, cell.config.common.episodes);
     let testing = test_episodes(cell, None);
@@ -596,7 +611,7 @@ fn rest(cell: &Cell, event: &CellEvent, progress: &TrainingProgress) -> Option<f
     }
 }
 
-/// Returns the number of test episodes of a cell: of all tests, or of those before the test with this name.
+/// Returns the number of test episodes of a cell. If `before` is the name of a test, counts only the tests before it.
 fn test_episodes(cell: &Cell, before: Option<&str>) -> f64 {
     let Tests { episodes, sets, selection, marks, .. } = &cell.tests;
     let of_mark = marks.iter().map(|mark| format!(" after {mark} episodes"));

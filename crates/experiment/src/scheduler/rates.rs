@@ -1,4 +1,4 @@
-//! Success rates of finished cells.
+//! Mean success rates of finished cells, for display during a run.
 
 use std::collections::BTreeMap;
 
@@ -7,18 +7,19 @@ use perturb_text::count;
 use crate::folder::CellResult;
 use crate::plan::Cell;
 
-/// Mean success of the cells with the same environment, method and training distribution, over settings and runs.
+/// Mean success rates of all finished cells with the same environment, method and training distribution. The mean is
+/// over settings and runs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Rate {
-    /// The kind of the cells, see [`Cell::described`].
+    /// Environment, method and training distribution of the cells, see [`Cell::described`].
     pub kind: String,
-    /// The number of cells.
+    /// The number of finished cells.
     pub cells: usize,
-    /// Success for each test set by its name, %.
+    /// Name of each test set with its mean success rate, %.
     pub success: Vec<(String, f64)>,
 }
 
-/// Collects the success rates, in the order of the plan.
+/// Collects [`Rate`]s in the order of the plan.
 #[derive(Debug, Default)]
 pub(crate) struct Rates(BTreeMap<usize, (Rate, Vec<f64>)>);
 
@@ -43,7 +44,7 @@ impl Rates {
     }
 }
 
-/// "CartPole ppo ff, trained on R: D 100.0, E 64.1 % (3 cells)".
+/// Format: "CartPole ppo ff, trained on R: D 100.0, E 64.1 % (3 cells)".
 impl std::fmt::Display for Rate {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let rates: Vec<String> = self.success.iter().map(|(name, percent)| format!("{name} {percent:.1}")).collect();

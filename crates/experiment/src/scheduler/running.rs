@@ -1,4 +1,4 @@
-//! Running groups, with one line for each.
+//! Describes each running group of cells in one line.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -6,16 +6,17 @@ use std::fmt;
 use super::CellEvent;
 use crate::plan::Cell;
 
-/// Cells that run together or, on a cluster, are of one kind.
+/// Running cells of one group: they run in one process or, on a cluster, are of one kind.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RunningGroup {
-    /// Environment and architecture.
+    /// Environment and architecture of the cells.
     pub kind: String,
     /// The ids of the cells, at least one, each with its last event.
     pub cells: Vec<(String, CellEvent)>,
 }
 
-/// "CartPole ff, 36 cells: 33 in training after 120 to 480 episodes, 3 in tests", or what happens to a single cell.
+/// Format: "CartPole ff, 36 cells: 33 in training after 120 to 480 episodes, 3 in tests". For a single cell: its id and
+/// last event.
 impl fmt::Display for RunningGroup {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if let [(id, event)] = &self.cells[..] {
@@ -41,16 +42,16 @@ impl fmt::Display for RunningGroup {
     }
 }
 
-/// Collects groups, in the order of their first cells.
+/// Collects running groups in the order of their first cells.
 #[derive(Default)]
 pub(super) struct Running {
     pub(super) groups: Vec<RunningGroup>,
-    /// Indices in `groups`, by the groups' numbers.
+    /// Index in `groups` by group number.
     places: HashMap<usize, usize>,
 }
 
 impl Running {
-    /// Adds a cell of the group with this number, or a cell that runs alone.
+    /// Adds a running cell with its last event. `group` is the number of its group; `None` for a cell that runs alone.
     pub(super) fn add(&mut self, cell: &Cell, group: Option<usize>, event: &CellEvent) {
         let entry = (cell.id.clone(), event.clone());
         if let Some(&place) = group.and_then(|number| self.places.get(&number)) {

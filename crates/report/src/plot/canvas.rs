@@ -1,4 +1,5 @@
-//! The canvas of pictures: texts, lines and areas in units.
+//! A canvas that draws texts, lines and areas. All positions and lengths are in units; a PNG has several pixels per
+//! unit.
 
 use plotters::coord::Shift;
 use plotters::prelude::*;
@@ -8,40 +9,40 @@ use super::colours::{FRAME, INK, LINES, PAPER};
 use super::dashes::dashes;
 use super::{FAMILY, PlotError, WIDTH, drawing, load_font};
 
-/// The size of all texts, as the library counts it: its SVG divides it by 1.24, which is 13.7 units, and in a column of 85 mm
-/// 9.2 pt.
+/// Font size of all texts, in the measure of plotters. In an SVG, plotters divides it by 1.24, which gives 13.7 units.
+/// A picture printed 85 mm wide then has text of 9.2 pt.
 const TEXT: u32 = 17;
-/// Distance from one line of text to the next, units.
+/// Height of a line of text, in units.
 pub(super) const LINE: f64 = 18.0;
-/// Margin on all sides of a picture, units.
+/// Margin on all sides of a picture, in units.
 pub(super) const MARGIN: f64 = 8.0;
-/// Width between the left and the right margin, units.
+/// Width between the left and the right margin, in units.
 pub(super) const INSIDE: f64 = WIDTH as f64 - 2.0 * MARGIN;
-/// The dashes that lines take in turn, see [`LineStyle::dashes`].
+/// Dash patterns of successive lines of a chart, see [`LineStyle::dashes`].
 const DASHES: [Option<(u32, u32)>; 3] = [None, Some((8, 4)), Some((2, 3))];
 /// The style of frames and ticks.
 pub(super) const TICK: LineStyle = LineStyle { colour: FRAME, width: 1, dashes: None };
 
-/// A position (x, y), units from the upper left corner.
+/// A position (x, y), in units from the upper left corner.
 pub(super) type CanvasPoint = (f64, f64);
 
-/// The style of a line; widths and lengths are in units.
+/// The style of a line. Widths and lengths are in units.
 #[derive(Clone, Copy)]
 pub(super) struct LineStyle {
     pub(super) colour: RGBColor,
     pub(super) width: u32,
-    /// Lengths of a dash and of a gap; `None` for a solid line.
+    /// Lengths of dashes and gaps; `None` for a solid line.
     pub(super) dashes: Option<(u32, u32)>,
 }
 
 impl LineStyle {
-    /// Returns the style of the `index`th of several lines.
+    /// Returns the style of line `index` of a chart, from 0. Colours and dash patterns repeat with different periods.
     pub(super) fn nth(index: usize) -> Self {
         Self { colour: LINES[index % LINES.len()], width: 2, dashes: DASHES[index % DASHES.len()] }
     }
 }
 
-/// The part of a text that is at its position.
+/// The horizontal alignment of a text: which part of it is at the given position.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum TextAnchor {
     Left,
@@ -49,14 +50,14 @@ pub(super) enum TextAnchor {
     Right,
 }
 
-/// Returns the width of a text, units.
+/// Returns the width of a text, in units.
 pub(super) fn text_width(text: &str) -> f64 {
     let known = load_font().ok().and_then(|()| font(1).font.box_size(text).ok());
     known.map_or(0.6 * f64::from(TEXT) * text.chars().count() as f64, |(width, _)| f64::from(width))
 }
 
-/// Breaks a text into lines of limited width, unless a word is wider. A number stays with the word before it, as in
-/// "seed 1".
+/// Breaks a text into lines of at most `width` units. A wider word gets its own line. A number stays on the line of the
+/// word before it, as in "seed 1".
 pub(super) fn wrapped(text: &str, width: f64) -> Vec<String> {
     let mut words: Vec<String> = Vec::new();
     for word in text.split_whitespace() {
@@ -79,7 +80,7 @@ fn font(scale: u32) -> TextStyle<'static> {
     (FAMILY, TEXT * scale).into_font().color(&INK)
 }
 
-/// A canvas of a backend.
+/// A drawing surface with coordinates in units, independent of the file format.
 pub(super) struct PlotCanvas<'a, DB: DrawingBackend> {
     pub(super) area: &'a DrawingArea<DB, Shift>,
     pub(super) scale: u32,
@@ -92,20 +93,21 @@ impl<'a, DB: DrawingBackend> PlotCanvas<'a, DB> {
         Ok(Self { area, scale })
     }
 
-    /// Converts a position to steps of the backend.
+    /// Converts a position in units to the pixels of the backend.
     pub(super) fn at(&self, (x, y): CanvasPoint) -> (i32, i32) {
         let step = |units: f64| (units * f64::from(self.scale)).round() as i32;
         (step(x), step(y))
     }
 
-    /// Writes a text in one line, vertically centred at the position.
+    /// Writes a line of text, vertically centred at the position.
     pub(super) fn text(&self, text: &str, at: CanvasPoint, side: TextAnchor) -> Result<(), PlotError> {
         let h = [HPos::Left, HPos::Center, HPos::Right][side as usize];
-        // The library's middle of a line of text is that of its letters in an SVG, and lies above them in a PNG.
+        // plotters does not centre text exactly: it uses the middle of the letters in an SVG, but a point above it in a
+        // PNG. So all texts are moved down by one unit.
         self.styled(text, font(self.scale).pos(Pos::new(h, VPos::Center)), (at.0, at.1 + 1.0))
     }
 
-    /// Writes a text upwards, with its middle at the position.
+    /// Writes a text rotated by 90°, to be read from bottom to top, with its middle at the position.
     pub(super) fn upright(&self, text: &str, at: CanvasPoint) -> Result<(), PlotError> {
         let turned = font(self.scale).transform(FontTransform::Rotate270);
         self.styled(text, turned.pos(Pos::new(HPos::Center, VPos::Center)), at)
@@ -115,7 +117,7 @@ impl<'a, DB: DrawingBackend> PlotCanvas<'a, DB> {
         self.area.draw_text(text, &style, self.at(at)).map_err(drawing)
     }
 
-    /// Writes lines of text below each other, the first at `top`, and returns the position of the next one.
+    /// Writes lines of text below each other, starting at `top`. Returns the y position below the last line.
     pub(super) fn lines(&self, lines: &[String], (x, top): CanvasPoint, side: TextAnchor) -> Result<f64, PlotError> {
         for (index, line) in lines.iter().enumerate() {
             self.text(line, (x, top + LINE * (index as f64 + 0.5)), side)?;
@@ -152,7 +154,7 @@ impl<'a, DB: DrawingBackend> PlotCanvas<'a, DB> {
         self.area.draw(&Circle::new(self.at(at), radius, style)).map_err(drawing)
     }
 
-    /// Width of a stroke.
+    /// Returns the plotters style of a line of `width` units.
     pub(super) fn stroke(&self, colour: RGBColor, width: u32) -> ShapeStyle {
         colour.stroke_width(width * self.scale)
     }

@@ -1,10 +1,10 @@
-//! Colours. Lines have the palette of Okabe and Ito, which people with any colour vision can tell apart. Surfaces have
-//! viridis, whose lightness rises with the value.
+//! Colours of pictures. Lines use the palette of Okabe and Ito, which people with any colour vision can tell apart.
+//! Heatmaps use viridis, whose lightness rises with the value.
 
 use plotters::style::RGBColor;
 
-/// Background colour. A dark page replaces it, [`INK`] and [`GRID`], see `report/style.css`. All other colours are
-/// visible on both backgrounds.
+/// Background colour. On a dark page, `report/style.css` replaces this colour, [`INK`] and [`GRID`]. All other colours
+/// are visible on both backgrounds.
 pub(super) const PAPER: RGBColor = RGBColor(255, 255, 255);
 /// Colour of texts.
 pub(super) const INK: RGBColor = RGBColor(34, 34, 34);
@@ -13,8 +13,8 @@ pub(super) const GRID: RGBColor = RGBColor(225, 225, 225);
 /// Colour of frames and ticks.
 pub(super) const FRAME: RGBColor = RGBColor(120, 120, 120);
 
-/// The colours of lines, after Okabe and Ito (2008), darkest first. Ink stands for black, so that a dark page replaces
-/// it. Yellow is left out, since it is invisible on white.
+/// The colours of lines, after Okabe and Ito (2008). [`INK`] takes the place of their black, so that a dark page can
+/// replace it. Yellow is left out because it is hard to see on white.
 pub(super) const LINES: [RGBColor; 7] = [
     INK,
     RGBColor(0, 114, 178),
@@ -25,7 +25,7 @@ pub(super) const LINES: [RGBColor; 7] = [
     RGBColor(230, 159, 0),
 ];
 
-/// Anchors of viridis (Smith and van der Walt, 2015) at equal distances.
+/// Colours of viridis (Smith and van der Walt, 2015) at equal distances. Colours between them are interpolated.
 const VIRIDIS: [(u8, u8, u8); 9] = [
     (68, 1, 84),
     (71, 45, 123),
@@ -38,22 +38,22 @@ const VIRIDIS: [(u8, u8, u8); 9] = [
     (253, 231, 37),
 ];
 
-/// Light to dark blue, for the background of a table's numbers. Text on it stays readable, and printing takes little
+/// Light to dark blue, for the background of numbers in tables. Text on it stays readable, and printing takes little
 /// ink.
 const BLUES: [(u8, u8, u8); 5] = [(247, 251, 255), (198, 219, 239), (107, 174, 214), (33, 113, 181), (8, 48, 107)];
 
-/// The colour for `share`, 0 … 1, from light to dark.
+/// Returns the background colour of a table cell: from light blue for a `share` of 0 to dark blue for 1.
 pub fn shade(share: f64) -> (u8, u8, u8) {
     blend(&BLUES, share)
 }
 
-/// The colour for `share`, 0 … 1, from dark to light.
+/// Returns the colour of a heatmap: from dark for a `share` of 0 to light for 1.
 pub(super) fn viridis(share: f64) -> RGBColor {
     let (r, g, b) = blend(&VIRIDIS, share);
     RGBColor(r, g, b)
 }
 
-/// A colour between the anchors.
+/// Interpolates linearly between `anchors`, which are at equal distances from 0 to 1. Clamps `share` to this range.
 fn blend(anchors: &[(u8, u8, u8)], share: f64) -> (u8, u8, u8) {
     let place = share.clamp(0.0, 1.0) * (anchors.len() - 1) as f64;
     let below = (place as usize).min(anchors.len() - 2);
@@ -63,12 +63,12 @@ fn blend(anchors: &[(u8, u8, u8)], share: f64) -> (u8, u8, u8) {
     (mix(low.0, high.0), mix(low.1, high.1), mix(low.2, high.2))
 }
 
-/// Whether white text has more contrast on a colour than black text.
+/// Returns whether white text has more contrast on this colour than black text.
 pub fn is_dark((r, g, b): (u8, u8, u8)) -> bool {
-    luminance((r, g, b)) < 0.179 // there both contrasts are equal
+    luminance((r, g, b)) < 0.179 // at this luminance, black and white text have the same contrast
 }
 
-/// Relative luminance, 0 … 1, as WCAG 2 defines it.
+/// Returns the relative luminance (0 … 1) of a colour, as WCAG 2 defines it.
 fn luminance((r, g, b): (u8, u8, u8)) -> f64 {
     let linear = |channel: u8| {
         let c = f64::from(channel) / 255.0;
@@ -108,7 +108,7 @@ mod tests {
         }
     }
 
-    /// WCAG asks for a contrast of 3 to 1 in graphics. Two colours of the palette have less on white, but lines also
+    /// WCAG requires a contrast of 3 to 1 in graphics. Two colours of the palette have less on white, but lines also
     /// differ in their dashes.
     #[test]
     fn lines_are_seen_on_white_and_on_a_dark_page() {

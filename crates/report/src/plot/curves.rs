@@ -1,4 +1,5 @@
-//! Training curves: three panels, D, R and E, below each other; and R+E, if anything is trained on it.
+//! Draws training curves: a panel for each training version, D, R and E, below each other. There is a fourth panel if a
+//! method was trained on R+E.
 
 use std::ops::Range;
 
@@ -10,7 +11,7 @@ use perturb_settings::Method;
 
 use super::panels::{PanelLine, PanelPoint, Panels, PlotPanel, RATES, index_of};
 
-/// The quantity that a picture shows over episodes or steps.
+/// The quantity on the vertical axis of training curves.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CurveQuantity {
     /// The mean undiscounted return.
@@ -40,7 +41,7 @@ impl std::fmt::Display for CurveQuantity {
     }
 }
 
-/// The picture of training curves, a panel for each version that is trained on.
+/// Returns the picture of an environment's training curves over the axis `by`, with a panel for each training version.
 pub fn draw_curves(curves: &EnvironmentCurves, quantity: CurveQuantity, by: BudgetAxis) -> Panels {
     let methods = distinct(curves.curves.iter().map(|curve| curve.method.clone()));
     let what = match quantity {

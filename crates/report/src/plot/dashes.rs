@@ -1,9 +1,9 @@
-//! Dashed lines, cut into their dashes with operations that round alike everywhere. plotters would cut them with the C
-//! library's `hypotf`. Its rounding depends on the library's version, and on Debian 12 it needs a newer glibc than the
-//! rest of the program.
+//! Cuts dashed lines into dashes, with operations whose rounding is the same on every machine. plotters would use the C
+//! library's `hypotf` instead. Its rounding depends on the library's version, and programs that use it need a newer
+//! glibc than Debian 12 has.
 
-/// The dashes of the line through these points, each a line of its own. It begins with a whole dash, and goes on around
-/// corners. Lengths are in the unit of the points, and above 0.
+/// Returns the dashes of the line through `points`, each as a list of points. The line starts with a full dash, and the
+/// pattern continues around corners. `dash` and `gap` are lengths above 0, in the unit of the points.
 pub(super) fn dashes(points: &[(f64, f64)], dash: f64, gap: f64) -> Vec<Vec<(f64, f64)>> {
     let mut done = Vec::new();
     let mut current: Vec<(f64, f64)> = points.iter().take(1).copied().collect();

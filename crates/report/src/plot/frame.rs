@@ -1,4 +1,4 @@
-//! A rectangle with axes, whose ticks and texts look alike in all pictures.
+//! The frame of a chart: a rectangle with axes, ticks and their numbers.
 
 use std::ops::Range;
 
@@ -9,23 +9,24 @@ use super::canvas::{CanvasPoint, LINE, LineStyle, PlotCanvas, TICK, TextAnchor, 
 use super::colours::GRID;
 use super::ticks::round_ticks;
 
-/// Least gap between two numbers along an axis, units.
+/// Minimum gap between neighbouring numbers below the x axis, in units.
 const BETWEEN: f64 = 6.0;
-/// Least gap between the first and the last number, where the ticks between have none, units. It is the width of a
-/// space.
+/// Minimum gap between the numbers of the first and the last tick if only these have numbers, in units. It is the width
+/// of a space.
 const SPACE: f64 = 4.6;
-/// Most that a number may stand out beyond its frame, which may have a neighbour, units.
+/// Maximum length by which a number may extend beyond the left or right edge of its frame, in units. Another frame may
+/// be next to it.
 const BEYOND: f64 = 2.0;
-/// The most ticks at an axis.
+/// Maximum number of ticks of an axis.
 const MAX_TICKS: usize = 6;
 /// The style of the grid lines behind a chart.
 const BEHIND: LineStyle = LineStyle { colour: GRID, width: 1, dashes: None };
-/// Height of the x axis' numbers with their ticks.
+/// Height of the ticks and numbers below an x axis, in units.
 pub(super) const NUMBERS: f64 = LINE + 5.0;
-/// Width of a y axis' name and the gap to its numbers.
+/// Width of a y axis' name with the gap to the axis' numbers, in units.
 pub(super) const NAME: f64 = LINE + 2.0;
 
-/// The position of a plot and the ranges of its axes.
+/// The position and size of a chart, in units, and the ranges of its axes.
 #[derive(Clone, Debug)]
 pub(super) struct Frame {
     pub(super) left: f64,
@@ -57,11 +58,11 @@ impl Frame {
         self.bottom() - self.height * share(&self.y, value)
     }
 
-    /// Returns the x ticks with their numbers. If not all numbers have room, only the first and the last tick have one,
-    /// or the last alone.
+    /// Returns the values of the x ticks, with their numbers as text. If the frame is too narrow for all numbers, only
+    /// the first and the last tick, or only the last tick, have one.
     fn x_ticks(&self) -> Vec<(f64, Option<String>)> {
         let sets: Vec<_> = (2..=MAX_TICKS).rev().map(|most| round_ticks(&self.x, most)).collect();
-        // A single number would not say how far it is to the next.
+        // A single tick would not show the scale of the axis.
         let several = || sets.iter().filter(|ticks| ticks.len() > 1);
         let mut all = several().filter(|ticks| ticks.windows(2).all(|pair| self.gap(&pair[0], &pair[1]) >= BETWEEN));
         if let Some(ticks) = all.next() {
@@ -75,13 +76,14 @@ impl Frame {
         numbered(&ticks, |index| index + 1 == ticks.len())
     }
 
-    /// Returns the gap between the numbers of two ticks, units.
+    /// Returns the gap between the numbers of two ticks, in units.
     fn gap(&self, left: &(f64, String), right: &(f64, String)) -> f64 {
         let middle = |(value, number): &(f64, String)| self.number(*value, number);
         middle(right) - middle(left) - (text_width(&left.1) + text_width(&right.1)) / 2.0
     }
 
-    /// Returns the x position of the middle of the number below a tick.
+    /// Returns the x position, in units, of the middle of the number below a tick. Near the edges the number is moved
+    /// inwards.
     fn number(&self, value: f64, number: &str) -> f64 {
         let half = text_width(number) / 2.0 - BEYOND;
         self.x(value).clamp(self.left + half, (self.right() - half).max(self.left + half))
@@ -97,7 +99,7 @@ fn numbered(ticks: &[(f64, String)], has_number: impl Fn(usize) -> bool) -> Vec<
     ticks.iter().enumerate().map(of).collect()
 }
 
-/// Returns the width of the numbers of a y axis of this height.
+/// Returns the width, in units, of the numbers beside a y axis with range `y` and this height.
 pub(super) fn y_numbers_width(y: &Range<f64>, height: f64) -> f64 {
     let frame = Frame { left: 0.0, top: 0.0, width: 0.0, height, x: 0.0..1.0, y: y.clone() };
     frame.y_ticks().iter().map(|(_, number)| text_width(number)).fold(0.0, f64::max) + 6.0
@@ -109,7 +111,7 @@ fn share(range: &Range<f64>, value: f64) -> f64 {
 }
 
 impl<DB: DrawingBackend> PlotCanvas<'_, DB> {
-    /// Draws the frame's edges, and grid lines at the ticks if `with_lines` is set.
+    /// Draws the frame's left and lower edges. If `with_lines` is set, also draws grid lines at the ticks.
     pub(super) fn frame(&self, frame: &Frame, with_lines: bool) -> Result<(), PlotError> {
         let Frame { left, top, .. } = *frame;
         let (right, bottom) = (frame.right(), frame.bottom());
@@ -156,7 +158,7 @@ mod tests {
 
     use super::*;
 
-    /// MountainCar's force: in a row of one panel, of three and of four.
+    /// The range is MountainCar's force. The widths are from rows of one, three and four panels.
     #[rstest]
     #[case(210.0, &["0.005", "0.010"])]
     #[case(85.0, &["0.002", "", "", "", "0.010"])]

@@ -1,6 +1,6 @@
-//! Heatmaps of policies with different training distributions, side by side. The upper row shows mean return over two
-//! parameters, the lower one success. Both show the boxes of R and E and the default. All heatmaps share their axes,
-//! and those of one quantity share its colour scale.
+//! Draws heatmaps of several policies side by side. The upper panels show the mean return over two parameters, the
+//! lower panels the success rate. Each panel also shows the ranges of R and E as boxes, and the default parameters as a
+//! ring. All panels share their axes. Panels of the same quantity share a colour scale.
 
 mod scale;
 mod surfaces;
@@ -18,42 +18,45 @@ use super::frame::{Frame, NAME, NUMBERS, y_numbers_width};
 use super::{Plot, PlotError, WIDTH, drawing};
 pub use scale::common_returns;
 
-/// The most panels in a row; if there are more, rows have fewer.
+/// Maximum number of columns in a single row.
 const MAX_COLUMNS: usize = 4;
+/// Number of columns in each row if there are more than [`MAX_COLUMNS`].
 const FEWER: usize = 3;
-/// Widest, lowest and highest panel.
+/// Maximum width of a panel, in units.
 const WIDEST: f64 = 210.0;
+/// Minimum and maximum height of a panel, in units.
 const HEIGHTS: Range<f64> = 96.0..150.0;
-/// Gap between panels, and between a panel and the texts below it, units.
+/// Gap between panels, and between a panel and the texts below it, in units.
 const GAP: f64 = 9.0;
-/// Height of the colour scale.
+/// Height of the colour scale, in units.
 const BAR: f64 = 10.0;
-/// The outlines of R's box and of E's, each within another, so that they are seen on every colour.
+/// The outline of R's box: a white line on a wider black line, so that it is visible on every colour.
 const RANDOM: [LineStyle; 2] = [outline(BLACK, 4), outline(WHITE, 2)];
+/// The outline of E's boxes: a red line on a wider white line.
 const EXTREME: [LineStyle; 2] = [outline(WHITE, 4), outline(RGBColor(200, 30, 30), 2)];
-/// Inset that keeps a box inside the frame.
+/// Minimum distance of a box from the edges of its panel, in units.
 const WITHIN: f64 = 2.0;
-/// Width and height of a sample in the legend, units.
+/// Width and height of a symbol in the legend, in units.
 const SAMPLE: (f64, f64) = (24.0, 14.0);
 
 const fn outline(colour: RGBColor, width: u32) -> LineStyle {
     LineStyle { colour, width, dashes: None }
 }
 
-/// Heatmaps over the same two parameters.
+/// A picture of heatmaps over the same two parameters, side by side.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeatmapPanels {
-    /// The lines above all panels: the subject, and how the heatmaps were made.
+    /// The lines above all panels: the subject of the picture, and how the heatmaps were made.
     pub title: Vec<String>,
     /// The x and y axes.
     pub axes: [Axis; 2],
-    /// The scale of mean returns.
+    /// The range of mean returns that the colour scale covers.
     pub returns: Range<f64>,
     /// The columns from left to right.
     pub columns: Vec<HeatmapColumn>,
 }
 
-/// A column of a picture of heatmaps.
+/// A column of the picture: one heatmap with its caption.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeatmapColumn {
     /// The caption of the column.
@@ -62,14 +65,14 @@ pub struct HeatmapColumn {
     pub content: Result<Heatmap, String>,
 }
 
-/// The quantity of a row of heatmaps.
+/// A quantity that heatmaps show: mean return or success rate.
 struct HeatmapQuantity {
     name: &'static str,
     range: Range<f64>,
     value: fn(&HeatmapPoint) -> f64,
 }
 
-/// The entries of the legend.
+/// The texts of the legend.
 const KEY: [&str; 3] = ["box of R, random", "box of E, extreme", "D, default"];
 
 impl Plot for HeatmapPanels {
@@ -116,13 +119,13 @@ impl Plot for HeatmapPanels {
         self.key(&canvas, top + LINE)
     }
 
-    /// Replaces the thousands of rectangles of the surfaces by a path for each colour.
+    /// Replaces the thousands of rectangles of the heatmaps by one path for each colour.
     fn finish(&self, svg: String) -> String {
         surfaces::as_paths(&svg)
     }
 }
 
-/// Returns the number of lines of the longest text.
+/// Returns the number of lines of the text with the most lines.
 fn most(texts: &[Vec<String>]) -> f64 {
     texts.iter().map(Vec::len).max().unwrap_or(0) as f64
 }
@@ -144,17 +147,17 @@ impl HeatmapPanels {
         self.columns.chunks(self.per_row())
     }
 
-    /// Returns the width and height of a panel.
+    /// Returns the width and height of a panel, in units.
     fn size(&self) -> (f64, f64) {
         let [_, y] = &self.axes;
         let left = MARGIN + NAME + y_numbers_width(&(y.low..y.high), HEIGHTS.start);
         let columns = self.per_row() as f64;
-        // Half of the last number is beyond its frame.
+        // The last number on the x axis may extend beyond its panel by 2 units.
         let width = (f64::from(WIDTH) - left - MARGIN - 2.0 - GAP * (columns - 1.0)) / columns;
         (width.min(WIDEST), width.clamp(HEIGHTS.start, HEIGHTS.end))
     }
 
-    /// Returns the frame of a panel in a row.
+    /// Returns the frame of the panel in this column of a row, whose upper edge is at `top`.
     fn frame(&self, column: usize, top: f64) -> Frame {
         let [x, y] = &self.axes;
         let (width, height) = self.size();
@@ -200,7 +203,7 @@ impl HeatmapPanels {
         if shown(x) && shown(y) { canvas.mark((frame.x(x.default), frame.y(y.default))) } else { Ok(()) }
     }
 
-    /// Returns the positions of the legend's samples from its top, and its height.
+    /// Returns the positions of the legend's symbols, relative to the top of the legend, and the legend's height.
     fn key_places(&self) -> ([CanvasPoint; 3], f64) {
         let (mut x, mut y) = (MARGIN, GAP);
         let places = KEY.map(|name| {
@@ -219,7 +222,7 @@ impl HeatmapPanels {
         for (index, (name, (x, y))) in KEY.into_iter().zip(self.key_places().0).enumerate() {
             let (left, above) = (x, top + y + (LINE - SAMPLE.1) / 2.0);
             let corners = [(left, above), (left + SAMPLE.0, above + SAMPLE.1)];
-            // On a colour of the surface, since white lines are not seen on white.
+            // The background is a colour of the heatmap, because white lines are invisible on white.
             canvas.rectangle(corners, viridis(0.4).filled())?;
             let middle = (left + SAMPLE.0 / 2.0, above + SAMPLE.1 / 2.0);
             match index {
@@ -234,13 +237,14 @@ impl HeatmapPanels {
 }
 
 impl<DB: DrawingBackend> PlotCanvas<'_, DB> {
-    /// Draws the surface of a heatmap. Neighbours of the same colour form one rectangle.
+    /// Draws the coloured surface of a heatmap. Neighbouring points of the same colour in a row form one rectangle.
     fn surface(&self, frame: &Frame, heatmap: &Heatmap, quantity: &HeatmapQuantity) -> Result<(), PlotError> {
         let ((left, top), (right, bottom)) =
             (self.at((frame.left, frame.top)), self.at((frame.right(), frame.bottom())));
         let (width, height, grid) = (right - left, bottom - top, heatmap.grid as i32);
         let edge = |length: i32, index: usize| length * index as i32 / grid;
-        // Renderers that smooth edges let the background through between rectangles, so it gets the mean colour.
+        // Renderers that smooth edges let the background shine through between rectangles, so the background gets the
+        // mean colour.
         let (low, high) = (quantity.range.start, quantity.range.end);
         let shares =
             heatmap.points.iter().map(|point| (((quantity.value)(point) - low) / (high - low)).clamp(0.0, 1.0));
@@ -266,26 +270,27 @@ impl<DB: DrawingBackend> PlotCanvas<'_, DB> {
         Ok(())
     }
 
-    /// Writes the reason in the place of a missing panel.
+    /// Writes the reason why a heatmap is missing into its panel.
     fn apology(&self, frame: &Frame, why: &str) -> Result<(), PlotError> {
         let (right, bottom) = (frame.right(), frame.bottom());
         self.line(&[(frame.left, frame.top), (right, frame.top), (right, bottom)], TICK)?;
         let mut lines = wrapped(why, frame.width - 4.0);
         if LINE * lines.len() as f64 > frame.height {
-            lines = vec!["missing".into()]; // the caption of its figure says why
+            lines = vec!["missing".into()]; // the reason does not fit; the picture's caption has it
         }
         let first = frame.middle().1 - LINE * lines.len() as f64 / 2.0;
         self.lines(&lines, (frame.middle().0, first), TextAnchor::Middle).map(|_| ())
     }
 
-    /// Draws a box of two lines, the second on top of the wider first one.
+    /// Draws the outline of a box twice: first with the wider line style, then with the narrower one on top.
     fn outline(
         &self,
         [(left, top), (right, bottom)]: [CanvasPoint; 2],
         lines: [LineStyle; 2],
     ) -> Result<(), PlotError> {
         for line in lines {
-            // Each side by itself, with the corners: a path around would not be closed, in a PNG.
+            // Draws each side separately, extended to the corners. plotters does not close the corners of a path in a
+            // PNG.
             let half = f64::from(line.width) / 2.0;
             for y in [top, bottom] {
                 self.line(&[(left - half, y), (right + half, y)], line)?;
@@ -297,14 +302,14 @@ impl<DB: DrawingBackend> PlotCanvas<'_, DB> {
         Ok(())
     }
 
-    /// Marks the default parameters by a black ring on a wider white one.
+    /// Marks the default parameters by a black ring on a wider white ring.
     fn mark(&self, at: CanvasPoint) -> Result<(), PlotError> {
         [(WHITE, 5), (BLACK, 2)]
             .into_iter()
             .try_for_each(|(colour, width)| self.circle(at, 4.0, self.stroke(colour, width)))
     }
 
-    /// Draws the quantity's name and the scale of its colours.
+    /// Draws the name of a quantity and its colour scale.
     fn colours(&self, quantity: &HeatmapQuantity, left: f64, top: f64) -> Result<(), PlotError> {
         self.text(quantity.name, (left, top + LINE / 2.0), TextAnchor::Left)?;
         let from = left + text_width("success rate, %") + 14.0;

@@ -1,4 +1,5 @@
-//! Numbers with their intervals, in groups below each other. Each may stand beside another number to compare it with.
+//! Draws numbers with their confidence intervals, in groups of rows. A row may also have a second number for
+//! comparison.
 
 use std::ops::Range;
 
@@ -10,48 +11,48 @@ use super::colours::{INK, PAPER};
 use super::frame::{Frame, NUMBERS};
 use super::{Plot, PlotError, WIDTH};
 
-/// Maximum width of names.
+/// Maximum width of the rows' names, in units. Longer names are wrapped.
 const NAMES: f64 = 150.0;
-/// Gap around a row and around a group, units.
+/// Gap between rows and between groups, in units.
 const GAP: f64 = 5.0;
-/// Distance of a number from the middle of its row, if a number to compare with is on the other side.
+/// Vertical distance of a number from the middle of its row, in units, if the row also has a second number.
 const APART: f64 = 4.5;
-/// Radius of a marker.
+/// Radius of a marker, in units.
 const RADIUS: f64 = 4.0;
-/// An interval has caps of this height on both sides.
+/// Half of the height of the caps at the ends of an interval, in units.
 const CAP: f64 = 3.5;
 
-/// Rows in groups that share their x axis.
+/// A picture of numbers with intervals: groups of rows with the same x axis.
 #[derive(Clone, Debug, PartialEq)]
 pub struct IntervalPlot {
     /// The title above all groups.
     pub(crate) title: String,
-    /// The name of the axis.
+    /// The name of the x axis.
     pub(crate) x_name: String,
     pub(crate) x: Range<f64>,
     pub(crate) groups: Vec<Group>,
-    /// The legend's texts for a number, its interval, and the number to compare with; the last two may be empty.
+    /// The legend's texts for a number, for its interval and for the second number. Unused texts may be empty.
     pub(crate) legend: [String; 3],
     /// The note below all groups.
     pub(crate) note: String,
 }
 
-/// Rows under a heading.
+/// A group of rows with a heading.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Group {
     pub(crate) name: String,
     pub(crate) rows: Vec<IntervalRow>,
 }
 
-/// A number with its interval.
+/// A row: a number with its interval.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct IntervalRow {
     pub(crate) name: String,
-    /// The index of the colour.
+    /// The index of the row's line style, see [`LineStyle::nth`].
     pub(crate) index: usize,
     pub(crate) point: Option<f64>,
     pub(crate) interval: Option<[f64; 2]>,
-    /// The number to compare with.
+    /// The second number, for comparison, for example the paper's.
     pub(crate) other: Option<f64>,
 }
 
@@ -117,7 +118,7 @@ impl IntervalPlot {
         (LINE * self.name_lines(row).len() as f64).max(LINE + 2.0) + GAP
     }
 
-    /// Returns the frame beside the names.
+    /// Returns the frame of a group's chart. It is right of the rows' names, with its upper edge at `top`.
     fn frame(&self, group: &Group, top: f64) -> Frame {
         let names = self.rows().flat_map(|row| self.name_lines(row));
         let left = MARGIN + names.map(|name| text_width(&name)).fold(0.0, f64::max) + 6.0;
@@ -140,7 +141,7 @@ impl IntervalPlot {
         }
         match row.point {
             Some(point) => canvas.circle((frame.x(point), y - apart), RADIUS, style.colour.filled())?,
-            // Where the paper's mark is not.
+            // The text goes to the side where it does not cover the second number.
             None if row.other.is_some_and(|other| frame.x(other) < frame.middle().0) => {
                 canvas.text("missing", (frame.right() - 6.0, y), TextAnchor::Right)?;
             }
@@ -149,7 +150,7 @@ impl IntervalPlot {
         row.other.map_or(Ok(()), |other| draw_other(canvas, (frame.x(other), y + apart)))
     }
 
-    /// Returns the entries of the legend.
+    /// Returns the index and the text of each legend entry whose symbol occurs in the picture.
     fn entries(&self) -> Vec<(usize, &str)> {
         let is_there =
             [true, self.rows().any(|row| row.interval.is_some()), self.rows().any(|row| row.other.is_some())];
@@ -185,7 +186,7 @@ fn draw_interval<DB: DrawingBackend>(
     [low, high].into_iter().try_for_each(|end| canvas.line(&[(end, y - CAP), (end, y + CAP)], style))
 }
 
-/// A hollow diamond.
+/// Draws the marker of a second number: a hollow diamond.
 fn draw_other<DB: DrawingBackend>(canvas: &PlotCanvas<'_, DB>, (x, y): CanvasPoint) -> Result<(), PlotError> {
     let corners = [(x, y - 5.0), (x + 5.0, y), (x, y + 5.0), (x - 5.0, y)];
     canvas.polygon(&corners, PAPER.filled())?;

@@ -1,8 +1,8 @@
-//! Pictures, as SVG and PNG.
+//! Draws pictures as SVG and PNG.
 //!
-//! All pictures fit a printed column: they have its width, and their texts are readable in it. Panels that do not fit
-//! side by side stand below each other, so pictures fit a telephone as well. Lines have the colours of Okabe and Ito,
-//! and dashes for print without colour. Surfaces have viridis. Ticks are at round numbers.
+//! All pictures have the width of a column in print, at which their texts are readable. Panels that do not fit side by
+//! side are below each other, so pictures also fit the screen of a telephone. Lines have the colours of Okabe and Ito,
+//! and dash patterns for print without colour. Heatmaps have the colours of viridis. Ticks are at round numbers.
 
 mod canvas;
 mod colours;
@@ -29,53 +29,55 @@ pub use panels::Panels;
 use perturb_experiment::FolderError;
 use perturb_files::{FileError, write_atomically};
 
-/// DejaVu Sans with only the letters that pictures need. Its licence is in the same folder.
+/// The font DejaVu Sans, reduced to the characters that pictures need. Its licence is in the same folder.
 const FONT: &[u8] = include_bytes!("../../data/fonts/DejaVuSans-subset.ttf");
-/// The font family in an SVG.
+/// The font family that an SVG names.
 pub const FAMILY: &str = "sans-serif";
-/// Width of a picture, units. An SVG shows a unit as one CSS pixel, and prints the picture in a column of 85 mm.
+/// Width of every picture, in units. In an SVG, a unit is one CSS pixel. Printed pictures are 85 mm wide, the width of
+/// a column.
 pub const WIDTH: u32 = 360;
-/// Steps of an SVG in a unit. More steps make lines smooth in print.
+/// Number of coordinate steps per unit in an SVG. plotters rounds coordinates to steps, so more steps make lines
+/// smoother.
 const SVG_SCALE: u32 = 4;
-/// Pixels of a PNG in a unit: 320 an inch in a column.
+/// Number of pixels per unit in a PNG. This gives some 320 pixels per inch in a column of 85 mm.
 pub const PNG_SCALE: u32 = 3;
 
-/// Why a picture could not be made.
+/// The reason why a picture could not be drawn or written.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum PlotError {
-    /// The plotting library refused.
+    /// plotters reported an error.
     #[error("cannot draw: {0}")]
     Draw(String),
     /// A file cannot be written.
     #[error(transparent)]
     File(#[from] FileError),
-    /// The folder cannot be read.
+    /// The experiment's folder cannot be read.
     #[error(transparent)]
     Folder(#[from] FolderError),
 }
 
-/// A picture that any backend can draw, [`WIDTH`] wide. All lengths are units times `scale`.
+/// A picture that can be drawn as SVG and as PNG. Its width is [`WIDTH`] units.
 pub trait Plot {
-    /// Returns the height, units.
+    /// Returns the height of the picture, in units.
     fn height(&self) -> u32;
 
-    /// Draws the picture.
+    /// Draws the picture on `area`, which has `scale` pixels or steps per unit.
     ///
     /// # Errors
-    /// Errors of the backend.
+    /// [`PlotError`] if the backend fails.
     fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError>;
 
-    /// Post-processes the SVG.
+    /// Post-processes the SVG. By default returns it unchanged.
     fn finish(&self, svg: String) -> String {
         svg
     }
 }
 
-/// A picture as SVG.
+/// Returns a picture as the text of an SVG.
 ///
 /// # Errors
-/// [`PlotError::Draw`].
+/// [`PlotError::Draw`] if plotters fails.
 pub fn svg(plot: &impl Plot) -> Result<String, PlotError> {
     load_font()?;
     let mut text = String::new();
@@ -86,15 +88,16 @@ pub fn svg(plot: &impl Plot) -> Result<String, PlotError> {
         plot.draw(&area, SVG_SCALE)?;
         area.present().map_err(drawing)?;
     }
-    // The library writes the size in steps. Only `width` and `height` become units; the `viewBox` stays in steps.
+    // plotters writes the size in steps. This replaces only the attributes `width` and `height` by units; the `viewBox`
+    // stays in steps.
     let size = |(width, height): (u32, u32)| format!("width=\"{width}\" height=\"{height}\"");
     Ok(plot.finish(text.replacen(&size(steps), &size((width, height)), 1)))
 }
 
-/// A picture as PNG, with [`PNG_SCALE`] pixels for each unit.
+/// Returns a picture as the bytes of a PNG, with [`PNG_SCALE`] pixels per unit.
 ///
 /// # Errors
-/// [`PlotError`].
+/// [`PlotError`] if plotters or the encoder fails.
 pub fn png(plot: &impl Plot) -> Result<Vec<u8>, PlotError> {
     load_font()?;
     let (width, height) = (WIDTH * PNG_SCALE, plot.height() * PNG_SCALE);
@@ -114,10 +117,10 @@ pub fn png(plot: &impl Plot) -> Result<Vec<u8>, PlotError> {
     Ok(file)
 }
 
-/// Writes a picture as SVG and as PNG. Adds `.svg` and `.png` to `path`, and replaces each file atomically.
+/// Writes a picture as SVG and as PNG. Appends `.svg` and `.png` to `path`, and replaces each file atomically.
 ///
 /// # Errors
-/// [`PlotError`].
+/// [`PlotError`] if the picture cannot be drawn or written.
 pub fn save(plot: &impl Plot, path: &Path) -> Result<(), PlotError> {
     for (ending, content) in [("svg", svg(plot)?.into_bytes()), ("png", png(plot)?)] {
         write_atomically(&path.with_added_extension(ending), &content)?;
@@ -125,14 +128,14 @@ pub fn save(plot: &impl Plot, path: &Path) -> Result<(), PlotError> {
     Ok(())
 }
 
-/// Makes the font known to the library, once.
+/// Registers the font with plotters at the first call. Must be called before drawing or measuring text.
 pub fn load_font() -> Result<(), PlotError> {
     static LOADED: OnceLock<bool> = OnceLock::new();
     let loaded = LOADED.get_or_init(|| register_font(FAMILY, FontStyle::Normal, FONT).is_ok());
     if *loaded { Ok(()) } else { Err(PlotError::Draw("the font is damaged".into())) }
 }
 
-/// Returns the error for a failure of the plotting library.
+/// Converts an error of plotters or of the PNG encoder.
 pub fn drawing(error: impl std::fmt::Display) -> PlotError {
     PlotError::Draw(error.to_string())
 }

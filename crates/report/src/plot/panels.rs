@@ -1,4 +1,4 @@
-//! Lines with bands in panels below each other, and what is drawn so.
+//! Draws line charts with bands, in panels below each other.
 
 use std::ops::Range;
 
@@ -10,33 +10,35 @@ use super::canvas::{INSIDE, LINE, LineStyle, MARGIN, PlotCanvas, TextAnchor, tex
 use super::frame::{Frame, NAME, NUMBERS, y_numbers_width};
 use super::{Plot, PlotError, WIDTH};
 
-/// Height of a panel's frame.
+/// Height of a panel's frame, in units.
 const HEIGHT: f64 = 128.0;
-/// Gap between two panels and around the legend, units.
+/// Gap between two panels and around the legend, in units.
 const GAP: f64 = 8.0;
-/// Length of a line's sample in the legend, and the gap between columns below it.
+/// Length of a line's sample in the legend, in units.
 const SAMPLE: f64 = 30.0;
+/// Gap between columns of the legend, in units.
 const BETWEEN: f64 = 16.0;
-/// Radius of a line's only point.
+/// Radius of the dot for a line with a single point, in units.
 const DOT: f64 = 3.0;
 
-/// The range of a success rate, %, with room for lines at its ends.
+/// Axis range for success rates, %. It is slightly larger than 0 to 100, so that lines at the ends are visible.
 pub(crate) const RATES: Range<f64> = -2.0..102.0;
 
-/// Panels that share a legend. Of successive panels with the same x axis, only the lowest shows its numbers.
+/// A picture of line charts below each other, with a common legend. If successive panels have the same x axis, only the
+/// lowest of them shows its numbers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Panels {
     /// The title above all panels.
     pub(crate) title: String,
     /// The panels from top to bottom.
     pub(crate) panels: Vec<PlotPanel>,
-    /// The names of the lines by index.
+    /// The names of the lines, by [`PanelLine::index`].
     pub(crate) legend: Vec<String>,
     /// The explanation of lines and bands, below the legend.
     pub(crate) note: String,
 }
 
-/// A chart.
+/// A line chart.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct PlotPanel {
     pub(crate) caption: String,
@@ -59,8 +61,9 @@ pub(crate) struct PanelLine {
 pub(crate) struct PanelPoint {
     pub(crate) x: f64,
     pub(crate) y: f64,
-    /// The band's ends.
+    /// The lower end of the band.
     pub(crate) low: f64,
+    /// The upper end of the band.
     pub(crate) high: f64,
 }
 
@@ -103,21 +106,22 @@ impl Panels {
         wrapped(&self.note, INSIDE)
     }
 
-    /// Whether the panel has an x axis: the last panel, and a panel whose next one has a different axis.
+    /// Returns whether the panel shows the numbers and the name of its x axis. The last panel does, and every panel
+    /// whose successor has a different x axis.
     fn has_x_axis(&self, index: usize) -> bool {
         let axis = |panel: &PlotPanel| (panel.x_name.clone(), panel.x.clone());
         self.panels.get(index + 1).is_none_or(|next| axis(next) != axis(&self.panels[index]))
     }
 
-    /// Returns the frame of a panel. The left edges of all frames are aligned.
+    /// Returns the frame of a panel with its upper edge at `top`. The left edges of all frames are aligned.
     fn frame(&self, panel: &PlotPanel, top: f64) -> Frame {
         let numbers = self.panels.iter().map(|panel| y_numbers_width(&panel.y, HEIGHT)).fold(0.0, f64::max);
         let left = MARGIN + NAME + numbers;
-        let width = f64::from(WIDTH) - left - MARGIN - 4.0; // half of the last number is beyond the frame
+        let width = f64::from(WIDTH) - left - MARGIN - 4.0; // the last number may extend beyond the frame by 4 units
         Frame { left, top, width, height: HEIGHT, x: panel.x.clone(), y: panel.y.clone() }
     }
 
-    /// Returns the left end and the row of each line in the legend, and the number of rows.
+    /// Returns the left end and the row of each legend entry, and the number of rows.
     fn legend_places(&self) -> (Vec<(f64, usize)>, usize) {
         let widest = self.legend.iter().map(|name| text_width(name)).fold(0.0, f64::max) + SAMPLE + 8.0 + BETWEEN;
         let columns = (((INSIDE + BETWEEN) / widest) as usize).clamp(1, self.legend.len().max(1));
@@ -134,7 +138,7 @@ impl Panels {
         (places, line)
     }
 
-    /// Draws the legend and returns its lower end.
+    /// Draws the legend at `top`, and returns the y position of its lower end.
     fn draw_legend<DB: DrawingBackend>(&self, canvas: &PlotCanvas<'_, DB>, top: f64) -> Result<f64, PlotError> {
         let (places, lines) = self.legend_places();
         for (index, (name, (x, line))) in self.legend.iter().zip(places).enumerate() {
@@ -146,7 +150,8 @@ impl Panels {
         Ok(top + LINE * lines as f64)
     }
 
-    /// Returns the drawn numbers as a table with a row for each point. `x_name` and `y_name` are the names of the axes.
+    /// Returns the drawn numbers as a table with a row for each point. Its columns `x_name` and `y_name` have the names
+    /// of the axes.
     pub(crate) fn table(&self) -> Table {
         let of_panel = |panel: &'_ PlotPanel| {
             let of_line = |line: &PanelLine| {
@@ -185,11 +190,11 @@ impl PlotPanel {
         canvas.x_ticks(frame, numbers)?;
         canvas.y_ticks(frame, true)?;
         canvas.upright(&self.y_name, (MARGIN + LINE / 2.0, frame.middle().1))?;
-        // What lies beyond the axis is at its end.
+        // Values outside the range of the axis are drawn at its end.
         let within = |y: f64| frame.y(y).clamp(frame.top, frame.bottom());
         for PanelLine { index, points } in &self.lines {
             let style = LineStyle::nth(*index);
-            // A line of one point is none.
+            // A single point has no line, so it is drawn as a dot with a bar.
             if let [point] = points[..] {
                 let (x, bar) = (frame.x(point.x), LineStyle { width: 1, dashes: None, ..style });
                 canvas.line(&[(x, within(point.low)), (x, within(point.high))], bar)?;
@@ -207,7 +212,7 @@ impl PlotPanel {
     }
 }
 
-/// Returns the index of `one` in `all`.
+/// Returns the index of `one` in `all`; 0 if it is not there.
 pub(crate) fn index_of<T: PartialEq>(all: &[T], one: &T) -> usize {
     all.iter().position(|known| known == one).unwrap_or_default()
 }

@@ -1,16 +1,16 @@
-//! Round numbers along an axis.
+//! Finds round numbers for the ticks of an axis, and formats them.
 
 use std::ops::Range;
 
-/// Returns at most `most` ticks in `range`, with their texts. Ticks are multiples of 1, 2 or 5 times a power of ten. An
-/// empty range has a tick at its low end alone.
+/// Returns at most `most` ticks in `range`, each with its text. Ticks are multiples of 1, 2 or 5 times a power of ten.
+/// An empty range has a single tick at its lower end.
 pub(super) fn round_ticks(range: &Range<f64>, most: usize) -> Vec<(f64, String)> {
     let span = range.end - range.start;
     if !span.is_finite() || span <= 0.0 {
         return vec![(range.start, tick(range.start))];
     }
     let smallest = (span / most.max(1) as f64).log10().floor() as i32;
-    // The ends count in spite of rounding.
+    // The slack includes ticks at the ends of the range despite rounding errors.
     let slack = 1e-9;
     let steps = (smallest..smallest + 3).flat_map(|power| [1.0, 2.0, 5.0].map(|factor| (factor, power)));
     let multiples = |(factor, power): (f64, i32)| {
@@ -21,7 +21,8 @@ pub(super) fn round_ticks(range: &Range<f64>, most: usize) -> Vec<(f64, String)>
     let Some((first, last, factor, power)) = steps.into_iter().find_map(multiples) else { return Vec::new() };
     let value = |index: i32| {
         let multiple = (first + f64::from(index)) * factor;
-        // Dividing by a whole number, the nearest to what is written.
+        // Dividing by a whole number gives the float closest to the decimal text. Multiplying by a negative power of
+        // ten would not.
         if power < 0 { multiple / 10_f64.powi(-power) } else { multiple * 10_f64.powi(power) }
     };
     let values: Vec<f64> = (0..=(last - first) as i32).map(value).collect();
@@ -29,7 +30,7 @@ pub(super) fn round_ticks(range: &Range<f64>, most: usize) -> Vec<(f64, String)>
     values.into_iter().map(|value| (value, written(value, power, largest))).collect()
 }
 
-/// Widens `range` outwards to the next ticks. An empty range stays as it is.
+/// Widens `range` on both sides to the next tick. Returns an empty range unchanged.
 pub(super) fn rounded(range: &Range<f64>) -> Range<f64> {
     match round_ticks(range, 6)[..] {
         [(first, _), (second, _), ..] => {
@@ -43,8 +44,8 @@ pub(super) fn rounded(range: &Range<f64>) -> Range<f64> {
     }
 }
 
-/// Formats a tick with the digits that multiples of ten to the `power` need. `largest`, the axis's largest value,
-/// decides whether numbers are written in thousands (k) or millions (M).
+/// Formats a tick with as many decimals as multiples of ten to the `power` need. `largest` is the largest value of the
+/// axis; it decides whether all ticks are in thousands (k) or millions (M).
 fn written(value: f64, power: i32, largest: f64) -> String {
     // Adding 0 makes a negative zero positive.
     if power < 0 {
@@ -59,7 +60,7 @@ fn written(value: f64, power: i32, largest: f64) -> String {
     }
 }
 
-/// Formats a number at an axis: short, and without rounding errors of binary fractions.
+/// Formats a number for an axis: short, and without rounding errors of binary fractions.
 fn tick(number: f64) -> String {
     let digits = match number.abs() {
         1e6.. => return format!("{}M", (number / 1e5).round() / 10.0),

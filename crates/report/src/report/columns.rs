@@ -1,4 +1,4 @@
-//! MethodColumns that several tables of a report have.
+//! Columns that several tables of a report have.
 
 use perturb_records::statistics::Summary;
 use perturb_settings::Method;
@@ -6,19 +6,19 @@ use perturb_text::TableBuilder;
 
 use super::numbers::or_empty;
 
-/// MethodColumns that several tables have.
+/// Adds columns that several tables have to a table builder.
 pub(crate) trait MethodColumns<'r, R: 'r>: Sized {
     /// Adds the columns that identify a method.
     fn method(self, method: impl Fn(&'r R) -> &'r Method) -> Self {
         self.method_as("", method)
     }
 
-    /// Adds the columns that identify a method, with names that begin with `prefix`. The preset, what is observed, and
-    /// whether the method was trained elsewhere have a column only if a row differs from the default, so that other files
-    /// stay as they were.
+    /// Adds the columns that identify a method. Their names begin with `prefix`. The columns `preset`, `observe` and
+    /// `elsewhere` are added only if some row differs from the default, so that files without such rows keep their old
+    /// format.
     fn method_as(self, prefix: &str, method: impl Fn(&'r R) -> &'r Method) -> Self;
 
-    /// Adds the number of runs, the mean and the standard deviation.
+    /// Adds the columns `runs`, `mean` and `std`: number of runs, mean and standard deviation.
     fn summary(self, summary: impl Fn(&'r R) -> Option<Summary>) -> Self;
 }
 

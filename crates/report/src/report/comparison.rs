@@ -1,27 +1,29 @@
-//! Comparisons of conditions over seeds and episodes, as tables and as a section of a page.
+//! Compares agents that were trained elsewhere, as tables and as a section of a page. A condition is an agent with its
+//! training distribution.
 
 use perturb_experiment::distinct;
 use perturb_records::comparison::{ComparedCondition, ComparedScore, ConditionComparison, compare};
 use perturb_records::{ExternalEvaluation, ExternalPolicy, Records};
 use perturb_text::Table;
 
-/// Explanation of the intervals of a comparison.
+/// Explanation, for users, of the intervals in a comparison.
 pub const INTERVALS_NOTE: &str = "\
 Intervals have 95 %. Those over seeds are t intervals, which cover the mean in 95 % also with three seeds if the means of\n\
 seeds are normally distributed; fewer than three seeds have none. Those over episodes speak of these policies in other\n\
 episodes. p is of t tests over seeds, corrected after Holm.";
 
-/// A comparison in an environment.
+/// The comparison of several conditions in one environment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EnvironmentComparison {
     /// The environment's name.
     pub environment: String,
-    /// The numbers.
+    /// The means of each condition, and the differences between conditions.
     pub comparison: ConditionComparison,
 }
 
-/// Compares the success of externally trained agents in each environment with several of them, by the tests that all of
-/// them have. An agent's policies with the same training distribution are its seeds.
+/// Compares the success rates of agents that were trained elsewhere, in each environment with at least two such agents.
+/// Only tests that all of them have are compared. An agent's policies with the same training distribution count as its
+/// seeds.
 pub(super) fn comparisons_of(assessed: &[ExternalEvaluation]) -> Vec<EnvironmentComparison> {
     let environments = distinct(assessed.iter().map(ExternalEvaluation::environment));
     environments.into_iter().filter_map(|environment| comparison_in(environment, assessed)).collect()
@@ -46,13 +48,13 @@ fn comparison_in(environment: &str, assessed: &[ExternalEvaluation]) -> Option<E
     let names = |records: &Records| records.about.tests.iter().map(|test| test.set.name.clone()).collect::<Vec<_>>();
     let mut common = names(&policies[0].1.records);
     common.retain(|name| policies.iter().all(|(_, policy)| names(&policy.records).contains(name)));
-    // Agents that were tested or judged otherwise are not compared.
+    // There is no comparison if agents were tested or judged differently.
     let comparison = compare(&conditions, &common, ComparedScore::Success, None).ok()?;
     Some(EnvironmentComparison { environment: environment.to_owned(), comparison })
 }
 
 impl EnvironmentComparison {
-    /// Returns the tables of means and, of several conditions, of differences.
+    /// Returns the table of means and, if there are several conditions, the table of differences.
     pub fn tables(&self) -> Vec<Table> {
         let differences = (!self.comparison.differences.is_empty()).then(|| self.differences_table());
         std::iter::once(self.means_table()).chain(differences).collect()

@@ -1,4 +1,4 @@
-//! Comparisons of methods in pairs, by runs with the same seed in the same environments.
+//! Compares every two methods, by pairs of runs with the same seed in the same environment.
 
 use perturb_experiment::{MethodResults, scores};
 use perturb_records::Metric;
@@ -10,15 +10,15 @@ use super::columns::MethodColumns;
 use super::index::ReportIndex;
 use super::{MISSING, Report};
 
-/// Number of bootstrap resamples. It is smaller than that of other numbers, because a report may have hundreds of
-/// comparisons.
+/// Number of bootstrap resamples for a comparison. It is smaller than for other numbers of a report, because a report
+/// may have hundreds of comparisons.
 const RESAMPLES: usize = 10_000;
-/// Minimum number of runs for a comparison.
+/// Minimum number of runs in each environment for a comparison.
 const MIN_RUNS: usize = 2;
-/// The name of all environments together.
+/// The name that stands for all environments together.
 const ALL: &str = "all";
 
-/// A comparison of two methods by a metric, over the runs that both have in each of the environments.
+/// A comparison of the methods x and y by one metric, over the runs that both have in every compared environment.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct MethodComparison {
     /// The environment's name, or [`ALL`].
@@ -26,9 +26,9 @@ pub(super) struct MethodComparison {
     x: Method,
     y: Method,
     metric: Metric,
-    /// The difference x − y, percentage points, mean over environments and runs.
+    /// The difference x − y in percentage points, averaged over environments and runs.
     difference: Bootstrapped,
-    /// The probability that a run of x is better than one of y.
+    /// The probability that a random run of x has a higher score than a random run of y.
     improvement: Bootstrapped,
     pairs: usize,
     p: f64,
@@ -36,7 +36,7 @@ pub(super) struct MethodComparison {
     corrected: f64,
 }
 
-/// Returns the comparisons over all environments. If there are several environments, those of each environment follow.
+/// Compares all methods over all environments together and then, if there are several, in each environment.
 pub(super) fn comparisons(scope: &ReportIndex<'_>, selections: &[MethodResults<'_>]) -> Vec<MethodComparison> {
     let environments = &scope.averaged;
     if let [environment] = environments[..] {
@@ -46,9 +46,9 @@ pub(super) fn comparisons(scope: &ReportIndex<'_>, selections: &[MethodResults<'
     family(scope, selections, ALL, environments).into_iter().chain(each).collect()
 }
 
-/// Returns the comparisons over some environments, which are corrected together. Reference lines are left out, because
-/// each would raise the corrected p-values of the others. Agents that were trained elsewhere are left out, because
-/// their runs share no seeds with others.
+/// Compares all methods over `environments`, and corrects the p-values of these comparisons together. Leaves out
+/// reference methods such as the random policy, because each of them would raise all corrected p-values. Also leaves
+/// out agents that were trained elsewhere, because their runs share no seeds with other runs.
 fn family(
     scope: &ReportIndex<'_>,
     selections: &[MethodResults<'_>],
@@ -75,8 +75,8 @@ fn family(
     family
 }
 
-/// Compares x with y. `scores` has x's scores in each environment, then y's. Returns `None` if there are fewer than
-/// [`MIN_RUNS`] runs.
+/// Compares x with y. `scores` has x's scores by environment and run, then y's in the same order. Returns `None` if
+/// there are fewer than [`MIN_RUNS`] runs. The corrected p-value is set later.
 fn compare(environment: &str, [x, y]: [&Method; 2], metric: Metric, scores: &[Vec<f64>]) -> Option<MethodComparison> {
     let (of_x, of_y) = scores.split_at(scores.len() / 2);
     let difference = |(x, y): (&Vec<f64>, &Vec<f64>)| x.iter().zip(y).map(|(x, y)| x - y).collect();
@@ -104,7 +104,7 @@ fn compare(environment: &str, [x, y]: [&Method; 2], metric: Metric, scores: &[Ve
 }
 
 impl Report<'_> {
-    /// Returns the table of comparisons over all environments; `None` if there is nothing to compare.
+    /// Returns the table of comparisons over all environments; `None` if there are no comparisons.
     pub(super) fn comparisons_table(&self) -> Option<Table> {
         let first = self.comparisons.first()?;
         let of_all = self.comparisons.chunk_by(|a, b| a.environment == b.environment).next()?;
@@ -149,7 +149,7 @@ impl Report<'_> {
     }
 }
 
-/// Formats a p-value with three decimals.
+/// Formats a p-value with three decimals. Smaller ones become "< 0.001".
 pub(super) fn shown(p: f64) -> String {
     if p < 0.0005 {
         "< 0.001".into()
@@ -169,12 +169,12 @@ mod tests {
         let plan = "environments = ['CartPole']\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff', 'rc']";
         let methods = perturb_experiment::Plan::parse("test", plan.into()).unwrap().methods();
         let compared = |scores: &[Vec<f64>]| compare(ALL, [&methods[0], &methods[1]], Metric::Default, scores);
-        // Two environments: x is better by 1 in each run, however far runs lie apart.
+        // In both environments, x is better by 1 in each run, although scores differ much between runs.
         let [x, y] = [0.0, 1.0].map(|less| [10.0, 50.0, 90.0].map(|score| score - less).to_vec());
         let comparison = compared(&[x.clone(), x.clone(), y.clone(), y]).unwrap();
         assert_eq!((comparison.difference.point, comparison.difference.interval_95), (1.0, Some([1.0, 1.0])));
         assert_eq!((comparison.pairs, comparison.p), (6, 2_f64.powi(-5)));
-        // Unpaired, a run is better than its own and those below it: 3 + 2 + 1 of 9.
+        // Of the 9 pairs of a run of x and a run of y, x is better in 3 + 2 + 1.
         assert!((comparison.improvement.point - 6.0 / 9.0).abs() < 1e-12);
         assert_eq!(compared(&[vec![1.0], vec![2.0]]), None, "one run says nothing of others");
     }

@@ -1,4 +1,4 @@
-//! CSV files of a report. An empty field is a missing number.
+//! The CSV files of a report. A missing number is an empty field.
 
 use perturb_protocol::Version;
 use perturb_records::Metric;
@@ -9,11 +9,12 @@ use super::Report;
 use super::columns::MethodColumns;
 use super::numbers::{MethodMetrics, counted, or_empty};
 
-/// Reads a bootstrapped number of a method's metric.
+/// A function that reads one of a method's bootstrapped numbers.
 type BootstrappedOf = fn(&MethodMetrics<'_>, Metric) -> Option<Bootstrapped>;
 
 impl Report<'_> {
-    /// Returns the files that a report has beside its documents and pictures, by their titles.
+    /// Returns the CSV files of the report, in addition to its documents and pictures. The title of each table is its
+    /// file name.
     pub fn files(&self) -> Vec<Table> {
         let rows: Vec<_> = self.metrics.iter().chain(&self.averages).collect();
         let more = [self.comparisons_file(), self.parameters_file()].into_iter().filter(|file| !file.rows.is_empty());
@@ -79,7 +80,8 @@ impl Report<'_> {
     }
 }
 
-/// Returns the file of the methods' three metrics, with t intervals of the means and the paper's numbers.
+/// Returns the file of each method's three metrics, with t intervals of the means and the paper's numbers. `name` is
+/// the file's name.
 pub(super) fn metrics_file(name: &str, rows: &[&MethodMetrics<'_>]) -> Table {
     let lines: Vec<_> = rows.iter().flat_map(|row| Metric::ALL.map(|metric| (*row, metric))).collect();
     let end = |(row, metric): &(&MethodMetrics<'_>, Metric), end: usize| {

@@ -1,11 +1,11 @@
-//! Training curves as lines of a file.
+//! Training curves as a CSV file.
 
 use perturb_experiment::{BudgetAxis, EnvironmentCurves};
 use perturb_text::Table;
 
 use super::columns::MethodColumns;
 
-/// A line for each point.
+/// Returns the file `curves.csv`, with a row for each point of each curve.
 pub fn curves_table(all: &[EnvironmentCurves]) -> Table {
     let curves = all.iter().flat_map(|of| of.curves.iter().map(|curve| (&of.environment, curve)));
     let by = curves.flat_map(|(environment, curve)| BudgetAxis::ALL.map(|by| (environment, curve, by)));

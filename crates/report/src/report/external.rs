@@ -1,11 +1,12 @@
-//! Externally trained agents in reports.
+//! Notes of a report about agents that were trained elsewhere.
 
 use std::collections::BTreeMap;
 
 use perturb_experiment::{MethodResults, Results, distinct, elsewhere};
 use perturb_records::{ExternalEvaluation, ExternalPolicy};
 
-/// Returns the notes that precede the agents' numbers.
+/// Returns the sentences about agents that were trained elsewhere: that they exist, how each policy was trained and
+/// tested, and whether its environment differs. Returns an empty list if there are no such agents.
 pub(super) fn sentences(results: &Results<'_>, selections: &[MethodResults<'_>]) -> Vec<String> {
     let agents = distinct(selections.iter().filter(|row| row.method.external).map(|row| row.method.clone()));
     if agents.is_empty() {
@@ -49,7 +50,7 @@ pub(super) fn sentences(results: &Results<'_>, selections: &[MethodResults<'_>])
     distinct(lines.into_iter())
 }
 
-/// Returns what is known of a policy.
+/// Returns a sentence on how a policy was trained and tested.
 fn policy_sentence(agent: &ExternalEvaluation, policy: &ExternalPolicy, run: u32) -> String {
     let ExternalPolicy { known, records, .. } = policy;
     let saved = if agent.name.is_empty() { "not saved".into() } else { format!("saved as `{}`", agent.name) };

@@ -1,5 +1,5 @@
-//! The main result of an experiment in one figure: Default, Interpolation and Extrapolation with intervals, beside the
-//! paper's numbers.
+//! The main result of an experiment: a picture of Default, Interpolation and Extrapolation with intervals beside the
+//! paper's numbers, and a sentence about it.
 
 use perturb_experiment::{Selection, distinct};
 use perturb_records::statistics::Bootstrapped;
@@ -14,19 +14,20 @@ use crate::plot::intervals::{Group, IntervalRow};
 use crate::plot::{IntervalPlot, panels};
 
 impl<'a> Report<'a> {
-    /// Returns the first pictures of the page: one of all environments together, or one for each environment if there
-    /// is only one or the average is not known.
+    /// Returns the first pictures of the page: a picture of the average over environments or, if there is no average, a
+    /// picture for each environment.
     pub(super) fn finding_pictures(&self) -> Vec<Picture> {
         self.opening_rows().into_iter().map(|rows| self.finding_picture(rows)).collect()
     }
 
-    /// Returns a sentence or two for each of these pictures.
+    /// Returns a text of one or two sentences for each of the [`finding_pictures`](Self::finding_pictures).
     pub(super) fn finding_sentences(&self) -> Vec<String> {
         let rows = self.opening_rows().into_iter();
         rows.filter_map(|rows| Some(format!("{}: {}", self.finding_of(rows), finding_sentence(rows)?))).collect()
     }
 
-    /// Returns the pictures of each environment, if the page begins with all together.
+    /// Returns a picture for each environment, if the first picture of the page is of the average. Otherwise returns an
+    /// empty list, because the page begins with these pictures.
     pub(super) fn environment_pictures(&self) -> Vec<Picture> {
         if !self.has_average() {
             return Vec::new();
@@ -46,7 +47,7 @@ impl<'a> Report<'a> {
         self.metrics.chunk_by(|a, b| a.environment == b.environment)
     }
 
-    /// Returns the name of the rows' environment, or of the average of several.
+    /// Returns the name of the environment of `rows`, or "Average over …".
     fn finding_of(&self, rows: &[MethodMetrics<'_>]) -> String {
         if rows[0].environment != AVERAGE {
             return rows[0].environment.to_owned();
@@ -113,10 +114,10 @@ impl<'a> Report<'a> {
     }
 }
 
-/// Names the method that extrapolates best, its lead, and its Extrapolation relative to Default. Returns `None` if no
-/// method has Extrapolation. Methods whose rounded numbers are equal share the first place, and none is called best. A
-/// number of one run is marked, and then no method is called best. The random policy is left out, since it has learned
-/// nothing.
+/// Returns a sentence that names the method with the best Extrapolation and the next one, and compares Extrapolation
+/// with Default. Returns `None` if no method has Extrapolation. If the rounded numbers of several methods are equal,
+/// they share the first place and none is called best. Numbers of a single run are marked, and then no method is called
+/// best either. The random policy is left out, because it has learned nothing.
 fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     let learned: Vec<_> = rows.iter().filter(|row| !row.method.is_random()).collect();
     let mean = |row: &MethodMetrics<'_>, metric| row.means.get(&metric).copied();
@@ -163,8 +164,8 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     ))
 }
 
-/// Names the methods whose Extrapolation is 0 although they have successes elsewhere, with the responsible scenarios.
-/// Empty if there are none.
+/// Returns a sentence that names the methods whose Extrapolation is 0 only because some scenarios have no success, with
+/// these scenarios. Returns an empty text if there are no such methods.
 fn zero_sentence<'a, 'm: 'a>(rows: impl Iterator<Item = &'a MethodMetrics<'m>>) -> String {
     let by = |row: &MethodMetrics<'_>| {
         let zeros: Vec<String> = row.zeros.iter().map(Scenario::to_string).collect();
@@ -185,12 +186,12 @@ fn shown(mean: Bootstrapped) -> String {
     }
 }
 
-/// Rounds to the shown digits, without a negative zero.
+/// Rounds to one decimal, as shown. Turns a negative zero into a positive one.
 fn rounded(points: f64) -> f64 {
     (10.0 * points).round() / 10.0 + 0.0
 }
 
-/// Names the numbers that have no interval; `None` if all have one.
+/// Returns a sentence that says which numbers have no interval, and why. Returns `None` if all numbers have one.
 fn too_few(rows: &[MethodMetrics<'_>]) -> Option<String> {
     let all: Vec<&Bootstrapped> = rows.iter().flat_map(|row| row.means.values()).collect();
     let without: Vec<_> = all.iter().filter(|mean| mean.interval_95.is_none()).collect();
@@ -203,7 +204,7 @@ fn too_few(rows: &[MethodMetrics<'_>]) -> Option<String> {
     }
 }
 
-/// Joins names for a sentence.
+/// Joins names for a sentence, e.g. "a, b and c". Without names returns [`MISSING`].
 pub(super) fn listed(names: &[impl AsRef<str>]) -> String {
     match names {
         [] => MISSING.to_owned(),

@@ -1,5 +1,5 @@
-//! Pictures of heatmaps, of an experiment and of agents that were trained elsewhere: one for each environment, pair of
-//! parameters, and method.
+//! Pictures of the heatmaps of an experiment and of agents that were trained elsewhere: one for each environment, pair
+//! of parameters and method.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
@@ -19,19 +19,20 @@ use super::pictures::{Picture, PictureDrawing, file_name};
 use crate::heatmap_policies::points_table;
 use crate::plot::{HeatmapColumn, HeatmapPanels, PlotError, common_returns};
 
-/// Heatmaps as pictures: one for each environment, pair of parameters and method, with a column for each training
-/// distribution. Each column is the mean over runs.
+/// The pictures of all heatmaps of a report. There is one for each environment, pair of parameters and method. It has a
+/// column for each training distribution, which shows the mean over runs.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct HeatmapPictures {
     /// The pictures that have at least one heatmap.
     pub pictures: Vec<Picture>,
-    /// Number of heatmaps, with the missing ones.
+    /// Number of heatmaps, including missing ones.
     pub total: usize,
-    /// Reasons for the missing heatmaps.
+    /// The reason for each missing heatmap.
     pub missing: Vec<NoHeatmap>,
 }
 
-/// A picture before its colour scale is known, which all pictures of an environment share.
+/// A picture without its colour scale. The scale is known when all drafts of the environment are made, because they
+/// share it.
 struct Draft<'a> {
     environment: &'a str,
     method: &'a Method,
@@ -39,7 +40,7 @@ struct Draft<'a> {
     columns: Vec<PictureColumn<'a>>,
 }
 
-/// The policies with the same training distribution.
+/// The policies of a picture with the same training distribution, and the mean of their heatmaps.
 struct PictureColumn<'a> {
     trained_on: TrainedOn<'a>,
     /// Number of policies, with and without a heatmap.
@@ -49,7 +50,7 @@ struct PictureColumn<'a> {
     mean: Option<Heatmap>,
 }
 
-/// A policy's heatmap, or why there is none.
+/// The heatmap of a policy, or the reason why there is none.
 #[derive(Clone)]
 struct ShownPolicy<'a> {
     trained_on: TrainedOn<'a>,
@@ -57,19 +58,20 @@ struct ShownPolicy<'a> {
     content: Result<(Heatmap, Origin), NoHeatmap>,
 }
 
-/// The origin of a heatmap.
+/// The seed of the test and the program that made a heatmap, for the caption.
 #[derive(Clone)]
 struct Origin {
     seed: u64,
-    /// The program's version and commit; `None` if it is not known.
+    /// The program's version and commit; `None` if they are not known.
     commit: Option<String>,
 }
 
-/// Returns the pictures of the cells in `folder` that belong to `selections`, and of externally trained agents among
-/// them. Without heatmaps of cells there are no pictures.
+/// Returns the pictures of all heatmaps of the policies in `selections`. Heatmaps of cells are read from `folder`, an
+/// experiment's folder. Heatmaps of agents that were trained elsewhere come from their recorded tests. A picture
+/// without any heatmap is left out.
 ///
 /// # Errors
-/// [`FolderError`] if a file is there that cannot be read.
+/// [`FolderError`] if a file exists but cannot be read.
 pub fn heatmap_pictures(
     selections: &[MethodResults<'_>],
     folder: Option<&Folder>,
@@ -110,7 +112,7 @@ pub fn heatmap_pictures(
     Ok(all)
 }
 
-/// The heatmap of a cell.
+/// Reads the heatmap of a cell's policy.
 fn shown<'a>(
     place: &HeatmapPlace<'a>,
     folder: Option<&Folder>,
@@ -125,8 +127,8 @@ fn shown<'a>(
     Ok(ShownPolicy { trained_on: place.trained_on, run: place.run, content })
 }
 
-/// Returns the heatmaps of an agent that was trained elsewhere, in the same order as those of cells. Empty for other
-/// rows.
+/// Returns the heatmaps of an agent that was trained elsewhere, ordered by training distribution and run, as for cells.
+/// Returns an empty list if the row is not of such an agent.
 fn shown_elsewhere<'a>(row: &MethodResults<'a>) -> Vec<(HeatmapKind, ShownPolicy<'a>)> {
     let mut all = Vec::new();
     for (&run, of_run) in &row.runs {
@@ -142,14 +144,14 @@ fn shown_elsewhere<'a>(row: &MethodResults<'a>) -> Vec<(HeatmapKind, ShownPolicy
 }
 
 impl<'a> Draft<'a> {
-    /// Returns a draft of policies, ordered by their training distribution.
+    /// Returns the draft of a picture. `shown` must be ordered by training distribution.
     fn new(
         (environment, method): (&'a str, &'a Method),
         kind: Option<&'a HeatmapKind>,
         shown: Vec<ShownPolicy<'a>>,
     ) -> Self {
         let mut columns: Vec<PictureColumn<'a>> = Vec::new();
-        // All of a picture have the points of its first.
+        // All heatmaps of a picture must have the same points as the first one.
         let mut first: Option<Heatmap> = None;
         for shown in shown.chunk_by(|a, b| a.trained_on == b.trained_on) {
             let (trained_on, policies) = (shown[0].trained_on, shown.len());
@@ -173,7 +175,7 @@ impl<'a> Draft<'a> {
         Self { environment, method, kind, columns }
     }
 
-    /// Returns `None` if nothing is there.
+    /// Finishes the picture with the colour scale `returns` for mean returns. Returns `None` if there is no heatmap.
     fn picture(&self, returns: &Range<f64>) -> Option<Picture> {
         let Self { environment, method, kind, columns } = self;
         let kind = (*kind)?;
@@ -211,7 +213,7 @@ impl<'a> Draft<'a> {
         )
     }
 
-    /// Returns the numbers as a table with a row for each column and point.
+    /// Returns the numbers of the picture as a table with a row for each column and grid point.
     fn table(&self, kind: &HeatmapKind) -> Table {
         let of_column = |column: &'_ PictureColumn<'a>| {
             let (trained_on, runs) = (column.trained_on.to_string(), column.origins.len());
@@ -229,7 +231,7 @@ impl PictureColumn<'_> {
         HeatmapColumn { caption: format!("trained on {}, {}", self.trained_on, self.runs()), content }
     }
 
-    /// Returns the number of runs in words.
+    /// Returns the number of averaged runs as text, e.g. "2 of 3 runs".
     fn runs(&self) -> String {
         match (self.origins.len(), self.policies) {
             (there, all) if there == all => count(all, "run"),
@@ -248,7 +250,7 @@ impl PictureColumn<'_> {
 }
 
 impl HeatmapPictures {
-    /// Returns advice about the missing heatmaps.
+    /// Returns sentences that say how many heatmaps are missing and how to make them.
     pub(super) fn advice(&self) -> Vec<String> {
         let waiting = self.missing.iter().filter(|why| **why == NoHeatmap::NoResult).count();
         let (makeable, all) = (self.missing.len() - waiting, self.total);
@@ -262,11 +264,11 @@ impl HeatmapPictures {
     }
 }
 
-/// Writes all pictures into the folder `out`. Deletes earlier heatmap pictures in it that are not among them. Returns
-/// the names of the written files without extensions.
+/// Writes all pictures into the folder `out`. Deletes old heatmap pictures in `out` that are not among the new ones.
+/// Returns the names of the written files without extensions.
 ///
 /// # Errors
-/// [`PlotError`].
+/// [`PlotError`] if a picture cannot be drawn or a file cannot be written.
 pub fn save_heatmaps<'a>(all: &'a HeatmapPictures, out: &Path) -> Result<Vec<&'a str>, PlotError> {
     all.pictures.iter().try_for_each(|picture| picture.save(out))?;
     let written: Vec<&str> = all.pictures.iter().map(|picture| picture.file.as_str()).collect();
@@ -279,7 +281,7 @@ pub fn save_heatmaps<'a>(all: &'a HeatmapPictures, out: &Path) -> Result<Vec<&'a
     Ok(written)
 }
 
-/// Joins the distinct reasons.
+/// Joins the different reasons for missing heatmaps.
 fn said<'a>(missing: impl Iterator<Item = &'a (u32, NoHeatmap)>) -> String {
     distinct(missing.map(|(_, why)| why.to_string())).join("; ")
 }

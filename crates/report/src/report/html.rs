@@ -1,5 +1,5 @@
-//! A report as one HTML page, complete in itself: no network, no script, all pictures inside, and the files that its links
-//! lead to.
+//! Renders a report as one self-contained HTML page: without scripts or network access, with all pictures and
+//! downloadable files inside.
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, percent_encode};
@@ -23,13 +23,13 @@ const STATISTICS: &str = "Pairs are runs of two methods with the same seed, in e
 const SURFACES: &str = "How the selected policies do over parameters. Heatmaps are means over runs; colours are mean return \
                         and success rate, the same in all pictures of an environment; what lies beyond their scale has the \
                         colour of its end. Boxes are R's and E's, the ring is D.";
-/// Characters of a file that its address writes in hexadecimal digits.
+/// Characters that a `data:` URI must percent-encode.
 const ENCODED: &AsciiSet =
     &NON_ALPHANUMERIC.remove(b'-').remove(b'_').remove(b'.').remove(b',').remove(b'/').remove(b'=');
-/// Length from which a text is broken into lines, bytes.
+/// Length of a text in a table, in bytes, above which it is broken into lines.
 const LONG: usize = 60;
 
-/// A section with a heading and an entry in the list of contents.
+/// A section of the page, with a heading and an entry in the list of contents.
 struct Section {
     id: &'static str,
     title: &'static str,
@@ -43,10 +43,10 @@ struct Subsection {
 }
 
 impl ReportBundle<'_> {
-    /// Everything as one HTML page that needs nothing else.
+    /// Renders the report with all pictures as one self-contained HTML page.
     ///
     /// # Errors
-    /// [`PlotError`].
+    /// [`PlotError`] if a picture cannot be drawn.
     pub fn page(&self) -> Result<String, PlotError> {
         let report = &self.report;
         let finding = report.finding_pictures().iter().map(figure).collect::<Result<Vec<_>, _>>()?;
@@ -74,7 +74,8 @@ impl ReportBundle<'_> {
         Ok(page(report, &finding, &shown, &missing).into_string())
     }
 
-    /// Returns the tables of the metrics, each environment's with its figure.
+    /// Returns the tables of metrics as subsections. The table of an environment is followed by the environment's
+    /// picture.
     fn metrics(&self) -> Result<Vec<Subsection>, PlotError> {
         let pictures = self.report.environment_pictures();
         let with_figure = |table: Table| {
@@ -110,7 +111,7 @@ impl ReportBundle<'_> {
     }
 }
 
-/// Results come first, and last how they were made and which figures are missing.
+/// Renders the page. Results come first; the last section says how they were made and which pictures are missing.
 fn page(report: &Report<'_>, finding: &[Markup], sections: &[&Section], missing: &[String]) -> Markup {
     let title = report.title();
     html! {
@@ -159,7 +160,7 @@ fn head(title: &str) -> Markup {
     }
 }
 
-/// Returns a comparison as a page of its own.
+/// Renders a comparison as a separate HTML page.
 pub fn comparison_page(of: &EnvironmentComparison) -> String {
     let conditions = distinct(of.comparison.means.iter().map(|row| row.condition.as_str()));
     let title = format!("{} on {}", listed(&conditions), of.environment);
@@ -184,7 +185,7 @@ fn comparison_subsection(of: &EnvironmentComparison) -> Subsection {
     Subsection { title: of.environment.clone(), content }
 }
 
-/// The plan's date and files.
+/// Renders the plan's date, and links to download its files.
 fn plan(report: &Report<'_>) -> Markup {
     html! {
         @if !report.plan.text.is_empty() {
@@ -212,7 +213,7 @@ impl Section {
                 @if self.subsections.len() > 1 {
                     " "
                     span {
-                        // Pictures of all environments together have no title.
+                        // The subsection of pictures over all environments has no title.
                         @for (i, subsection) in self.subsections.iter().enumerate().filter(|(_, it)| !it.title.is_empty()) {
                             @if i > 0 { " · " }
                             a href={ "#" (self.subsection_id(i)) } { (short(&subsection.title)) }
@@ -238,7 +239,7 @@ impl Section {
 
 fn table_subsection(table: &Table, shaded: bool) -> Subsection {
     let groups: Vec<&[Column]> = table.columns.chunk_by(|a, b| a.group == b.group).collect();
-    // Where each but the first group of columns begins.
+    // Whether a column starts a group of columns, except the first group.
     let starts = |column: usize| {
         groups.len() > 1 && column > 0 && table.columns[column].group != table.columns[column - 1].group
     };
@@ -261,7 +262,7 @@ fn table_subsection(table: &Table, shaded: bool) -> Subsection {
                     tr {
                         @for (i, column) in table.columns.iter().enumerate() {
                             th class=[classes(&[("text", !column.is_number), ("start", starts(i))])] scope="col" {
-                                // The first column of a group is what the group is called; the others are not.
+                                // The first column of a group has the name of the group, which is already above it.
                                 @if column.group.as_ref() == Some(&column.name) { "here" } @else { (column.name) }
                             }
                         }
@@ -269,7 +270,7 @@ fn table_subsection(table: &Table, shaded: bool) -> Subsection {
                 }
                 tbody {
                     @for (row, entries) in table.rows.iter().enumerate() {
-                        // A line above a method's first row, where methods have several.
+                        // The class `next` draws a line above the first row of each method.
                         @let next = shaded && row > 0 && entries[0] != table.rows[row - 1][0];
                         tr class=[next.then_some("next")] {
                             @for (i, (entry, column)) in entries.iter().zip(&table.columns).enumerate() {
@@ -299,7 +300,7 @@ fn cell(entry: &Entry, column: &Column, starts: bool, shaded: bool) -> Markup {
     html! { td class=[class] style=[style] { (entry.text) } }
 }
 
-/// Returns the names that apply; `None` if none does.
+/// Returns the CSS classes that apply, separated by spaces; `None` if none applies.
 fn classes(names: &[(&str, bool)]) -> Option<String> {
     let applying: Vec<&str> = names.iter().filter(|(_, applies)| *applies).map(|(name, _)| *name).collect();
     (!applying.is_empty()).then(|| applying.join(" "))
@@ -314,7 +315,7 @@ fn by_environment(pictures: &[Picture]) -> Result<Vec<Subsection>, PlotError> {
     pictures.chunk_by(|a, b| a.environment == b.environment).map(subsection).collect()
 }
 
-/// Returns the pictures as figures, side by side where there is room.
+/// Renders pictures as figures, side by side if there is room.
 fn figures(pictures: &[Picture]) -> Result<Markup, PlotError> {
     let figures = pictures.iter().map(figure).collect::<Result<Vec<_>, _>>()?;
     Ok(html! { @if !figures.is_empty() { div.figures { @for one in figures { (one) } } } })
@@ -324,7 +325,7 @@ fn figure(Picture { file, name, caption, drawing, data, .. }: &Picture) -> Resul
     let svg = svg(drawing)?;
     Ok(html! {
         figure {
-            // Named for those who do not see it.
+            // The label is for screen readers.
             div role="img" aria-label=(name) { (PreEscaped(&svg)) }
             figcaption {
                 (caption)
@@ -338,7 +339,7 @@ fn figure(Picture { file, name, caption, drawing, data, .. }: &Picture) -> Resul
     })
 }
 
-/// Returns a `data:` address that holds `content`, so that links work wherever the page is.
+/// Returns a `data:` URI that contains `content`, so that links work without other files.
 fn data_uri(media_type: &str, content: &[u8]) -> String {
     format!("data:{media_type};charset=utf-8,{}", percent_encode(content, ENCODED))
 }
@@ -347,12 +348,12 @@ fn list(notes: &[String]) -> Markup {
     html! { @if !notes.is_empty() { ul.missing { @for note in notes { li { (prose(note)) } } } } }
 }
 
-/// Returns a text in which words between backticks are set as code.
+/// Renders a text. Words between backticks become code.
 fn prose(text: &str) -> Markup {
     html! { @for (i, part) in text.split('`').enumerate() { @if i % 2 == 1 { code { (part) } } @else { (part) } } }
 }
 
-/// Returns the part of a title before its details.
+/// Returns the start of a title, before ": " or " over ", for the list of contents.
 fn short(title: &str) -> &str {
     let end = [": ", " over "].iter().filter_map(|separator| title.find(separator)).min();
     &title[..end.unwrap_or(title.len())]

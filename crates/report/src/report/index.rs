@@ -1,4 +1,5 @@
-//! Rows and columns of a report, from its plan and from externally trained agents.
+//! The environments, methods and test sets that a report shows, from its plan and from agents that were trained
+//! elsewhere.
 
 use std::collections::BTreeSet;
 
@@ -7,14 +8,14 @@ use perturb_protocol::Version;
 use perturb_records::TrainedOn;
 use perturb_settings::Method;
 
-/// Environments, methods and tests of a report, in the order in which it shows them.
+/// The environments, methods and test sets of a report, in the order in which they are shown.
 #[derive(Clone, Debug)]
 pub(super) struct ReportIndex<'a> {
-    /// The environments of averages: the plan's, or all if there is no plan.
+    /// The environments that averages are over: the plan's environments, or all environments if there is no plan.
     pub(super) averaged: Vec<&'a str>,
-    /// All environments that have rows.
+    /// All environments in the report.
     pub(super) environments: Vec<&'a str>,
-    /// All methods that have rows.
+    /// All methods in the report.
     pub(super) methods: Vec<Method>,
     /// The names of the test sets.
     pub(super) tested_on: Vec<&'a str>,
@@ -28,25 +29,25 @@ impl<'a> ReportIndex<'a> {
         let assessed = elsewhere(selections);
         let of_others = assessed.iter().flat_map(|(_, policy, _)| &policy.records.about.tests).map(|test| &test.set);
         let mut tested_on = distinct(of_plan.chain(of_others).map(|set| set.name.as_str()));
-        // Of agents alone, their own sets come first.
+        // Sets that are not versions come after the versions. Without a plan they come first.
         let own_set = if plan.cells.is_empty() { -1 } else { Version::KNOWN.len() as i32 };
         tested_on.sort_by_key(|name| version(name).map_or(own_set, |version| version as i32));
         Self { averaged, environments, methods: distinct(selections.iter().map(|row| row.method.clone())), tested_on }
     }
 }
 
-/// Returns the version called `name`.
+/// Returns the version with this name; `None` if there is none.
 pub(super) fn version(name: &str) -> Option<Version> {
     Version::KNOWN.into_iter().find(|version| version.to_string() == name)
 }
 
-/// Whether a row belongs among the scenarios. Agents whose training distribution is unknown do not.
+/// Returns whether a row is shown in the tables of scenarios. Agents that were not trained on a known version are not.
 pub(super) fn has_scenarios(row: &MethodResults<'_>) -> bool {
     !row.method.external || trained_on(row).iter().any(|one| matches!(one, TrainedOn::Version(_)))
 }
 
-/// Returns what the policies of a row were trained on. A run of an agent that was trained elsewhere may lack what another
-/// one has.
+/// Returns the training distributions of all policies in a row. Runs of an agent that was trained elsewhere may have
+/// different ones, so this is their union.
 pub(super) fn trained_on<'a>(row: &MethodResults<'a>) -> BTreeSet<TrainedOn<'a>> {
     row.runs.values().flat_map(|run| run.selected.keys().copied()).collect()
 }

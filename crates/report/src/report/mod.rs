@@ -1,7 +1,8 @@
-//! An experiment's results beside the paper's.
+//! The report of an experiment: its results beside the paper's numbers.
 //!
-//! [`Report::new`] has the numbers; [`Report::text`], [`Report::markdown`] and [`ReportBundle::page`] make documents of
-//! them, [`Report::files`] CSV. Nothing in them depends on when, where or in how many attempts the cells were done.
+//! [`Report::new`] computes the numbers. [`Report::text`], [`Report::markdown`] and [`ReportBundle::page`] render them
+//! as documents, and [`Report::files`] as CSV files. The output depends only on the results: not on when, where or in
+//! how many attempts the cells were run.
 
 mod columns;
 mod comparison;
@@ -46,7 +47,7 @@ pub struct Report<'a> {
     plan: &'a Plan,
     scope: ReportIndex<'a>,
     selections: &'a [MethodResults<'a>],
-    /// Sentences, with `names` between backticks.
+    /// Sentences on the scope and origin of the results. Code words are between backticks.
     provenance: Vec<String>,
     metrics: Vec<MethodMetrics<'a>>,
     averages: Vec<MethodMetrics<'a>>,
@@ -56,8 +57,9 @@ pub struct Report<'a> {
 }
 
 impl<'a> Report<'a> {
-    /// Returns the report of `results`. `selections` were made from them, `recorded` are their recorded episodes, and
-    /// `checks` compare requested with applied parameters in these.
+    /// Computes the report of `results`. `selections` are the selected policies, including agents that were trained
+    /// elsewhere. `recorded` has the recorded episodes of selected cells. `checks` are the comparisons of requested and
+    /// applied parameters in recorded episodes.
     pub fn new(
         results: &'a Results<'a>,
         selections: &'a [MethodResults<'a>],
@@ -79,26 +81,26 @@ impl<'a> Report<'a> {
         }
     }
 
-    /// Renders the tables for a terminal of `width` columns.
+    /// Renders the report as text for a terminal that is `width` characters wide.
     pub fn text(&self, width: usize) -> String {
         let shown = self.tables().map(|table| format!("\n{}\n{}\n", table.title, table.to_text_within(width)));
         format!("{}\n{}", self.sentences().join("\n"), shown.collect::<String>())
     }
 
-    /// Renders the report as Markdown, for GitHub for example.
+    /// Renders the report as Markdown, for example for GitHub.
     pub fn markdown(&self) -> String {
         let shown = self.tables().map(|table| format!("\n## {}\n\n{}\n", table.title, table.to_markdown()));
         format!("# Results\n\n{}\n{}", self.sentences().join("\n\n"), shown.collect::<String>())
     }
 
-    /// Returns the pictures that there are numbers for: the main result, each environment, performance profiles, and
-    /// success over parameters.
+    /// Returns the pictures of the report: the main result, each environment, performance profiles, and success over
+    /// parameters. Pictures without numbers are left out.
     pub fn pictures(&self) -> Vec<Picture> {
         let finding = self.finding_pictures().into_iter().chain(self.environment_pictures());
         finding.chain(self.profiles_picture()).chain(self.parameter_pictures()).collect()
     }
 
-    /// Returns the sentences with the main result and its scope.
+    /// Returns the sentences of the main result, followed by the scope and origin of the results.
     fn sentences(&self) -> Vec<String> {
         self.finding_sentences().into_iter().chain(self.provenance.iter().cloned()).collect()
     }
@@ -108,7 +110,7 @@ impl<'a> Report<'a> {
         numbers.chain(self.iqm_table()).chain(self.comparisons_table())
     }
 
-    /// Returns all cells that the report's numbers come from.
+    /// Returns all selected cells, whose tests the report shows.
     fn selected(&self) -> Vec<Selected<'a>> {
         let runs = self.selections.iter().flat_map(|selection| selection.runs.values());
         runs.flat_map(|run| run.selected.values().flatten()).filter_map(Reported::cell).collect()

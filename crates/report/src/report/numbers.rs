@@ -1,4 +1,4 @@
-//! The numbers of a report, beside the paper's.
+//! Computes the metrics of a report, and pairs them with the paper's.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -12,58 +12,62 @@ use perturb_settings::Method;
 
 use super::index::{ReportIndex, has_scenarios};
 
-/// Resamples of a bootstrap, as many as rliable takes.
+/// Number of bootstrap resamples. It is the default of the Python package rliable.
 const RESAMPLES: usize = 50_000;
-/// Number of bootstrap resamples with a selection in each, which costs hundreds of times more.
+/// Number of bootstrap resamples that repeat the selection. Such a resample takes hundreds of times longer.
 const N_BOOTSTRAP_SELECTION: usize = 10_000;
-/// The best success rate, %. The optimality gap is the distance from it.
+/// The best possible success rate, %. The optimality gap is measured from it.
 const MAX_SUCCESS: f64 = 100.0;
-/// The name of all environments together, here and in the paper.
+/// The name, in reports and in the paper, of the average over environments.
 pub(super) const AVERAGE: &str = "Average";
 
-/// A method's metrics in an environment or over all environments. Unknown metrics are left out.
+/// A method's metrics in one environment, or averaged over environments. The maps have no entry for a metric that
+/// cannot be computed.
 pub(super) struct MethodMetrics<'a> {
     pub(super) environment: &'a str,
     pub(super) method: Method,
     pub(super) ours: BTreeMap<Metric, Summary>,
-    /// The range of `ours` over the choices among tied configurations.
+    /// The range that `ours` can have, depending on which of the tied configurations are chosen.
     pub(super) ties: BTreeMap<Metric, TieRange>,
     pub(super) papers: BTreeMap<Metric, Summary>,
-    /// Whether `ours` can be compared with `papers`.
+    /// Whether `ours` can be compared with `papers`: whether the environment has the paper's physics.
     pub(super) comparable: bool,
-    /// The means of `ours` again, with intervals where there are enough runs for one.
+    /// The means of `ours`, with their 95 % t intervals if there are enough runs.
     pub(super) means: BTreeMap<Metric, Bootstrapped>,
-    /// Scenarios that alone make Extrapolation 0 in a run.
+    /// Scenarios with a success rate of 0 that make Extrapolation 0 in some run, although another of its three
+    /// scenarios has successes.
     pub(super) zeros: BTreeSet<Scenario>,
-    /// Interquartile means, over all environments only.
+    /// Interquartile means; only in the average over environments.
     pub(super) iqms: BTreeMap<Metric, Bootstrapped>,
-    /// Optimality gaps, over all environments only.
+    /// Optimality gaps; only in the average over environments.
     pub(super) gaps: BTreeMap<Metric, Bootstrapped>,
-    /// Interquartile means and optimality gaps, with every selection repeated in each resample.
+    /// Interquartile means and optimality gaps, with intervals from a bootstrap that repeats every selection in each
+    /// resample.
     pub(super) reselected: BTreeMap<Metric, [Bootstrapped; 2]>,
     pub(super) done: usize,
     pub(super) cells: usize,
 }
 
 impl MethodMetrics<'_> {
-    /// Returns our mean minus the paper's. `None` if they cannot be compared, or one is missing.
+    /// Returns our mean minus the paper's mean, in percentage points. Returns `None` if they cannot be compared, or one
+    /// of them is missing.
     pub(super) fn difference(&self, metric: Metric) -> Option<f64> {
         self.comparable.then_some(())?;
         Some(self.ours.get(&metric)?.mean - self.papers.get(&metric)?.mean)
     }
 
-    /// Returns the number of runs that have all metrics.
+    /// Returns the number of runs in the metric with the fewest; 0 if a metric is missing.
     pub(super) fn runs(&self) -> usize {
         least(|metric| self.ours.get(&metric).map(|summary| summary.runs))
     }
 
-    /// Returns the number of runs that have all interquartile means.
+    /// Returns the number of runs in the interquartile mean with the fewest; 0 if one is missing.
     pub(super) fn iqm_runs(&self) -> usize {
         least(|metric| self.iqms.get(&metric).map(|iqm| iqm.runs))
     }
 }
 
-/// Returns the metrics of each selection.
+/// Returns the metrics of each method in each environment.
 pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics<'a>> {
     let of_selection = |selection: &MethodResults<'a>| MethodMetrics {
         environment: selection.environment,
@@ -83,7 +87,8 @@ pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics
     selections.iter().filter(|row| has_scenarios(row)).map(of_selection).collect()
 }
 
-/// Returns the metrics of each method, averaged over the plan's environments.
+/// Returns the metrics of each method, averaged over the environments in `scope.averaged`. Metrics of a method that
+/// lacks one of these environments are left out.
 pub(super) fn averages<'a>(
     scope: &ReportIndex<'_>,
     selections: &[MethodResults<'a>],
@@ -118,12 +123,12 @@ pub(super) fn averages<'a>(
             method,
         }
     };
-    // An agent that was tested in some environments has no average over all.
+    // Agents that were trained elsewhere and lack some environment have no average.
     let methods = scope.methods.iter().filter(|method| !method.external || is_everywhere(method));
     methods.cloned().map(of_method).collect()
 }
 
-/// The test episodes of all runs and tied configurations together.
+/// Counts successes and episodes of a test over all runs and tied configurations.
 pub(super) fn counted(selection: &MethodResults<'_>, trained_on: TrainedOn<'_>, tested_on: &str) -> Counted {
     let trained = selection.runs.values().flat_map(|run| run.tied_on(trained_on));
     let tests = trained.filter_map(|selected| selected.test(tested_on));
@@ -143,14 +148,16 @@ fn known<T>(of: impl Fn(Metric) -> Option<T>) -> BTreeMap<Metric, T> {
     Metric::ALL.into_iter().filter_map(|metric| Some((metric, of(metric)?))).collect()
 }
 
-/// The mean over environments and the runs that all of them have, with its t interval within 0 … 100 %.
+/// Returns the mean of a metric over environments and over the runs that all of them have, %. Clamps its t interval to
+/// 0 … 100 %.
 fn mean_with_interval(selections: &[&MethodResults<'_>], metric: Metric) -> Option<Bootstrapped> {
     let mean = mean_with_t_interval(&scores(selections, metric))?;
     let interval_95 = mean.interval_95.map(|interval| interval.map(|end| end.clamp(0.0, MAX_SUCCESS)));
     Some(Bootstrapped { interval_95, ..mean })
 }
 
-/// Returns the scenarios without success in a run where another of the three has some.
+/// Returns the scenarios of Extrapolation that have no success in some run, although another of its three scenarios has
+/// successes in this run.
 fn zeros(selections: &[&MethodResults<'_>]) -> BTreeSet<Scenario> {
     let of_run = |run: &SelectedRun<'_>| {
         let zero = |scenario: &Scenario| Some((*scenario, run.rate(*scenario)? == 0.0));

@@ -1,4 +1,4 @@
-//! Pictures of a report's numbers, for its page and as separate files.
+//! The pictures of a report, for its page and as separate files.
 
 use std::path::Path;
 
@@ -10,31 +10,31 @@ use plotters::prelude::{DrawingArea, DrawingBackend};
 
 use crate::plot::{HeatmapPanels, IntervalPlot, Panels, Plot, PlotError, save};
 
-/// A picture.
+/// A picture of a report with its texts and its data.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Picture {
     /// The environment; empty for a picture of all environments.
     pub environment: String,
-    /// The names of the files, without extension.
+    /// The name of the picture's files, without extension.
     pub file: String,
-    /// Alternative text.
+    /// The alternative text, for readers who cannot see the picture.
     pub name: String,
     /// The caption.
     pub caption: String,
-    /// The drawing.
+    /// The drawing itself.
     pub drawing: PictureDrawing,
-    /// The drawn numbers.
+    /// The drawn numbers, as a table.
     pub data: Table,
 }
 
-/// A drawing of a report's numbers.
+/// The drawing of a picture, by kind.
 #[derive(Clone, Debug, PartialEq)]
 pub enum PictureDrawing {
-    /// Lines.
+    /// Line charts.
     Panels(Panels),
-    /// Numbers with intervals.
+    /// Numbers with their intervals.
     Intervals(IntervalPlot),
-    /// Surfaces over two parameters.
+    /// Heatmaps over two parameters.
     Heatmaps(HeatmapPanels),
 }
 
@@ -67,14 +67,14 @@ impl Picture {
     /// Writes the picture into the folder `out` as SVG, PNG and CSV.
     ///
     /// # Errors
-    /// [`PlotError`].
+    /// [`PlotError`] if the picture cannot be drawn or a file cannot be written.
     pub fn save(&self, out: &Path) -> Result<(), PlotError> {
         save(&self.drawing, &out.join(&self.file))?;
         Ok(write_atomically(&out.join(format!("{}.csv", self.file)), &self.data.to_csv())?)
     }
 }
 
-/// The method's name in small letters, digits and hyphens.
+/// Returns the method's name as a part of a file name: in lower-case letters, digits and hyphens.
 pub(super) fn file_name(method: &Method) -> String {
     let name = method.to_string().to_lowercase();
     let words = name.split(|letter: char| !letter.is_ascii_alphanumeric()).filter(|word| !word.is_empty());

@@ -1,4 +1,4 @@
-//! Performance profiles over all environments.
+//! Performance profiles: the share of runs whose score is above a threshold, for each threshold.
 
 use perturb_experiment::{MethodResults, scores};
 use perturb_records::Metric;
@@ -13,20 +13,20 @@ use super::numbers::MethodMetrics;
 use super::pictures::{Picture, PictureDrawing};
 use crate::plot::panels::{PanelLine, PanelPoint, Panels, PlotPanel, RATES, index_of};
 
-/// Resamples of the bootstrap.
+/// Number of bootstrap resamples for the intervals of a profile.
 const RESAMPLES: usize = 10_000;
-/// Thresholds are 0, 1 … 100 %.
+/// The highest threshold, %. Thresholds are 0, 1 … 100 %.
 const THRESHOLDS: u32 = 100;
 
-/// A method's performance profile by a metric.
+/// The performance profile of a method by one metric, over all averaged environments.
 pub(super) struct Profile {
     method: Method,
     metric: Metric,
-    /// The share of runs, 0 … 1, above each threshold.
+    /// The share of runs (0 … 1) whose score is above each threshold.
     shares: Vec<Bootstrapped>,
 }
 
-/// Returns the profiles of the methods in `averages`, which have runs in all averaged environments.
+/// Returns the profiles of the methods in `averages` by every metric for which a method has an interquartile mean.
 pub(super) fn profiles(
     scope: &ReportIndex<'_>,
     selections: &[MethodResults<'_>],
@@ -64,7 +64,7 @@ impl Report<'_> {
             .build()
     }
 
-    /// Returns the picture of the profiles; `None` if there are none.
+    /// Returns the picture of all profiles; `None` if there are none.
     pub(super) fn profiles_picture(&self) -> Option<Picture> {
         self.profiles.first()?;
         let methods = &self.scope.methods;

@@ -1,4 +1,4 @@
-//! The scope of a report and how its results were made: the sentences of its last section.
+//! The sentences of a report's last section: the scope of the results, and how they were made.
 
 use std::collections::BTreeSet;
 
@@ -12,13 +12,14 @@ use perturb_text::count;
 use super::external;
 use super::finding::listed;
 
-/// The paper's budgets.
+/// The paper's number of training episodes.
 const PAPER_EPISODES: u64 = 15_000;
+/// The paper's number of episodes of each test.
 const PAPER_TEST_EPISODES: u64 = 1000;
-/// Maximum number of failures that the report explains.
+/// Maximum number of failures whose reasons the report shows.
 const MAX_REASONS: usize = 3;
 
-/// Returns the sentences, with `names` between backticks.
+/// Returns the sentences. Code words are between backticks.
 pub(super) fn sentences(
     results: &Results<'_>,
     selections: &[MethodResults<'_>],
@@ -77,7 +78,7 @@ pub(super) fn sentences(
     lines
 }
 
-/// Describes the rule and the seeds that select configurations.
+/// Returns a sentence on the selection rule and the seeds.
 fn rule(plan: &Plan) -> String {
     let tuning = seeds(plan.cells.iter().filter(|cell| cell.tuned_as.is_none()));
     match plan.selection {
@@ -105,7 +106,7 @@ fn seeds<'a>(cells: impl Iterator<Item = &'a Cell>) -> String {
     }
 }
 
-/// Returns the number that all cells have, or the least and the greatest: "5 to 9".
+/// Returns the number that all cells have in common, or the range of the numbers, e.g. "5 to 9".
 fn range(cells: &[Cell], of: fn(&Cell) -> u64) -> String {
     let numbers: BTreeSet<u64> = cells.iter().map(of).collect();
     match (numbers.first(), numbers.last()) {
@@ -114,7 +115,7 @@ fn range(cells: &[Cell], of: fn(&Cell) -> u64) -> String {
     }
 }
 
-/// Returns notes about the selected configurations.
+/// Returns sentences about selections that are incomplete: waiting, without a result, or with failed tuning cells.
 fn selected(tuned: &[Tuned<'_>]) -> Vec<String> {
     let all = tuned.len();
     let name = |tuned: &Tuned<'_>| format!("{} {} on {}", tuned.environment, tuned.method, tuned.trained_on);
@@ -135,7 +136,8 @@ fn selected(tuned: &[Tuned<'_>]) -> Vec<String> {
     told.map(|(what, names)| format!("{} of {all} selections {what}: {}.", names.len(), names.join(", "))).collect()
 }
 
-/// Describes the check of requested and applied parameters in tests with recorded episodes.
+/// Returns a sentence on the comparison of requested and applied parameters in recorded test episodes. Returns `None`
+/// if no episodes were compared.
 fn agreement(results: &Results<'_>, selections: &[MethodResults<'_>], checks: &[ParameterCheck]) -> Option<String> {
     let of_cells: u64 = results.done().flat_map(|result| result.results.values()).map(|test| test.episodes).sum();
     let others: Vec<_> = elsewhere(selections).into_iter().map(|(_, policy, _)| &policy.records).collect();
@@ -154,7 +156,7 @@ fn agreement(results: &Results<'_>, selections: &[MethodResults<'_>], checks: &[
     })
 }
 
-/// Describes what all trainings and tests have in common.
+/// Returns a sentence on budgets, training distributions, presets, test sets and success rules.
 fn settings(plan: &Plan) -> String {
     let all = || plan.cells.iter().chain(&plan.candidates);
     let budget = |of: fn(&Cell) -> u64, papers: u64| match range(&plan.cells, of) {

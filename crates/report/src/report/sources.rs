@@ -1,4 +1,4 @@
-//! The inputs of a report: an experiment's folder or a study of a results table, assessments of agents that were
+//! The inputs of a report: an experiment (a folder or a study in a results table), assessments of agents that were
 //! trained elsewhere, or both.
 
 use std::path::{Path, PathBuf};
@@ -17,34 +17,34 @@ use super::comparison::comparisons_of;
 use super::{EnvironmentComparison, HeatmapPictures, Report, heatmap_pictures};
 use crate::plot::PlotError;
 
-/// The name of a folder's study in its table.
+/// The name of the study when a folder is exported to a table.
 const EXPORTED: &str = "experiment";
 
-/// The inputs of a report.
+/// The inputs of a report, from which [`ReportInputs::read`] makes it.
 #[derive(Clone, Debug, Default)]
 pub struct ReportInputs {
-    /// An experiment; `None` for a study, or for assessments alone.
+    /// The folder of the experiment; `None` if the report is of a study or of assessments alone.
     pub folder: Option<Folder>,
-    /// A study of a results table.
+    /// The study of a results table; `None` if the report is of a folder or of assessments alone.
     pub study: Option<StudySource>,
-    /// The selection rule to use instead of the plan's.
+    /// The selection rule to use in place of the plan's; `None` for the plan's own rule.
     pub rule: Option<Selection>,
-    /// The assessments of agents that were trained elsewhere, in the order of their rows.
+    /// Assessments of agents that were trained elsewhere, in the order in which the report shows them.
     pub assessed: Vec<ExternalEvaluation>,
 }
 
-/// A study of a results table.
+/// A study in a results table: an experiment whose results the table contains.
 #[derive(Clone, Debug)]
 pub struct StudySource {
     table: ResultsTable,
     name: String,
-    /// The path that was given.
+    /// The path as the user gave it, `FILE.parquet` or `FILE.parquet/STUDY`.
     path: PathBuf,
-    /// The file of the study's recorded episodes, which need not exist.
+    /// The path of the study's recorded episodes. The file may be missing.
     episodes: PathBuf,
 }
 
-/// Why there is no report.
+/// The reason why a report cannot be made.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
@@ -65,41 +65,41 @@ pub enum ReportError {
     Records(#[from] RecordsError),
     #[error(transparent)]
     Table(#[from] TableError),
-    /// A table has no study of this name, or has several studies and the path names none.
+    /// The table has no study with this name, or it has several studies and the path names none of them.
     #[error(
         "{} has no study `{study}`: give one of them as {}/STUDY: {}",
         table.display(), table.display(), known.join(", ")
     )]
     NoStudy { table: PathBuf, study: String, known: Vec<String> },
-    /// A folder has neither an experiment nor an assessment.
+    /// The folder contains neither an experiment nor an assessment.
     #[error(
         "{} holds neither an experiment (plan.toml) nor an assessment (assessment.json): give the --out of `perturb run`, \
          the folder of Assessment.save, or the study of a results table, FILE.parquet/STUDY",
         path.display()
     )]
     Neither { path: PathBuf },
-    /// There are two experiments.
+    /// The inputs contain two experiments.
     #[error("{} and {} are both experiments: a report is of one, and of any number of assessments", first.display(), second.display())]
     Experiments { first: PathBuf, second: PathBuf },
 }
 
 /// A report with its training curves, comparisons and heatmaps.
 pub struct ReportBundle<'a> {
-    /// The numbers.
+    /// The report with its numbers.
     pub report: Report<'a>,
-    /// The training curves.
+    /// The training curves of each environment.
     pub curves: &'a [EnvironmentCurves],
-    /// Comparisons of agents that were trained elsewhere, for environments with several of them.
+    /// Comparisons of agents that were trained elsewhere, for each environment with several of them.
     pub comparisons: Vec<EnvironmentComparison>,
-    /// The heatmaps.
+    /// The pictures of heatmaps.
     pub heatmaps: &'a HeatmapPictures,
 }
 
 impl ReportInputs {
-    /// Adds what is in the folder `path`.
+    /// Adds the input at `path`: the folder of an experiment or of an assessment, or a study in a results table.
     ///
     /// # Errors
-    /// [`ReportError`] if there is nothing, or a second experiment.
+    /// [`ReportError`] if `path` is none of these, cannot be read, or is a second experiment.
     pub fn add(&mut self, path: &Path) -> Result<(), ReportError> {
         let folder = Folder::new(path);
         if ExternalEvaluation::is_in(path) {
@@ -120,10 +120,10 @@ impl ReportInputs {
         first.map_or(Ok(()), |first| Err(ReportError::Experiments { first, second: path.to_owned() }))
     }
 
-    /// The rule by which configurations are selected, if it is another one than the plan's.
+    /// Returns the requested selection rule if it differs from the plan's rule, otherwise `None`.
     ///
     /// # Errors
-    /// [`ReportError`].
+    /// [`ReportError`] if the plan cannot be read.
     pub fn another_rule(&self) -> Result<Option<Selection>, ReportError> {
         let Some(rule) = self.rule else { return Ok(None) };
         let plan = match (&self.folder, &self.study) {
@@ -134,10 +134,11 @@ impl ReportInputs {
         Ok((rule != plan.selection).then_some(rule))
     }
 
-    /// Reads everything, and gives the report to `make`.
+    /// Reads all inputs, computes the report, and passes it to `make`. Returns the result of `make`. The report borrows
+    /// from the inputs, so it exists only during this call.
     ///
     /// # Errors
-    /// [`ReportError`], and those of `make`.
+    /// [`ReportError`] if the inputs cannot be read, and the errors of `make`.
     pub fn read<T, E: From<ReportError>>(self, make: impl FnOnce(ReportBundle<'_>) -> Result<T, E>) -> Result<T, E> {
         let Self { folder, study, rule, assessed } = self;
         let mut checks = Vec::new();
@@ -174,7 +175,8 @@ impl ReportInputs {
 }
 
 impl StudySource {
-    /// Exports the results in `folder` to a table. Adds the comparisons of requested with applied parameters to `checks`.
+    /// Exports the results in `folder` to a table in memory. Adds the comparisons of requested and applied parameters
+    /// in recorded episodes to `checks`.
     fn exported(folder: &Folder, checks: &mut Vec<ParameterCheck>) -> Result<Self, ReportError> {
         let plan = Plan::load(&folder.require_plan()?)?;
         let rows = export(&plan, folder, EXPORTED, |_, records| checks.push(records.agreement()))?;
@@ -184,7 +186,9 @@ impl StudySource {
         Ok(Self { table, name: EXPORTED.into(), episodes: PathBuf::new(), path })
     }
 
-    /// Reads the recorded episodes of selected cells, where they are there. Those of `folder` were compared before.
+    /// Reads the recorded episodes of selected cells, if they exist, into `recorded`. For a study without a folder,
+    /// also adds the comparisons of parameters in all its episodes to `checks`; for a folder, the export already did
+    /// so.
     fn add_episodes(
         &self,
         folder: Option<&Folder>,
@@ -213,8 +217,8 @@ impl StudySource {
         Ok(())
     }
 
-    /// Finds the study that `path` names: FILE.parquet/STUDY, or FILE.parquet with a single study. Returns `None` if no
-    /// part of `path` is a Parquet file.
+    /// Reads the study that `path` names: `FILE.parquet/STUDY`, or `FILE.parquet` if it contains a single study.
+    /// Returns `None` if `path` does not lead to a Parquet file.
     fn find(path: &Path) -> Result<Option<Self>, ReportError> {
         let is_table = |path: &&Path| path.extension().is_some_and(|ending| ending == "parquet") && path.is_file();
         let Some(file) = path.ancestors().find(is_table) else { return Ok(None) };
@@ -232,13 +236,13 @@ impl StudySource {
 
     fn plan(&self) -> Result<Plan, PlanError> {
         self.table.studies.get(&self.name).map_or_else(
-            || Ok(Plan::without_cells()), // the study was found in the table
+            || Ok(Plan::without_cells()), // unreachable: `find` has checked that the table has the study
             |plan| Plan::of_study(&self.name, plan),
         )
     }
 }
 
-/// Returns the plan by the wanted rule, with the cells that are selected.
+/// Returns the plan with the selection rule `rule`, or else its own, and with the cells that the selection adds.
 fn selected_plan(plan: Plan, states: Option<&dyn CellStates>, rule: Option<Selection>) -> Result<Plan, ReportError> {
     let Some(states) = states else { return Ok(plan) };
     let rule = rule.unwrap_or(plan.selection);

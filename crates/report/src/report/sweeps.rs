@@ -1,4 +1,4 @@
-//! Success over a parameter, of all runs together.
+//! Success rate over the value of a parameter, from the recorded episodes of all runs together.
 
 use perturb_experiment::{MethodResults, Recorded, distinct};
 use perturb_protocol::Version;
@@ -13,7 +13,7 @@ use super::index::{ReportIndex, trained_on};
 use super::pictures::{Picture, PictureDrawing};
 use crate::plot::panels::{PanelLine, PanelPoint, Panels, PlotPanel, RATES, index_of};
 
-/// Successes of all runs together in a part of a parameter's range.
+/// The successes of a method in one bin of a parameter's range, counted over all runs.
 pub(super) struct SweepPoint<'a> {
     environment: &'a str,
     method: &'a Method,
@@ -25,7 +25,7 @@ pub(super) struct SweepPoint<'a> {
     counted: Counted,
 }
 
-/// The selected policies of a method that have recorded episodes.
+/// The selected policies of a method and a training distribution that have recorded episodes, one for each run.
 struct PolicyGroup<'a> {
     method: &'a Method,
     trained_on: TrainedOn<'a>,
@@ -33,13 +33,14 @@ struct PolicyGroup<'a> {
 }
 
 impl<'a> PolicyGroup<'a> {
-    /// Returns the tests of each run.
+    /// Returns the outcomes of the test `tested_on`, for each run that has it.
     fn tests(&self, tested_on: &'a str) -> impl Iterator<Item = &'a Outcomes> {
         self.policies.iter().filter_map(move |policy| policy.test(tested_on))
     }
 }
 
-/// Success over each parameter that varies in a test.
+/// Counts successes over each parameter that varies in a test. All methods of an environment have the same bins. Bins
+/// without episodes are left out.
 pub(super) fn over_parameters<'a>(
     scope: &ReportIndex<'a>,
     selections: &'a [MethodResults<'a>],
@@ -107,7 +108,8 @@ impl Report<'_> {
             .build()
     }
 
-    /// Returns a picture for each environment and training distribution, with a panel for each parameter.
+    /// Returns a picture for each environment and training version, with a panel for each parameter. Training on
+    /// parameter sets of the plan is left out.
     pub(super) fn parameter_pictures(&self) -> Vec<Picture> {
         let is_of_version = |row: &&SweepPoint<'_>| Version::ALL.iter().any(|it| it.to_string() == row.tested_on);
         let all: Vec<_> = self.over_parameters.iter().filter(is_of_version).collect();
@@ -151,10 +153,10 @@ impl Report<'_> {
         }
     }
 
-    /// Returns the panel of a parameter, whose rows are `rows`.
+    /// Returns the panel of a parameter. `rows` are all points of this parameter.
     fn parameter_panel(&self, rows: &[&SweepPoint<'_>]) -> PlotPanel {
         let RecordedParameter { name, unit, .. } = rows[0].parameter;
-        // A line ends where a test ends, and where it draws nothing.
+        // A line joins neighbouring bins of the same method and test. It is interrupted at bins without episodes.
         let joined = |a: &&SweepPoint<'_>, b: &&SweepPoint<'_>| {
             (a.method, a.tested_on, a.bin.high) == (b.method, b.tested_on, b.bin.low)
         };

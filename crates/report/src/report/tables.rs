@@ -1,4 +1,4 @@
-//! The numbers of a report as tables for reading.
+//! The numbers of a report as tables for readers.
 
 use perturb_experiment::MethodResults;
 use perturb_records::statistics::Summary;
@@ -10,14 +10,15 @@ use super::index::{trained_on, version};
 use super::numbers::{MethodMetrics, counted};
 use super::{MISSING, Report};
 
-/// The text for a number that the paper does not have.
+/// The text for a number that does not exist, for example one that the paper does not report.
 const NOT_GIVEN: &str = "–";
 
-/// A row of results, and the distribution that its policies were trained on.
+/// A row of a scenario table: the results of a method in an environment, and one of its training distributions.
 pub(super) type ScenarioRow<'r, 'a> = (&'r MethodResults<'a>, TrainedOn<'a>);
 
 impl Report<'_> {
-    /// Returns the tables of the three metrics: the average if there are several environments, then each environment.
+    /// Returns the tables of Default, Interpolation and Extrapolation: a table of the average if there are several
+    /// environments, then a table for each environment.
     pub(super) fn metrics_tables(&self) -> Vec<Table> {
         let environments = &self.scope.averaged;
         let averages = (environments.len() > 1)
@@ -49,7 +50,7 @@ impl Report<'_> {
             .build()
     }
 
-    /// The interquartile mean of each metric, with both of its intervals, and the optimality gap.
+    /// Returns the table of interquartile means and optimality gaps with their intervals; `None` if it has no rows.
     pub(super) fn iqm_table(&self) -> Option<Table> {
         let title = "Interquartile means and optimality gaps: over all environments and the runs that all of them have, with \
                      95 % stratified bootstrap intervals; where something was selected, also the interval with every \
@@ -71,7 +72,8 @@ impl Report<'_> {
         (!table.rows.is_empty()).then_some(table)
     }
 
-    /// Success in each test of each environment: the nine scenarios, and those of other sets.
+    /// Returns a table for each environment with the success rates in all tests: the nine scenarios, and tests on other
+    /// sets.
     pub(super) fn scenario_tables(&self) -> Vec<Table> {
         let table = |rows: &[ScenarioRow<'_, '_>]| {
             let title =
@@ -95,13 +97,13 @@ impl Report<'_> {
         self.scenario_rows().chunk_by(|a, b| a.0.environment == b.0.environment).map(table).collect()
     }
 
-    /// Returns each row of results once for each distribution that its policies were trained on.
+    /// Returns a row for each environment, method and training distribution.
     pub(super) fn scenario_rows(&self) -> Vec<ScenarioRow<'_, '_>> {
         let of = |row| trained_on(row).into_iter().map(move |train| (row, train));
         self.selections.iter().flat_map(of).collect()
     }
 
-    /// Returns the tests to list for a row. Agents that were trained elsewhere have only the tests that were run.
+    /// Returns the tests to list for a row. For agents that were trained elsewhere, lists only tests that were run.
     pub(super) fn tests_of<'r>(
         &'r self,
         (row, train): ScenarioRow<'r, 'r>,

@@ -1,13 +1,13 @@
-//! The head of a report: its title, and the plan's description of itself.
+//! The title of a report, and the plan's own description of the experiment.
 
 use super::Report;
 use super::finding::listed;
 
-/// Maximum number of methods in a title.
+/// Maximum number of methods that a title names. For more methods it has only their number.
 const MAX_NAMED: usize = 3;
 
 impl Report<'_> {
-    /// Returns the plan's title, or one with the methods and environments.
+    /// Returns the plan's title or, if it has none, a title that names methods and environments.
     pub(super) fn title(&self) -> String {
         if !self.plan.title.is_empty() {
             return self.plan.title.clone();
@@ -20,13 +20,14 @@ impl Report<'_> {
         format!("Generalisation of {methods} on {}", listed(&self.scope.environments))
     }
 
-    /// Returns the plan's description of itself, as paragraphs.
+    /// Returns the paragraphs of the comment at the start of the experiment file.
     pub(super) fn abstract_paragraphs(&self) -> Vec<String> {
         opening_comment(&self.plan.text)
     }
 }
 
-/// The paragraphs of the comment that a file begins with. One whose lines are all indented has commands.
+/// Returns the paragraphs of the comment at the start of a file. Leaves out paragraphs whose lines are all indented,
+/// because they contain commands.
 fn opening_comment(text: &str) -> Vec<String> {
     let comment = text.lines().skip_while(|line| line.trim().is_empty());
     let lines: Vec<&str> = comment.map_while(|line| line.trim().strip_prefix('#')).collect();

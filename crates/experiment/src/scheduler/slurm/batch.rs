@@ -1,31 +1,33 @@
-//! Division of cells into jobs. A job takes minutes, since every job costs seconds of Slurm and of its node.
+//! Divides cells into jobs of some minutes each. Shorter jobs would waste time, because every job costs Slurm and its
+//! node some seconds.
 
 use super::MAX_CELLS_PER_JOB;
 
-/// Intended duration of a job. Estimates assume that episodes last until the step limit; most end earlier.
+/// Intended duration of a job in seconds. Most jobs end earlier, because estimates assume that every episode lasts
+/// until the step limit.
 pub(super) const JOB_SECONDS: f64 = 300.0;
 
-/// The size of jobs.
+/// Maximum size of a job.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum JobSize {
-    /// A number of cells.
+    /// Maximum number of cells.
     Cells(usize),
-    /// A number of seconds.
+    /// Maximum sum of the cells' estimated durations, in seconds.
     Seconds(f64),
 }
 
-/// A cell that is to be submitted.
+/// A cell to submit, with its estimated duration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct CellLoad {
     /// The index in the plan.
     pub(super) cell: usize,
-    /// The estimated duration.
+    /// The estimated duration in seconds.
     pub(super) seconds: f64,
 }
 
-/// Cuts `groups` into at most `most_jobs` jobs, in their order. The cells of a job are of one group. If the number of
-/// jobs is too small for jobs of this duration, jobs become longer. Cells that still have no job wait for a later
-/// submission.
+/// Divides the cells of `groups` into at most `max_jobs` jobs, in order. All cells of a job are from one group. If
+/// there would be too many jobs of a size in seconds, jobs become longer. If there are still too many, the cells of the
+/// last jobs are left out and wait for a later submission. Returns the indices of each job's cells.
 pub(super) fn batches(groups: &[Vec<CellLoad>], mut size: JobSize, max_jobs: usize) -> Vec<Vec<usize>> {
     let all: f64 = groups.iter().flatten().map(|load| load.seconds).sum();
     loop {
@@ -66,7 +68,7 @@ fn cut(group: &[CellLoad], size: JobSize) -> Vec<Vec<usize>> {
 mod tests {
     use super::*;
 
-    /// Returns one group of cells with these estimated durations, s.
+    /// Returns one group of cells with these estimated durations, in seconds.
     fn loads(seconds: &[f64]) -> Vec<Vec<CellLoad>> {
         vec![seconds.iter().enumerate().map(|(cell, &seconds)| CellLoad { cell, seconds }).collect()]
     }

@@ -1,4 +1,4 @@
-//! Slurm's commands and their answers.
+//! Calls Slurm's commands and parses their output.
 
 use std::ffi::OsStr;
 use std::fs::File;
@@ -15,18 +15,19 @@ use super::job::QueuedJob;
 use super::options::{OptionError, SlurmOptions, text_of};
 use super::submission::Submission;
 
-/// Timeout of Slurm's commands.
+/// Timeout of a Slurm command.
 const LIMIT: Duration = Duration::from_secs(60);
-/// Interval at which a running command is checked.
+/// Interval between checks whether a command has ended.
 const TICK: Duration = Duration::from_millis(20);
-/// The format of squeue's lines.
+/// Output format of squeue: array, index, state, reason, node and name of a job.
 const FIELDS: &str = "%F|%K|%T|%r|%N|%j";
-/// Separates the fields of squeue's lines.
+/// Separator of the fields in a line of squeue.
 const SEPARATOR: char = '|';
-/// Prefix of the lines that squeue prints above the jobs of each cluster if there are several, also with --noheader.
+/// Prefix of heading lines in squeue's output. With several clusters, squeue prints one above each cluster's jobs, even
+/// with --noheader.
 const CLUSTER_HEADING: &str = "CLUSTER:";
 
-/// Slurm on this machine.
+/// The commands of the Slurm installation on this machine.
 #[derive(Clone, Debug)]
 pub struct Slurm {
     directory: Option<PathBuf>,
@@ -40,23 +41,23 @@ impl Default for Slurm {
 }
 
 impl Slurm {
-    /// Uses the commands in `directory` instead of those on the PATH. A command may take `limit` to answer.
+    /// Uses the commands in `directory` instead of the commands on the PATH. `limit` is the timeout of each command.
     pub fn in_directory(directory: PathBuf, limit: Duration) -> Self {
         Self { directory: Some(directory), limit }
     }
 
-    /// Refuses machines without Slurm's commands.
+    /// Checks that Slurm's commands work on this machine.
     ///
     /// # Errors
-    /// [`SlurmError::NotInstalled`], or the commands' own errors.
+    /// [`SlurmError::NotInstalled`], or an error of a command.
     pub fn check(&self, stop: &StopFlag) -> Result<(), SlurmError> {
         ["sbatch", "squeue", "scontrol"].into_iter().try_for_each(|name| self.call(name, ["--version"], stop).map(drop))
     }
 
-    /// Returns the jobs of arrays with these names, including jobs that ended a short time ago.
+    /// Asks Slurm for the jobs of the arrays with these names. Includes jobs that ended a short time ago.
     ///
     /// # Errors
-    /// The error of squeue, or that it did not answer.
+    /// [`SlurmError`] if squeue fails or does not answer in time.
     pub(super) fn queue(&self, names: &[&str], stop: &StopFlag) -> Result<QueueAnswer, SlurmError> {
         if names.is_empty() {
             return Ok(QueueAnswer::default());
@@ -67,10 +68,10 @@ impl Slurm {
         QueueAnswer::parse(&text)
     }
 
-    /// Returns the maximum number of jobs in an array.
+    /// Asks Slurm for the maximum number of jobs in an array.
     ///
     /// # Errors
-    /// The error of scontrol, or that it did not answer.
+    /// [`SlurmError`] if scontrol fails or does not answer in time, or arrays are disabled.
     pub(super) fn max_jobs(&self, stop: &StopFlag) -> Result<usize, SlurmError> {
         let text = self.call("scontrol", ["show", "config"], stop)?;
         match parse_setting(&text, "MaxArraySize").map(str::parse::<usize>) {
@@ -80,11 +81,11 @@ impl Slurm {
         }
     }
 
-    /// Submits an array and returns its number. A signal does not interrupt it, because then nobody would know whether Slurm
-    /// accepted the array.
+    /// Submits an array and returns its number. Signals do not interrupt the command, because it would then be unknown
+    /// whether Slurm accepted the array.
     ///
     /// # Errors
-    /// The error of sbatch, or that it did not answer.
+    /// [`SlurmError`] if sbatch fails or does not answer in time.
     pub(super) fn submit(&self, submission: &Submission, options: &SlurmOptions) -> Result<String, SlurmError> {
         let arguments = sbatch_arguments(submission, options)?;
         let text = self.call("sbatch", &arguments, &StopFlag::default())?;
@@ -96,7 +97,8 @@ impl Slurm {
         number.ok_or_else(|| not_understood("sbatch", "the number of a job", &text))
     }
 
-    /// Runs a command to its end, and returns its standard output.
+    /// Runs a command until it ends, and returns its standard output. Kills it after the timeout, or when `stop` is
+    /// raised.
     fn call<S: AsRef<OsStr>>(
         &self,
         name: &'static str,
@@ -110,7 +112,8 @@ impl Slurm {
         let mut command = Command::new(program);
         command.args(arguments).stdin(Stdio::null());
         command.stdout(output.try_clone().map_err(failed)?).stderr(errors.try_clone().map_err(failed)?);
-        // A user's default filters of squeue would hide jobs. Defaults of sbatch are kept, such as accounts and memory.
+        // A user's default filters for squeue would hide jobs, so they are removed. Defaults for sbatch, such as
+        // account and memory, are kept.
         for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("SQUEUE_")) {
             command.env_remove(key);
         }
@@ -125,7 +128,7 @@ impl Slurm {
             }
             let stopped = stop.signal().is_some();
             if stopped || start.elapsed() >= self.limit {
-                let _ = child.kill(); // an error means that it has ended meanwhile
+                let _ = child.kill(); // an error means that it has already ended
                 let _ = child.wait();
                 return Err(SlurmError::Silent { program: name, limit: start.elapsed().min(self.limit) });
             }
@@ -141,7 +144,7 @@ impl Slurm {
     }
 }
 
-/// Reads a file from its start.
+/// Reads a file from its start as text.
 fn content(file: &mut File) -> std::io::Result<String> {
     let mut bytes = Vec::new();
     file.rewind()?;
@@ -159,7 +162,7 @@ fn sbatch_arguments(submission: &Submission, options: &SlurmOptions) -> Result<V
         "--nodes=1".to_owned(),
         "--ntasks=1".to_owned(),
         format!("--cpus-per-task={}", options.task.cores()),
-        "--requeue".to_owned(), // what a lost node did goes back into the queue, also while nobody watches
+        "--requeue".to_owned(), // Slurm itself queues the jobs of a lost node again, even if no `perturb run` is watching
         format!("--chdir={path}"),
         format!("--output={}/%a.jsonl", path.replace('%', "%%")),
         format!("--error={}/%a.log", path.replace('%', "%%")),
@@ -171,11 +174,11 @@ fn sbatch_arguments(submission: &Submission, options: &SlurmOptions) -> Result<V
     Ok(arguments)
 }
 
-/// The answer of squeue.
+/// The parsed output of squeue.
 #[derive(Debug, Default)]
 pub(super) struct QueueAnswer {
     pub(super) jobs: Vec<QueuedJob>,
-    /// Lines that are no jobs, for example from a site's wrapper or plugin.
+    /// Output lines that are not jobs, for example from a site's wrapper or plugin.
     pub(super) foreign: Vec<String>,
 }
 
@@ -198,7 +201,7 @@ fn parse_job(line: &str) -> Result<QueuedJob, SlurmError> {
     let [array, index, state, reason, node, name] = fields[..] else {
         return Err(not_understood("squeue", FIELDS, line));
     };
-    // CANCELLED may be followed by the user who cancelled the job.
+    // The number of the user who cancelled a job may follow CANCELLED.
     let state = state.split([' ', '+']).next().unwrap_or_default();
     let index = index.parse().map_err(|_| not_understood("squeue", "an index of an array", line))?;
     let [array, state, reason, node, name] = [array, state, reason, node, name].map(str::to_owned);

@@ -8,7 +8,7 @@ use super::super::count;
 use super::options::OptionError;
 use crate::folder::FolderError;
 
-/// Cells cannot be run with Slurm.
+/// The reason why cells cannot be run with Slurm.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
@@ -26,7 +26,7 @@ pub enum SlurmError {
     #[error("{program} did not answer within {} s; is Slurm's controller up? The same command resumes", limit.as_secs())]
     Silent {
         program: &'static str,
-        /// The time limit of the answer.
+        /// The time after which the command was killed.
         limit: Duration,
     },
     /// A command's output does not have the expected format.

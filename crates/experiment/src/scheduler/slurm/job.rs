@@ -1,6 +1,6 @@
 //! A job in Slurm's queue.
 
-/// States of jobs that will not run again. In every other state a job is still in the queue.
+/// States of jobs that have ended and will not run again. A job in any other state is still in the queue.
 const ENDED: [&str; 10] = [
     "BOOT_FAIL",
     "CANCELLED",
@@ -14,7 +14,7 @@ const ENDED: [&str; 10] = [
     "TIMEOUT",
 ];
 
-/// A job of an array, as squeue shows it.
+/// A job of an array, as squeue lists it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct QueuedJob {
     /// The array's number.
@@ -25,14 +25,14 @@ pub struct QueuedJob {
     pub state: String,
     /// Slurm's reason for the state, often "None".
     pub reason: String,
-    /// The node that runs or ran the job; empty while it waits.
+    /// The node that runs or ran the job; empty while the job waits.
     pub node: String,
     /// The array's name.
     pub name: String,
 }
 
 impl QueuedJob {
-    /// Returns a job that was just submitted.
+    /// Returns the queue entry of a job that was just submitted.
     pub(super) fn pending(array: &str, index: usize, name: &str) -> Self {
         let [array, state, name] = [array, "PENDING", name].map(str::to_owned);
         Self { array, index, state, reason: String::new(), node: String::new(), name }

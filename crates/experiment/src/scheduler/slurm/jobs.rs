@@ -1,4 +1,4 @@
-//! Submits cells as job arrays, and follows their jobs.
+//! The backend that submits cells as Slurm job arrays and follows their jobs.
 
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
@@ -21,10 +21,11 @@ use super::submission::{self, Submission};
 use crate::folder::Folder;
 use crate::plan::{Grouping, Plan, distinct};
 
-/// Maximum number of different lines of squeue without a job that are reported.
+/// Maximum number of different non-job lines of squeue that are reported to the user.
 const MAX_FOREIGN_LINES: usize = 10;
 
-/// The jobs of a folder in Slurm's queue. Jobs that are in the queue when this process ends stay there.
+/// A [`Backend`] that runs cells as jobs of Slurm. Jobs stay in Slurm's queue when this process ends. A later process
+/// with the same folder finds them again.
 pub struct Jobs<'a> {
     plan: &'a Plan,
     folder: &'a Folder,
@@ -33,34 +34,36 @@ pub struct Jobs<'a> {
     costs: &'a dyn Fn() -> Result<Vec<f64>, AnyError>,
     known_costs: Option<Vec<f64>>,
     stop: &'a StopFlag,
-    /// Indices in the plan, by the cells' ids.
+    /// Index in the plan by cell id.
     places: HashMap<&'a str, usize>,
     submissions: Vec<Submission>,
-    /// The last job of each cell: the index of its submission, and its index in the array.
+    /// The last job of each cell: index in `submissions`, and index in the job array.
     last: HashMap<usize, (usize, usize)>,
-    /// Slurm's last answer, and the number of answers so far.
+    /// The jobs in Slurm's last answer.
     queue: Vec<QueuedJob>,
+    /// Number of Slurm's answers so far.
     answers: u32,
-    /// Positions in the jobs' event files, by submission and index.
+    /// Read positions in the jobs' event files, by number of the submission and index of the job.
     told: HashMap<(u32, usize), LogCursor>,
-    /// Submissions that this process has seen in the queue.
+    /// Numbers of the submissions that this process has seen in the queue.
     watched: HashSet<u32>,
-    /// Cells that the scheduler handed to this backend and that were not given back.
+    /// Cells that this backend has accepted from the scheduler and not handed back.
     taken: HashSet<usize>,
-    /// Cells in `taken` that were missing in Slurm's last answer.
+    /// Cells in `taken` that had no job in Slurm's last answer.
     suspects: HashSet<usize>,
-    /// Lock on the decision what to submit. It is held from the request for the queue to the submission.
+    /// Lock that lets only one process at a time decide what to submit. It is held from the request for the queue until
+    /// the submission.
     deciding: Option<Lock>,
     ask_at: Option<Instant>,
-    /// Lines of squeue without a job that were reported already.
+    /// Non-job lines of squeue that have already been reported to the user.
     foreign: HashSet<String>,
-    /// The reason why Slurm does not answer or does not accept jobs.
+    /// The last reported reason why Slurm does not answer or does not accept jobs; `None` after an answer.
     trouble: Option<String>,
     /// Events for the next call of `poll`.
     news: Vec<BackendEvent>,
 }
 
-/// Read position in the event file of a job, and the cells that the job has started according to these events.
+/// Read position in the event file of a job (bytes), and the cells that the job has started according to its events.
 #[derive(Default)]
 struct LogCursor {
     offset: u64,
@@ -68,8 +71,8 @@ struct LogCursor {
 }
 
 impl<'a> Jobs<'a> {
-    /// Returns the jobs of `folder`. `costs` estimates the duration of each cell by index, s; it is called at most
-    /// once, before the first submission.
+    /// Returns the backend for `plan` in `folder`. `costs` estimates the duration of each cell, in seconds by index in
+    /// the plan. It is called at most once, before the first submission that needs it.
     pub fn new(
         plan: &'a Plan,
         folder: &'a Folder,
@@ -103,7 +106,7 @@ impl<'a> Jobs<'a> {
         }
     }
 
-    /// Asks Slurm for the jobs of all submissions with unfinished cells of the plan.
+    /// Asks Slurm for the state of all jobs that have unfinished cells of the plan.
     fn ask(&mut self) -> Result<()> {
         let mut submissions = submission::list(self.folder).map_err(SlurmError::from)?;
         let matters = |id: &String| self.places.contains_key(&**id) && !self.folder.cell(id).is_settled(false);
@@ -117,7 +120,7 @@ impl<'a> Jobs<'a> {
                 self.news.push(BackendEvent::Note(format!("squeue printed a line that is no job, ignored: {line}")));
             }
         }
-        // If the folder was deleted and made again, its names also belong to older arrays.
+        // If the folder was deleted and created again, older arrays may have the same names.
         self.queue.retain(|job| submissions.iter().any(|submission| submission.has(job)));
         self.submissions = submissions;
         self.last.clear();
@@ -127,7 +130,7 @@ impl<'a> Jobs<'a> {
         Ok(())
     }
 
-    /// Records the last job of each cell in a submission.
+    /// Records the job of each cell of a submission as its last job.
     fn remember(&mut self, submission: usize) {
         for (index, cells) in self.submissions[submission].jobs.iter().enumerate() {
             let cells = cells.iter().filter_map(|id| self.places.get(&**id));
@@ -135,7 +138,7 @@ impl<'a> Jobs<'a> {
         }
     }
 
-    /// Continues without an answer of Slurm, and reports the error once.
+    /// Continues the run despite an error of Slurm. Reports the error to the user once.
     fn put_up_with(&mut self, error: &RunError) {
         let words = error.to_string();
         if self.trouble.as_ref() != Some(&words) {
@@ -144,7 +147,8 @@ impl<'a> Jobs<'a> {
         }
     }
 
-    /// Records which arrays are in the queue, and the numbers of arrays whose submission was interrupted.
+    /// Reports the arrays that are in the queue. Records the numbers of arrays whose submission was interrupted before
+    /// their number was stored.
     fn adopt(&mut self) -> Result<()> {
         for submission in &mut self.submissions {
             let jobs: Vec<_> = self.queue.iter().filter(|job| job.is_live() && submission.has(job)).collect();
@@ -160,14 +164,14 @@ impl<'a> Jobs<'a> {
         Ok(())
     }
 
-    /// Reads the new events of job `index`.
+    /// Reads the new events of job `index` of a submission.
     fn read(&mut self, submission: usize, index: usize) -> Result<()> {
         let submission = &self.submissions[submission];
         let path = submission.events(index);
         if !path.exists() {
-            return Ok(()); // it has not begun
+            return Ok(()); // the job has not started
         }
-        // The file is opened each time, because a network file system then looks for new content.
+        // Opening the file each time makes a network file system look for new content.
         let (file, _) = open_plain(&path).map_err(io("open", &path))?;
         let told = self.told.entry((submission.number, index)).or_default();
         for line in read_lines(&file, &mut told.offset).map_err(io("read", &path))? {
@@ -175,7 +179,7 @@ impl<'a> Jobs<'a> {
             if line.event.is_a_turn() {
                 told.cells.insert(cell);
             }
-            // A job repeats attempts itself, so an attempt's end is not reported while the job runs.
+            // A job repeats failed attempts itself, so the end of an attempt is not reported while the job runs.
             if !line.event.is_last() {
                 self.news.push(BackendEvent::Event(cell, line.event));
             }
@@ -183,8 +187,9 @@ impl<'a> Jobs<'a> {
         Ok(())
     }
 
-    /// Reads the events of running jobs, and gives back the cells whose jobs have left the queue. A job must be missing in
-    /// two answers in succession, because a result may become visible here a little after the end of its job.
+    /// Reads the events of running jobs, and hands back the unfinished cells whose jobs have left the queue. A job must
+    /// be missing in two successive answers of Slurm, because on a network file system its result may become visible
+    /// only some time after its end.
     fn give_back(&mut self) -> Result<()> {
         let jobs: HashSet<(usize, usize)> = self.taken.iter().filter_map(|cell| self.last.get(cell).copied()).collect();
         for (submission, index) in jobs {
@@ -205,7 +210,7 @@ impl<'a> Jobs<'a> {
             self.taken.remove(&cell);
             let job = self.last.get(&cell).map(|&(submission, index)| (self.submissions[submission].number, index));
             let told = job.and_then(|job| self.told.get(&job)).map(|told| &told.cells);
-            // The end of a job does not count against a cell that the job had not started.
+            // The job had not started this cell, so its end does not count as a failed attempt.
             let had_its_turn = told.is_none_or(|cells| cells.is_empty() || cells.contains(&cell));
             self.news.push(match had_its_turn {
                 true => BackendEvent::Event(cell, CellEvent::Killed { reason: self.how_it_ended(cell) }),
@@ -216,7 +221,8 @@ impl<'a> Jobs<'a> {
         Ok(())
     }
 
-    /// Ends the run if all jobs of the missing cells were cancelled, because that was intended.
+    /// Returns [`SlurmError::Cancelled`] if all jobs of the missing cells were cancelled, because then a user wants to
+    /// stop the run.
     fn refuse_cancelled(&self, missing: &HashSet<usize>) -> Result<()> {
         let submission = |cell| self.last.get(cell).map(|&(submission, _)| &self.submissions[submission]);
         let cancelled = |cell| {
@@ -243,7 +249,7 @@ impl<'a> Jobs<'a> {
         self.news.push(BackendEvent::Note(format!("{cells} left Slurm's queue without a result ({})", how.join(", "))));
     }
 
-    /// Returns the name of the last job of a cell, and its final state.
+    /// Returns the name of a cell's last job, e.g. "17_3", and its state in Slurm's last answer.
     fn end_of(&self, cell: usize) -> (String, &str) {
         let Some(&(submission, index)) = self.last.get(&cell) else { return ("a job".into(), "gone") };
         let submission = &self.submissions[submission];
@@ -252,7 +258,7 @@ impl<'a> Jobs<'a> {
         (format!("{array}_{index}"), job.map_or("gone", |job| &job.state))
     }
 
-    /// Describes the end of a cell's last job, with the job's last output.
+    /// Describes how a cell's last job ended, with the last line of its log.
     fn how_it_ended(&self, cell: usize) -> String {
         let (job, state) = self.end_of(cell);
         let log = self.last.get(&cell).map(|&(submission, index)| self.submissions[submission].log(index));
@@ -264,7 +270,7 @@ impl<'a> Jobs<'a> {
         }
     }
 
-    /// Submits the cells of `groups` that Slurm accepts, and returns them.
+    /// Submits as many cells of `groups` as Slurm allows in one array, and returns their indices.
     fn submit(&mut self, groups: &[Vec<PendingCell>]) -> Result<Vec<usize>> {
         let max_jobs = match self.slurm.max_jobs(self.stop) {
             Ok(number) => number,
@@ -278,7 +284,7 @@ impl<'a> Jobs<'a> {
         let array = match self.slurm.submit(&submission, self.options) {
             Ok(array) => array,
             Err(error @ (SlurmError::Refused { .. } | SlurmError::NotInstalled { .. } | SlurmError::Option(_))) => {
-                submission.forget()?; // nothing was accepted
+                submission.forget()?; // Slurm accepted nothing
                 return self.put_off(error.into());
             }
             Err(error) => return Err(error.into()),
@@ -298,8 +304,8 @@ impl<'a> Jobs<'a> {
         Ok(cells)
     }
 
-    /// Handles a refused submission. While jobs are in the queue, the cause may be a limit on their number, so the cells
-    /// wait for a later attempt. Otherwise the error ends the run.
+    /// Handles a refused submission. If other jobs are in the queue, a limit on their number may be the cause, so the
+    /// cells wait for a later submission. Otherwise the error ends the run.
     fn put_off(&mut self, error: RunError) -> Result<Vec<usize>> {
         if self.live().next().is_none() {
             return Err(error);
@@ -316,7 +322,8 @@ impl<'a> Jobs<'a> {
         }
     }
 
-    /// Estimates the duration of each cell from finished cells of its kind or from a measurement.
+    /// Estimates the duration of each cell, from finished cells with the same environment and method or from a
+    /// measurement.
     fn loads(&mut self, groups: &[Vec<PendingCell>]) -> Result<Vec<Vec<CellLoad>>> {
         let unknown = groups.iter().flatten().any(|offer| offer.seconds.is_none());
         if self.options.cells_per_job.is_none() && unknown && self.known_costs.is_none() {
@@ -334,7 +341,7 @@ impl<'a> Jobs<'a> {
         self.queue.iter().filter(|job| job.is_live())
     }
 
-    /// Returns the cells of the jobs in the queue.
+    /// Returns the indices of all cells whose jobs are in the queue.
     fn queued(&self) -> HashSet<usize> {
         let cells =
             |job: &QueuedJob| self.submissions.iter().find(|submission| submission.has(job))?.jobs.get(job.index);
@@ -347,7 +354,7 @@ impl<'a> Jobs<'a> {
 }
 
 impl Backend for Jobs<'_> {
-    /// Returns one group for each kind of cells. A job divides its cells into groups itself.
+    /// Returns one group for each kind of cells. Each job divides its own cells into smaller groups.
     fn grouping(&self) -> Grouping {
         Grouping::BY_KIND
     }
@@ -356,7 +363,7 @@ impl Backend for Jobs<'_> {
         false
     }
 
-    /// Returns false, because a run finds the results in the folder.
+    /// Returns false: the scheduler finds results in the folder.
     fn tells_ends(&self) -> bool {
         false
     }
@@ -365,7 +372,7 @@ impl Backend for Jobs<'_> {
         self.deciding = None;
         if self.ask_at.is_none_or(|time| now >= time) {
             self.ask_at = Some(now + self.options.queue_interval);
-            // Only one process at a time decides what to submit.
+            // Only the process that holds this lock decides what to submit.
             let directory = submission::directory(self.folder);
             create_folder(&directory)?;
             self.deciding = Lock::try_take(&directory)?;
@@ -396,14 +403,16 @@ impl Backend for Jobs<'_> {
             for offer in group {
                 let place = self.folder.cell(self.id(offer.cell));
                 match offer.retry {
-                    // The job that recorded this failure has finished with the cell, although it may still run others.
+                    // The job that recorded this failure no longer works on the cell, although it may still run other
+                    // cells.
                     Some(failure) if place.failure_id() == Some(failure) => {
                         if place.clear_failure_if(failure)? {
                             left.push(*offer);
                         }
                     }
                     _ if queued.contains(&offer.cell) => taken.push(offer.cell),
-                    // An earlier process submitted this cell, so it must be missing in two answers.
+                    // An earlier process submitted this cell. It is submitted again only if it is missing in two
+                    // answers.
                     _ if self.answers == 1 && self.last.contains_key(&offer.cell) => {}
                     _ => left.push(*offer),
                 }

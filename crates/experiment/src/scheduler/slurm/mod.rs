@@ -1,17 +1,17 @@
-//! Runs a plan's cells as jobs of Slurm, in a folder that all its nodes can read and write.
+//! Runs a plan's cells as Slurm jobs. All nodes must be able to read and write the experiment's folder.
 //!
-//! Results in the folder alone decide which cells are done. Slurm only tells which of the other cells are still in its
-//! queue. The remaining cells are submitted as an array, whose jobs each run several cells of one kind in groups. So a
-//! watching process has no state that a later one would need. A lost node, a time limit or a cancelled job is noticed by the
-//! next process that watches.
+//! A cell is done when its result is in the folder. The process that watches the run asks Slurm which of the other
+//! cells are still in its queue, and submits the remaining cells as a job array. Each job of the array runs several
+//! cells of one kind in groups. All state is in the folder and in Slurm's queue, so the watching process may end, and a
+//! later one continues. The later process also notices lost nodes, exceeded time limits and cancelled jobs.
 //!
 //! ```text
-//! DIR/slurm/lock               locked while one of several watching processes decides and submits
+//! DIR/slurm/lock               locked by the process that decides what to submit
 //! DIR/slurm/N/plan.toml        the plan of the Nth submission
-//! DIR/slurm/N/cells.txt        line K+1: the cells of job K of its array, separated by commas
-//! DIR/slurm/N/job.sh           what every job of the array runs
-//! DIR/slurm/N/submission.json  the name in Slurm's queue and, once it is accepted, the number
-//! DIR/slurm/N/K.log            what job K said
+//! DIR/slurm/N/cells.txt        line K+1: the cells of job K of the array, separated by commas
+//! DIR/slurm/N/job.sh           the script that every job of the array runs
+//! DIR/slurm/N/submission.json  the array's name in Slurm's queue and, once accepted, its number
+//! DIR/slurm/N/K.log            standard error of job K
 //! ```
 
 mod batch;
@@ -29,7 +29,8 @@ pub use job::QueuedJob;
 pub use jobs::Jobs;
 pub use options::{JobCommand, OptionError, SlurmOptions, TimeLimit};
 
-/// Maximum number of cells of a job. Their ids must fit in one argument of a command, which Linux limits to 128 KiB.
+/// Maximum number of cells in a job. The ids of a job's cells must fit in one command-line argument, which Linux limits
+/// to 128 KiB.
 pub const MAX_CELLS_PER_JOB: usize = 1000;
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Options for Slurm. They are checked before the first submission.
+//! Options of runs with Slurm, and their checks before the first submission.
 
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -6,52 +6,53 @@ use std::time::Duration;
 
 use super::MAX_CELLS_PER_JOB;
 
-/// Options of a submission.
+/// Options of a run with Slurm.
 #[derive(Clone, Debug)]
 pub struct SlurmOptions {
-    /// The partition; `None` leaves it to Slurm.
+    /// The partition to submit to; `None` for Slurm's default.
     pub partition: Option<String>,
-    /// Time limit of a job; `None` for the partition's limit.
+    /// Time limit of each job; `None` for the partition's limit.
     pub time: Option<TimeLimit>,
-    /// Maximum number of running jobs of an array, at least 1; `None` for no limit.
+    /// Maximum number of jobs of an array that run at the same time, at least 1; `None` for no limit.
     pub array_limit: Option<u32>,
-    /// Number of cells of a job, 1 to [`MAX_CELLS_PER_JOB`]. With `None` a job gets as many cells as take some minutes.
+    /// Number of cells in a job, 1 to [`MAX_CELLS_PER_JOB`]. If `None`, a job gets as many cells as take an estimated
+    /// five minutes.
     pub cells_per_job: Option<usize>,
-    /// The command of a job.
+    /// The command that each job runs.
     pub task: JobCommand,
-    /// Interval of requests to Slurm. A cell counts as lost after two answers in a row.
+    /// Interval between requests to Slurm. A cell counts as lost if its job is missing in two answers in a row.
     pub queue_interval: Duration,
 }
 
-/// The command of a job on its node.
+/// The command that a job runs on its node: `perturb run --cell …`.
 #[derive(Clone, Debug)]
 pub struct JobCommand {
-    /// The program `perturb`, at a place that all nodes see.
+    /// Absolute path of the program `perturb`. All nodes must see the file.
     pub program: PathBuf,
-    /// Number of groups of cells that run at the same time, at least 1.
+    /// Number of groups of cells that run in parallel in one job, at least 1.
     pub jobs: usize,
     /// Maximum number of cells in a group, at least 1.
     pub group: usize,
-    /// Number of physics threads of each of the `jobs` servers that the job starts on its node, at least 1. Unused if there
-    /// are `servers`.
+    /// Number of physics threads of each server that the job starts on its node, at least 1. The job starts `jobs`
+    /// servers. Unused if `servers` is not empty.
     pub workers: usize,
-    /// Folders of tasks that these servers also serve, absolute.
+    /// Absolute paths of task folders that the job's servers also serve.
     pub tasks: Vec<PathBuf>,
-    /// Addresses of servers that all jobs share; empty for a private one in each job.
+    /// Addresses of servers that all jobs share; empty if each job starts its own servers.
     pub servers: Vec<String>,
-    /// Time that a job waits for lost servers, s.
+    /// Time that a job waits for lost servers, in seconds.
     pub server_wait: u32,
 }
 
 impl JobCommand {
-    /// Returns the number of cores that a job requests. A group's trainings and their environments run alternately, so they
-    /// share one core. Each further thread of its server has a core.
+    /// Returns the number of cores that a job requests from Slurm. A group's learner and its server's first physics
+    /// thread run alternately, so they share one core. Each further physics thread gets its own core.
     pub fn cores(&self) -> usize {
         if self.servers.is_empty() { self.jobs.saturating_mul(self.workers) } else { self.jobs }
     }
 }
 
-/// Errors of options.
+/// The reason why an option of Slurm was refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
@@ -62,7 +63,7 @@ pub enum OptionError {
          DAYS-HH:MM, DAYS-HH:MM:SS, e.g. 90 or 1-12:00:00, and more than zero"
     )]
     Time { got: String },
-    /// The number of cells is out of range.
+    /// The number of cells per job is out of range.
     #[error("{got} cells a job: expected 1 to {MAX_CELLS_PER_JOB}")]
     CellsPerJob { got: usize },
     /// The path has characters that are not allowed in a script or in Slurm's options.
@@ -75,10 +76,10 @@ pub enum OptionError {
 }
 
 impl SlurmOptions {
-    /// Checks the options that their types do not check.
+    /// Checks the number of cells per job and all paths. `folder` is the experiment's folder.
     ///
     /// # Errors
-    /// [`OptionError`].
+    /// [`OptionError`] for the first invalid option.
     pub fn check(&self, folder: &Path) -> Result<(), OptionError> {
         if let Some(got) = self.cells_per_job.filter(|number| !(1..=MAX_CELLS_PER_JOB).contains(number)) {
             return Err(OptionError::CellsPerJob { got });
@@ -90,7 +91,7 @@ impl SlurmOptions {
     }
 }
 
-/// Returns a path as text for scripts and Slurm's options.
+/// Returns a path as text for scripts and Slurm's options. Refuses paths that are relative or that Slurm could misread.
 pub(super) fn text_of(path: &Path) -> Result<&str, OptionError> {
     let refuse = |reason| OptionError::Path { path: path.to_owned(), reason };
     let text = path.to_str().ok_or_else(|| refuse("it is not UTF-8"))?;
@@ -104,7 +105,7 @@ pub(super) fn text_of(path: &Path) -> Result<&str, OptionError> {
     Ok(text)
 }
 
-/// A time limit in one of Slurm's forms.
+/// A time limit in one of Slurm's formats, e.g. `90` (minutes) or `1-12:00:00`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TimeLimit {
     text: String,
@@ -112,7 +113,7 @@ pub struct TimeLimit {
 }
 
 impl TimeLimit {
-    /// Returns the limit as it was written.
+    /// Returns the limit as the user wrote it.
     pub fn text(&self) -> &str {
         &self.text
     }

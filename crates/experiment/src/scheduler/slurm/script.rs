@@ -1,12 +1,13 @@
-//! The script that all jobs of an array run.
+//! Generates the shell script that all jobs of an array run.
 
 use std::path::Path;
 
 use super::options::{JobCommand, OptionError, text_of};
 
-/// Returns the script of the submission in `submission`, for the experiment in `folder`.
+/// Returns the script for the submission in the folder `submission`, which belongs to the experiment in `folder`.
 ///
-/// `exec` makes the program the process that Slurm signals: it then finishes its iterations and writes checkpoints.
+/// The script ends with `exec`, so that Slurm's signals reach `perturb` itself: it then finishes its current iterations
+/// and writes checkpoints.
 pub(super) fn script(task: &JobCommand, folder: &Path, submission: &Path) -> Result<String, OptionError> {
     let cells = quoted(text_of(&submission.join("cells.txt"))?);
     let plan = quoted(text_of(&submission.join("plan.toml"))?);
@@ -41,7 +42,7 @@ exec "$program" run {plan} --json --out {folder} --cell "$cells" --jobs {jobs} -
     ))
 }
 
-/// Quotes a word for the shell.
+/// Quotes a text as a single word for the shell.
 fn quoted(text: &str) -> String {
     format!("'{}'", text.replace('\'', r"'\''"))
 }
@@ -52,7 +53,7 @@ mod tests {
 
     use super::*;
 
-    /// Runs a script whose program prints its arguments.
+    /// Runs the script of `task` as job `index`. Returns whether it succeeded, and its output.
     fn run(task: &JobCommand, directory: &Path, index: &str) -> (bool, String) {
         let text = script(task, &directory.join("it's $HOME"), directory).unwrap();
         let path = directory.join("job.sh");

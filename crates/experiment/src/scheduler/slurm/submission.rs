@@ -1,4 +1,5 @@
-//! Submissions in the experiment's folder.
+//! Reads and writes submissions in the experiment's folder. A submission is one Slurm job array with its plan and its
+//! cells.
 
 use std::path::{Path, PathBuf};
 
@@ -13,7 +14,7 @@ use crate::plan::Plan;
 const CELLS: &str = "cells.txt";
 const DOCUMENT: &str = "submission.json";
 
-/// An array that was submitted, or was prepared for a submission.
+/// A job array that was submitted to Slurm, or prepared for it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Submission {
     /// Number of the submission, from 1.
@@ -22,18 +23,18 @@ pub(super) struct Submission {
     pub(super) path: PathBuf,
     /// The ids of each job's cells, by the job's index in the array.
     pub(super) jobs: Vec<Vec<String>>,
-    /// The array's name and number in Slurm.
+    /// The array's name and, once known, its number in Slurm.
     pub(super) names: SlurmNames,
 }
 
-/// `submission.json`.
+/// The content of `submission.json`: how to find the array in Slurm's queue.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct SlurmNames {
-    /// The array's name in the queue. It is chosen before the submission. If this process ends before it receives the
-    /// number, the next process finds the array by its name.
+    /// The array's name in the queue, chosen before the submission. If this process ends before Slurm returns the
+    /// array's number, the next process finds the array by its name.
     pub(super) name: String,
-    /// The array's number; `None` until it is known.
+    /// The array's number; `None` until Slurm has returned it.
     pub(super) job: Option<String>,
 }
 
@@ -45,7 +46,7 @@ pub(super) fn directory(folder: &Folder) -> PathBuf {
     folder.path().join("slurm")
 }
 
-/// Returns all submissions, the oldest first.
+/// Reads all complete submissions, oldest first.
 pub(super) fn list(folder: &Folder) -> Result<Vec<Submission>, FolderError> {
     let directory = directory(folder);
     let mut submissions = Vec::new();
@@ -55,7 +56,7 @@ pub(super) fn list(folder: &Folder) -> Result<Vec<Submission>, FolderError> {
     Ok(submissions)
 }
 
-/// Returns the numbers of the submissions in order, including incomplete ones.
+/// Returns the numbers of all submissions in ascending order, including incomplete ones.
 fn numbers(directory: &Path) -> files::Result<Vec<u32>> {
     let paths = files::list(directory)?;
     let mut numbers: Vec<u32> = paths.iter().filter_map(|path| path.file_name()?.to_str()?.parse().ok()).collect();
@@ -63,7 +64,8 @@ fn numbers(directory: &Path) -> files::Result<Vec<u32>> {
     Ok(numbers)
 }
 
-/// Reads the submission in `path`. Returns `None` if its preparation was interrupted before it was sent to Slurm.
+/// Reads the submission in `path`. Returns `None` if it is incomplete, because its preparation was interrupted before
+/// it was sent to Slurm.
 fn read(path: &Path, number: u32) -> Result<Option<Submission>, FolderError> {
     let Some(names) = folder::read(&path.join(DOCUMENT))? else { return Ok(None) };
     let text = files::read_plain_text(&path.join(CELLS), MAX_CELLS_BYTES)?;
@@ -71,7 +73,8 @@ fn read(path: &Path, number: u32) -> Result<Option<Submission>, FolderError> {
     Ok(Some(Submission { number, path: path.to_owned(), jobs, names }))
 }
 
-/// Writes the files of a submission before it is sent to Slurm, `submission.json` last.
+/// Writes the files of a new submission, which can then be sent to Slurm. Writes `submission.json` last, which makes
+/// the submission complete. `script` returns the job script, given the folder of the submission.
 pub(super) fn create(
     folder: &Folder,
     plan: &Plan,
@@ -85,7 +88,7 @@ pub(super) fn create(
     plan.files().try_for_each(|(name, content)| write_atomically(&path.join(name), content))?;
     write_atomically(&path.join(CELLS), lines.as_bytes())?;
     write_atomically(&path.join("job.sh"), script(&path)?.as_bytes())?;
-    // Folders of different places have different names in one queue.
+    // The hash of the path makes names of different folders differ in the same queue.
     let place = crc32c::crc32c(path.as_os_str().as_encoded_bytes());
     let names = SlurmNames { name: format!("perturb-{place:08x}-{number}"), job: None };
     let submission = Submission { number, path, jobs, names };
@@ -94,7 +97,7 @@ pub(super) fn create(
 }
 
 impl Submission {
-    /// Stores the number that Slurm returned.
+    /// Stores the array's number that Slurm returned.
     pub(super) fn accepted(&mut self, job: &str) -> files::Result<()> {
         self.names.job = Some(job.to_owned());
         self.write()
@@ -105,12 +108,12 @@ impl Submission {
         job.name == self.names.name && self.names.job.as_ref().is_none_or(|array| *array == job.array)
     }
 
-    /// Returns the path of the event file of job `index`.
+    /// Returns the path of the event file of job `index`, with one JSON event per line.
     pub(super) fn events(&self, index: usize) -> PathBuf {
         self.path.join(format!("{index}.jsonl"))
     }
 
-    /// Returns the path of the job's log.
+    /// Returns the path of the log of job `index`.
     pub(super) fn log(&self, index: usize) -> PathBuf {
         self.path.join(format!("{index}.log"))
     }

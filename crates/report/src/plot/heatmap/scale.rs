@@ -1,4 +1,4 @@
-//! Ranges of the colours of mean returns.
+//! Colour scales for mean returns.
 
 use std::ops::Range;
 
@@ -6,24 +6,27 @@ use perturb_records::Heatmap;
 
 use crate::plot::ticks::rounded;
 
-/// The fixed scales of the paper's environments: (name, low, high). They make pictures from different experiments
-/// comparable. A scale ends where little is left to gain; all higher returns have its last colour.
+/// The fixed colour scales of the paper's environments: (name, lowest return, highest return). Fixed scales make
+/// pictures from different experiments comparable. A scale ends at the return of a very good policy; all higher returns
+/// have the last colour.
 const FIXED: [(&str, f64, f64); 6] = [
-    // 1 for each of at most 200 steps.
+    // The reward is 1 for each of at most 200 steps.
     ("CartPole", 0.0, 200.0),
-    // -1 for each of at most 200 steps; 110 are a success, and the best policies take some 100.
+    // The reward is -1 for each of at most 200 steps. An episode of up to 110 steps is a success, and the best policies
+    // take some 100.
     ("MountainCar", -200.0, -100.0),
-    // -1 for each of at most 500 steps; 80 are a success.
+    // The reward is -1 for each of at most 500 steps. An episode of up to 80 steps is a success.
     ("Acrobot", -500.0, -80.0),
-    // A rod that hangs or spins has some -1600 after 200 steps; one that is swung up and held -100 to -300, by where it began.
+    // A pendulum that hangs or spins gets a return of some -1600 in 200 steps. A pendulum that is swung up and held
+    // gets -100 to -300, depending on its initial state.
     ("Pendulum", -1600.0, -200.0),
-    // 1 for each of 1000 steps alive, and for the 20 m of a success 1212, less the cost of the motors.
+    // The reward is 1 for each of 1000 steps alive, plus 1212 for the 20 m of a success, minus the cost of the motors.
     ("HalfCheetah", 0.0, 2000.0),
     ("Hopper", 0.0, 2000.0),
 ];
 
-/// Returns the colour scale for the mean returns of `heatmaps` in `environment`. The paper's environments have a fixed
-/// scale. Other scales reach from the lowest to the highest return, rounded outwards.
+/// Returns the common colour scale for the mean returns of `heatmaps`. The paper's environments have fixed scales. In
+/// other environments, the scale is the range of all returns, rounded outwards.
 pub fn common_returns<'a>(environment: &str, heatmaps: impl Iterator<Item = &'a Heatmap>) -> Range<f64> {
     if let Some((_, low, high)) = FIXED.into_iter().find(|(name, ..)| *name == environment) {
         return low..high;

@@ -1,6 +1,6 @@
-//! Surfaces in an SVG. The plotting library writes an element for each rectangle: ten thousand elements, a megabyte,
-//! for a picture with six surfaces. Scaled pictures also show thin lines of background between the rectangles. A path
-//! for each colour takes a tenth of the bytes, and its edges are crisp.
+//! Merges the rectangles of heatmaps in an SVG. plotters writes an element for each rectangle: ten thousand elements, a
+//! megabyte, for a picture of six heatmaps. If such a picture is scaled, the background also shows as thin lines
+//! between rectangles. One path for each colour takes a tenth of the bytes, and leaves no such lines.
 
 use std::collections::BTreeMap;
 
@@ -12,7 +12,7 @@ pub(super) fn as_paths(svg: &str) -> String {
     for line in svg.split_inclusive('\n') {
         match Rectangle::parse(line) {
             Some(Rectangle { colour, x, y, width, height }) => {
-                // The end of a path is where it began.
+                // `z` closes the rectangle back to its start.
                 let path = surface.entry(colour).or_default();
                 path.push_str(&format!("M{x} {y}h{width}v{height}h-{width}z"));
             }
@@ -32,7 +32,7 @@ fn flush(surface: &mut BTreeMap<&str, String>, shown: &mut String) {
     }
 }
 
-/// A filled rectangle, as the library writes it.
+/// A filled rectangle, as plotters writes it.
 struct Rectangle<'a> {
     colour: &'a str,
     x: &'a str,
