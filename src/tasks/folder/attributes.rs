@@ -1,5 +1,5 @@
-//! Attributes of the elements of a model's text, as the elements or their classes of defaults have them, and the geoms that
-//! only pictures show.
+//! Looks up attributes in a model's MJCF text, including those that elements inherit from default classes. Also finds
+//! the geoms that matter only for pictures.
 
 use super::{
     error::Result,
@@ -7,19 +7,19 @@ use super::{
 };
 use roxmltree::{Document, Node};
 
-/// A model's text, parsed.
+/// A model's parsed MJCF text.
 #[derive(Clone, Copy)]
 pub(super) struct ModelText<'a, 'input> {
     pub(super) document: &'a Document<'input>,
 }
 
 impl<'a, 'input> ModelText<'a, 'input> {
-    /// All elements of a name.
+    /// Returns all elements with this tag name.
     pub(super) fn elements(self, tag: &'a str) -> impl Iterator<Item = Node<'a, 'input>> {
         self.document.descendants().filter(move |node| node.has_tag_name(tag))
     }
 
-    /// An attribute of an element, or of its class of defaults.
+    /// Returns an attribute of an element, or the value that the element inherits from its default class.
     pub(super) fn get(self, node: Node<'a, 'input>, key: &str) -> Option<&'a str> {
         if let Some(own) = node.attribute(key) {
             return Some(own);
@@ -38,18 +38,18 @@ impl<'a, 'input> ModelText<'a, 'input> {
         nested.chain(top).find_map(of_class)
     }
 
-    /// An attribute of the compiler.
+    /// Returns an attribute of the `<compiler>` element.
     pub(super) fn compiler(self, key: &str) -> Option<&'a str> {
         self.elements("compiler").filter_map(|node| node.attribute(key)).last()
     }
 
-    /// The `<inertial>` of a body, if the compiler takes it.
+    /// Returns the `<inertial>` element of a body. `None` if there is none, or if the compiler is set to ignore it.
     pub(super) fn inertial(self, body: Node<'a, 'input>) -> Option<Node<'a, 'input>> {
         let inertial = body.children().find(|child| child.has_tag_name("inertial"));
         inertial.filter(|_| self.compiler("inertiafromgeom") != Some("true"))
     }
 
-    /// Whether a geom is a mesh that can touch nothing and gives its body no mass.
+    /// Whether a geom is a mesh that affects only pictures: it cannot touch anything, and adds no mass to its body.
     pub(super) fn is_shown_only(self, geom: Node<'a, 'input>) -> bool {
         let is_zero = |key| self.get(geom, key).unwrap_or("1").trim() == "0";
         let is_mesh = self.get(geom, "type") == Some("mesh") && self.get(geom, "mesh").is_some();
@@ -57,17 +57,18 @@ impl<'a, 'input> ModelText<'a, 'input> {
         is_mesh && has_inertia && is_zero("contype") && is_zero("conaffinity")
     }
 
-    /// Whether a geom is left out of the text of the physics: only pictures show it, and nothing can name it.
+    /// Whether the text of the physics can omit a geom: it affects only pictures, and has no name by which a task could
+    /// refer to it.
     pub(super) fn is_left_out(self, geom: Node<'a, 'input>) -> bool {
         !geom.has_attribute("name") && self.is_shown_only(geom)
     }
 }
 
-/// The text without the geoms that only pictures show, and without the meshes that only these have: no byte of the
-/// physics depends on them, and meshes take most of the time of a compilation.
+/// Returns a model's text without the geoms that affect only pictures, and without the meshes that only these geoms
+/// use. The physics stay the same byte for byte. Compilation becomes faster, because meshes take most of its time.
 ///
 /// # Errors
-/// [`super::Error`] if the text is no XML.
+/// [`super::Error`] if the text is not XML.
 pub(super) fn without_shown(text: &Text) -> Result<Text> {
     let document = parse("the model", &text.xml)?;
     let attributes = ModelText { document: &document };

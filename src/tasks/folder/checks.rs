@@ -1,4 +1,4 @@
-//! Refuses, when a folder is loaded, edits that cannot have an effect.
+//! Checks, when a folder is loaded, that the edits of parameters can have an effect.
 
 use super::{
     elements::Elements,
@@ -9,15 +9,15 @@ use super::{
 };
 use perturb_mujoco::{Field, Index, Kind, Model, Options};
 
-/// The smallest dimension of a contact with torsional friction.
+/// Minimal dimension (`condim`) of a contact with torsional friction.
 const TORSION_DIMENSION: i32 = 4;
-/// The smallest dimension of a contact with rolling friction.
+/// Minimal dimension (`condim`) of a contact with rolling friction.
 const ROLL_DIMENSION: i32 = 6;
 
-/// Refuses the edits that cannot change the physics.
+/// Checks that each edit of a parameter can change the physics.
 ///
 /// # Errors
-/// [`super::Error`] with the parameter and the reason.
+/// [`super::Error`] with the parameter and the reason, if an edit cannot.
 pub(super) fn check(
     tables: &[Table<'_>],
     parameters: &[EditedParameter],
@@ -48,7 +48,7 @@ pub(super) fn check(
     Ok(())
 }
 
-/// Refuses a parameter that edits a number twice, or a number that an earlier parameter edits.
+/// Refuses a parameter that edits a number of the model twice, or a number that an earlier parameter edits.
 fn same_number(table: &Table<'_>, parameter: &EditedParameter, earlier: &[EditedParameter]) -> Result<()> {
     let mut seen = std::collections::HashMap::new();
     for other in earlier {
@@ -70,7 +70,7 @@ fn same_number(table: &Table<'_>, parameter: &EditedParameter, earlier: &[Edited
     Ok(())
 }
 
-/// Refuses edits of forces and effects that the model's flags switch off.
+/// Refuses edits of a part of the physics, such as contacts, that the model's flags switch off.
 fn switched_off(table: &Table<'_>, edit: &Edit, model: &Model) -> Result<()> {
     let flags = model.options().disable_flags;
     let (bits, what) = match (edit.targets.subject, edit.targets.field) {
@@ -89,7 +89,7 @@ fn switched_off(table: &Table<'_>, edit: &Edit, model: &Model) -> Result<()> {
     Err(without_effect(table, format_args!("the model switches {what} off by a <flag>; leave the flag out")))
 }
 
-/// Refuses edits of the ranges of elements that have no limits.
+/// Refuses edits of the range of a joint or actuator that has no limits.
 fn limits(table: &Table<'_>, edit: &Edit, model: &Model) -> Result<()> {
     let free = edit.targets.ids.iter().zip(&edit.targets.names);
     let mut free = free.filter(|(id, _)| !is_limited(model, edit.targets.subject, **id));
@@ -103,7 +103,7 @@ fn limits(table: &Table<'_>, edit: &Edit, model: &Model) -> Result<()> {
     }
 }
 
-/// Refuses edits of the wind in a model without a medium.
+/// Refuses edits of the wind if the model has no air: density and viscosity are 0 and no parameter edits them.
 fn wind(table: &Table<'_>, parameters: &[EditedParameter], model: &Model) -> Result<()> {
     let is_edited = |field: Field| parameters.iter().any(|other| other.places().any(|(edited, _)| edited == field));
     let has_medium =
@@ -114,7 +114,7 @@ fn wind(table: &Table<'_>, parameters: &[EditedParameter], model: &Model) -> Res
     Err(without_effect(table, "there is no air; give the model <option density=\"1.2\" viscosity=\"0.00002\"/>"))
 }
 
-/// Refuses edits of a friction that MuJoCo uses in no contact.
+/// Refuses edits of a geom's friction that no contact would use, for all or some of the parameter's values.
 fn friction(
     table: &Table<'_>,
     edit: &Edit,
@@ -148,7 +148,7 @@ fn friction(
             ),
         ));
     }
-    // The friction of a geom that some parameter edits is no bound.
+    // A geom whose friction is edited, too, is not compared with.
     let edited: Vec<usize> = parameters
         .iter()
         .flat_map(EditedParameter::places)
@@ -167,8 +167,9 @@ fn friction(
             model.field(Field::GeomFriction)[3 * contact.other + column]
         }
     };
-    // Robots walk on fixed geoms, so the largest friction of these is the bound. Without a fixed geom the bound is the
-    // smallest friction of the moving ones.
+    // MuJoCo uses the larger friction of two touching geoms, so an edited friction below the other geom's has no
+    // effect. The other geoms are first of all the fixed ones, on which robots walk: their maximum is the limit.
+    // Without fixed geoms, the limit is the minimum of the moving ones.
     let fixed = others.clone().filter(|contact| contact.other_is_fixed).max_by(|a, b| limit(a).total_cmp(&limit(b)));
     let moving = others.min_by(|a, b| limit(a).total_cmp(&limit(b)));
     let counts = |contact: &&Contact| contact.dimension >= needed;
@@ -193,7 +194,7 @@ fn friction(
     }))
 }
 
-/// Returns the smallest number that the parameter can write into the model, at one of its bounds.
+/// Returns the smallest number that an edit can write into the model. It is reached at one of the parameter's bounds.
 fn smallest(edit: &Edit, parameter: &EditedParameter, model: &Model) -> f64 {
     let bounds = parameter.parameter.bounds;
     let numbers = edit
@@ -204,7 +205,7 @@ fn smallest(edit: &Edit, parameter: &EditedParameter, model: &Model) -> f64 {
     numbers.fold(f64::INFINITY, f64::min)
 }
 
-/// A contact that MuJoCo may find between an edited geom and another one.
+/// A possible contact between an edited geom, `own`, and another geom.
 struct Contact {
     own: usize,
     other: usize,
@@ -214,15 +215,15 @@ struct Contact {
     other_is_fixed: bool,
 }
 
-/// Whether a geom can touch another one.
+/// Whether a geom can touch any other geom.
 pub(super) fn can_touch(model: &Model, geom: usize) -> bool {
     let mut declared = model.index_array(Index::PairGeom1).iter().chain(model.index_array(Index::PairGeom2));
     declared.any(|&other| other as usize == geom) || !contacts_of(model, geom).is_empty()
 }
 
-/// Returns the possible contacts of a geom, without those of declared pairs.
+/// Returns the possible contacts of a geom, except with geoms with which the model declares it as a pair.
 fn contacts_of(model: &Model, geom: usize) -> Vec<Contact> {
-    // The value 1 means that MuJoCo finds contacts of declared pairs only.
+    // The value 1 means that only declared pairs can touch.
     if model.options().collision == 1 {
         return Vec::new();
     }
@@ -237,7 +238,7 @@ fn contacts_of(model: &Model, geom: usize) -> Vec<Contact> {
     let weld_of = |geom: usize| weld[body[geom] as usize];
     let can_touch = |&other: &usize| {
         let (own, its) = (weld_of(geom), weld_of(other));
-        // Bodies that are welded together count as one. This is the body that the parent of such a group belongs to.
+        // Bodies that are welded together count as one body. This is the parent of such a body.
         let parent_of = |body: i32| weld[parent[body as usize] as usize];
         let fits = contact_type[geom] & affinity[other] != 0 || contact_type[other] & affinity[geom] != 0;
         let related = own != 0 && its != 0 && (parent_of(own) == its || parent_of(its) == own);

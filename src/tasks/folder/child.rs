@@ -1,5 +1,5 @@
-//! Loads a folder for the first time in a process of its own, because MuJoCo 2.2.2 aborts on some models and compiles
-//! others for ever.
+//! Loads a folder in a separate process first, because MuJoCo 2.2.2 aborts the process on some models and never
+//! finishes the compilation of others.
 
 use super::error::{LoadError, escaped};
 use rustix::process::{Resource, Rlimit, setrlimit};
@@ -13,20 +13,22 @@ use std::{
 };
 use tokio::time::Instant;
 
-/// Limits of the process that loads a folder.
+/// Maximal memory of the process that loads a folder, in bytes.
 const MAX_MEMORY_BYTES: u64 = 2 << 30;
+/// Maximal CPU time of the process that loads a folder, in s.
 const MAX_CPU_SECONDS: u64 = 60;
+/// Maximal wall-clock time of the process that loads a folder, in s. After it the process is killed.
 const MAX_WALL_SECONDS: u64 = 120;
-/// Interval at which the process is checked.
+/// Interval between two checks whether the process has ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(2);
-/// Limit of the process's output that is kept, in bytes.
+/// Maximal length of the process's output and of its errors that is stored, in bytes. The rest is dropped.
 const MAX_OUTPUT_BYTES: u64 = 1 << 20;
 
-/// Limits the memory and the CPU time of this process, and forbids core files. Call it before the process loads a
-/// folder that was never loaded before.
+/// Limits the memory and CPU time of this process, and disables core files. Call it in a process that will load an
+/// untested folder.
 ///
 /// # Errors
-/// [`io::Error`] if the system refuses.
+/// [`io::Error`] if the operating system refuses.
 pub fn limit_this_process() -> io::Result<()> {
     let limit = |resource, most: u64| setrlimit(resource, Rlimit { current: Some(most), maximum: Some(most) });
     limit(Resource::As, MAX_MEMORY_BYTES)?;
@@ -36,11 +38,11 @@ pub fn limit_this_process() -> io::Result<()> {
     Ok(())
 }
 
-/// Loads a folder in a process of `program`, a `perturb-server`, and returns the report that `--check` prints. The
-/// report has the speed if `measured`.
+/// Loads a folder in a separate process, and returns the report that `--check` prints. `program` is the path of
+/// `perturb-server`. If `measured`, the report includes the speed of the environment.
 ///
 /// # Errors
-/// [`LoadError`] with the error that the process printed, or with its exit status if it printed none.
+/// [`LoadError`] with the error that the process printed. If it printed none, with the way in which it ended.
 pub fn check(program: &Path, folder: &Path, measured: bool) -> Result<String, LoadError> {
     let refuse = |problem: String| LoadError::new(folder, problem);
     let mut child = Command::new(program)
@@ -68,7 +70,7 @@ pub fn check(program: &Path, folder: &Path, measured: bool) -> Result<String, Lo
     }
 }
 
-/// The beginning of the line that the process writes on standard error about a folder that it refuses.
+/// The start of the line on standard error by which the process reports the error of a folder.
 pub const COMPLAINT: &str = "perturb-server: refused: ";
 
 fn how_it_ended(status: ExitStatus, last_words: Option<&str>) -> String {
@@ -94,7 +96,7 @@ fn how_it_ended(status: ExitStatus, last_words: Option<&str>) -> String {
     }
 }
 
-/// Waits for the end of a process, and kills it after [`MAX_WALL_SECONDS`].
+/// Waits for the end of a process. Kills it after [`MAX_WALL_SECONDS`] and returns `None`.
 fn wait(child: &mut Child) -> io::Result<Option<ExitStatus>> {
     let start = Instant::now();
     while start.elapsed() < Duration::from_secs(MAX_WALL_SECONDS) {
@@ -108,13 +110,14 @@ fn wait(child: &mut Child) -> io::Result<Option<ExitStatus>> {
     Ok(None)
 }
 
-/// Reads all that a process writes, on a thread, and keeps the beginning.
+/// Starts a thread that reads an output of a process to its end. It returns the first [`MAX_OUTPUT_BYTES`] bytes as
+/// text.
 fn collect(stream: Option<impl Read + Send + 'static>) -> thread::JoinHandle<String> {
     thread::spawn(move || {
         let mut kept = Vec::new();
         if let Some(mut stream) = stream {
             let _ = (&mut stream).take(MAX_OUTPUT_BYTES).read_to_end(&mut kept);
-            let _ = io::copy(&mut stream, &mut io::sink()); // so that it can end
+            let _ = io::copy(&mut stream, &mut io::sink()); // so that a full pipe does not block the process
         }
         String::from_utf8_lossy(&kept).into_owned()
     })

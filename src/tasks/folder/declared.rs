@@ -1,4 +1,5 @@
-//! The disturbances of a task: the element that is pushed, and the sets of R and E that the file declares.
+//! The disturbances that a task's file configures: the body that is pushed, and the values of disturbances in versions
+//! R and E.
 
 use super::{
     elements::Elements,
@@ -14,18 +15,19 @@ const SETS: &[&str] = &["random", "extreme"];
 const PUSH: &[&str] = &["body", "axes"];
 const AXES: [&str; 3] = ["x", "y", "z"];
 
-/// The pushes of a task.
+/// The body of a task that is pushed, and the description of its pushes.
 #[derive(Clone, Copy)]
 pub(super) struct Push {
-    /// The number of the body that is pushed.
+    /// The index of the body that is pushed.
     pub(super) body: usize,
     pub(super) spec: PushSpec,
 }
 
 impl Push {
-    /// Reads the table `push`. By default the first body that can move is pushed, along x and y. `None` if no body can.
+    /// Reads the table `push`. The default is the first body that can move, pushed along x and y. Returns `None` if no
+    /// body can move.
     pub(super) fn new(table: Option<&Table<'_>>, model: &Model, elements: &Elements) -> Result<Option<Self>> {
-        // The number of the body that a body is fixed to; 0 for the world.
+        // For each body the index of the body to which it is fixed, or its own; 0 is the world.
         let fixed_to = model.index_array(Index::BodyWeld);
         let mut body = (1..model.n_body()).find(|&body| fixed_to[body] != 0);
         let mut axes: &'static [usize] = &[0, 1];
@@ -56,7 +58,8 @@ impl Push {
     }
 }
 
-/// Reads the table `disturbances`, whose keys are names of disturbances.
+/// Reads the table `disturbances`, whose keys are names of disturbances. Returns each with its values in versions R and
+/// E.
 pub(super) fn read(top: &Table<'_>, spec: &EnvironmentSpec) -> Result<Vec<Parameter>> {
     let Some(value) = top.get("disturbances") else { return Ok(Vec::new()) };
     let table = value.table()?;

@@ -1,4 +1,5 @@
-//! Finds edits without a visible effect: the physics is the same, byte for byte, at both ends of E.
+//! Finds parameters without a visible effect: a short simulation gives the same bytes with the extreme values of
+//! version E as with the defaults.
 
 use super::environment::Task;
 use crate::{
@@ -7,14 +8,14 @@ use crate::{
 };
 use perturb_mujoco::{Error, Simulation};
 
-/// Number of timesteps of random controls from the initial state.
+/// Number of timesteps in a simulation that is compared.
 const N_STEPS: usize = 200;
 
-/// Returns the parameters whose edits change nothing in 200 timesteps of random controls from the initial state. They
-/// may still have an effect in other states: a friction has none before the robot falls.
+/// Returns the names of the parameters that change nothing in 200 timesteps with random controls from the initial
+/// state. They may have an effect in other states; for instance, friction has none before the robot touches the floor.
 ///
 /// # Errors
-/// MuJoCo's fatal ones.
+/// MuJoCo's fatal errors.
 pub(super) fn unseen(task: &'static Task) -> Result<Vec<&'static str>, Error> {
     let defaults: Vec<f64> = task.spec.parameters.iter().map(|parameter| parameter.default).collect();
     let own = trajectory(task, &defaults)?;
@@ -33,7 +34,8 @@ pub(super) fn unseen(task: &'static Task) -> Result<Vec<&'static str>, Error> {
     Ok(unseen)
 }
 
-/// Returns the states, as bits, after each timestep of random controls, until the physics diverge.
+/// Simulates [`N_STEPS`] timesteps with random controls, and returns the bits of all positions and velocities after
+/// each. Stops early if the physics diverge. `values` are the parameters.
 fn trajectory(task: &'static Task, values: &[f64]) -> Result<Vec<u64>, Error> {
     let edit = task.template.edit(&task.parameters, values)?;
     shared::with(&task.template, |shared| {

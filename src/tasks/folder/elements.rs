@@ -1,4 +1,4 @@
-//! Finds the elements of a model by the names that a task gives.
+//! Finds the elements of a model by the names and patterns in a task's file.
 
 use super::{
     error::{Result, escaped, listed},
@@ -7,7 +7,7 @@ use super::{
 use perturb_mujoco::{Index, Kind, Model};
 use perturb_protocol::names::did_you_mean;
 
-/// The names of a model's elements. An element without a name is called `#3`, after its number.
+/// The names of all elements of a model, by kind. An element without a name is called by its index, such as `#3`.
 #[derive(Debug)]
 pub(super) struct Elements {
     names: Vec<(Kind, Vec<String>)>,
@@ -33,24 +33,25 @@ impl Elements {
         Self { names: KINDS.map(|kind| (kind, names(kind))).into() }
     }
 
-    /// The names of a kind, in the model's order.
+    /// The names of all elements of a kind, in the model's order.
     pub(super) fn names(&self, kind: Kind) -> &[String] {
         self.names.iter().find(|(known, _)| *known == kind).map_or(&[], |(_, names)| names)
     }
 
-    /// The name of an element.
+    /// The name of the element with this index.
     pub(super) fn name(&self, kind: Kind, id: usize) -> &str {
         self.names(kind).get(id).map_or("", String::as_str)
     }
 
-    /// The number of the element of this name.
+    /// Returns the index of the element whose name is the text `value`.
     pub(super) fn find(&self, kind: Kind, value: &Value<'_>) -> Result<usize> {
         let name = value.text()?;
         self.names(kind).iter().position(|known| known == name).ok_or_else(|| self.unknown(kind, name, value))
     }
 
-    /// The numbers of the elements that a value names: a name, a pattern with `*` and `?`, or a list of these, in the
-    /// list's order and within a pattern in the model's. A pattern never means the world.
+    /// Returns the indices of the elements that `value` names: a name, a pattern with `*` and `?`, or a list of names
+    /// and patterns. They are in the order of the list, and in the model's order within a pattern. A pattern never
+    /// matches the world body.
     pub(super) fn select(&self, kind: Kind, value: &Value<'_>) -> Result<Vec<usize>> {
         let mut selected = Vec::new();
         for pattern in value.texts()? {
@@ -79,7 +80,7 @@ impl Elements {
     }
 }
 
-/// An actuator's name; without one that of its joint.
+/// Returns the name of an actuator. If it has none, returns the name of the joint that it drives.
 pub(super) fn actuator_name(model: &Model, elements: &Elements, actuator: usize) -> String {
     let name = elements.name(Kind::Actuator, actuator);
     match actuated_joint(model, actuator) {
@@ -88,18 +89,18 @@ pub(super) fn actuator_name(model: &Model, elements: &Elements, actuator: usize)
     }
 }
 
-/// The joint that an actuator drives, if it drives one.
+/// Returns the index of the joint that an actuator drives; `None` if it drives another kind of element.
 pub(super) fn actuated_joint(model: &Model, actuator: usize) -> Option<usize> {
     let drives_a_joint = matches!(model.index_array(Index::ActuatorTransmission)[actuator], 0 | 1);
     drives_a_joint.then(|| model.index_array(Index::ActuatorTarget)[2 * actuator] as usize)
 }
 
-/// Whether a name fits a pattern, in which `*` stands for any text and `?` for any character.
+/// Whether a name matches a pattern, in which `*` matches any text and `?` any single character.
 fn matches(pattern: &str, name: &str) -> bool {
     let (pattern, name): (Vec<char>, Vec<char>) = (pattern.chars().collect(), name.chars().collect());
     let (mut p, mut n) = (0, 0);
-    // The position of the last star in the pattern, and the position in the name up to which the star has matched. On a
-    // mismatch the star matches one more character.
+    // The index of the last star in the pattern, and the index in the name up to which that star matches. After a
+    // mismatch, the star is extended by one more character.
     let mut star: Option<(usize, usize)> = None;
     while n < name.len() {
         match pattern.get(p) {

@@ -1,4 +1,5 @@
-//! The environment of a folder. MuJoCo computes the physics; the file defines observations, rewards and ends.
+//! The environment of a folder. MuJoCo simulates the model; `task.toml` defines observations, rewards and ends of
+//! episodes.
 
 use super::{
     number::{Context, Stage},
@@ -17,21 +18,21 @@ use crate::{
 use perturb_mujoco::{Error as SimulationError, Field, Simulation};
 use std::sync::Arc;
 
-/// Limit of positions and velocities in a saved state. Beyond this value MuJoCo itself reports divergence.
+/// Maximal absolute position or velocity in a saved state. MuJoCo reports divergence above this value.
 const MAX_STATE: f64 = 1e10;
-/// The message of an `expect`. A worker that panics with it loses its batch, not the server.
+/// The reason why an `expect` holds. If it does not, the worker's panic ends its batch, but not the server.
 const NO_MEMORY: &str = "there is memory for the one simulation of this thread";
 
-/// The state whose body poses a step's readings have.
+/// The time at which the poses that a step's readings use are computed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Poses {
-    /// The poses of MuJoCo's step: those at the beginning of the last timestep, or in the last stage of RK4.
+    /// Before the last timestep of the step, as MuJoCo leaves them. With the integrator RK4, in its last stage.
     Before,
-    /// The poses after the step, which are computed for this purpose.
+    /// After the step. They are computed in addition.
     After,
 }
 
-/// The compiled task of a folder. It lives as long as the process.
+/// The task of a folder, with its compiled model. It lives as long as the process.
 pub(super) struct Task {
     pub(super) spec: EnvironmentSpec,
     pub(super) template: Template,
@@ -45,32 +46,32 @@ pub(super) struct Task {
     pub(super) terminate_when_unhealthy: bool,
     pub(super) goal: Goal,
     pub(super) reset: Reset,
-    /// The range of each control, `[A]`.
+    /// The range of each control, one for each action.
     pub(super) controls: Vec<(f64, f64)>,
-    /// Whether actions of ±1 mean the ends of these ranges.
+    /// Whether actions are scaled: ±1 are the ends of the control's range.
     pub(super) scaled: bool,
     pub(super) parameters: Vec<EditedParameter>,
     pub(super) applied: Vec<AppliedQuantity>,
-    /// The body that is pushed; none if no body moves.
+    /// The index of the body that is pushed; `None` if no body can move.
     pub(super) pushed_body: Option<usize>,
-    /// The disturbances with sets of R and E, which the catalogue has among the parameters.
+    /// The disturbances whose values in versions R and E the file configures. The catalogue lists them as parameters.
     pub(super) disturbances: Vec<Parameter>,
     pub(super) needs: Needs,
-    /// Whether the model's text scales its masses to a total. Edited masses are not scaled.
+    /// Whether the model's text has `settotalmass`, which scales all masses. Edited masses are not scaled again.
     pub(super) has_total_mass: bool,
 }
 
-/// The computations that all readings together need in each step.
+/// The computations that a task's readings need in each step.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Needs {
     pub(super) stage: Stage,
     pub(super) external_forces: bool,
-    /// The number of numbers that terms remember from one step to the next.
+    /// The total of numbers that reward terms remember from one step to the next.
     pub(super) n_remembered: usize,
 }
 
 impl Needs {
-    /// Returns the computations that the readings of a task need.
+    /// Collects the computations that the parts of a task need.
     pub(super) fn new(observation: &[Reading], reward: &[Term], healthy: &[Range], goal: &Goal) -> Self {
         let ranges = healthy.iter().chain(&goal.ranges).map(Range::reading);
         let achieved = goal.achieved.iter().map(|(_, reading)| reading);
@@ -87,40 +88,42 @@ impl Needs {
 
 /// An environment of a folder.
 ///
-/// A step sets the controls to the action, clipped to their range, and holds them for `frame_skip` timesteps. Then
-/// health, the reward's terms, the observation and the achieved value are computed in this order, from the same state.
+/// A step sets the controls to the action, clipped to their range, and simulates `frame_skip` timesteps. Then it
+/// computes health, the terms of the reward, the observation and the achieved value, in this order, from the same
+/// state.
 ///
-/// The physics diverge if MuJoCo warns of a number or of lost contacts, if it fails, or if a number that is read is not
-/// finite. Then the step terminates, all terms except those of health are 0, and the observation stays that of the step
-/// before. After a reset to a state that diverges at once the observation is zeros.
+/// The physics diverge if MuJoCo raises a warning, for instance of a bad number or of dropped contacts, or a fatal
+/// error, or if a reading is not finite. Then the episode terminates, all terms except those of the kind `healthy` are
+/// 0, and the observation of the previous step stays. If a reset sets a state that diverges at once, the observation is
+/// all zeros.
 ///
-/// An environment has no simulation of its own. It holds the parameters and the state that a shared simulation gets
-/// before it runs for this environment, and the results that are kept afterwards.
+/// An environment has no simulation of its own. It stores its parameters and state, which are written into a shared
+/// simulation before each step, and the results of the step.
 pub(super) struct FolderEnvironment {
     task: &'static Task,
     edit: Arc<ModelEdit>,
-    /// State of MuJoCo as [`Simulation::state`] writes it. Undefined once the physics diverged.
+    /// The state in the layout of [`Simulation::state`]. It is undefined after the physics diverged.
     state: Box<[f64]>,
-    /// The numbers that terms remember.
+    /// The numbers that reward terms remember from the previous step.
     remembered: Box<[f64]>,
-    /// The last action, `[A]`; zeros after a reset.
+    /// The last action; zeros after a reset.
     action: Box<[f32]>,
     observation: Box<[f32]>,
     achieved: f64,
-    /// The force on the pushed body in the next step, N.
+    /// The force on the pushed body in the next step, in N; `None` without a push.
     push: Option<[f64; 3]>,
     /// Whether the physics have diverged since the last reset.
     diverged: bool,
-    /// Whether the model could not be compiled with the lengths of the last parameters: it has those before, and each
-    /// episode begins diverged.
+    /// Whether the model could not be compiled with the lengths of the last parameters. Then the previous edit stays,
+    /// and each episode ends as diverged in its first step.
     is_impossible: bool,
 }
 
 impl FolderEnvironment {
-    /// An environment with default parameters.
+    /// Creates an environment with default parameters.
     ///
     /// # Errors
-    /// [`Error::Model`] if there is no memory for a simulation.
+    /// [`Error::Model`] if there is not enough memory for a simulation.
     pub(super) fn new(task: &'static Task) -> Result<Self, Error> {
         let defaults: Vec<f64> = task.spec.parameters.iter().map(|parameter| parameter.default).collect();
         let edit = task
@@ -143,14 +146,14 @@ impl FolderEnvironment {
         Ok(environment)
     }
 
-    /// Returns positions and velocities, which follow the time in the state.
+    /// Returns the positions and the velocities in the state, for editing.
     fn positions_mut(&mut self) -> (&mut [f64], &mut [f64]) {
         let model = &self.task.template.model;
         let (qpos, rest) = self.state[1..].split_at_mut(model.n_q());
         (qpos, &mut rest[..model.n_v()])
     }
 
-    /// Sets the model's initial state.
+    /// Sets the state to the model's initial state, and clears action, observation and achieved value.
     fn clear(&mut self) {
         self.state.copy_from_slice(&self.task.template.state);
         self.action.fill(0.0);
@@ -158,13 +161,13 @@ impl FolderEnvironment {
         self.achieved = 0.0;
     }
 
-    /// Begins an episode from the present state.
+    /// Begins an episode in the current state.
     fn start(&mut self) {
         let task = self.task;
         let started = shared::with(&task.template, |shared| {
             let (simulation, numbers) = shared.at(&self.edit, &self.state)?;
-            // The simulation is shared: no reading may see the external forces of another environment. `forward`
-            // computes the forces again if a sensor needs them.
+            // The simulation may still have the external forces of another environment, which no reading may see.
+            // `forward` computes them again if a sensor needs them.
             simulation.clear_external_forces();
             simulation.forward()?;
             simulation.state(&mut self.state);
@@ -183,7 +186,8 @@ impl FolderEnvironment {
         self.diverged = self.is_impossible || !matches!(started, Ok(true));
     }
 
-    /// Computes the observation and the achieved value, and stores them if all numbers are finite.
+    /// Computes the observation and the achieved value, and stores them. Returns false and stores nothing if a number
+    /// is not finite. `is_first` is true at the start of an episode.
     fn observe_now(
         &mut self,
         simulation: &Simulation,
@@ -235,8 +239,8 @@ impl FolderEnvironment {
         for _ in 0..task.frame_skip {
             simulation.step_without_search()?;
         }
-        // The state is saved before poses are computed again, because that changes where the solver starts and normalises
-        // quaternions.
+        // The state is copied before poses are computed again, because that computation changes the solver's starting
+        // point and normalises quaternions.
         simulation.state(&mut self.state);
         if task.poses == Poses::After {
             match task.needs.stage {
@@ -275,7 +279,8 @@ impl FolderEnvironment {
         Ok(Some(Transition { terminated, goal, diverged: false }))
     }
 
-    /// Writes the reward terms of a step whose physics diverged. Returns its transition, which ends the episode.
+    /// Writes the reward terms of a step whose physics diverged to `reward_terms`. Returns the transition that ends the
+    /// episode.
     fn fail(&mut self, reward_terms: &mut [f64]) -> Transition {
         self.diverged = true;
         for (value, term) in reward_terms.iter_mut().zip(&self.task.reward) {
@@ -333,7 +338,7 @@ impl Environment for FolderEnvironment {
         &self.task.hash
     }
 
-    /// Writes the action whose controls are as near to 0 as their ranges allow.
+    /// Writes the action that makes each control the number in its range nearest to 0.
     fn neutral_action(&self, out: &mut [f32]) {
         for (entry, &(low, high)) in out.iter_mut().zip(&self.task.controls) {
             let control = 0.0_f64.clamp(low, high);
@@ -351,7 +356,7 @@ impl Environment for FolderEnvironment {
         let reset = &self.task.reset;
         let (qpos, qvel) = self.positions_mut();
         reset.draw(stream, qpos, qvel);
-        // The initial position of a free body is where the model has it.
+        // Edited lengths may move bodies with free joints, so their initial positions are moved, too.
         let (own, compiled) = (Arc::clone(&self.task.template.model), Arc::clone(&self.edit.compiled));
         if !Arc::ptr_eq(&own, &compiled) {
             let initial = own.field(Field::InitialPositions).iter().zip(compiled.field(Field::InitialPositions));
@@ -407,7 +412,7 @@ impl Environment for FolderEnvironment {
         out.extend_from_slice(&self.state);
         out.extend_from_slice(&self.remembered);
         if self.diverged {
-            out[physics..].fill(0.0); // nothing follows from it any more, and it may not be finite
+            out[physics..].fill(0.0); // a diverged state is not used any more, and may not be finite
         }
         out.extend(self.action.iter().chain(&self.observation).map(|&value| f64::from(value)));
         out.push(self.achieved);

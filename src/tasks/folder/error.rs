@@ -1,35 +1,36 @@
-//! Why a folder is refused.
+//! Errors of loading a folder.
 
 use std::{fmt, path::Path};
 
-/// A folder that cannot be served: the place of the mistake and a sentence with the remedy.
+/// The reason why a folder cannot be loaded: where the mistake is, what is expected, and what to do.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{place}{problem}")]
 pub struct Error {
-    /// The file, with the line if there is one, as `task.toml, line 12: `; empty where the folder itself is wrong.
+    /// The file and the line, such as `task.toml, line 12: `. Without a line if the whole file is wrong; empty if the
+    /// folder itself is wrong.
     place: String,
     /// The mistake, what is expected, and what to do.
     problem: String,
 }
 
 impl Error {
-    /// An error about the folder as a whole.
+    /// Creates an error about the folder itself.
     pub(crate) fn folder(problem: impl fmt::Display) -> Self {
         Self { place: String::new(), problem: problem.to_string() }
     }
 
-    /// An error in a file.
+    /// Creates an error about a whole file.
     pub(crate) fn file(name: &str, problem: impl fmt::Display) -> Self {
         Self { place: format!("{}: ", escaped(name)), problem: problem.to_string() }
     }
 
-    /// An error in a line of a file, counted from 1.
+    /// Creates an error in a line of a file. Lines count from 1.
     pub(crate) fn line(name: &str, line: usize, problem: impl fmt::Display) -> Self {
         Self { place: format!("{}, line {line}: ", escaped(name)), problem: problem.to_string() }
     }
 }
 
-/// A folder that cannot be served, with its path.
+/// The error of a folder that cannot be loaded, with the folder's path.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("--task {folder}: {problem}")]
 pub struct LoadError {
@@ -38,18 +39,19 @@ pub struct LoadError {
 }
 
 impl LoadError {
-    /// Makes the error with which loading `folder` failed.
+    /// Creates the error for the folder with this path.
     pub fn new(folder: &Path, problem: impl fmt::Display) -> Self {
         Self { folder: escaped(&folder.display().to_string()), problem: problem.to_string() }
     }
 
-    /// The error without the folder's path.
+    /// The message without the folder's path.
     pub fn problem(&self) -> &str {
         &self.problem
     }
 }
 
-/// Prepares a text of a file for an error or a log: escapes control characters and shortens long texts.
+/// Makes text from a file safe for error messages and logs: escapes control characters, and shortens it to 100
+/// characters.
 pub(crate) fn escaped(text: &str) -> String {
     const MAX_CHARS: usize = 100;
     let mut shown: String = text.chars().take(MAX_CHARS).flat_map(char::escape_debug).collect();
@@ -59,7 +61,7 @@ pub(crate) fn escaped(text: &str) -> String {
     shown.replace("\\'", "'").replace("\\\"", "\"")
 }
 
-/// Joins the first names of a list for an error.
+/// Joins up to 12 names by commas, for an error message. "none" if there are no names.
 pub(crate) fn listed<'a>(names: impl Iterator<Item = &'a str> + Clone) -> String {
     const MAX_NAMES: usize = 12;
     let mut shown = names.clone().take(MAX_NAMES).map(escaped).collect::<Vec<_>>().join(", ");

@@ -1,4 +1,4 @@
-//! Reads the file `task.toml`, compiles the model and assembles the task.
+//! Reads the file `task.toml`, compiles the model and builds the task.
 
 use super::{
     attributes, checks,
@@ -26,7 +26,7 @@ use crate::{
 use perturb_mujoco::{Field, Flags, Index, Kind, Model};
 use perturb_protocol::names::is_spelled;
 
-/// The keys of the file.
+/// The keys at the top level of `task.toml`.
 pub(super) const KEYS: &[&str] = &[
     "format",
     "name",
@@ -51,7 +51,7 @@ pub(super) const KEYS: &[&str] = &[
     "disturbances",
 ];
 const ACTIONS: &[&str] = &["scaled", "range"];
-/// The format that this server reads.
+/// The version of the format of `task.toml` that this server reads.
 const FORMAT: u32 = 1;
 
 const MAX_FRAME_SKIP: u32 = 1000;
@@ -66,10 +66,10 @@ const MAX_PARAMETERS: usize = 32;
 const MAX_TERMS: usize = 64;
 const MAX_NAME_CHARS: usize = 64;
 
-/// Reads a folder's task.
+/// Builds the task of a folder from its `task.toml` and model.
 ///
 /// # Errors
-/// [`Error`].
+/// [`Error`] with the file, the line and what to do.
 pub(super) fn read(files: &mut Files) -> Result<Task> {
     let text = table::decode(table::FILE, files.task())?.to_owned();
     let document = table::parse(&text)?;
@@ -82,7 +82,8 @@ pub(super) fn read(files: &mut Files) -> Result<Task> {
     let about = Header::new(&top)?;
     let main = top.require("model", "\"robot.xml\"")?.text()?;
     let mut mjcf = mjcf::read(files, main)?;
-    // Numbers of elements are those of the model as it stands in the folder.
+    // Geoms that affect only pictures are removed, unless the file refers to elements by index (`#3`), because removing
+    // geoms changes indices.
     if edits_lengths(&top) && !text.contains("\"#") && !text.contains("'#") {
         mjcf.physics = attributes::without_shown(&mjcf.physics)?;
         mjcf.leaves_out = true;
@@ -91,14 +92,15 @@ pub(super) fn read(files: &mut Files) -> Result<Task> {
     assemble(&top, about, (mjcf, model, main), files.hash())
 }
 
-/// Whether a parameter may need the model to be compiled again. What is wrong about it is told later.
+/// Whether a parameter may edit a length, for which the model is compiled again. Errors in the tables are ignored here,
+/// since they are reported later.
 fn edits_lengths(top: &Table<'_>) -> bool {
     let parameters = top.tables("parameter").unwrap_or_default();
     let mut edits = parameters.iter().flat_map(|table| table.tables("edit").unwrap_or_default());
     edits.any(|edit| matches!(edit.text("field"), Ok(Some("length" | "size" | "position" | "radius"))))
 }
 
-/// Settings that do not need the model.
+/// The settings of a task that do not depend on the model.
 struct Header {
     name: &'static str,
     revision: u32,
@@ -145,7 +147,7 @@ impl Header {
     }
 }
 
-/// Compiles the physics' model and checks its sizes.
+/// Compiles the model of the physics, and checks its size, timestep and numbers.
 fn compile(mjcf: &Mjcf, main: &str) -> Result<Model> {
     let files: Vec<(&str, &[u8])> =
         mjcf.physics.files.iter().map(|(name, bytes)| (name.as_str(), bytes.as_slice())).collect();
@@ -185,6 +187,7 @@ fn compile(mjcf: &Mjcf, main: &str) -> Result<Model> {
     Ok(model)
 }
 
+/// Builds the task from the parsed file and the compiled model. `hash` is the hash of the folder's files.
 fn assemble(top: &Table<'_>, about: Header, (mjcf, model, main): (Mjcf, Model, &str), hash: String) -> Result<Task> {
     let elements = Elements::new(&model);
     let observation = top.require("observation", "[{ joint = \"*\", get = \"position\" }]")?.tables()?;
@@ -284,7 +287,7 @@ fn reward(top: &Table<'_>, model: &Model, elements: &Elements) -> Result<Vec<Ter
     Err(value.error(format_args!("there are {} terms; expected 1 to {MAX_TERMS}", terms.len())))
 }
 
-/// The range of each control, and whether actions are scaled to it.
+/// Returns the range of each control, and whether actions are scaled so that ±1 are the ends of the range.
 fn controls(top: &Table<'_>, model: &Model, elements: &Elements) -> Result<(Vec<(f64, f64)>, bool)> {
     let table = top.get("actions").map(|value| value.table()).transpose()?;
     let (mut scaled, mut given) = (false, None);
@@ -343,7 +346,8 @@ fn parameters(
     Ok((parameters, applied))
 }
 
-/// Returns the two parameters that a heat map shows: those that the file names, or else the first two.
+/// Returns the two parameters that heat maps show: those that the file names, otherwise the first two. `None` if there
+/// are fewer than two.
 fn heatmap_axes(top: &Table<'_>, parameters: &[EditedParameter]) -> Result<Option<[&'static str; 2]>> {
     let names: Vec<&'static str> = parameters.iter().map(|edited| edited.parameter.name).collect();
     let Some(value) = top.get("heatmap") else {
@@ -384,8 +388,8 @@ fn action_channels(model: &Model, elements: &Elements, controls: &[(f64, f64)], 
     leaked_list(names.iter().zip(controls).map(channel))
 }
 
-/// Returns the entries of a state: positions, then velocities. Their bounds are far beyond the values of any episode
-/// and exclude absurd numbers.
+/// Returns the entries of an exact state: positions, then velocities. Their bounds are far beyond the values of any
+/// episode; they exclude absurd numbers.
 fn state_channels(model: &Model, elements: &Elements) -> &'static [Channel] {
     let mut channels = Vec::new();
     for is_velocity in [false, true] {
@@ -417,7 +421,7 @@ fn state_channels(model: &Model, elements: &Elements) -> &'static [Channel] {
     leaked_list(channels.into_iter())
 }
 
-/// Estimates the cost of a step in µs by the model's sizes. The pool cuts batches by it; no result depends on it.
+/// Estimates the computing time of a step in µs from the size of the model, see [`EnvironmentSpec::step_cost`].
 fn step_cost(model: &Model, frame_skip: u32) -> f64 {
     let (dofs, geoms) = (model.n_v() as f64, model.n_geom() as f64);
     // RK4 computes the dynamics four times.

@@ -1,4 +1,5 @@
-//! The files of a folder. Each is read once, within limits and only inside the folder, and counts for the hash.
+//! Reads the files of a task's folder: each once, within limits of size, and never outside of the folder. All of them
+//! enter the hash of the task.
 
 use super::error::{Error, Result, escaped};
 use sha2::{Digest, Sha256};
@@ -10,16 +11,16 @@ use std::{
     time::SystemTime,
 };
 
-/// The task's own file.
+/// The name of the file that describes the task.
 pub(super) const TASK: &str = "task.toml";
-/// Limit of all files that are read, in bytes.
+/// Maximal total size of the files of a folder that are read, in bytes.
 const MAX_BYTES: u64 = 64 << 20;
-/// Limit of the number of files that are read. MuJoCo has room for 1999 besides the model's text.
+/// Maximal number of files of a folder that are read. MuJoCo accepts 1999 in addition to the model's text.
 const MAX_FILES: usize = 1900;
-/// Limit of the task's own file, in bytes.
+/// Maximal size of `task.toml`, in bytes.
 const MAX_TASK_BYTES: usize = 1 << 20;
 
-/// The files that were read, by their paths within the folder.
+/// A folder, and the contents of its files that were read so far, by their paths within the folder.
 #[derive(Debug)]
 pub(super) struct Files {
     root: PathBuf,
@@ -27,7 +28,7 @@ pub(super) struct Files {
     bytes: u64,
 }
 
-/// A file as it was read.
+/// The content of a file, and its modification time when it was read.
 #[derive(Debug)]
 struct FileContent {
     bytes: Vec<u8>,
@@ -35,10 +36,10 @@ struct FileContent {
 }
 
 impl Files {
-    /// Opens a folder and reads its task.
+    /// Opens a folder and reads its `task.toml`.
     ///
     /// # Errors
-    /// [`Error`] if `folder` is not a folder, or has no readable task.
+    /// [`Error`] if `folder` is not a folder, or its `task.toml` cannot be read or is too large.
     pub(super) fn open(folder: &Path) -> Result<Self> {
         let refuse = |problem: String| Error::folder(problem);
         let root = folder.canonicalize().map_err(|error| refuse(format!("the folder cannot be opened: {error}")))?;
@@ -55,12 +56,13 @@ impl Files {
         Ok(files)
     }
 
-    /// The task's own file.
+    /// The content of `task.toml`.
     pub(super) fn task(&self) -> &[u8] {
         self.read.get(TASK).map_or(&[], |file| file.bytes.as_slice())
     }
 
-    /// Reads a file, given by its path within the folder. `who` names it in errors, for instance `robot.xml`.
+    /// Returns the content of the file at a path within the folder, and reads it if it was not read before. `who` is
+    /// the file that refers to it, for error messages, for instance `robot.xml`.
     ///
     /// # Errors
     /// [`Error`] if the path leaves the folder, if the file cannot be read, or if a limit is exceeded.
@@ -73,7 +75,7 @@ impl Files {
         Ok(self.read.get(&name).map_or(&[], |file| file.bytes.as_slice()))
     }
 
-    /// Returns a path within the folder without `.`, `..` and links.
+    /// Resolves `.`, `..` and links in a path within the folder. The result must be inside the folder.
     fn resolve(&self, path: &str, who: &str) -> Result<String> {
         let shown = escaped(path);
         let refuse = |problem: &str| Error::folder(format_args!("{who} names the file {shown:?}, which {problem}"));
@@ -110,8 +112,8 @@ impl Files {
         Ok(FileContent { bytes, modified: about.modified().ok() })
     }
 
-    /// The SHA-256, in hexadecimal, of the list of all files that were read: each with its path and the SHA-256 of its
-    /// bytes, the task first, the others in the order of their paths.
+    /// Returns a hash of all files that were read: the SHA-256, in hexadecimal, of each file's path and the SHA-256 of
+    /// its content. `task.toml` comes first, then the others by path.
     pub(super) fn hash(&self) -> String {
         let task = self.read.get_key_value(TASK);
         let others = self.read.iter().filter(|(name, _)| *name != TASK);
@@ -124,12 +126,12 @@ impl Files {
         hexadecimal(&all.finalize())
     }
 
-    /// Whether the files on the disk still have the bytes that were read.
+    /// Whether all files on the disk still have the contents that were read. Reads them again.
     pub(super) fn are_unchanged(&self) -> bool {
         self.read.iter().all(|(name, file)| self.is_unchanged(name, file))
     }
 
-    /// Like [`Files::are_unchanged`], but does not read files that were not written since.
+    /// Like [`Files::are_unchanged`], but reads only files whose modification time has changed.
     pub(super) fn look_unchanged(&self) -> bool {
         let is_as_old = |name: &str, file: &FileContent| {
             let modified = self.root.join(name).metadata().and_then(|about| about.modified()).ok();
@@ -144,12 +146,12 @@ impl Files {
         has_length && std::fs::read(&path).is_ok_and(|now| now == file.bytes)
     }
 
-    /// The names of the files that were read.
+    /// The paths, within the folder, of the files that were read.
     pub(super) fn names(&self) -> impl Iterator<Item = &str> {
         self.read.keys().map(String::as_str)
     }
 
-    /// The bytes of all files that were read.
+    /// The total size of the files that were read, in bytes.
     pub(super) fn n_bytes(&self) -> u64 {
         self.bytes
     }

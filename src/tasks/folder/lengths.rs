@@ -1,7 +1,9 @@
-//! A text of the model in which lengths and sizes are edited: the numbers that take part, and what each becomes.
+//! Edits of lengths, sizes and positions in the text of a model: which numbers of the text change, and how they follow
+//! from the parameters.
 //!
-//! A scaled body is scaled about the anchor of its first hinge or ball joint, so that it stays attached; without one, about
-//! the origin of its frame. The anchors of the bodies that it carries move with it; these keep their own sizes.
+//! A body is scaled about the anchor of its first hinge or ball joint, so that it stays attached to its parent. Without
+//! such a joint it is scaled about the origin of its frame. The bodies attached to it move with it, but keep their
+//! sizes.
 
 use super::{
     attributes::ModelText,
@@ -15,19 +17,20 @@ use perturb_mujoco::{Field, Index, Model};
 use roxmltree::Node;
 use std::collections::BTreeMap;
 
-/// A number of the model that takes a parameter's value by another compilation.
+/// A length, size, radius or position of the model that follows a parameter. The model must be compiled again to change
+/// it.
 #[derive(Debug)]
 pub(super) struct Slot {
-    /// The number of the parameter.
+    /// The index of the parameter.
     pub(super) parameter: usize,
     edit: Edit,
     target: Target,
-    /// The target's value in the model as compiled.
+    /// The value in the unedited model.
     own: f64,
 }
 
 impl Slot {
-    /// The slots of all parameters.
+    /// Collects the slots of all parameters.
     pub(super) fn all(parameters: &[EditedParameter], model: &Model) -> Vec<Self> {
         let mut slots = Vec::new();
         for (parameter, edited) in parameters.iter().enumerate() {
@@ -40,7 +43,8 @@ impl Slot {
         slots
     }
 
-    /// The factor of a length or size, or the shift of a position in m.
+    /// Returns by how much the slot changes with these parameter values: a factor for a length, size or radius, a shift
+    /// in m for a position.
     pub(super) fn amount(&self, values: &[f64]) -> f64 {
         let value = values[self.parameter];
         match self.target {
@@ -50,13 +54,13 @@ impl Slot {
         }
     }
 
-    /// The amount that changes nothing.
+    /// Returns the amount that changes nothing: 0 for a position, otherwise 1.
     pub(super) fn neutral(&self) -> f64 {
         if matches!(self.target, Target::Position(..)) { 0.0 } else { 1.0 }
     }
 }
 
-/// A part of a number: a coefficient, times the amount of a slot if it has one.
+/// A summand of a number in the text: `coefficient`, times the amount (or its square) of a slot if there is one.
 #[derive(Debug, Clone, Copy)]
 struct Summand {
     coefficient: f64,
@@ -70,7 +74,8 @@ impl Summand {
     }
 }
 
-/// A number of the text: the sum of its parts, or its own value where no slot of it changes anything.
+/// A number in the text: the sum of its parts. If no slot in the parts changes anything, it is exactly `own`, without
+/// rounding errors of the sum.
 #[derive(Debug)]
 struct EditedNumber {
     own: f64,
@@ -92,27 +97,28 @@ impl EditedNumber {
     }
 }
 
-/// An attribute with its numbers.
+/// The name of an attribute, and its numbers.
 type Attribute = (&'static str, Vec<EditedNumber>);
 
 #[derive(Debug)]
 enum Piece {
     Text(String),
-    /// An element: its beginning, the edited attributes, and its end.
+    /// An edited element: its start with the unedited attributes, the edited attributes, and its end.
     Element(String, Vec<Attribute>, &'static str),
 }
 
-/// A text whose numbers depend on the amounts of slots.
+/// A model's text whose numbers depend on the amounts of slots.
 #[derive(Debug)]
 pub(super) struct EditedText {
     pieces: Vec<Piece>,
 }
 
 impl EditedText {
-    /// Prepares a text. `leaves_out` says whether the model lacks the geoms that only pictures show. `refuse` makes the error of a slot.
+    /// Finds the numbers in a text that the slots change. `leaves_out` says whether `model` lacks the geoms that affect
+    /// only pictures. `refuse` creates an error from the index of a slot and a reason.
     ///
     /// # Errors
-    /// The error that `refuse` makes, if an element has no such length or cannot follow the edit.
+    /// An error of `refuse` if an element does not have the edited length, or cannot follow the edit.
     pub(super) fn new(
         text: &Text,
         model: &Model,
@@ -148,7 +154,7 @@ impl EditedText {
         Ok(Self { pieces })
     }
 
-    /// The text with these amounts of the slots.
+    /// Returns the text with these amounts of the slots.
     pub(super) fn write(&self, slots: &[Slot], amounts: &[f64]) -> String {
         let mut text = String::new();
         for piece in &self.pieces {
@@ -168,23 +174,25 @@ impl EditedText {
     }
 }
 
-/// The slots that scale a body.
+/// The indices of the slots that scale a body.
 #[derive(Clone, Copy, Default)]
 struct Scaling {
     /// The slot that scales positions and lengths.
     along: Option<usize>,
-    /// The slot that scales all else, too.
+    /// The slot that scales everything else, too, such as radii.
     size: Option<usize>,
 }
 
+/// Collects the edited elements of a text.
 struct Editor<'a, 'input> {
     attributes: ModelText<'a, 'input>,
     model: &'a Model,
     slots: &'a [Slot],
-    /// Whether the physics' text lacks the geoms that only pictures show.
+    /// Whether `model` lacks the geoms that affect only pictures.
     leaves_out: bool,
     refuse: &'a dyn Fn(usize, &str) -> super::error::Error,
-    /// For each line of an edited element its beginning, without the edited attributes, and these.
+    /// The edited elements by their line in the text: the element's start without the edited attributes, and the edited
+    /// attributes.
     edited: BTreeMap<u32, (String, Vec<Attribute>)>,
 }
 
@@ -215,7 +223,7 @@ impl<'a, 'input> Editor<'a, 'input> {
         Ok(())
     }
 
-    /// The slots that scale a body, of which there may be one.
+    /// Finds the slot that scales a body. Refuses a second one.
     fn scaling(&self, body: usize) -> Result<Scaling> {
         let mut scaling = Scaling::default();
         for (slot, Slot { target, .. }) in self.slots.iter().enumerate() {
@@ -232,7 +240,7 @@ impl<'a, 'input> Editor<'a, 'input> {
         Ok(scaling)
     }
 
-    /// Refuses constraints between bodies whose anchors would not follow.
+    /// Refuses equality constraints that name a scaled body, because their anchors would not follow.
     fn constraints(&self, bodies: &[Node<'a, 'input>], scalings: &[Scaling]) -> Result<()> {
         for constraint in self.attributes.elements("connect").chain(self.attributes.elements("weld")) {
             for name in ["body1", "body2"].into_iter().filter_map(|key| constraint.attribute(key)) {
@@ -247,7 +255,8 @@ impl<'a, 'input> Editor<'a, 'input> {
         Ok(())
     }
 
-    /// The position of a body's frame: its anchor moves with its parent, and it is scaled about its anchor.
+    /// Edits the position of a body's frame. The body's anchor moves with a scaled parent. If the body itself is
+    /// scaled, its frame moves relative to the anchor.
     fn frame(&mut self, node: Node<'a, 'input>, body: usize, scalings: &[Scaling]) -> Result<()> {
         let parent = self.model.index_array(Index::BodyParent)[body] as usize;
         let (carried, own) = (scalings[parent].along, scalings[body].along);
@@ -282,7 +291,7 @@ impl<'a, 'input> Editor<'a, 'input> {
         Ok(())
     }
 
-    /// The elements of a body. `rank` counts its geoms.
+    /// Edits the elements inside a body. `rank` is the number of the body's geoms so far, and is updated.
     fn content(&mut self, node: Node<'a, 'input>, body: usize, scaling: Scaling, rank: &mut usize) -> Result<()> {
         let inertial = self.attributes.inertial(node);
         for child in node.children().filter(Node::is_element) {
@@ -320,7 +329,7 @@ impl<'a, 'input> Editor<'a, 'input> {
         Ok(())
     }
 
-    /// The number of a body's geom of this rank.
+    /// Returns the index in the model of a body's geom number `rank`, counted from 0.
     fn geom_of(&self, body: usize, rank: usize) -> Option<usize> {
         let bodies = self.model.index_array(Index::GeomBody).iter().enumerate();
         bodies.filter(|(_, of)| **of as usize == body).nth(rank).map(|(geom, _)| geom)
@@ -368,7 +377,7 @@ impl<'a, 'input> Editor<'a, 'input> {
         }
     }
 
-    /// Scales each number of an attribute by its slot in `first`, and the numbers after these by `rest`.
+    /// Scales the first numbers of an attribute by the slots in `first`, one each, and the remaining numbers by `rest`.
     fn scale(
         &mut self,
         node: Node<'a, 'input>,
@@ -386,14 +395,14 @@ impl<'a, 'input> Editor<'a, 'input> {
         Ok(())
     }
 
-    /// Returns the numbers of an attribute, which the element or its defaults set; `absent` if neither does.
+    /// Returns the numbers of an attribute of an element or of its default class; `absent` if neither has it.
     fn numbers(&self, node: Node<'a, 'input>, key: &str, absent: &[f64]) -> Result<Vec<f64>> {
         let Some(text) = self.attributes.get(node, key) else { return Ok(absent.to_vec()) };
         let numbers = text.split_whitespace().map(|number| number.parse().ok()).collect::<Option<Vec<f64>>>();
         numbers.ok_or_else(|| (self.refuse)(0, &format!("{key}=\"{text}\" of the model is no list of numbers")))
     }
 
-    /// Replaces an attribute of an element.
+    /// Replaces an attribute of an element by edited numbers.
     fn set(&mut self, node: Node<'a, 'input>, key: &'static str, numbers: Vec<EditedNumber>) {
         if numbers.is_empty() {
             return;
@@ -408,8 +417,8 @@ impl<'a, 'input> Editor<'a, 'input> {
     }
 }
 
-/// The point of a body, in the axes of its parent and from the body's origin, at which it is attached: the anchor of its
-/// first hinge or ball joint.
+/// Returns the vector from the origin of a body's frame to the point at which it is attached, in the axes of its
+/// parent. This point is the anchor of its first hinge or ball joint, or the origin itself if it has none.
 pub(super) fn attachment(model: &Model, body: usize) -> [f64; 3] {
     let (types, bodies) = (model.index_array(Index::JointType), model.index_array(Index::JointBody));
     let is_own = |&joint: &usize| bodies[joint] as usize == body && matches!(types[joint], 1 | 3);
@@ -419,7 +428,7 @@ pub(super) fn attachment(model: &Model, body: usize) -> [f64; 3] {
     if anchor == [0.0; 3] || *rotation == [1.0, 0.0, 0.0, 0.0] {
         return anchor;
     }
-    // v + 2 w (u × v) + 2 u × (u × v), where the quaternion is w and u.
+    // Rotates the anchor v by the quaternion (w, u): v + 2 w (u × v) + 2 u × (u × v).
     let (w, u) = (rotation[0], [rotation[1], rotation[2], rotation[3]]);
     let cross =
         |a: [f64; 3], b: [f64; 3]| [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];

@@ -1,4 +1,4 @@
-//! Loading a folder, which stays in memory until the process ends.
+//! Loads a folder into memory, where it stays until the process ends.
 
 use super::{
     environment::{FolderEnvironment, Task},
@@ -10,7 +10,8 @@ use super::{
 use crate::env::{self, EnvironmentSpec, disturbance};
 use std::{fmt, path::Path, sync::OnceLock};
 
-/// A loaded folder. It lives as long as the process: environments, catalogues and sessions refer to it.
+/// A handle to a loaded folder. The folder stays in memory until the process ends, because environments, catalogues and
+/// sessions refer to it.
 #[derive(Clone, Copy)]
 pub struct Folder {
     pub(super) task: &'static Task,
@@ -19,12 +20,13 @@ pub struct Folder {
 }
 
 impl Folder {
-    /// The environment; with disturbances among its parameters, if the task declares sets for one.
+    /// The description of the environment. If the file configures values of a disturbance in versions R and E, all
+    /// disturbances are among the parameters.
     pub fn spec(&self) -> &'static EnvironmentSpec {
         self.spec
     }
 
-    /// Whether the files on the disk are still those that were loaded.
+    /// Whether the files on the disk still have the loaded contents.
     pub fn is_unchanged(&self) -> bool {
         self.files.look_unchanged()
     }
@@ -36,13 +38,13 @@ impl fmt::Debug for Folder {
     }
 }
 
-/// Loads a folder. Its contents stay in memory until the process ends, because sessions refer to them.
+/// Loads a folder. It stays in memory until the process ends, because sessions refer to it.
 ///
-/// A model may abort the process or take all of its memory: load folders that were never loaded before in a process of
-/// their own.
+/// MuJoCo may abort the process or use all its memory for a bad model. Call [`check`](super::child::check) first for a
+/// folder that is new.
 ///
 /// # Errors
-/// [`Error`] with the place and the remedy.
+/// [`Error`] with the file, the line and what to do.
 pub fn load(folder: &Path) -> Result<Folder, Error> {
     let mut files = Files::open(folder)?;
     let task = file::read(&mut files)?;
@@ -51,23 +53,25 @@ pub fn load(folder: &Path) -> Result<Folder, Error> {
     }
     let files: &'static Files = Box::leak(Box::new(files));
     let task: &'static mut Task = Box::leak(Box::new(task));
-    // The spec's closure needs the address of the task, and the task contains the spec.
+    // The task contains the spec, whose closure refers to the task. So the closure reads the task's address from a
+    // cell, which is set below.
     let address: &'static OnceLock<&'static Task> = Box::leak(Box::default());
     task.spec.make = Box::leak(Box::new(move || match address.get() {
         Some(task) => Ok(Box::new(FolderEnvironment::new(task)?) as Box<dyn env::Environment>),
         None => Err(env::Error::Model { environment: "", reason: "it is not loaded yet".into() }),
     }));
     let task: &'static Task = task;
-    let _ = address.set(task); // it is set once
+    let _ = address.set(task); // cannot fail: it is set only here
     let declared = &task.disturbances;
     let spec = if declared.is_empty() { &task.spec } else { disturbance::declare(&task.spec, declared) };
     Ok(Folder { task, spec, files })
 }
 
-/// Reads the model `main` of a folder and its includes, without MuJoCo. It is meant for tests with untrusted files.
+/// Reads and checks the model file `main` of a folder and its includes, without compiling it by MuJoCo. Meant for tests
+/// with arbitrary files.
 ///
 /// # Errors
-/// [`Error`] with the place and the remedy.
+/// [`Error`] with the file, the line and what to do.
 pub fn read_model(folder: &Path, main: &str) -> Result<(), Error> {
     mjcf::read(&mut Files::open(folder)?, main).map(|_| ())
 }

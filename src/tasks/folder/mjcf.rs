@@ -1,8 +1,8 @@
-//! Reads the MJCF of a folder. Includes are resolved here, only inside the folder. MuJoCo gets a rewritten text and the
-//! files from memory, so that it reads nothing from the disk.
+//! Reads the MJCF model of a folder. This module resolves includes, and reads only files inside the folder. MuJoCo gets
+//! a rewritten text and the contents of the files, so it reads nothing from the disk.
 //!
-//! The physics' text lacks textures, materials, skins and `<visual>`, which cost memory in every simulation and change no
-//! byte of the physics; the picture's text has them.
+//! There are two texts. The text for pictures has everything. The text for the physics lacks textures, materials, skins
+//! and `<visual>`, which would cost memory in every simulation and do not affect the physics.
 
 use super::{
     error::{Error, Result, escaped},
@@ -12,14 +12,14 @@ use super::{
 use roxmltree::{Document, Node, ParsingOptions};
 use std::{collections::BTreeMap, fmt::Write};
 
-/// Limit of the depth of elements. The recursions of MuJoCo and of this file go as deep.
+/// Maximal nesting depth of elements. It bounds the recursion of MuJoCo and of this module.
 const MAX_DEPTH: usize = 200;
-/// Limit of the elements, attributes and texts of one file.
+/// Maximal total of elements, attributes and text nodes in one file.
 const MAX_NODES: u32 = 2_000_000;
-/// Limit of the elements of a composite. Except inside a box each has at least one degree of freedom, so a composite
-/// with more would exceed the limit of these anyway, after minutes of compilation.
+/// Maximal number of elements of a composite. Nearly every element has at least one degree of freedom, so a larger
+/// composite would exceed the limit of degrees of freedom anyway, but only after minutes of compilation.
 const MAX_COMPOSITE_ELEMENTS: f64 = 10_000.0;
-/// Attributes that name files, by element. `true`: the physics needs the file.
+/// Attributes that refer to files: the element, its attributes, and whether the physics needs the file.
 const FILE_ATTRIBUTES: [(&str, &[&str], bool); 4] = [
     ("mesh", &["file"], true),
     ("hfield", &["file"], true),
@@ -27,41 +27,41 @@ const FILE_ATTRIBUTES: [(&str, &[&str], bool); 4] = [
     ("skin", &["file"], false),
 ];
 
-/// A model in the form that MuJoCo gets.
+/// The texts of a model that MuJoCo compiles, and what else is known about it.
 #[derive(Debug)]
 pub(super) struct Mjcf {
-    /// Text that the physics is compiled from.
+    /// The text for the physics.
     pub(super) physics: Text,
-    /// Text that pictures are drawn from.
+    /// The text for pictures.
     pub(super) picture: Text,
-    /// The attributes that `<statistic>` gives.
+    /// The names of the attributes of `<statistic>` in the model.
     pub(super) statistic: Vec<String>,
-    /// Whether the model's masses are scaled to a total.
+    /// Whether the model has `settotalmass`, which scales all masses to a total.
     pub(super) has_total_mass: bool,
-    /// Whether the physics' text lacks the geoms that only pictures show.
+    /// Whether the text for the physics lacks the geoms that affect only pictures.
     pub(super) leaves_out: bool,
 }
 
-/// A text with one element per line, and the files that it names.
+/// An MJCF text with one element per line, and the files to which it refers.
 #[derive(Debug, Default)]
 pub(super) struct Text {
     pub(super) xml: String,
-    /// Names and bytes, as [`perturb_mujoco::Model::from_files`] takes them.
+    /// The names and contents of the files, for [`perturb_mujoco::Model::from_files`].
     pub(super) files: Vec<(String, Vec<u8>)>,
-    /// For each line of the text the file and the line it comes from.
+    /// For each line of the text the original file (an index in `sources`) and line.
     lines: Vec<(usize, u32)>,
-    /// The names of the files that the lines come from.
+    /// The names of the original files.
     sources: Vec<String>,
 }
 
 impl Text {
-    /// The file and line of a line of the text, both counted from 1.
+    /// Returns the original file and line of a line of the text. Lines count from 1.
     pub(super) fn source(&self, line: usize) -> Option<(&str, u32)> {
         let (file, line) = *self.lines.get(line.checked_sub(1)?)?;
         Some((self.sources.get(file)?, line))
     }
 
-    /// The text without some lines, counted from 1.
+    /// Returns the text without the lines `rows`, which count from 1.
     pub(super) fn without(&self, rows: &[u32]) -> Self {
         let mut kept =
             Self { xml: String::new(), files: self.files.clone(), lines: Vec::new(), sources: self.sources.clone() };
@@ -78,7 +78,7 @@ impl Text {
         self.lines.push((file, line));
     }
 
-    /// The name under which MuJoCo finds a file of the folder.
+    /// Adds a file of the folder, if it is not `known` yet. Returns the name by which the text refers to it.
     fn add_file(&mut self, path: &str, bytes: &[u8], known: &mut BTreeMap<String, String>) -> String {
         if let Some(name) = known.get(path) {
             return name.clone();
@@ -92,10 +92,10 @@ impl Text {
     }
 }
 
-/// Reads the model `main` of a folder.
+/// Reads the model file `main` of a folder and its includes, and writes the texts for MuJoCo.
 ///
 /// # Errors
-/// [`Error`] with file and line.
+/// [`Error`] with the file and the line.
 pub(super) fn read(files: &mut Files, main: &str) -> Result<Mjcf> {
     let mut sources = Vec::new();
     collect(files, main, "task.toml", &mut sources)?;
@@ -132,7 +132,8 @@ pub(super) fn read(files: &mut Files, main: &str) -> Result<Mjcf> {
     Ok(Mjcf { physics, picture, statistic, has_total_mass, leaves_out: false })
 }
 
-/// Reads a file and those that it includes, each once.
+/// Reads a model file and all files that it includes, and appends their names and texts to `sources`. `who` is the file
+/// that refers to it, for error messages.
 fn collect(files: &mut Files, path: &str, who: &str, sources: &mut Vec<(String, String)>) -> Result<()> {
     let text = decode(path, files.read(path, who)?)?.to_owned();
     let included: Vec<String> = {
@@ -154,6 +155,7 @@ fn collect(files: &mut Files, path: &str, who: &str, sources: &mut Vec<(String, 
     Ok(())
 }
 
+/// Parses a model file. Refuses document type definitions, and files with too many or too deeply nested elements.
 pub(super) fn parse<'a>(name: &str, text: &'a str) -> Result<Document<'a>> {
     let options = ParsingOptions { allow_dtd: false, nodes_limit: MAX_NODES, ..ParsingOptions::default() };
     let document = Document::parse_with_options(text, options).map_err(|error| {
@@ -170,7 +172,7 @@ pub(super) fn parse<'a>(name: &str, text: &'a str) -> Result<Document<'a>> {
     Ok(document)
 }
 
-/// An error at an element.
+/// Creates an error about an element, with its line.
 fn at(name: &str, node: &Node<'_, '_>, problem: impl std::fmt::Display) -> Error {
     let line = node.document().text_pos_at(node.range().start).row;
     Error::line(name, line as usize, problem)
@@ -186,7 +188,7 @@ fn check_root(name: &str, root: &Node<'_, '_>) -> Result<()> {
     }
 }
 
-/// Refuses a composite with more elements than [`MAX_COMPOSITE_ELEMENTS`], which would compile for minutes.
+/// Refuses a composite with more than [`MAX_COMPOSITE_ELEMENTS`] elements, because its compilation would take minutes.
 fn check_composite(name: &str, node: &Node<'_, '_>) -> Result<()> {
     let count = node.attribute("count").unwrap_or_default();
     // Counts that are not numbers are refused by MuJoCo itself.
@@ -198,16 +200,16 @@ fn check_composite(name: &str, node: &Node<'_, '_>) -> Result<()> {
     Err(at(name, node, problem))
 }
 
-/// A file of the model.
+/// A parsed file of the model.
 struct Part<'a> {
     name: &'a str,
     document: &'a Document<'a>,
-    /// The offsets of line ends.
+    /// The byte offsets of the line ends.
     line_ends: Vec<usize>,
 }
 
 impl Part<'_> {
-    /// The line of an element, counted from 1.
+    /// Returns the line of an element, counted from 1.
     fn line(&self, node: &Node<'_, '_>) -> u32 {
         1 + self.line_ends.partition_point(|&end| end < node.range().start) as u32
     }
@@ -217,7 +219,7 @@ fn line_ends(text: &str) -> Vec<usize> {
     text.bytes().enumerate().filter(|&(_, byte)| byte == b'\n').map(|(offset, _)| offset).collect()
 }
 
-/// Folders in which the compiler looks for files. The last `<compiler>` that names one counts, as in MuJoCo.
+/// The subfolders in which MuJoCo looks for files. As in MuJoCo, the last `<compiler>` that sets a subfolder counts.
 #[derive(Default)]
 struct Folders {
     mesh: String,
@@ -243,7 +245,7 @@ impl Folders {
         folders
     }
 
-    /// The path within the folder of a file that an element names.
+    /// Returns the path, within the task's folder, of a file to which an element refers.
     fn path(&self, element: &str, file: &str) -> String {
         let file = file.replace('\\', "/");
         let name = if self.strip_path { file.rsplit('/').next().unwrap_or_default() } else { &file };
@@ -262,14 +264,16 @@ enum Kept {
     PictureOnly,
 }
 
+/// Writes the text for the physics and the text for pictures.
 struct Writer<'a> {
     files: &'a mut Files,
     parts: &'a [Part<'a>],
     folders: Folders,
     physics: Text,
     picture: Text,
-    /// The names under which MuJoCo finds the files of the physics' text, by their paths in the folder.
+    /// The names of files in the text for the physics, by their paths in the folder.
     physics_names: BTreeMap<String, String>,
+    /// The names of files in the text for pictures, by their paths in the folder.
     picture_names: BTreeMap<String, String>,
 }
 
@@ -301,7 +305,8 @@ impl Writer<'_> {
             }
             write_attribute(&mut picture, key, &picture_value);
         }
-        // MuJoCo names an element without a name after its file. The file is renamed here, so the name is written out.
+        // MuJoCo gives an element without a name the name of its file. Files are renamed here, so the original name is
+        // added.
         if let Some(file) = node.attribute("file").filter(|_| names_file(tag, "file").is_some())
             && !node.has_attribute("name")
             && !in_defaults(&node)
@@ -330,7 +335,7 @@ impl Writer<'_> {
         Ok(())
     }
 
-    /// Writes the elements of an included file in its place.
+    /// Writes the elements of an included file instead of the `<include>` element.
     fn include(&mut self, node: Node<'_, '_>, kept: Kept, depth: usize) -> Result<()> {
         let file = node.attribute("file").unwrap_or_default().replace('\\', "/");
         let parts = self.parts;
@@ -341,8 +346,8 @@ impl Writer<'_> {
         Ok(())
     }
 
-    /// Returns the names of a file in the text of the physics and in that of the picture. Files that only pictures need
-    /// are read, too, because they count for the hash.
+    /// Reads a file to which an element refers. Returns its name in the text for the physics and in the text for
+    /// pictures. Files that only pictures need are read, too, because they enter the hash of the task.
     fn file(&mut self, part: usize, node: &Node<'_, '_>, value: &str, needed: bool) -> Result<(String, String)> {
         let source = &self.parts[part];
         let path = self.folders.path(node.tag_name().name(), value);
@@ -355,16 +360,17 @@ impl Writer<'_> {
     }
 }
 
-/// Whether an attribute names a file, and whether the physics needs it.
+/// Returns whether the physics needs the file to which an attribute refers; `None` if the attribute does not refer to a
+/// file.
 fn names_file(tag: &str, key: &str) -> Option<bool> {
     FILE_ATTRIBUTES.iter().find(|(element, keys, _)| *element == tag && keys.contains(&key)).map(|entry| entry.2)
 }
 
-/// Whether an element concerns only pictures.
+/// Whether an element affects only pictures.
 fn is_visual(node: &Node<'_, '_>) -> bool {
     match node.tag_name().name() {
         "visual" | "texture" | "material" => true,
-        // A composite's skin is a part of its geometry's description.
+        // The skin of a composite is not an asset, and stays in the description of the composite.
         "skin" => node.parent().is_some_and(|parent| parent.has_tag_name("asset")),
         _ => false,
     }
@@ -389,7 +395,8 @@ pub(super) fn write_attribute(element: &mut String, key: &str, value: &str) {
     element.push('"');
 }
 
-/// Returns MuJoCo's error about a text, with the file and line of the user, and a hint where a newer MuJoCo is needed.
+/// Converts MuJoCo's error about a text to an error with the user's file and line. Adds a hint if the text uses a
+/// keyword of a newer MuJoCo.
 pub(super) fn explain(text: &Text, main: &str, reason: &str) -> Error {
     let said = escaped_reason(reason);
     let line = reason.split("line ").nth(1).and_then(|rest| {
@@ -407,14 +414,15 @@ pub(super) fn explain(text: &Text, main: &str, reason: &str) -> Error {
     }
 }
 
-/// Returns MuJoCo's message without its line and column, which refer to the rewritten text.
+/// Returns MuJoCo's message without line and column, which would refer to the rewritten text. Escapes control
+/// characters.
 pub(super) fn escaped_reason(reason: &str) -> String {
     let cut = reason.find(", line ").unwrap_or(reason.len());
     let words: String = reason[..cut].chars().flat_map(char::escape_debug).collect();
     words.replace("\\'", "'").replace("\\\"", "\"").trim().to_owned()
 }
 
-/// Keywords of newer versions of MJCF, each with what to write for 2.2.2.
+/// MJCF keywords of newer MuJoCo versions, each with an alternative for MuJoCo 2.2.2.
 const HINTS: [(&str, &str); 14] = [
     ("actuatorfrcrange", "limit the actuator's force by its forcerange"),
     ("actuatorfrclimited", "limit the actuator's force by its forcerange"),

@@ -1,16 +1,17 @@
-//! Tasks that are folders: an MJCF model and a file `task.toml`. docs/tasks.md explains the file.
+//! Tasks that users define by a folder with an MJCF model and a file `task.toml`. docs/tasks.md explains the file.
 //!
-//! A folder is loaded in this order:
+//! The modules, in the order in which a folder passes through them:
 //!
-//! - `files` reads what the folder holds, and nothing outside of it; `table` reads TOML with places for errors.
-//! - `mjcf` resolves includes and writes the texts for MuJoCo; `elements` finds elements by name.
-//! - `file` assembles the task from `reading` with its `number`s, `reward`, `rules`, `reset` and `parameter` with its
-//!   `target`s.
-//! - `checks` refuses edits that cannot have an effect, and `effect` looks for edits without a visible effect.
-//! - `attributes` looks up attributes of the model's elements, `lengths` edits the model's text, and `recompilation`
-//!   compiles it for each other value.
-//! - `environment` is the environment. `template` has the simulations, which all environments of a thread share.
-//! - `child` loads a folder for the first time in a process of its own, and `report` says what `--check` prints.
+//! - `child` loads a new folder in a separate process first, because MuJoCo may crash or hang.
+//! - `files` reads the files of the folder; `table` reads TOML, and reports the line of each error.
+//! - `mjcf` resolves includes and writes the model's text for MuJoCo; `elements` finds model elements by name.
+//! - `file` builds the task from its parts: `reading` and `number` (what is read from the simulation), `reward`,
+//!   `rules`, `reset`, `parameter` and `target` (what a parameter edits).
+//! - `checks` refuses edits that cannot have an effect; `effect` finds edits that have no visible effect.
+//! - `lengths` edits lengths in the model's text, with the help of `attributes`; `recompilation` compiles the edited
+//!   text.
+//! - `environment` is the environment; `template` applies edits to the simulation that a thread's environments share.
+//! - `report` writes the report that `--check` prints.
 
 mod attributes;
 mod checks;
@@ -43,5 +44,5 @@ pub use error::{Error, LoadError};
 pub use load::{Folder, load, read_model};
 pub use report::report;
 
-/// A JSON schema of `task.toml`.
+/// The JSON schema of `task.toml`.
 pub const SCHEMA: &str = include_str!("schema.json");

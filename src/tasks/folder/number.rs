@@ -1,8 +1,8 @@
-//! The numbers that a reading consists of, and the way in which each is read.
+//! The numbers that a task can read from a simulation, and how each is computed.
 
 use perturb_mujoco::{Field, Model, Reading as Array, Simulation};
 
-/// The computation that MuJoCo must have done before a reading. Each stage includes the previous one.
+/// The computation that MuJoCo must do before a number can be read. Each stage includes the previous one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Stage {
     /// No computation: positions, velocities and actions are always known.
@@ -13,70 +13,71 @@ pub(super) enum Stage {
     Forward,
 }
 
-/// A number that is read.
+/// A number that a task reads from a simulation, or from the action.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Number {
-    /// Consecutive numbers of an array: (first, how many).
+    /// Consecutive numbers of an array: (array, index of the first, count).
     Array(Array, usize, usize),
-    /// Sine of an entry of `qpos`.
+    /// The sine of the entry of `qpos` with this index.
     Sin(usize),
-    /// Cosine of an entry of `qpos`.
+    /// The cosine of the entry of `qpos` with this index.
     Cos(usize),
-    /// A joint's position, with its range scaled to ±1: (joint, entry of `qpos`).
+    /// A joint's position, scaled so that its range becomes ±1: (joint, index in `qpos`).
     Scaled(usize, usize),
-    /// A component of a body's velocity at its centre of mass: 0 to 2 angular, 3 to 5 linear.
+    /// A component of a body's velocity at its centre of mass: (body, component). Components 0 to 2 are angular, 3 to 5
+    /// linear.
     BodyVelocity(usize, usize),
-    /// A body's turn about x, y or z: 0 roll, 1 pitch, 2 yaw.
+    /// An angle of a body's orientation: (body, angle). Angle 0 is roll, 1 pitch, 2 yaw.
     Angle(usize, usize),
-    /// Whether a geom touches another.
+    /// 1 if the geom with this index touches another geom, otherwise 0.
     Touching(usize),
-    /// A component of the common centre of mass of bodies.
+    /// A coordinate of the common centre of mass of several bodies: (bodies, axis).
     Centre(Vec<usize>, usize),
-    /// A component of the vector between two points.
+    /// A component of the vector from one point to another: (from, to, axis).
     Between(Point, Point, usize),
-    /// The distance of two points.
+    /// The distance between two points.
     Distance(Point, Point),
-    /// An entry of the action as it was received.
+    /// An entry of the action, as it was received.
     Action(usize),
-    /// An entry of the action of the step before.
+    /// An entry of the previous step's action.
     PreviousAction(usize),
     Constant(f64),
-    /// Simulated seconds since the reset.
+    /// The simulated time since the reset, in s.
     Time,
 }
 
-/// A point whose position MuJoCo computes.
+/// A point whose position MuJoCo computes: of a body, a site or a geom.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Point {
     pub(super) array: Array,
     pub(super) id: usize,
 }
 
-/// A number's name in `task.toml`, such as `root.x`, its name as a channel, and its unit and range.
+/// The description of a number: its names, unit and range.
 #[derive(Debug, Clone)]
 pub(super) struct Entry {
-    /// Name by which `without` and `axes` find it.
+    /// The name in `task.toml`, such as `root.x`, by which the keys `without` and `axes` select it.
     pub(super) name: String,
-    /// The element's name alone.
+    /// The name of the model element alone, such as `root`.
     pub(super) element: String,
-    /// The kind of element, which distinguishes equal names.
+    /// The kind of element. It distinguishes elements of different kinds with the same name.
     pub(super) kind: &'static str,
-    /// Name as a channel of the observation.
+    /// The name as an entry of the observation.
     pub(super) channel: String,
     pub(super) unit: &'static str,
     pub(super) low: f64,
     pub(super) high: f64,
 }
 
-/// The actions from which a step's numbers are computed, besides the simulation.
+/// The actions that numbers may read in addition to the simulation.
 pub(super) struct Context<'a> {
-    /// The action as received, `[A]`.
+    /// The action of the step, as it was received.
     pub(super) action: &'a [f32],
-    /// The action of the step before, `[A]`.
+    /// The action of the previous step; zeros after a reset.
     pub(super) previous_action: &'a [f32],
 }
 
-/// Returns a unique channel name for each number.
+/// Returns the channel names of numbers, made unique by prefixes and suffixes where necessary.
 pub(super) fn unique_channels<'a>(entries: impl Iterator<Item = &'a Entry>) -> Vec<String> {
     let mut names: Vec<String> = Vec::new();
     let mut taken = std::collections::BTreeSet::new();
@@ -96,7 +97,8 @@ pub(super) fn unique_channels<'a>(entries: impl Iterator<Item = &'a Entry>) -> V
     names
 }
 
-/// An entry without bounds.
+/// Creates the description of a number without bounds. Its name is `element.part`, or `element` if `part` is empty; its
+/// channel name is made from `suffix`.
 pub(super) fn entry(element: &str, part: &str, suffix: String, unit: &'static str) -> Entry {
     let name = if part.is_empty() { element.to_owned() } else { format!("{element}.{part}") };
     Entry {
@@ -110,13 +112,13 @@ pub(super) fn entry(element: &str, part: &str, suffix: String, unit: &'static st
     }
 }
 
-/// Converts a text to a channel's name: letters, digits and underscores. `#` stays before an unnamed element's number.
+/// Converts a text to a channel name: replaces all characters except letters, digits and `#` by underscores.
 pub(super) fn channel_name(text: &str) -> String {
     text.chars().map(|c| if c.is_alphanumeric() || c == '#' { c } else { '_' }).collect()
 }
 
 impl Number {
-    /// Returns the computation that is needed before the number is read.
+    /// Returns the computation that MuJoCo must do before the number can be read.
     pub(super) fn stage(&self) -> Stage {
         use Array::{
             Activations, BodyCentres, BodyInertias, BodyPositions, BodyRotations, BodyVelocities, Controls,
@@ -145,7 +147,7 @@ impl Number {
         }
     }
 
-    /// Appends the number, or the numbers of an array.
+    /// Appends the number, or the numbers of an array, to `out`.
     pub(super) fn read(&self, simulation: &Simulation, context: &Context<'_>, out: &mut Vec<f64>) {
         let value = match self {
             Self::Array(array, first, length) => {
@@ -190,7 +192,7 @@ impl Point {
     }
 }
 
-/// A joint's position, with its range scaled to ±1.
+/// Scales a joint's position so that its range becomes ±1.
 pub(super) fn scaled(model: &Model, joint: usize, position: f64) -> f64 {
     let range = &model.field(Field::JointRange)[2 * joint..][..2];
     2.0 * (position - (range[0] + range[1]) / 2.0) / (range[1] - range[0])

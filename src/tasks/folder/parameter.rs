@@ -1,4 +1,5 @@
-//! The parameters of a task: which numbers of the model each edits, within which bounds, and the sets of its versions.
+//! The parameters of a task: the numbers of the model that each edits, its bounds, and the values that each version
+//! draws.
 
 use super::{
     elements::Elements,
@@ -15,7 +16,7 @@ const PARAMETER: &[&str] = &["name", "unit", "description", "edit", "default", "
 const EDIT: [&str; 2] = ["by", "factor"];
 const APPLIED: [&str; 2] = ["name", "unit"];
 
-/// An edit: all its targets take the parameter's value in the same way.
+/// An edit: numbers of the model that follow a parameter's value in the same way.
 #[derive(Debug, Clone)]
 pub(super) struct Edit {
     pub(super) targets: Targets,
@@ -23,7 +24,7 @@ pub(super) struct Edit {
     factor: f64,
 }
 
-/// A parameter with its edits.
+/// A parameter, and the edits of the model that it makes.
 #[derive(Debug, Clone)]
 pub(super) struct EditedParameter {
     pub(super) parameter: Parameter,
@@ -31,7 +32,7 @@ pub(super) struct EditedParameter {
 }
 
 impl EditedParameter {
-    /// Makes a parameter from its TOML table.
+    /// Reads a parameter from its TOML table.
     pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements) -> Result<Self> {
         let name = table.require("name", "\"torso_mass\"")?;
         let name = identifier(&name, name.text()?)?;
@@ -63,7 +64,7 @@ impl EditedParameter {
         Ok(edited)
     }
 
-    /// Refuses bounds at which an edited number would not be physical.
+    /// Refuses bounds at which an edited number would not be physical, such as a negative mass.
     fn check_physical(&self, bounds: &Value<'_>, model: &Model) -> Result<()> {
         let Interval { low, high } = self.parameter.bounds;
         for edit in &self.edits {
@@ -84,17 +85,18 @@ impl EditedParameter {
         Ok(())
     }
 
-    /// The array and the index of each number of the model that the parameter edits.
+    /// Returns the array and the index of each number of the model that the parameter edits.
     pub(super) fn places(&self) -> impl Iterator<Item = (Field, usize)> + '_ {
         self.targets().map(Target::place)
     }
 
-    /// The targets of all edits.
+    /// Returns the targets of all edits.
     pub(super) fn targets(&self) -> impl Iterator<Item = Target> + '_ {
         self.edits.iter().flat_map(|edit| edit.targets.all.iter().copied())
     }
 
-    /// Applies a value to a simulation that has the pristine model. What is compiled is in that model already.
+    /// Applies a value to a simulation whose model is `pristine`. Lengths are skipped, since `pristine` was compiled
+    /// with them.
     pub(super) fn apply(&self, pristine: &Model, simulation: &mut Simulation, value: f64) {
         for edit in &self.edits {
             for &target in edit.targets.all.iter().filter(|target| !target.is_recompiled()) {
@@ -106,7 +108,7 @@ impl EditedParameter {
         }
     }
 
-    /// Whether the value leaves the pristine model as it is.
+    /// Whether applying the value would leave the model `pristine` unchanged.
     pub(super) fn is_pristine(&self, pristine: &Model, value: f64) -> bool {
         self.edits.iter().all(|edit| {
             edit.targets.all.iter().filter(|target| !target.is_recompiled()).all(|target| {
@@ -116,9 +118,9 @@ impl EditedParameter {
         })
     }
 
-    /// Reads the parameter's value back from the model. Of the values of all targets it returns the one that is
-    /// farthest from the requested value. `own` is the model as it stands in the folder, `compiled` the one that was
-    /// compiled with the lengths.
+    /// Reads the parameter's value back from the edited `model`. If its targets have different values, returns the one
+    /// that differs most from `requested`. `own` is the folder's model without edits, `compiled` the model with edited
+    /// lengths but without other edits.
     pub(super) fn read_back(&self, (own, compiled): (&Model, &Model), model: &Model, requested: f64) -> f64 {
         let values = self.edits.iter().flat_map(|edit| {
             edit.targets.all.iter().map(|target| {
@@ -161,7 +163,7 @@ impl Edit {
         Ok(Self { targets: Targets::new(table, model, elements, change)?, change, factor })
     }
 
-    /// Returns the number that an edit with `value` writes in place of the pristine number `own`.
+    /// Returns the number that replaces the unedited number `own` if the parameter has this `value`.
     pub(super) fn number(&self, own: f64, value: f64) -> f64 {
         match self.change {
             Change::Set => self.factor * value,
@@ -170,12 +172,12 @@ impl Edit {
         }
     }
 
-    /// Returns the value with which an edit writes this number, or adds it.
+    /// Returns the parameter's value from the `number` that an edit wrote or added, the inverse of [`Edit::number`].
     fn unscaled(&self, number: f64) -> f64 {
         if self.factor.abs() == 1.0 { number * self.factor } else { number / self.factor }
     }
 
-    /// Refuses a value at which a range would be empty.
+    /// Refuses a value that would make a range empty.
     fn check_range(&self, bounds: &Value<'_>, model: &Model, (target, at): (Target, usize), value: f64) -> Result<()> {
         let (field, number) = (target.place().0, self.number(target.value(model), value));
         let own = model.field(field);
@@ -190,7 +192,7 @@ impl Edit {
     }
 }
 
-/// Returns the value of version D: the file's, or else the model's.
+/// Returns the value of version D: the file's `default`, otherwise the value in the model.
 fn default(table: &Table<'_>, model: &Model, edits: &[Edit]) -> Result<f64> {
     if let Some(default) = table.number("default")? {
         return Ok(default);
@@ -216,7 +218,8 @@ fn default(table: &Table<'_>, model: &Model, edits: &[Edit]) -> Result<f64> {
     }
 }
 
-/// The sets of R and E, which must fit each other.
+/// Reads the interval of version R and the two intervals of version E. Those of E must adjoin that of R, below and
+/// above.
 pub(super) fn sets(table: &Table<'_>, bounds: (f64, f64), default: f64) -> Result<(Interval, [Interval; 2])> {
     let within = |value: &Value<'_>, name: &str, (low, high): (f64, f64)| {
         if bounds.0 <= low && high <= bounds.1 {
@@ -249,7 +252,7 @@ pub(super) fn sets(table: &Table<'_>, bounds: (f64, f64), default: f64) -> Resul
     Ok((Interval::new(random.0, random.1), [Interval::new(below.0, below.1), Interval::new(above.0, above.1)]))
 }
 
-/// A number of the model that receipts have besides the parameters.
+/// A number of the model that receipts report in addition to the parameters.
 #[derive(Debug, Clone)]
 pub(super) struct AppliedQuantity {
     pub(super) quantity: Quantity,
@@ -257,7 +260,7 @@ pub(super) struct AppliedQuantity {
 }
 
 impl AppliedQuantity {
-    /// Makes an applied quantity from its TOML table.
+    /// Reads an applied quantity from its TOML table.
     pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements) -> Result<Self> {
         table.only(&[&KEYS[..], &APPLIED].concat())?;
         let name = table.require("name", "\"torso_mass\"")?;
@@ -274,7 +277,7 @@ impl AppliedQuantity {
         Ok(Self { quantity, target })
     }
 
-    /// The number in a model.
+    /// Returns the number in a model.
     pub(super) fn read(&self, model: &Model) -> f64 {
         self.target.value(model)
     }

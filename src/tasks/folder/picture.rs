@@ -1,4 +1,4 @@
-//! The view of a folder's pictures.
+//! The camera of a folder's pictures.
 
 use super::{elements::Elements, error::Result, table::Table};
 use crate::scene::ModelView;
@@ -8,9 +8,9 @@ const PICTURE: &[&str] = &["camera", "look_at", "distance", "azimuth", "elevatio
 const AZIMUTH: f64 = 90.0;
 const ELEVATION: f64 = -15.0;
 
-/// Makes the view from the TOML table `picture`. Without a table the picture shows the whole model from the side.
+/// Reads the camera from the TOML table `picture`. Without a table, pictures show the whole model from the side.
 pub(super) fn view(table: Option<&Table<'_>>, model: &Model, elements: &Elements) -> Result<ModelView> {
-    // The statistics hold the extent and the centre of the model at the places 3 and 4 to 6.
+    // Entry 3 of the statistics is the model's extent, entries 4 to 6 are its centre.
     let statistic = model.field(Field::Statistic);
     let centre = std::array::from_fn(|i| statistic[4 + i]);
     let mut view = (centre, 1.5 * statistic[3], AZIMUTH, ELEVATION, None);

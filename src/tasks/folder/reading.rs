@@ -1,4 +1,4 @@
-//! Readings: what a task reads from the simulation, as a list of numbers with names.
+//! Readings: lists of named numbers that a task reads from the simulation, for observations, rewards and rules.
 
 use super::{
     elements::Elements,
@@ -9,7 +9,7 @@ use super::{
 };
 use perturb_mujoco::{Kind, Model, Reading as Array, Simulation};
 
-/// Subjects of readings, by the key that names them.
+/// The keys of a reading that say what is read. Each reading has exactly one of them.
 const SUBJECTS: [&str; 12] = [
     "joint",
     "body",
@@ -24,10 +24,10 @@ const SUBJECTS: [&str; 12] = [
     "constant",
     "time",
 ];
-/// The keys of a reading besides its subject.
+/// The other keys of a reading.
 const OPTIONS: [&str; 6] = ["to", "get", "axes", "without", "scale", "clip"];
 
-/// A list of numbers.
+/// A list of numbers that a task reads, with an optional scale and clipping range for all of them.
 #[derive(Debug, Clone)]
 pub(super) struct Reading {
     numbers: Vec<Number>,
@@ -37,7 +37,7 @@ pub(super) struct Reading {
 }
 
 impl Reading {
-    /// Makes a reading from its TOML table.
+    /// Reads the definition of a reading from its TOML table.
     pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements) -> Result<Self> {
         table.only(&[&SUBJECTS[..], &OPTIONS].concat())?;
         let (subject, value) = table.one_of(&SUBJECTS).map_err(|_| {
@@ -79,27 +79,27 @@ impl Reading {
         Ok(Self { numbers: join(numbers), entries, scale, clip })
     }
 
-    /// The number of numbers.
+    /// How many numbers the reading has.
     pub(super) fn len(&self) -> usize {
         self.entries.len()
     }
 
-    /// The numbers' names, units and ranges.
+    /// The names, units and ranges of the numbers.
     pub(super) fn entries(&self) -> &[Entry] {
         &self.entries
     }
 
-    /// Returns the computation that is needed before the numbers are read.
+    /// Returns the computation that MuJoCo must do before the numbers can be read.
     pub(super) fn stage(&self) -> Stage {
         self.numbers.iter().map(Number::stage).max().unwrap_or(Stage::State)
     }
 
-    /// Whether the external forces on bodies are read.
+    /// Whether the reading includes external forces on bodies, which MuJoCo does not compute by default.
     pub(super) fn needs_external_forces(&self) -> bool {
         self.numbers.iter().any(|number| matches!(number, Number::Array(Array::BodyExternalForces, ..)))
     }
 
-    /// Appends the numbers.
+    /// Appends the numbers, scaled and clipped, to `out`.
     pub(super) fn read(&self, simulation: &Simulation, context: &Context<'_>, out: &mut Vec<f64>) {
         let begin = out.len();
         for number in &self.numbers {
@@ -132,7 +132,7 @@ fn range((low, high): (f64, f64), scale: f64, clip: Option<(f64, f64)>) -> (f64,
     if low < high { (low, high) } else { (low, low + 1.0) }
 }
 
-/// Joins neighbouring numbers of an array.
+/// Joins consecutive numbers of the same array to one [`Number::Array`], which is faster to read.
 fn join(numbers: Vec<Number>) -> Vec<Number> {
     let mut joined: Vec<Number> = Vec::new();
     for number in numbers {

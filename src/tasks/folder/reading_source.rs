@@ -1,4 +1,4 @@
-//! Resolves the description of a reading in a task's file to numbers of the simulation.
+//! Converts the TOML description of a reading to the numbers of the simulation that it means.
 
 use super::{
     elements::{Elements, actuator_name},
@@ -8,7 +8,7 @@ use super::{
 };
 use perturb_mujoco::{Field, Flags, Index, Kind, Model, Reading as Array};
 
-/// Readings of each kind of element.
+/// The values of the key `get` for each kind of element.
 const OF_A_JOINT: &[&str] = &["position", "velocity", "sin", "cos", "scaled", "actuation", "constraint"];
 const OF_A_BODY: &[&str] = &[
     "position",
@@ -28,14 +28,14 @@ const OF_A_GEOM: &[&str] = &["position", "touching"];
 const OF_AN_ACTUATOR: &[&str] = &["control", "force", "activation"];
 const OF_TWO_POINTS: &[&str] = &["vector", "distance"];
 
-/// The TOML table of a reading, with the model and the elements to which the table refers.
+/// The TOML table of a reading, and the model to whose elements the table refers.
 pub(super) struct Source<'a> {
     pub(super) table: &'a Table<'a>,
     pub(super) model: &'a Model,
     pub(super) elements: &'a Elements,
 }
 
-/// Numbers with their names.
+/// Numbers with their names, units and ranges.
 pub(super) type Numbers = Vec<(Number, Entry)>;
 
 const AXES: [&str; 3] = ["x", "y", "z"];
@@ -44,13 +44,13 @@ const FREE_VELOCITY: [&str; 6] = ["vx", "vy", "vz", "wx", "wy", "wz"];
 const SPATIAL: [&str; 6] = ["rx", "ry", "rz", "tx", "ty", "tz"];
 const INERTIA: [&str; 10] = ["xx", "yy", "zz", "xy", "xz", "yz", "mx", "my", "mz", "m"];
 
-/// MuJoCo's types of joints.
+/// MuJoCo's number for each type of joint.
 const FREE: i32 = 0;
 const BALL: i32 = 1;
 const SLIDE: i32 = 2;
 
 impl Source<'_> {
-    /// Returns the numbers of a subject. `value` is the value of the subject's key.
+    /// Returns the numbers that a key such as `joint` means, with its `value`.
     pub(super) fn numbers(&self, subject: &str, value: &Value<'_>) -> Result<Numbers> {
         match subject {
             "joint" => self.joints(value),
@@ -68,7 +68,8 @@ impl Source<'_> {
         }
     }
 
-    /// Returns the value of `get`, which must be among `known`.
+    /// Returns the value of the key `get`, which must be in `known`. Without the key returns `default`, if there is
+    /// one.
     fn get(&self, subject: &str, known: &[&'static str], default: Option<&'static str>) -> Result<&'static str> {
         let Some(value) = self.table.get("get") else {
             let problem =
@@ -82,7 +83,7 @@ impl Source<'_> {
         })
     }
 
-    /// Refuses the key `get` for a subject with only one quantity.
+    /// Refuses the key `get`, for subjects that have only one quantity.
     fn no_get(&self, subject: &str) -> Result<()> {
         match self.table.get("get") {
             None => Ok(()),
@@ -246,7 +247,7 @@ impl Source<'_> {
         Ok(AXES.iter().enumerate().map(number).collect())
     }
 
-    /// A point, as `{ body = "name" }`.
+    /// Reads a point, written for instance `{ body = "name" }`.
     fn point(&self, value: &Value<'_>) -> Result<Point> {
         let table = value.table()?;
         table.only(&["body", "site", "geom"])?;
@@ -312,7 +313,7 @@ impl Source<'_> {
         Ok(self.elements.select(Kind::Actuator, value)?.into_iter().map(number).collect())
     }
 
-    /// Keeps the components along the axes that a text such as "xz" names.
+    /// Removes all numbers except the components along the axes in a text such as "xz".
     pub(super) fn only_axes(&self, axes: &Value<'_>, all: &mut Numbers) -> Result<()> {
         let text = axes.text()?;
         let wrong =
@@ -343,7 +344,8 @@ fn joint_unit(get: &str, kind: i32, part: &str) -> &'static str {
     }
 }
 
-/// The place of an actuator's activation: actuators with dynamics have one each, in the model's order.
+/// Returns the index of an actuator's activation; `None` if the actuator has no dynamics. Each actuator with dynamics
+/// has one activation, in the model's order.
 fn activation(model: &Model, actuator: usize) -> Option<usize> {
     let dynamics = model.index_array(Index::ActuatorDynamics);
     (dynamics[actuator] != 0).then(|| dynamics[..actuator].iter().filter(|&&kind| kind != 0).count())

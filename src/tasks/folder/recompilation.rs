@@ -1,5 +1,4 @@
-//! Models with other lengths: compiled again from the edited text, and cached by the values of the parameters that change
-//! it.
+//! Compiles a model again with edited lengths, and caches the compiled models.
 
 use super::{
     error::Result,
@@ -14,13 +13,14 @@ use std::{
     sync::{Arc, Mutex, PoisonError},
 };
 
-/// Limit of a model whose lengths are edited, in bytes: each environment has one of its own.
+/// Maximal size of a model whose lengths are edited, in bytes. Each environment may need a model of its own.
 const MAX_MODEL_BYTES: usize = 1 << 20;
-/// Limits of the cache of a task.
+/// Maximal total size of the cached models of a task, in bytes.
 const MAX_CACHE_BYTES: usize = 8 << 20;
+/// Maximal number of cached models of a task.
 const MAX_CACHED: usize = 1024;
 
-/// The texts of a model with edited lengths, and the models that were compiled from them.
+/// The texts of a model whose lengths can be edited, and a cache of compiled models.
 #[derive(Debug)]
 pub(super) struct Recompilation {
     slots: Vec<Slot>,
@@ -32,17 +32,18 @@ pub(super) struct Recompilation {
 
 #[derive(Debug, Default)]
 struct CompiledModels {
+    /// The models, by the bits of the amounts of all slots.
     models: HashMap<Box<[u64]>, Arc<Model>>,
-    /// The keys, the oldest first.
+    /// The keys of `models`, oldest first.
     order: VecDeque<Box<[u64]>>,
 }
 
 impl Recompilation {
-    /// Prepares for the parameters that need it; `None` if none does. The model is compiled at the ends of their bounds, of
-    /// R and of E.
+    /// Prepares the edits of lengths. Returns `None` if no parameter edits a length. As a check, compiles the model
+    /// with each such parameter at the ends of its bounds and of its intervals in R and E.
     ///
     /// # Errors
-    /// [`super::Error`] with the parameter and the value, if an edit cannot be made.
+    /// [`super::Error`] with the parameter and the value, if the text cannot be edited or the model cannot be compiled.
     pub(super) fn new(
         tables: &[Table<'_>],
         parameters: &[EditedParameter],
@@ -87,7 +88,7 @@ impl Recompilation {
         Ok(Some(own))
     }
 
-    /// The names of the parameters whose values need another compilation.
+    /// Returns the names of the parameters that edit lengths.
     pub(super) fn parameters<'a>(
         &'a self,
         parameters: &'a [EditedParameter],
@@ -104,18 +105,18 @@ impl Recompilation {
         self.slots.iter().zip(amounts).all(|(slot, amount)| amount.to_bits() == slot.neutral().to_bits())
     }
 
-    /// The model with the lengths of these parameters: `own`, which is the model as it stands in the folder, if none is
-    /// changed.
+    /// Returns the model with the lengths of the parameters `values`, from the cache if possible. If no length differs,
+    /// returns `own`, the folder's model without edits.
     ///
     /// # Errors
-    /// [`Error::Compile`].
+    /// [`Error::Compile`] if the model cannot be compiled with these lengths.
     pub(super) fn model(&self, own: &Arc<Model>, values: &[f64]) -> std::result::Result<Arc<Model>, Error> {
         let amounts = self.amounts(values);
         if self.is_neutral(&amounts) {
             return Ok(Arc::clone(own));
         }
         let key: Box<[u64]> = amounts.iter().map(|amount| amount.to_bits()).collect();
-        // Nothing in the cache can be half-written by a panic.
+        // A poisoned mutex is harmless, since no panic can leave the cache in a bad state.
         let lock = || self.cache.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(found) = lock().models.get(&key) {
             return Ok(Arc::clone(found));
@@ -133,7 +134,7 @@ impl Recompilation {
         Ok(model)
     }
 
-    /// The model that pictures show, as MJCF; `None` if no length is changed.
+    /// Returns the MJCF for pictures with the lengths of the parameters `values`; `None` if no length differs.
     pub(super) fn picture(&self, values: &[f64]) -> Option<String> {
         let amounts = self.amounts(values);
         (!self.is_neutral(&amounts)).then(|| self.picture.write(&self.slots, &amounts))

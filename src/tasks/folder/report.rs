@@ -1,4 +1,4 @@
-//! The report that `--check` prints of a folder.
+//! The report about a folder that `perturb-server --check` prints.
 
 use super::{
     effect,
@@ -13,15 +13,15 @@ use perturb_mujoco::Kind;
 use std::{fmt::Write, path::Path, time::Duration};
 use tokio::time::Instant;
 
-/// Duration for which steps are timed.
+/// Duration of the measurement of the speed.
 const TIMED: Duration = Duration::from_millis(200);
-/// Number of compilations that are timed.
+/// Number of compilations whose median time is reported.
 const N_COMPILATIONS: u32 = 9;
-/// Lists longer than this are shortened.
+/// Maximal number of names in a list of the report. Longer lists are shortened.
 const MAX_LISTED: usize = 24;
 
 impl Folder {
-    /// Returns the parameters whose edits have no visible effect in some steps from the initial state.
+    /// Returns the names of the parameters that have no visible effect in a short simulation from the initial state.
     ///
     /// # Errors
     /// [`Error`] if MuJoCo raises a fatal error.
@@ -30,11 +30,11 @@ impl Folder {
     }
 }
 
-/// Loads a folder and describes it: model, observations, actions, rewards, ends, parameters, sizes, and the edits
-/// without a visible effect. The speed is measured and reported if `measured`.
+/// Loads a folder and describes it: model, observations, actions, rewards, ends of episodes, parameters, memory, and
+/// parameters without a visible effect. If `measured`, also measures and reports the speed.
 ///
 /// # Errors
-/// [`LoadError`] with the place and the remedy.
+/// [`LoadError`] with the file, the line and what to do.
 pub fn report(path: &Path, measured: bool) -> Result<String, LoadError> {
     let refuse = |error: Error| LoadError::new(path, error);
     let folder = load(path).map_err(refuse)?;
@@ -51,7 +51,8 @@ pub fn report(path: &Path, measured: bool) -> Result<String, LoadError> {
     Ok(text)
 }
 
-/// Describes what parameters cost that need another compilation.
+/// Writes the line about parameters that edit lengths: their names, the time of a compilation, and the memory of a
+/// model.
 fn lengths(out: &mut String, task: &Task, recompilation: &Recompilation, time: Option<Duration>) -> std::fmt::Result {
     let names: Vec<&str> = recompilation.parameters(&task.parameters).collect();
     let kilobytes = task.template.model.model_bytes() / 1000;
@@ -63,11 +64,12 @@ fn lengths(out: &mut String, task: &Task, recompilation: &Recompilation, time: O
     )
 }
 
-/// The median time of a compilation with other lengths, near the upper ends of E.
+/// Measures the median time to compile the model with edited lengths. The parameters are near the upper ends of version
+/// E.
 fn compilation_time(task: &Task, recompilation: &Recompilation) -> Result<Duration, perturb_mujoco::Error> {
     let mut times = Vec::new();
     for i in 1..=N_COMPILATIONS {
-        let share = 1.0 - f64::from(i) * 1e-6; // values that are not cached
+        let share = 1.0 - f64::from(i) * 1e-6; // gives values that are not in the cache
         let value = |parameter: &Parameter| {
             let high = parameter.extreme[1].high;
             parameter.default + share * (high - parameter.default)
@@ -81,6 +83,7 @@ fn compilation_time(task: &Task, recompilation: &Recompilation) -> Result<Durati
     Ok(times[times.len() / 2])
 }
 
+/// Writes all of the report except the line about lengths.
 fn describe(out: &mut String, task: &Task, files: &Files, unseen: &[&str], trial: Option<Trial>) -> std::fmt::Result {
     let (spec, model) = (&task.spec, &task.template.model);
     let names: Vec<&str> = files.names().collect();
@@ -184,16 +187,16 @@ fn shortened(names: &[&str]) -> String {
     format!("{}, …, {}", names[..MAX_LISTED - 1].join(", "), names[names.len() - 1])
 }
 
-/// Steps of random actions on version D.
+/// The result of stepping an environment with random actions on version D.
 struct Trial {
     steps_per_second: f64,
-    /// Episodes that ended.
+    /// Number of episodes that ended.
     episodes: u32,
-    /// Episodes that ended because the physics diverged.
+    /// Number of episodes that ended because the physics diverged.
     diverged: u32,
 }
 
-/// Takes steps for [`TIMED`].
+/// Steps an environment with random actions for the time [`TIMED`].
 fn try_steps(task: &'static Task) -> Result<Trial, crate::env::Error> {
     let spec = &task.spec;
     let distributions = spec.distributions(Version::D);

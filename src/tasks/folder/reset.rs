@@ -1,7 +1,8 @@
-//! The initial state of an episode: the model's, or a keyframe's, with noise.
+//! The random initial state of an episode: the model's initial state or a keyframe, with noise, and joints that are
+//! placed by rules.
 //!
-//! Numbers are drawn from the episode's stream in this order: the positions that have noise, in the model's order; the
-//! velocities that have noise, in the same order; then for each entry of `joints` its positions and its velocities.
+//! Random numbers are drawn in this order: noise on positions, in the model's order; noise on velocities, in the
+//! model's order; then for each table in `joints` its positions and its velocities.
 
 use super::{
     elements::Elements,
@@ -16,46 +17,47 @@ const RESET: &[&str] = &["keyframe", "position", "velocity", "joints"];
 const NOISE: &[&str] = &["uniform", "normal"];
 const JOINTS: &[&str] = &["joint", "position", "velocity"];
 const PLACEMENT: &[&str] = &["uniform", "normal", "disc", "box", "beyond"];
-/// Limit of the draws of a point of a box until one lies outside of a circle. After the limit the last draw counts.
+/// Maximal number of draws of a point in a box until one is far enough from 0. If none is, the last draw is used.
 const MAX_DRAWS: usize = 1000;
 
 /// Noise that is added to a number.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Noise {
-    /// Uniform, from minus this number to this number.
+    /// Uniform between minus this number and this number.
     Uniform(f64),
-    /// Normal with mean 0 and this standard deviation.
+    /// Normally distributed with mean 0 and this standard deviation.
     Normal(f64),
 }
 
-/// Rule by which the positions or velocities of some joints are drawn.
+/// The rule by which the positions or velocities of some joints are drawn.
 #[derive(Debug, Clone, PartialEq)]
 enum Placement {
-    /// The initial values with noise.
+    /// Each number is its initial value plus noise.
     Noise(Noise),
-    /// Every value is this number.
+    /// Each number has this value.
     Fixed(f64),
-    /// Every value is uniform in this interval.
+    /// Each number is uniform in this interval.
     Interval(f64, f64),
-    /// A pair, uniform in a disc of this radius about 0.
+    /// Two numbers, the coordinates of a point that is uniform in a disc about 0 with this radius.
     Disc(f64),
-    /// Each number is uniform in its interval, and the distance of their vector from 0 is larger than this.
+    /// The numbers are the coordinates of a point that is uniform in the box of these intervals, farther from 0 than
+    /// the given distance.
     Box(Vec<(f64, f64)>, f64),
 }
 
 /// The distribution of initial states.
 #[derive(Debug, Clone)]
 pub(super) struct Reset {
-    /// Positions, then velocities, without noise: `[Q + V]`.
+    /// The positions, then the velocities, without noise.
     base: Vec<f64>,
-    /// The numbers that get noise, by their index in `base`.
+    /// The indices in `base` of the numbers with noise, and their noise.
     noise: Vec<(usize, Noise)>,
-    /// The numbers, by their indices in `base`, that are drawn together by a rule.
+    /// The indices in `base` of numbers that are drawn together, and their rule.
     placed: Vec<(Vec<usize>, Placement)>,
 }
 
 impl Reset {
-    /// Makes the distribution from the TOML table `reset`, if there is one.
+    /// Reads the distribution from the TOML table `reset`. Without a table, the state is the model's initial state.
     pub(super) fn new(table: Option<&Table<'_>>, model: &Model, elements: &Elements) -> Result<Self> {
         let (n_q, n_v) = (model.n_q(), model.n_v());
         let mut base = [model.field(Field::InitialPositions), &vec![0.0; n_v]].concat();
@@ -97,7 +99,7 @@ impl Reset {
         Ok(Self { base, noise, placed })
     }
 
-    /// Draws a state: positions, then velocities.
+    /// Draws an initial state, and writes its positions and velocities to `qpos` and `qvel`.
     pub(super) fn draw(&self, stream: &mut Stream, qpos: &mut [f64], qvel: &mut [f64]) {
         let mut state = self.base.clone();
         for &(number, noise) in &self.noise {
@@ -112,7 +114,7 @@ impl Reset {
     }
 }
 
-/// The entries of a joint in `qpos`, or in `qvel`.
+/// Returns the indices of a joint's entries in `qpos`, or in `qvel` if `velocity`.
 fn numbers_of(model: &Model, joint: usize, velocity: bool) -> std::ops::Range<usize> {
     let (starts, end) = if velocity {
         (model.index_array(Index::JointVelocity), model.n_v())
@@ -140,7 +142,7 @@ impl Noise {
 }
 
 impl Placement {
-    /// Reads the rule by which `n` numbers are drawn.
+    /// Reads the rule for drawing `n` numbers.
     fn new(value: &Value<'_>, n: usize) -> Result<Self> {
         if value.is_list() {
             let (low, high) = value.interval()?;
@@ -209,8 +211,8 @@ fn positive(value: &Value<'_>) -> Result<f64> {
     if size >= 0.0 { Ok(size) } else { Err(value.error(format_args!("{size} is negative; expected 0 or more"))) }
 }
 
-/// The number below which a standard normal variable lies with probability `p` in [0, 1), by Wichura's algorithm AS 241
-/// (1988), as Python's `statistics.NormalDist` computes it. Probability 0 counts as 2^-54.
+/// Returns the quantile of the standard normal distribution for probability `p` in [0, 1), by Wichura's algorithm AS
+/// 241 (1988), which Python's `statistics.NormalDist` uses, too. Probability 0 counts as 2^-54.
 #[expect(clippy::excessive_precision, reason = "the published coefficients")]
 fn normal_quantile(p: f64) -> f64 {
     const CENTRE: ([f64; 8], [f64; 8]) = (

@@ -1,4 +1,4 @@
-//! The reward's terms.
+//! The terms of a task's reward.
 
 use super::{
     elements::{Elements, actuated_joint},
@@ -11,9 +11,10 @@ use super::{
 use crate::env::RewardTerm;
 use perturb_mujoco::{Flags, Index, Kind, Model, Simulation};
 
-/// Kinds of terms, by the key that names them.
+/// The keys of a term that say what kind it is. Each term has exactly one of them.
 pub(super) const KINDS: [&str; 10] =
     ["value", "rate", "squared", "norm", "within", "near", "power", "limits", "healthy", "constant"];
+/// The other keys of a term.
 pub(super) const OPTIONS: [&str; 12] = [
     "name",
     "description",
@@ -28,12 +29,12 @@ pub(super) const OPTIONS: [&str; 12] = [
     "sigma",
     "otherwise",
 ];
-/// Limit of the absolute value of a term: actions may be as large as an f32 can be, and their squares must not make a
-/// reward that is not finite.
+/// Maximal absolute value of a term. An action may have any f32 value, and the reward, which may contain its square,
+/// must still be finite.
 const MAX_TERM: f64 = 1e30;
 /// The natural logarithm of 0.1.
 const LN_0_1: f64 = -std::f64::consts::LN_10;
-/// The part of a joint's range beyond which it is at its limit.
+/// Absolute scaled position above which a joint counts as at its limit. Its range is scaled to ±1.
 const AT_LIMIT: f64 = 0.99;
 
 /// A term of the reward.
@@ -51,7 +52,7 @@ pub(super) struct Term {
 #[derive(Debug, Clone)]
 enum TermKind {
     Value(Reading),
-    /// The change of a reading per second, with the index of its first number in [`Step::before`].
+    /// The change of a reading per second: (reading, index of its first number in [`Step::before`]).
     Rate(Reading, usize),
     Squared(Reading),
     Norm(Reading),
@@ -66,9 +67,9 @@ enum TermKind {
         reading: Reading,
         sigma: f64,
     },
-    /// The mechanical power of actuators. Each has its number and the entry of its joint in `qvel`.
+    /// The mechanical power of actuators: (actuator, index of its joint in `qvel`).
     Power(Vec<(usize, usize)>),
-    /// The number of joints at a limit. Each joint has its number and its entry in `qpos`.
+    /// The number of joints at a limit: (joint, index in `qpos`).
     Limits(Vec<(usize, usize)>),
     Healthy {
         otherwise: f64,
@@ -76,27 +77,27 @@ enum TermKind {
     Constant,
 }
 
-/// The way in which [`TermKind::Within`] falls over its margin.
+/// How [`TermKind::Within`] decreases with the distance from the range.
 #[derive(Debug, Clone, Copy)]
 enum MarginShape {
-    /// Falls from 1 to 0 at the margin, and is 0 beyond.
+    /// Linearly from 1 at the range to 0 at the margin and beyond.
     Linear,
-    /// Falls as dm_control's tolerance: exp(ln(0.1) × (distance / margin)²), which is 0.1 at the margin.
+    /// As exp(ln(0.1) × (distance / margin)²), like dm_control's `tolerance`. This is 0.1 at the margin.
     Gaussian,
 }
 
-/// The values from which terms are computed, besides the simulation.
+/// The values of a step that terms use in addition to the simulation.
 pub(super) struct Step<'a> {
     pub(super) context: Context<'a>,
     pub(super) healthy: bool,
-    /// Simulated seconds of a step.
+    /// The simulated time of a step, in s.
     pub(super) seconds: f64,
-    /// The numbers of [`Term::remembered`] after the step before, of all terms.
+    /// The numbers of the readings [`Term::remembered`] of all terms, after the previous step.
     pub(super) before: &'a [f64],
 }
 
 impl Term {
-    /// Makes a term from its TOML table. `n_remembered` counts the numbers that the terms before it remember.
+    /// Reads a term from its TOML table. `n_remembered` is the total of numbers that earlier terms remember.
     pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements, n_remembered: usize) -> Result<Self> {
         let name = table.require("name", "\"forward\"")?;
         let name = identifier(&name, name.text()?)?;
@@ -191,7 +192,7 @@ impl Term {
         Ok(term)
     }
 
-    /// The term as a formula.
+    /// Returns the term's formula as text, the default of its description.
     fn formula(&self, key: &str) -> String {
         let names = self.kind.reading().map_or_else(String::new, |reading| {
             let channels: Vec<&str> = reading.entries().iter().map(|entry| entry.channel.as_str()).collect();
@@ -222,7 +223,7 @@ impl Term {
         }
     }
 
-    /// The reading whose numbers must be remembered from one step to the next.
+    /// Returns the reading whose numbers the term needs from the previous step; `None` if it needs none.
     pub(super) fn remembered(&self) -> Option<&Reading> {
         match &self.kind {
             TermKind::Rate(reading, _) => Some(reading),
@@ -230,17 +231,17 @@ impl Term {
         }
     }
 
-    /// Returns the computation that is needed before the term is computed.
+    /// Returns the computation that MuJoCo must do before the term can be computed.
     pub(super) fn stage(&self) -> Stage {
         self.kind.reading().map_or(Stage::State, Reading::stage)
     }
 
-    /// Whether the external forces on bodies are read.
+    /// Whether the term reads external forces on bodies, which MuJoCo does not compute by default.
     pub(super) fn needs_external_forces(&self) -> bool {
         self.kind.reading().is_some_and(Reading::needs_external_forces)
     }
 
-    /// Computes the term after a step. `numbers` is a scratch buffer.
+    /// Computes the term after a step. `numbers` is a buffer that is overwritten.
     pub(super) fn compute(&self, simulation: &Simulation, step: &Step<'_>, numbers: &mut Vec<f64>) -> f64 {
         numbers.clear();
         if let Some(reading) = self.kind.reading() {
@@ -282,7 +283,7 @@ impl Term {
         self.limited(self.weight * value)
     }
 
-    /// Returns the term's value once the physics diverged.
+    /// Returns the term's value in a step whose physics diverged.
     pub(super) fn diverged(&self) -> f64 {
         match self.kind {
             TermKind::Healthy { otherwise } => otherwise,
@@ -290,19 +291,20 @@ impl Term {
         }
     }
 
-    /// The sum, in order, or the mean.
+    /// Returns the sum of the numbers, or their mean if the term has `mean`.
     fn total(&self, numbers: impl ExactSizeIterator<Item = f64>) -> f64 {
         let n = numbers.len() as f64;
         let sum: f64 = numbers.sum();
         if self.mean { sum / n } else { sum }
     }
 
-    /// Returns the numbers minus the target.
+    /// Returns the numbers minus the term's target.
     fn differences<'a>(&'a self, numbers: &'a [f64]) -> impl ExactSizeIterator<Item = f64> + 'a {
         let target = |i: usize| self.target.get(i).or(self.target.first()).copied().unwrap_or(0.0);
         numbers.iter().enumerate().map(move |(i, x)| x - target(i))
     }
 
+    /// Limits the absolute value to `at_least` … `at_most`.
     fn limited(&self, value: f64) -> f64 {
         let (least, most) = (self.at_least.unwrap_or(0.0), self.at_most.unwrap_or(MAX_TERM).min(MAX_TERM));
         if value.is_nan() { value } else { value.signum() * value.abs().min(most).max(least) }
@@ -323,7 +325,7 @@ impl TermKind {
     }
 }
 
-/// Reads the target: a number for all that is read, or a list with a number for each.
+/// Reads the key `target`: one number for all numbers of the reading, or a list with a number for each.
 fn target(table: &Table<'_>, reading: Option<&Reading>) -> Result<Vec<f64>> {
     let Some(value) = table.get("target") else { return Ok(Vec::new()) };
     if !value.is_list() {
@@ -340,7 +342,8 @@ fn target(table: &Table<'_>, reading: Option<&Reading>) -> Result<Vec<f64>> {
     }
 }
 
-/// The actuators of a table `{ actuator = "*" }` that drive joints of one degree of freedom.
+/// Reads the actuators of a table such as `{ actuator = "*" }`. Each must drive a hinge or slide. Returns their
+/// indices, and the indices of their joints in `qvel`.
 fn power(value: &Value<'_>, model: &Model, elements: &Elements) -> Result<Vec<(usize, usize)>> {
     let table = value.table()?;
     table.only(&["actuator"])?;
@@ -356,7 +359,8 @@ fn power(value: &Value<'_>, model: &Model, elements: &Elements) -> Result<Vec<(u
     actuators.into_iter().map(place).collect()
 }
 
-/// The joints of a table `{ joint = "*" }` that have limits; a pattern leaves the others out.
+/// Reads the joints of a table such as `{ joint = "*" }`. Skips joints other than hinges and slides with a range.
+/// Returns their indices, and their indices in `qpos`.
 fn limits(value: &Value<'_>, model: &Model, elements: &Elements) -> Result<Vec<(usize, usize)>> {
     let table = value.table()?;
     table.only(&["joint"])?;
@@ -375,7 +379,7 @@ fn limits(value: &Value<'_>, model: &Model, elements: &Elements) -> Result<Vec<(
     }
 }
 
-/// A name of a term, parameter or quantity: letters, digits and underscores, at most 64.
+/// Checks the name of a term, parameter or quantity: a letter, then letters, digits and underscores, at most 64 in all.
 pub(super) fn identifier<'a>(value: &Value<'_>, name: &'a str) -> Result<&'a str> {
     const MAX_CHARS: usize = 64;
     let starts = name.starts_with(|c: char| c.is_ascii_alphabetic());

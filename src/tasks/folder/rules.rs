@@ -1,4 +1,4 @@
-//! Ranges of readings, which define health and goals, and the success rule of an episode.
+//! Rules of a task: ranges of readings, which define health and goals, and the success rule of an episode.
 
 use super::{
     elements::Elements,
@@ -27,7 +27,7 @@ const SUCCESS: &[&str] = &[
 ];
 const ACHIEVEMENTS: [&str; 7] = ["greatest", "least", "last", "steps", "first", "last_steps", "longest"];
 
-/// The range of a reading. All of its numbers must lie in it.
+/// A condition: all numbers of a reading lie in a range.
 #[derive(Debug, Clone)]
 pub(super) struct Range {
     reading: Reading,
@@ -38,7 +38,7 @@ pub(super) struct Range {
 }
 
 impl Range {
-    /// Makes a range from its TOML table.
+    /// Reads a range from its TOML table.
     pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements) -> Result<Self> {
         table.only(RANGE)?;
         let of = table.require("of", "{ joint = \"root\", get = \"position\" }")?.table()?;
@@ -64,17 +64,17 @@ impl Range {
         }
     }
 
-    /// Reads a list of ranges.
+    /// Reads a list of ranges from their TOML tables.
     pub(super) fn list(tables: &[Table<'_>], model: &Model, elements: &Elements) -> Result<Vec<Self>> {
         tables.iter().map(|table| Self::new(table, model, elements)).collect()
     }
 
-    /// Returns the reading whose numbers are compared.
+    /// The reading whose numbers must lie in the range.
     pub(super) fn reading(&self) -> &Reading {
         &self.reading
     }
 
-    /// Whether all numbers are finite and lie in the range. `numbers` is a scratch buffer.
+    /// Whether all numbers of the reading are finite and lie in the range. `numbers` is a buffer that is overwritten.
     pub(super) fn holds(&self, simulation: &Simulation, context: &Context<'_>, numbers: &mut Vec<f64>) -> bool {
         numbers.clear();
         self.reading.read(simulation, context, numbers);
@@ -88,7 +88,7 @@ impl Range {
     }
 }
 
-/// The rule by which the readings of an episode's steps give the value that it achieved.
+/// The way to combine a reading's values after each step of an episode to the value that the episode achieved.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Best {
     Greatest,
@@ -96,18 +96,18 @@ pub(super) enum Best {
     Last,
 }
 
-/// The part of the success rule that the environment computes.
+/// The success rule of a task, with the readings that it needs.
 #[derive(Debug, Clone)]
 pub(super) struct Goal {
-    /// Reading that the rule compares, if it compares one.
+    /// The reading whose value the rule compares; `None` if the rule counts steps.
     pub(super) achieved: Option<(Best, Reading)>,
-    /// The ranges of the goal, if the rule counts the steps at which the goal holds.
+    /// The conditions of the goal, if the rule counts steps at which the goal is met; otherwise empty.
     pub(super) ranges: Vec<Range>,
     pub(super) rule: Success,
 }
 
 impl Goal {
-    /// Makes the goal from the TOML table `success`, for episodes of at most `step_limit` steps.
+    /// Reads the success rule from the TOML table `success`, for episodes of at most `step_limit` steps.
     pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements, step_limit: u32) -> Result<Self> {
         table.only(SUCCESS)?;
         let description = table.require("description", "\"the torso came 10 m far\"")?.text()?;
@@ -168,7 +168,8 @@ impl Goal {
     }
 }
 
-/// Leaks a text, so that it lives as long as the process. The fixed description of an environment needs such texts.
+/// Leaks a text, so that it lives as long as the process, as an [`EnvironmentSpec`](crate::env::EnvironmentSpec)
+/// requires.
 pub(super) fn leaked(text: &str) -> &'static str {
     Box::leak(text.to_owned().into_boxed_str())
 }

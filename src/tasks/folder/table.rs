@@ -1,4 +1,4 @@
-//! Reading TOML with the line and the place of each mistake.
+//! Reads TOML values. Errors have the line and the key of the mistake.
 
 use super::error::{Error, Result, escaped};
 use perturb_protocol::names::did_you_mean;
@@ -8,10 +8,11 @@ use toml::{
     de::{DeTable, DeValue},
 };
 
-/// The name of the file in errors.
+/// The name of the file in error messages.
 pub(super) const FILE: &str = "task.toml";
 
-/// A table of the file, with its place for errors, such as `parameter friction`; empty at the top.
+/// A table of the file. `place` names it in error messages, such as `parameter friction`; it is empty for the top-level
+/// table.
 #[derive(Clone)]
 pub(super) struct Table<'a> {
     text: &'a str,
@@ -20,7 +21,7 @@ pub(super) struct Table<'a> {
     span: Range<usize>,
 }
 
-/// A value of a table, with its place for errors.
+/// A value in a table. `place` names it in error messages.
 pub(super) struct Value<'a> {
     text: &'a str,
     value: &'a DeValue<'a>,
@@ -28,7 +29,7 @@ pub(super) struct Value<'a> {
     span: Range<usize>,
 }
 
-/// The text without a byte order mark.
+/// Decodes a UTF-8 text, and removes a byte order mark. `name` is the file's name for errors.
 ///
 /// # Errors
 /// [`Error`] if the bytes are not UTF-8.
@@ -40,10 +41,10 @@ pub(super) fn decode<'a>(name: &str, bytes: &'a [u8]) -> Result<&'a str> {
     })
 }
 
-/// Parses the file.
+/// Parses the text of `task.toml`.
 ///
 /// # Errors
-/// [`Error`] where it is not TOML.
+/// [`Error`] with the line if the text is not TOML.
 pub(super) fn parse(text: &str) -> Result<Spanned<DeTable<'_>>> {
     DeTable::parse(text).map_err(|error| {
         let line = line_of(text, error.span().map_or(0, |span| span.start));
@@ -55,7 +56,7 @@ fn line_of(text: &str, offset: usize) -> usize {
     1 + text.bytes().take(offset).filter(|&byte| byte == b'\n').count()
 }
 
-/// An error at an offset of the file, about what stands at `place`.
+/// Creates an error about the table or value `place`, with the line of this byte offset.
 fn error(text: &str, offset: usize, place: &str, problem: impl std::fmt::Display) -> Error {
     let line = line_of(text, offset);
     match place {
@@ -65,17 +66,17 @@ fn error(text: &str, offset: usize, place: &str, problem: impl std::fmt::Display
 }
 
 impl<'a> Table<'a> {
-    /// The table at the top.
+    /// The top-level table of a document with this text.
     pub(super) fn top(text: &'a str, document: &'a Spanned<DeTable<'a>>) -> Self {
         Self { text, entries: document.get_ref(), place: String::new(), span: 0..0 }
     }
 
-    /// An error about this table.
+    /// Creates an error about this table.
     pub(super) fn error(&self, problem: impl std::fmt::Display) -> Error {
         error(self.text, self.span.start, &self.place, problem)
     }
 
-    /// Returns this table with another place.
+    /// Sets the name of this table in error messages.
     pub(super) fn at(mut self, place: impl Into<String>) -> Self {
         self.place = place.into();
         self
@@ -94,7 +95,7 @@ impl<'a> Table<'a> {
         Ok(())
     }
 
-    /// The value of a key.
+    /// Returns the value of a key, if the key is present.
     pub(super) fn get(&self, key: &str) -> Option<Value<'a>> {
         let value = self.entries.get(key)?;
         let place = if self.place.is_empty() { key.to_owned() } else { format!("{}: {key}", self.place) };
@@ -106,15 +107,15 @@ impl<'a> Table<'a> {
         self.entries.contains_key(key)
     }
 
-    /// Returns the value of a required key.
+    /// Returns the value of a required key. `example` is a value for the error message if the key is missing.
     pub(super) fn require(&self, key: &str, example: &str) -> Result<Value<'a>> {
         self.get(key).ok_or_else(|| self.error(format_args!("{key} is missing; give for instance {key} = {example}")))
     }
 
-    /// Returns the only key of `keys` that is present, with its value.
+    /// Returns the key of `keys` that is present, and its value.
     ///
     /// # Errors
-    /// An error about this table if none or several of them are present.
+    /// An error if none or several of the keys are present.
     pub(super) fn one_of(&self, keys: &[&'static str]) -> Result<(&'static str, Value<'a>)> {
         let mut found = keys.iter().filter_map(|&key| Some((key, self.get(key)?)));
         let (key, value) = found.next().ok_or_else(|| self.error(format_args!("give one of {}", keys.join(", "))))?;
@@ -124,29 +125,29 @@ impl<'a> Table<'a> {
         }
     }
 
-    /// Returns a finite number, or `None` if the key is absent.
+    /// Returns the finite number of a key; `None` if the key is absent.
     pub(super) fn number(&self, key: &str) -> Result<Option<f64>> {
         self.get(key).map(|value| value.number()).transpose()
     }
 
-    /// Returns a text, or `None` if the key is absent.
+    /// Returns the text of a key; `None` if the key is absent.
     pub(super) fn text(&self, key: &str) -> Result<Option<&'a str>> {
         self.get(key).map(|value| value.text()).transpose()
     }
 
-    /// Returns `true` or `false`, or `None` if the key is absent.
+    /// Returns the boolean of a key; `None` if the key is absent.
     pub(super) fn flag(&self, key: &str) -> Result<Option<bool>> {
         self.get(key).map(|value| value.flag()).transpose()
     }
 
-    /// Returns the tables of a list, each with the place `key[i]`. The result is empty if the key is absent.
+    /// Returns the list of tables of a key; empty if the key is absent. Errors name the tables `key[i]`.
     pub(super) fn tables(&self, key: &str) -> Result<Vec<Table<'a>>> {
         self.get(key).map_or(Ok(Vec::new()), |value| value.tables())
     }
 }
 
 impl<'a> Value<'a> {
-    /// An error about this value.
+    /// Creates an error about this value.
     pub(super) fn error(&self, problem: impl std::fmt::Display) -> Error {
         error(self.text, self.span.start, &self.place, problem)
     }
@@ -155,7 +156,7 @@ impl<'a> Value<'a> {
         self.error(format_args!("this is of type {}; expected {expected}", self.value.type_str()))
     }
 
-    /// A finite number.
+    /// Returns the value as a finite number.
     pub(super) fn number(&self) -> Result<f64> {
         let number = match self.value {
             DeValue::Float(number) => number.as_str().replace('_', "").parse::<f64>().ok(),
@@ -165,7 +166,7 @@ impl<'a> Value<'a> {
         number.filter(|number| number.is_finite()).ok_or_else(|| self.error("expected a finite number"))
     }
 
-    /// A whole number within bounds.
+    /// Returns the value as a whole number in `low` … `high`.
     pub(super) fn integer(&self, low: u32, high: u32) -> Result<u32> {
         let DeValue::Integer(number) = self.value else { return Err(self.wrong("a whole number")) };
         let parsed = i64::from_str_radix(number.as_str(), number.radix()).ok();
@@ -173,12 +174,12 @@ impl<'a> Value<'a> {
         inside.ok_or_else(|| self.error(format_args!("{} is not within {low} … {high}", number.as_str())))
     }
 
-    /// A text.
+    /// Returns the value as a text.
     pub(super) fn text(&self) -> Result<&'a str> {
         self.value.as_str().ok_or_else(|| self.wrong("a text in quotes"))
     }
 
-    /// `true` or `false`.
+    /// Returns the value as a boolean.
     pub(super) fn flag(&self) -> Result<bool> {
         self.value.as_bool().ok_or_else(|| self.wrong("true or false"))
     }
@@ -193,13 +194,13 @@ impl<'a> Value<'a> {
         self.value.is_array()
     }
 
-    /// A table.
+    /// Returns the value as a table.
     pub(super) fn table(&self) -> Result<Table<'a>> {
         let entries = self.value.as_table().ok_or_else(|| self.wrong("a table, as { key = value }"))?;
         Ok(Table { text: self.text, entries, place: self.place.clone(), span: self.span.clone() })
     }
 
-    /// The elements of a list, each at the place `key[i]`.
+    /// Returns the elements of a list. Errors name them `key[i]`.
     pub(super) fn list(&self) -> Result<Vec<Value<'a>>> {
         let list = self.value.as_array().ok_or_else(|| self.wrong("a list, as [first, second]"))?;
         let element = |(i, value): (usize, &'a Spanned<DeValue<'a>>)| Value {
@@ -211,17 +212,17 @@ impl<'a> Value<'a> {
         Ok(list.iter().enumerate().map(element).collect())
     }
 
-    /// The tables of a list.
+    /// Returns the value as a list of tables.
     pub(super) fn tables(&self) -> Result<Vec<Table<'a>>> {
         self.list()?.iter().map(Value::table).collect()
     }
 
-    /// A list of finite numbers.
+    /// Returns the value as a list of finite numbers.
     pub(super) fn numbers(&self) -> Result<Vec<f64>> {
         self.list()?.iter().map(Value::number).collect()
     }
 
-    /// An interval: two numbers, the first at most the second.
+    /// Returns the value as an interval: a list of two numbers, of which the first is not larger.
     pub(super) fn interval(&self) -> Result<(f64, f64)> {
         match self.numbers()?[..] {
             [low, high] if low <= high => Ok((low, high)),
@@ -232,7 +233,7 @@ impl<'a> Value<'a> {
         }
     }
 
-    /// A text, or a list of texts that is not empty.
+    /// Returns the value as a list of texts: a text counts as a list of one. The list must not be empty.
     pub(super) fn texts(&self) -> Result<Vec<&'a str>> {
         if !self.is_list() {
             return Ok(vec![self.text()?]);

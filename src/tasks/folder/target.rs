@@ -1,4 +1,4 @@
-//! The numbers of a model that edits change, and how each is set and read back.
+//! The numbers of a model that parameters edit, and how each is set, scaled and read back.
 
 use super::{
     elements::{Elements, actuator_name},
@@ -7,7 +7,7 @@ use super::{
 };
 use perturb_mujoco::{Field, Flags, Index, Kind, Model, Simulation};
 
-/// The kinds of elements that can be edited, by the key that names them, with their fields.
+/// The editable elements: the key in the file, the kind, and the editable fields.
 pub(super) const EDITABLE: [(&str, Kind, &[&str]); 6] = [
     ("body", Kind::Body, &["mass", "length", "size", "position"]),
     ("geom", Kind::Geom, &["friction", "friction_torsion", "friction_roll", "radius"]),
@@ -16,63 +16,64 @@ pub(super) const EDITABLE: [(&str, Kind, &[&str]); 6] = [
     ("actuator", Kind::Actuator, &["gear", "kp", "kv", "forcerange"]),
     ("tendon", Kind::Tendon, &["stiffness", "damping"]),
 ];
-/// The options that can be edited.
+/// The options of the model that can be edited.
 pub(super) const OPTIONS: &[&str] = &["gravity", "wind", "density", "viscosity"];
-/// The keys that name the edited numbers.
+/// The keys by which an edit names the numbers that it changes.
 pub(super) const KEYS: [&str; 10] =
     ["body", "geom", "pair", "joint", "actuator", "tendon", "option", "field", "axis", "end"];
 
-/// The numbers of an actuator's gain and bias.
+/// How many numbers the gain of an actuator has; its bias has as many.
 const N_GAIN: usize = 10;
-/// The numbers of an actuator's gear.
+/// How many numbers the gear of an actuator has.
 const N_GEAR: usize = 6;
 
-/// A value of the model.
+/// A value of the model that an edit changes. The fields of variants are indices of elements, if not described
+/// otherwise.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Target {
-    /// A number by itself.
+    /// A single number: (array, index).
     Number(Field, usize),
-    /// Two numbers that are always the same: (array, first).
+    /// Two consecutive numbers that are always equal: (array, index of the first).
     Twins(Field, usize),
-    /// Both ends of a range, if the lower end is the negative of the upper end: (array, index of the lower end).
+    /// Both ends of a range that is symmetric about 0: (array, index of the lower end). The value is the upper end.
     Symmetric(Field, usize),
     /// Both ends of a range, which are scaled together: (array, index of the lower end).
     Ends(Field, usize),
-    /// A body's mass. Its inertia follows in proportion.
+    /// The mass of a body. Its inertia changes in proportion.
     Mass(usize),
-    /// An actuator's gear: the first number; the others follow in proportion.
+    /// The first number of an actuator's gear. The other numbers change in proportion.
     Gear(usize),
-    /// A position servo's gain, and its bias.
+    /// The gain `kp` of a position servo. Its bias changes with it.
     PositionGain(usize),
-    /// A velocity servo's gain, and its bias.
+    /// The gain `kv` of a velocity servo. Its bias changes with it.
     VelocityGain(usize),
-    /// The damping of an actuator with an affine bias.
+    /// The damping `kv` of an actuator with an affine bias.
     ActuatorDamping(usize),
-    /// The length of a body, which is that of its longest capsule or cylinder. (body, geom)
+    /// The length of a body, defined by its longest capsule or cylinder: (body, geom).
     Length(usize, usize),
-    /// The size of a body in all directions, of which there are multiples only. (body, one of its geoms)
+    /// The size of a body in all directions, which can only be scaled: (body, one of its geoms).
     Size(usize, usize),
     /// The radius of a sphere, a capsule or a cylinder.
     Radius(usize),
-    /// A coordinate of a body's frame in that of its parent. (body, axis)
+    /// A coordinate of a body's position relative to its parent: (body, axis).
     Position(usize, usize),
 }
 
-/// Several targets, and the element and field that they have in common.
+/// The targets of an edit. They are the same field of one or more elements of the same kind, or an option of the model.
 #[derive(Debug, Clone)]
 pub(super) struct Targets {
     pub(super) all: Vec<Target>,
-    /// The kind, or `option`.
+    /// The key of the kind of elements, such as `body`, or `option`.
     pub(super) subject: &'static str,
-    /// The field, or the option.
+    /// The name of the field, or of the option.
     pub(super) field: &'static str,
     /// The indices of the elements; empty for an option.
     pub(super) ids: Vec<usize>,
-    /// The names of the elements, or the option's.
+    /// The names of the elements, or the name of the option.
     pub(super) names: Vec<String>,
 }
 
-/// The rule by which a value changes a target.
+/// How a parameter's value changes a target: replaces it, multiplies it, or is added to it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Change {
     Set,
@@ -81,7 +82,7 @@ pub(super) enum Change {
 }
 
 impl Targets {
-    /// Reads the targets that a table names.
+    /// Reads the targets of an edit from its TOML table.
     pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements, change: Change) -> Result<Self> {
         let subjects = ["body", "geom", "pair", "joint", "actuator", "tendon", "option"];
         let (subject, value) = table.one_of(&subjects)?;
@@ -193,8 +194,8 @@ impl Targets {
         Ok(Self { all, subject: "option", field: option, ids: Vec::new(), names: vec![option.to_owned()] })
     }
 
-    /// The minimum of physical values, and whether it is excluded. Masses are positive, and most other values not
-    /// negative.
+    /// Returns the minimum of physical values of the targets, and whether the minimum itself is excluded. `None` if
+    /// there is no minimum. Masses must be positive, and most other values must not be negative.
     pub(super) fn least(&self) -> Option<(f64, bool)> {
         match (self.subject, self.field) {
             ("body", "position") => None,
@@ -206,7 +207,7 @@ impl Targets {
     }
 }
 
-/// The number of the axis that a table names.
+/// Reads the key `axis`: 0 for x, 1 for y, 2 for z.
 fn axis(table: &Table<'_>, of: &str) -> Result<usize> {
     let axis = table.get("axis").ok_or_else(|| table.error(format_args!("{of} has three axes; give axis = \"z\"")))?;
     let text = axis.text()?;
@@ -214,13 +215,13 @@ fn axis(table: &Table<'_>, of: &str) -> Result<usize> {
     found.ok_or_else(|| axis.error(format_args!("{:?} is no axis; expected x, y or z", escaped(text))))
 }
 
-/// MuJoCo's types of geoms.
+/// MuJoCo's number for each type of geom.
 const SPHERE: i32 = 2;
 const CAPSULE: i32 = 3;
 const CYLINDER: i32 = 5;
 const BOX: i32 = 6;
 
-/// The geoms of a body, each with its type.
+/// Returns the geoms of a body, each with its type.
 fn geoms(model: &Model, body: usize) -> impl Iterator<Item = (usize, i32)> + '_ {
     let types = model.index_array(Index::GeomType).iter().copied().enumerate();
     types.filter(move |(geom, _)| model.index_array(Index::GeomBody)[*geom] as usize == body)
@@ -229,7 +230,7 @@ fn geoms(model: &Model, body: usize) -> impl Iterator<Item = (usize, i32)> + '_ 
 fn length(model: &Model, body: usize) -> Option<Target> {
     let long = geoms(model, body).filter(|(_, kind)| matches!(*kind, CAPSULE | CYLINDER)).map(|(geom, _)| geom);
     let half = |geom: &usize| model.field(Field::GeomSize)[3 * geom + 1];
-    // Of equal ones the first.
+    // Among equally long geoms the first counts.
     let longest = long.reduce(|a, b| if half(&b) > half(&a) { b } else { a })?;
     (body > 0).then_some(Target::Length(body, longest))
 }
@@ -255,7 +256,7 @@ fn mass(model: &Model, body: usize) -> Option<Target> {
     (model.field(Field::BodyMass)[body] > 0.0).then_some(Target::Mass(body))
 }
 
-/// The degrees of freedom of a joint.
+/// Returns the indices of a joint's degrees of freedom.
 pub(super) fn degrees_of_freedom(model: &Model, joint: usize) -> std::ops::Range<usize> {
     let starts = model.index_array(Index::JointVelocity);
     let end = starts.get(joint + 1).map_or(model.n_v(), |&next| next as usize);
@@ -275,7 +276,7 @@ fn range(table: &Table<'_>, field: Field, first: usize, change: Change) -> Resul
     }
 }
 
-/// MuJoCo's type of an affine bias.
+/// MuJoCo's number for an affine bias of an actuator.
 const AFFINE: i32 = 1;
 
 fn position_gain(model: &Model, actuator: usize) -> Option<Target> {
@@ -301,7 +302,7 @@ fn velocity_gain(model: &Model, actuator: usize) -> Option<Target> {
 }
 
 impl Target {
-    /// The array that holds the value, and its index there.
+    /// Returns the array and the index of the number that holds the value.
     pub(super) fn place(self) -> (Field, usize) {
         match self {
             Self::Number(field, at) | Self::Twins(field, at) => (field, at),
@@ -316,12 +317,12 @@ impl Target {
         }
     }
 
-    /// Whether the value enters the model's text, which is compiled again.
+    /// Whether the model must be compiled again to change the value, since it is a length, size, radius or position.
     pub(super) fn is_recompiled(self) -> bool {
         matches!(self, Self::Length(..) | Self::Size(..) | Self::Radius(_) | Self::Position(..))
     }
 
-    /// The arrays that an edit changes itself.
+    /// Returns the arrays that an edit of this target changes, without those that MuJoCo derives from them.
     pub(super) fn fields(self) -> Vec<Field> {
         match self {
             Self::Mass(_) => vec![Field::BodyMass, Field::BodyInertia],
@@ -330,12 +331,12 @@ impl Target {
         }
     }
 
-    /// Whether derived constants must be computed again after an edit.
+    /// Whether MuJoCo must compute derived constants again after an edit, see [`Simulation::set_const`].
     pub(super) fn changes_constants(self) -> bool {
         matches!(self.place().0, Field::BodyMass | Field::DofArmature | Field::ActuatorGear)
     }
 
-    /// Whether both ends of a symmetric range have the same absolute value. True for other targets.
+    /// Whether the ends of a [`Target::Symmetric`] have the same absolute value. True for other targets.
     fn is_consistent(self, model: &Model) -> bool {
         match self {
             Self::Symmetric(field, at) => model.field(field)[at] == -model.field(field)[at + 1],
@@ -343,7 +344,7 @@ impl Target {
         }
     }
 
-    /// Returns the target's value in a model.
+    /// Returns the value in a model.
     pub(super) fn value(self, model: &Model) -> f64 {
         let (field, at) = self.place();
         let value = model.field(field)[at];
@@ -354,14 +355,14 @@ impl Target {
         }
     }
 
-    /// Sets the value in a simulation's model, which still has the pristine value.
+    /// Sets the value in the model of a simulation, which still has the unedited value of `pristine`.
     pub(super) fn set(self, pristine: &Model, simulation: &mut Simulation, value: f64) {
         let (field, at) = self.place();
         let own = self.value(pristine);
         simulation.field_mut(field)[at] = if matches!(self, Self::ActuatorDamping(_)) { -value } else { value };
         match self {
             Self::Number(..) | Self::ActuatorDamping(_) => {}
-            Self::Length(..) | Self::Size(..) | Self::Radius(_) | Self::Position(..) => {} // they are compiled
+            Self::Length(..) | Self::Size(..) | Self::Radius(_) | Self::Position(..) => {} // set by another compilation
             Self::Twins(..) => simulation.field_mut(field)[at + 1] = value,
             Self::Symmetric(..) => simulation.field_mut(field)[at - 1] = -value,
             // Ranges with two ends are only scaled, never set.
@@ -385,7 +386,7 @@ impl Target {
         }
     }
 
-    /// Multiplies the value and the numbers that follow it by a factor.
+    /// Sets the value, and the numbers that change in proportion, to their values in `pristine` times a factor.
     pub(super) fn scale(self, pristine: &Model, simulation: &mut Simulation, factor: f64) {
         let (field, at) = self.place();
         let mut multiply =
@@ -393,7 +394,7 @@ impl Target {
         multiply(field, at);
         match self {
             Self::Number(..) | Self::ActuatorDamping(_) => {}
-            Self::Length(..) | Self::Size(..) | Self::Radius(_) | Self::Position(..) => {} // they are compiled
+            Self::Length(..) | Self::Size(..) | Self::Radius(_) | Self::Position(..) => {} // set by another compilation
             Self::Twins(..) => multiply(field, at + 1),
             Self::Symmetric(..) | Self::Ends(..) => multiply(field, at - 1),
             Self::Mass(body) => (0..3).for_each(|i| multiply(Field::BodyInertia, 3 * body + i)),
@@ -403,7 +404,7 @@ impl Target {
         }
     }
 
-    /// Returns the factor by which the value in `model` differs from the pristine one.
+    /// Returns the value in `model` divided by the value in `pristine`.
     pub(super) fn factor(self, pristine: &Model, model: &Model) -> f64 {
         let (field, at) = self.place();
         let own = pristine.field(field)[at];
@@ -414,7 +415,7 @@ impl Target {
         }
     }
 
-    /// Whether the pristine value is 0, so that a factor has no effect on it.
+    /// Whether the value in `pristine` is 0, so that scaling has no effect.
     pub(super) fn is_zero(self, pristine: &Model) -> bool {
         let (field, at) = self.place();
         let lower = matches!(self, Self::Ends(..)).then(|| pristine.field(field)[at - 1]);
@@ -422,7 +423,7 @@ impl Target {
     }
 }
 
-/// Whether an element of a kind has limits that its range could change.
+/// Whether the joint or actuator with this index has limits, so that its range has an effect.
 pub(super) fn is_limited(model: &Model, subject: &str, id: usize) -> bool {
     match subject {
         "joint" => model.flags(Flags::JointLimited)[id] != 0,
@@ -430,7 +431,7 @@ pub(super) fn is_limited(model: &Model, subject: &str, id: usize) -> bool {
     }
 }
 
-/// Makes the error that an edit cannot have an effect, always in the same wording.
+/// Creates the error that an edit cannot have an effect, for the reason `why`.
 pub(super) fn without_effect(table: &Table<'_>, why: impl std::fmt::Display) -> Error {
     table.error(format_args!("it has no effect: {why}"))
 }

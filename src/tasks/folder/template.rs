@@ -1,41 +1,42 @@
-//! The compiled model of a folder, and its edits.
+//! The compiled model of a folder, and how parameters edit it.
 
 use super::{parameter::EditedParameter, recompilation::Recompilation, target::Target};
 use crate::tasks::shared;
 use perturb_mujoco::{Error, Field, Model, Simulation};
 use std::sync::Arc;
 
-/// A compiled model, which nothing changes.
+/// The compiled model of a folder, which is never modified, and what is needed to edit simulations of it.
 #[derive(Debug)]
 pub(super) struct Template {
     pub(super) model: Arc<Model>,
-    /// The initial [state](Simulation::state), `[n_state]`.
+    /// The model's initial [state](Simulation::state).
     pub(super) state: Vec<f64>,
-    /// The fields that edits change, and the fields that are derived from these.
+    /// The fields that the parameters edit, and the fields that MuJoCo derives from them.
     fields: Vec<Field>,
-    /// The edits of lengths, if there are any.
+    /// The edits of lengths; `None` if no parameter edits a length.
     pub(super) recompilation: Option<Recompilation>,
-    /// Whether derived fields must be computed after an edit.
+    /// Whether MuJoCo must compute derived fields after an edit.
     derives: bool,
-    /// The entries of [`Field::Statistic`] that the model's text gives.
+    /// The indices in [`Field::Statistic`] of the numbers that the model's text sets, which edits must not change.
     statistic: Vec<usize>,
 }
 
-/// A change of the model: the parameters, and the fields that result from them.
+/// An edit of the model: the parameters, and the fields of the model that follow from them.
 #[derive(Debug)]
 pub(super) struct ModelEdit {
-    /// The parameters, `[P]`.
+    /// The values of the parameters, in order.
     pub(super) values: Box<[f64]>,
-    /// The model with the lengths of these parameters, and without the other edits.
+    /// The model with the lengths of these parameters, but without other edits.
     pub(super) compiled: Arc<Model>,
     fields: Box<[f64]>,
 }
 
 impl Template {
-    /// Makes a template of a compiled model. `statistic` names the attributes of the text's `<statistic>`.
+    /// Creates a template of a compiled model. `statistic` has the names of the attributes that the text's
+    /// `<statistic>` sets.
     ///
     /// # Errors
-    /// [`Error::Fatal`] without memory.
+    /// [`Error::Fatal`] if there is not enough memory.
     pub(super) fn new(model: Model, statistic: &[String]) -> Result<Self, Error> {
         let mut state = vec![0.0; model.n_state()];
         Simulation::new(model.try_clone()?)?.state(&mut state);
@@ -46,7 +47,7 @@ impl Template {
         Ok(Self { model, state, fields: Vec::new(), recompilation: None, derives: false, statistic })
     }
 
-    /// Prepares the template for edits by these parameters.
+    /// Prepares the template for edits by these parameters. Call it once, before the first edit.
     pub(super) fn prepare(&mut self, parameters: &[EditedParameter], recompilation: Option<Recompilation>) {
         self.recompilation = recompilation;
         let edited = || parameters.iter().flat_map(EditedParameter::targets);
@@ -61,7 +62,7 @@ impl Template {
         }
     }
 
-    /// The model with the lengths of these parameters.
+    /// Returns the model with the lengths of the parameters `values`.
     fn compiled(&self, values: &[f64]) -> Result<Arc<Model>, Error> {
         match &self.recompilation {
             None => Ok(Arc::clone(&self.model)),
@@ -71,10 +72,10 @@ impl Template {
 }
 
 impl Template {
-    /// The edit to these parameters, by this thread's simulation.
+    /// Returns the edit for the parameters `values`, computed by this thread's simulation.
     ///
     /// # Errors
-    /// MuJoCo's fatal ones, and [`Error::Compile`] if the model cannot have these lengths.
+    /// MuJoCo's fatal errors, and [`Error::Compile`] if the model cannot be compiled with these lengths.
     pub(super) fn edit(&'static self, parameters: &[EditedParameter], values: &[f64]) -> Result<Arc<ModelEdit>, Error> {
         shared::with(self, |shared| {
             shared.edit(
@@ -138,7 +139,7 @@ impl shared::SharedModel for Template {
     }
 }
 
-/// Whether values are the same bit for bit, because 0 and -0 make different models.
+/// Whether two lists of values are equal bit for bit. 0 and -0 differ, because they result in different models.
 fn is_same(a: &[f64], b: &[f64]) -> bool {
     a.len() == b.len() && a.iter().zip(b).all(|(a, b)| a.to_bits() == b.to_bits())
 }
