@@ -1,7 +1,8 @@
 //! Acting: a policy's forward pass in plain f32 loops.
 //!
-//! libtorch needs 30 µs for one observation, most of it not arithmetic; these loops need a few. An [`Actor`] gives the
-//! same bytes for an observation whatever else is in the batch: each output is a sum in one fixed order.
+//! libtorch needs about 30 µs for one observation, most of it overhead. These loops need a few µs. An [`Actor`] returns
+//! the same bytes for an observation regardless of the rest of the batch, because each output is summed in a fixed
+//! order.
 
 use rand_chacha::ChaCha8Rng;
 
@@ -13,57 +14,59 @@ use crate::sample::{sample_categorical, sample_gaussian, sample_uniform};
 use crate::spec::{ActionKind, PolicySpec};
 use crate::weights::Weights;
 
-/// Computes actions, log-probabilities and values. Acting allocates nothing after its creation for batches of at most
-/// `max_batch`, except where the caller's outputs grow.
+/// Computes a policy's actions, log-probabilities and values for batches of at most `max_batch` observations. After its
+/// creation it allocates no memory, except to grow the caller's output buffers.
 ///
-/// A recurrent policy's actor keeps a memory for every environment. [`Actor::act`] advances it. [`Actor::forget`]
-/// clears it at the end of an episode (RL²: of a trial). Computing values alone does not change it.
+/// The actor of a recurrent policy has a memory for every environment. [`Actor::act`] updates this memory, and
+/// [`Actor::values`] reads it. Call [`Actor::forget`] to clear it at the end of an episode, or with RL² at the end of a
+/// trial.
 #[derive(Clone, Debug)]
 pub struct Actor {
     spec: PolicySpec,
     max_batch: usize,
     network: Network,
     log_std: Vec<f32>,
-    /// Continuous actions are uniform in a box, not Gaussian.
+    /// Whether continuous actions are sampled uniformly from a box instead of from a Gaussian.
     uniform: bool,
-    /// Whether the networks were swapped for others, which do not have the weights.
+    /// Whether the networks were swapped for others. The actor then refuses to act until weights are loaded.
     is_stale: bool,
 }
 
-/// The networks of an architecture.
+/// The networks of a feed-forward or of a recurrent policy.
 #[derive(Clone, Debug)]
 enum Network {
     FeedForward(FeedForward),
     Recurrent(Box<Recurrent>),
 }
 
-/// The output of an actor in N environments.
+/// Actions, log-probabilities and values for N environments.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ActorOutput {
-    /// The kind of the actions.
+    /// Whether the actions are discrete or continuous.
     pub kind: ActionKind,
-    /// `[N, A]` actions as sampled, not clipped. A discrete action is its index as f32, exact below 2²⁴, with A = 1.
+    /// `[N, A]` sampled actions, not clipped to any bounds. A discrete action has A = 1 and is stored as its index,
+    /// which f32 represents exactly below 2²⁴.
     pub actions: Vec<f32>,
     /// `[N]` log-probabilities (densities, if continuous) of the actions.
     pub log_probs: Vec<f32>,
-    /// `[N]` values of the observations.
+    /// `[N]` estimated state values V of the observations.
     pub values: Vec<f32>,
 }
 
-/// The random streams from which the environments' actions are sampled.
+/// A source of random numbers for sampling actions in N environments.
 pub trait Streams {
-    /// The stream of `environment`, one of 0 … N-1.
+    /// Returns the random number generator for `environment`, an index in 0 … N-1.
     fn stream(&mut self, environment: usize) -> &mut ChaCha8Rng;
 }
 
-/// A single stream for all environments, in their order.
+/// Uses one generator for all environments.
 impl Streams for ChaCha8Rng {
     fn stream(&mut self, _: usize) -> &mut ChaCha8Rng {
         self
     }
 }
 
-/// A stream for each environment.
+/// Uses a separate generator for each environment.
 impl Streams for Vec<ChaCha8Rng> {
     fn stream(&mut self, environment: usize) -> &mut ChaCha8Rng {
         &mut self[environment]
@@ -71,7 +74,7 @@ impl Streams for Vec<ChaCha8Rng> {
 }
 
 impl Actor {
-    /// An actor for at most `max_batch` observations at a time, with all weights 0 until [`Actor::load`].
+    /// Creates an actor for batches of at most `max_batch` observations. All weights are 0 until [`Actor::load`].
     pub fn new(spec: &PolicySpec, max_batch: usize) -> Self {
         let log_std = match spec.action {
             ActionKind::Discrete { .. } => Vec::new(),
@@ -84,25 +87,26 @@ impl Actor {
         Actor { spec: spec.clone(), max_batch, network, log_std, uniform: false, is_stale: false }
     }
 
-    /// From now on a continuous action is uniform in a box: its middle is the policy's mean, half its width the standard
-    /// deviation. Discrete actions are sampled as before: equal logits make them uniform.
+    /// Makes the actor sample continuous actions uniformly from a box. The centre of the box is the policy's mean, and
+    /// half of its width is the standard deviation. Discrete actions are still sampled from the logits; equal logits
+    /// make them uniform.
     pub fn act_uniformly(&mut self) {
         self.uniform = true;
     }
 
-    /// Loads weights, whose names and shapes must be those of [`PolicySpec::layout`]. The environments' memories stay.
+    /// Loads weights, whose names and shapes must match [`PolicySpec::layout`]. Keeps the memories of the environments.
     ///
     /// # Errors
-    /// [`Error::Arrays`] for other names or shapes.
+    /// [`Error::Arrays`] if a name or a shape differs.
     pub fn load(&mut self, weights: &Weights) -> Result<()> {
         self.spec.check(weights)?;
         self.load_flat(&weights.iter().flat_map(|array| array.data.iter().copied()).collect::<Vec<f32>>())
     }
 
-    /// Loads all weights `[P]` in a row.
+    /// Loads all weights as one array `[P]`, in the order of [`PolicySpec::layout`].
     ///
     /// # Errors
-    /// [`Error::Length`].
+    /// [`Error::Length`] if the number of weights is wrong.
     pub fn load_flat(&mut self, weights: &[f32]) -> Result<()> {
         check_length("weights [P]", weights.len(), self.spec.n_weights())?;
         let mut rest = weights;
@@ -115,9 +119,10 @@ impl Actor {
         Ok(())
     }
 
-    /// From now on caches the activations of a feed-forward policy's networks while it acts for `n_steps` with the same weights,
-    /// for [`Differentiator::load_from`](crate::Differentiator::load_from). Has no effect if these steps and the values of one
-    /// more batch have more than 64 observations.
+    /// Makes the actor of a feed-forward policy cache the activations of its networks, for
+    /// [`Differentiator::load_from`](crate::Differentiator::load_from). The cache must hold the observations of
+    /// `n_steps` steps and of one more batch, whose values are computed afterwards. If these are more than 64
+    /// observations, this call has no effect.
     pub fn keep_activations(&mut self, n_steps: usize) {
         match &mut self.network {
             Network::FeedForward(network) if self.max_batch.saturating_mul(n_steps.saturating_add(1)) <= BLOCK => {
@@ -127,8 +132,9 @@ impl Actor {
         }
     }
 
-    /// The networks of a feed-forward policy of shape `spec`, to be swapped for others, and log σ `[A]` of its actions. The
-    /// actor refuses to act until weights are loaded.
+    /// Returns the networks and log σ `[A]` of a feed-forward policy, so that the caller can swap the networks for
+    /// others. The actor then refuses to act until weights are loaded. Returns `None` if the policy is recurrent or its
+    /// shape is not `spec`.
     pub(crate) fn give_networks(&mut self, spec: &PolicySpec) -> Option<(&mut FeedForward, &[f32])> {
         match &mut self.network {
             Network::FeedForward(network) if self.spec == *spec => {
@@ -139,10 +145,15 @@ impl Actor {
         }
     }
 
-    /// Samples an action for each normalised observation of `observations` `[N, O]`, in order of n; draws from `streams`
-    /// once per discrete action and twice per element of a continuous one. Replaces what is in `out`.
+    /// Samples an action for each row of the normalised `observations` `[N, O]`, and overwrites `out`. Rows are
+    /// processed in order. A discrete action takes one number from `streams`, a Gaussian action two for each element,
+    /// and a uniform action one for each element.
     ///
-    /// Row n belongs to environment n: a recurrent policy adds the observation to that environment's memory.
+    /// Row n belongs to environment n. A recurrent policy updates that environment's memory.
+    ///
+    /// # Errors
+    /// [`Error::NoWeights`] if weights must be loaded first, [`Error::Length`] if `observations` does not fit, and
+    /// [`Error::PolicyOutput`] if an output is not finite.
     pub fn act(&mut self, observations: &[f32], streams: &mut impl Streams, out: &mut ActorOutput) -> Result<()> {
         let n_envs = self.count(observations)?;
         let width = self.spec.action.width();
@@ -177,8 +188,8 @@ impl Actor {
         Ok(())
     }
 
-    /// Replaces `out` `[N]` by the values V of the normalised `observations` `[N, O]`. Row n belongs to environment n, whose
-    /// memory is used, but not changed.
+    /// Writes the values V of the normalised `observations` `[N, O]` to `out` `[N]`. Row n belongs to environment n. A
+    /// recurrent policy reads that environment's memory without changing it.
     pub fn values(&mut self, observations: &[f32], out: &mut Vec<f32>) -> Result<()> {
         let n_envs = self.count(observations)?;
         let values = match &mut self.network {
@@ -189,8 +200,9 @@ impl Actor {
         Ok(())
     }
 
-    /// Replaces `out` `[K]` by the values of final `observations` `[K, O]`. Row k belongs to environment `environments[k]`,
-    /// whose memory must still be that of the episode that ended: call this before [`Actor::forget`].
+    /// Writes the values V of the final `observations` `[K, O]` to `out` `[K]`. Row k belongs to environment
+    /// `environments[k]`. Call this before [`Actor::forget`], because a recurrent policy needs its memory of the
+    /// episode that ended.
     pub fn values_in(&mut self, observations: &[f32], environments: &[usize], out: &mut Vec<f32>) -> Result<()> {
         check_length("environments [K]", environments.len(), self.count(observations)?)?;
         let values = match &mut self.network {
@@ -201,14 +213,15 @@ impl Actor {
         Ok(())
     }
 
-    /// Empties the memory of `environment`, one of 0 … `max_batch`-1, after the end of its episode.
+    /// Clears the memory of `environment` (0 … `max_batch`-1). Call it when the environment's episode has ended. Has no
+    /// effect on a feed-forward policy.
     pub fn forget(&mut self, environment: usize) {
         if let Network::Recurrent(network) = &mut self.network {
             network.forget(environment);
         }
     }
 
-    /// [`max_batch`, S] the memory of every environment, S = [`PolicySpec::memory_size`].
+    /// Returns the memories of all environments, `[max_batch, S]` with S = [`PolicySpec::memory_size`].
     pub fn memory(&self) -> &[f32] {
         match &self.network {
             Network::FeedForward(_) => &[],
@@ -216,10 +229,10 @@ impl Actor {
         }
     }
 
-    /// Restores a memory that [`Actor::memory`] returned.
+    /// Restores memories that [`Actor::memory`] returned.
     ///
     /// # Errors
-    /// [`Error::Length`] if it is not [`max_batch`, S]; nothing is changed then.
+    /// [`Error::Length`] if the length is not `max_batch` · S. The memories are then unchanged.
     pub fn set_memory(&mut self, memory: &[f32]) -> Result<()> {
         check_length("memory [N, S]", memory.len(), self.memory().len())?;
         if let Network::Recurrent(network) = &mut self.network {
@@ -228,7 +241,7 @@ impl Actor {
         Ok(())
     }
 
-    /// The number of observations. An error if the actor may not act.
+    /// Returns the number of observations. Fails if weights must be loaded first, or if the length does not fit.
     fn count(&self, observations: &[f32]) -> Result<usize> {
         if self.is_stale {
             return Err(Error::NoWeights);
@@ -240,14 +253,14 @@ impl Actor {
     }
 }
 
-/// Replaces `out` by the first numbers of the first `n` rows of a value head.
+/// Replaces `out` by the first element of each of the first `n` rows.
 fn replace_by_first_column(out: &mut Vec<f32>, rows: RowsFrom<'_>, n: usize) {
     out.clear();
     out.extend((0..n).map(|n| rows.row(n)[0]));
 }
 
 impl ActorOutput {
-    /// No actions yet, with capacity for `n_envs`.
+    /// Creates an empty output with capacity for `n_envs` environments.
     pub fn new(kind: ActionKind, n_envs: usize) -> Self {
         ActorOutput {
             kind,
@@ -257,7 +270,8 @@ impl ActorOutput {
         }
     }
 
-    /// Replaces `bytes` by the actions as the protocol encodes them: little-endian i32 `[N]`, or f32 `[N, A]`.
+    /// Encodes the actions as the protocol does, and replaces `bytes` by the result: little-endian i32 `[N]` if
+    /// discrete, little-endian f32 `[N, A]` if continuous.
     pub fn write_bytes(&self, bytes: &mut Vec<u8>) {
         bytes.clear();
         match self.kind {

@@ -1,4 +1,4 @@
-//! Acting with the two feed-forward networks.
+//! Acting with a feed-forward policy: one network for the policy, one for the value.
 
 use std::mem::swap;
 use std::ops::Range;
@@ -7,44 +7,45 @@ use crate::kernel::{Rows, RowsFrom, run};
 use crate::perceptron::{Forward, Perceptron};
 use crate::spec::PolicySpec;
 
-/// Samples whose activations are held at once: those of both networks fit into the processor's second-level cache.
+/// Maximal number of samples whose activations are in memory at once. The activations of both networks then fit into
+/// the processor's L2 cache.
 pub(crate) const BLOCK: usize = 64;
 
-/// Two separate perceptrons.
+/// The policy network and the value network of a feed-forward policy.
 #[derive(Clone, Debug)]
 pub(crate) struct Networks {
-    /// Computes logits or means.
+    /// Computes the logits of discrete actions, or the means of continuous ones.
     pub(crate) policy: Perceptron,
     /// Computes V(s).
     pub(crate) value: Perceptron,
 }
 
-/// The activations of both networks at rows of observations.
+/// The inputs and the activations of both networks for a batch of observations, one row for each.
 #[derive(Clone, Debug)]
 pub(crate) struct Activations {
-    /// [rows, O].
+    /// `[rows, O]` inputs of both networks.
     pub(crate) observations: Rows,
-    /// Outputs of the policy network's layers.
+    /// `[rows, layer's width]` outputs of each layer of the policy network.
     pub(crate) policy_layers: Vec<Rows>,
-    /// Outputs of the value network's layers.
+    /// `[rows, layer's width]` outputs of each layer of the value network.
     pub(crate) value_layers: Vec<Rows>,
 }
 
-/// Networks that act.
+/// The networks of a feed-forward policy that acts, with buffers and a cache for activations.
 #[derive(Clone, Debug)]
 pub(crate) struct FeedForward {
     observation_size: usize,
     networks: Networks,
     activations: Activations,
-    /// Maximal number of cached rows.
+    /// Maximal number of rows in the cache; 0 if nothing is cached.
     max_cached: usize,
-    /// Number of cached rows: all observations that were acted on since the weights were loaded. `None` if there were more, or
-    /// if there are no weights.
+    /// Number of rows in the cache: every observation since the weights were loaded. `None` if there were more than
+    /// `max_cached`, or if no weights are loaded.
     cached: Option<usize>,
 }
 
 impl Networks {
-    /// The networks of a policy of `spec`, with weights 0.
+    /// Creates the networks of a policy of shape `spec`, with all weights 0.
     pub(crate) fn new(spec: &PolicySpec) -> Self {
         let network = |outputs| {
             let mut layers = spec.hidden_layers();
@@ -54,7 +55,8 @@ impl Networks {
         Networks { policy: network(spec.action.outputs()), value: network(1) }
     }
 
-    /// Loads weights in the order of [`PolicySpec::layout`] from the front of `numbers`, and removes them there.
+    /// Loads weights in the order of [`PolicySpec::layout`] from the front of `numbers`, and advances `numbers` past
+    /// them.
     pub(crate) fn load(&mut self, numbers: &mut &[f32]) {
         self.policy.load(numbers);
         self.value.load(numbers);
@@ -62,7 +64,7 @@ impl Networks {
 }
 
 impl Activations {
-    /// Buffers for the activations of `networks`, of a policy of `spec`, at this number of rows.
+    /// Creates buffers for the activations of `networks` at `rows` observations.
     pub(crate) fn new(spec: &PolicySpec, networks: &Networks, rows: usize) -> Self {
         Activations {
             observations: Rows::new(rows, spec.observation_size),
@@ -79,8 +81,8 @@ impl FeedForward {
         FeedForward { observation_size: spec.observation_size, networks, activations, max_cached: 0, cached: None }
     }
 
-    /// From now on caches the activations while acting, for [`FeedForward::exchange`]: up to [`BLOCK`] rows, those of values
-    /// included.
+    /// Turns on the cache of activations, for [`FeedForward::exchange`]. It holds up to [`BLOCK`] rows. Observations
+    /// for which only values are computed use rows too.
     pub(crate) fn keep(&mut self, spec: &PolicySpec) {
         self.max_cached = BLOCK;
         self.activations = Activations::new(spec, &self.networks, BLOCK);
@@ -92,8 +94,8 @@ impl FeedForward {
         self.cached = Some(0);
     }
 
-    /// Swaps the networks for others and, if any rows are cached, the activations for those of a [`BLOCK`]. Returns the number
-    /// of cached rows. Weights must be loaded before acting again.
+    /// Swaps the networks for `networks`. If any rows are cached, also swaps the activations for `activations`, which
+    /// must have [`BLOCK`] rows. Returns the number of cached rows. Weights must be loaded before acting again.
     pub(crate) fn exchange(&mut self, networks: &mut Networks, activations: &mut Activations) -> usize {
         swap(&mut self.networks, networks);
         let cached = self.cached.take().unwrap_or(0);
@@ -103,7 +105,7 @@ impl FeedForward {
         cached
     }
 
-    /// Computes the rows of the policy's outputs and of the values.
+    /// Computes both networks for `n` observations. Returns the rows of the policy's outputs and of the values.
     pub(crate) fn act(&mut self, observations: &[f32], n: usize) -> (RowsFrom<'_>, RowsFrom<'_>) {
         let rows = self.value_rows(observations, n);
         let (network, Activations { observations, policy_layers, value_layers }) =
@@ -114,14 +116,15 @@ impl FeedForward {
         (policy_layers[last].from(rows.start), value_layers[last].from(rows.start))
     }
 
-    /// Computes the rows of the values.
+    /// Computes the value network for `n` observations. Returns the rows of the values.
     pub(crate) fn values(&mut self, observations: &[f32], n: usize) -> RowsFrom<'_> {
         let rows = self.value_rows(observations, n);
         let layers = &self.activations.value_layers;
         layers[layers.len() - 1].from(rows.start)
     }
 
-    /// Computes values. Returns their rows: behind the cached ones or, if there is no space for them, in place of these.
+    /// Computes the value network for `n` observations. Returns the range of rows with the results: after the cached
+    /// rows, or from row 0 if the cache is full.
     fn value_rows(&mut self, observations: &[f32], n: usize) -> Range<usize> {
         self.cached = self.cached.filter(|cached| cached + n <= self.max_cached);
         let first = self.cached.unwrap_or(0);
@@ -143,7 +146,8 @@ mod tests {
 
     const O: usize = 3;
 
-    /// Number of cached rows after `steps` steps of `n` environments, each followed by the values of `n` observations.
+    /// Returns the number of cached rows after `steps` steps of `n` environments, each followed by the values of `n`
+    /// observations.
     fn cached(keeps: bool, n: usize, steps: usize) -> usize {
         let spec = PolicySpec::feed_forward(O, ActionKind::Discrete { n: 2 });
         let mut acting = FeedForward::new(&spec, n);

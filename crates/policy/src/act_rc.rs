@@ -1,4 +1,4 @@
-//! Acting with the recurrent network; the equations are in `rc.rs` of `crates/torch`.
+//! Acting with a recurrent policy. The equations are in `rc.rs` of `crates/torch`.
 
 use pulp::Simd;
 
@@ -7,35 +7,36 @@ use crate::math::{sigmoid, tanh};
 use crate::perceptron::{Forward, Layer, Perceptron, take};
 use crate::spec::PolicySpec;
 
-/// Hidden layers, an LSTM and two heads, with the memory of every environment.
+/// A recurrent policy: hidden layers, an LSTM, a policy head and a value head. Also holds the memory of every
+/// environment.
 #[derive(Clone, Debug)]
 pub(crate) struct Recurrent {
     observation_size: usize,
-    /// X: numbers that enter the LSTM from below.
+    /// X, the number of inputs that the LSTM gets from the hidden layers.
     hidden_size: usize,
-    /// H, the width of the LSTM.
+    /// H, the number of units of the LSTM.
     width: usize,
     hidden: Perceptron,
-    /// Maps x and h together, `[X + H]`, to i, f, g and o, `[4H]`.
+    /// Maps the concatenation of x and h, `[X + H]`, to the sums of the LSTM's gates i, f, g and o, `[4H]`.
     gates: Layer,
     policy: Layer,
     value: Layer,
-    /// [max_batch, 2H]: h, then c, of every environment.
+    /// `[max_batch, 2H]` memory of every environment: the LSTM's output h, then its cell state c.
     memory: Vec<f32>,
-    // Rows of a batch.
-    /// [max_batch, O].
+    // The remaining fields are buffers with one row for each environment of a batch.
+    /// `[max_batch, O]` observations.
     observations: Rows,
-    /// Outputs of each hidden layer.
+    /// Outputs of each hidden layer, one element for each layer.
     hidden_layers: Vec<Rows>,
-    /// [max_batch, X + H].
+    /// `[max_batch, X + H]` inputs of the LSTM: x, then h.
     inputs: Rows,
-    /// [max_batch, 4H].
+    /// `[max_batch, 4H]` sums of the LSTM's gates.
     sums: Rows,
-    /// [max_batch, 2H]: the memory after the step.
+    /// `[max_batch, 2H]` memory after the step.
     next: Rows,
-    /// [max_batch, n or A].
+    /// `[max_batch, n]` logits or `[max_batch, A]` means.
     outputs: Rows,
-    /// [max_batch, 1].
+    /// `[max_batch, 1]` values V.
     values: Rows,
 }
 
@@ -64,7 +65,8 @@ impl Recurrent {
         }
     }
 
-    /// Loads weights in the order of [`PolicySpec::layout`] from the front of `numbers`, and removes them there.
+    /// Loads weights in the order of [`PolicySpec::layout`] from the front of `numbers`, and advances `numbers` past
+    /// them.
     pub(crate) fn load(&mut self, numbers: &mut &[f32]) {
         self.hidden.load(numbers);
         self.gates.load_inputs(0, take(numbers, 4 * self.width * self.hidden_size));
@@ -74,7 +76,8 @@ impl Recurrent {
         self.value.load(numbers);
     }
 
-    /// Computes the rows of the policy's outputs and of the values for environments 0 … `n_envs`-1, and moves their memories on.
+    /// Runs the network for environments 0 … `n_envs`-1 and updates their memories. Returns the rows of the policy's
+    /// outputs and of the values.
     pub(crate) fn advance(&mut self, observations: &[f32], n_envs: usize) -> (RowsFrom<'_>, RowsFrom<'_>) {
         self.step(observations, 0..n_envs);
         for (n, memory) in self.memory.chunks_exact_mut(2 * self.width).take(n_envs).enumerate() {
@@ -83,7 +86,8 @@ impl Recurrent {
         (self.outputs.from(0), self.values.from(0))
     }
 
-    /// Computes the rows of the values of `observations` in `environments`. The memories stay.
+    /// Runs the network for `observations` of `environments`. Returns the rows of the values, and leaves the memories
+    /// unchanged.
     pub(crate) fn values(
         &mut self,
         observations: &[f32],
@@ -101,12 +105,12 @@ impl Recurrent {
         &self.memory
     }
 
-    /// The memories, to be overwritten.
+    /// Returns the memories for writing.
     pub(crate) fn memory_mut(&mut self) -> &mut [f32] {
         &mut self.memory
     }
 
-    /// Computes `next`, outputs and values from `observations` and the memories of `environments`.
+    /// Computes the fields `next`, `outputs` and `values` from `observations` and the memories of `environments`.
     fn step(&mut self, observations: &[f32], environments: impl ExactSizeIterator<Item = usize>) {
         let n = environments.len();
         self.observations.copy(0, observations, self.observation_size);
@@ -119,7 +123,8 @@ impl Recurrent {
     }
 }
 
-/// A step of `n` environments, whose rows are filled.
+/// The arguments of the vectorised step of `n` environments. The rows of `observations`, `inputs` and `next` must be
+/// filled.
 struct RecurrentStep<'a> {
     network: &'a mut Recurrent,
     n: usize,
@@ -147,8 +152,8 @@ impl Kernel for RecurrentStep<'_> {
     }
 }
 
-/// Replaces the old cell states in `c` by the new ones, and `h` by the new outputs. `sums` holds i, f, g and o before their
-/// nonlinearities, and is overwritten.
+/// Computes the LSTM of one environment. Replaces the cell states `c` and the outputs `h` by those after the step.
+/// `sums` holds the sums of the gates i, f, g and o before their nonlinearities, and is overwritten.
 #[inline(always)]
 fn cell(sums: &mut [f32], h: &mut [f32], c: &mut [f32]) {
     let width = c.len();

@@ -1,4 +1,4 @@
-//! The gradient backend of a policy.
+//! Choice of the gradient backend for a policy.
 
 use crate::act::Actor;
 use crate::differentiator::Differentiator;
@@ -10,11 +10,13 @@ use crate::recurrent::{RecurrentDifferentiator, recurrent_differentiator};
 use crate::samples::SequenceSamples;
 use crate::spec::PolicySpec;
 
-/// The backend of a policy of shape `spec`. For a feed-forward policy it computes with `threads` threads, at least 1, whose
-/// number changes no byte. For a recurrent policy it ignores `threads`.
+/// Creates the gradient backend for a policy of shape `spec`. A feed-forward policy's backend uses `threads` threads,
+/// at least 1; their number does not change the results. A recurrent policy's backend ignores `threads`.
 ///
 /// # Errors
-/// Threads that cannot be started; a recurrent policy in a process without a registered library for recurrent policies.
+/// [`Error::Threads`](crate::Error::Threads) if the threads cannot be started.
+/// [`Error::NoRecurrentGradients`](crate::Error::NoRecurrentGradients) if the policy is recurrent and no library is
+/// [registered](crate::register_recurrent).
 pub fn gradient_backend(spec: &PolicySpec, threads: usize) -> Result<Box<dyn GradientBackend>> {
     Ok(match spec.lstm {
         None => Box::new(Differentiator::new(spec, threads)?),
@@ -22,7 +24,8 @@ pub fn gradient_backend(spec: &PolicySpec, threads: usize) -> Result<Box<dyn Gra
     })
 }
 
-/// The backend of recurrent policies. Each gradient gets the weights anew, so that none are cached.
+/// The gradient backend of recurrent policies. It caches neither weights nor activations: each call gets the weights
+/// again.
 struct RecurrentBackend(Box<dyn RecurrentDifferentiator>);
 
 impl GradientBackend for RecurrentBackend {

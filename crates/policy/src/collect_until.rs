@@ -1,41 +1,41 @@
-//! The amount of experience between two updates, and the part that is still to be collected.
+//! The amount of experience to collect between two updates, and how much of it is still missing.
 
 /// The amount of experience that a learner collects between two updates.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CollectUntil {
-    /// T steps of each environment. Episodes continue from one rollout to the next.
+    /// T steps of each environment. An episode may continue in the next rollout.
     Steps(usize),
-    /// L complete episodes in all environments together, each in a freshly drawn environment. All environments are reset
-    /// first.
+    /// L complete episodes, counted over all environments. The environments are reset first, and each episode draws new
+    /// parameters.
     Episodes(usize),
 }
 
-/// The part of a [`CollectUntil`] that is still to be played.
+/// The part of a [`CollectUntil`] that is not yet collected.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum RemainingRollout {
-    /// Steps of each environment.
+    /// The number of steps still to play in each environment.
     Steps(usize),
-    /// Complete episodes of each environment.
+    /// The number of complete episodes still to play, for each environment.
     Episodes(EpisodeQuotas),
 }
 
-/// Number of episodes that each environment still has to play.
+/// The number of episodes that each environment still has to play.
 ///
-/// The quotas are fixed beforehand, as evenly as possible. The first L episodes to end would be biased towards short ones.
-/// An environment that has met its quota is stepped on, but its steps are neither stored as episodes nor part of any
-/// statistics.
+/// The L episodes are divided among the environments in advance, as evenly as possible. Taking the first L episodes to
+/// end would favour short episodes. An environment that has played its number is still stepped with the batch, but its
+/// further steps are not stored and do not enter statistics.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct EpisodeQuotas {
-    /// `[N]`
+    /// `[N]` episodes left to play.
     left: Vec<usize>,
-    /// `[N]` whether the next step counts.
+    /// `[N]` whether the environment's next step is collected.
     active: Vec<bool>,
-    /// `[N]` whether the last step counted.
+    /// `[N]` whether the environment's last step was collected.
     stepped: Vec<bool>,
 }
 
 impl CollectUntil {
-    /// Starts to count in N = `n_envs` environments.
+    /// Starts counting in N = `n_envs` environments.
     pub fn begin(self, n_envs: usize) -> RemainingRollout {
         let count = match self {
             Self::Steps(count) => return RemainingRollout::Steps(count),
@@ -48,7 +48,7 @@ impl CollectUntil {
 }
 
 impl RemainingRollout {
-    /// Whether nothing is left to play.
+    /// Returns whether everything is collected.
     pub fn is_done(&self) -> bool {
         match self {
             Self::Steps(left) => *left == 0,
@@ -56,7 +56,7 @@ impl RemainingRollout {
         }
     }
 
-    /// Counts a step of all environments, which ended the episodes of the `ended` slots.
+    /// Counts one step of all environments. `ended` lists the environments (0 … N-1) whose episodes ended with it.
     pub fn advance(&mut self, ended: impl Iterator<Item = usize>) {
         match self {
             Self::Steps(left) => *left = left.saturating_sub(1),
@@ -70,18 +70,18 @@ impl RemainingRollout {
         }
     }
 
-    /// `[N]` whether the last step counted; `None` if it counted everywhere.
+    /// Returns, for each environment `[N]`, whether its last step was collected. `None` means all of them.
     pub fn stepped(&self) -> Option<&[bool]> {
         if let Self::Episodes(quotas) = self { Some(&quotas.stepped) } else { None }
     }
 
-    /// `[N]` whether the next step will count; `None` if it will count everywhere. The observation after an environment's
-    /// last episode belongs to an episode that is not collected.
+    /// Returns, for each environment `[N]`, whether its next step will be collected. `None` means all of them. After an
+    /// environment's last episode, the first observation of its next episode is not part of the rollout.
     pub fn active(&self) -> Option<&[bool]> {
         if let Self::Episodes(quotas) = self { Some(&quotas.active) } else { None }
     }
 
-    /// Whether an episode that the last step ended in `slot` is one of those to be collected.
+    /// Returns whether the episode that ended with the last step in environment `slot` is part of the rollout.
     pub fn counts(&self, slot: usize) -> bool {
         self.stepped().is_none_or(|stepped| stepped[slot])
     }

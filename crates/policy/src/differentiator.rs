@@ -15,39 +15,39 @@ use crate::perceptron::{Backward, Forward};
 use crate::samples::{Samples, SequenceSamples};
 use crate::spec::PolicySpec;
 
-/// Maximal number of parts of a minibatch, and so of threads that work on one.
+/// Maximal number of parts into which a minibatch is divided. No more threads than this can work on one minibatch.
 const MAX_PARTS: usize = 16;
 
-/// Differentiates losses of a feed-forward policy.
+/// Computes the gradients of a feed-forward policy's loss.
 ///
-/// A minibatch is cut into parts by its size alone, and their gradients are added in order: the same bytes with any
-/// number of threads.
+/// The division of a minibatch into parts depends only on its size, and the gradients of the parts are added in order.
+/// The result therefore has the same bytes with any number of threads.
 #[derive(Debug)]
 pub struct Differentiator {
     spec: PolicySpec,
-    /// P.
+    /// P, the number of weights.
     n_weights: usize,
     networks: Networks,
     gaussian: Gaussian,
     parts: Vec<MinibatchPart>,
-    /// Whether `networks` have the weights that the next gradient is for.
+    /// Whether `networks` hold the weights for which the next gradient is computed.
     is_current: bool,
-    /// Number of rows of the first part whose activations an actor has computed.
+    /// Number of rows of the first part whose activations were already computed by an actor.
     computed: usize,
-    /// The other threads; `None` if the calling thread does everything.
+    /// The additional threads; `None` if the calling thread does all the work.
     threads: Option<ThreadPool>,
 }
 
-/// Buffers for a part of a minibatch.
+/// The buffers and results for one part of a minibatch.
 #[derive(Debug)]
 struct MinibatchPart {
     block: SampleBlock,
-    /// `[P]` the derivatives of the part's losses. Empty in the first part, which writes to the caller's gradient.
+    /// `[P]` gradient of the part's losses. Empty in the first part, which writes to the caller's buffer instead.
     gradient: Vec<f32>,
     losses: Losses,
 }
 
-/// Buffers for the forward and backward pass of a block of samples.
+/// The buffers for the forward and backward pass of at most [`BLOCK`] samples.
 #[derive(Debug)]
 struct SampleBlock {
     activations: Activations,
@@ -66,7 +66,8 @@ impl SampleBlock {
 }
 
 impl Differentiator {
-    /// A differentiator of policies of shape `spec` that computes with `threads` threads, at least 1; more than 16 are not used.
+    /// Creates a differentiator for policies of shape `spec` that uses `threads` threads, at least 1 and at most 16. A
+    /// larger number is reduced to 16.
     ///
     /// # Errors
     /// [`Error::Threads`] if the threads cannot be started.
@@ -89,7 +90,7 @@ impl Differentiator {
     /// Loads weights `[P]`.
     ///
     /// # Errors
-    /// Another length.
+    /// [`Error::Length`] if the number of weights is wrong.
     pub fn load(&mut self, weights: &[f32]) -> Result<()> {
         check_length("weights [P]", weights.len(), self.n_weights)?;
         let mut rest = weights;
@@ -104,9 +105,12 @@ impl Differentiator {
         if self.is_current { Ok(()) } else { self.load(weights) }
     }
 
-    /// Takes the networks of an actor that has the weights, which is quicker than loading them, with the activations that [it
-    /// has cached](Actor::keep_activations). Returns whether the actor has this shape; otherwise nothing happens. The actor gets
-    /// other networks, and refuses to act until it has loaded weights ([`Error::NoWeights`]).
+    /// Takes over the networks of an actor that has the weights for the next gradient, instead of loading them, which
+    /// takes longer. Also takes over the activations that [the actor has cached](Actor::keep_activations). In exchange
+    /// the actor gets this differentiator's networks, and refuses to act until weights are loaded
+    /// ([`Error::NoWeights`]).
+    ///
+    /// Returns whether the actor's policy is feed-forward and has the same shape. If not, nothing is exchanged.
     #[must_use]
     pub fn load_from(&mut self, actor: &mut Actor) -> bool {
         self.make_parts(1);
@@ -116,7 +120,7 @@ impl Differentiator {
         true
     }
 
-    /// Adds buffers until there are `n` parts.
+    /// Creates missing parts until there are at least `n`.
     fn make_parts(&mut self, n: usize) {
         while self.parts.len() < n {
             let length = if self.parts.is_empty() { 0 } else { self.n_weights };
@@ -125,7 +129,7 @@ impl Differentiator {
         }
     }
 
-    /// Whether the first part has the cached activations of exactly the samples at `indices`.
+    /// Returns whether the first part's cached activations are those of exactly the samples at `indices`.
     fn has_computed(&self, samples: &Samples<'_>, indices: &[u32]) -> bool {
         let size = self.spec.observation_size;
         let are_all = indices.len() == self.computed && indices.iter().enumerate().all(|(b, &i)| i as usize == b);
@@ -136,11 +140,11 @@ impl Differentiator {
             })
     }
 
-    /// Writes the derivatives of the total loss of the samples at `indices` with respect to `weights` `[P]` to
+    /// Writes the gradient of the total loss over the samples at `indices`, with respect to `weights` `[P]`, to
     /// `gradient` `[P]`. `weights` must be those that were loaded. Returns the losses.
     ///
     /// # Errors
-    /// Lengths that do not fit, or no indices.
+    /// [`Error::Length`] if an array has the wrong length, [`Error::NoSamples`] if `indices` is empty.
     ///
     /// # Panics
     /// If an index is out of range, or a discrete action is not in 0 … n-1.
@@ -202,7 +206,7 @@ impl Differentiator {
                 parts.iter_mut().enumerate().for_each(|(k, part)| work(k, part, gradient.take()));
             }
         }
-        // In order of parts, whichever thread ended first.
+        // Adds the parts in order, so that the sum does not depend on which thread finished first.
         let mut losses = Losses::default();
         for (place, part) in parts.iter().enumerate() {
             losses += part.losses;
@@ -213,10 +217,11 @@ impl Differentiator {
         Ok(objective.means(losses, n))
     }
 
-    /// Replaces `outputs` by the logits `[B, n]` or means `[B, A]` at `observations` `[B, O]`.
+    /// Computes the policy network at `observations` `[B, O]`, and replaces `outputs` by the logits `[B, n]` or means
+    /// `[B, A]`.
     ///
     /// # Errors
-    /// A length that does not fit.
+    /// [`Error::Length`] if `observations` is not a multiple of O long.
     pub fn outputs(&mut self, observations: &[f32], outputs: &mut Vec<f32>) -> Result<()> {
         let size = self.spec.observation_size;
         check_length("observations [B, O]", observations.len(), observations.len() / size * size)?;
@@ -278,7 +283,7 @@ impl GradientBackend for Differentiator {
     }
 }
 
-/// Adds `more` to `sums`.
+/// The arguments of the vectorised addition of `more` to `sums`, element by element.
 struct Add<'a> {
     sums: &'a mut [f32],
     more: &'a [f32],
@@ -291,30 +296,30 @@ impl Kernel for Add<'_> {
     }
 }
 
-/// The inputs that all parts of a minibatch share.
+/// The inputs that are the same for all parts of a minibatch.
 struct MinibatchContext<'a> {
     spec: &'a PolicySpec,
     networks: &'a Networks,
     gaussian: &'a Gaussian,
     weights: &'a [f32],
     samples: &'a Samples<'a>,
-    /// Whether the samples' activations are cached.
+    /// Whether the activations of the samples are already in the first part's buffers.
     is_computed: bool,
     objective: &'a Objective,
-    /// Mean of the advantages.
+    /// Mean of the advantages; 0 if they are not normalised.
     mean: f32,
-    /// Factor for their distance from the mean.
+    /// Factor by which an advantage's distance from the mean is multiplied; 1 if advantages are not normalised.
     scale: f32,
     /// Number of samples in the minibatch.
     n: usize,
 }
 
-/// The work on one part.
+/// The arguments of the vectorised gradient of one part.
 struct Differentiation<'a> {
     context: MinibatchContext<'a>,
     indices: &'a [u32],
     block: &'a mut SampleBlock,
-    /// `[P]`.
+    /// `[P]` the gradient, which is overwritten.
     sums: &'a mut [f32],
     losses: &'a mut Losses,
 }
@@ -330,8 +335,8 @@ impl Kernel for Differentiation<'_> {
 }
 
 impl Differentiation<'_> {
-    /// The forward pass, the losses and the backward pass of the samples at `indices`, at most [`BLOCK`]. With `ADD` the
-    /// derivatives are added to the sums.
+    /// Computes the forward pass, the losses and the backward pass of the samples at `indices`, at most [`BLOCK`]. With
+    /// `ADD` the derivatives are added to `sums`, otherwise they replace `sums`.
     #[inline(always)]
     fn block<S: Simd, const ADD: bool>(&mut self, simd: S, indices: &[u32]) {
         let SampleBlock { activations, through_policy, through_value } = &mut *self.block;

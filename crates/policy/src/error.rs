@@ -1,13 +1,13 @@
-//! Errors of a policy's arrays and numbers.
+//! Errors of policies, normalisers and gradients.
 
 /// A failure of a policy, a normaliser or a gradient step.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A part of a policy's shape is empty.
+    /// A size in a policy's shape is 0.
     #[error("{name} is 0, but must be at least 1")]
     Empty {
-        /// The part.
+        /// The name of the size.
         name: &'static str,
     },
     /// An array has the wrong number of elements.
@@ -15,22 +15,22 @@ pub enum Error {
     Length {
         /// The array, with its axes, e.g. "observations `[N, O]`".
         name: &'static str,
-        /// Elements that were given.
+        /// Number of elements in the array.
         got: usize,
-        /// Elements that were expected.
+        /// Number of elements that it must have.
         expected: usize,
     },
-    /// Saved arrays do not fit: one is missing, superfluous, misnamed or has another shape.
+    /// Saved arrays do not match the expected ones: one is missing, superfluous or misnamed, or has the wrong shape.
     #[error("array {position} is {got}, expected {expected}; were these saved with other settings?")]
     Arrays {
-        /// Place in the list.
+        /// Index of the first wrong array in the list.
         position: usize,
-        /// Name and shape that were found, or "missing".
+        /// Name and shape of the saved array, or "missing".
         got: String,
-        /// Name and shape that were expected, or "nothing".
+        /// Name and shape of the expected array, or "nothing".
         expected: String,
     },
-    /// A number that must be finite is not.
+    /// A loss or a gradient is infinite or NaN.
     #[error("{what} became {value} at update {update}; lower the learning rate, or look for very large rewards")]
     NotFinite {
         /// The quantity, e.g. "the loss".
@@ -40,48 +40,48 @@ pub enum Error {
         /// Index of the gradient step, from 0.
         update: u64,
     },
-    /// A policy gave a log-probability or a value that is infinite or NaN.
+    /// A policy computed an action, a log-probability or a value that is infinite or NaN.
     #[error(
         "the policy's output in environment {environment} is not finite; its weights or observation hold NaN or inf"
     )]
     PolicyOutput {
-        /// The environment, 0 … N-1.
+        /// The index of the environment, 0 … N-1.
         environment: usize,
     },
-    /// The policy cannot act, because its networks were moved out of it.
+    /// The policy's networks were moved to a gradient backend. Load weights before it acts again.
     #[error("the policy's networks were moved out of it; load weights before it acts again")]
     NoWeights,
-    /// A gradient of no samples was asked for.
+    /// A gradient was requested for an empty set of samples.
     #[error("a minibatch is empty, but must have at least 1 sample")]
     NoSamples,
-    /// The system starts no more threads.
-    #[error("{wanted} threads cannot be started: {reason}; ask for fewer")]
+    /// The operating system could not start the threads.
+    #[error("{wanted} threads cannot be started: {reason}; use fewer threads")]
     Threads {
-        /// Number of threads to start.
+        /// Number of threads that were requested.
         wanted: usize,
-        /// The system's message.
+        /// The operating system's error message.
         reason: String,
     },
-    /// Nothing is registered that differentiates recurrent policies.
+    /// No library that computes gradients of recurrent policies is registered in this process.
     #[error("this program cannot train recurrent policies: use perturb-recurrent, which has libtorch")]
     NoRecurrentGradients,
-    /// The library that differentiates recurrent policies refused an operation.
+    /// The library that computes gradients of recurrent policies returned an error.
     #[error("{library}: {reason}")]
     Library {
         /// The library's name.
         library: &'static str,
-        /// The library's message.
+        /// The library's error message.
         reason: String,
     },
-    /// Impossible statistics.
+    /// Saved statistics of a normaliser are invalid.
     #[error("the statistics of {name} are invalid: {reason}")]
     Statistics {
-        /// The normalised quantity: observations or rewards.
+        /// The quantity that is normalised: "observations" or "rewards".
         name: &'static str,
-        /// The reason.
+        /// A description of the fault.
         reason: String,
     },
-    /// An input that must be finite is not.
+    /// An observation or a reward is infinite or NaN.
     #[error("{name} hold {value}; the environment's numbers must be finite")]
     Input {
         /// The array, with its axes.
@@ -94,10 +94,10 @@ pub enum Error {
 /// A result with this module's [`Error`].
 pub type Result<T> = std::result::Result<T, Error>;
 
-/// `Ok` if a slice has the expected length.
+/// Checks that an array called `name`, which has `got` elements, has `expected` elements.
 ///
 /// # Errors
-/// [`Error::Length`] otherwise.
+/// [`Error::Length`] if the numbers differ.
 pub fn check_length(name: &'static str, got: usize, expected: usize) -> Result<()> {
     if got == expected { Ok(()) } else { Err(Error::Length { name, got, expected }) }
 }

@@ -7,27 +7,28 @@ use crate::objective::Objective;
 use crate::recurrent::RecurrentBatch;
 use crate::samples::{Samples, SequenceSamples};
 
-/// Computes gradients of policies of one shape. A feed-forward policy has [`Differentiator`](crate::Differentiator), a
-/// recurrent one [what is registered](crate::register_recurrent). [`gradient_backend`](crate::gradient_backend) chooses.
+/// Computes gradients for policies of one shape. [`Differentiator`](crate::Differentiator) implements it for
+/// feed-forward policies, and a [registered library](crate::register_recurrent) for recurrent ones.
+/// [`gradient_backend`](crate::gradient_backend) chooses between them.
 pub trait GradientBackend {
-    /// Prepares the sequences of a rollout, to be learned from several times.
+    /// Prepares the sequences of a rollout, so that several gradients can be computed from them.
     ///
     /// # Errors
-    /// Arrays whose lengths do not fit, or what libtorch refuses.
+    /// An error if an array has the wrong length, or if libtorch reports one.
     fn batch<'a>(&self, sequences: &SequenceSamples<'a>) -> Result<GradientBatch<'a>>;
 
-    /// Stores the distributions of the policy with `weights` `[P]` as those of the policy that acted in `batch`. The KL
-    /// divergence is measured from them.
+    /// Stores the action distributions of the policy with `weights` `[P]` in `batch`, as those of the policy that
+    /// acted. The KL divergence is measured from these distributions.
     ///
     /// # Errors
-    /// A batch of other observations, or another number of weights.
+    /// An error if the batch does not fit this policy, or if the number of weights is wrong.
     fn remember_acting(&mut self, weights: &[f32], batch: &mut GradientBatch<'_>) -> Result<()>;
 
-    /// Writes the gradient of `objective` with `weights` `[P]` over `sequences` of `batch` to `gradient` `[P]`. Returns the
-    /// losses.
+    /// Computes the gradient of `objective` at `weights` `[P]` over the `sequences` of `batch`, given by their indices.
+    /// Writes it to `gradient` `[P]`, and returns the losses.
     ///
     /// # Errors
-    /// Arrays of other lengths, or what libtorch refuses.
+    /// An error if an array has the wrong length, or if libtorch reports one.
     fn gradient(
         &mut self,
         weights: &[f32],
@@ -37,31 +38,32 @@ pub trait GradientBackend {
         gradient: &mut [f32],
     ) -> Result<Losses>;
 
-    /// Must be called when the weights have changed since the last call of this backend.
+    /// Tells the backend that the weights have changed. Call it after every change, before the next gradient.
     fn weights_changed(&mut self);
 
-    /// Takes the networks of an actor that has the present weights, with their cached activations, to skip a forward pass. The
-    /// actor must load weights before it acts again. A recurrent policy's backend does nothing.
+    /// Takes over the networks of an actor that has the current weights, with their cached activations, to skip a
+    /// forward pass. The actor must load weights before it acts again. A recurrent policy's backend does nothing.
     fn reuse_activations(&mut self, actor: &mut Actor);
 }
 
-/// A rollout as M sequences, each of which the policy must see whole. A recurrent policy needs the steps of an environment
-/// in order: M = N. A feed-forward policy takes every sample by itself: M is the number of samples, T·N without padding.
+/// A rollout prepared for gradients, as M sequences that a minibatch cannot split. A recurrent policy needs the steps
+/// of an environment in order, so a sequence is an environment and M = N. For a feed-forward policy each sample is a
+/// sequence of its own, so M is the number of samples: T·N minus padding.
 pub enum GradientBatch<'a> {
     /// A batch of a feed-forward policy.
     FeedForward {
-        /// The rollout.
+        /// The samples of the rollout, `[T, N, …]`, with padding.
         samples: Samples<'a>,
-        /// The indices of the samples in the rollout.
+        /// The indices of the samples in the rollout that are not padding.
         indices: Vec<u32>,
-        /// The distributions of the policy that acted, if they were remembered.
+        /// The action distributions of the policy that acted, if [`GradientBackend::remember_acting`] stored them.
         acting: Option<ActingOutputs>,
     },
     /// A batch of a recurrent policy.
     Recurrent(Box<dyn RecurrentBatch>),
 }
 
-/// The distributions of the policy that acted, at B samples.
+/// The action distributions of the policy that acted, for B samples.
 #[derive(Clone, Debug)]
 pub struct ActingOutputs {
     /// `[B, n]` logits, or `[B, A]` means.
@@ -71,7 +73,7 @@ pub struct ActingOutputs {
 }
 
 impl GradientBatch<'_> {
-    /// The indices of all sequences.
+    /// Returns the indices of all sequences.
     pub fn sequences(&self) -> Vec<u32> {
         match self {
             Self::FeedForward { indices, .. } => indices.clone(),

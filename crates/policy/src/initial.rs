@@ -1,4 +1,4 @@
-//! Initial weights.
+//! Initial weights of a policy.
 
 use rand_chacha::ChaCha8Rng;
 
@@ -6,16 +6,17 @@ use crate::random::normal;
 use crate::spec::PolicySpec;
 use crate::weights::{NamedArray, Weights};
 
-/// Gain of hidden layers, which undoes what tanh takes from the variance.
+/// Gain of the hidden layers. It compensates for the variance that tanh removes.
 const HIDDEN_GAIN: f64 = std::f64::consts::SQRT_2;
-/// Gain of the policy's last layer: actions start nearly independent of the observation.
+/// Gain of the policy's output layer. It is small, so that the first actions hardly depend on the observation.
 const POLICY_GAIN: f64 = 0.01;
-/// Gain of the value's last layer.
+/// Gain of the value network's output layer.
 const VALUE_GAIN: f64 = 1.0;
-/// Gain of the LSTM: each of its two matrices is orthogonal as a whole, all four gates together, as the reference's.
+/// Gain of the LSTM. Its input matrix and its recurrent matrix are each orthogonal as a whole, with all four gates
+/// together, as in the reference implementation (OpenAI Baselines).
 const LSTM_GAIN: f64 = 1.0;
 
-/// Orthogonal weights, biases 0, log standard deviations 0.
+/// Draws the initial weights of a policy: orthogonal matrices. Biases and log standard deviations are 0.
 pub fn initial_weights(spec: &PolicySpec, rng: &mut ChaCha8Rng) -> Weights {
     let draw = |(name, shape): (String, Vec<usize>)| {
         let data = match shape[..] {
@@ -27,7 +28,7 @@ pub fn initial_weights(spec: &PolicySpec, rng: &mut ChaCha8Rng) -> Weights {
     spec.layout().into_iter().map(draw).collect()
 }
 
-/// The gain of the weights called `name`.
+/// Returns the gain of the weight matrix called `name`.
 fn gain(spec: &PolicySpec, name: &str) -> f64 {
     let last = if spec.lstm.is_some() { String::new() } else { format!(".{}", spec.hidden.len()) };
     if name == format!("policy{last}.weight") {
@@ -41,10 +42,10 @@ fn gain(spec: &PolicySpec, name: &str) -> f64 {
     }
 }
 
-/// A matrix [rows, columns] whose shorter side's vectors are orthogonal and `gain` long (Saxe et al., 2014,
-/// arXiv:1312.6120), drawn uniformly: Gram-Schmidt on normal vectors, in f64.
+/// Draws a matrix `[rows, columns]` uniformly from those with orthogonal vectors of length `gain` along the shorter
+/// axis (Saxe et al., 2014, arXiv:1312.6120). Applies Gram-Schmidt orthogonalisation to normal vectors, in f64.
 ///
-/// The second pass of Gram-Schmidt removes what rounding left of the first, so that Wᵀ W = gain² I holds to the
+/// A second pass of Gram-Schmidt removes the rounding errors of the first, so that Wᵀ W = gain² I holds up to the
 /// rounding of the result to f32.
 fn orthogonal(rows: usize, columns: usize, gain: f64, rng: &mut ChaCha8Rng) -> Vec<f32> {
     let count = rows.min(columns);
@@ -88,7 +89,8 @@ mod tests {
                 for j in 0..count {
                     let product: f64 = (0..length).map(|k| at(i, k) * at(j, k)).sum();
                     let expected = if i == j { gain * gain } else { 0.0 };
-                    // Each of at most 64 products of unit vectors' elements is off by 2⁻²³ of its size, times gain².
+                    // Each of at most 64 products of unit vectors' elements has a relative rounding error of 2⁻²³,
+                    // times gain².
                     assert!((product - expected).abs() < 3e-7 * gain * gain, "{rows}x{columns} {i} {j}: {product}");
                 }
             }

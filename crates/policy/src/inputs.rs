@@ -1,55 +1,56 @@
-//! The inputs of a policy.
+//! Inputs of a policy.
 
 use crate::act::ActorOutput;
 use crate::error::{Result, check_length};
 use crate::spec::ActionKind;
 
-/// Makes a policy's inputs from observations: the observations as they are or, for RL², each with the action of the previous
-/// step and its result, (s_t, a_{t-1}, r_{t-1}, d_{t-1}), Duan et al. (2016), arXiv:1611.02779, section 2.2:
+/// Builds a policy's inputs from observations. Without RL², an input is the observation. With RL² it is (s_t, a_{t-1},
+/// r_{t-1}, d_{t-1}), the observation with the previous step of its environment (Duan et al., 2016, arXiv:1611.02779,
+/// section 2.2):
 ///
-/// - s_t `[O]`: the observation, normalised;
-/// - a_{t-1}: one-hot `[n]` if actions are discrete, else as sampled `[A]`;
-/// - r_{t-1}: the reward, normalised;
-/// - d_{t-1}: 1 if the step ended an episode, else 0.
+/// - s_t `[O]`: the normalised observation;
+/// - a_{t-1}: the action, one-hot `[n]` if discrete, as sampled `[A]` if continuous;
+/// - r_{t-1}: the normalised reward;
+/// - d_{t-1}: the done flag, 1 if the step ended an episode, else 0.
 ///
-/// The last three are 0 at the start of a trial.
+/// The previous step is all 0 at the start of a trial.
 #[derive(Clone, Debug)]
 pub struct Inputs {
     observation_size: usize,
     action: ActionKind,
-    /// `[N, E]` the previous steps: action, reward and done flag. E = 0 if inputs are observations alone.
+    /// `[N, E]` previous step of every environment: action, reward and done flag. E = 0 without RL².
     previous: Vec<f32>,
-    /// E, the length of a previous step.
+    /// E, the length of a previous step: the action's length + 2, or 0 without RL².
     extra: usize,
     rows: Vec<f32>,
 }
 
 impl Inputs {
-    /// Inputs of N = `n_envs` environments at the start of a trial. `with_previous_step` adds the last action, reward and done
-    /// flag.
+    /// Creates the inputs of N = `n_envs` environments at the start of a trial. With `with_previous_step` (RL²) they
+    /// include the previous action, reward and done flag.
     pub fn new(observation_size: usize, action: ActionKind, n_envs: usize, with_previous_step: bool) -> Self {
         let extra = if with_previous_step { action.outputs() + 2 } else { 0 };
         Inputs { observation_size, action, previous: vec![0.0; n_envs * extra], extra, rows: Vec::new() }
     }
 
-    /// O, the length of an observation.
+    /// Returns O, the length of an observation.
     pub fn observation_size(&self) -> usize {
         self.observation_size
     }
 
-    /// I = O + E, the length of an input.
+    /// Returns I = O + E, the length of an input.
     pub fn size(&self) -> usize {
         self.observation_size + self.extra
     }
 
-    /// The inputs `[N, I]` of `observations` `[N, O]`.
+    /// Returns the inputs `[N, I]` for `observations` `[N, O]` of all environments.
     pub fn from_observations<'a>(&'a mut self, observations: &'a [f32]) -> &'a [f32] {
         let n_envs = observations.len() / self.observation_size;
         self.rows(observations, 0..n_envs, false)
     }
 
-    /// Returns the inputs `[K, I]` of final observations `[K, O]` of `environments` `[K]`. Their previous step is the
-    /// one that was remembered last, with a done flag of 0, as if no episode had ended.
+    /// Returns the inputs `[K, I]` for the final observations `[K, O]` of `environments` `[K]`. Each contains the step
+    /// that [`Inputs::remember`] stored last. Its done flag is set to 0, as if the episode had not ended.
     pub fn from_final_observations<'a>(&'a mut self, observations: &'a [f32], environments: &[usize]) -> &'a [f32] {
         self.rows(observations, environments.iter().copied(), true)
     }
@@ -74,10 +75,11 @@ impl Inputs {
         &self.rows
     }
 
-    /// Remembers a step: its actions, normalised `rewards` `[N]`, and `done` `[N]` where an episode ended.
+    /// Stores a step as the previous one: its actions, its normalised `rewards` `[N]`, and `done` `[N]`, which is true
+    /// where an episode ended.
     ///
     /// # Errors
-    /// Lengths that do not fit.
+    /// [`Error::Length`](crate::Error::Length) if an array has the wrong length.
     pub fn remember(&mut self, acts: &ActorOutput, rewards: &[f32], done: &[bool]) -> Result<()> {
         if self.extra == 0 {
             return Ok(());
@@ -103,20 +105,20 @@ impl Inputs {
         Ok(())
     }
 
-    /// Clears the previous step of `environment`, at the start of a trial.
+    /// Clears the previous step of `environment`. Call it at the start of a trial.
     pub fn forget(&mut self, environment: usize) {
         self.previous[environment * self.extra..][..self.extra].fill(0.0);
     }
 
-    /// `[N, E]` the previous steps of all environments.
+    /// Returns the previous steps of all environments, `[N, E]`.
     pub fn previous_steps(&self) -> &[f32] {
         &self.previous
     }
 
-    /// Restores the previous steps that [`Inputs::previous_steps`] returned.
+    /// Restores previous steps that [`Inputs::previous_steps`] returned.
     ///
     /// # Errors
-    /// Another length.
+    /// [`Error::Length`](crate::Error::Length) if the array has the wrong length.
     pub fn restore(&mut self, previous_steps: &[f32]) -> Result<()> {
         check_length("previous steps [N, E]", previous_steps.len(), self.previous.len())?;
         self.previous.copy_from_slice(previous_steps);

@@ -1,7 +1,10 @@
-//! A policy as portable arithmetic, with the same bytes on every processor: its shape and weights ([`PolicySpec`],
-//! [`Weights`]), acting ([`Actor`]), inputs and normalisation ([`Inputs`], [`Normalisers`]), playing ([`Player`]), and the
-//! learning of feed-forward policies ([`Objective`], [`Differentiator`], [`Optimiser`]). Plain f32 loops, without libtorch.
-//! libtorch [differentiates recurrent policies](register_recurrent) in programs that have it.
+//! A policy as portable arithmetic that gives the same bytes on every processor. It consists of the policy's shape and
+//! weights ([`PolicySpec`], [`Weights`]), action sampling ([`Actor`]), inputs and normalisation ([`Inputs`],
+//! [`Normalisers`]), playing in environments ([`Player`]), and learning of feed-forward policies ([`Objective`],
+//! [`Differentiator`], [`Optimiser`]).
+//!
+//! The code is plain f32 loops and does not need libtorch. Programs that link libtorch can [register
+//! it](register_recurrent) to compute the gradients of recurrent policies.
 #![forbid(unsafe_code)]
 #![deny(clippy::disallowed_methods)]
 

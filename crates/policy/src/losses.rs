@@ -1,23 +1,25 @@
-//! The parts of a loss.
+//! The terms of a loss.
 
-/// The parts of a loss, as means over samples.
+/// The terms of a loss, as means over samples.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Losses {
-    /// The surrogate.
+    /// The policy's term, see [`Surrogate`](crate::Surrogate).
     pub policy: f64,
-    /// The value loss, before `vf_coef`.
+    /// The value loss, not multiplied by `vf_coef`.
     pub value: f64,
-    /// Entropy of the action distributions, nats.
+    /// Entropy of the action distributions, in nats.
     pub entropy: f64,
-    /// The sum that is minimised.
+    /// The total loss, which an update minimises.
     pub total: f64,
-    /// Estimate of the KL divergence of the new from the acting policy, in nats: 1/B Σ_b (ρ_b - 1 - log ρ_b), which is not
-    /// negative but for rounding (as stable-baselines3; the reference logs 1/B Σ_b ½ log² ρ_b, which is the same to second order). 0 without
-    /// ratios.
+    /// Estimate of the KL divergence of the new policy from the acting policy, in nats: 1/B Σ_b (ρ_b - 1 - log ρ_b), as
+    /// in stable-baselines3. It is never negative, apart from rounding. OpenAI Baselines logs 1/B Σ_b ½ log² ρ_b, which
+    /// is equal to second order. 0 for losses without probability ratios.
     pub approx_kl: f64,
-    /// Share of samples whose ratio is outside 1 ± range; 0 without ratios.
+    /// Share of samples, 0 … 1, whose probability ratio is outside of 1 ± `range`. 0 for losses without probability
+    /// ratios.
     pub clip_fraction: f64,
-    /// KL(π_old ‖ π), nats; 0 where the acting distributions are not given.
+    /// KL(π_old ‖ π), in nats, computed from the distributions. 0 if the distributions of the acting policy are not
+    /// given.
     pub kl_divergence: f64,
 }
 

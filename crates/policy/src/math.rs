@@ -1,34 +1,34 @@
-//! Functions that give the same bytes on every processor. The C library's choose their instructions by the processor, and
-//! round differently.
+//! Functions that return the same bytes on every processor. The C library chooses instructions by processor, which
+//! changes the rounding.
 
-/// eˣ.
+/// Returns eˣ.
 pub fn exp(x: f32) -> f32 {
     libm::expf(x)
 }
 
-/// The natural logarithm.
+/// Returns the natural logarithm of `x`.
 pub fn ln(x: f32) -> f32 {
     libm::logf(x)
 }
 
-/// 1/(1 + e⁻ˣ) to 2e-7, absolutely.
+/// Returns the logistic function 1/(1 + e⁻ˣ), with an absolute error below 2e-7.
 #[inline(always)]
 pub(crate) fn sigmoid(x: f32) -> f32 {
     0.5 + 0.5 * tanh(0.5 * x)
 }
 
-/// tanh x to 3e-7, absolutely; NaN stays NaN. Free of branches and calls, unlike the C library's, and so several times
-/// as fast over arrays.
+/// Returns tanh x, with an absolute error below 3e-7. NaN stays NaN. It has neither branches nor calls, so over arrays
+/// it is several times as fast as the C library's function.
 ///
 /// tanh x = sign(x) (1 - e)/(1 + e) with e = exp(-2|x|) = 2^k 2^f, where k is an integer and |f| ≤ ½. 2^f is its Taylor
 /// polynomial of degree 6, whose remainder is below (½ ln 2)⁷/7! = 1.2e-7.
 #[inline(always)]
 pub(crate) fn tanh(x: f32) -> f32 {
-    /// Adding 1.5·2²³ rounds to an integer, which then stands in the low bits.
+    /// Adding 1.5·2²³ rounds a number to an integer, which is then in the low bits of the sum.
     const ROUND: f32 = 12_582_912.0;
-    /// tanh 9.1 differs from 1 by less than 2⁻²⁵.
+    /// Arguments are limited to ±9.1, where tanh differs from ±1 by less than 2⁻²⁵.
     const LARGEST: f32 = 9.1;
-    /// (ln 2)^i / i! for i = 6 … 0.
+    /// The Taylor coefficients of 2^f: (ln 2)^i / i! for i = 6 … 0.
     const TAYLOR: [f32; 7] =
         [1.540_353e-4, 1.333_355_8e-3, 9.618_129e-3, 5.550_411e-2, 0.240_226_5, std::f32::consts::LN_2, 1.0];
 
@@ -47,7 +47,7 @@ pub(crate) fn tanh(x: f32) -> f32 {
 }
 
 #[cfg(test)]
-#[allow(clippy::disallowed_methods)] // what it is compared with
+#[allow(clippy::disallowed_methods)] // the test compares with the standard library's functions
 mod tests {
     use super::tanh;
 

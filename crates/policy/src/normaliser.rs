@@ -1,21 +1,22 @@
 //! Running normalisation of observations and rewards, as stable-baselines3's VecNormalize.
 //!
-//! In training, call `update` and then `normalise`; in testing only `normalise`, which changes no statistics. All state is
-//! f64 and serde-serialisable, and is part of a checkpoint.
+//! In training, call `update` and then `normalise`. In testing, call only `normalise`, which does not change the
+//! statistics. All state is f64, can be serialised with serde, and is part of a checkpoint.
 //!
-//! The reference starts its variances from a prior of 1 with the weight of 10⁻⁴ samples. Here there is none: the
-//! statistics are exactly those of the data, and a variance of fewer than two samples counts as 1.
+//! The reference implementation (OpenAI Baselines) starts its variances from a prior of 1 with the weight of 10⁻⁴
+//! samples. Here there is no prior: the statistics are exactly those of the data. With fewer than two samples the
+//! variance counts as 1.
 
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result, check_length};
 
-/// Normalised numbers are clipped to ±10.
+/// Bound to which normalised numbers are clipped: ±10.
 const CLIP: f64 = 10.0;
-/// Added to variances, so that constants are not divided by 0.
+/// Number that is added to variances, so that constants are not divided by 0.
 const EPSILON: f64 = 1e-8;
 
-/// Mean and variance of the vectors seen so far, in f64.
+/// Running mean and variance of the vectors seen so far, by element, in f64.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunningMoments {
@@ -26,17 +27,17 @@ pub struct RunningMoments {
 }
 
 impl RunningMoments {
-    /// Moments of vectors of `size` numbers, of which none was seen yet.
+    /// Creates the moments of vectors of `size` numbers, before any vector was seen.
     pub fn new(size: usize) -> Self {
         RunningMoments { count: 0, mean: vec![0.0; size], squares: vec![0.0; size] }
     }
 
-    /// Moments with saved numbers.
+    /// Creates moments from saved numbers.
     pub fn from_parts(count: u64, mean: Vec<f64>, squares: Vec<f64>) -> Self {
         RunningMoments { count, mean, squares }
     }
 
-    /// Adds `rows` of `size` numbers: computes their own moments in two passes, and merges them.
+    /// Adds `rows`, vectors of `size` numbers. Computes the moments of `rows` in two passes and merges them.
     fn take<'a>(&mut self, rows: impl Iterator<Item = &'a [f32]> + Clone) {
         let count = rows.clone().count();
         for i in 0..self.mean.len() {
@@ -45,7 +46,7 @@ impl RunningMoments {
         self.count += count as u64;
     }
 
-    /// Adds element `i` of `count` vectors, which the caller counts afterwards.
+    /// Adds element `i` of `count` vectors. The caller must add `count` to the number of vectors afterwards.
     fn take_column(&mut self, i: usize, count: usize, column: impl Iterator<Item = f64> + Clone) {
         if count > 0 {
             let mean = column.clone().sum::<f64>() / count as f64;
@@ -54,9 +55,9 @@ impl RunningMoments {
         }
     }
 
-    /// Adds the vectors of `other`. The result is that of all vectors in any order, up to rounding (Chan, Golub and LeVeque,
-    /// 1979): with δ = mean_b - mean_a,
-    /// mean = mean_a + δ n_b/n and squares = squares_a + squares_b + δ² n_a n_b/n.
+    /// Adds the vectors that `other` has seen. Up to rounding, the result does not depend on the order of the vectors
+    /// (Chan, Golub and LeVeque, 1979). With δ = mean_b - mean_a, mean = mean_a + δ n_b/n and squares = squares_a +
+    /// squares_b + δ² n_a n_b/n.
     pub fn merge(&mut self, other: &RunningMoments) -> Result<()> {
         check_length("moments", other.mean.len(), self.mean.len())?;
         if other.count == 0 {
@@ -77,7 +78,7 @@ impl RunningMoments {
         self.squares[i] += squares + delta * delta * a * b / (a + b);
     }
 
-    /// Checks that these can be moments of vectors of `size` numbers. The error is the reason why they cannot.
+    /// Checks that these are possible moments of vectors of `size` numbers. The error is a description of the fault.
     fn check(&self, size: usize) -> std::result::Result<(), String> {
         for (name, numbers) in [("mean", &self.mean), ("squares", &self.squares)] {
             if numbers.len() != size {
@@ -96,29 +97,29 @@ impl RunningMoments {
         Ok(())
     }
 
-    /// Number of vectors seen.
+    /// Returns the number of vectors seen.
     pub fn count(&self) -> u64 {
         self.count
     }
 
-    /// Sums of squared distances from the mean.
+    /// Returns the sums of squared distances from the mean, by element.
     pub fn squares(&self) -> &[f64] {
         &self.squares
     }
 
-    /// Means, 0 before anything was seen.
+    /// Returns the means, by element; 0 before any vector was seen.
     pub fn mean(&self) -> &[f64] {
         &self.mean
     }
 
-    /// Population variance (divided by the count) of element `i`; 1 if fewer than two vectors were seen.
+    /// Returns the population variance (divided by the count) of element `i`, or 1 if fewer than two vectors were seen.
     pub fn variance(&self, i: usize) -> f64 {
         if self.count < 2 { 1.0 } else { self.squares[i] / self.count as f64 }
     }
 }
 
-/// Normalises observations: (x - mean)/√(variance + 10⁻⁸) of every element, clipped to ±10. The last `left_alone` elements
-/// are not normalised.
+/// Normalises each element of an observation to (x - mean)/√(variance + 10⁻⁸), clipped to ±10. The last `left_alone`
+/// elements are not changed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ObservationNormaliser {
@@ -133,36 +134,36 @@ fn is_zero(number: &usize) -> bool {
 }
 
 impl ObservationNormaliser {
-    /// A normaliser of observations of O = `observation_size` numbers, of which none was seen yet.
+    /// Creates a normaliser for observations of O = `observation_size` numbers, before any observation was seen.
     pub fn new(observation_size: usize) -> Self {
         Self::from_moments(RunningMoments::new(observation_size))
     }
 
-    /// A normaliser with these statistics.
+    /// Creates a normaliser with these statistics.
     pub fn from_moments(moments: RunningMoments) -> Self {
         ObservationNormaliser { moments, left_alone: 0 }
     }
 
-    /// Adds `left_alone` elements at the end of observations, which are not normalised. Observed parameters are such
-    /// elements, since they are scaled already. They may also be constant throughout a training, and a division by their
-    /// deviation would then stretch later differences without bound.
+    /// Adds `left_alone` elements at the end of observations, which are not normalised. Use it for observed parameters:
+    /// they are scaled already. They may also be constant throughout a training; dividing by their tiny deviation would
+    /// then magnify later differences without bound.
     #[must_use]
     pub fn leaving_alone(self, left_alone: usize) -> Self {
         ObservationNormaliser { left_alone, ..self }
     }
 
-    /// O, the length of an observation.
+    /// Returns O, the length of an observation.
     fn observation_size(&self) -> usize {
         self.moments.mean.len() + self.left_alone
     }
 
-    /// The statistics.
+    /// Returns the statistics of the normalised elements.
     pub fn moments(&self) -> &RunningMoments {
         &self.moments
     }
 
-    /// Checks that this can normalise observations of `observation_size` numbers except the last `left_alone`. The error is the
-    /// reason why it cannot.
+    /// Checks that this normalises observations of `observation_size` numbers except the last `left_alone`. The error
+    /// is a description of the fault.
     pub fn check(&self, observation_size: usize, left_alone: usize) -> std::result::Result<(), String> {
         if self.left_alone != left_alone {
             return Err(format!("left_alone is {}, expected {left_alone}", self.left_alone));
@@ -170,12 +171,14 @@ impl ObservationNormaliser {
         self.moments.check(observation_size.saturating_sub(left_alone))
     }
 
-    /// Adds `observations` `[N, O]` to the statistics. Infinite numbers and NaN are refused and change nothing.
+    /// Adds `observations` `[N, O]` to the statistics. Returns an error for infinite numbers and NaN, and then changes
+    /// nothing.
     pub fn update(&mut self, observations: &[f32]) -> Result<()> {
         self.update_active(observations, None)
     }
 
-    /// Adds the `observations` `[N, O]` of only the `active` `[N]` environments to the statistics.
+    /// Adds `observations` `[N, O]` to the statistics, but only those of the environments where `active` `[N]` is true.
+    /// `None` adds all.
     pub fn update_active(&mut self, observations: &[f32], active: Option<&[bool]>) -> Result<()> {
         let size = self.observation_size();
         check_length("observations [N, O]", observations.len(), observations.len() / size * size)?;
@@ -191,7 +194,7 @@ impl ObservationNormaliser {
         Ok(())
     }
 
-    /// Normalises `observations` `[N, O]` in place. The statistics stay.
+    /// Normalises `observations` `[N, O]` in place, without changing the statistics.
     pub fn normalise(&self, observations: &mut [f32]) -> Result<()> {
         let size = self.observation_size();
         check_length("observations [N, O]", observations.len(), observations.len() / size * size)?;
@@ -206,60 +209,64 @@ impl ObservationNormaliser {
     }
 }
 
-/// Normalises rewards: divides them by the standard deviation of the discounted returns R_t = γ R_{t-1} + r_t that every
-/// environment has had so far (Engstrom et al., 2020, arXiv:2005.12729), and clips to ±10. Their mean is kept.
+/// Normalises rewards by a division, which keeps their sign, and clips the results to ±10. The divisor is the standard
+/// deviation of all discounted returns R_t = γ R_{t-1} + r_t seen so far (Engstrom et al., 2020, arXiv:2005.12729). The
+/// mean is not subtracted.
 ///
-/// R starts at 0 in every episode, or trial, as in stable-baselines3; or it runs on over their ends, as in the reference.
+/// Normally R starts from 0 in every episode, or with RL² in every trial, as in stable-baselines3. With `runs_on` it is
+/// not reset at these ends, as in the reference implementation (OpenAI Baselines).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RewardNormaliser {
     gamma: f64,
-    /// `[N]` R of the running episodes.
+    /// `[N]` discounted return R of each environment.
     returns: Vec<f64>,
     moments: RunningMoments,
-    /// Whether R runs on.
+    /// Whether R is not reset at the ends of episodes.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     runs_on: bool,
 }
 
 impl RewardNormaliser {
-    /// A normaliser for N = `n_envs` environments, of which no reward was seen yet; `gamma` is the discount factor per step.
+    /// Creates a normaliser for N = `n_envs` environments, before any reward was seen. `gamma` is the discount factor
+    /// per step.
     pub fn new(n_envs: usize, gamma: f64) -> Self {
         Self::from_parts(gamma, vec![0.0; n_envs], RunningMoments::new(1))
     }
 
-    /// The statistics of the discounted returns.
+    /// Returns the statistics of the discounted returns.
     pub fn moments(&self) -> &RunningMoments {
         &self.moments
     }
 
-    /// A normaliser with saved numbers: `gamma`, R `[N]` and the statistics.
+    /// Creates a normaliser from saved numbers: the discount factor `gamma`, the discounted returns R `[N]` and their
+    /// statistics.
     pub fn from_parts(gamma: f64, returns: Vec<f64>, moments: RunningMoments) -> Self {
         RewardNormaliser { gamma, returns, moments, runs_on: false }
     }
 
-    /// Sets whether R runs on over the ends of episodes and trials.
+    /// Sets whether R runs on, instead of being reset, at the ends of episodes and trials.
     pub fn running_on(self, runs_on: bool) -> Self {
         RewardNormaliser { runs_on, ..self }
     }
 
-    /// Whether R runs on over the ends of episodes and trials.
+    /// Returns whether R runs on, instead of being reset, at the ends of episodes and trials.
     pub fn runs_on(&self) -> bool {
         self.runs_on
     }
 
-    /// The discount factor per step.
+    /// Returns the discount factor per step.
     pub fn gamma(&self) -> f64 {
         self.gamma
     }
 
-    /// `[N]` R of the running episodes.
+    /// Returns the discounted return R of each environment, `[N]`.
     pub fn returns(&self) -> &[f64] {
         &self.returns
     }
 
-    /// Checks that this belongs to a training of `n_envs` environments with `gamma`, whose R runs on or not. The error is the
-    /// difference.
+    /// Checks that this normaliser belongs to a training with `n_envs` environments, the discount factor `gamma` and
+    /// this setting of `runs_on`. The error describes the difference.
     pub fn fits(&self, n_envs: usize, gamma: f64, runs_on: bool) -> std::result::Result<(), String> {
         if self.returns.len() != n_envs {
             return Err(format!("returns has {} numbers, expected {n_envs}", self.returns.len()));
@@ -276,7 +283,7 @@ impl RewardNormaliser {
         Ok(())
     }
 
-    /// Checks that this can normalise rewards. The error is the reason why it cannot.
+    /// Checks that the saved numbers are possible. The error is a description of the fault.
     pub fn check(&self) -> std::result::Result<(), String> {
         if !(0.0..=1.0).contains(&self.gamma) {
             return Err(format!("gamma is {}, but must be between 0 and 1", self.gamma));
@@ -287,15 +294,15 @@ impl RewardNormaliser {
         self.moments.check(1)
     }
 
-    /// Adds a step's `rewards` `[N]` to the statistics. Where `done` `[N]`, at the end of an episode or, with trials, of a
-    /// trial, the discounted return starts again from 0 in the next step, unless it runs on. Infinite numbers and NaN are
-    /// refused and change nothing.
+    /// Adds a step's `rewards` `[N]` to the statistics. `done` `[N]` is true at the end of an episode, or with RL² of a
+    /// trial; the discounted return then starts again from 0 in the next step, unless it runs on. Returns an error for
+    /// infinite numbers and NaN, and then changes nothing.
     pub fn update(&mut self, rewards: &[f32], done: &[bool]) -> Result<()> {
         self.update_active(rewards, done, None)
     }
 
-    /// Adds a step's `rewards` `[N]` of only the `active` `[N]` environments to the statistics, see
-    /// [`RewardNormaliser::update`].
+    /// Adds a step's `rewards` `[N]` to the statistics, but only those of the environments where `active` `[N]` is
+    /// true. See [`RewardNormaliser::update`].
     pub fn update_active(&mut self, rewards: &[f32], done: &[bool], active: Option<&[bool]>) -> Result<()> {
         check_length("rewards [N]", rewards.len(), self.returns.len())?;
         check_length("done [N]", done.len(), self.returns.len())?;
@@ -318,15 +325,15 @@ impl RewardNormaliser {
         Ok(())
     }
 
-    /// Starts the discounted returns of all environments again from 0, as after a reset of the environments from
-    /// outside, unless they run on. The statistics stay.
+    /// Resets the discounted returns of all environments to 0, unless they run on. Call it after the environments were
+    /// reset before the ends of their episodes. Does not change the statistics.
     pub fn reset_returns(&mut self) {
         if !self.runs_on {
             self.returns.fill(0.0);
         }
     }
 
-    /// Normalises `rewards` in place. The statistics stay.
+    /// Normalises `rewards` in place, without changing the statistics.
     pub fn normalise(&self, rewards: &mut [f32]) {
         let scale = scale(self.moments.variance(0));
         for reward in rewards {

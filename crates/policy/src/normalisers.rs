@@ -1,9 +1,9 @@
-//! The normalisers between an environment and a policy.
+//! The normalisers of observations and rewards, between an environment and a policy.
 
 use crate::error::{Result, check_length};
 use crate::normaliser::{ObservationNormaliser, RewardNormaliser};
 
-/// The normalisers of a policy; `None` where nothing is normalised.
+/// The normalisers of a policy. A field is `None` if its quantity is not normalised.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Normalisers {
     /// The normaliser of observations.
@@ -12,19 +12,19 @@ pub struct Normalisers {
     pub rewards: Option<RewardNormaliser>,
 }
 
-/// Whether statistics are updated.
+/// Whether a normaliser's statistics are updated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Statistics {
-    /// Numbers are added to the statistics, and normalised with the updated ones, as stable-baselines3's VecNormalize does in
-    /// training.
+    /// Each batch is first added to the statistics, then normalised with the updated statistics, as in the training
+    /// mode of stable-baselines3's VecNormalize.
     Running,
-    /// Statistics stay as they are.
+    /// The statistics are not changed.
     Frozen,
 }
 
 impl Normalisers {
-    /// Normalises `observations` `[N, O]`, after adding those of the `active` `[N]` environments, or all, to running
-    /// statistics.
+    /// Normalises `observations` `[N, O]`. If `statistics` are running, first adds the observations of the environments
+    /// where `active` `[N]` is true, or of all if it is `None`.
     pub(crate) fn take_observations(
         &mut self,
         observations: &mut [f32],
@@ -38,8 +38,8 @@ impl Normalisers {
         normaliser.normalise(observations)
     }
 
-    /// Normalises a step's `rewards` `[N]`, after adding those of the `active` `[N]` environments, or all, to running
-    /// statistics. `done` `[N]`: where the discounted return ends.
+    /// Normalises a step's `rewards` `[N]`. If `statistics` are running, first adds the rewards of the environments
+    /// where `active` `[N]` is true, or of all if it is `None`. `done` `[N]` is true where the discounted return ends.
     pub(crate) fn take_rewards(
         &mut self,
         rewards: &mut [f32],
@@ -55,15 +55,17 @@ impl Normalisers {
         Ok(())
     }
 
-    /// Normalises final observations `[K, O]`; the statistics stay.
+    /// Normalises final observations `[K, O]` without changing the statistics.
     pub(crate) fn normalise(&self, observations: &mut [f32]) -> Result<()> {
         self.observations.as_ref().map_or(Ok(()), |normaliser| normaliser.normalise(observations))
     }
 
-    /// Checks that these fit N environments with observations of O numbers, the last `left_alone` of which are not normalised.
+    /// Checks that the normalisers fit N = `n_envs` environments whose observations have `observation_size` numbers, of
+    /// which the last `left_alone` are not normalised.
     ///
     /// # Errors
-    /// [`Error::Statistics`](crate::Error::Statistics) with the reason; [`Error::Length`](crate::Error::Length).
+    /// [`Error::Statistics`](crate::Error::Statistics) if the statistics are impossible or have the wrong size,
+    /// [`Error::Length`](crate::Error::Length) if the discounted returns are not N numbers.
     pub fn check(&self, n_envs: usize, observation_size: usize, left_alone: usize) -> Result<()> {
         let named = |name| move |reason| crate::error::Error::Statistics { name, reason };
         if let Some(normaliser) = &self.observations {

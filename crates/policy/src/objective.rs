@@ -5,44 +5,47 @@ use crate::math::{exp, ln};
 use crate::sample::{LOG_TAU, greatest_and_total};
 use crate::spec::ActionKind;
 
-/// The policy's part of a loss.
+/// The policy's term in a loss.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Surrogate {
-    /// The policy gradient's: -1/B Σ_b advantage_b log π(a_b | s_b). Mnih et al. (2016), arXiv:1602.01783.
+    /// The policy-gradient loss of A2C: -1/B Σ_b advantage_b log π(a_b | s_b). Mnih et al. (2016), arXiv:1602.01783.
     PolicyGradient,
-    /// PPO's clipped surrogate, Schulman et al. (2017), arXiv:1707.06347, equation 7, negated. With the ratio
-    /// ρ_b = π(a_b | s_b)/π_old(a_b | s_b) it is
+    /// The negated clipped surrogate of PPO, Schulman et al. (2017), arXiv:1707.06347, equation 7. With the probability
+    /// ratio ρ_b = π(a_b | s_b)/π_old(a_b | s_b) it is
     ///
     /// 1/B Σ_b max(-advantage_b ρ_b, -advantage_b clip(ρ_b, 1 - range, 1 + range)).
     Clipped {
-        /// Half the width of the interval around 1.
+        /// Half of the width of the interval around 1 to which ratios are clipped.
         range: f64,
     },
 }
 
-/// A loss over B samples: surrogate - `ent_coef` · mean entropy + `vf_coef` · value loss + `kl_coef` · mean KL(π_old ‖ π).
+/// The loss over B samples: surrogate - `ent_coef` · mean entropy + `vf_coef` · value loss + `kl_coef` · mean KL(π_old
+/// ‖ π).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Objective {
-    /// The policy's part.
+    /// The policy's term.
     pub surrogate: Surrogate,
-    /// Whether advantages are first normalised to mean 0 and standard deviation 1:
-    /// (advantage_b - mean)/(standard deviation + 10⁻⁸). The deviation is the population's, as in the reference;
-    /// stable-baselines3 takes the sample's. A single advantage becomes 0.
+    /// Whether advantages are first normalised to mean 0 and standard deviation 1: (advantage_b - mean)/(standard
+    /// deviation + 10⁻⁸). The standard deviation is that of the population (divided by B), as in OpenAI Baselines;
+    /// stable-baselines3 divides by B - 1. A single advantage becomes 0.
     pub normalize_advantages: bool,
-    /// Weight of the entropy, per nat.
+    /// Weight of the entropy, which is in nats.
     pub ent_coef: f64,
     /// Weight of the value loss.
     pub vf_coef: f64,
-    /// Range by which a value may move from the rollout's and still lower the loss, in the unit of the normalised rewards. The
-    /// value loss is 1/B Σ_b max((V_b - R_b)², (V_b' - R_b)²) with V_b' = old_b + clip(V_b - old_b, -range, range). It is not in
-    /// the paper on PPO, but in the reference. `None`: 1/B Σ_b (V_b - R_b)², without the factor ½ of some versions of the
-    /// reference.
+    /// Range for clipping the change of a value V_b from the rollout's value old_b, in units of the normalised rewards.
+    /// The value loss is then 1/B Σ_b max((V_b - R_b)², (V_b' - R_b)²) with V_b' = old_b + clip(V_b - old_b, -range,
+    /// range). This clipping is not in the PPO paper, but in OpenAI Baselines.
+    ///
+    /// `None` turns clipping off: the value loss is 1/B Σ_b (V_b - R_b)², without the factor ½ that some versions of
+    /// Baselines have.
     pub value_clip_range: Option<f64>,
-    /// Weight of the divergence from the acting policy, per nat.
+    /// Weight of the KL divergence from the acting policy, which is in nats.
     pub kl_coef: f64,
 }
 
-/// The distributions of the policy that acted, at B samples.
+/// The action distributions of the policy that acted, for B samples.
 #[derive(Clone, Copy, Debug)]
 pub struct Acting<'a> {
     /// `[B, n]` logits, or `[B, A]` means.
@@ -51,19 +54,19 @@ pub struct Acting<'a> {
     pub log_std: &'a [f32],
 }
 
-/// A sample of a rollout.
+/// A sample of a rollout, with the data that its loss needs.
 pub(crate) struct Sample<'a> {
     pub(crate) action: &'a [f32],
     pub(crate) old_log_prob: f32,
     pub(crate) old_value: f32,
-    /// The advantage, normalised if the objective says so.
+    /// The advantage; normalised if `normalize_advantages` is set.
     pub(crate) advantage: f32,
     pub(crate) return_: f32,
-    /// The acting policy's logits or means, and log standard deviations.
+    /// The acting policy's logits or means, and its log standard deviations.
     pub(crate) acting: Option<(&'a [f32], &'a [f32])>,
 }
 
-/// The deviations of continuous actions, which are the same at every sample. Empty for discrete ones.
+/// The standard deviations of continuous actions, which do not depend on the observation. Empty for discrete actions.
 #[derive(Clone, Debug)]
 pub(crate) struct Gaussian {
     /// `[A]` log σ.
@@ -83,22 +86,22 @@ impl Gaussian {
     }
 }
 
-/// The policy's outputs at one sample, and buffers for the derivatives of the loss with respect to these outputs.
+/// The outputs of the policy for one sample, and buffers for the loss's derivatives with respect to these outputs.
 pub(crate) struct Outputs<'a> {
     /// `[n]` logits, or `[A]` means.
     pub(crate) head: &'a [f32],
     pub(crate) gaussian: &'a Gaussian,
     pub(crate) value: f32,
-    /// Derivatives with respect to `head`; overwritten.
+    /// Derivatives with respect to `head`; the buffer is overwritten.
     pub(crate) by_head: &'a mut [f32],
-    /// `[A]` derivatives with respect to log σ; the sample's are added.
+    /// `[A]` derivatives with respect to log σ; this sample's derivatives are added to the buffer.
     pub(crate) by_log_std: &'a mut [f32],
-    /// The derivative with respect to the value; overwritten.
+    /// The derivative with respect to `value`; the buffer is overwritten.
     pub(crate) by_value: &'a mut f32,
 }
 
 impl Objective {
-    /// The means over `n` samples whose losses have these `sums`, with their total.
+    /// Divides the `sums` of the losses of `n` samples by `n`, and computes the total loss from these means.
     pub(crate) fn means(&self, sums: Losses, n: usize) -> Losses {
         let mut means = sums;
         let parts = [
@@ -115,8 +118,8 @@ impl Objective {
         means
     }
 
-    /// Computes the losses of one of `n` samples, and their derivatives with respect to the policy's outputs. The
-    /// derivatives are divided by `n`, the losses are not.
+    /// Computes the losses of one sample, and their derivatives with respect to the policy's outputs. The derivatives
+    /// are divided by `n`, the number of samples in the minibatch; the losses are not.
     #[inline(always)]
     pub(crate) fn differentiate(
         &self,
@@ -193,7 +196,7 @@ impl Objective {
         losses
     }
 
-    /// The value loss of a sample, and its derivative with respect to the value.
+    /// Returns the value loss of a sample, and its derivative with respect to the value.
     #[inline(always)]
     fn value_loss(&self, value: f32, sample: &Sample<'_>) -> (f32, f32) {
         let error = value - sample.return_;
@@ -202,12 +205,12 @@ impl Objective {
         let moved = value - sample.old_value;
         let error = sample.old_value + moved.clamp(-range as f32, range as f32) - sample.return_;
         let clipped = error * error;
-        // Where nothing is clipped, the two are equal up to rounding.
+        // Without clipping, the two losses are equal up to rounding; the derivative is then that of `free`.
         if free.0 >= clipped || moved.abs() <= range as f32 { free } else { (clipped, 0.0) }
     }
 
-    /// The derivative of a sample's surrogate with respect to its log-probability. Stores the surrogate's figures in
-    /// `losses`.
+    /// Returns the derivative of a sample's surrogate with respect to its log-probability. Stores the surrogate,
+    /// `approx_kl` and `clip_fraction` in `losses`.
     #[inline(always)]
     fn policy_loss(&self, log_prob: f32, sample: &Sample<'_>, losses: &mut Losses) -> f32 {
         let Surrogate::Clipped { range } = self.surrogate else {
@@ -220,7 +223,7 @@ impl Objective {
         let clipped = -sample.advantage * ratio.clamp((1.0 - range) as f32, (1.0 + range) as f32);
         losses.approx_kl = f64::from(ratio - 1.0 - log_ratio);
         losses.clip_fraction = f64::from(u8::from((ratio - 1.0).abs() > range as f32));
-        // The two are equal where nothing is clipped. NaN is passed on.
+        // Without clipping, the two losses are equal. NaN compares as false, so a NaN loss is passed on.
         let (loss, derivative) = if clipped > free { (clipped, 0.0) } else { (free, free) };
         losses.policy = f64::from(loss);
         derivative

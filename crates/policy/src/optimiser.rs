@@ -1,4 +1,4 @@
-//! Optimisers over a policy's P weights as one array.
+//! Optimisers. A policy's P weights are one array.
 
 use pulp::Simd;
 
@@ -6,10 +6,10 @@ use crate::error::{Error, Result, check_length};
 use crate::kernel::{Kernel, run};
 use crate::weights::{NamedArray, check_arrays};
 
-/// Number of partial sums that are computed side by side. It fixes the order of a sum.
+/// Number of partial sums into which the sum of squares is split. It fixes the order of additions, and so the rounding.
 const SUMS: usize = 8;
 
-/// The rule that turns a gradient into a step.
+/// The rule that turns a gradient into a change of the weights.
 #[derive(Clone, Debug)]
 pub enum UpdateRule {
     /// RMSProp.
@@ -18,13 +18,14 @@ pub enum UpdateRule {
     Adam(Adam),
 }
 
-/// RMSProp (Hinton, 2012, lecture 6e) in TensorFlow's form, which the reference uses: for i = 0 … P-1,
+/// RMSProp (Hinton, 2012, lecture 6e) in TensorFlow's form, which OpenAI Baselines uses. For i = 0 … P-1, with the
+/// gradient g and the learning rate η:
 ///
 /// s_i ← α s_i + (1 - α) g_i²,
 /// w_i ← w_i - η g_i/√(s_i + ε),
 ///
-/// where s starts at 1 and ε is inside the root. libtorch starts s at 0 and adds ε outside, which makes the first steps ten
-/// times as long: A2C is known to be less stable with it.
+/// The averages s start at 1, and ε is inside of the root. libtorch starts s at 0 and adds ε outside of the root. This
+/// makes its first steps ten times as long, and A2C is known to be less stable with it.
 #[derive(Clone, Debug)]
 pub struct RmsProp {
     alpha: f32,
@@ -32,15 +33,16 @@ pub struct RmsProp {
     mean_square: Vec<f32>,
 }
 
-/// Adam, Kingma and Ba (2015), arXiv:1412.6980, algorithm 1, with β₁ = 0.9 and β₂ = 0.999: for i = 0 … P-1 and
-/// t = 1, 2, …,
+/// Adam, Kingma and Ba (2015), arXiv:1412.6980, algorithm 1, with β₁ = 0.9 and β₂ = 0.999. For i = 0 … P-1 and t = 1,
+/// 2, …, with the gradient g and the learning rate η:
 ///
 /// m_i ← β₁ m_i + (1 - β₁) g_i,
 /// v_i ← β₂ v_i + (1 - β₂) g_i²,
 /// w_i ← w_i - η/(1 - β₁ᵗ) m_i/(√(v_i/(1 - β₂ᵗ)) + ε).
 ///
-/// This is libtorch's form. TensorFlow, which the reference uses, adds ε to √v_i before the correction. So its ε is larger
-/// by up to √1000 in the first steps. With ε = 1e-5 this matters only to weights whose gradient is that small.
+/// This is libtorch's form. TensorFlow, which OpenAI Baselines uses, adds ε to √v_i before the correction by √(1 -
+/// β₂ᵗ). This makes TensorFlow's ε effectively larger, by up to √1000 in the first steps. With ε = 1e-5 the difference
+/// matters only to weights whose gradient is about as small as ε.
 #[derive(Clone, Debug)]
 pub struct Adam {
     epsilon: f32,
@@ -52,20 +54,20 @@ const BETA_1: f64 = 0.9;
 const BETA_2: f64 = 0.999;
 
 impl UpdateRule {
-    /// RMSProp with decay α and ε for `n_weights` weights.
+    /// Creates RMSProp for `n_weights` weights, with the decay α = `alpha` of the averages and ε = `epsilon`.
     pub fn rms_prop(alpha: f64, epsilon: f64, n_weights: usize) -> Self {
         let mean_square = vec![1.0; n_weights];
         UpdateRule::RmsProp(RmsProp { alpha: alpha as f32, epsilon: epsilon as f32, mean_square })
     }
 
-    /// Adam with ε for `n_weights` weights.
+    /// Creates Adam for `n_weights` weights, with ε = `epsilon`.
     pub fn adam(epsilon: f64, n_weights: usize) -> Self {
         let mean = vec![0.0; n_weights];
         let mean_square = vec![0.0; n_weights];
         UpdateRule::Adam(Adam { epsilon: epsilon as f32, mean, mean_square })
     }
 
-    /// Makes a step on `weights` `[P]` against a gradient; `update` counts the steps before this one.
+    /// Changes the weights by one step against the gradient. `update` is the number of steps before this one.
     fn step(&mut self, update: u64, step: GradientStep<'_>) {
         match self {
             UpdateRule::RmsProp(state) => run(RmsPropStep { state, step }),
@@ -73,7 +75,7 @@ impl UpdateRule {
         }
     }
 
-    /// P.
+    /// Returns P, the number of weights.
     fn size(&self) -> usize {
         match self {
             UpdateRule::RmsProp(state) => state.mean_square.len(),
@@ -81,7 +83,7 @@ impl UpdateRule {
         }
     }
 
-    /// The running averages, by name, each `[P]`.
+    /// Returns the running averages with their names, each `[P]`.
     fn averages(&self) -> Vec<(&'static str, &[f32])> {
         match self {
             UpdateRule::RmsProp(state) => vec![("mean_square", &state.mean_square)],
@@ -89,7 +91,7 @@ impl UpdateRule {
         }
     }
 
-    /// The running averages by name, to be overwritten.
+    /// Returns the running averages with their names, for writing.
     fn averages_mut(&mut self) -> Vec<(&'static str, &mut [f32])> {
         match self {
             UpdateRule::RmsProp(state) => vec![("mean_square", &mut state.mean_square)],
@@ -98,16 +100,16 @@ impl UpdateRule {
     }
 }
 
-/// The inputs of a step.
+/// The inputs of one gradient step.
 struct GradientStep<'a> {
     learning_rate: f64,
     /// `[P]`
     weights: &'a mut [f32],
     /// `[P]`
     gradient: &'a [f32],
-    /// The share of the gradient that is left after clipping, 0 … 1.
+    /// Factor by which the gradient is multiplied to clip its norm, 0 … 1.
     scale: f32,
-    /// The share of each weight that is left after decay, 0 … 1.
+    /// Factor by which each weight is multiplied for weight decay, 0 … 1.
     keep: f32,
 }
 
@@ -160,12 +162,13 @@ impl Kernel for AdamStep<'_> {
     }
 }
 
-/// Takes gradient steps: clips the gradient by its global norm, applies the update rule, and lets all weights decay,
+/// Changes weights by gradient steps. Each step clips the gradient by its global norm, applies the update rule, and
+/// decays all weights:
 ///
 /// w_i ← (1 - η λ) w_i - the rule's step,
 ///
-/// Loshchilov and Hutter (2019), arXiv:1711.05101, as libtorch's AdamW. The decay is decoupled: the update rule scales
-/// gradients, but not the decay.
+/// with the learning rate η and the decay λ (Loshchilov and Hutter, 2019, arXiv:1711.05101, as in libtorch's AdamW).
+/// The decay is decoupled from the gradient: the rule's running averages do not scale it.
 #[derive(Clone, Debug)]
 pub struct Optimiser {
     optimiser: UpdateRule,
@@ -175,30 +178,32 @@ pub struct Optimiser {
 }
 
 impl Optimiser {
-    /// A fresh optimiser. Gradients longer than `max_grad_norm` are scaled down to it, and no weight decays.
+    /// Creates an optimiser without weight decay. A gradient whose norm exceeds `max_grad_norm` is scaled down to this
+    /// norm.
     pub fn new(optimiser: UpdateRule, max_grad_norm: f64) -> Self {
         Optimiser { optimiser, max_grad_norm, weight_decay: 0.0, n_updates: 0 }
     }
 
-    /// Sets the decay λ = `weight_decay`, at least 0.
+    /// Sets the weight decay λ = `weight_decay`, at least 0.
     #[must_use]
     pub fn with_weight_decay(self, weight_decay: f64) -> Self {
         Optimiser { weight_decay, ..self }
     }
 
-    /// Gradient steps so far.
+    /// Returns the number of gradient steps so far.
     pub fn n_updates(&self) -> u64 {
         self.n_updates
     }
 
-    /// Makes a step of `weights` `[P]` down the `gradient` `[P]` of a loss whose value is `loss`. Returns the gradient's global
-    /// norm before clipping.
+    /// Changes `weights` `[P]` by one step against the `gradient` `[P]` of a loss whose value is `loss`. Returns the
+    /// gradient's global norm before clipping.
     ///
-    /// Clipping scales the whole gradient by max_grad_norm/norm where norm > max_grad_norm, exactly, as TensorFlow's
-    /// `clip_by_global_norm`; libtorch adds 1e-6 to the norm.
+    /// Clipping multiplies a gradient whose norm exceeds `max_grad_norm` by exactly max_grad_norm/norm, as TensorFlow's
+    /// `clip_by_global_norm` does. libtorch adds 1e-6 to the norm.
     ///
     /// # Errors
-    /// [`Error::NotFinite`] for a loss or a gradient that is not finite, [`Error::Length`]; nothing is changed then.
+    /// [`Error::NotFinite`] if the loss or the gradient is not finite, [`Error::Length`] if an array has the wrong
+    /// length. The weights are then unchanged.
     pub fn step(&mut self, loss: f64, gradient: &[f32], weights: &mut [f32], learning_rate: f64) -> Result<f64> {
         check_length("gradient [P]", gradient.len(), self.optimiser.size())?;
         check_length("weights [P]", weights.len(), self.optimiser.size())?;
@@ -217,7 +222,7 @@ impl Optimiser {
         if value.is_finite() { Ok(()) } else { Err(Error::NotFinite { what, value, update: self.n_updates }) }
     }
 
-    /// The running averages as named arrays, each `[P]`.
+    /// Returns the running averages as named arrays, each `[P]`.
     pub fn state(&self) -> Vec<NamedArray> {
         let array = |(name, data): (&str, &[f32])| NamedArray {
             name: name.to_owned(),
@@ -227,10 +232,10 @@ impl Optimiser {
         self.optimiser.averages().into_iter().map(array).collect()
     }
 
-    /// Restores a saved state.
+    /// Restores the number of gradient steps and the running averages that [`Optimiser::state`] returned.
     ///
     /// # Errors
-    /// [`Error::Arrays`] if it is another optimiser's.
+    /// [`Error::Arrays`] if names or shapes differ, for example because the arrays are from another update rule.
     pub fn load_state(&mut self, n_updates: u64, arrays: &[NamedArray]) -> Result<()> {
         let size = self.optimiser.size();
         let mut averages = self.optimiser.averages_mut();
@@ -244,7 +249,7 @@ impl Optimiser {
     }
 }
 
-/// √ Σ_i g_i² in f64, in [`SUMS`] sums side by side.
+/// The arguments of the vectorised norm √(Σ_i g_i²). It is computed in f64, in [`SUMS`] partial sums.
 struct Norm<'a> {
     gradient: &'a [f32],
     norm: &'a mut f64,

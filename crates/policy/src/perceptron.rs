@@ -1,4 +1,4 @@
-//! A multilayer perceptron, forward and backward.
+//! The forward and backward pass of a multilayer perceptron.
 
 use std::ops::Range;
 
@@ -7,13 +7,13 @@ use pulp::Simd;
 use crate::kernel::{Kernel, LANES, Lane, Rows, lanes};
 use crate::product::{Factor, Matrix, outer, sum_rows};
 
-/// A linear layer.
+/// A linear layer: weights and biases.
 #[derive(Clone, Debug)]
 pub(crate) struct Layer {
     inputs: usize,
     outputs: usize,
     matrix: Matrix,
-    /// [lanes of outputs].
+    /// The biases of the outputs, padded to whole lanes.
     biases: Vec<Lane>,
 }
 
@@ -22,46 +22,48 @@ impl Layer {
         Layer { inputs, outputs, matrix: Matrix::new(inputs, outputs), biases: vec![[0.0; LANES]; lanes(outputs)] }
     }
 
-    /// Loads `weights` [outputs, n] of n inputs, those from `first` on.
+    /// Loads `weights` `[outputs, n]` for n inputs, starting at input `first`.
     pub(crate) fn load_inputs(&mut self, first: usize, weights: &[f32]) {
         self.matrix.load(first, weights, self.outputs);
     }
 
-    /// Loads biases `[outputs]`.
+    /// Loads the biases `[outputs]`.
     pub(crate) fn load_biases(&mut self, biases: &[f32]) {
         self.biases.as_flattened_mut()[..biases.len()].copy_from_slice(biases);
     }
 
-    /// Loads weights [outputs, inputs] and biases `[outputs]` from the front of `numbers`, and removes them there.
+    /// Loads weights `[outputs, inputs]` and biases `[outputs]` from the front of `numbers`, and advances `numbers`
+    /// past them.
     pub(crate) fn load(&mut self, numbers: &mut &[f32]) {
         self.load_inputs(0, take(numbers, self.outputs * self.inputs));
         self.load_biases(take(numbers, self.outputs));
     }
 
-    /// bias + Σ_i input_i weight_i of `rows`, added up in order of i.
+    /// Computes the outputs bias + Σ_i input_i weight_i for the given `rows` of `from`, and writes them to the same
+    /// rows of `to`. Products are added in order of i.
     #[inline(always)]
     pub(crate) fn apply<S: Simd>(&self, simd: S, from: &Rows, rows: Range<usize>, to: &mut Rows) {
         self.matrix.factor().apply_here(simd, from, rows, Some(&self.biases), to);
     }
 }
 
-/// Cuts the first `n` of `numbers` off.
+/// Returns the first `n` of `numbers`, and advances `numbers` past them.
 pub(crate) fn take<'a>(numbers: &mut &'a [f32], n: usize) -> &'a [f32] {
     let (first, rest) = numbers.split_at(n);
     *numbers = rest;
     first
 }
 
-/// Layers with tanh between them.
+/// A multilayer perceptron: linear layers with tanh between them.
 #[derive(Clone, Debug)]
 pub(crate) struct Perceptron {
     layers: Vec<Layer>,
-    /// Whether tanh follows the last layer too.
+    /// Whether tanh is also applied after the last layer.
     squash_last: bool,
 }
 
 impl Perceptron {
-    /// A perceptron whose layers have these numbers of inputs and outputs.
+    /// Creates a perceptron from pairs (inputs, outputs), one for each layer. All weights are 0.
     pub(crate) fn new(layers: &[(usize, usize)], squash_last: bool) -> Self {
         Perceptron {
             layers: layers.iter().map(|&(inputs, outputs)| Layer::new(inputs, outputs)).collect(),
@@ -69,17 +71,18 @@ impl Perceptron {
         }
     }
 
-    /// Buffers for the layers' outputs for a batch of `n`.
+    /// Creates buffers for the outputs of all layers, for a batch of `n` rows.
     pub(crate) fn buffers(&self, n: usize) -> Vec<Rows> {
         self.layers.iter().map(|layer| Rows::new(n, layer.outputs)).collect()
     }
 
-    /// Loads weights and biases, layer by layer, from the front of `numbers`, and removes them there.
+    /// Loads the weights and biases of all layers in order from the front of `numbers`, and advances `numbers` past
+    /// them.
     pub(crate) fn load(&mut self, numbers: &mut &[f32]) {
         self.layers.iter_mut().for_each(|layer| layer.load(numbers));
     }
 
-    /// Computes every layer's outputs, one of `outputs` each, for `rows` of `inputs`.
+    /// Computes the outputs of every layer for the given `rows` of `inputs`. `outputs` has one buffer for each layer.
     #[inline(always)]
     fn forward<S: Simd>(&self, simd: S, inputs: &Rows, rows: Range<usize>, outputs: &mut [Rows]) {
         for (i, layer) in self.layers.iter().enumerate() {
@@ -92,7 +95,7 @@ impl Perceptron {
     }
 }
 
-/// Computes a perceptron's outputs, see [`Perceptron::forward`].
+/// The arguments of the vectorised forward pass, see [`Perceptron::forward`].
 pub(crate) struct Forward<'a> {
     pub(crate) network: &'a Perceptron,
     pub(crate) inputs: &'a Rows,
@@ -107,10 +110,10 @@ impl Kernel for Forward<'_> {
     }
 }
 
-/// The backward pass through a perceptron whose last layer is without tanh.
+/// The backward pass through a perceptron that has no tanh after its last layer.
 #[derive(Clone, Debug)]
 pub(crate) struct Backward {
-    /// P, the number of weights and biases.
+    /// P, the number of weights and biases together.
     n_weights: usize,
     layers: Vec<LayerBackward>,
 }
@@ -119,12 +122,12 @@ pub(crate) struct Backward {
 struct LayerBackward {
     inputs: usize,
     outputs: usize,
-    /// Derivatives with respect to this layer's outputs before their tanh, for a batch.
+    /// Derivatives of the loss with respect to this layer's outputs before tanh, one row for each sample.
     deltas: Rows,
 }
 
 impl Backward {
-    /// The backward pass through `perceptron`, with buffers for batches of `n`.
+    /// Creates the backward pass through `perceptron`, with buffers for batches of `n` rows.
     pub(crate) fn new(perceptron: &Perceptron, n: usize) -> Self {
         let of = |layer: &Layer| LayerBackward {
             inputs: layer.inputs,
@@ -135,19 +138,21 @@ impl Backward {
         Backward { n_weights: layers.iter().map(LayerBackward::n_weights).sum(), layers }
     }
 
-    /// P, the number of weights and biases.
+    /// Returns P, the number of weights and biases together.
     pub(crate) fn n_weights(&self) -> usize {
         self.n_weights
     }
 
-    /// The buffer for the derivatives with respect to the perceptron's outputs. Fill it before [`Backward::sum`].
+    /// Returns the buffer for the derivatives of the loss with respect to the perceptron's outputs. Fill it before
+    /// [`Backward::sum`].
     pub(crate) fn by_outputs(&mut self) -> &mut Rows {
         let last = self.layers.len() - 1;
         &mut self.layers[last].deltas
     }
 
-    /// Writes the derivatives of a sum over the first `n` rows with respect to `weights` `[P]` to `sums` `[P]`. With
-    /// `ADD` it adds them instead. `outputs` are those of [`Perceptron::forward`] for `inputs`.
+    /// Computes the derivatives of the loss, summed over the first `n` rows, with respect to `weights` `[P]`. Writes
+    /// them to `sums` `[P]`, or adds them to `sums` with `ADD`. `outputs` must be the results of
+    /// [`Perceptron::forward`] for `inputs`.
     #[inline(always)]
     pub(crate) fn sum<S: Simd, const ADD: bool>(
         &mut self,

@@ -11,15 +11,17 @@ use crate::normalisers::{Normalisers, Statistics};
 use crate::random::{Purpose, normal, stream, trial_stream};
 use crate::spec::PolicySpec;
 
-/// Plays N environments with a policy: [`Player::act`] chooses actions, the caller steps the environments, and
-/// [`Player::observe`] takes the results. Learner and server play with the same code, so that they give the same bytes.
+/// Plays N environments with a policy. [`Player::act`] chooses actions, the caller steps the environments with them,
+/// and [`Player::observe`] takes the results. The learner and the server share this code, so that both produce the same
+/// bytes.
 ///
-/// Memories are emptied where a trial ends. In a trial of one episode that is the episode's end. In a trial of several
-/// episodes (RL²), the policy's inputs tell it of the ends in between. The learner treats such a trial as one episode: flags
-/// of ends in between are left out, and the discounted returns that rewards are divided by run on.
+/// The policy's memory of an environment is cleared when a trial ends. A trial of one episode ends with its episode. In
+/// a trial of several episodes (RL²), the done flag among the policy's inputs marks the ends of episodes within the
+/// trial. The learner treats such a trial as one episode: its rollout omits these flags, and the discounted returns for
+/// normalising rewards are not reset there.
 ///
-/// Final observations are normalised with statistics that include the observations after them. Noise is added only to the
-/// observations from which actions are chosen: neither to final observations nor to statistics.
+/// The observations after a step are added to the statistics before the final observations are normalised. Noise is
+/// added only to the observations from which actions are chosen, not to final observations or to statistics.
 #[derive(Clone, Debug)]
 pub struct Player {
     actor: Actor,
@@ -32,65 +34,67 @@ pub struct Player {
     noise: f64,
     /// `[N, O]` normalised observations from which the next actions are chosen.
     observations: Vec<f32>,
-    /// `[N]` whether those are the first of a trial.
+    /// `[N]` whether the environment's observation is the first of a trial.
     starts: Vec<bool>,
-    /// The previous step.
+    /// The last step, with its actions and results.
     previous: PreviousStep,
-    /// Actions as the protocol encodes them.
+    /// The last actions, in the encoding of the protocol.
     bytes: Vec<u8>,
-    /// V of the present observations.
+    /// Buffer for the values V of observations.
     values: Vec<f32>,
 }
 
-/// The source of randomness for actions, and whether statistics run.
+/// The role of a player in a training or a test: its random numbers, and whether its statistics are updated.
 #[derive(Clone, Debug)]
-#[allow(clippy::large_enum_variant)] // a player has one, and its stream is read at every action
+#[allow(clippy::large_enum_variant)] // a player has only one role, and reads its stream at every action
 pub enum Role {
-    /// Statistics run. All noise and all actions come from one stream, in the environments' order.
+    /// In training, the statistics are updated. One random stream gives all actions and all noise, in the order of the
+    /// environments.
     Training(ChaCha8Rng),
-    /// Statistics are frozen. Each trial has a stream of its own, see [`trial_stream`].
+    /// In testing, the statistics are frozen. Each trial has its own random stream, see [`trial_stream`].
     Testing(TrialStreams),
 }
 
-/// The streams of the present trials.
+/// The random streams of the trials in progress.
 #[derive(Clone, Debug)]
 pub struct TrialStreams {
     seed: u64,
-    /// `[N]` the environments' indices.
+    /// `[N]` environment indices, which are part of a stream's seed.
     indices: Vec<u32>,
     streams: Vec<ChaCha8Rng>,
 }
 
-/// The state of a training's player, without weights and normalisers, that decides what it does next.
+/// The state of a player between two steps of a training, without weights and normalisers. With these it determines all
+/// further actions.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PlayerState {
     /// `[N, O]` normalised observations from which the next actions are chosen.
     pub observations: Vec<f32>,
-    /// `[N]` whether those are the first of a trial.
+    /// `[N]` whether the environment's observation is the first of a trial.
     pub starts: Vec<bool>,
     /// `[N, E]` the previous steps, see [`Inputs`].
     pub previous_steps: Vec<f32>,
     /// `[N, S]` the policy's memory; empty for a feed-forward policy.
     pub memory: Vec<f32>,
-    /// The stream of sampled actions and of noise.
+    /// The random stream for actions and noise.
     pub actions: ChaCha8Rng,
 }
 
-/// The end of an episode.
+/// An episode that ended in a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SlotEnd {
     /// The environment, 0 … N-1.
     pub slot: usize,
-    /// Counts the environment's trials from 0.
+    /// Index of the trial in its environment, from 0.
     pub trial_index: u64,
-    /// Counts the trial's episodes from 0.
+    /// Index of the episode in its trial, from 0.
     pub episode_in_trial: u32,
 }
 
-/// The results of a step in N environments that are reset automatically where an episode ends.
+/// The results of a step in N environments, each of which is reset automatically when its episode ends.
 #[derive(Clone, Copy, Debug)]
 pub struct StepOutcome<'a> {
-    /// `[N, O]` observations; where an episode ended, the first one of the next.
+    /// `[N, O]` observations after the step. If an episode ended, this is the first observation of the next episode.
     pub observations: &'a [f32],
     /// `[N]` rewards.
     pub rewards: &'a [f32],
@@ -98,36 +102,36 @@ pub struct StepOutcome<'a> {
     pub terminated: &'a [bool],
     /// `[N]` whether the step limit ended the episode.
     pub truncated: &'a [bool],
-    /// `[K, O]` last observations of the episodes that ended, in the order of `ended`.
+    /// `[K, O]` final observations of the episodes that ended, in the order of `ended`.
     pub final_observations: &'a [f32],
     /// `[K]` the episodes that ended, in order of slots.
     pub ended: &'a [SlotEnd],
 }
 
-/// A step of N environments, as a rollout stores it; or T steps, with arrays `[T, N, …]`.
+/// A step of N environments as stored in a rollout, or T steps with arrays `[T, N, …]`.
 #[derive(Clone, Copy, Debug)]
 pub struct RolloutStep<'a> {
     /// `[N, I]` normalised inputs from which the actions were chosen.
     pub observations: &'a [f32],
-    /// `[N]` whether the policy's memory was emptied before the step.
+    /// `[N]` whether the policy's memory was cleared before the step.
     pub starts: &'a [bool],
     /// `[N, A]` actions, as in [`ActorOutput`].
     pub actions: &'a [f32],
     /// `[N]` log-probabilities of the actions under the acting policy.
     pub log_probs: &'a [f32],
-    /// `[N]` V(s_t).
+    /// `[N]` values V(s_t) of the observations.
     pub values: &'a [f32],
-    /// `[N]` rewards r_t for the actions, normalised.
+    /// `[N]` normalised rewards r_t that followed the actions.
     pub rewards: &'a [f32],
-    /// `[N]` whether the task ended the episode, or the trial.
+    /// `[N]` whether the task ended the episode; with RL², only at the end of a trial.
     pub terminated: &'a [bool],
-    /// `[N]` whether the time limit ended the episode, or the trial.
+    /// `[N]` whether the step limit ended the episode; with RL², only at the end of a trial.
     pub truncated: &'a [bool],
-    /// `[N]` V(final observation) where truncated; ignored elsewhere.
+    /// `[N]` value V of the final observation, if `truncated`. Ignore the other elements.
     pub truncation_values: &'a [f32],
 }
 
-/// The arrays of a [`RolloutStep`], and buffers from which they are made.
+/// The arrays of the last step, see [`RolloutStep`], and temporary buffers.
 #[derive(Clone, Debug)]
 struct PreviousStep {
     acted_on: Vec<f32>,
@@ -155,18 +159,18 @@ impl Streams for Role {
 }
 
 impl Role {
-    /// The role of a training with `seed`.
+    /// Returns the role for a training with `seed`.
     pub fn training(seed: u64) -> Self {
         Self::Training(stream(seed, Purpose::Actions))
     }
 
-    /// The role of a test with `seed` in N = `n_envs` environments with successive indices, at the start of their first
-    /// trials.
+    /// Returns the role for a test with `seed` in N = `n_envs` environments. Their environment indices are successive
+    /// numbers from `first_environment_index`, and each is at the start of its first trial.
     pub fn testing(seed: u64, first_environment_index: u32, n_envs: usize) -> Self {
         Self::testing_in(seed, (0..n_envs).map(|slot| (first_environment_index + slot as u32, 0)))
     }
 
-    /// The role of a test with `seed` in environments given by their index and the index of their trial.
+    /// Returns the role for a test with `seed`. `environments` gives the environment index and the trial index of each.
     pub fn testing_in(seed: u64, environments: impl Iterator<Item = (u32, u64)>) -> Self {
         let stream = |(index, trial)| (index, trial_stream(seed, Purpose::TestActions, index, trial));
         let (indices, streams) = environments.map(stream).unzip();
@@ -179,15 +183,15 @@ impl Role {
 }
 
 impl TrialStreams {
-    /// The seed of the test.
+    /// Returns the seed of the test.
     pub fn seed(&self) -> u64 {
         self.seed
     }
 }
 
 impl Player {
-    /// A player whose weights are 0 until [`Player::load`], and whose observations are 0 until [`Player::begin`] or
-    /// [`Player::restore`]. `inputs` must be fresh and fit `spec`.
+    /// Creates a player. `inputs` must be new and fit `spec`. Weights are 0 until [`Player::load`], and observations
+    /// are 0 until [`Player::begin`] or [`Player::restore`].
     pub fn new(
         spec: &PolicySpec,
         inputs: Inputs,
@@ -213,61 +217,62 @@ impl Player {
         }
     }
 
-    /// Makes the player act as [`Actor::act_uniformly`] says.
+    /// Makes the player sample continuous actions uniformly, see [`Actor::act_uniformly`].
     #[must_use]
     pub fn uniformly(mut self) -> Self {
         self.actor.act_uniformly();
         self
     }
 
-    /// Adds normal noise with this standard deviation, at least 0, to observations in training, after their normalisation. The
-    /// previous step in RL²'s inputs gets none.
+    /// Adds normally distributed noise with the standard deviation `noise`, at least 0, to normalised observations in
+    /// training. The previous step in RL²'s inputs gets no noise.
     #[must_use]
     pub fn with_noise(self, noise: f64) -> Self {
         Self { noise, ..self }
     }
 
-    /// Makes the player cache activations as [`Actor::keep_activations`] says.
+    /// Makes the player cache the activations of `n_steps` steps, see [`Actor::keep_activations`].
     #[must_use]
     pub fn keeping_activations(mut self, n_steps: usize) -> Self {
         self.actor.keep_activations(n_steps);
         self
     }
 
-    /// N, the number of environments.
+    /// Returns N, the number of environments.
     pub fn n_envs(&self) -> usize {
         self.starts.len()
     }
 
-    /// Episodes in a trial.
+    /// Returns the number of episodes in a trial.
     pub fn episodes_per_trial(&self) -> u32 {
         self.episodes_per_trial
     }
 
-    /// O, the length of an observation.
+    /// Returns O, the length of an observation.
     pub fn observation_size(&self) -> usize {
         self.observation_size
     }
 
-    /// Loads all weights `[P]` in a row. The memory stays.
+    /// Loads all weights as one array `[P]`, and keeps the policy's memory.
     ///
     /// # Errors
-    /// [`Error::Length`](crate::Error::Length).
+    /// [`Error::Length`](crate::Error::Length) if the number of weights is wrong.
     pub fn load(&mut self, weights: &[f32]) -> Result<()> {
         self.actor.load_flat(weights)
     }
 
-    /// Lets `backend` take the networks with which this player acts, see [`GradientBackend::reuse_activations`]. Weights must
-    /// be loaded before this player acts again.
+    /// Lets `backend` take over the networks with which this player acts, see [`GradientBackend::reuse_activations`].
+    /// Call [`Player::load`] before this player acts again.
     pub fn give_activations(&mut self, backend: &mut dyn GradientBackend) {
         backend.reuse_activations(&mut self.actor);
     }
 
-    /// Begins a trial in every environment with `observations` `[N, O]`. Those of the environments where `remaining` counts are
-    /// added to running statistics.
+    /// Begins a trial in every environment, whose first observations are `observations` `[N, O]`. In training, adds the
+    /// observations to the statistics, but only those of environments whose next step is collected according to
+    /// `remaining`.
     ///
     /// # Errors
-    /// Another length; numbers that are not finite.
+    /// An error if the length is wrong or an observation is not finite.
     pub fn begin(&mut self, observations: &[f32], remaining: Option<&RemainingRollout>) -> Result<()> {
         check_length("observations [N, O]", observations.len(), self.observations.len())?;
         self.observations.copy_from_slice(observations);
@@ -285,11 +290,11 @@ impl Player {
         Ok(())
     }
 
-    /// Replaces the observation of `slot` by `observation` `[O]`, after its environment was brought to another state. The
-    /// statistics stay.
+    /// Replaces the observation of the environment `slot` by `observation` `[O]`, which is normalised without changing
+    /// the statistics. Call it after the environment was set to another state.
     ///
     /// # Errors
-    /// Another length.
+    /// [`Error::Length`](crate::Error::Length) if the observation has the wrong length.
     pub fn see(&mut self, slot: usize, observation: &[f32]) -> Result<()> {
         check_length("observation [O]", observation.len(), self.observation_size)?;
         let row = &mut self.observations[slot * self.observation_size..][..self.observation_size];
@@ -297,8 +302,8 @@ impl Player {
         self.normalisers.normalise(row)
     }
 
-    /// Begins trial `trial_index` of a test with `seed` in `slot`. The memory is emptied, and the sampled actions depend only on
-    /// the trial's address.
+    /// Begins trial `trial_index` of a test with `seed` in the environment `slot`. Clears the policy's memory. The
+    /// trial's sampled actions then depend only on the seed, the environment index and the trial index.
     pub fn begin_trial(&mut self, slot: usize, seed: u64, trial_index: u64) {
         self.actor.forget(slot);
         self.inputs.forget(slot);
@@ -307,10 +312,10 @@ impl Player {
         }
     }
 
-    /// Chooses the next actions, encoded as the protocol says.
+    /// Chooses the next actions and returns them in the encoding of the protocol, see [`ActorOutput::write_bytes`].
     ///
     /// # Errors
-    /// [`Error::PolicyOutput`](crate::Error::PolicyOutput).
+    /// [`Error::PolicyOutput`](crate::Error::PolicyOutput) if an output of the policy is not finite.
     pub fn act(&mut self) -> Result<&[u8]> {
         let Self { actor, inputs, role, observations, starts, previous, bytes, .. } = self;
         let rows = inputs.from_observations(observations);
@@ -322,16 +327,17 @@ impl Player {
         Ok(bytes)
     }
 
-    /// The last actions, encoded as the protocol says.
+    /// Returns the last actions in the encoding of the protocol.
     pub fn actions(&self) -> &[u8] {
         &self.bytes
     }
 
-    /// Takes the results of the last actions. `remaining` must have been advanced already. It selects the environments
-    /// whose rewards and next observations are added to statistics.
+    /// Takes the results of the last actions. In training, adds rewards and observations to the statistics, but only
+    /// those of environments whose steps are collected according to `remaining`. Call `remaining.advance` before this
+    /// method.
     ///
     /// # Errors
-    /// Other lengths; numbers that are not finite.
+    /// An error if an array has the wrong length or a number is not finite.
     pub fn observe(&mut self, outcome: &StepOutcome<'_>, remaining: Option<&RemainingRollout>) -> Result<()> {
         let n_envs = self.starts.len();
         check_length("observations [N, O]", outcome.observations.len(), self.observations.len())?;
@@ -376,7 +382,7 @@ impl Player {
         }
     }
 
-    /// The previous step: the actions of [`Player::act`] and the results that [`Player::observe`] took.
+    /// Returns the last step: the actions that [`Player::act`] chose and the results that [`Player::observe`] took.
     pub fn played(&self) -> RolloutStep<'_> {
         let step = &self.previous;
         RolloutStep {
@@ -392,10 +398,11 @@ impl Player {
         }
     }
 
-    /// V `[N]` of the present observations; 0 after complete episodes, because nothing follows them.
+    /// Returns the values V `[N]` of the current observations, from which a rollout of steps is bootstrapped. Returns 0
+    /// after a rollout of complete episodes, because no step follows them.
     ///
     /// # Errors
-    /// Observations that do not fit.
+    /// An error if the policy must first load weights.
     pub fn last_values(&mut self, remaining: &RemainingRollout) -> Result<&[f32]> {
         match remaining {
             RemainingRollout::Steps(_) => {
@@ -409,22 +416,22 @@ impl Player {
         Ok(&self.values)
     }
 
-    /// `[N, S]` the policy's memory of every environment.
+    /// Returns the policy's memory of every environment, `[N, S]`.
     pub fn memory(&self) -> &[f32] {
         self.actor.memory()
     }
 
-    /// The source of randomness for actions.
+    /// Returns the role: the random numbers for actions, and whether statistics are updated.
     pub fn role(&self) -> &Role {
         &self.role
     }
 
-    /// The statistics so far.
+    /// Returns the normalisers with the statistics so far.
     pub fn normalisers(&self) -> &Normalisers {
         &self.normalisers
     }
 
-    /// The state between two steps; `None` in a test.
+    /// Returns the player's state between two steps, for [`Player::restore`]. `None` in a test.
     pub fn state(&self) -> Option<PlayerState> {
         let Role::Training(actions) = &self.role else { return None };
         Some(PlayerState {
@@ -436,7 +443,7 @@ impl Player {
         })
     }
 
-    /// Restores a saved state of a training.
+    /// Restores a state that [`Player::state`] returned. The player then has the training role.
     ///
     /// # Errors
     /// [`Error::Length`](crate::Error::Length) if an array does not fit.
@@ -470,7 +477,7 @@ impl PreviousStep {
         }
     }
 
-    /// Copies rewards and flags. The flags of ends within a trial are cleared.
+    /// Copies rewards and flags from `outcome`. Clears the flags of episodes that ended within a trial.
     fn take(&mut self, outcome: &StepOutcome<'_>, episodes_per_trial: u32) {
         self.rewards.copy_from_slice(outcome.rewards);
         self.terminated.copy_from_slice(outcome.terminated);
@@ -487,7 +494,7 @@ impl PreviousStep {
         }
     }
 
-    /// Gathers the final observations of truncated episodes. Returns whether there are any.
+    /// Collects the final observations of truncated episodes. Returns whether there are any.
     fn gather_truncated(&mut self, outcome: &StepOutcome<'_>, observation_size: usize) -> bool {
         self.truncation_values.fill(0.0);
         self.finals.clear();

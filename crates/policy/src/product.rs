@@ -1,11 +1,11 @@
-//! Products of small matrices, as loops that the compiler turns into vector instructions.
+//! Products of small matrices, written as loops that the compiler vectorises.
 //!
-//! Every number is one sum in one order, whatever the width of the vectors and the other rows of a batch: vectors run
-//! over numbers that do not wait for each other. Multiplications and additions stay apart, for a fused one rounds
-//! differently, and not every processor has it. So the bytes are the same on all.
+//! Every result is a single sum in a fixed order. It depends neither on the width of the vectors nor on the other rows
+//! of the batch, because a vector holds independent sums. Multiplications and additions are separate instructions: a
+//! fused multiply-add rounds differently, and some processors lack it. Therefore all processors compute the same bytes.
 //!
-//! Loops count where an iterator would read better: iterators and `from_fn` over arrays were not compiled into the kernels,
-//! and their calls took a third of a small gradient.
+//! Loops use indices where an iterator would be easier to read: the compiler did not inline iterators and `from_fn`
+//! over arrays into the kernels, and their calls took a third of the time of a small gradient.
 #![allow(clippy::needless_range_loop)]
 
 use std::ops::Range;
@@ -14,14 +14,15 @@ use pulp::Simd;
 
 use crate::kernel::{Kernel, LANES, Lane, Rows, call, lanes};
 
-/// The start of a sum without biases.
+/// The initial value of sums without biases.
 const ZERO: Lane = [0.0; LANES];
 
-/// A matrix in the order in which a product reads it: for each lane of outputs, for each input, that input's weights.
+/// A weight matrix in the order in which a product reads it: for each lane of outputs and each input, the weights from
+/// this input to these outputs.
 #[derive(Clone, Debug)]
 pub(crate) struct Matrix {
     inputs: usize,
-    /// [lanes of outputs, inputs].
+    /// `[lanes of outputs, inputs]` weights.
     data: Vec<Lane>,
 }
 
@@ -30,7 +31,7 @@ impl Matrix {
         Matrix { inputs, data: vec![[0.0; LANES]; lanes(outputs) * inputs] }
     }
 
-    /// Loads the weights `matrix` [outputs, n] of n inputs, those from `first` on.
+    /// Loads the weights `matrix` `[outputs, n]` of n inputs, starting at input `first`.
     pub(crate) fn load(&mut self, first: usize, matrix: &[f32], outputs: usize) {
         let inputs = matrix.len() / outputs;
         for (block, lanes) in matrix.chunks(LANES * inputs).zip(self.data.chunks_exact_mut(self.inputs)) {
@@ -42,7 +43,7 @@ impl Matrix {
         }
     }
 
-    /// The matrix as the right side of a product.
+    /// Returns the matrix as the right factor of a product.
     #[inline(always)]
     pub(crate) fn factor(&self) -> Factor<'_> {
         let outputs = self.data.len() / self.inputs * LANES;
@@ -51,27 +52,28 @@ impl Matrix {
     }
 }
 
-/// The right side of a product, with the strides of its numbers.
+/// The right factor of a product: a matrix with the strides of its numbers.
 #[derive(Clone, Copy)]
 pub(crate) struct Factor<'a> {
     numbers: &'a [f32],
     inputs: usize,
     outputs: usize,
-    /// Stride from a lane of outputs to the next.
+    /// Distance in `numbers` from a lane of outputs to the next lane.
     per_column: usize,
-    /// Stride from an input to the next.
+    /// Distance in `numbers` from an input to the next input.
     per_input: usize,
 }
 
 impl<'a> Factor<'a> {
-    /// Uses the rows of `matrix` [inputs, `outputs`], without a copy.
+    /// Makes a factor of the row-major `matrix` `[inputs, outputs]`, without a copy.
     #[inline(always)]
     pub(crate) fn rows(matrix: &'a [f32], outputs: usize) -> Self {
         Factor { numbers: matrix, inputs: matrix.len() / outputs, outputs, per_column: LANES, per_input: outputs }
     }
 
-    /// `rows` of `from` times this: to_b = start + Σ_i from_bi weights_i, added up in order of i. `start` has one lane for
-    /// each of outputs.
+    /// Multiplies `rows` of `from` by this matrix and writes the result to the same rows of `to`: to_b = start + Σ_i
+    /// from_bi weights_i, added in order of i. `start` has the initial values of all outputs, in lanes; `None` stands
+    /// for 0.
     pub(crate) fn apply<S: Simd>(
         self,
         simd: S,
@@ -83,7 +85,8 @@ impl<'a> Factor<'a> {
         call(simd, Apply { factor: self, from, rows, start, to });
     }
 
-    /// The product, inlined into its caller.
+    /// Computes the same product as [`Factor::apply`], inlined into its caller. Most rows are computed in blocks of
+    /// eight or of four to seven; the last one to three rows are computed singly.
     #[inline(always)]
     pub(crate) fn apply_here<S: Simd>(
         self,
@@ -120,8 +123,8 @@ impl<'a> Factor<'a> {
         }
     }
 
-    /// Computes a lane of outputs for `rows`: eight rows at once, and the last four to seven together. `WHOLE` says that
-    /// the lane has [`LANES`] outputs.
+    /// Computes one lane of outputs, `column`, for `rows`: eight rows at once, and the last four to seven together.
+    /// `WHOLE` says that all [`LANES`] numbers of the lane are outputs.
     #[inline(always)]
     fn columns<S: Simd, const WHOLE: bool>(
         self,
@@ -146,15 +149,15 @@ impl<'a> Factor<'a> {
         }
     }
 
-    /// The numbers of a lane of outputs, from the first input's to the last input's. All whole lanes are equally long, so
-    /// an index that was checked for one lane need not be checked for the next.
+    /// Returns the weights of one lane of outputs, from the first input's to the last input's. These slices are equally
+    /// long for all whole lanes, so the compiler can omit repeated bounds checks.
     #[inline(always)]
     fn column<const WHOLE: bool>(self, column: usize) -> &'a [f32] {
         let last = if WHOLE { LANES } else { self.outputs % LANES };
         &self.numbers[column * self.per_column..][..(self.inputs - 1) * self.per_input + last]
     }
 
-    /// Vector number `vector` of input `i` in a [`Factor::column`].
+    /// Returns one vector of weights of input `i`: number `vector` in the lane that `column` holds.
     #[inline(always)]
     fn vector<S: Simd, const WHOLE: bool>(self, column: &[f32], i: usize, vector: usize) -> S::f32s {
         if WHOLE {
@@ -166,7 +169,8 @@ impl<'a> Factor<'a> {
         S::as_simd_f32s(&lane).0[vector]
     }
 
-    /// Computes `R` rows at once: each vector of weights is loaded once for all of them.
+    /// Computes one lane of outputs for `R` rows at once, so that each vector of weights is loaded only once for all of
+    /// them.
     #[inline(always)]
     fn product<S: Simd, const R: usize, const WHOLE: bool>(
         self,
@@ -197,7 +201,8 @@ impl<'a> Factor<'a> {
         }
     }
 
-    /// Computes one row, `C` columns at once: the sums are independent, so that the processor computes them in parallel.
+    /// Computes `C` lanes of outputs for one row. The sums are independent, so the processor can compute them in
+    /// parallel.
     #[inline(always)]
     fn row_product<S: Simd, const C: usize, const WHOLE: bool>(
         self,
@@ -234,7 +239,7 @@ impl<'a> Factor<'a> {
     }
 }
 
-/// Arguments of [`Factor::apply`].
+/// The arguments of [`Factor::apply`].
 struct Apply<'a> {
     factor: Factor<'a>,
     from: &'a Rows,
@@ -251,7 +256,7 @@ impl Kernel for Apply<'_> {
     }
 }
 
-/// Transposes `block` [[`LANES`], columns], four columns at a time. Returns the number of columns that were transposed.
+/// Transposes `block` `[LANES, columns]`, four columns at a time. Returns the number of columns that were transposed.
 fn transpose(block: &[f32], columns: &mut [Lane]) -> usize {
     let width = columns.len();
     let (columns, _) = columns.as_chunks_mut::<4>();
@@ -267,7 +272,7 @@ fn transpose(block: &[f32], columns: &mut [Lane]) -> usize {
     4 * columns.len()
 }
 
-/// Transposes with the shuffle instructions, which the compiler does not find by itself.
+/// Transposes a 4 × 4 matrix with shuffle instructions, which the compiler does not choose by itself.
 #[inline(always)]
 fn transpose_tile(rows: [[f32; 4]; 4]) -> [[f32; 4]; 4] {
     #[cfg(target_arch = "x86_64")]
@@ -287,8 +292,8 @@ fn transpose_tile(rows: [[f32; 4]; 4]) -> [[f32; 4]; 4] {
     std::array::from_fn(|column| rows.map(|row| row[column]))
 }
 
-/// Writes Σ_b deltas_bo inputs_bi, over the first `n` rows in order of b, to `sums` [outputs, `size`], or adds them with
-/// `ADD`.
+/// Computes the outer products Σ_b deltas_bo inputs_bi over the first `n` rows, in order of b. Writes them to `sums`
+/// `[outputs, size]`, or adds them to `sums` with `ADD`. `size` is the number of inputs.
 pub(crate) fn outer<S: Simd, const ADD: bool>(
     simd: S,
     sums: &mut [f32],
@@ -300,7 +305,7 @@ pub(crate) fn outer<S: Simd, const ADD: bool>(
     call(simd, Outer::<ADD> { sums, size, deltas, inputs, n });
 }
 
-/// Arguments of [`outer`].
+/// The arguments of [`outer`].
 struct Outer<'a, const ADD: bool> {
     sums: &'a mut [f32],
     size: usize,
@@ -317,7 +322,7 @@ impl<const ADD: bool> Kernel for Outer<'_, ADD> {
     }
 }
 
-/// The body of [`outer`], inlined into its caller.
+/// Computes the same as [`outer`], inlined into its caller.
 #[inline(always)]
 fn outer_here<S: Simd, const ADD: bool>(
     simd: S,
@@ -347,7 +352,8 @@ fn outer_here<S: Simd, const ADD: bool>(
     }
 }
 
-/// Computes `R` outputs from `first` on for a lane of inputs. `WHOLE` says that the lane has [`LANES`] inputs.
+/// Computes the rows of `sums` of `R` outputs, starting at output `first`, for one lane of inputs, `column`. `WHOLE`
+/// says that all [`LANES`] numbers of the lane are inputs.
 #[inline(always)]
 fn outers<S: Simd, const R: usize, const ADD: bool, const WHOLE: bool>(
     simd: S,
@@ -397,7 +403,7 @@ fn outers<S: Simd, const R: usize, const ADD: bool, const WHOLE: bool>(
     }
 }
 
-/// Writes the sums of the first `n` rows, in their order, to `sums`, or adds them with `ADD`.
+/// Sums the first `n` rows, in order. Writes the sums to `sums`, or adds them to `sums` with `ADD`.
 #[inline(always)]
 pub(crate) fn sum_rows<const ADD: bool>(sums: &mut [f32], rows: &Rows, n: usize) {
     if !ADD {
@@ -421,10 +427,10 @@ mod tests {
     const INPUTS: usize = 69;
     const OUTPUTS: usize = 85;
 
-    /// Products with a matrix and with its transpose for `n` rows, and sums over the rows.
+    /// The operations under test: products of `n` rows with a matrix and with its transpose, and sums over the rows.
     struct Products<'a> {
         matrix: &'a Matrix,
-        /// `[OUTPUTS, INPUTS]` the numbers of `matrix`.
+        /// `[OUTPUTS, INPUTS]` numbers of `matrix`.
         flat: &'a [f32],
         from: &'a Rows,
         n: usize,
@@ -453,7 +459,7 @@ mod tests {
         (0..n).map(|_| normal(&mut rng) as f32).collect()
     }
 
-    /// The result of `run`, as bits.
+    /// Returns the results of `run` as bits.
     fn bits(n: usize, run: impl FnOnce(Products<'_>)) -> Vec<u32> {
         let flat = numbers(INPUTS * OUTPUTS, 1);
         let mut matrix = Matrix::new(INPUTS, OUTPUTS);
@@ -482,7 +488,7 @@ mod tests {
         all.concat().iter().map(|x| x.to_bits()).collect()
     }
 
-    /// The same result by the definitions, one number at a time.
+    /// Computes the same results by their definitions, one number at a time.
     fn naive(n: usize) -> Vec<u32> {
         let matrix = numbers(INPUTS * OUTPUTS, 1);
         let rows = numbers(n * INPUTS, 2);

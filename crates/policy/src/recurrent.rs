@@ -1,4 +1,5 @@
-//! The interface to the gradients of recurrent policies. This crate has none: a library that has them registers itself here.
+//! The interface for computing gradients of recurrent policies. This crate has no implementation: a library that has
+//! one registers itself here.
 
 use std::sync::OnceLock;
 
@@ -8,32 +9,32 @@ use crate::objective::Objective;
 use crate::samples::SequenceSamples;
 use crate::spec::PolicySpec;
 
-/// Computes gradients of recurrent policies of one shape.
+/// Computes gradients for recurrent policies of one shape.
 pub trait RecurrentDifferentiator {
-    /// Copies `sequences`, to be learned from several times.
+    /// Copies `sequences`, so that several gradients can be computed from them.
     ///
     /// # Errors
-    /// Arrays whose lengths do not fit.
+    /// An error if an array has the wrong length.
     fn batch(&self, sequences: &SequenceSamples<'_>) -> Result<Box<dyn RecurrentBatch>>;
 }
 
-/// Sequences that a recurrent policy learns from.
+/// Sequences of steps from which a recurrent policy learns.
 pub trait RecurrentBatch {
-    /// N, the number of sequences.
+    /// Returns N, the number of sequences.
     fn count(&self) -> usize;
 
-    /// Stores the distributions of the policy with `weights` `[P]` as those of the policy that acted. The KL divergence is
-    /// measured from them.
+    /// Stores the action distributions of the policy with `weights` `[P]`, as those of the policy that acted. The KL
+    /// divergence is measured from these distributions.
     ///
     /// # Errors
-    /// Another number of weights.
+    /// An error if the number of weights is wrong.
     fn remember_acting(&mut self, weights: &[f32]) -> Result<()>;
 
-    /// Writes the derivatives of the total loss with `weights` `[P]` over the `sequences` with these indices to `gradient`
-    /// `[P]`. Returns the losses.
+    /// Computes the gradient of the total loss at `weights` `[P]`, over the `sequences` with these indices. Writes it
+    /// to `gradient` `[P]`, and returns the losses.
     ///
     /// # Errors
-    /// Arrays of other lengths, or what the library refuses.
+    /// An error if an array has the wrong length, or if the library reports one.
     fn gradient(
         &self,
         weights: &[f32],
@@ -43,25 +44,25 @@ pub trait RecurrentBatch {
     ) -> Result<Losses>;
 }
 
-/// Makes the differentiator of recurrent policies of a shape.
+/// A function that creates the differentiator for recurrent policies of a given shape.
 pub type MakeRecurrent = fn(&PolicySpec) -> Result<Box<dyn RecurrentDifferentiator>>;
 
 static RECURRENT: OnceLock<MakeRecurrent> = OnceLock::new();
 
-/// Registers `make` for recurrent policies, in the whole process. Only the first call has an effect.
+/// Registers `make` for the whole process. Only the first call has an effect.
 pub fn register_recurrent(make: MakeRecurrent) {
-    let _ = RECURRENT.set(make); // another library would give other bytes in the middle of a training
+    let _ = RECURRENT.set(make); // replacing the library during a training would change its results
 }
 
-/// Whether recurrent policies can be differentiated in this process.
+/// Returns whether a library for the gradients of recurrent policies is registered in this process.
 pub fn has_recurrent() -> bool {
     RECURRENT.get().is_some()
 }
 
-/// The differentiator of recurrent policies of this shape.
+/// Creates the differentiator for recurrent policies of shape `spec`.
 ///
 /// # Errors
-/// [`Error::NoRecurrentGradients`] if nothing is registered; what the library refuses.
+/// [`Error::NoRecurrentGradients`] if no library is registered, or the library's error.
 pub fn recurrent_differentiator(spec: &PolicySpec) -> Result<Box<dyn RecurrentDifferentiator>> {
     let make = RECURRENT.get().ok_or(Error::NoRecurrentGradients)?;
     make(spec)

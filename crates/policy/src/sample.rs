@@ -1,9 +1,9 @@
-//! Sampling actions.
+//! Sampling of actions, with their log-probabilities:
 //!
-//! Categorical over logits l_j, j = 0 … n-1: log π(a) = l_a - log Σ_j exp l_j.
-//! Diagonal Gaussian with means μ_i and log standard deviations log σ_i, i = 0 … A-1:
-//! log π(a) = -½ Σ_i ((a_i - μ_i)/σ_i)² - Σ_i log σ_i - ½ A log 2π.
-//! Uniform in the box with middles μ_i and half widths σ_i: log π(a) = -Σ_i log 2σ_i.
+//! - Categorical distribution with logits l_j, j = 0 … n-1: log π(a) = l_a - log Σ_j exp l_j.
+//! - Diagonal Gaussian with means μ_i and log standard deviations log σ_i, i = 0 … A-1: log π(a) = -½ Σ_i ((a_i -
+//!   μ_i)/σ_i)² - Σ_i log σ_i - ½ A log 2π.
+//! - Uniform distribution in a box with centre μ_i and half widths σ_i: log π(a) = -Σ_i log 2σ_i.
 
 use rand_chacha::ChaCha8Rng;
 
@@ -13,18 +13,19 @@ use crate::random::{normal, uniform};
 /// log 2π.
 pub(crate) const LOG_TAU: f32 = 1.837_877_1;
 
-/// The maximum of `logits`, and the sum of their exponentials relative to it: a log-probability is l_j - maximum - log total.
+/// Returns the maximum of `logits`, and the sum of exp(l_j - maximum) over all logits l_j. The log-probability of
+/// choice j is then l_j - maximum - log sum.
 pub(crate) fn greatest_and_total(logits: &[f32]) -> (f32, f32) {
     let greatest = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
     (greatest, logits.iter().map(|logit| exp(logit - greatest)).sum())
 }
 
-/// Draws from the categorical distribution of `logits` by inverting the cumulative sum; one uniform number a draw.
-/// Returns the choice and its log-probability.
+/// Samples from the categorical distribution with these `logits`, by inverting its cumulative sum. Takes one number
+/// from `rng`. Returns the choice and its log-probability.
 pub(crate) fn sample_categorical(logits: &[f32], rng: &mut ChaCha8Rng) -> (usize, f32) {
     let (greatest, total) = greatest_and_total(logits);
     let target = uniform(rng) * f64::from(total);
-    let mut choice = logits.len() - 1; // where rounding leaves target at the total
+    let mut choice = logits.len() - 1; // chosen if rounding makes `target` at least the last sum
     let mut sum = 0.0f32;
     for (j, logit) in logits.iter().enumerate() {
         sum += exp(logit - greatest);
@@ -36,8 +37,8 @@ pub(crate) fn sample_categorical(logits: &[f32], rng: &mut ChaCha8Rng) -> (usize
     (choice, logits[choice] - greatest - ln(total))
 }
 
-/// Draws an action `[A]` from the Gaussian of `means` `[A]` and `log_std` `[A]` into `action`; two uniform numbers an
-/// element. Returns the log-density.
+/// Samples an action `[A]` from the Gaussian with `means` `[A]` and log standard deviations `log_std` `[A]`, and writes
+/// it to `action`. Takes two numbers from `rng` for each element. Returns the log-density.
 pub(crate) fn sample_gaussian(means: &[f32], log_std: &[f32], rng: &mut ChaCha8Rng, action: &mut [f32]) -> f32 {
     let mut log_prob = -0.5 * LOG_TAU * means.len() as f32;
     for ((action, mean), log_std) in action.iter_mut().zip(means).zip(log_std) {
@@ -48,8 +49,9 @@ pub(crate) fn sample_gaussian(means: &[f32], log_std: &[f32], rng: &mut ChaCha8R
     log_prob
 }
 
-/// Draws an action `[A]` uniformly from the box with `middles` `[A]` and the logarithms of half its widths, `log_half`
-/// `[A]`, into `action`; one uniform number an element. Returns the log-density.
+/// Samples an action `[A]` uniformly from a box, and writes it to `action`. The box has its centre at `middles` `[A]`,
+/// and `log_half` `[A]` are the logarithms of half its widths. Takes one number from `rng` for each element. Returns
+/// the log-density.
 pub(crate) fn sample_uniform(middles: &[f32], log_half: &[f32], rng: &mut ChaCha8Rng, action: &mut [f32]) -> f32 {
     let mut log_prob = 0.0;
     for ((action, middle), log_half) in action.iter_mut().zip(middles).zip(log_half) {
@@ -60,7 +62,7 @@ pub(crate) fn sample_uniform(middles: &[f32], log_half: &[f32], rng: &mut ChaCha
 }
 
 #[cfg(test)]
-#[allow(clippy::disallowed_methods)] // what it is compared with
+#[allow(clippy::disallowed_methods)] // the test compares with the standard library's functions
 mod tests {
     use super::*;
     use crate::random::{Purpose, stream};
@@ -82,7 +84,7 @@ mod tests {
                 counts[i][((5.0 * (place + 1.0)) as usize).min(9)] += 1;
             }
         }
-        // Four standard deviations of a tenth of the draws: √(draws · 0.1 · 0.9).
+        // The tolerance is four standard deviations of the number of draws in a tenth of the box: √(draws · 0.1 · 0.9).
         for count in counts.into_iter().flatten() {
             assert!((f64::from(count) - 10_000.0).abs() < 380.0, "{counts:?}");
         }
@@ -103,7 +105,7 @@ mod tests {
         }
         for (count, &logit) in counts.iter().zip(&logits) {
             let p = f64::from(logit).exp() / total;
-            // Four standard deviations of a binomial share; the seed is fixed.
+            // The tolerance is four standard deviations of a binomial share. The seed is fixed.
             let tolerance = 4.0 * (p * (1.0 - p) / f64::from(draws)).sqrt();
             assert!((f64::from(*count) / f64::from(draws) - p).abs() < tolerance, "{counts:?}");
         }
@@ -128,7 +130,7 @@ mod tests {
             }
             product += z[0] * z[1] / f64::from(draws);
         }
-        // Four standard errors: 1/√draws of a mean and a covariance, √2/√draws of a variance.
+        // The tolerances are four standard errors: 1/√draws for a mean and a covariance, √2/√draws for a variance.
         for i in 0..2 {
             assert!(sums[i].abs() < 0.0127 && (squares[i] - 1.0).abs() < 0.018, "{sums:?} {squares:?}");
         }

@@ -1,4 +1,4 @@
-//! Samples of a rollout, from which gradients are computed.
+//! The samples of a rollout, from which gradients are computed.
 
 use crate::error::{Result, check_length};
 use crate::objective::Acting;
@@ -9,38 +9,39 @@ use crate::spec::PolicySpec;
 pub struct Samples<'a> {
     /// `[B, O]` normalised observations.
     pub observations: &'a [f32],
-    /// `[B, A]` actions; a discrete one is its index, A = 1.
+    /// `[B, A]` actions. A discrete action has A = 1 and is its index.
     pub actions: &'a [f32],
-    /// `[B]` log-probabilities under the policy that acted.
+    /// `[B]` log-probabilities of the actions under the policy that acted.
     pub old_log_probs: &'a [f32],
-    /// `[B]` values of the policy that acted.
+    /// `[B]` values V that the policy computed when it acted.
     pub old_values: &'a [f32],
     /// `[B]` advantages.
     pub advantages: &'a [f32],
-    /// `[B]` value targets.
+    /// `[B]` target values for V.
     pub returns: &'a [f32],
-    /// The distributions of the policy that acted, for the KL divergence.
+    /// The action distributions of the policy that acted, if the loss has a KL divergence.
     pub acting: Option<Acting<'a>>,
 }
 
-/// Sequences of T steps of N environments, each of which a recurrent policy must see whole. B = T·N, and the sample of
-/// step t of environment n is t·N + n.
+/// Sequences of T steps of N environments. A recurrent policy needs each sequence as a whole. There are B = T·N
+/// samples; step t of environment n is sample t·N + n.
 #[derive(Clone, Copy, Debug)]
 pub struct SequenceSamples<'a> {
-    /// The samples, `[T, N, …]`.
+    /// The samples, whose arrays are `[T, N, …]`.
     pub samples: Samples<'a>,
-    /// T.
+    /// T, the number of steps.
     pub n_steps: usize,
-    /// `[T, N]`: whether an episode starts with that step.
+    /// `[T, N]` whether the step is the first of an episode.
     pub starts: &'a [bool],
-    /// `[N, S]` the memory before the first step, S = [`PolicySpec::memory_size`].
+    /// `[N, S]` memory of the policy before the first step, with S = [`PolicySpec::memory_size`].
     pub memory: &'a [f32],
-    /// `[N]`: the number of first steps of environment n that are samples; the others are padding. `None`: all are samples.
+    /// `[N]` number of steps of each environment that are samples; later steps are padding. `None` if there is no
+    /// padding.
     pub lengths: Option<&'a [usize]>,
 }
 
 impl Samples<'_> {
-    /// Checks that all arrays have as many samples as `returns`, for a policy of `spec`.
+    /// Checks that all arrays have the same number of samples and fit a policy of shape `spec`.
     pub(crate) fn check(&self, spec: &PolicySpec) -> Result<()> {
         let Samples { observations, actions, old_log_probs, old_values, advantages, returns, acting } = self;
         let n = returns.len();
@@ -56,7 +57,7 @@ impl Samples<'_> {
         check_length("acting log_std [A]", acting.log_std.len(), spec.action.log_stds())
     }
 
-    /// Mean of the advantages at `indices`, and 1/(standard deviation + 10⁻⁸).
+    /// Returns the mean of the advantages at `indices`, and 1/(standard deviation + 10⁻⁸).
     pub(crate) fn mean_and_scale(&self, indices: &[u32]) -> (f32, f32) {
         let picked = || indices.iter().map(|&i| f64::from(self.advantages[i as usize]));
         let n = indices.len() as f64;
@@ -67,7 +68,7 @@ impl Samples<'_> {
 }
 
 impl SequenceSamples<'_> {
-    /// The places t·N + n of the samples, in order.
+    /// Returns the indices t·N + n of all samples that are not padding, in order.
     pub fn indices(&self) -> Vec<u32> {
         let count = self.samples.returns.len();
         let Some(lengths) = self.lengths else { return (0..count as u32).collect() };

@@ -5,24 +5,25 @@ use serde::{Deserialize, Serialize};
 use crate::error::{Error, Result};
 use crate::weights::{Weights, check_arrays};
 
-/// The kind of actions that a policy takes.
+/// The kind of actions that a policy takes, and their probability distribution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ActionKind {
-    /// A choice, 0 … n-1: a categorical distribution over `n` logits.
+    /// A choice from 0 … n-1, with a categorical distribution.
     Discrete {
-        /// Number of choices.
+        /// The number n of choices, which is also the number of logits.
         n: usize,
     },
-    /// A vector of `size` numbers: a diagonal Gaussian whose log standard deviations do not depend on the state.
+    /// A vector of numbers, with a diagonal Gaussian distribution. Its log standard deviations do not depend on the
+    /// state.
     Continuous {
-        /// Length of the vector.
+        /// The length A of the vector.
         size: usize,
     },
 }
 
 impl ActionKind {
-    /// A: f32 numbers that hold one action, 1 for discrete actions.
+    /// Returns A, the number of f32 that represent one action; 1 for discrete actions.
     pub fn width(self) -> usize {
         match self {
             ActionKind::Discrete { .. } => 1,
@@ -30,7 +31,7 @@ impl ActionKind {
         }
     }
 
-    /// Number of log standard deviations: A, or 0 for discrete actions.
+    /// Returns the number of log standard deviations: A for continuous actions, 0 for discrete ones.
     pub fn log_stds(self) -> usize {
         match self {
             ActionKind::Discrete { .. } => 0,
@@ -38,7 +39,7 @@ impl ActionKind {
         }
     }
 
-    /// Outputs of the policy network: n logits, or A means.
+    /// Returns the number of outputs of the policy network: n logits for discrete actions, A means for continuous ones.
     pub fn outputs(self) -> usize {
         match self {
             ActionKind::Discrete { n } => n,
@@ -47,34 +48,39 @@ impl ActionKind {
     }
 }
 
-/// The shape of a policy.
+/// The shape of a policy's networks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PolicySpec {
-    /// O, the length of an input: an observation, with RL² also the previous step, see [`Inputs`](crate::Inputs).
+    /// O, the length of an input. An input is an observation, and with RL² also the previous step, see
+    /// [`Inputs`](crate::Inputs).
     pub observation_size: usize,
-    /// The actions.
+    /// The kind of actions.
     pub action: ActionKind,
-    /// Widths of the hidden layers. Feed-forward: of the policy network and of the value network; the paper uses `[64, 64]`.
-    /// Recurrent: of the one network below the LSTM; the paper uses `[256, 256]`.
+    /// Numbers of units in the hidden layers. A feed-forward policy has these layers in its policy network and again in
+    /// its value network; the paper uses `[64, 64]`. A recurrent policy has them once, before its LSTM; the paper uses
+    /// `[256, 256]`.
     pub hidden: Vec<usize>,
-    /// H: width of the LSTM of a recurrent policy, for which the paper uses 256; None for a feed-forward one.
+    /// H, the number of units in the LSTM of a recurrent policy; the paper uses 256. `None` for a feed-forward policy.
     #[serde(default)]
     pub lstm: Option<usize>,
 }
 
 impl PolicySpec {
-    /// The paper's feed-forward policy for inputs of `input_size` numbers.
+    /// Returns the shape of the paper's feed-forward policy for inputs of `input_size` numbers.
     pub fn feed_forward(input_size: usize, action: ActionKind) -> Self {
         Self { observation_size: input_size, action, hidden: vec![64, 64], lstm: None }
     }
 
-    /// The paper's recurrent policy for inputs of `input_size` numbers.
+    /// Returns the shape of the paper's recurrent policy for inputs of `input_size` numbers.
     pub fn recurrent(input_size: usize, action: ActionKind) -> Self {
         Self { observation_size: input_size, action, hidden: vec![256, 256], lstm: Some(256) }
     }
 
-    /// Refuses empty spaces and layers.
+    /// Checks that no size is 0.
+    ///
+    /// # Errors
+    /// [`Error::Empty`] with the name of the first size that is 0.
     pub fn validate(&self) -> Result<()> {
         let positive = |name, got: usize| if got > 0 { Ok(()) } else { Err(Error::Empty { name }) };
         positive("observation_size", self.observation_size)?;
@@ -83,29 +89,33 @@ impl PolicySpec {
         self.lstm.map_or(Ok(()), |width| positive("the width of the LSTM", width))
     }
 
-    /// S = 2H, the length of a recurrent policy's memory of an environment: the LSTM's output h, then its cell state c. 0 for a
-    /// feed-forward policy. The memory before the first step of an episode is all 0.
+    /// Returns S = 2H, the length of a recurrent policy's memory of one environment; 0 for a feed-forward policy. The
+    /// memory consists of the LSTM's output h, followed by its cell state c. It is all 0 before the first step of an
+    /// episode.
     pub fn memory_size(&self) -> usize {
         self.lstm.map_or(0, |width| 2 * width)
     }
 
-    /// Inputs and outputs of each hidden layer.
+    /// Returns the numbers of inputs and outputs of each hidden layer.
     pub fn hidden_layers(&self) -> Vec<(usize, usize)> {
         let inputs = std::iter::once(self.observation_size).chain(self.hidden.iter().copied());
         inputs.zip(self.hidden.iter().copied()).collect()
     }
 
-    /// Numbers that leave the last hidden layer.
+    /// Returns the number of outputs of the last hidden layer, or O if there is none.
     pub fn hidden_size(&self) -> usize {
         self.hidden.last().copied().unwrap_or(self.observation_size)
     }
 
-    /// Names and shapes of the weights, in order.
+    /// Returns the names and shapes of all weights, in order.
     ///
-    /// Feed-forward: "policy.0.weight" [out, in], "policy.0.bias" `[out]`, …, "value.0.weight", …. Recurrent:
-    /// "hidden.0.weight" [out, in], "hidden.0.bias" `[out]`, …, "lstm.input.weight" [4H, in], "lstm.recurrent.weight"
-    /// `[4H, H]`, "lstm.bias" `[4H]`, "policy.weight" [out, H], "policy.bias", "value.weight" `[1, H]`, "value.bias"; the rows
-    /// of the LSTM are those of its gates i, f, g, o. Both: "log_std" `[A]` for continuous actions.
+    /// Feed-forward: "policy.0.weight" `[out, in]`, "policy.0.bias" `[out]`, …, "value.0.weight", ….
+    ///
+    /// Recurrent: "hidden.0.weight" `[out, in]`, "hidden.0.bias" `[out]`, …, "lstm.input.weight" `[4H, in]`,
+    /// "lstm.recurrent.weight" `[4H, H]`, "lstm.bias" `[4H]`, "policy.weight" `[out, H]`, "policy.bias", "value.weight"
+    /// `[1, H]`, "value.bias". The rows of the LSTM's arrays belong to its gates i, f, g and o, in this order.
+    ///
+    /// Both end with "log_std" `[A]` if actions are continuous.
     pub fn layout(&self) -> Vec<(String, Vec<usize>)> {
         let mut layout = Vec::new();
         let linear = |name: &str, inputs: usize, outputs: usize| {
@@ -136,7 +146,7 @@ impl PolicySpec {
         layout
     }
 
-    /// P: the number of weights.
+    /// Returns P, the number of all weights.
     pub fn n_weights(&self) -> usize {
         let linear = |(inputs, outputs): (usize, usize)| outputs * (inputs + 1);
         let hidden: usize = self.hidden_layers().into_iter().map(linear).sum();
@@ -148,7 +158,10 @@ impl PolicySpec {
             }
     }
 
-    /// Whether `weights` have this specification's names and shapes, in order.
+    /// Checks that `weights` have the names and shapes of [`PolicySpec::layout`], in order.
+    ///
+    /// # Errors
+    /// [`Error::Arrays`] at the first difference.
     pub fn check(&self, weights: &Weights) -> Result<()> {
         check_arrays(weights, &self.layout())
     }

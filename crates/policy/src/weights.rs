@@ -1,4 +1,4 @@
-//! Arrays with names.
+//! Arrays with names, in which weights and optimiser states are saved.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,18 +7,21 @@ use crate::error::{Error, Result};
 /// An array with a name, in row-major order.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct NamedArray {
-    /// Unique within its list.
+    /// The name, which is unique in its list.
     pub name: String,
-    /// Length of each axis.
+    /// The length of each axis.
     pub shape: Vec<usize>,
-    /// The elements, as many as the product of `shape`.
+    /// The elements. Their number is the product of `shape`.
     pub data: Vec<f32>,
 }
 
 /// The weights of a policy, in the order of [`PolicySpec::layout`](crate::PolicySpec::layout).
 pub type Weights = Vec<NamedArray>;
 
-/// Whether `arrays` have these names, shapes and lengths, in order.
+/// Checks that `arrays` have the names, shapes and lengths of `layout`, in order.
+///
+/// # Errors
+/// [`Error::Arrays`] at the first difference.
 pub fn check_arrays(arrays: &[NamedArray], layout: &[(String, Vec<usize>)]) -> Result<()> {
     let say = |name: &str, shape: &[usize], length: usize| format!("\"{name}\" {shape:?} of {length} elements");
     for position in 0..arrays.len().max(layout.len()) {

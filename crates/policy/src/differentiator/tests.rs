@@ -1,4 +1,4 @@
-//! Cached activations are used only where they are right.
+//! Tests that cached activations are used only when they are right.
 
 use super::*;
 use crate::act::ActorOutput;
@@ -17,7 +17,7 @@ const OBJECTIVE: Objective = Objective {
     kl_coef: 0.0,
 };
 
-/// A differentiator with the activations that an actor cached for `observations`, and their weights.
+/// Returns a differentiator with the activations that an actor cached for `observations`, and the weights.
 fn taken(observations: &[f32]) -> (Differentiator, Vec<f32>) {
     let spec = PolicySpec::feed_forward(O, ACTION);
     let weights: Vec<f32> = (0..spec.n_weights()).map(|i| 0.01 * (i % 7) as f32 - 0.03).collect();
@@ -54,7 +54,7 @@ const OBSERVATIONS: [f32; 6] = [1.0, 2.0, 3.0, 4.0, 5.0, 0.0];
 #[test]
 fn what_was_kept_serves_the_same_samples_as_often_as_they_come() {
     let (mut differentiator, weights) = taken(&OBSERVATIONS);
-    // The changed number shows that the cached rows are used and not computed again.
+    // The changed number proves that the cached rows are used instead of being computed again.
     let head = differentiator.parts[0].block.activations.value_layers.len() - 1;
     for _ in 0..2 {
         differentiator.parts[0].block.activations.value_layers[head].row_mut(2)[0] = 77.0;

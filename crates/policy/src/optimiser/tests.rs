@@ -7,7 +7,7 @@ fn gradients_are_clipped_by_global_norm() {
     let gradient = [3.0f32, 0.0, -4.0];
     for (largest, scale) in [(0.5, 0.1), (5.0, 1.0), (10.0, 1.0)] {
         let step = |largest, gradient: [f32; 3]| {
-            // With α 0 and a large ε, a step is the gradient divided by 1000, up to a small share.
+            // With α = 0 and a large ε, a step is nearly the gradient divided by 1000.
             let mut optimiser = Optimiser::new(UpdateRule::rms_prop(0.0, 1e6, 3), largest).with_weight_decay(0.25);
             let mut weights = WEIGHTS;
             (optimiser.step(1.0, &gradient, &mut weights, 1.0).expect("a step"), weights)
@@ -18,7 +18,8 @@ fn gradients_are_clipped_by_global_norm() {
     }
 }
 
-/// Five steps by numpy (`crates/torch/tests/fixtures/make_losses.py`), with an ε so large that its place matters.
+/// Expected values are five steps computed with numpy (`crates/torch/tests/fixtures/make_losses.py`). The ε is so large
+/// that it matters whether it is inside or outside of the root.
 #[test]
 fn steps_agree_with_numpy() {
     let cases: serde_json::Value =

@@ -10,7 +10,7 @@ fn spec(action: ActionKind, hidden: &[usize]) -> PolicySpec {
     PolicySpec { observation_size: 17, action, hidden: hidden.to_vec(), lstm: None }
 }
 
-/// Weights that differ from the initial ones everywhere: every number, also of biases and log_std, moves by about 0.1.
+/// Returns weights that all differ from the initial ones, biases and log_std included, by about 0.1.
 fn moved(spec: &PolicySpec) -> Weights {
     let mut rng = stream(9, Purpose::Weights);
     let mut weights = initial_weights(spec, &mut stream(1, Purpose::Weights));
@@ -54,7 +54,7 @@ fn initial_weights_are_orthogonal() {
     );
     assert_eq!(names.last(), Some(&("log_std", &[6][..])));
     for array in &weights {
-        // The shorter side holds that many orthogonal vectors of length gain: their squares add up to count·gain².
+        // The shorter axis has `count` orthogonal vectors of length `gain`, so all squares sum to count·gain².
         let squares: f64 = array.data.iter().map(|&x| f64::from(x).powi(2)).sum();
         let count = array.shape.iter().min().copied().unwrap_or(0) as f64;
         let expected = match array.name.as_str() {
@@ -102,13 +102,13 @@ fn actions_do_not_depend_on_the_rest_of_the_batch() {
 
 #[test]
 fn actions_follow_the_closed_form_of_the_last_layer_alone() {
-    // Without hidden layers the logits are the biases where the observation is 0.
+    // Without hidden layers, the logits for an observation of 0 are the biases.
     let spec = spec(DISCRETE, &[]);
     let mut weights = moved(&spec);
     weights[1].data = vec![2.0f32.ln(), 0.0, 1.0f32.ln()]; // probabilities ½, ¼, ¼
     let acts = act(&mut actor(&spec, &weights, 20_000), &spec, &vec![0.0; 17 * 20_000], 3);
     let share = |choice: f32| acts.actions.iter().filter(|&&a| a == choice).count() as f64 / 20_000.0;
-    // Four standard deviations of a share: 4·√(p(1-p)/20 000).
+    // The tolerance is four standard deviations of a share: 4·√(p(1-p)/20 000).
     assert!(
         (share(0.0) - 0.5).abs() < 0.0142 && (share(1.0) - 0.25).abs() < 0.0123 && (share(2.0) - 0.25).abs() < 0.0123
     );

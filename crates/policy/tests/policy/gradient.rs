@@ -1,4 +1,4 @@
-//! Gradients: the properties that must hold for every backend.
+//! Tests of properties that the gradients of every backend must have.
 
 use std::f64::consts::TAU;
 
@@ -25,7 +25,7 @@ const OBJECTIVE: Objective = Objective {
     kl_coef: 0.0,
 };
 
-/// The gradient over `n` samples by `threads` threads.
+/// Computes the gradient over `n` samples with `threads` threads.
 fn gradient(action: ActionKind, n: usize, threads: usize) -> Vec<f32> {
     let spec = PolicySpec::feed_forward(O, action);
     let weights = initial_weights(&spec, &mut stream(1, Purpose::Weights));
@@ -65,8 +65,8 @@ fn the_number_of_threads_changes_no_byte(
     }
 }
 
-/// Acts in N environments for T steps: fewer observations than the cache holds, as many, and more. Values are computed in
-/// between.
+/// Acts in N environments for T steps, with fewer observations than the cache holds, exactly as many, and more. Values
+/// are also computed between the steps.
 #[rstest]
 fn cached_activations_give_the_same_gradient(
     #[values(ActionKind::Discrete { n: 2 }, ActionKind::Continuous { size: 3 })] action: ActionKind,
@@ -151,14 +151,14 @@ fn networks_of_an_actor_give_the_same_gradient(
     assert!(expected.iter().filter(|&&g| g != 0.0).count() > expected.len() / 2);
     assert_eq!(gradient(&mut taken), expected);
 
-    // The actor now has the other networks, and refuses to act.
+    // The actor now has the differentiator's networks, and refuses to act.
     let mut acts = ActorOutput::new(action, 1);
     let refused = actor.act(&numbers(O, 3), &mut stream(1, Purpose::Actions), &mut acts);
     assert_eq!(refused, Err(Error::NoWeights));
     assert_eq!(actor.values(&numbers(O, 3), &mut Vec::new()), Err(Error::NoWeights));
     assert_eq!(actor.values_in(&numbers(O, 3), &[0], &mut Vec::new()), Err(Error::NoWeights));
 
-    // With new weights it acts as a new actor does, and its networks can be taken again.
+    // With new weights it acts like a new actor, and its networks can be taken over again.
     let others: Vec<f32> = numbers(spec.n_weights(), 7).iter().map(|x| 0.2 * x).collect();
     let acts = |actor: &mut Actor| {
         let mut acts = ActorOutput::new(action, 1);
@@ -199,7 +199,7 @@ fn only_networks_of_the_same_shape_are_taken_over() {
     }
 }
 
-/// A perceptron in f64, whose weights are taken from the front of `weights`.
+/// Computes a perceptron in f64, with weights from the front of `weights`.
 fn perceptron(spec: &PolicySpec, weights: &mut &[f64], x: &[f32], outputs: usize) -> Vec<f64> {
     let mut layers = spec.hidden_layers();
     layers.push((spec.hidden_size(), outputs));
@@ -221,7 +221,7 @@ fn log_softmax(logits: &[f64]) -> Vec<f64> {
     logits.iter().map(|l| l - total).collect()
 }
 
-/// Log-probability, entropy and divergence from the acting policy, by the textbook's formulas.
+/// Returns the log-probability, the entropy and the KL divergence from the acting policy, by textbook formulas.
 fn distribution(
     action: ActionKind,
     head: &[f64],
@@ -254,7 +254,7 @@ fn distribution(
     }
 }
 
-/// The total of `objective` over all `samples`, in f64.
+/// Computes the total loss of `objective` over all `samples`, in f64.
 fn total(spec: &PolicySpec, weights: &[f64], samples: &Samples<'_>, objective: &Objective) -> f64 {
     let n = samples.returns.len();
     let advantages: Vec<f64> = samples.advantages.iter().map(|&x| f64::from(x)).collect();
@@ -290,7 +290,7 @@ fn total(spec: &PolicySpec, weights: &[f64], samples: &Samples<'_>, objective: &
 
 #[rstest]
 fn gradients_are_finite_differences(
-    // The second kind of action has more outputs than the kernel computes side by side.
+    // The second kind of action has more outputs than one lane of the kernel.
     #[values(ActionKind::Discrete { n: 3 }, ActionKind::Discrete { n: 19 }, ActionKind::Continuous { size: 2 })]
     action: ActionKind,
     #[values(&[], &[7], &[5, 18])] hidden: &[usize],
@@ -337,7 +337,8 @@ fn gradients_are_finite_differences(
         distance += (slope - f64::from(got)).powi(2);
         size += slope * slope;
     }
-    // f32 sums; a kink within 1e-6 of a weight would show as more.
+    // The tolerance covers the rounding of f32 sums. A larger difference would appear if the loss had a kink within
+    // 1e-6 of a weight.
     assert!(distance.sqrt() < 1e-5 * size.sqrt(), "off by {:e} of {:e}", distance.sqrt(), size.sqrt());
 }
 

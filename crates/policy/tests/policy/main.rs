@@ -1,4 +1,4 @@
-//! The tests of policies as arithmetic, one program.
+//! Tests of policies as arithmetic, in one test program.
 #![allow(clippy::disallowed_methods)] // of references
 
 mod acting;

@@ -1,10 +1,10 @@
-//! Running normalisation of observations and rewards.
+//! Tests of the running normalisation of observations and rewards.
 
 use perturb_policy::random::{Purpose, normal, stream};
 use perturb_policy::{Error, ObservationNormaliser, RewardNormaliser};
 use proptest::prelude::*;
 
-/// Mean and population variance in two passes.
+/// Returns the mean and the population variance, computed in two passes.
 fn moments(numbers: &[f64]) -> (f64, f64) {
     let mean = numbers.iter().sum::<f64>() / numbers.len() as f64;
     (mean, numbers.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / numbers.len() as f64)
@@ -36,7 +36,7 @@ proptest! {
             merged.merge(&parts[order[2]]).expect("the same size");
             for got in [in_order.moments(), &merged] {
                 prop_assert_eq!(got.count(), numbers.len() as u64);
-                // f64 rounding of 200 numbers up to 1100, and of their squares.
+                // The tolerance covers the f64 rounding of 200 numbers up to 1100, and of their squares.
                 prop_assert!((got.mean()[0] - mean).abs() < 1e-10);
                 prop_assert!((got.variance(0) - variance).abs() < 1e-7);
             }
@@ -57,7 +57,7 @@ fn observations_get_mean_0_and_variance_1_in_every_element() {
     for i in 0..3 {
         let (mean, variance) =
             moments(&observations.iter().skip(i).step_by(3).map(|&x| f64::from(x)).collect::<Vec<_>>());
-        // ε = 1e-8 of the smallest variance, 1e-4, and f32 rounding.
+        // The tolerance covers f32 rounding and ε = 1e-8, relative to the smallest variance of 1e-4.
         assert!(mean.abs() < 1e-6 && (variance - 1.0).abs() < 2e-4, "{i}: {mean} {variance}");
     }
 }
@@ -151,7 +151,7 @@ fn elements_left_alone_are_not_normalised() {
     normaliser.normalise(&mut normalised).expect("rows");
     let ends = [&normalised[1..3], &normalised[4..]].concat();
     assert_eq!(ends, [5.0, -3.0, 5.0, 70.0], "not even a constant, nor beyond the clip");
-    // The square root of 1 + 10⁻⁸, in float32.
+    // The divisor is the square root of 1 + 10⁻⁸, in float32.
     assert!((normalised[0] + 1.0).abs() < 1e-6 && (normalised[3] - 1.0).abs() < 1e-6, "{normalised:?}");
     assert_eq!(normaliser.check(3, 2), Ok(()));
     assert!(normaliser.check(3, 0).is_err() && normaliser.check(2, 2).is_err());

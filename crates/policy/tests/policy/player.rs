@@ -1,4 +1,4 @@
-//! Tests of players: noise, statistics, memories.
+//! Tests of players: noise, statistics and memories.
 
 use perturb_policy::{
     ActionKind, Inputs, Normalisers, ObservationNormaliser, Player, PolicySpec, RewardNormaliser, Role, RunningMoments,
@@ -9,7 +9,7 @@ use rstest::rstest;
 const DISCRETE: ActionKind = ActionKind::Discrete { n: 2 };
 const GAMMA: f64 = 0.5;
 
-/// A player of one environment whose observations are one number.
+/// Creates a player of one environment whose observation is one number.
 fn player(episodes_per_trial: u32, with_outcomes: bool, normalisers: Normalisers, role: Role) -> Player {
     let inputs = Inputs::new(1, DISCRETE, 1, with_outcomes);
     let spec = PolicySpec { observation_size: inputs.size(), action: DISCRETE, hidden: vec![], lstm: None };
@@ -19,7 +19,7 @@ fn player(episodes_per_trial: u32, with_outcomes: bool, normalisers: Normalisers
     player
 }
 
-/// Plays step `t` of episodes with two steps each, whose observations are all 3.
+/// Plays step `t` of a series of episodes of two steps, in which every observation is 3.
 fn step(player: &mut Player, t: u64, episodes_per_trial: u32, reward: f32) {
     player.act().expect("an action");
     let episode = t / 2;
@@ -63,7 +63,7 @@ fn the_return_that_rewards_are_divided_by_runs_over(
     assert_eq!(returns, expected);
 }
 
-/// The environment always shows 3. With mean 1 and deviation 2 the policy sees N(1, 0.25²).
+/// Every observation is 3. With mean 1 and standard deviation 2 the policy's input follows N(1, 0.25²).
 #[test]
 fn only_training_sees_noise() {
     let played = |noise: f64, role: Role| {
@@ -89,7 +89,8 @@ fn only_training_sees_noise() {
     assert!(played(0.25, Role::testing(1, 0, 1)).0.iter().all(|x| (x - 1.0).abs() < 1e-4));
 }
 
-/// Plays two environments whose two observed numbers are always 3. The step limit ends both first episodes at once.
+/// Plays two environments whose observations are always (3, 3). The step limit ends both first episodes in the same
+/// step.
 #[test]
 fn final_observations_have_no_noise() {
     let played = |noise: f64| {
@@ -122,7 +123,7 @@ fn final_observations_have_no_noise() {
     assert!(values == value_of_clean && values[0] != 0.0, "{values:?}");
 }
 
-/// A saved state fixes all later noise and everything that follows from it.
+/// A saved state determines all later noise, and everything that depends on this noise.
 #[test]
 fn noise_continues_from_a_saved_state() {
     let none = || Normalisers::default();
@@ -138,8 +139,8 @@ fn noise_continues_from_a_saved_state() {
     }
 }
 
-/// Statistics stay as they are, and rewards are normalised. In contrast, the reference gives a policy of RL² raw rewards in
-/// tests.
+/// In tests, statistics are not updated and rewards are normalised. In contrast, the code of the paper's authors gives
+/// an RL² policy raw rewards in tests.
 #[test]
 fn tests_leave_statistics_unchanged() {
     // Means of 1 and variances of 4 and 100.
