@@ -1,4 +1,4 @@
-//! Arrays as safetensors.
+//! Reading and writing of arrays as safetensors files.
 
 use std::collections::HashMap;
 
@@ -6,10 +6,10 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
 use perturb_policy::{NamedArray, PolicySpec, Weights};
 
-/// The entry of a file's metadata that holds the checkpoint's JSON document.
+/// The key of the checkpoint's JSON document in the metadata of a safetensors file.
 const DOCUMENT: &str = "perturb";
 
-/// An array to be written: its elements are little-endian `bytes`.
+/// An array to be written. Its elements are in `bytes`, little-endian.
 #[derive(Clone, Debug)]
 pub struct Array {
     name: String,
@@ -19,33 +19,34 @@ pub struct Array {
 }
 
 impl Array {
-    /// Returns an array of `shape`.
+    /// Creates an array of f32 with any shape.
     pub fn f32(name: impl Into<String>, shape: Vec<usize>, data: &[f32]) -> Self {
         let bytes = data.iter().flat_map(|x| x.to_le_bytes()).collect();
         Self { name: name.into(), dtype: Dtype::F32, shape, bytes }
     }
 
-    /// Returns an array with one axis.
+    /// Creates a one-dimensional array of u64.
     pub fn u64(name: &str, data: impl ExactSizeIterator<Item = u64>) -> Self {
         let shape = vec![data.len()];
         Self { name: name.to_owned(), dtype: Dtype::U64, shape, bytes: data.flat_map(u64::to_le_bytes).collect() }
     }
 
-    /// Returns an array with one axis.
+    /// Creates a one-dimensional array of bytes.
     pub fn u8(name: &str, bytes: Vec<u8>) -> Self {
         Self { name: name.to_owned(), dtype: Dtype::U8, shape: vec![bytes.len()], bytes }
     }
 }
 
-/// A file of `arrays`.
+/// Encodes `arrays` as a safetensors file.
 ///
 /// # Errors
-/// Two arrays of one name.
+/// A description of the fault, for example two arrays with the same name.
 pub fn encode(arrays: &[Array]) -> Result<Vec<u8>, String> {
     encode_with(arrays, "format", "perturb".to_owned())
 }
 
-/// A file of `arrays` with one entry of metadata. The order of several would change from run to run.
+/// Encodes `arrays` as a safetensors file with one entry of metadata. With several entries, their order would change
+/// from run to run.
 fn encode_with(arrays: &[Array], key: &str, value: String) -> Result<Vec<u8>, String> {
     let views: Vec<(&str, TensorView<'_>)> = arrays
         .iter()
@@ -56,40 +57,42 @@ fn encode_with(arrays: &[Array], key: &str, value: String) -> Result<Vec<u8>, St
     safetensors::serialize(views, Some(metadata)).map_err(|error| error.to_string())
 }
 
-/// A file that was read.
+/// The arrays of a safetensors file.
 #[derive(Debug)]
 pub struct Arrays<'a>(SafeTensors<'a>);
 
 impl<'a> Arrays<'a> {
+    /// Parses a safetensors file.
+    ///
     /// # Errors
-    /// A description of what is wrong with the file.
+    /// A description of the fault if the file is not valid.
     pub fn decode(bytes: &'a [u8]) -> Result<Self, String> {
         SafeTensors::deserialize(bytes).map(Self).map_err(|error| error.to_string())
     }
 
-    /// The array `name` with its shape.
+    /// Returns the array called `name`, with its shape.
     ///
     /// # Errors
-    /// If it is not there, or of another type.
+    /// A description of the fault if the array is missing or has another type.
     pub fn f32(&self, name: &str) -> Result<NamedArray, String> {
         let tensor = self.get(name, Dtype::F32)?;
         let data = tensor.data().as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
         Ok(NamedArray { name: name.to_owned(), shape: tensor.shape().to_vec(), data })
     }
 
-    /// The array `name`.
+    /// Returns the elements of the array called `name`.
     ///
     /// # Errors
-    /// If it is not there, or of another type.
+    /// A description of the fault if the array is missing or has another type.
     pub fn u64(&self, name: &str) -> Result<Vec<u64>, String> {
         let tensor = self.get(name, Dtype::U64)?;
         Ok(tensor.data().as_chunks::<8>().0.iter().map(|bytes| u64::from_le_bytes(*bytes)).collect())
     }
 
-    /// The array `name`.
+    /// Returns the elements of the array called `name`.
     ///
     /// # Errors
-    /// If it is not there, or of another type.
+    /// A description of the fault if the array is missing or has another type.
     pub fn u8(&self, name: &str) -> Result<&'a [u8], String> {
         Ok(self.get(name, Dtype::U8)?.data())
     }
@@ -107,12 +110,12 @@ pub(super) fn encode_weights(weights: &Weights) -> Result<Vec<u8>, String> {
     encode(&arrays_of(weights))
 }
 
-/// A file of the weights that describes itself: its metadata hold the checkpoint's JSON document.
+/// Encodes `weights` as a safetensors file that contains the checkpoint's JSON document in its metadata.
 pub(super) fn encode_policy(weights: &Weights, document: String) -> Result<Vec<u8>, String> {
     encode_with(&arrays_of(weights), DOCUMENT, document)
 }
 
-/// Reads the document of a file that describes itself.
+/// Reads the checkpoint's JSON document from the metadata of a safetensors file.
 pub(super) fn decode_document(bytes: &[u8]) -> Result<String, String> {
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|error| error.to_string())?;
     let document = metadata.metadata().as_ref().and_then(|entries| entries.get(DOCUMENT)).cloned();

@@ -6,16 +6,17 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Counters {
-    /// Rollouts and updates.
+    /// Number of iterations; each consists of a rollout and an update.
     pub iterations: u64,
-    /// Steps of all environments together; EPOpt's are those of complete episodes.
+    /// Number of steps, summed over all environments. EPOpt counts only the steps of complete episodes.
     pub timesteps: u64,
-    /// Episodes that the budget counts: those that ended or, with EPOpt, those that it learned from.
+    /// Number of episodes that count towards the training's budget: all that ended or, with EPOpt, those that it
+    /// learned from.
     pub episodes: u64,
-    /// Episodes that ended; EPOpt generates more than it learns from.
+    /// Number of episodes that ended. EPOpt plays more episodes than it learns from.
     #[serde(default)]
     pub generated_episodes: u64,
-    /// Steps that were learned from.
+    /// Number of steps that were learned from.
     #[serde(default)]
     pub learned_timesteps: u64,
 }

@@ -1,4 +1,4 @@
-//! The part of an environment that a checkpoint stores.
+//! The properties of an environment that a checkpoint stores.
 
 use std::fmt;
 
@@ -7,37 +7,38 @@ use perturb_protocol::disturbance::is_disturbance;
 use perturb_protocol::proto;
 use serde::{Deserialize, Serialize};
 
-/// The properties of an environment that a policy depends on.
+/// The properties of an environment on which a policy depends.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EnvironmentSummary {
-    /// Raised by every change of dynamics, reward or observation.
+    /// The environment's revision, which every change of dynamics, reward or observation increases.
     pub revision: u32,
-    /// An episode is truncated after this many steps.
+    /// The number of steps after which an episode is truncated.
     pub step_limit: u32,
-    /// Names of the entries of an observation.
+    /// The names of an observation's elements.
     pub observation: Vec<String>,
-    /// The actions.
+    /// The kind and the number of actions.
     pub action: ActionKind,
-    /// Names of the parameters.
+    /// The names of the parameters. If the training used disturbances, they are at the end.
     pub parameters: Vec<String>,
-    /// Names of the quantities that receipts read back; empty in checkpoints of programs that did not keep them.
+    /// The names of the quantities that the server reads back from the physics. Empty in checkpoints of older programs,
+    /// which did not store them.
     #[serde(default)]
     pub applied: Vec<String>,
-    /// SHA-256 of the model; empty without one.
+    /// SHA-256 of the environment's model (MJCF text); empty if it has no model.
     pub model_hash: String,
 }
 
-/// The name of the property that is the hash of a model.
+/// The name of the property `model_hash` in error messages.
 const MODEL: &str = "model";
 
-/// Returns how to mend a difference in the property `what`, as the beginning of a sentence's last part; empty unless the files
-/// of a task's folder may have changed.
+/// Returns a remedy for a difference in the property `what`, as the beginning of the last part of an error message. It
+/// is empty unless the model differs, because then the files of a task's folder may have changed.
 pub fn task_remedy(what: &str) -> &'static str {
     if what == MODEL { "if the task is a folder, serve its original files; otherwise " } else { "" }
 }
 
-/// An environment is no longer what a policy was trained in.
+/// The error if a served environment differs from the one in which a policy was trained.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "the checkpoint was trained in {environment} with {what} {trained}, but the server has {served}: {}test with the version \
@@ -45,18 +46,18 @@ pub fn task_remedy(what: &str) -> &'static str {
     task_remedy(what)
 )]
 pub struct Changed {
-    /// The environment.
+    /// The name of the environment.
     pub environment: String,
     /// The name of the property that differs.
     pub what: &'static str,
-    /// In training.
+    /// The property's value in training.
     pub trained: String,
-    /// On the server.
+    /// The property's value on the server.
     pub served: String,
 }
 
 impl EnvironmentSummary {
-    /// Returns the summary of an environment; `None` if its action space is not given.
+    /// Returns the properties of an environment, or `None` if its action space is missing.
     pub fn from_environment(environment: &proto::Environment) -> Option<Self> {
         let action = match environment.action.as_ref()?.kind.as_ref()? {
             proto::action_space::Kind::Discrete(discrete) => ActionKind::Discrete { n: discrete.names.len() },
@@ -74,13 +75,14 @@ impl EnvironmentSummary {
         })
     }
 
-    /// The parameters that are no disturbances.
+    /// Returns the names of the parameters that are not disturbances.
     fn own_parameters(&self) -> Vec<&str> {
         self.parameters.iter().map(String::as_str).filter(|name| !is_disturbance(name)).collect()
     }
 
-    /// The first part in which `served` is not what this says, with both values; `None` if they are equal. Disturbances are
-    /// not compared: they are no part of the environment, and observations tell whether a policy sees them.
+    /// Returns the first property that differs in `served`, with the values of both. Returns `None` if all are equal.
+    /// Disturbances are not compared, because they are not part of the environment; if a policy observes them, the
+    /// observations differ.
     pub fn difference(&self, served: &Self) -> Option<(&'static str, String, String)> {
         let both = |what, trained: &dyn fmt::Debug, served: &dyn fmt::Debug| {
             Some((what, format!("{trained:?}"), format!("{served:?}")))

@@ -1,4 +1,5 @@
-//! The files of a checkpoint: written whole or not at all, read only if they are what was written.
+//! The files of arrays in a checkpoint. They are written atomically, and their checksums are compared when they are
+//! read.
 
 use std::fs::File;
 use std::io::Read;
@@ -11,7 +12,7 @@ use super::{CheckpointError, Result};
 
 const ARRAYS_SUFFIX: &str = ".safetensors";
 
-/// Names a file of arrays and says how to tell whether it is whole.
+/// The entry for a file of arrays in `checkpoint.json`: its name, its length and its checksum.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ArraysFile {
     pub(super) file: String,
@@ -20,46 +21,46 @@ pub struct ArraysFile {
 }
 
 impl ArraysFile {
-    /// Writes `content` to a file with a unique name, which begins with `prefix`: [`RESUME_PREFIX`](super::RESUME_PREFIX) or
-    /// the prefix of weights.
+    /// Writes `content` to a file in `directory` and returns its entry. The file's name is unique and begins with
+    /// `prefix`, which is [`RESUME_PREFIX`](super::RESUME_PREFIX) or the prefix of weights.
     ///
     /// # Errors
-    /// The operating system's.
+    /// An error of the operating system.
     pub fn write(directory: &Path, prefix: &str, iterations: u64, content: &[u8]) -> Result<Self> {
         let file = Self::describe(prefix, iterations, content);
         write_atomically(&directory.join(&file.file), content)?;
         Ok(file)
     }
 
-    /// Describes `content` as [`ArraysFile::write`] does, without writing it.
+    /// Returns the entry that [`ArraysFile::write`] would return for `content`, without writing a file.
     pub(super) fn describe(prefix: &str, iterations: u64, content: &[u8]) -> Self {
         let crc32c = crc32c::crc32c(content);
-        // The checksum is part of the name: a file that is in use is never written over by another content.
+        // The name contains the checksum, so a file in use is never overwritten by other content.
         let file = format!("{prefix}{iterations:08}-{crc32c:08x}{ARRAYS_SUFFIX}");
         Self { file, bytes: content.len() as u64, crc32c }
     }
 
-    /// Returns the file's path. The file is always in `directory`, whatever folder its name has.
+    /// Returns the path of the file in `directory`. Ignores any folder in the stored name.
     pub fn path(&self, directory: &Path) -> PathBuf {
         directory.join(Path::new(&self.file).file_name().unwrap_or_default())
     }
 
-    /// Makes sure that the file is there, is a plain file, and has the length that was written.
+    /// Checks that the file exists, is a regular file and has the right length.
     ///
     /// # Errors
-    /// [`CheckpointError`].
+    /// [`CheckpointError`] if it does not.
     pub(super) fn require(&self, directory: &Path) -> Result<()> {
         self.open(directory).map(drop)
     }
 
-    /// Reads the file and checks its length, before anything is read, and its checksum.
+    /// Reads the file. Checks its length before reading, and its checksum afterwards.
     ///
     /// # Errors
-    /// [`CheckpointError`], also if the checksum does not match.
+    /// [`CheckpointError`] if the file cannot be read, or if its length or checksum is wrong.
     pub fn read(&self, directory: &Path) -> Result<Vec<u8>> {
         let path = self.path(directory);
         let mut content = Vec::new();
-        let mut file = self.open(directory)?.take(self.bytes.saturating_add(1)); // it may grow meanwhile
+        let mut file = self.open(directory)?.take(self.bytes.saturating_add(1)); // another process may append to it meanwhile
         file.read_to_end(&mut content).map_err(files::io("read", &path))?;
         self.require_content(&content).map_err(|reason| damaged(&path, reason))?;
         Ok(content)
@@ -76,7 +77,7 @@ impl ArraysFile {
         }
     }
 
-    /// Checks length and checksum of `content`.
+    /// Checks the length and the checksum of `content`.
     ///
     /// # Errors
     /// A description of the difference.
@@ -90,7 +91,8 @@ impl ArraysFile {
     }
 }
 
-/// Deletes files of arrays, beginning with one of `prefixes`, that are not `current`, and what broken-off writes left.
+/// Deletes the files of arrays that begin with one of `prefixes` and are not in `current`. Also deletes temporary files
+/// of interrupted writes.
 pub(super) fn remove_others(directory: &Path, prefixes: &[&str], current: &[&str]) -> files::Result<()> {
     for path in files::list(directory)? {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -102,7 +104,7 @@ pub(super) fn remove_others(directory: &Path, prefixes: &[&str], current: &[&str
     Ok(())
 }
 
-/// Names the file that `reason` makes unusable.
+/// Returns the error that the file at `path` is unusable because of `reason`.
 pub fn damaged(path: &Path, reason: String) -> CheckpointError {
     CheckpointError::Damaged { path: path.to_owned(), reason }
 }

@@ -1,12 +1,13 @@
-//! Checkpoints: a directory with `checkpoint.json` and the files of arrays that it names, the policy's weights and what
-//! the training needs to go on, which only the learner understands.
+//! Checkpoints of trainings. A checkpoint is a directory with `checkpoint.json` and the files of arrays that it names.
+//! The arrays are the policy's weights, and the state from which the training can resume, which only the learner
+//! interprets.
 //!
-//! Writing is atomic: the arrays get new names first, then `checkpoint.json`, which names them with their sizes and
-//! checksums, is renamed into place, and only then the old arrays are deleted. Whatever moment the program or the
-//! machine dies at, the directory holds a complete checkpoint, the old one or the new one.
+//! Writing is atomic. First the arrays are written to files with new names. Then `checkpoint.json`, which contains
+//! their names, sizes and checksums, is renamed into place. Finally the old arrays are deleted. If the program or the
+//! machine stops at any moment, the directory holds a complete checkpoint, either the old or the new one.
 //!
-//! A policy that is only to be tested may also be one file: its weights as safetensors, with the same JSON document in
-//! the file's metadata.
+//! A policy that only has to be tested may also be a single file: its weights as safetensors, with the same JSON
+//! document in the file's metadata.
 #![forbid(unsafe_code)]
 
 mod arrays;
@@ -34,78 +35,78 @@ use self::files::remove_others;
 pub use self::files::{ArraysFile, damaged};
 pub use self::named::find as find_policy;
 
-/// Format of the JSON document; raised when older programs could misread it. Format 1 also stores what follows from the
-/// configuration. Formats 1 and 2 have no checksum.
+/// Format version of the JSON document. Increase it when older programs could misread the document. Format 1 also
+/// stores values that follow from the configuration. Formats 1 and 2 have no checksum.
 const FORMAT_VERSION: u32 = 3;
-/// The first format with a checksum.
+/// The first format version with a checksum.
 const SEALED: u32 = 3;
-/// Maximum number of times that a checkpoint is read while a training replaces it again and again.
+/// Maximum number of attempts to read a checkpoint, in case a training replaces it during each attempt.
 const MAX_LOOKS: u32 = 20;
-/// The file that makes a directory a checkpoint.
+/// The name of the JSON document; a directory that contains it is a checkpoint.
 pub const JSON: &str = "checkpoint.json";
 const WEIGHTS_PREFIX: &str = "weights-";
-/// Begins the names of files of what resuming needs.
+/// The prefix of the files of arrays from which a training resumes.
 pub const RESUME_PREFIX: &str = "resume-";
 
-/// A trained policy with everything that testing needs.
+/// A trained policy with everything that a test needs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Checkpoint {
-    /// Everything but the weights.
+    /// The checkpoint's data other than the weights.
     pub state: State,
-    /// The shape of the policy. If the policy was trained by perturb, it is that of [`State::policy`].
+    /// The shape of the policy's networks. For a policy trained by perturb it equals [`State::policy`].
     pub policy: PolicySpec,
     /// The policy's weights, in the order of [`PolicySpec::layout`].
     pub weights: Weights,
 }
 
-/// Everything in a checkpoint but the weights.
+/// The data of a checkpoint other than the weights.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct State {
-    /// The environment at the time of training.
+    /// The environment's properties at the time of the training.
     pub environment_spec: EnvironmentSummary,
-    /// The statistics of observations; `None` if they were not normalised.
+    /// The normaliser of observations with its statistics; `None` if they are not normalised.
     pub observation_normaliser: Option<ObservationNormaliser>,
-    /// The statistics of rewards; `None` if they were not normalised.
+    /// The normaliser of rewards with its statistics; `None` if they are not normalised.
     pub reward_normaliser: Option<RewardNormaliser>,
     /// The progress of the training.
     pub counters: Counters,
-    /// The training's configuration, flat, as in `config.toml`.
+    /// The configuration of the training, as a flat table like `config.toml`.
     pub config: TrainConfig,
-    /// The programs that trained, each with its commit, in order and without repetitions; empty in checkpoints of
-    /// earlier programs, which did not say.
+    /// The versions of the programs that trained the policy, each with its commit, in order and without repetitions.
+    /// Empty in checkpoints of older programs, which did not store them.
     #[serde(default)]
     pub commits: Vec<String>,
 }
 
-/// The state of a training in addition to its policy, from which it resumes.
+/// The state from which a training resumes, in addition to its policy.
 #[derive(Clone, Debug)]
 pub struct Resume {
-    /// The file of arrays, whose name begins with [`RESUME_PREFIX`].
+    /// The entry of the file with the state's arrays, whose name begins with [`RESUME_PREFIX`].
     pub arrays: ArraysFile,
-    /// The entry in `checkpoint.json`.
+    /// The entry `resume` of `checkpoint.json`.
     pub document: serde_json::Value,
 }
 
-/// `checkpoint.json`.
+/// The content of `checkpoint.json`.
 #[derive(Serialize, Deserialize)]
 struct CheckpointDocument {
     format_version: u32,
     weights: ArraysFile,
-    /// The state of the training. Tests do not read it.
+    /// The state from which the training resumes. Tests do not read it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     resume: Option<serde_json::Value>,
     #[serde(flatten)]
     rest: serde_json::Value,
 }
 
-/// Why a checkpoint cannot be written or read.
+/// A failure to read or write a checkpoint.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CheckpointError {
-    /// The operating system refused a file.
+    /// The operating system could not read or write a file.
     #[error(transparent)]
     File(#[from] FileError),
-    /// There is no checkpoint.
+    /// The path contains no checkpoint.
     #[error(
         "{} holds no checkpoint: expected checkpoint.json there or in its folder checkpoint/; give the --out of a \
          training, or the name of a policy in results/",
@@ -115,7 +116,7 @@ pub enum CheckpointError {
         /// The given path.
         path: PathBuf,
     },
-    /// A name is the beginning of several.
+    /// The name is not unique: several policies begin with it or resemble it.
     #[error("`{name}` could be any of these policies in {}, give the name or the path of one: {}", folder.display(), names.join(", "))]
     Several {
         /// The given name.
@@ -128,44 +129,44 @@ pub enum CheckpointError {
     /// A file is damaged.
     #[error("{} is not a usable checkpoint: {reason}", path.display())]
     Damaged {
-        /// The file.
+        /// The path of the file.
         path: PathBuf,
-        /// The fault.
+        /// A description of the fault.
         reason: String,
     },
-    /// The file has an unknown format, probably that of a newer program, which can read it.
+    /// The file has an unknown format, probably of a newer program.
     #[error(
         "{} has format {format}, and this program reads 1 to {FORMAT_VERSION}: use the version of perturb that wrote it, or \
          an undamaged copy",
         path.display()
     )]
     Newer {
-        /// The file.
+        /// The path of the file.
         path: PathBuf,
         /// The format of the file.
         format: u64,
     },
-    /// There is a policy, but not the state of its training.
+    /// The checkpoint contains the policy, but not the state from which its training could resume.
     #[error(
         "the checkpoint in {} can be tested but not resumed: it holds the policy without the state of its training, as \
          those of earlier versions of perturb; train again with --overwrite",
         path.display()
     )]
     NotResumable {
-        /// The directory.
+        /// The directory of the checkpoint.
         path: PathBuf,
     },
 }
 
-/// A result with a [`CheckpointError`].
+/// A result with [`CheckpointError`] as its error.
 pub type Result<T> = std::result::Result<T, CheckpointError>;
 
 impl Checkpoint {
-    /// Replaces the checkpoint in `directory`, which is created if it is not there. Without `resume` it can be tested,
-    /// but its training cannot be resumed.
+    /// Writes the checkpoint to `directory`, which is created if needed, and replaces an earlier checkpoint. Without
+    /// `resume`, the policy can be tested, but its training cannot be resumed.
     ///
     /// # Errors
-    /// [`CheckpointError::File`]; the earlier checkpoint, if any, is then still there.
+    /// [`CheckpointError::File`] if a file cannot be written. An earlier checkpoint then still exists.
     pub fn save(&self, directory: &Path, resume: Option<Resume>) -> Result<()> {
         let iterations = self.state.counters.iterations;
         let (resume_file, resume) = resume.map(|Resume { arrays, document }| (arrays.file, document)).unzip();
@@ -187,12 +188,12 @@ impl Checkpoint {
         Ok(remove_others(directory, &[WEIGHTS_PREFIX, RESUME_PREFIX], &current)?)
     }
 
-    /// Reads the checkpoint in `path`, in its folder `checkpoint`, or in the file `path`. If there is none, reads the
-    /// checkpoint of the cell whose id is `path`, or the only one that begins with `path`, below `results/` or the folder
-    /// in the variable `PERTURB_RESULTS`.
+    /// Reads a checkpoint. `path` may be its directory, the directory above the folder `checkpoint`, or a policy file.
+    /// Otherwise `path` is taken as the id of a cell, or as the beginning of exactly one id. Cells are searched below
+    /// `results/`, or below the folder in the environment variable `PERTURB_RESULTS`.
     ///
     /// # Errors
-    /// [`CheckpointError`], which names the file.
+    /// [`CheckpointError`] with the path of the file.
     pub fn load(path: &Path) -> Result<Self> {
         let named = named::find(path)?;
         let path = named.as_deref().unwrap_or(path);
@@ -202,11 +203,11 @@ impl Checkpoint {
         CheckpointDocument::read_with(path, Self::from_document)
     }
 
-    /// Reads the checkpoint in `path`, or in its folder `checkpoint`. Returns also the folder in which it was found, and
-    /// the document of its training's state.
+    /// Reads a checkpoint to resume its training. `path` is its directory, or the directory above the folder
+    /// `checkpoint`. Returns the checkpoint, its directory, and the entry `resume` of `checkpoint.json`.
     ///
     /// # Errors
-    /// [`CheckpointError`], which names the file.
+    /// [`CheckpointError`] with the path of the file.
     pub fn load_resumable(path: &Path) -> Result<(Self, PathBuf, serde_json::Value)> {
         CheckpointDocument::read_with(path, |directory, mut document| {
             let resume = document.resume.take();
@@ -216,7 +217,7 @@ impl Checkpoint {
         })
     }
 
-    /// Reads the policy that `document` in `directory` describes.
+    /// Reads the policy that the `document` in `directory` describes.
     fn from_document(directory: &Path, document: CheckpointDocument) -> Result<Self> {
         let state = State::from_document(directory, document.rest)?;
         let policy = state.policy();
@@ -226,26 +227,27 @@ impl Checkpoint {
         Ok(Self { state, policy, weights })
     }
 
-    /// Names the policy: the iterations of its training, and a checksum of its weights. Weights of equal trainings have
-    /// the same name.
+    /// Returns the id of the policy: the number of iterations of its training, and a checksum of its weights. Policies
+    /// with equal weights after the same number of iterations have the same id.
     ///
     /// # Errors
-    /// A description of what is wrong with the weights.
+    /// A description of the fault if the weights cannot be encoded.
     pub fn id(&self) -> std::result::Result<String, String> {
         let weights = encode_weights(&self.weights)?;
         Ok(format!("{:08}-{:08x}", self.state.counters.iterations, crc32c::crc32c(&weights)))
     }
 
-    /// The weights one after the other, in the order of [`PolicySpec::layout`].
+    /// Returns all weights as one array, in the order of [`PolicySpec::layout`].
     pub fn flat_weights(&self) -> Vec<f32> {
         self.weights.iter().flat_map(|array| array.data.iter().copied()).collect()
     }
 
-    /// The policy as it plays in tests, with sampled actions and frozen statistics, in N = `n_envs` environments whose
-    /// indices are `first_environment_index` and so on. `seed` fixes the actions.
+    /// Creates a player that tests the policy, with sampled actions and frozen statistics, in N = `n_envs`
+    /// environments. Their environment indices are successive numbers from `first_environment_index`. `seed` determines
+    /// the actions.
     ///
     /// # Errors
-    /// Weights that do not fit.
+    /// An error if the weights do not fit the policy.
     pub fn player(&self, n_envs: usize, seed: u64, first_environment_index: u32) -> perturb_policy::Result<Player> {
         let Self { state, policy, weights } = self;
         let normalisers = Normalisers {
@@ -265,11 +267,11 @@ impl Checkpoint {
 }
 
 impl State {
-    /// Reads the state of the checkpoint in `path`, or in its folder `checkpoint`. Does not read the weights, but checks
-    /// that they are there.
+    /// Reads the state of a checkpoint without its weights, but checks that the file of weights exists. `path` is the
+    /// checkpoint's directory, or the directory above the folder `checkpoint`.
     ///
     /// # Errors
-    /// [`CheckpointError`], which names the file.
+    /// [`CheckpointError`] with the path of the file.
     pub fn load(path: &Path) -> Result<Self> {
         CheckpointDocument::read_with(path, |directory, document| {
             let state = Self::from_document(directory, document.rest)?;
@@ -278,7 +280,7 @@ impl State {
         })
     }
 
-    /// Reads the state from the document of `checkpoint.json` in `directory`.
+    /// Parses the state from the `document` of `checkpoint.json` in `directory`.
     fn from_document(directory: &Path, document: serde_json::Value) -> Result<Self> {
         let json = directory.join(JSON);
         let state: Self = serde_json::from_value(document)
@@ -287,7 +289,7 @@ impl State {
         Ok(state)
     }
 
-    /// Whether the statistics are those that the configuration asks for; says what is wrong if they are not.
+    /// Checks that the normalisers fit the configuration and the environment. The error describes the fault.
     fn check(&self) -> std::result::Result<(), String> {
         let (common, gamma) = (&self.config.common, self.config.settings.gamma());
         let observations = match &self.observation_normaliser {
@@ -306,10 +308,10 @@ impl State {
         rewards.map_err(|reason| format!("reward_normaliser: {reason}"))
     }
 
-    /// Whether `served` is the environment that this was trained in.
+    /// Checks that `served` is the environment in which the policy was trained.
     ///
     /// # Errors
-    /// [`Changed`], with the first difference.
+    /// [`Changed`] with the first difference.
     pub fn check_unchanged(&self, served: &proto::Environment) -> std::result::Result<(), Changed> {
         let trained = &self.environment_spec;
         let (what, trained, served) = match EnvironmentSummary::from_environment(served) {
@@ -322,20 +324,20 @@ impl State {
         Err(Changed { environment: self.config.common.environment.clone(), what, trained, served })
     }
 
-    /// Returns the number of parameters at the end of an observation.
+    /// Returns the number of elements at the end of an observation that are parameters.
     fn parameters_seen(&self) -> usize {
         if self.config.common.observe.sees_parameters() { self.environment_spec.parameters.len() } else { 0 }
     }
 
-    /// Returns a new normaliser of observations, if they are normalised. Observed parameters are not normalised, since
-    /// they are scaled already.
+    /// Creates a normaliser of observations without statistics, or returns `None` if observations are not normalised.
+    /// Observed parameters are not normalised, because they are scaled already.
     pub fn fresh_normaliser(&self) -> Option<ObservationNormaliser> {
         let (size, parameters) = (self.environment_spec.observation.len(), self.parameters_seen());
         let fresh = || ObservationNormaliser::new(size.saturating_sub(parameters)).leaving_alone(parameters);
         self.config.common.normalize_observations.then(fresh)
     }
 
-    /// The shape of a policy that this was trained with.
+    /// Returns the shape of the policy that a training with this configuration has.
     pub fn policy(&self) -> PolicySpec {
         if self.config.settings.is_random() {
             let observation_size = self.inputs(1).size();
@@ -353,7 +355,7 @@ impl State {
         shape(self.inputs(1).size(), self.environment_spec.action)
     }
 
-    /// Returns the policy's inputs for `n_envs` environments at the start of a trial.
+    /// Creates the policy's inputs for `n_envs` environments at the start of a trial.
     pub fn inputs(&self, n_envs: usize) -> Inputs {
         let EnvironmentSummary { observation, action, .. } = &self.environment_spec;
         Inputs::new(observation.len(), *action, n_envs, self.config.settings.has_trials())
@@ -361,8 +363,8 @@ impl State {
 }
 
 impl CheckpointDocument {
-    /// Reads the document with [`CheckpointDocument::read`] and passes it to `take`. A training may have replaced the
-    /// checkpoint meanwhile and deleted the arrays that this document names. Then reads the new one.
+    /// Reads `checkpoint.json` and passes it to `take`, which reads the files that the document names. If these files
+    /// are missing, because a training has replaced the checkpoint in the meantime, reads the new checkpoint.
     fn read_with<T>(path: &Path, mut take: impl FnMut(&Path, Self) -> Result<T>) -> Result<T> {
         let mut last = String::new();
         for _ in 1..MAX_LOOKS {
@@ -379,7 +381,8 @@ impl CheckpointDocument {
         take(&directory, document)
     }
 
-    /// Reads `checkpoint.json` in `path`, or in its folder `checkpoint`. Returns also the folder in which it was found.
+    /// Reads `checkpoint.json` in the directory `path`, or in its folder `checkpoint`. Also returns the directory in
+    /// which the file was found.
     fn read(path: &Path) -> Result<(PathBuf, Self)> {
         let directory = match has_file(&path.join(JSON))? {
             true => path.to_owned(),
@@ -391,12 +394,12 @@ impl CheckpointDocument {
         Ok((directory, Self::parse(&json, &text)?))
     }
 
-    /// Reads the `text` of the file `path`.
+    /// Parses the `text` of the file at `path`, and checks its format and checksum.
     fn parse(path: &Path, text: &[u8]) -> Result<Self> {
         let not_understood = |error: serde_json::Error| damaged(path, format!("it is not understood: {error}"));
         let mut value: serde_json::Value = serde_json::from_slice(text).map_err(not_understood)?;
         let sealed = checksum::open(&mut value);
-        // Another format may have other entries.
+        // The format is checked first, because documents of other formats may have other entries.
         let format = value.get("format_version").and_then(serde_json::Value::as_u64);
         if let Some(format) = format.filter(|format| !(1..=u64::from(FORMAT_VERSION)).contains(format)) {
             return Err(CheckpointError::Newer { path: path.to_owned(), format });

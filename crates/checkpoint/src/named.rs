@@ -1,5 +1,5 @@
-//! Finds policies by name, or by the folder of their cell: files in folders `policies` below `results/`, and cells below
-//! `results/` whose trainings were kept.
+//! Finds policies by name, or by the folder of their cell. It searches policy files in folders called `policies` below
+//! `results/`, and cells below `results/` whose trainings were kept.
 
 use std::path::{Component, Path, PathBuf};
 
@@ -9,23 +9,23 @@ use perturb_protocol::names;
 use super::single_file::{SUFFIX, is_policy};
 use super::{CheckpointError, JSON, Result};
 
-/// The folder of the policies, unless [`VARIABLE`] is set.
+/// The folder that is searched, unless the environment variable [`VARIABLE`] is set.
 const FOLDER: &str = "results";
 const VARIABLE: &str = "PERTURB_RESULTS";
-/// The folder of policy files.
+/// The name of folders with policy files.
 const POLICIES: &str = "policies";
-/// Maximal number of folders between the folder of the policies and `cells`.
+/// Maximal depth of folders called `cells` below the folder that is searched.
 const DEPTH: usize = 3;
-/// Maximum difference in length between a name and a suggestion.
+/// Maximum difference in length between a name and a suggested id, in characters.
 const MAX_LENGTH_DIFFERENCE: usize = 3;
 
-/// Finds the checkpoint that `path` stands for, if `path` holds none itself. `path` may be the folder of a cell or a
-/// policy file, also relative to `results/`, or the id of a cell, or a unique beginning of an id. Upper and lower case are
-/// equal.
+/// Finds the checkpoint that `path` refers to, if `path` is not a checkpoint itself. `path` may be the folder of a cell
+/// or a policy file, also relative to `results/`. It may also be the id of a cell, or the unique beginning of an id.
+/// Upper and lower case are not distinguished.
 ///
 /// # Errors
-/// [`CheckpointError::Several`] with the cells whose ids begin with the name or, if there is none, with the cells whose ids
-/// are similar.
+/// [`CheckpointError::Several`] with the cells whose ids begin with the name or, if there are none, whose ids resemble
+/// it.
 pub fn find(path: &Path) -> Result<Option<PathBuf>> {
     let folder = std::env::var_os(VARIABLE).filter(|folder| !folder.is_empty());
     let found = find_below(&folder.map_or_else(|| FOLDER.into(), PathBuf::from), path);
@@ -61,8 +61,8 @@ fn find_below(folder: &Path, path: &Path) -> Result<Option<PathBuf>> {
     let mut meant = of(&begins);
     if meant.is_empty() {
         let nearest = names::closest(name, all.iter().map(|kept| kept.id.as_str()));
-        // Ids have similar beginnings, so that a missing folder such as `hopper_run` resembles one. A misspelled id has
-        // about the length of the id.
+        // Ids have similar beginnings, so the name of a missing folder such as `hopper_run` resembles an id. A
+        // suggestion must also have about the same length, as a misspelled id does.
         meant = of(&|id| nearest == Some(id) && id.len().abs_diff(name.len()) <= MAX_LENGTH_DIFFERENCE);
     }
     if meant.is_empty() {
@@ -73,20 +73,20 @@ fn find_below(folder: &Path, path: &Path) -> Result<Option<PathBuf>> {
     Err(CheckpointError::Several { name: name.to_owned(), folder: folder.to_owned(), names })
 }
 
-/// Whether a path is one that a checkpoint is read from.
+/// Returns whether a checkpoint can be read from `path`.
 fn holds_checkpoint(path: &Path) -> Result<bool> {
     Ok(is_policy(path)? || has_file(&path.join(JSON))? || has_file(&path.join("checkpoint").join(JSON))?)
 }
 
-/// A policy that was found.
+/// A policy that the search found.
 struct StoredPolicy {
     id: String,
-    /// The folder of its cell, or its file.
+    /// The folder of the cell that trained it, or the policy file.
     cell: PathBuf,
     checkpoint: PathBuf,
 }
 
-/// Adds the policies in the order of their paths. Skips folders that cannot be listed.
+/// Adds all policies below `folder` to `found`, in the order of their paths. Skips folders that cannot be listed.
 fn collect(folder: &Path, depth: usize, found: &mut Vec<StoredPolicy>) {
     let kept = |cell: PathBuf| {
         let id = cell.file_name()?.to_str()?.to_owned();

@@ -1,4 +1,4 @@
-//! A policy in one file: its weights, with the checkpoint's JSON document in the metadata.
+//! A policy in one file: the weights, with the checkpoint's JSON document in the metadata.
 
 use std::path::Path;
 
@@ -10,20 +10,19 @@ use super::{
     decode_document, decode_weights, encode_policy, encode_weights,
 };
 
-/// The ending of policy files.
+/// The extension of policy files.
 pub(crate) const SUFFIX: &str = "safetensors";
 
-/// Whether `path` names a policy file that exists.
+/// Returns whether `path` is an existing policy file.
 pub(crate) fn is_policy(path: &Path) -> Result<bool> {
     Ok(path.extension().is_some_and(|ending| ending == SUFFIX) && has_file(path)?)
 }
 
 impl Checkpoint {
-    /// Writes the policy to the file `path`, complete or not at all. It can be tested, but its training cannot be
-    /// resumed.
+    /// Writes the policy to the file `path` atomically. The policy can be tested, but its training cannot be resumed.
     ///
     /// # Errors
-    /// [`CheckpointError`](super::CheckpointError).
+    /// [`CheckpointError`](super::CheckpointError) if the file cannot be written.
     pub fn save_file(&self, path: &Path) -> Result<()> {
         let not_written = |reason: String| damaged(path, reason);
         let weights = encode_weights(&self.weights).map_err(not_written)?;
@@ -40,10 +39,10 @@ impl Checkpoint {
         Ok(write_atomically(path, &content)?)
     }
 
-    /// Reads the policy in the file `path`.
+    /// Reads the policy from the file `path`.
     ///
     /// # Errors
-    /// [`CheckpointError`](super::CheckpointError), also if the checksum does not match.
+    /// [`CheckpointError`](super::CheckpointError) if the file cannot be read, or if a checksum is wrong.
     pub(crate) fn load_file(path: &Path) -> Result<Self> {
         let content = files::read(path)?;
         let text = decode_document(&content).map_err(|reason| damaged(path, reason))?;

@@ -9,7 +9,7 @@ use rand::Rng;
 use super::*;
 
 fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
-    // Odd seeds feed-forward, even ones recurrent.
+    // Odd seeds give a feed-forward policy, even seeds a recurrent one.
     let architecture = if seed.is_multiple_of(2) { "rc" } else { "ff" };
     let mut normaliser = ObservationNormaliser::new(3);
     normaliser.update(&[0.1, 1e-7, -3.0, 0.3, 2e-7, 5.0]).unwrap();
@@ -41,7 +41,7 @@ fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
     Checkpoint { state, policy, weights }
 }
 
-/// The policies that the repository has, which the learner wrote.
+/// Returns the policy files of the repository, which the learner wrote.
 fn shipped() -> impl Iterator<Item = PathBuf> {
     let policies = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../results/policies");
     files::list(&policies).unwrap().into_iter()
@@ -54,7 +54,7 @@ fn shipped_policies_are_read_and_saved_under_their_names() {
         let policy = Checkpoint::load(&path).unwrap();
         let folder = tempfile::tempdir().unwrap();
         policy.save(folder.path(), None).unwrap();
-        // The name of the weights' file holds the checksum of the weights.
+        // The name of the file of weights contains the weights' checksum.
         let weights = format!("weights-{}.safetensors", policy.id().unwrap());
         assert!(folder.path().join(&weights).is_file(), "{weights}");
         let copy = folder.path().join("copy.safetensors");
@@ -142,7 +142,7 @@ fn damage_is_named() {
     let replaced = |from: &'static str, to: &'static str| {
         move |text: String, _| {
             assert!(text.contains(from), "{from}");
-            // A document with another content and the checksum of that content.
+            // Writes changed content with its correct checksum.
             let mut document = serde_json::from_str(&text.replacen(from, to, 1)).unwrap();
             checksum::open(&mut document).unwrap_err();
             serde_json::to_vec_pretty(&WithChecksum::new(&document).unwrap()).unwrap()
@@ -157,7 +157,7 @@ fn damage_is_named() {
     assert!(spoil("checkpoint", &|_, bytes| bytes[..bytes.len() / 2].to_vec()).contains("not understood"));
     let later = replaced("\"format_version\": 3", "\"format_version\": 9");
     assert!(spoil("checkpoint", &later).contains("has format 9, and this program reads 1 to 3"));
-    // Another architecture has other weights, whatever their checksum.
+    // The weights do not fit another architecture, even if their checksum is correct.
     let other = replaced("\"architecture\": \"ff\"", "\"architecture\": \"rc\"");
     let message = spoil("checkpoint", &other);
     assert!(message.contains("arrays, expected"), "{message}");
@@ -165,7 +165,7 @@ fn damage_is_named() {
     assert!(spoil("checkpoint", &statistics).contains("observation_normaliser: there is none"));
 }
 
-/// The JSON holds the statistics, for instance, which are in no other file.
+/// The JSON document must be protected too: for instance, the normalisers' statistics are in no other file.
 #[test]
 fn no_byte_of_the_json_changes_a_checkpoint_unnoticed() {
     let directory = tempfile::tempdir().unwrap();
@@ -179,14 +179,14 @@ fn no_byte_of_the_json_changes_a_checkpoint_unnoticed() {
         other[at] ^= 1;
         fs::write(&path, other).unwrap();
         match Checkpoint::load(directory.path()) {
-            // The changes are a space, and a last digit that rounds to the same number.
+            // Accepted changes are a space, and a last digit that rounds to the same number.
             Ok(loaded) => assert!(loaded == saved, "byte {at}, {:?}", text[at] as char),
             Err(_) => refused += 1,
         }
     }
     assert!(refused > text.len() / 2, "{refused} of {}", text.len());
 
-    // A missing checksum is refused, too, and so is an earlier format beside a checksum.
+    // A missing checksum is an error, and so is an earlier format with a checksum.
     let mut document: serde_json::Value = serde_json::from_slice(&text).unwrap();
     document["format_version"] = 2.into();
     fs::write(&path, document.to_string()).unwrap();

@@ -1,22 +1,23 @@
-//! Checksums of files. With them a changed byte is an error, and never leads to another result.
+//! Checksums of files. They turn a changed byte into an error, instead of a different result.
 //!
-//! A JSON document has the entry `crc32c`: CRC-32C of the rest of the document as compact JSON with sorted names, so that
-//! spaces and order do not matter. Any other file holds `perturb.crc32c=` with eight hexadecimal digits: CRC-32C of the
-//! bytes before and behind it. Files of earlier programs have neither, and are read without a check.
+//! In a JSON document, the entry `crc32c` is the CRC-32C of the rest of the document, as compact JSON with sorted keys.
+//! So spaces and the order of entries do not matter. Any other file contains `perturb.crc32c=` followed by eight
+//! hexadecimal digits: the CRC-32C of all bytes before and after this text. Files of earlier programs have no checksum,
+//! and are read without a check.
 
 use serde::Serialize;
 use serde_json::Value;
 
-/// The entry that holds the checksum.
+/// The key of the checksum in a JSON document.
 const ENTRY: &str = "crc32c";
-/// Comes before a file's checksum.
+/// The text before the checksum in other files.
 const MARK: &[u8] = b"perturb.crc32c=";
-/// Digits of a file's checksum.
+/// The number of hexadecimal digits of the checksum in other files.
 const DIGITS: usize = 8;
-/// The error for a document with a wrong checksum.
+/// The error message for a wrong checksum.
 pub const CHECKSUM_MISMATCH: &str = "the checksum does not match, because the file was changed or damaged";
 
-/// A document and its checksum, in one object.
+/// A JSON document together with its checksum, for serialisation as one object.
 #[derive(Serialize)]
 pub struct WithChecksum<'a, T> {
     #[serde(flatten)]
@@ -25,19 +26,19 @@ pub struct WithChecksum<'a, T> {
 }
 
 impl<'a, T: Serialize> WithChecksum<'a, T> {
-    /// `document`, which must be an object.
+    /// Computes the checksum of `document`, which must serialise to a JSON object.
     ///
     /// # Errors
-    /// The serializer's error, if `document` cannot be written as JSON.
+    /// The serialiser's error if `document` cannot be written as JSON.
     pub fn new(document: &'a T) -> serde_json::Result<Self> {
         Ok(Self { document, crc32c: checksum(&serde_json::to_value(document)?) })
     }
 }
 
-/// Takes the checksum out of a document that was read; says whether it had one.
+/// Removes the checksum from a JSON document and compares it. Returns whether the document had a checksum.
 ///
 /// # Errors
-/// [`CHECKSUM_MISMATCH`] if it does not match.
+/// [`CHECKSUM_MISMATCH`] if the checksum is wrong.
 pub fn open(document: &mut Value) -> Result<bool, &'static str> {
     match document.as_object_mut().and_then(|entries| entries.remove(ENTRY)) {
         None => Ok(false),
@@ -46,21 +47,21 @@ pub fn open(document: &mut Value) -> Result<bool, &'static str> {
     }
 }
 
-/// Returns the checksum of a document without its checksum entry.
+/// Computes the checksum of a document from which the checksum entry was removed.
 fn checksum(document: &Value) -> u32 {
     crc32c::crc32c(document.to_string().as_bytes())
 }
 
-/// Puts the checksum of `file` into it, at a `place` where no reader looks.
+/// Inserts the checksum of `file` at the byte offset `place`, which the file's readers must ignore.
 pub fn insert(file: &mut Vec<u8>, place: usize) {
     let digits = format!("{:0DIGITS$x}", crc32c::crc32c(file));
     file.splice(place..place, [MARK, digits.as_bytes()].concat());
 }
 
-/// Checks the checksum in `file`. A file without one is accepted.
+/// Compares the checksum in `file` with its content. Accepts a file without a checksum.
 ///
 /// # Errors
-/// [`CHECKSUM_MISMATCH`] if the content was changed.
+/// [`CHECKSUM_MISMATCH`] if the checksum is wrong or incomplete.
 pub fn check(file: &[u8]) -> Result<(), &'static str> {
     let Some(place) = file.windows(MARK.len()).rposition(|piece| piece == MARK) else { return Ok(()) };
     let (before, rest) = (&file[..place], &file[place + MARK.len()..]);

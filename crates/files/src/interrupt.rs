@@ -1,4 +1,4 @@
-//! Signals as a flag that loops look at, and folders that do not outlive them.
+//! Signals as a flag that loops can poll, and temporary folders that are deleted when a signal ends the program.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -10,30 +10,30 @@ use std::time::{Duration, Instant};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::Notify;
 
-/// The folders of all [`Scratch`].
+/// The folders of all existing [`Scratch`] values.
 static SCRATCH: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
-/// The signal by which the kernel warns a process that has used its processor time. It comes every second.
+/// The signal SIGXCPU, with which the kernel warns a process every second that its CPU time is used up.
 const SIGXCPU: i32 = 24;
 
-/// Raised when the program is asked to end.
+/// A flag that is raised when the program is asked to end.
 #[derive(Clone, Debug, Default)]
 pub struct StopFlag(Arc<Raised>);
 
 #[derive(Debug, Default)]
 struct Raised {
-    /// The signal's number; 0 so far.
+    /// The number of the first signal, or 0 before any.
     signal: AtomicI32,
     since: OnceLock<Instant>,
     notify: Notify,
 }
 
 impl StopFlag {
-    /// A flag that the signals INT, TERM, HUP, USR1, USR2 and XCPU raise. A second INT or TERM ends the program at once.
-    /// Terminals, batch systems and the kernel repeat the others. Of these, what the program was started to ignore, as
-    /// HUP under `nohup`, stays ignored.
+    /// Returns a flag that the signals INT, TERM, HUP, USR1, USR2 and XCPU raise. A second INT or TERM ends the program
+    /// immediately. The other signals may arrive repeatedly, from terminals, batch systems and the kernel. Those of
+    /// them that the program was started to ignore, such as HUP under `nohup`, are still ignored.
     ///
     /// # Errors
-    /// The operating system's.
+    /// An error of the operating system.
     pub fn on_signals() -> std::io::Result<Self> {
         let flag = Self::default();
         let raised = flag.clone();
@@ -52,24 +52,24 @@ impl StopFlag {
         Ok(flag)
     }
 
-    /// The number of the first signal that was received; `None` if none was received yet.
+    /// Returns the number of the first signal, or `None` before any.
     pub fn signal(&self) -> Option<i32> {
         Some(self.0.signal.load(Ordering::SeqCst)).filter(|&number| number != 0)
     }
 
-    /// Raises the flag, as signal `number` would.
+    /// Raises the flag as if signal `number` had arrived.
     pub fn raise(&self, number: i32) {
-        let _ = self.0.since.set(Instant::now()); // the first one counts
+        let _ = self.0.since.set(Instant::now()); // only the first time is kept
         let _ = self.0.signal.compare_exchange(0, number, Ordering::SeqCst, Ordering::SeqCst);
         self.0.notify.notify_waiters();
     }
 
-    /// The time since the flag was raised; `None` if it was not raised yet.
+    /// Returns the time since the flag was raised, or `None` if it is not raised.
     pub fn elapsed(&self) -> Option<Duration> {
         self.0.since.get().map(Instant::elapsed)
     }
 
-    /// Waits until the flag is raised. Returns the number of the signal.
+    /// Waits until the flag is raised, and returns the number of the signal.
     pub async fn raised(&self) -> i32 {
         loop {
             let notified = self.0.notify.notified();
@@ -81,13 +81,13 @@ impl StopFlag {
     }
 }
 
-/// The signals that ask a program to end.
+/// The signals with which users and systems ask a program to end.
 const ENDING: [SignalKind; 2] = [SignalKind::interrupt(), SignalKind::terminate()];
 
-/// Lets SIGINT and SIGTERM end the program at once. For programs that have nothing to finish.
+/// Makes SIGINT and SIGTERM end the program immediately. For programs that have nothing to complete.
 ///
 /// # Errors
-/// The operating system's.
+/// An error of the operating system.
 pub fn end_on_signals() -> std::io::Result<()> {
     watch(&ENDING, |number| {
         let _ = writeln!(std::io::stderr(), "stopped by signal {number}"); // the terminal may be gone
@@ -95,7 +95,7 @@ pub fn end_on_signals() -> std::io::Result<()> {
     })
 }
 
-/// Calls `hear` with the number of each signal of these `kinds`.
+/// Calls `hear` from a new thread with the number of each arriving signal of these `kinds`.
 fn watch(kinds: &[SignalKind], mut hear: impl FnMut(i32) + Send + 'static) -> std::io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let mut signals = {
@@ -119,7 +119,7 @@ fn watch(kinds: &[SignalKind], mut hear: impl FnMut(i32) + Send + 'static) -> st
     Ok(())
 }
 
-/// The signals that this process was started to ignore, as a mask whose lowest bit is signal 1.
+/// Returns the signals that this process was started to ignore, as a mask whose lowest bit is signal 1.
 fn ignored_signals() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
@@ -130,7 +130,7 @@ fn contains(mask: u64, signal: i32) -> bool {
     mask >> (signal - 1) & 1 == 1
 }
 
-/// Ends the program with the status that shells give to signal `number`, and deletes what is temporary.
+/// Deletes all temporary folders and ends the program with the exit status that shells use for signal `number`.
 fn end(number: i32) -> ! {
     for folder in scratch().iter() {
         let _ = std::fs::remove_dir_all(folder); // the program ends anyway
@@ -138,7 +138,8 @@ fn end(number: i32) -> ! {
     std::process::exit(128 + number);
 }
 
-/// A temporary folder, which lives no longer than this value, nor than a program that a signal ends.
+/// A temporary folder that is deleted when this value is dropped, or when [`StopFlag`] or [`end_on_signals`] ends the
+/// program.
 #[derive(Debug)]
 pub struct Scratch(PathBuf);
 
@@ -146,15 +147,15 @@ impl Scratch {
     /// Creates a new temporary folder.
     ///
     /// # Errors
-    /// The operating system's.
+    /// An error of the operating system.
     pub fn new() -> std::io::Result<Self> {
-        let mut known = scratch(); // so that no signal comes between
+        let mut known = scratch(); // held until the folder is registered, so that a signal cannot leave it behind
         let folder = tempfile::Builder::new().prefix("perturb-").tempdir()?.keep();
         known.push(folder.clone());
         Ok(Self(folder))
     }
 
-    /// The path of the folder.
+    /// Returns the path of the folder.
     pub fn path(&self) -> &Path {
         &self.0
     }
@@ -163,7 +164,7 @@ impl Scratch {
 impl Drop for Scratch {
     fn drop(&mut self) {
         let mut known = scratch();
-        let _ = std::fs::remove_dir_all(&self.0); // what is left of it harms nobody
+        let _ = std::fs::remove_dir_all(&self.0); // remaining files in a temporary folder do no harm
         known.retain(|folder| *folder != self.0);
     }
 }

@@ -1,4 +1,4 @@
-//! Files: errors that name them, writing that happens wholly or not at all, locks.
+//! Files: errors that contain the path, atomic writing, locks and checksums.
 #![forbid(unsafe_code)]
 
 use std::fs::{self, File};
@@ -23,28 +23,29 @@ pub use self::lock::{Lock, is_locked};
 pub use self::plain::{Stamp, leads_out, read_plain, read_plain_text};
 pub use perturb_system::open_plain;
 
-/// The prefix of files that a write has not finished.
+/// The prefix of the names of temporary files, which are renamed after they are complete.
 pub const TEMPORARY_PREFIX: &str = ".tmp-";
-/// Maximum size of a TOML file that is read, in bytes. The parser's memory is up to some 200 times the text.
+/// Maximum size of a TOML file, in bytes. The parser's memory can be about 200 times the size of the file.
 pub const MAX_TOML_BYTES: u64 = 256 << 10;
 
-/// A boxed error, for messages only.
+/// A boxed error that is only displayed.
 pub type AnyError = Box<dyn std::error::Error + Send + Sync>;
 
-/// The operating system refused a file.
+/// An error of the operating system, with the path of the file.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot {action} {}: {source}", path.display())]
 pub struct FileError {
-    /// The action, e.g. "read".
+    /// The attempted action, e.g. "read".
     pub action: &'static str,
-    /// The path to which the action was applied.
+    /// The path of the file or folder.
     pub path: PathBuf,
-    /// The operating system's answer.
+    /// The operating system's error.
     pub source: std::io::Error,
 }
 
 impl FileError {
-    /// Whether the machine is at fault, e.g. by a full disk or a lost mount, and not the content of a folder.
+    /// Returns whether the machine is at fault, e.g. because of a full disk or a lost mount, rather than the content of
+    /// a folder.
     pub fn is_fault(&self) -> bool {
         use ErrorKind::{AlreadyExists, InvalidData, InvalidInput, IsADirectory, NotADirectory, NotFound};
         let kind = self.source.kind();
@@ -52,43 +53,45 @@ impl FileError {
     }
 }
 
-/// A result with a [`FileError`].
+/// A result with [`FileError`] as its error.
 pub type Result<T> = std::result::Result<T, FileError>;
 
-/// Names the file in the operating system's error.
+/// Returns a function that adds the action and the path to an error of the operating system.
 pub fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> FileError {
     let path = path.to_owned();
     move |source| FileError { action, path, source }
 }
 
-/// Reads a plain file, which must be there.
+/// Reads a regular file, which must exist.
 ///
 /// # Errors
-/// The operating system's; a pipe or a device, and a file larger than anything that a run writes.
+/// An error of the operating system. Also if the path is a pipe or a device, or if the file has more than 1 GiB.
 pub fn read(path: &Path) -> Result<Vec<u8>> {
     read_if_there(path)?.ok_or_else(|| io("read", path)(Errno::NOENT.into()))
 }
 
-/// Reads the text of a plain TOML file.
+/// Reads the text of a TOML file.
 ///
 /// # Errors
-/// The operating system's; a pipe or a device, a file that is not UTF-8, and more than [`MAX_TOML_BYTES`].
+/// An error of the operating system. Also if the path is a pipe or a device, or if the file has more than
+/// [`MAX_TOML_BYTES`] or is not UTF-8.
 pub fn read_toml(path: &Path) -> Result<String> {
     read_plain_text(path, MAX_TOML_BYTES)
 }
 
-/// A plain file's content; `None` if it is not there.
+/// Reads a regular file. Returns `None` if it does not exist.
 ///
 /// # Errors
-/// The operating system's; a pipe or a device, and what is larger than anything that a run writes.
+/// An error of the operating system. Also if the path is a pipe or a device, or if the file has more than 1 GiB.
 pub fn read_if_there(path: &Path) -> Result<Option<Vec<u8>>> {
     read_plain(path, plain::MAX_BYTES)
 }
 
-/// Returns the metadata of a path, or `None` if nothing is there. A failure of the file system is an error, not `None`.
+/// Returns the metadata of a path, or `None` if it does not exist. A failure of the file system is an error instead of
+/// `None`.
 ///
 /// # Errors
-/// The operating system's.
+/// An error of the operating system.
 pub fn look(path: &Path) -> Result<Option<fs::Metadata>> {
     match fs::metadata(path).map_err(io("look for", path)) {
         Ok(metadata) => Ok(Some(metadata)),
@@ -97,26 +100,26 @@ pub fn look(path: &Path) -> Result<Option<fs::Metadata>> {
     }
 }
 
-/// Whether a plain file is at a path.
+/// Returns whether `path` is a regular file.
 ///
 /// # Errors
-/// As those of [`look`].
+/// The errors of [`look`].
 pub fn has_file(path: &Path) -> Result<bool> {
     Ok(look(path)?.is_some_and(|metadata| metadata.is_file()))
 }
 
-/// Creates a folder and those above it, unless they are there.
+/// Creates a folder and all its missing parents.
 ///
 /// # Errors
-/// The operating system's.
+/// An error of the operating system.
 pub fn create_folder(path: &Path) -> Result<()> {
     fs::create_dir_all(path).map_err(io("create", path))
 }
 
-/// The paths in a folder, sorted; none if it is not there.
+/// Returns the sorted paths of everything in a folder. Returns none if the folder does not exist.
 ///
 /// # Errors
-/// The operating system's.
+/// An error of the operating system.
 pub fn list(folder: &Path) -> Result<Vec<PathBuf>> {
     let list = || fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<std::io::Result<Vec<PathBuf>>>();
     let mut paths = if_there(list()).map_err(io("list", folder))?.unwrap_or_default();
@@ -124,28 +127,28 @@ pub fn list(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-/// Refuses a path that is no folder.
+/// Returns an error unless `path` is a readable folder.
 ///
 /// # Errors
-/// The operating system's.
+/// An error of the operating system.
 pub fn require_folder(path: &Path) -> Result<()> {
     fs::read_dir(path).map(drop).map_err(io("list", path))
 }
 
-/// Deletes a file, or a folder with everything in it, if it is there.
+/// Deletes a file, or a folder with its content. Does nothing if the path does not exist.
 ///
 /// # Errors
-/// The operating system's.
+/// An error of the operating system.
 pub fn delete(path: &Path) -> Result<()> {
     let deleted = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
     if_there(deleted).map(drop).map_err(io("delete", path))
 }
 
-/// Writes a file in one piece: it appears complete, and on the disk, or not at all. Creates missing folders. An existing
-/// file that is no plain file, e.g. a pipe, is written to and not replaced.
+/// Writes a file atomically: after a crash or a failure the file is either complete and on disk, or unchanged. Creates
+/// missing folders. If `path` is not a regular file, e.g. a pipe, the content is written to it directly.
 ///
 /// # Errors
-/// The operating system's; an earlier file is then still there.
+/// An error of the operating system. An earlier file then still exists.
 pub fn write_atomically(path: &Path, content: &[u8]) -> Result<()> {
     if path.metadata().is_ok_and(|metadata| !metadata.is_file()) {
         return fs::write(path, content).map_err(io("write", path));
@@ -156,21 +159,21 @@ pub fn write_atomically(path: &Path, content: &[u8]) -> Result<()> {
     replace(file, path)
 }
 
-/// Creates a hidden temporary file in the folder of `path`, which exists. Its name begins with `prefix`.
+/// Creates a hidden temporary file in the folder of `path`, which must exist. The file's name begins with `prefix`.
 ///
 /// # Errors
-/// The operating system's.
+/// An error of the operating system.
 pub fn temporary_beside(path: &Path, prefix: &str) -> Result<NamedTempFile> {
-    // As readable as any other file that is created here; temporary files are otherwise their owner's alone.
+    // Gives the file the usual permissions of new files. By default, only the owner could read it.
     let mode = <fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666);
     let folder = folder_of(path);
     tempfile::Builder::new().prefix(prefix).permissions(mode).tempfile_in(folder).map_err(io("write in", folder))
 }
 
-/// Creates a file without a name, which is deleted when it is closed.
+/// Creates a temporary file without a name. It is deleted when it is closed.
 ///
 /// # Errors
-/// The operating system's, with the variable that chooses the folder.
+/// An error of the operating system. Its message recommends the variable `TMPDIR`.
 pub fn temporary_file() -> std::io::Result<File> {
     tempfile::tempfile().map_err(|error| {
         let folder = std::env::temp_dir();
@@ -179,11 +182,11 @@ pub fn temporary_file() -> std::io::Result<File> {
     })
 }
 
-/// Renames a complete temporary file to `path`. Content and name are on the disk afterwards. Where the file system
-/// cannot rename, the content is copied.
+/// Renames a complete temporary file to `path`. Afterwards the content and the name are on disk. If the file system
+/// does not support renaming, copies the content instead.
 ///
 /// # Errors
-/// The operating system's.
+/// An error of the operating system.
 pub fn replace(file: NamedTempFile, path: &Path) -> Result<()> {
     sync_file(file.as_file(), path).map_err(io("write", path))?;
     if let Err(error) = file.persist(path) {
@@ -194,7 +197,7 @@ pub fn replace(file: NamedTempFile, path: &Path) -> Result<()> {
     sync_folder(folder_of(path))
 }
 
-/// Copies the content of a temporary file, but not its permissions.
+/// Copies the content of a temporary file to `path`, but not its permissions.
 fn copy(file: &NamedTempFile, path: &Path) -> std::io::Result<()> {
     let mut copy = File::create(path)?;
     std::io::copy(&mut file.reopen()?, &mut copy)?;
@@ -206,10 +209,10 @@ fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
-/// Makes sure, before there is anything to write, that [`write_atomically`] will find its folder and may write there.
+/// Checks in advance that [`write_atomically`] can write to `path`: that the folder exists and is writable.
 ///
 /// # Errors
-/// [`FileError`], with what to do.
+/// [`FileError`] with advice to the user.
 pub fn require_writable(path: &Path) -> Result<()> {
     let refuse = |kind, words: String| Err(io("write", path)(std::io::Error::new(kind, words)));
     let folder = folder_of(path);
@@ -217,7 +220,7 @@ pub fn require_writable(path: &Path) -> Result<()> {
         Ok(metadata) if metadata.is_dir() => {
             return refuse(ErrorKind::IsADirectory, "it is a folder; give the name of a file".into());
         }
-        Ok(metadata) if !metadata.is_file() => return Ok(()), // a pipe, or a terminal
+        Ok(metadata) if !metadata.is_file() => return Ok(()), // for example a pipe or a terminal
         _ => {}
     }
     if !folder.is_dir() {
@@ -233,47 +236,48 @@ pub fn require_writable(path: &Path) -> Result<()> {
     tempfile::tempfile_in(folder).map(drop).map_err(io("write", path))
 }
 
-/// Makes sure that files can be written to `folder`, which is created later if it is not there.
+/// Checks in advance that files can be written to `folder`. If `folder` does not exist, checks its nearest existing
+/// parent.
 ///
 /// # Errors
-/// [`FileError`].
+/// [`FileError`] if no file can be created there.
 pub fn require_writable_folder(folder: &Path) -> Result<()> {
     let existing = folder.ancestors().find(|path| path.is_dir()).unwrap_or(Path::new("."));
     tempfile::Builder::new().prefix(TEMPORARY_PREFIX).tempfile_in(existing).map(drop).map_err(io("write in", folder))
 }
 
-/// Writes a document as JSON, in one piece.
+/// Writes a document as a JSON file, atomically.
 ///
 /// # Errors
-/// The operating system's.
+/// An error of the operating system.
 pub fn write_json(path: &Path, document: &impl Serialize) -> Result<()> {
     let mut text = serde_json::to_vec_pretty(document).map_err(|error| io("write", path)(error.into()))?;
     text.push(b'\n');
     write_atomically(path, &text)
 }
 
-/// Brings the names in a folder to the disk, where the file system can do that.
+/// Flushes the names in a folder to the disk, if the file system supports this.
 ///
 /// # Errors
-/// The operating system's.
+/// An error of the operating system.
 pub fn sync_folder(path: &Path) -> Result<()> {
     let synced = match File::open(path) {
-        // A folder may be writable and not readable.
+        // A folder may be writable without being readable.
         Err(error) if error.kind() == ErrorKind::PermissionDenied => Ok(()),
         opened => opened.and_then(|folder| folder.sync_all()),
     };
     unless_unsupported(Operation::Sync, synced, path).map(drop).map_err(io("sync", path))
 }
 
-/// Brings the content of `file`, which is at `path`, to the disk, where the file system can do that.
+/// Flushes the content of `file`, which is at `path`, to the disk, if the file system supports this.
 ///
 /// # Errors
-/// The operating system's.
+/// An error of the operating system.
 pub fn sync_file(file: &File, path: &Path) -> std::io::Result<()> {
     unless_unsupported(Operation::Sync, file.sync_all(), path).map(drop)
 }
 
-/// Turns the error "not found" into `None`.
+/// Replaces the error "not found" by `None`.
 fn if_there<T>(result: std::io::Result<T>) -> std::io::Result<Option<T>> {
     match result {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),

@@ -1,4 +1,4 @@
-//! Locks of folders against other processes.
+//! Locks that protect folders from other processes.
 
 use std::fs::{File, TryLockError};
 use std::os::unix::fs::OpenOptionsExt;
@@ -10,35 +10,35 @@ use perturb_system::plain::nonblocking_flag;
 use super::support::{Operation, unless_unsupported};
 use super::{Result, io};
 
-/// The file in a folder that is locked. Linux's NFS client cannot lock a folder itself.
+/// The name of the file that is locked in place of its folder, because NFS on Linux cannot lock a folder.
 const LOCK_FILE: &str = "lock";
-/// Attempts to take a lock while another process only tests it.
+/// Maximum number of attempts to take a lock, while another process only tests it.
 const MAX_LOCK_TRIES: u32 = 100;
-/// Time between two of these attempts. A test takes some microseconds.
+/// Time between two attempts. A test takes some microseconds.
 const LOCK_RETRY_INTERVAL: Duration = Duration::from_millis(1);
 
-/// An advisory lock: it ends with the process that holds it, however it ends.
+/// An advisory lock of a folder. The operating system releases it when the process ends for any reason.
 #[derive(Debug)]
 pub struct Lock(File);
 
 impl Drop for Lock {
-    /// Unlocks before the file is closed. A process that is just being started has copies of all open files for a moment,
-    /// so closing alone would not unlock.
+    /// Unlocks explicitly before the file is closed. Closing may not be enough: a child process that is just being
+    /// started briefly has copies of all open files.
     fn drop(&mut self) {
-        let _ = self.0.unlock(); // after a failure the closing unlocks
+        let _ = self.0.unlock(); // if this fails, closing the file releases the lock
     }
 }
 
 impl Lock {
-    /// Takes the lock of `folder`: its file `lock`, which is created if it is missing. Returns `None` while another process
-    /// has the lock. A process that only [tests the lock](is_locked) does not have it. On a file system without locks every
-    /// process gets the lock, and a warning says so once.
+    /// Takes the lock of `folder`. Creates the file `lock` in the folder if it is missing. Returns `None` if another
+    /// process has the lock; a process that only [tests the lock](is_locked) does not count. On a file system without
+    /// locks, every process gets the lock, and the first time a warning is logged.
     ///
     /// # Errors
-    /// The operating system's.
+    /// An error of the operating system.
     pub fn try_take(folder: &Path) -> Result<Option<Self>> {
         let path = folder.join(LOCK_FILE);
-        // NFS needs both permissions: reading for a shared lock, writing for an exclusive one.
+        // NFS requires read permission for a shared lock and write permission for an exclusive lock.
         let mut options = File::options();
         options.create(true).truncate(false).read(true).write(true).custom_flags(nonblocking_flag());
         let file = options.open(&path).map_err(io("open", &path))?;
@@ -47,7 +47,8 @@ impl Lock {
             if exclusive != Some(false) {
                 return Ok(Some(Self(file)));
             }
-            // A taken lock is exclusive, a test of it is shared. If a shared lock is possible, another process only tests.
+            // A lock that is held is exclusive, while a test uses a shared lock. So if a shared lock is possible,
+            // another process only tests.
             match supported(file.try_lock_shared(), &path).map_err(io("lock", &path))? {
                 Some(true) => file.unlock().map_err(io("unlock", &path))?,
                 _ => return Ok(None),
@@ -57,19 +58,21 @@ impl Lock {
         Ok(None)
     }
 
-    /// Whether `folder` was locked before: it has the file that is locked.
+    /// Returns whether `folder` was ever locked: whether it contains the file `lock`.
     pub fn is_there(folder: &Path) -> bool {
         folder.join(LOCK_FILE).exists()
     }
 }
 
-/// Whether a process has the lock of `folder`. Takes a shared lock for a moment, for which [`Lock::try_take`] waits.
+/// Returns whether a process holds the lock of `folder`. The test takes a shared lock for a moment, for which
+/// [`Lock::try_take`] waits.
 pub fn is_locked(folder: &Path) -> bool {
     let file = File::options().read(true).custom_flags(nonblocking_flag()).open(folder.join(LOCK_FILE));
     file.is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
 }
 
-/// Whether a lock was taken; `None` if the file system has no locks.
+/// Converts the result of a locking attempt: whether the lock was taken, or `None` if the file system does not support
+/// locks.
 fn supported(taken: std::result::Result<(), TryLockError>, path: &Path) -> std::io::Result<Option<bool>> {
     let taken = match taken {
         Ok(()) => Ok(true),
@@ -95,7 +98,7 @@ mod tests {
     fn lock_ends_with_its_value_despite_inherited_files() {
         let directory = tempfile::tempdir().unwrap();
         let lock = Lock::try_take(directory.path()).unwrap().unwrap();
-        let copy = lock.0.try_clone().unwrap(); // a process that is being started gets such a copy
+        let copy = lock.0.try_clone().unwrap(); // a child process that is just being started has such a copy
         assert!(Lock::try_take(directory.path()).unwrap().is_none());
         drop(lock);
         assert!(Lock::try_take(directory.path()).unwrap().is_some());

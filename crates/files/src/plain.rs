@@ -1,4 +1,5 @@
-//! Plain files in folders to which others may write: opens them without waiting, limits their size, and recognises changes.
+//! Regular files in folders to which other users may write. Opening them never blocks, their size is limited, and
+//! changes are detected.
 
 use std::fs::Metadata;
 use std::io::{Error, ErrorKind};
@@ -9,10 +10,11 @@ use rustix::io::Errno;
 
 use super::{Result, if_there, io};
 
-/// Maximal size of a file that is read whole, in bytes.
+/// Maximal size of a file that is read into memory, in bytes.
 pub(super) const MAX_BYTES: u64 = 1 << 30;
 
-/// Identifies the content of a file without reading it: the stamp changes when the content does.
+/// The inode, the length and the modification time of a file. They change when the content changes, so the content need
+/// not be compared.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub struct Stamp {
     inode: u64,
@@ -21,57 +23,57 @@ pub struct Stamp {
 }
 
 impl Stamp {
-    /// Returns the stamp of the file at `path`; `None` if there is none.
+    /// Returns the stamp of the file at `path`, or `None` if it does not exist.
     pub fn read(path: &Path) -> Option<Self> {
         std::fs::metadata(path).ok().as_ref().map(Self::from_metadata)
     }
 
-    /// Returns the stamp for a file's metadata.
+    /// Returns the stamp of the file with this metadata.
     pub fn from_metadata(file: &Metadata) -> Self {
         Self { inode: file.ino(), length: file.len(), changed: (file.mtime(), file.mtime_nsec()) }
     }
 
-    /// The stamp as text that needs no escaping in URLs.
+    /// Returns the stamp as text that needs no escaping in URLs.
     pub fn tag(&self) -> String {
         let Self { inode, length, changed: (seconds, nanoseconds) } = self;
         format!("{inode:x}-{length:x}-{seconds:x}-{nanoseconds:x}")
     }
 
-    /// The time of the last change, s since 1970.
+    /// Returns the modification time, in seconds since 1970.
     pub fn seconds(&self) -> i64 {
         self.changed.0
     }
 
-    /// The inode number.
+    /// Returns the inode number.
     pub fn inode(&self) -> u64 {
         self.inode
     }
 
-    /// The length, bytes.
+    /// Returns the length of the file, in bytes.
     pub fn length(&self) -> u64 {
         self.length
     }
 }
 
-/// Reads a plain file of at most `most` bytes; `None` if it is not there.
+/// Reads a regular file of at most `most` bytes. Returns `None` if it does not exist.
 ///
 /// # Errors
-/// The operating system's; a file that is not plain, or longer.
+/// An error of the operating system. Also if the file is not regular, or longer than `most`.
 pub fn read_plain(path: &Path, most: u64) -> Result<Option<Vec<u8>>> {
     if_there(perturb_system::read_plain(path, most)).map_err(io("read", path))
 }
 
-/// Reads the text in a plain file of at most `most` bytes.
+/// Reads a regular file of at most `most` bytes as UTF-8 text.
 ///
 /// # Errors
-/// As those of [`read_plain`]; a file that is not there or not UTF-8.
+/// The errors of [`read_plain`]. Also if the file does not exist or is not UTF-8.
 pub fn read_plain_text(path: &Path, most: u64) -> Result<String> {
     let content = read_plain(path, most)?.ok_or_else(|| io("read", path)(Errno::NOENT.into()))?;
     String::from_utf8(content).map_err(|error| io("read", path)(Error::new(ErrorKind::InvalidData, error.utf8_error())))
 }
 
-/// Whether `name` in `folder` is, or goes through, a symbolic link to a place outside `root` or to a hidden place in it.
-/// `folder` is in `root` and has no symbolic links.
+/// Returns whether the path `name` in `folder` passes a symbolic link that leads outside of `root`, or to a hidden file
+/// or folder in it. `folder` must be inside of `root` and must not contain symbolic links.
 pub fn leads_out(root: &Path, folder: &Path, name: impl AsRef<Path>) -> bool {
     let mut path = folder.to_owned();
     name.as_ref().components().any(|component| {
@@ -82,7 +84,7 @@ pub fn leads_out(root: &Path, folder: &Path, name: impl AsRef<Path>) -> bool {
 
 fn is_elsewhere(root: &Path, path: &Path) -> bool {
     let real = match path.canonicalize() {
-        Err(error) => return error.kind() != ErrorKind::NotFound, // a link to nothing leads nowhere
+        Err(error) => return error.kind() != ErrorKind::NotFound, // a dangling link leads nowhere
         Ok(real) => real,
     };
     let hidden = |name: &std::ffi::OsStr| name.as_encoded_bytes().starts_with(b".");

@@ -1,4 +1,5 @@
-//! Operations that some file systems refuse: what is done without them, and what is then not protected.
+//! Operations that some file systems do not support. A missing operation is skipped, and its consequence is logged
+//! once.
 
 use std::io::{Error, Result};
 use std::path::Path;
@@ -6,22 +7,23 @@ use std::sync::atomic::{AtomicU8, Ordering};
 
 use rustix::io::Errno;
 
-/// The operations whose absence this process has reported, as bits.
+/// The operations whose absence this process has logged, as bits.
 static REPORTED: AtomicU8 = AtomicU8::new(0);
 
-/// An operation that a file system may not have.
+/// An operation that a file system may not support.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Operation {
-    /// An advisory lock. Lustre without `-o flock`, NFS without a lock daemon and some FUSE systems have none.
+    /// An advisory lock. Lustre without `-o flock`, NFS without a lock daemon and some FUSE systems do not support it.
     Lock,
-    /// Bringing a file or the names in a folder to the disk.
+    /// Flushing a file, or the names in a folder, to the disk.
     Sync,
-    /// Replacing a file by renaming another one. A file that is mounted alone cannot be replaced.
+    /// Replacing a file by renaming another file. It is impossible if the file itself is a mount point.
     Rename,
 }
 
 impl Operation {
-    /// Whether `error` says that the file system does not have the operation, rather than that it failed.
+    /// Returns whether `error` means that the file system does not support the operation, rather than that the
+    /// operation failed.
     fn is_missing(self, error: &Error) -> bool {
         let errno = Errno::from_io_error(error);
         let others: &[Errno] = match self {
@@ -32,7 +34,7 @@ impl Operation {
         errno.is_some_and(|errno| errno == Errno::NOSYS || errno == Errno::OPNOTSUPP || others.contains(&errno))
     }
 
-    /// Describes the consequence.
+    /// Describes the consequence of the missing operation, for the log.
     fn consequence(self) -> &'static str {
         match self {
             Self::Lock => {
@@ -48,10 +50,10 @@ impl Operation {
     }
 }
 
-/// Returns `None` in place of the error of a file system that does not have `operation`. Reports that once.
+/// Replaces the error of a file system that does not support `operation` by `None`, and logs the consequence once.
 ///
 /// # Errors
-/// Every other error.
+/// All other errors.
 pub(crate) fn unless_unsupported<T>(operation: Operation, result: Result<T>, path: &Path) -> Result<Option<T>> {
     match result {
         Err(error) if operation.is_missing(&error) => {

@@ -1,34 +1,35 @@
-//! A parameter along an axis of a heatmap.
+//! A parameter that varies along an axis of a heatmap.
 
 use perturb_protocol::proto::{self, Interval};
 use serde::{Deserialize, Serialize};
 
-/// A parameter as an axis.
+/// An axis of a heatmap: a parameter and the range of its values.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Axis {
-    /// The parameter.
+    /// The name of the parameter.
     pub name: String,
     /// The unit; "1" if dimensionless.
     pub unit: String,
-    /// The value in D.
+    /// The default value, which version D uses.
     pub default: f64,
-    /// The lowest value of R and E.
+    /// The lowest value that version R or E draws.
     pub low: f64,
-    /// The highest value of R and E.
+    /// The highest value that version R or E draws.
     pub high: f64,
-    /// R, as pairs of low and high.
+    /// The intervals from which version R draws, as pairs (low, high).
     pub random: Vec<(f64, f64)>,
-    /// E, as pairs of low and high.
+    /// The intervals from which version E draws, as pairs (low, high).
     pub extreme: Vec<(f64, f64)>,
 }
 
 impl Axis {
-    /// The value of the `index`th of `grid` points, which stand in the middle of equal parts.
+    /// Returns the value of grid point `index`, from 0. The axis is divided into `grid` equal parts, and each point is
+    /// in the middle of its part.
     pub fn value(&self, index: usize, grid: usize) -> f64 {
         self.low + (self.high - self.low) * (index as f64 + 0.5) / grid as f64
     }
 
-    /// The axis of a parameter.
+    /// Returns the axis for a parameter.
     pub fn new(parameter: &proto::Parameter) -> Self {
         let pairs = |distribution: &Option<proto::Distribution>| -> Vec<(f64, f64)> {
             let intervals = distribution.iter().flat_map(|distribution| &distribution.intervals);

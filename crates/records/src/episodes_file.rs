@@ -1,7 +1,8 @@
-//! The recorded episodes of a study's policies in one file, a row group for each policy.
+//! A file with the recorded episodes of all policies of a study. Each policy has a row group of its own.
 //!
-//! Applied parameters are left out, since the requested ones and the environment decide them. So the file takes a third
-//! of the space of the cells' own files, and a row still has an episode's address and all that came of it.
+//! The file omits the applied parameters, because they follow from the requested parameters and the environment. It
+//! therefore takes a third of the space of the separate files of the cells. Each row still has the episode's address
+//! (seed and indices) and all its results.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -12,16 +13,16 @@ use serde::{Deserialize, Serialize};
 use crate::parquet_file::{ColumnValues, NamedColumn, ParquetFile, RowGroup, encode};
 use crate::records::{Ending, EpisodeRecord, Records, RecordsError, RecordsMetadata};
 
-/// The name of the schema in the file.
+/// The name of the Parquet schema.
 const MESSAGE: &str = "study_episodes";
 
-/// The recorded episodes of policies by their cells' ids, without applied parameters.
+/// The recorded episodes of a study, by the id of the cell that trained the policy. Applied parameters are omitted.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StudyEpisodes {
     cells: BTreeMap<String, Records>,
 }
 
-/// The JSON document in the file's metadata: the policies in the order of the row groups.
+/// The JSON document in the Parquet file's metadata. It lists the policies in the order of the row groups.
 #[derive(Serialize, Deserialize)]
 struct StudyMetadata {
     policies: Vec<EpisodesEntry>,
@@ -34,15 +35,15 @@ struct EpisodesEntry {
 }
 
 impl StudyEpisodes {
-    /// Returns the path of a study's file in the folder of a results table.
+    /// Returns the path of the episodes file of `study` in the `folder` of a results table.
     pub fn path(folder: &Path, study: &str) -> PathBuf {
         folder.join("episodes").join(format!("{}.parquet", study.replace('/', "-")))
     }
 
-    /// Reads the file in `path`; `None` if there is no such file.
+    /// Reads the file at `path`. Returns `None` if it does not exist.
     ///
     /// # Errors
-    /// [`RecordsError`].
+    /// [`RecordsError`] if the file cannot be read, or has another format.
     pub fn read_if_there(path: &Path) -> Result<Option<Self>, RecordsError> {
         let Some(content) = read_if_there(path)? else { return Ok(None) };
         if ParquetFile::is_other(&content) {
@@ -52,32 +53,32 @@ impl StudyEpisodes {
         Self::decode(content).map(Some).map_err(damaged)
     }
 
-    /// Writes the file, complete or not at all.
+    /// Writes the file atomically.
     ///
     /// # Errors
-    /// [`RecordsError`].
+    /// [`RecordsError`] if the file cannot be written.
     pub fn write(&self, path: &Path) -> Result<(), RecordsError> {
         let damaged = |error: AnyError| RecordsError::Damaged { path: path.to_owned(), reason: error.to_string() };
         Ok(write_atomically(path, &self.encode().map_err(damaged)?)?)
     }
 
-    /// Returns the episodes of a cell's policy.
+    /// Returns the episodes of the policy that the cell with id `cell` trained.
     pub fn of_cell(&self, cell: &str) -> Option<&Records> {
         self.cells.get(cell)
     }
 
-    /// Returns the number of policies.
+    /// Returns the number of policies in the file.
     pub fn policies(&self) -> usize {
         self.cells.len()
     }
 
-    /// Adds the episodes of a cell's policy, or replaces them.
+    /// Adds the episodes of a cell's policy without their applied parameters. Replaces the cell's earlier episodes.
     pub fn insert(&mut self, cell: &str, records: Records) {
         self.cells.insert(cell.to_owned(), without_applied(records));
     }
 
-    /// Returns a sentence on the first episode of the test on `set` that differs from that of `replayed`; `None` if all
-    /// are equal.
+    /// Compares the recorded episodes of `cell` on test set `set` with `replayed`. Returns a description of the first
+    /// episode that differs, or `None` if all are equal or none were recorded.
     pub fn first_difference(&self, cell: &str, set: &str, replayed: &Records) -> Option<String> {
         let replayed = without_applied(replayed.clone());
         let mut recorded = self.of_cell(cell)?.episodes_on(set);
@@ -137,7 +138,7 @@ impl StudyEpisodes {
         encode(MESSAGE, &columns, serde_json::to_string(&about)?, &groups)
     }
 
-    /// Returns the parameters of all environments.
+    /// Returns the sorted names of the parameters of all environments.
     fn parameters(&self) -> Vec<String> {
         let all = self.cells.values().flat_map(|records| &records.about.parameters);
         let mut names: Vec<String> = all.map(|parameter| parameter.name.clone()).collect();

@@ -3,7 +3,7 @@ use perturb_protocol::Version;
 use super::*;
 use crate::fixture::assessed;
 
-/// Two policies in environments with different parameters.
+/// The episodes of two policies, in environments with different parameters.
 fn study() -> (StudyEpisodes, [Records; 2]) {
     let records = |environment: &str, steps| {
         let agent = assessed("a", environment, &[Some(Version::D)], [steps, 190, 5]);

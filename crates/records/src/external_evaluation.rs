@@ -1,12 +1,13 @@
-//! Tests of agents that no cell of an experiment trained: what the Python package's `Assessment.save` writes, and what
-//! reports show beside cells.
+//! Recorded tests of agents that were not trained by an experiment. `Assessment.save` of the Python package writes
+//! them, and reports show them beside an experiment's own results.
 //!
 //! ```text
-//! DIR/assessment.json        the agent, and what is known of each of its policies
-//! DIR/episodes.parquet       the recorded tests of a policy; of several episodes-D.parquet and so on
+//! DIR/assessment.json        the agent, and metadata of each of its policies
+//! DIR/episodes.parquet       the recorded tests of a policy; with several policies episodes-D.parquet and so on
 //! ```
 //!
-//! Every figure follows from the records. How an agent was trained is not known here, so that it has no settings.
+//! Every number in a report is computed from the records. The training of an agent is not known here, so it has no
+//! settings.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -24,55 +25,58 @@ use crate::results::TestResult;
 use crate::scenarios::TrainedOn;
 use crate::success::Rule;
 
-/// The file that lists the other files of an evaluation.
+/// The name of the file that lists the other files of an evaluation.
 pub const ASSESSMENT: &str = "assessment.json";
-/// Format of `assessment.json`; raised when older programs could misread it.
+/// Format version of `assessment.json`. Increase it when older programs could misread the file.
 const FORMAT_VERSION: u32 = 1;
-/// Maximum number of times that a folder is read while another program replaces it.
+/// Maximum number of attempts to read a folder, in case another program is replacing its files.
 const MAX_LOOKS: u32 = 3;
-/// Time between two of these readings.
+/// Time between two attempts.
 const RETRY_INTERVAL: Duration = Duration::from_millis(50);
 
-/// The tests of an agent in one environment.
+/// The recorded tests of an agent in one environment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExternalEvaluation {
-    /// The evaluation's name in reports: the name of its folder, or empty if it was never saved.
+    /// The name of the evaluation in reports. It is the name of its folder, or empty if it was never saved.
     pub name: String,
-    /// The agent's name in reports, e.g. "PPO".
+    /// The name of the agent in reports, e.g. "PPO".
     pub agent: String,
-    /// The policies: at least one, all of one environment, each with another training distribution.
+    /// The agent's policies, at least one. All are of the same environment, and each has a different training
+    /// distribution.
     policies: Vec<ExternalPolicy>,
 }
 
-/// A policy and its recorded tests.
+/// A policy of an external agent, with its recorded tests.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExternalPolicy {
-    /// Metadata that is not in the records.
+    /// Metadata of the policy that the records do not contain.
     pub known: PolicyMetadata,
-    /// Every episode.
+    /// The recorded episodes of all its tests.
     pub records: Records,
     results: BTreeMap<String, TestResult>,
     outcomes: PolicyOutcomes,
 }
 
-/// Metadata of a policy that is not in its records.
+/// Metadata of an external policy that its records do not contain.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PolicyMetadata {
-    /// The distribution of parameters in training; `None` if it is unknown or is none of the versions.
+    /// The version whose parameters the policy was trained on. `None` if unknown, or if it was trained on other
+    /// parameters.
     pub trained_on: Option<Version>,
-    /// Steps of its training, of all environments together; `None` if not known.
+    /// Number of training steps, summed over all environments; `None` if unknown.
     pub timesteps: Option<u64>,
-    /// The seed from which the seeds of the tests follow.
+    /// The seed from which the seeds of the tests are derived.
     pub seed: u64,
-    /// Number of episodes that was requested for each test.
+    /// Number of episodes requested for each test.
     pub episodes: u64,
-    /// The observation of the policy.
+    /// What the policy observes.
     pub observe: Observe,
-    /// Whether the policy took the mode of its actions' distribution. `None` if the evaluation did not decide this.
+    /// Whether actions were the mode of the policy's distribution instead of samples. `None` if the evaluation did not
+    /// control this.
     pub deterministic: Option<bool>,
 }
 
-/// `assessment.json`.
+/// The content of `assessment.json`.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct EvaluationDocument {
@@ -89,37 +93,37 @@ struct PolicyEntry {
     known: PolicyMetadata,
 }
 
-/// Why an assessment cannot be used.
+/// A failure to read, write or combine the tests of an external agent.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum ExternalEvaluationError {
-    /// The operating system refused a file.
+    /// The operating system could not read or write a file.
     #[error(transparent)]
     File(#[from] FileError),
-    /// Records are missing or damaged.
+    /// The recorded episodes are missing or damaged.
     #[error(transparent)]
     Records(#[from] RecordsError),
-    /// There is no assessment.
+    /// The folder does not contain an `assessment.json`.
     #[error("{} holds no assessment: it has no {ASSESSMENT}; give a folder of Assessment.save", path.display())]
     Missing { path: PathBuf },
-    /// The document is damaged, or was written by an incompatible program.
+    /// `assessment.json` is damaged, or was written by an incompatible program.
     #[error("{} is damaged: {reason}", path.display())]
     Damaged {
         path: PathBuf,
         /// The fault.
         reason: String,
     },
-    /// The document has an unknown format.
+    /// `assessment.json` has a format version that this program cannot read.
     #[error("{} has format {got}; this program reads {FORMAT_VERSION}", path.display())]
     Format { path: PathBuf, got: u64 },
-    /// Policies that are not those of one agent in one environment.
+    /// The policies are of different environments, or two have the same training distribution.
     #[error("policies of an assessment have one environment and different training distributions, but {got}")]
     Mixed {
-        /// The violated condition.
+        /// The condition that is violated.
         got: String,
     },
-    /// The folder for the assessment is not empty.
+    /// The folder to write to is not empty.
     #[error("{} is not empty; {instead}", path.display())]
     NotEmpty {
         path: PathBuf,
@@ -131,7 +135,7 @@ pub enum ExternalEvaluationError {
 type Result<T> = std::result::Result<T, ExternalEvaluationError>;
 
 impl ExternalPolicy {
-    /// Returns a policy with the results of its recorded tests.
+    /// Creates a policy and computes the results of its recorded tests.
     pub fn new(known: PolicyMetadata, records: Records) -> Self {
         let names = || records.about.tests.iter().map(|test| test.set.name.as_str());
         let results = names().map(|name| (name.to_owned(), records.result(name, None))).collect();
@@ -139,33 +143,35 @@ impl ExternalPolicy {
         Self { known, records, results, outcomes }
     }
 
-    /// The figures of its test on a set or version; `None` if it was not tested there.
+    /// Returns the results of the test on the set or version called `tested_on`; `None` if the policy was not tested on
+    /// it.
     pub fn test(&self, tested_on: &str) -> Option<&TestResult> {
         self.results.get(tested_on)
     }
 
-    /// Returns the episodes by test.
+    /// Returns the parameters and outcomes of the episodes, by test.
     pub fn outcomes(&self) -> &PolicyOutcomes {
         &self.outcomes
     }
 
-    /// The file of its records in an assessment's folder.
+    /// Returns the name of the file with the policy's records in an evaluation's folder.
     pub fn file_name(&self) -> String {
         let of = |version: Version| format!("episodes-{}.parquet", version.file_name());
         self.known.trained_on.map_or_else(|| FILE.to_owned(), of)
     }
 
-    /// Returns the training distribution.
+    /// Returns the training distribution of the policy.
     pub fn trained_on<'a>(&self) -> TrainedOn<'a> {
         self.known.trained_on.map_or(TrainedOn::Unknown, TrainedOn::Version)
     }
 }
 
 impl ExternalEvaluation {
-    /// Returns an evaluation of at least one policy.
+    /// Creates an evaluation from at least one policy.
     ///
     /// # Errors
-    /// [`ExternalEvaluationError::Mixed`].
+    /// [`ExternalEvaluationError::Mixed`] if there is no policy, if environments differ, or if two policies have the
+    /// same training distribution.
     pub fn new(name: String, agent: String, policies: Vec<ExternalPolicy>) -> Result<Self> {
         let environments: BTreeSet<&str> = policies.iter().map(|it| it.records.about.environment.as_str()).collect();
         let trained: BTreeSet<_> = policies.iter().map(ExternalPolicy::trained_on).collect();
@@ -180,7 +186,7 @@ impl ExternalEvaluation {
         Ok(Self { name, agent, policies })
     }
 
-    /// Returns the environment.
+    /// Returns the name of the environment.
     pub fn environment(&self) -> &str {
         &self.policies[0].records.about.environment
     }
@@ -190,7 +196,7 @@ impl ExternalEvaluation {
         &self.policies
     }
 
-    /// The row of reports to which the evaluation belongs.
+    /// Returns the method under which reports list the agent.
     pub fn method(&self) -> Method {
         Method {
             algorithm: self.agent.clone(),
@@ -202,16 +208,16 @@ impl ExternalEvaluation {
         }
     }
 
-    /// Whether there is an assessment in the folder `path`.
+    /// Returns whether the folder `path` contains an `assessment.json`.
     pub fn is_in(path: &Path) -> bool {
         path.join(ASSESSMENT).is_file()
     }
 
-    /// Reads the assessment in the folder `path`. Another program may be replacing it, so a folder whose files do not fit
-    /// together is read again.
+    /// Reads an evaluation from the folder `path`. If the files do not fit together, tries up to three times, because
+    /// another program may be replacing them.
     ///
     /// # Errors
-    /// [`ExternalEvaluationError`], which names the file.
+    /// [`ExternalEvaluationError`], with the path of the file.
     pub fn read(path: &Path) -> Result<Self> {
         for _ in 1..MAX_LOOKS {
             match Self::read_once(path) {
@@ -242,7 +248,7 @@ impl ExternalEvaluation {
         let document: EvaluationDocument = serde_json::from_value(value).map_err(damaged)?;
         let mut policies = Vec::new();
         for PolicyEntry { file, known } in document.policies {
-            // Only the file's name counts: the file is always in this folder.
+            // Uses only the last component of the path, because the file must be in this folder.
             let file = Path::new(&file).file_name().unwrap_or_default();
             let policy = ExternalPolicy::new(known, Records::read(&path.join(file))?);
             if file != policy.file_name().as_str() {
@@ -256,12 +262,14 @@ impl ExternalEvaluation {
         Self::new(name, document.agent, policies)
     }
 
-    /// Writes the assessment into the folder `path`, which must be new or empty unless it holds an assessment that may be
-    /// overwritten. Deletes the records of an overwritten assessment, and nothing else in the folder.
+    /// Writes the evaluation to the folder `path`. The folder must be new or empty, unless it contains an evaluation
+    /// and `overwrite` is set. Of an overwritten evaluation, deletes only the files with records that are no longer
+    /// needed.
     ///
     /// # Errors
-    /// [`ExternalEvaluationError`]. Nothing is deleted before everything is written: after a failure a former
-    /// `assessment.json` is still there, and a new folder has none.
+    /// [`ExternalEvaluationError`] if the folder is not empty or a file cannot be written. Old files are deleted only
+    /// after all new files are written. So after a failure an old `assessment.json` still exists, and a new folder has
+    /// none.
     pub fn write(&self, path: &Path, overwrite: bool) -> Result<()> {
         let (json, is_one) = (path.join(ASSESSMENT), Self::is_in(path));
         let replaced = overwrite && is_one;
@@ -285,10 +293,10 @@ impl ExternalEvaluation {
         Ok(gone.map(|file| path.join(file)).try_for_each(|path| files::delete(&path))?)
     }
 
-    /// Judges success by `rule` instead of the recorded rule.
+    /// Determines the success of all episodes by `rule` instead of the recorded rule.
     ///
     /// # Errors
-    /// [`ValueError`] if the episodes cannot be judged by it.
+    /// [`ValueError`] if `rule` cannot be applied to the recorded episodes.
     pub fn judged_by(self, rule: &Rule) -> std::result::Result<Self, ValueError> {
         let judge = |policy: ExternalPolicy| {
             let same = policy.records.about.criterion(rule).ok() == policy.records.about.success;
@@ -305,11 +313,12 @@ impl ExternalEvaluation {
     }
 }
 
-/// The files of records that the document `json` names; none if the document is missing or cannot be understood.
+/// Returns the names of the records files that the document `json` lists. Returns none if the document is missing or
+/// cannot be parsed.
 fn records_named_in(json: &Path) -> Result<BTreeSet<String>> {
     let text = read_if_there(json)?.unwrap_or_default();
     let mut value = serde_json::from_slice(&text).unwrap_or_default();
-    // A document with a wrong checksum still names its files.
+    // A document with a wrong checksum can still be parsed for its files.
     let _ = checksum::open(&mut value);
     let entries =
         serde_json::from_value(value).map_or_else(|_| Vec::new(), |document: EvaluationDocument| document.policies);

@@ -1,5 +1,5 @@
-//! Records for tests.
-#![allow(dead_code, reason = "each crate that includes it needs a part")]
+//! Example records for tests.
+#![allow(dead_code, reason = "each crate that includes this file uses only some of its functions")]
 
 use perturb_protocol::Version;
 use perturb_records::success::{Criterion, Side};
@@ -9,7 +9,8 @@ use perturb_records::{
 };
 use perturb_settings::Observe;
 
-/// The `index`th episode of a test on `set`, with one requested parameter and `steps` as the achieved value.
+/// Returns an episode of a test on `set`, in the environment `index`. It has one requested parameter and lasts `steps`
+/// steps, which are also the achieved value.
 pub fn episode(set: &str, index: u32, requested: f64, steps: u32, success: bool) -> EpisodeRecord {
     EpisodeRecord {
         set: set.into(),
@@ -28,7 +29,8 @@ pub fn episode(set: &str, index: u32, requested: f64, steps: u32, success: bool)
     }
 }
 
-/// A policy's heatmap on Pendulum. `figures` gives the mean return and the success rate, %, by mass and length.
+/// Returns the heatmap of a policy on Pendulum, over mass and length. `figures` computes the mean return and the
+/// success rate, in %, for a mass and a length.
 pub fn heatmap(grid: usize, figures: impl Fn(f64, f64) -> (f64, f64)) -> Heatmap {
     let axis = |name: &str, unit: &str| Axis {
         name: name.into(),
@@ -50,8 +52,9 @@ pub fn heatmap(grid: usize, figures: impl Fn(f64, f64) -> (f64, f64)) -> Heatmap
     Heatmap { environment, base: Version::D, fixed: Default::default(), grid, episodes: 20, points, axes }
 }
 
-/// An agent in `environment` with a policy for each of `trained_on`. In each of the ten episodes of its tests on D, R and E
-/// it took `steps`; 195 steps are a success.
+/// Returns an agent in `environment` with one policy for each element of `trained_on`. `steps` are the lengths of the
+/// first episodes of its tests on D, R and E; each of the ten episodes of a test is one step longer than the one
+/// before. 195 steps are a success.
 pub fn assessed(agent: &str, environment: &str, trained_on: &[Option<Version>], steps: [u32; 3]) -> ExternalEvaluation {
     let criterion = |threshold| Criterion {
         quantity: "steps".into(),

@@ -1,4 +1,4 @@
-//! Heatmaps: return and success of policies over two parameters.
+//! Heatmaps: mean return and success rate of policies over two parameters.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,33 +11,33 @@ use crate::axis::Axis;
 use crate::records::{EpisodeRecord, Records};
 use crate::statistics::mean;
 
-/// Maximal number of points along an axis: the environments of all points run together.
+/// Maximal number of points along an axis. It is limited because the environments of all points run together.
 pub const MAX_POINTS: usize = 100;
 
-/// Options of a heatmap.
+/// The options of a heatmap.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct HeatmapOptions {
-    /// Names of the two parameters, along x and along y.
+    /// The names of the parameters along x and along y.
     pub parameters: [String; 2],
-    /// The distribution of all other parameters. In D they have their defaults. In R and E they are drawn for each
-    /// episode (RL²: each trial).
+    /// The version from which all other parameters are drawn. In D they have their defaults. In R and E they are drawn
+    /// for each episode, or with RL² for each trial.
     pub base: Version,
-    /// Points along each axis, 1 … 100.
+    /// The number of points along each axis, 1 … 100.
     pub grid: usize,
-    /// Episodes at each point, at least 1.
+    /// The number of episodes at each point, at least 1.
     pub episodes: u64,
-    /// Fixes all randomness.
+    /// The seed of all random numbers.
     pub seed: u64,
-    /// Values of other parameters, in place of the base's.
+    /// Fixed values of other parameters, which take precedence over `base`.
     #[serde(default, skip_serializing_if = "Context::is_empty")]
     pub fixed: Context,
 }
 
 impl HeatmapOptions {
-    /// Returns the number of episodes of all points together.
+    /// Returns the total number of episodes at all points.
     ///
     /// # Errors
-    /// [`ValueError`] if the number is not below 2^64.
+    /// [`ValueError`] if the number is 2^64 or more.
     pub fn total_episodes(&self) -> Result<u64, ValueError> {
         let total =
             (self.grid as u64).checked_mul(self.grid as u64).and_then(|points| points.checked_mul(self.episodes));
@@ -47,35 +47,35 @@ impl HeatmapOptions {
     }
 }
 
-/// The parameters and the base of a heatmap. Heatmaps of one kind can be compared.
+/// The parameters of a heatmap and the version of its other parameters. Only heatmaps of the same kind can be compared.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct HeatmapKind {
     /// The names of the parameters along x and along y.
     pub parameters: [String; 2],
-    /// The distribution of the other parameters.
+    /// The version from which the other parameters are drawn.
     pub base: Version,
 }
 
-/// A policy's figures over two parameters, or the means of several policies'.
+/// The mean return and success rate of a policy over two parameters, or the means over several policies.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Heatmap {
     /// The environment's name in the catalogue.
     pub environment: String,
     /// The axes x and y.
     pub axes: [Axis; 2],
-    /// The distribution of the other parameters, see [`HeatmapOptions::base`].
+    /// The version from which the other parameters are drawn, see [`HeatmapOptions::base`].
     pub base: Version,
-    /// The values of parameters that are fixed.
+    /// The other parameters that have a fixed value.
     pub fixed: Context,
-    /// G, points along each axis.
+    /// G, the number of points along each axis.
     pub grid: usize,
-    /// Episodes of each policy at each point.
+    /// The number of episodes of each policy at each point.
     pub episodes: u64,
-    /// `[G, G]`, by y, then x, in ascending order.
+    /// The points `[G, G]`, by y, then x, both ascending.
     pub points: Vec<HeatmapPoint>,
 }
 
-/// A policy's figures where the two parameters have these values.
+/// A point of a heatmap: the results for one pair of parameter values.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HeatmapPoint {
     /// The value of the parameter along x.
@@ -84,19 +84,19 @@ pub struct HeatmapPoint {
     pub y: f64,
     /// The mean undiscounted return.
     pub mean_return: f64,
-    /// The success rate of the point's episodes, %.
+    /// The success rate, in %.
     pub success_percent: f64,
 }
 
 impl HeatmapOptions {
-    /// Returns the kind of the heatmap.
+    /// Returns the parameters and the version of the heatmap.
     pub fn kind(&self) -> HeatmapKind {
         HeatmapKind { parameters: self.parameters.clone(), base: self.base }
     }
 }
 
 impl std::fmt::Display for HeatmapKind {
-    /// Formats the kind as in the names of files.
+    /// Formats the kind as it appears in file names.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { parameters: [x, y], base } = self;
         write!(f, "{x}-{y}")?;
@@ -105,10 +105,11 @@ impl std::fmt::Display for HeatmapKind {
 }
 
 impl Heatmap {
-    /// The name of the test set in a heatmap's records.
+    /// The name of the test set whose records make up a heatmap.
     pub const SET: &str = "heatmap";
 
-    /// The axes of a heatmap's set: the two parameters that vary, the faster one along x. `None` for another set.
+    /// Returns the axes of a heatmap's test set: x is the parameter that varies faster from context to context, y the
+    /// other varying parameter. Returns `None` if `set` is not a heatmap's.
     pub(crate) fn axes_of(set: &TestSet, environment: &proto::Environment) -> Option<[Axis; 2]> {
         let contexts = set.listed();
         let [first, second, ..] = contexts.as_slice() else { return None };
@@ -126,14 +127,15 @@ impl Heatmap {
         Some(if faster? == 0 { [one, other] } else { [other, one] })
     }
 
-    /// Computes the heatmap of recorded episodes, if they contain the test of one.
+    /// Computes the heatmap from a policy's records, with the axes that the records contain. Returns `None` if there is
+    /// no heatmap's test among them.
     pub fn from_recorded_test(records: &Records) -> Option<Self> {
         let axes = records.about.tests.iter().find_map(|test| test.axes.clone())?;
         Self::from_records(records, axes)
     }
 
-    /// Returns the contexts of a heatmap's set over `axes`, with `grid` points along each axis. Other parameters have
-    /// the values of `fixed`.
+    /// Returns the contexts (parameter values) of all points over `axes`, with `grid` points along each axis. Other
+    /// parameters have the values of `fixed`.
     pub fn contexts(axes: &[Axis; 2], grid: usize, fixed: &Context) -> Vec<Context> {
         let context = |point: usize| {
             let places = [point % grid, point / grid];
@@ -148,13 +150,13 @@ impl Heatmap {
         HeatmapKind { parameters: self.axes.clone().map(|axis| axis.name), base: self.base }
     }
 
-    /// Returns the base of a recorded heatmap; `None` for other tests.
+    /// Returns the version of the other parameters in a recorded heatmap; `None` if there is no heatmap's test.
     pub fn base_of(records: &Records) -> Option<Version> {
         records.about.tests.iter().find(|test| test.set.name == Self::SET).map(|test| test.set.version)
     }
 
-    /// Computes the heatmap of a recorded test over `axes`, whose contexts are the points, by y, then x. `None` if the
-    /// episodes are those of another test.
+    /// Computes the heatmap from a policy's records, for given `axes`. The test's contexts are the points, by y, then
+    /// x. Returns `None` if there is no heatmap's test, or if its contexts do not fit the axes.
     pub fn from_records(records: &Records, axes: [Axis; 2]) -> Option<Self> {
         let test = records.about.tests.iter().find(|test| test.set.name == Self::SET)?;
         let contexts = test.set.listed();
@@ -190,7 +192,8 @@ impl Heatmap {
         heatmap.is_whole().then_some(heatmap)
     }
 
-    /// The means of several policies' figures at each point; `None` without heatmaps, or if their points differ.
+    /// Averages heatmaps of several policies, point by point. Returns `None` if there are none, or if their axes, grids
+    /// or other options differ.
     pub fn mean(heatmaps: &[Self]) -> Option<Self> {
         let first = heatmaps.first()?;
         let about = |of: &Self| Self { points: Vec::new(), ..of.clone() };
@@ -207,8 +210,8 @@ impl Heatmap {
         Some(Self { points: first.points.iter().enumerate().map(point).collect(), ..about(first) })
     }
 
-    /// Replaces the points by those in `csv`, written by [`heatmap_table`]; `None` if they do not fit the axes and the
-    /// grid.
+    /// Replaces the points by those in `csv`, which [`heatmap_table`] wrote. Returns `None` if they do not fit the axes
+    /// and the grid.
     pub fn with_points(self, csv: &[u8]) -> Option<Self> {
         let mut reader = csv::Reader::from_reader(csv);
         let rows: Result<Vec<[f64; 4]>, _> = reader.deserialize().collect();
@@ -218,17 +221,17 @@ impl Heatmap {
         read.is_whole().then_some(read)
     }
 
-    /// Whether each point has the values of its place in the grid.
+    /// Returns whether every point has the parameter values of its position in the grid.
     fn is_whole(&self) -> bool {
         let ([x, y], grid) = (&self.axes, self.grid);
         let fits = |(index, point): (usize, &HeatmapPoint)| {
             (point.x, point.y) == (x.value(index % grid, grid), y.value(index / grid, grid))
         };
-        // A foreign file may have no points, or a grid whose number of points overflows.
+        // A file of another origin may have no points, or a grid whose number of points overflows.
         grid > 0 && grid.checked_mul(grid) == Some(self.points.len()) && self.points.iter().enumerate().all(fits)
     }
 
-    /// Describes the values of the parameters that are no axes.
+    /// Describes the values of the parameters that are not axes.
     pub fn others(&self) -> String {
         let fixed: String = self.fixed.iter().map(|(name, value)| format!("{name} = {value}, ")).collect();
         match self.base {
@@ -238,7 +241,7 @@ impl Heatmap {
     }
 }
 
-/// A line for each point.
+/// Returns a table with a row for each point.
 pub fn heatmap_table(heatmap: &Heatmap) -> Table {
     let [x, y] = &heatmap.axes;
     Table::builder("", &heatmap.points)

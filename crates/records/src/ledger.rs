@@ -1,8 +1,9 @@
-//! Audit of a policy by servers' ledgers: the training drew from the claimed distribution, and never from its test
-//! sets.
+//! Audit of a policy by the servers' ledgers. A ledger records from which parameter distributions each session drew its
+//! environments, with their seeds and indices. The audit checks that the training drew from the claimed distribution,
+//! and that it never drew from the policy's test sets.
 //!
-//! Tokens tell who trained: they are the names under which the training's seed was drawn. Everything that these tokens
-//! drew before the training's end may have been learned from, in any session.
+//! The audit first finds the tokens under which the training's seed was drawn. The owners of these tokens may have
+//! learned from everything that these tokens drew, in any session, before the training ended.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -16,66 +17,67 @@ use perturb_settings::Common;
 
 use crate::records::{RecordedTest, Records};
 
-/// Ledgers of one or several servers, whose chains hold.
+/// The ledgers of one or several servers, with valid digest chains.
 #[derive(Debug, Default)]
 pub struct Ledgers {
     heads: Vec<Head>,
-    /// The sampling of each environment.
+    /// The draws of each environment.
     drawn: Vec<Drawn>,
-    /// The environments of each address in a session.
+    /// The environments of each session, seed and environment index.
     at: BTreeMap<(SessionId, u64, u32), EnvironmentAddress>,
     refused: Vec<Refused>,
-    /// The end of each server process; `None` if it is not known.
+    /// The end of each server process; `None` if it is unknown.
     over: Vec<Option<Moment>>,
-    /// A line that contradicts itself.
+    /// The index and description of a line that contradicts itself.
     defect: Option<(u64, &'static str)>,
 }
 
-/// The sampling of environments with one seed and index in a session.
+/// The draws of all environments with the same seed and environment index in a session.
 #[derive(Debug, Default)]
 struct EnvironmentAddress {
-    /// Indices of entries of `drawn` that have not ended.
+    /// Indices in `drawn` of environments that are still in use.
     open: Vec<usize>,
-    /// Ends so far. They are assigned to environments when all have ended.
+    /// Recorded ends that are not yet assigned to environments. They are assigned when there is one for each
+    /// environment in `open`.
     ends: Vec<(Option<u64>, Moment)>,
-    /// Indices of the entries that ended last.
+    /// Indices in `drawn` of the environments that ended last.
     closed: Vec<usize>,
 }
 
-/// Maximal number of environments that a line may name.
+/// Maximal number of environments in a line.
 const MAX_ENVS: u32 = 1 << 22;
 
-/// The end of a ledger.
+/// The last line of a ledger.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Head {
-    /// The file of the ledger.
+    /// The path of the ledger.
     pub path: PathBuf,
-    /// Number of lines.
+    /// The number of lines.
     pub lines: u64,
     /// The digest of the last line.
     pub digest: String,
-    /// Number of bytes behind the last line: a line that is being written or was not finished.
+    /// The number of bytes after the last line. They are a line that is being written or was never completed.
     pub unfinished: u64,
 }
 
-/// The result of the audit of one policy.
+/// The result of auditing one policy.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct Proof {
-    /// The names of the tokens under which its training drew, `None` for a session without a token; empty if no ledger has
-    /// the training.
+    /// The names of the tokens under which the training drew parameters. `None` stands for a session without a token.
+    /// Empty if no ledger contains the training.
     pub tokens: BTreeSet<Option<String>>,
-    /// Sessions of its training.
+    /// The number of sessions of the training.
     pub sessions: usize,
-    /// Findings against the policy, one sentence each.
+    /// Descriptions of findings against the policy.
     pub against: Vec<String>,
-    /// Requests that were refused to the policy's tokens before it ended, one sentence each.
+    /// Descriptions of requests by these tokens that the servers refused before the training ended.
     pub refused: Vec<String>,
 }
 
-/// A session: the index of the server process, and the session's number in it.
+/// Identifies a session: the index of the server process in the ledgers, and the session's number in this process.
 type SessionId = (usize, u64);
 
-/// The position of a line.
+/// The position, session and author of a line.
 #[derive(Debug, Clone)]
 struct LedgerLine {
     at: Moment,
@@ -83,7 +85,7 @@ struct LedgerLine {
     who: LedgerSession,
 }
 
-/// The time of a record: its position in its ledger, and the clock between ledgers.
+/// The time of a line. Lines of one ledger are ordered by their number `n`, lines of different ledgers by the clock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Moment {
     ledger: usize,
@@ -97,22 +99,22 @@ impl Moment {
     }
 }
 
-/// An environment that began to draw.
+/// The draws of an environment from one region.
 #[derive(Debug)]
 struct Drawn {
     line: Arc<LedgerLine>,
     seed: u64,
     index: u32,
-    /// Index of the first episode.
+    /// The index of the first episode.
     first: u64,
-    /// Index of the last episode, if it is known. Smaller than `first` if nothing was drawn.
+    /// The last episode that was drawn.
     last: LastDraw,
-    /// The time at which the end of its sampling was recorded.
+    /// The time at which the environment's last episode was recorded; `None` if it was not.
     ended: Option<Moment>,
     region: Arc<Region>,
 }
 
-/// The last episode that was begun.
+/// The last episode that an environment began: none, the episode with an index, or not recorded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum LastDraw {
     None,
@@ -120,7 +122,7 @@ enum LastDraw {
     Unknown,
 }
 
-/// A refused sampling request of a session.
+/// A session's request to draw from a region, which the server refused.
 #[derive(Debug)]
 struct Refused {
     line: LedgerLine,
@@ -129,10 +131,11 @@ struct Refused {
 }
 
 impl Ledgers {
-    /// Reads ledgers and checks their chains. `known` are digests from elsewhere, each of which must be that of a line.
+    /// Reads ledgers and checks their digest chains. `known` are digests noted earlier, each of which must occur in a
+    /// ledger.
     ///
     /// # Errors
-    /// A sentence on the first ledger that cannot be read or is not valid.
+    /// A description of the first ledger that cannot be read or is not valid.
     pub fn read(paths: &[PathBuf], known: &[String]) -> Result<Self, String> {
         let (mut ledgers, mut missing) = (Self::default(), known.iter().collect::<Vec<_>>());
         for path in paths {
@@ -163,7 +166,7 @@ impl Ledgers {
         }
     }
 
-    /// Returns the end of each ledger.
+    /// Returns the last line of each ledger.
     pub fn heads(&self) -> &[Head] {
         &self.heads
     }
@@ -178,7 +181,7 @@ impl Ledgers {
         let line = |who: LedgerSession| LedgerLine { at, session: (beginning, who.session), who };
         match event {
             LedgerEvent::Began { .. } => {
-                // The earlier server process of this ledger had ended by then.
+                // The earlier server process of the same ledger ended before this line.
                 if n > 0
                     && let Some(over) = self.over.last_mut()
                 {
@@ -194,7 +197,7 @@ impl Ledgers {
         }
     }
 
-    /// Takes a sampling record. Its ends happened before its beginnings.
+    /// Stores a record of draws. Its ends precede its beginnings.
     fn take_draws(&mut self, line: LedgerLine, DrawRecord { regions, begins, ends, .. }: DrawRecord) {
         let named = begins.iter().map(|begin| begin.count).chain(ends.iter().map(|end| end.count));
         if named.fold(0, u32::saturating_add) > MAX_ENVS {
@@ -223,12 +226,12 @@ impl Ledgers {
     fn end_one(&mut self, address: (SessionId, u64, u32), end: (Option<u64>, Moment)) {
         let address = self.at.entry(address).or_default();
         address.ends.push(end);
-        // If no environment was drawing, those that had ended before went on.
-        let went_on = address.open.is_empty();
+        // If no environment was in use, those that ended last had continued to draw.
+        let continued = address.open.is_empty();
         if address.ends.len() < address.open.len() {
             return;
         }
-        if !went_on {
+        if !continued {
             address.closed = std::mem::take(&mut address.open);
         }
         let ends = std::mem::take(&mut address.ends);
@@ -239,13 +242,13 @@ impl Ledgers {
             .unwrap_or(LastDraw::None);
         for &which in &address.closed {
             let drawn = &mut self.drawn[which];
-            drawn.last = if went_on { drawn.last.max(last) } else { last };
+            drawn.last = if continued { drawn.last.max(last) } else { last };
             drawn.ended = Some(end.1);
         }
     }
 
-    /// Audits a policy that was trained for `episodes` episodes in an environment as `training` says, together with its
-    /// recorded tests.
+    /// Audits a policy with its recorded tests. It was trained for `episodes` episodes in `environment` with the
+    /// settings `training`.
     pub fn prove(
         &self,
         training: &Common,
@@ -254,7 +257,7 @@ impl Ledgers {
         records: &Records,
     ) -> Proof {
         let claimed = Region::from_version(environment, training.version, &training.parameters);
-        // Other trainings with the same seed draw from other regions.
+        // A training with the same seed but other parameters is a different one.
         let is_own = |drawn: &&Drawn| {
             drawn.line.who.environment == environment.name
                 && drawn.last != LastDraw::None
@@ -275,7 +278,7 @@ impl Ledgers {
                 format!("of the {episodes} episodes of its training, {name}, {drawn} were drawn: give all ledgers");
             proof.against.push(few);
         }
-        // A session without a recorded end counts until the end of its server process.
+        // If the end of a session is not recorded, it counts until the end of its server process.
         let end = |drawn: &&Drawn| drawn.ended.or(self.over.get(drawn.line.session.0).copied().flatten());
         let ends: Vec<Option<Moment>> = own.iter().map(end).collect();
         let is_its = |line: &LedgerLine| {
@@ -321,15 +324,15 @@ impl Ledgers {
     }
 }
 
-/// Returns one region for each context of a test: the parameters that the test draws from. Regions inside `claimed`,
-/// the region of the training, are left out.
+/// Returns the parameter region of each context of a test. Omits regions that lie inside `claimed`, the region of the
+/// training.
 fn tested(environment: &proto::Environment, test: &RecordedTest, claimed: &Region) -> Vec<Region> {
     let of = |context| Region::from_version(environment, test.set.version, &test.set.parameters(context));
     test.set.listed().iter().map(of).filter(|region| !region.is_within([claimed])).collect()
 }
 
 impl Drawn {
-    /// Returns the number of sampled episodes; the largest number if it is not known.
+    /// Returns the number of episodes that were drawn, or the maximum of u64 if it is unknown.
     fn episodes(&self) -> u64 {
         match self.last {
             LastDraw::None => 0,
@@ -338,7 +341,7 @@ impl Drawn {
         }
     }
 
-    /// Whether it may have drawn a recorded episode of a test.
+    /// Returns whether the environment may have drawn a recorded episode of `test`.
     fn has_episode(&self, test: &RecordedTest, records: &Records) -> bool {
         let may = |episode: u64| match self.last {
             LastDraw::None => false,

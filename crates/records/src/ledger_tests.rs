@@ -1,4 +1,4 @@
-//! Proofs from invented ledgers.
+//! Tests of the audit with artificial ledgers.
 
 use std::path::{Path, PathBuf};
 
@@ -25,8 +25,8 @@ fn environment() -> proto::Environment {
     proto::Environment { name: "CartPole".into(), parameters: vec![length], ..Default::default() }
 }
 
-/// 100 episodes of a training on R with seed 1, in two environments, and a test on R and E of seed 7, environment 0,
-/// episode 5.
+/// Audits a training on R with seed 1, 100 episodes and two environments. The policy's tests on R and E have seed 7,
+/// and one episode each: environment 0, episode 5.
 fn prove(ledgers: &Ledgers) -> Proof {
     let table: Table = toml::from_str("environment = 'CartPole'\nversion = 'R'\nseed = 1\nnum_envs = 2").unwrap();
     let training = TrainConfig::load(None, &[], table).unwrap().common;
@@ -74,7 +74,7 @@ fn ends(session: u64, token: &str, (seed, index, count, episode): (u64, u32, u32
     LedgerEvent::Draws(DrawRecord { who: who(session, token), regions: Vec::new(), begins: Vec::new(), ends })
 }
 
-/// The events of the training, with the token of ann.
+/// Returns the ledger's events of the training, with ann's token.
 fn trained() -> [LedgerEvent; 2] {
     [begins(0, "ann", R, (1, 0, 2, 0)), ends(0, "ann", (1, 0, 2, 49))]
 }
@@ -100,7 +100,7 @@ fn early_draws_from_test_sets_count_against_a_policy() {
     let with = |event: LedgerEvent| proof(&[begun.clone(), event, ended.clone()]);
     says(&with(begins(1, "ann", E, (9, 0, 1, 0))), "line 3 of ");
     says(&with(begins(1, "ann", RE, (9, 0, 1, 0))), "of the test set E, had been drawn");
-    // The test on R and that on E have the same seed here, and so the same episode.
+    // The tests on R and E have the same seed here, and so the same episode.
     assert_eq!(with(begins(1, "ann", R, (7, 0, 1, 0))).against.len(), 2);
     for (seed, index, count, episode) in [(7, 1, 9, 0), (7, 0, 1, 6), (8, 0, 9, 0)] {
         assert!(with(begins(1, "ann", R, (seed, index, count, episode))).against.is_empty(), "another episode");
@@ -126,7 +126,7 @@ fn a_session_without_an_end_lasts_as_long_as_its_server() {
     says(&proof(&[begun.clone(), leak.clone(), again.clone()]), "of the test set E");
     assert!(proof(&[begun.clone(), again.clone(), leak.clone()]).against.is_empty(), "its server had ended by then");
     says(&proof(&[begun.clone(), leak.clone()]), "of the test set E");
-    // Session 0 of another server process is another session.
+    // A session 0 of another server process is a different session.
     let other = [begun, again, begins(0, "bob", E, (9, 0, 1, 0)), ends(0, "bob", (1, 0, 2, 0))];
     assert!(proof(&other).against.is_empty());
 }
@@ -147,16 +147,16 @@ fn sessions_on_several_servers_are_found_in_all_their_ledgers() {
 #[test]
 fn an_end_is_that_of_what_was_open_and_of_nothing_later() {
     let [begun, ended] = trained();
-    // The same seed drawn twice, the second time without an end.
+    // The same seed is drawn twice. The second drawing has no recorded end.
     let again = begins(1, "ann", R, (7, 0, 1, 0));
     let reset = [begun.clone(), again.clone(), ends(1, "ann", (7, 0, 1, 0)), again, ended.clone()];
     let found = proof(&reset);
     assert_eq!(found.against.len(), 2, "{found:?}");
-    // Many short draws do not add up to a long one for each environment.
+    // Many short draws are not the same as one long draw of each environment.
     let short: Vec<LedgerEvent> =
         (0..9).flat_map(|_| [begins(0, "ann", R, (1, 0, 2, 0)), ends(0, "ann", (1, 0, 2, 4))]).collect();
     says(&proof(&short), "90 were drawn");
-    // A part that was given back early does not end the others.
+    // An environment that is freed early does not end the draws of the others.
     let early = [begun.clone(), ends(0, "ann", (1, 0, 1, 49)), begins(1, "ann", E, (9, 0, 1, 0))];
     says(&proof(&early), "of the test set E");
     // The server draws nothing for a refused request.

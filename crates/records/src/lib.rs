@@ -1,16 +1,18 @@
-//! The recorded episodes of tests, what follows from them, and the paper's numbers to compare with.
+//! Recorded episodes of tests, the statistics computed from them, and the paper's numbers for comparison.
 //!
-//! - [`ResultsTable`] has every result of studies in one Parquet file, [`StudyEpisodes`] the episodes of one study.
-//! - [`Records`] are the episodes of a policy's tests, in a Parquet file; [`testing`] says which episodes a test plays.
-//! - [`success`] has the rules of success; [`outcomes`] has success over parameters and thresholds, and tail risk.
-//! - [`statistics`] are means, intervals and tests over runs; [`Metric`] and [`Scenario`] are the paper's.
-//! - [`Heatmap`] is a policy over two parameters; [`ExternalEvaluation`] is an agent that no experiment trained.
-//! - [`comparison`] compares conditions over their seeds and over episodes.
-//! - [`paper`] has the published numbers; [`ledger`] compares records with a server's ledger.
+//! - [`ResultsTable`] holds every result of several studies, and [`StudyEpisodes`] the episodes of one study. Each is
+//!   one Parquet file.
+//! - [`Records`] are the recorded episodes of a policy's tests. [`testing`] chooses the episodes of a test.
+//! - [`success`] has the rules of success. [`outcomes`] computes success over parameters, and tail risk.
+//! - [`statistics`] has means, intervals and significance tests over runs. [`Metric`] and [`Scenario`] are the paper's.
+//! - [`Heatmap`] shows a policy's results over two parameters. [`ExternalEvaluation`] holds the tests of an agent that
+//!   was not trained by an experiment.
+//! - [`comparison`] compares conditions over seeds and over episodes.
+//! - [`paper`] has the published numbers. [`ledger`] checks a policy against the servers' ledgers.
 #![forbid(unsafe_code)]
 
 #[cfg(test)]
-extern crate self as perturb_records; // by this name fixtures call it in every crate
+extern crate self as perturb_records; // `fixture.rs` uses this name, because other crates include the file too
 
 mod axis;
 pub mod comparison;

@@ -6,15 +6,16 @@ use serde::Deserialize;
 use crate::scenarios::Metric;
 use crate::statistics::Summary;
 
-/// Every number of its tables.
+/// Every number in the paper's tables.
 const TABLE: &str = include_str!("../data/paper_results.csv");
-/// The paper's environments by their names in the catalogue.
+/// The paper's environments, by their names in the catalogue.
 pub const ENVIRONMENTS: [&str; 6] = ["CartPole", "MountainCar", "Acrobot", "Pendulum", "HalfCheetah", "Hopper"];
-/// Environments with another physics engine than the paper's. Their numbers cannot be compared.
+/// Environments for which perturb uses another physics engine than the paper. Their numbers cannot be compared with the
+/// paper's.
 const OTHER_ENGINE: [&str; 2] = ["HalfCheetah", "Hopper"];
 const RUNS: usize = 5;
 
-/// Whether numbers of an environment can be compared with the paper's.
+/// Returns whether results in an environment can be compared with the paper's.
 pub fn is_comparable(environment: &str) -> bool {
     !OTHER_ENGINE.contains(&environment)
 }
@@ -41,13 +42,14 @@ impl Record {
     }
 }
 
-/// The paper's number for a method in an environment; `None` if it has none. The environment "Average" stands for all six.
+/// Returns the paper's number for a method in an environment; `None` if it has none. "Average" as the environment
+/// stands for the average over all six.
 pub fn number(environment: &str, method: &Method, metric: Metric) -> Option<Summary> {
     let record = records().find(|record| record.metric == metric && record.is_of(environment, method))?;
     Some(Summary { mean: record.mean_percent, std: Some(record.std_percent), runs: RUNS })
 }
 
-/// The methods that the paper has numbers of in `environment`, in its order.
+/// Returns the methods for which the paper has numbers in `environment`, in the paper's order.
 pub fn methods(environment: &str) -> Vec<Method> {
     let mut methods = Vec::new();
     for record in records().filter(|record| record.environment == environment) {
@@ -66,7 +68,8 @@ pub fn methods(environment: &str) -> Vec<Method> {
     methods
 }
 
-/// The paper's average over `environments`: the published one for all six, otherwise the mean of their published numbers.
+/// Returns the paper's average over `environments`. For all six this is the published average, otherwise the mean of
+/// the published numbers.
 pub fn average(environments: &[&str], method: &Method, metric: Metric) -> Option<Summary> {
     let means: Option<Vec<f64>> = environments.iter().map(|name| Some(number(name, method, metric)?.mean)).collect();
     let means = means?;
@@ -138,7 +141,7 @@ mod tests {
         assert_eq!(average(&["CartPole", "Ant"], &a2c, Metric::Default), None);
     }
 
-    /// The paper's averages follow from its tables of the environments, to the two digits that they are rounded to.
+    /// The paper's averages equal the means of its tables of the environments, to the published two decimals.
     #[test]
     fn the_published_averages_are_those_of_the_environments() {
         let averages: Vec<Record> = records().filter(|record| record.environment == "Average").collect();
@@ -148,7 +151,8 @@ mod tests {
             let method = Method { algorithm, architecture, episodes_per_trial, preset, observe, external: false };
             let means = ENVIRONMENTS.map(|environment| number(environment, &method, metric).unwrap().mean);
             let mean = means.iter().sum::<f64>() / means.len() as f64;
-            // Either is rounded to 0.01: half of that each, and some for the binary fractions.
+            // Both numbers are rounded to 0.01, so each may be off by half of it. The rest of the tolerance is for
+            // binary rounding.
             assert!((mean - mean_percent).abs() < 0.0101, "{method} {metric}: {mean} is not {mean_percent}");
         }
     }

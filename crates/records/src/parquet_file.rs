@@ -1,7 +1,8 @@
-//! Parquet files: columns by their names, and a JSON document about them in the file's metadata.
+//! Reading and writing of Parquet files: named columns, and a JSON document in the file's metadata.
 //!
-//! Parquet, because pandas, polars, DuckDB and R read it without us, with types and units of 64 bits, at about half the
-//! size of CSV; and because its Rust implementation is Apache's own. The same columns give the same bytes.
+//! Parquet was chosen because pandas, polars, DuckDB and R can read it without perturb. It has types, including 64-bit
+//! integers, and takes about half the space of CSV. Its Rust implementation is Apache's own. Equal columns give equal
+//! bytes.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -19,39 +20,39 @@ use parquet::schema::parser::parse_message_type;
 use parquet::schema::types::Type;
 use perturb_files::{AnyError, checksum};
 
-/// The key of the JSON document in the file's metadata.
+/// The key under which the JSON document is stored in the file's metadata.
 const KEY: &str = "perturb";
-/// The first and last bytes of a Parquet file.
+/// The bytes with which every Parquet file begins and ends.
 const MAGIC: &[u8] = b"PAR1";
-/// Maximum size of a column's dictionary, bytes. Longer texts are repeated in every row.
+/// Maximum size of a column's dictionary, in bytes. Beyond it, texts are written in full in every row.
 const MAX_DICTIONARY_BYTES: usize = 8 << 20;
 
 /// The values of a column, one for each row.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ColumnValues<'a> {
-    /// Names.
+    /// Texts, such as names.
     Text(Vec<&'a str>),
-    /// Texts that some rows lack.
+    /// Texts that are missing in some rows.
     OptionalText(Vec<Option<&'a str>>),
-    /// Seeds and indices.
+    /// 64-bit unsigned integers, such as seeds and indices.
     Unsigned64(Vec<u64>),
-    /// Counts that some rows lack.
+    /// 64-bit unsigned integers that are missing in some rows, such as counts.
     OptionalUnsigned64(Vec<Option<u64>>),
-    /// Numbers of steps and of environments.
+    /// 32-bit unsigned integers, such as numbers of steps.
     Unsigned32(Vec<u32>),
-    /// Truth values.
+    /// Booleans.
     Flag(Vec<bool>),
-    /// Measured numbers.
+    /// Floating-point numbers.
     Number(Vec<f64>),
-    /// Numbers that some rows lack.
+    /// Floating-point numbers that are missing in some rows.
     Optional(Vec<Option<f64>>),
 }
 
-/// A column's name with its values.
+/// The name and the values of a column.
 pub(crate) type NamedColumn<'a> = (String, ColumnValues<'a>);
 
 impl ColumnValues<'_> {
-    /// Returns the column's type in the schema, before and after the column's name.
+    /// Returns the column's type in Parquet's schema language, as the texts before and after the column's name.
     fn kind(&self) -> (&'static str, &'static str) {
         match self {
             Self::Text(_) => ("required binary", " (STRING)"),
@@ -79,7 +80,7 @@ impl ColumnValues<'_> {
         }
     }
 
-    /// Returns a value as text; empty if the row has none.
+    /// Returns the value in `row` as text, or an empty text if it is missing.
     pub(crate) fn shown(&self, row: usize) -> String {
         fn optional<T: ToString>(value: Option<T>) -> String {
             value.map_or_else(String::new, |value| value.to_string())
@@ -96,7 +97,7 @@ impl ColumnValues<'_> {
         }
     }
 
-    /// Writes the values of the rows in `rows`.
+    /// Writes the values of `rows`.
     fn write(&self, rows: Range<usize>, writer: &mut SerializedColumnWriter<'_>) -> Result<usize, ParquetError> {
         match self {
             Self::Text(texts) => {
@@ -108,7 +109,7 @@ impl ColumnValues<'_> {
                 let known: Vec<ByteArray> = texts.iter().flatten().map(|&text| text.into()).collect();
                 writer.typed::<ByteArrayType>().write_batch(&known, Some(&levels(texts)), None)
             }
-            // Parquet's unsigned numbers are signed ones of the same bits.
+            // Parquet stores an unsigned integer as the signed integer with the same bits.
             Self::Unsigned64(numbers) => {
                 let numbers: Vec<i64> = numbers[rows].iter().map(|number| number.cast_signed()).collect();
                 writer.typed::<Int64Type>().write_batch(&numbers, None, None)
@@ -133,7 +134,7 @@ impl ColumnValues<'_> {
     }
 }
 
-/// Says for each row whether it has a value.
+/// Returns 1 for each row with a value and 0 for each row without, which Parquet calls definition levels.
 fn levels<T>(values: &[Option<T>]) -> Vec<i16> {
     values.iter().map(|value| value.is_some().into()).collect()
 }
@@ -147,7 +148,8 @@ fn schema(message: &str, columns: &[NamedColumn<'_>]) -> Result<Type, ParquetErr
     parse_message_type(&format!("message {message} {{ {} }}", lines.join(" ")))
 }
 
-/// Returns a file of `columns` with the JSON text `about`. Each range of `groups` becomes a row group.
+/// Encodes `columns` as a Parquet file. `message` is the schema's name, and `about` the JSON document in the metadata.
+/// Each range of `groups` becomes a row group.
 pub(crate) fn encode(
     message: &str,
     columns: &[NamedColumn<'_>],
@@ -172,34 +174,36 @@ pub(crate) fn encode(
         rows.close()?;
     }
     let mut file = file.into_inner()?;
-    // Before the footer, whose length stands before the last four bytes: readers find everything by its offset.
+    // Inserts a checksum before the footer. This leaves the file readable, because readers find the footer from the
+    // end, and everything else by its offset. The footer's length is in the first four of the last eight bytes.
     let footer = file.last_chunk::<8>().map_or(0, |end| 8 + u32::from_le_bytes([end[0], end[1], end[2], end[3]]));
     let place = file.len() - footer as usize;
     checksum::insert(&mut file, place);
     Ok(file)
 }
 
-/// Returns one row group with all rows of `columns`.
+/// Returns the range of all rows of `columns`, to write them as a single row group.
 pub(crate) fn one_group(columns: &[NamedColumn<'_>]) -> [Range<usize>; 1] {
     let rows = columns.first().map_or(0, |(_, values)| values.len());
     [Range { start: 0, end: rows }]
 }
 
-/// A Parquet file that was read.
+/// A Parquet file opened for reading.
 pub(crate) struct ParquetFile {
     reader: SerializedFileReader<Bytes>,
     about: String,
 }
 
 impl ParquetFile {
-    /// Whether `content` is no Parquet file. A damaged one may still begin or end as one.
+    /// Returns whether `content` is certainly not a Parquet file. A damaged Parquet file still counts as one if its
+    /// beginning or its end is intact.
     pub(crate) fn is_other(content: &[u8]) -> bool {
         !content.is_empty() && !content.starts_with(MAGIC) && !content.ends_with(MAGIC)
     }
 
-    /// Opens a file after its checksum was compared.
+    /// Opens a file. Fails if its checksum is wrong.
     pub(crate) fn open(content: Vec<u8>) -> Result<Self, AnyError> {
-        // This is checked first: the decoder believes what a damaged file says, and may panic.
+        // The checksum is compared first, because the decoder trusts the content of a damaged file and may panic.
         checksum::check(&content).map_err(|broken| format!("{broken}; use an undamaged copy, or test again"))?;
         let reader = SerializedFileReader::new(Bytes::from(content))?;
         let metadata = reader.metadata().file_metadata().key_value_metadata();
@@ -209,12 +213,12 @@ impl ParquetFile {
         Ok(Self { reader, about })
     }
 
-    /// Returns the JSON document of the file's metadata.
+    /// Returns the JSON document in the file's metadata.
     pub(crate) fn about(&self) -> &str {
         &self.about
     }
 
-    /// Refuses a file whose columns do not begin with `columns`.
+    /// Checks that the file's first columns have the names and types of `columns`.
     pub(crate) fn require(&self, message: &str, columns: &[NamedColumn<'_>]) -> Result<(), AnyError> {
         let there = self.reader.metadata().file_metadata().schema().get_fields();
         for (index, column) in schema(message, columns)?.get_fields().iter().enumerate() {
@@ -235,14 +239,14 @@ impl ParquetFile {
         self.reader.num_row_groups()
     }
 
-    /// Returns a row group.
+    /// Returns the row group with this index.
     pub(crate) fn group(&self, index: usize) -> Result<RowGroup<'_>, AnyError> {
         Ok(RowGroup { group: self.reader.get_row_group(index)? })
     }
 }
 
-/// A part of the rows of a file. It is read by columns, since row by row takes four times as long, and a report reads
-/// millions.
+/// A row group: some of the rows of a file. It is read by column, because reading by row takes four times as long, and
+/// reports read millions of rows.
 pub(crate) struct RowGroup<'a> {
     group: Box<dyn RowGroupReader + 'a>,
 }
@@ -253,12 +257,12 @@ impl RowGroup<'_> {
         usize::try_from(self.group.metadata().num_rows()).unwrap_or_default()
     }
 
-    /// Returns the place of the column with this name, if there is one.
+    /// Returns the index of the column called `name`, or `None` if there is none.
     pub(crate) fn place(&self, name: &str) -> Option<usize> {
         self.group.metadata().columns().iter().position(|column| column.column_descr().name() == name)
     }
 
-    /// Reads the column in `place`, in which some rows may have no value.
+    /// Reads column number `place`, in which rows may lack a value.
     fn values<T: DataType>(&self, place: usize) -> Result<Vec<Option<T::T>>, AnyError> {
         let column = self.group.metadata().column(place).column_descr();
         let (name, is_optional) = (column.name().to_owned(), column.max_def_level() > 0);
@@ -282,7 +286,7 @@ impl RowGroup<'_> {
         Ok(there.into_iter().map(|there| if there == 1 { values.next() } else { None }).collect())
     }
 
-    /// Reads a column that has a value in each row.
+    /// Reads column number `place`, in which every row must have a value.
     fn all<T: DataType>(&self, place: usize) -> Result<Vec<T::T>, AnyError> {
         let values: Option<Vec<T::T>> = self.values::<T>(place)?.into_iter().collect();
         values.ok_or_else(|| "a row has no value where each must have one".into())

@@ -2,16 +2,16 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Figures over test episodes.
+/// Statistics over the episodes of a test.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TestResult {
     /// The number of episodes. With RL², only the last episode of each trial counts.
     pub episodes: u64,
-    /// The share of the episodes that were successes.
+    /// Success rate, in %.
     pub success_percent: f64,
-    /// The 95 % Wilson interval of `success_percent`, [low, high], %.
+    /// The 95 % Wilson interval of the success rate, [low, high] in %.
     pub success_percent_95: [f64; 2],
-    /// Mean undiscounted return, never normalised.
+    /// Mean undiscounted return of the original, not normalised rewards.
     pub mean_return: f64,
     /// Mean number of steps.
     pub mean_length: f64,

@@ -1,4 +1,4 @@
-//! The paper's protocol: versions, scenarios and metrics.
+//! The paper's evaluation protocol: versions, scenarios and metrics.
 
 use std::fmt;
 
@@ -8,27 +8,28 @@ use crate::statistics::geometric_mean;
 
 use perturb_protocol::Version;
 
-/// Returns the paper's versions, and those other versions for which `is_there` holds.
+/// Returns the paper's versions D, R and E, and every other version for which `is_there` returns true.
 pub fn versions(is_there: impl Fn(Version) -> bool) -> Vec<Version> {
     Version::KNOWN.into_iter().filter(|version| Version::ALL.contains(version) || is_there(*version)).collect()
 }
 
-/// The training distribution of a policy.
+/// The parameter distribution on which a policy was trained.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum TrainedOn<'a> {
-    /// D, R, E or R+E.
+    /// A version: D, R, E or R+E.
     Version(Version),
-    /// The plan's own set of that name.
+    /// A parameter set of the experiment file, by its name.
     Set(&'a str),
-    /// Another or an unknown distribution, for policies that were trained elsewhere.
+    /// An unknown distribution, or one that is neither a version nor a set. Only policies that were not trained by the
+    /// experiment have it.
     Unknown,
 }
 
-/// The name of an unknown training distribution.
+/// The display name of an unknown distribution.
 const UNKNOWN: &str = "unknown";
 
 impl TrainedOn<'_> {
-    /// Returns the name for use in file names.
+    /// Returns a name that is suitable for file names.
     pub fn file_name(&self) -> &str {
         match self {
             TrainedOn::Version(version) => version.file_name(),
@@ -48,7 +49,7 @@ impl std::fmt::Display for TrainedOn<'_> {
     }
 }
 
-/// Training on one version and testing on another, e.g. "DR".
+/// A pair of a training version and a testing version. "DR", for example, is trained on D and tested on R.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Scenario {
     /// The version of the training.
@@ -58,7 +59,7 @@ pub struct Scenario {
 }
 
 impl Scenario {
-    /// The nine pairs: DD, DR, DE, RD, … EE.
+    /// Returns the nine scenarios of the paper: DD, DR, DE, RD, …, EE.
     pub fn all() -> impl Iterator<Item = Scenario> {
         Version::ALL.into_iter().flat_map(|train| Version::ALL.map(|test| Scenario { train, test }))
     }
@@ -70,15 +71,15 @@ impl fmt::Display for Scenario {
     }
 }
 
-/// A metric of the paper.
+/// A metric of generalisation from the paper.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Metric {
-    /// The success rate of DD.
+    /// The success rate of scenario DD.
     Default,
-    /// The success rate of RR.
+    /// The success rate of scenario RR.
     Interpolation,
-    /// The geometric mean of the success rates of DR, DE and RE.
+    /// The geometric mean of the success rates of scenarios DR, DE and RE.
     Extrapolation,
 }
 
@@ -93,7 +94,7 @@ impl Metric {
         Scenario { train: Version::R, test: Version::E },
     ];
 
-    /// The metric from the success rates of scenarios; `None` if a scenario that it needs has no rate.
+    /// Computes the metric from the success rates of scenarios. Returns `None` if a rate that it needs is missing.
     pub fn value(self, rate_of: impl Fn(Scenario) -> Option<f64>) -> Option<f64> {
         use Version::{D, R};
         let rate = |train, test| rate_of(Scenario { train, test });

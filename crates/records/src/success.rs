@@ -1,4 +1,4 @@
-//! Success criteria of episodes.
+//! Criteria for the success of an episode.
 
 use std::fmt;
 use std::str::FromStr;
@@ -9,38 +9,38 @@ use serde::{Deserialize, Serialize};
 
 use perturb_settings::{ValueError, require};
 
-/// Quantities that count steps.
+/// The names of quantities that are numbers of steps.
 const STEPS: [&str; 2] = ["steps", "steps_in_a_row"];
 
-/// A criterion of success: an episode succeeds if its quantity reaches the threshold or is better.
+/// A success criterion: an episode is a success if a quantity is on the right side of a threshold.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Criterion {
     /// The quantity that is compared, e.g. "steps" or "distance".
     pub quantity: String,
-    /// The unit; "1" for steps.
+    /// The unit of the quantity; "1" for steps.
     pub unit: String,
-    /// The side of the threshold on which episodes are successes.
+    /// The side of the threshold on which values are successes.
     pub side: Side,
     /// The threshold, in the quantity's unit.
     pub threshold: f64,
-    /// The maximum value in an episode: the step limit, if steps are compared. Episodes cannot be judged by thresholds
-    /// beyond it.
+    /// The maximum value that an episode can have: the step limit, if the quantity is a number of steps. Thresholds
+    /// above it are rejected.
     #[serde(default)]
     pub most: Option<f64>,
 }
 
-/// A side of a threshold. The threshold itself belongs to both sides.
+/// A side of a threshold. Both sides include the threshold itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Side {
-    /// The threshold or more.
+    /// Values at or above the threshold.
     AtLeast,
-    /// The threshold or less.
+    /// Values at or below the threshold.
     AtMost,
 }
 
-/// A threshold that the user chose, written `steps=90`.
+/// A success threshold that the user chose, written for example `steps=90`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Threshold {
     /// The quantity that is compared.
@@ -49,28 +49,28 @@ pub struct Threshold {
     pub value: f64,
 }
 
-/// The success rule of a test, written `text`, `code` or `steps=90`.
+/// The rule that chooses the success criterion of a test, written `text`, `code` or for example `steps=90`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Rule {
-    /// The environment's own rule, which is that of the paper's text.
+    /// The environment's own criterion, which is that of the paper's text.
     Text,
-    /// The rule of the paper's published code.
+    /// The criterion of the paper's published code.
     Code,
-    /// Another threshold for the one of these two rules that compares its quantity.
+    /// Another threshold for one of these two criteria: the one whose quantity the threshold names.
     At(Threshold),
 }
 
-/// The name of a threshold in errors.
+/// The name of a threshold in error messages.
 const THRESHOLD: &str = "the success threshold";
 
 impl Criterion {
-    /// Returns the criterion of `environment` after the paper's text; `None` if its server does not say.
+    /// Returns the criterion of the paper's text for `environment`; `None` if the server did not state it.
     pub fn from_environment(environment: &proto::Environment) -> Option<Self> {
         Self::read(environment.success.as_ref()?, environment.step_limit)
     }
 
-    /// Returns the criterion of the paper's published code; `None` if the server does not say.
+    /// Returns the criterion of the paper's published code for `environment`; `None` if the server did not state it.
     pub fn from_environment_code(environment: &proto::Environment) -> Option<Self> {
         Self::read(environment.code_success.as_ref()?, environment.step_limit)
     }
@@ -86,10 +86,10 @@ impl Criterion {
         Some(Self { quantity, unit, side, threshold: success.threshold, most })
     }
 
-    /// Returns the criterion with another threshold.
+    /// Returns this criterion with another threshold.
     ///
     /// # Errors
-    /// [`ValueError`] if the threshold is one of another quantity.
+    /// [`ValueError`] if the threshold is for another quantity, or above the step limit.
     pub fn with(&self, threshold: &Threshold) -> Result<Self, ValueError> {
         let expected = format!("one of {}, e.g. {}={}", self.quantity, self.quantity, self.threshold);
         require(threshold.quantity == self.quantity, THRESHOLD, threshold, expected)?;
@@ -98,7 +98,7 @@ impl Criterion {
         Ok(Self { threshold: threshold.value, ..self.clone() })
     }
 
-    /// Whether an episode that achieved this value is a success. Without a value it is none.
+    /// Returns whether an episode with this value is a success. An episode without a value is a failure.
     pub fn holds(&self, achieved: Option<f64>) -> bool {
         achieved.is_some_and(|achieved| match self.side {
             Side::AtLeast => achieved >= self.threshold,
@@ -108,10 +108,11 @@ impl Criterion {
 }
 
 impl Rule {
-    /// The criterion by this rule; `text` and `code` are the environment's.
+    /// Returns the criterion that this rule chooses. `text` and `code` are the environment's two criteria.
     ///
     /// # Errors
-    /// [`ValueError`] if no rule compares the threshold's quantity, or if the server does not say what is compared.
+    /// [`ValueError`] if neither criterion compares the threshold's quantity, or if the server did not state the
+    /// criterion.
     pub fn criterion(&self, text: Option<&Criterion>, code: Option<&Criterion>) -> Result<Criterion, ValueError> {
         let unknown = |expected| move || ValueError::new("the rule of success", self, expected);
         match self {

@@ -1,4 +1,4 @@
-//! Choice and recording of a test's episodes. Equal policies have equal records, whichever program plays them.
+//! Choice and recording of a test's episodes. The same policy gives the same records with any program that plays it.
 
 use perturb_policy::random::{Purpose, stream};
 use perturb_protocol::region::{self, Region};
@@ -9,18 +9,18 @@ use rand::Rng;
 use crate::heatmap::Heatmap;
 use crate::records::{Difference, EpisodeRecord, RecordedTest, Records};
 
-/// Maximal number of environments that are tested together, unless a set has more contexts.
+/// Maximal number of environments in a test, unless the test set has more contexts.
 const MAX_ENVS: usize = 100;
 
-/// Why a test's episodes are not recorded.
+/// The reason why a test's episodes cannot be recorded.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum NotRecorded {
-    /// Episodes did not run with the requested parameters.
+    /// An episode did not run with the requested parameters.
     #[error("testing on {set}: {difference}, so results would be wrong; this is a server bug, please report it")]
     NotApplied { set: String, difference: Difference },
-    /// The server requested other parameters of its physics than the client had asked for.
+    /// The server drew a parameter from other values than the client requested.
     #[error(
         "testing on {set}: the server was asked for {parameter} in {asked}, but its receipt says {got}; this is a server \
          bug, please report it"
@@ -28,29 +28,30 @@ pub enum NotRecorded {
     NotRequested { set: String, parameter: String, asked: String, got: f64 },
 }
 
-/// The seed of the test environments on `version`.
+/// Returns the seed of a test's environments on `version`.
 ///
-/// The seed is the first, second, third or fourth number (D, R, E, R+E) of the stream of `seed` for `purpose`, which is
-/// [`Purpose::TestEnvironments`] or [`Purpose::SelectionEnvironments`]. So a test never repeats episodes of the training or
-/// of the selection, whatever the seeds, and the versions are independent. Sets have the seed of their base version: two
-/// sets differ in parameters, not in initial states.
+/// It is the first, second, third or fourth number, for D, R, E or R+E, of the random stream of `seed` for `purpose`.
+/// The purpose is [`Purpose::TestEnvironments`] or [`Purpose::SelectionEnvironments`]. A test therefore never repeats
+/// episodes of the training or of the selection, whatever their seeds, and the versions are independent. A parameter
+/// set uses the seed of its base version, so two sets of the same version have the same initial states.
 pub fn environment_seed(purpose: Purpose, seed: u64, version: Version) -> u64 {
     let mut rng = stream(seed, purpose);
     let drawn: [u64; Version::KNOWN.len()] = std::array::from_fn(|_| rng.next_u64());
     drawn[version as usize]
 }
 
-/// `[N]` the number of trials for which each environment is tested. Environment i has context i modulo their number. Every
-/// context has equally many episodes, at least 1. `contexts` is at least 1.
+/// Returns for each environment `[N]` the number of its trials that count. Environment i has context i modulo
+/// `contexts`. Every context gets the same number of episodes, at least 1, and in all at least `episodes`. `contexts`
+/// must be at least 1.
 fn quotas(episodes: u64, contexts: usize) -> Vec<u64> {
     let each = episodes.div_ceil(contexts as u64).max(1);
-    // A single context gets as many environments as it can use. Several contexts share them equally.
+    // One context gets as many environments as it can use. Several contexts divide the environments equally.
     let copies = ((MAX_ENVS / contexts) as u64).clamp(1, each);
     (0..copies).flat_map(|i| vec![each / copies + u64::from(i < each % copies); contexts]).collect()
 }
 
-/// Collects the episodes of a running test. The first trials of each environment count, and the last episode of each trial.
-/// Counting the first episodes to end would favour short ones.
+/// Collects the episodes of a running test. Of each environment, a number of trials fixed in advance counts, and of
+/// each trial the last episode. Taking the first episodes to end would favour short episodes.
 #[derive(Clone, Debug)]
 pub struct TestCollector {
     test: RecordedTest,
@@ -60,25 +61,25 @@ pub struct TestCollector {
 }
 
 impl TestCollector {
-    /// Collects `episodes` episodes on `set`. `seed` and `purpose` are described at [`environment_seed`]. Of a trial
-    /// with several episodes, the last one counts.
+    /// Creates a collector of `episodes` episodes on `set`. For `seed` and `purpose` see [`environment_seed`]. Only the
+    /// last of a trial's `episodes_per_trial` episodes counts.
     pub fn new(set: TestSet, purpose: Purpose, seed: u64, episodes: u64, episodes_per_trial: u32) -> Self {
         let quotas = quotas(episodes, set.listed().len());
         let seed = environment_seed(purpose, seed, set.version);
         Self { test: RecordedTest { set, seed, axes: None }, quotas, episodes_per_trial, counted: Vec::new() }
     }
 
-    /// The test, with the seed of its environments.
+    /// Returns the test, with the seed of its environments.
     pub fn test(&self) -> &RecordedTest {
         &self.test
     }
 
-    /// N.
+    /// Returns N, the number of environments.
     pub fn num_envs(&self) -> usize {
         self.quotas.len()
     }
 
-    /// Takes the episodes that `ended` in some steps. Those that do not count are passed over.
+    /// Takes the episodes that ended in some steps, and ignores those that do not count.
     pub fn take(&mut self, ended: impl IntoIterator<Item = EndedEpisode>) {
         let Self { quotas, episodes_per_trial, .. } = self;
         let counts = |end: &EndedEpisode| {
@@ -88,16 +89,16 @@ impl TestCollector {
         self.counted.extend(ended.into_iter().filter(counts));
     }
 
-    /// Number of episodes that were counted, and the number to be reached.
+    /// Returns the number of episodes so far, and the number to be collected.
     pub fn progress(&self) -> (u64, u64) {
-        // Saturates: a sum that overflows would end a test of very many episodes before its first one.
+        // The sum saturates. An overflow would end a test of very many episodes before its first episode.
         (self.counted.len() as u64, self.quotas.iter().fold(0, |sum, &quota| sum.saturating_add(quota)))
     }
 
-    /// Adds the episodes to `records`, which are of policies in `environment`.
+    /// Adds the test and its episodes to `records`, which must be of a policy in `environment`.
     ///
     /// # Errors
-    /// [`NotRecorded`], if the server played something else; nothing was added then.
+    /// [`NotRecorded`] if an episode's parameters were not those of the test. Nothing is then added.
     pub fn finish(self, environment: &proto::Environment, records: &mut Records) -> Result<(), NotRecorded> {
         let Self { mut test, mut counted, .. } = self;
         test.axes = Heatmap::axes_of(&test.set, environment);
@@ -119,7 +120,8 @@ impl TestCollector {
     }
 }
 
-/// Returns the permitted values of each parameter in a context of a set, for each part of its version.
+/// Returns the permitted values of each parameter in one context of a set. R+E permits either all values of R or all
+/// values of E, so it has two elements; other versions have one.
 fn asked(environment: &proto::Environment, set: &TestSet, context: &Context) -> Vec<Vec<Distribution>> {
     let region = Region::from_version(environment, set.version, &set.parameters(context));
     let in_order = |values: &region::ParameterBox| {
@@ -128,7 +130,7 @@ fn asked(environment: &proto::Environment, set: &TestSet, context: &Context) -> 
     region.boxes().iter().map(in_order).collect()
 }
 
-/// Checks that the server's physics got what was requested: all parameters from one part of the version.
+/// Checks that the server's requested parameters are those of the test, and for R+E that all are from R or all from E.
 fn check_requested(
     environment: &proto::Environment,
     set: &TestSet,
@@ -145,7 +147,8 @@ fn check_requested(
     })
 }
 
-/// The first parameter outside its distribution. All parameters must be from the same part.
+/// Returns the index of a parameter outside its permitted values, or `None` if all parameters are inside those of one
+/// element of `asked`.
 fn wrong(asked: &[Vec<Distribution>], requested: &[f64]) -> Option<usize> {
     let in_part = |asked: &Vec<Distribution>| {
         let requested = requested.iter().copied().chain(std::iter::repeat(f64::NAN));

@@ -1,4 +1,4 @@
-//! The settings of a training, and the sets of parameters that policies are trained and tested on.
+//! The settings of a training, and the parameter sets on which policies are trained and tested.
 #![forbid(unsafe_code)]
 
 pub mod sets;

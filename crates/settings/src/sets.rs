@@ -1,4 +1,5 @@
-//! Test sets: a version of an environment, or parameters of your own.
+//! Parameter sets: the parameter values that a policy is tested on. A set is a version of an environment (D, R, E or
+//! R+E), possibly with values of the user for some parameters.
 
 mod rows;
 
@@ -13,32 +14,34 @@ use serde::{Deserialize, Serialize};
 pub use self::rows::set_of_csv;
 use crate::value_error::{ValueError, require};
 
-/// The values that named parameters may take; the others keep their version's.
+/// Distributions of parameters by name. Parameters that are not listed have the distribution of their version.
 pub type Parameters = BTreeMap<String, Distribution>;
-/// A value for each of some parameters. The other parameters follow the version.
+/// A context: fixed values of some parameters, by name. Parameters that are not listed have the distribution of their
+/// version.
 pub type Context = BTreeMap<String, f64>;
 
-/// Maximal number of contexts of a set: all of them run together.
+/// Maximal number of contexts in a set. It is limited because the environments of all contexts run together.
 const MAX_CONTEXTS: usize = DEFAULT_MAX_ENVS;
 
-/// A set of parameters that a policy is tested on.
+/// A parameter set that a policy is tested on.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TestSet {
     /// The name of the set in results.
     pub name: String,
-    /// The distribution of parameters that are not listed.
+    /// The version, from which parameters are drawn that `contexts` does not list.
     pub version: Version,
-    /// The parameters that are listed.
+    /// The parameters whose values the set determines itself.
     pub contexts: Contexts,
 }
 
-/// The choice of the listed parameters in a set's episodes.
+/// How the parameters that a set lists get their values.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Contexts {
-    /// Drawn anew for each episode (RL²: each trial).
+    /// Values are drawn from these distributions for each episode, or with RL² for each trial.
     Drawn(Parameters),
-    /// Each of these for equally many episodes: a grid, or the rows of a file.
+    /// Each of these contexts is used for the same number of episodes. Contexts are the points of a grid or the rows of
+    /// a file.
     Listed(Vec<Context>),
 }
 
@@ -49,7 +52,7 @@ impl From<Version> for TestSet {
 }
 
 impl TestSet {
-    /// The set's version, if the set replaces none of its parameters.
+    /// Returns the set's version if the set lists no parameters of its own, else `None`.
     pub fn plain(&self) -> Option<Version> {
         match &self.contexts {
             Contexts::Drawn(parameters) if parameters.is_empty() => Some(self.version),
@@ -57,7 +60,7 @@ impl TestSet {
         }
     }
 
-    /// The distributions that replace the version's in every episode.
+    /// Returns the distributions that replace those of the version in every episode. Empty if the set lists contexts.
     pub fn drawn(&self) -> Parameters {
         match &self.contexts {
             Contexts::Drawn(parameters) => parameters.clone(),
@@ -65,14 +68,14 @@ impl TestSet {
         }
     }
 
-    /// The values that replace the version's in `context`.
+    /// Returns the distributions that replace those of the version in `context`.
     pub fn parameters(&self, context: &Context) -> Parameters {
         let mut parameters = self.drawn();
         parameters.extend(context.iter().map(|(name, value)| (name.clone(), Distribution::fixed(*value))));
         parameters
     }
 
-    /// The names of the parameters that the set replaces, some of them several times.
+    /// Returns the names of the parameters that the set lists. Names may occur several times.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         let (drawn, listed) = match &self.contexts {
             Contexts::Drawn(parameters) => (Some(parameters), None),
@@ -82,7 +85,7 @@ impl TestSet {
         drawn.chain(listed.into_iter().flatten().flat_map(BTreeMap::keys)).map(String::as_str)
     }
 
-    /// The set's contexts; a single empty context if its parameters are drawn.
+    /// Returns the contexts of the set. If it lists none, returns one empty context.
     pub fn listed(&self) -> Vec<Context> {
         match &self.contexts {
             Contexts::Drawn(_) => vec![Context::new()],
@@ -90,10 +93,10 @@ impl TestSet {
         }
     }
 
-    /// Checks that `environment` has the set's parameters and accepts all of their values.
+    /// Checks that `environment` has the set's parameters and accepts all their values.
     ///
     /// # Errors
-    /// [`ValueError`], which names the parameter and what is accepted.
+    /// [`ValueError`] with the name of the parameter and the accepted values.
     pub fn check(&self, environment: &proto::Environment) -> Result<(), ValueError> {
         match &self.contexts {
             Contexts::Drawn(parameters) => check(&self.name, parameters, environment),
@@ -105,10 +108,11 @@ impl TestSet {
     }
 }
 
-/// Checks that `environment` has these `parameters` and accepts all of their values. `set` is the set's name in errors.
+/// Checks that `environment` has these `parameters` and accepts all their values. `set` is the name of the set in error
+/// messages.
 ///
 /// # Errors
-/// [`ValueError`], which names the parameter and what is accepted.
+/// [`ValueError`] with the name of the parameter and the accepted values.
 pub fn check(set: &str, parameters: &Parameters, environment: &proto::Environment) -> Result<(), ValueError> {
     for (name, distribution) in parameters {
         let Some(known) = environment.parameter(name) else {
@@ -126,7 +130,7 @@ pub fn check(set: &str, parameters: &Parameters, environment: &proto::Environmen
     Ok(())
 }
 
-/// The names of an environment's parameters, and of its disturbances.
+/// Lists the names of an environment's parameters and disturbances, for error messages.
 pub fn known_names(environment: &proto::Environment) -> String {
     let list = |parameters: &[proto::Parameter]| {
         parameters.iter().map(|parameter| parameter.name.as_str()).collect::<Vec<_>>().join(", ")
@@ -136,10 +140,10 @@ pub fn known_names(environment: &proto::Environment) -> String {
     if disturbances.is_empty() { own } else { format!("{own}, or a disturbance: {disturbances}") }
 }
 
-/// Refuses two sets with the same name: results are told apart by their set's name.
+/// Checks that all sets have different names, because results are identified by the name of their set.
 ///
 /// # Errors
-/// [`ValueError`], which names the set.
+/// [`ValueError`] with the name that occurs twice.
 pub fn distinct(sets: &[TestSet]) -> Result<(), ValueError> {
     sets.iter().enumerate().try_for_each(|(index, TestSet { name, .. })| {
         let is_new = sets[..index].iter().all(|earlier| earlier.name != *name);
@@ -147,23 +151,25 @@ pub fn distinct(sets: &[TestSet]) -> Result<(), ValueError> {
     })
 }
 
-/// The values of one parameter in a set, written `length=0.3..0.4,0.8..0.9`, `mass=0.1`, or as points of a grid,
-/// `length=0.1..1.0/10` or `length=0.1,0.2,0.5`. Two whole numbers as in `force=7,5` are refused, because they may be a
-/// number with a decimal comma; `force=7, 5` has two values.
+/// The values of one parameter, as the user writes them: a distribution (`length=0.3..0.4,0.8..0.9` or `mass=0.1`), or
+/// points of a grid (`length=0.1..1.0/10` or `length=0.1,0.2,0.5`).
+///
+/// Two whole numbers without a space, as in `force=7,5`, are rejected, because 7,5 may be a number with a decimal
+/// comma. `force=7, 5` has two values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Assignment {
-    /// By its name in the catalogue.
+    /// The name of the parameter in the catalogue.
     pub parameter: String,
-    /// The accepted values.
+    /// The values of the parameter.
     pub values: Values,
 }
 
-/// The values of a parameter in a set.
+/// The values of a parameter, in a distribution or as points.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Values {
-    /// A distribution, from which values are drawn.
+    /// A distribution from which a value is drawn for each episode.
     Drawn(Distribution),
-    /// Points of a grid.
+    /// The points of a grid along this parameter.
     Points(Vec<f64>),
 }
 
@@ -199,8 +205,8 @@ impl Values {
     }
 }
 
-/// Returns the points of `low..high/count`: `count` points from `low` to `high`, both included. The points between are
-/// rounded to twelve digits, so that 0.4 is 0.4 and not 0.39999999999999997.
+/// Parses `low..high/count`: `count` points at equal distances from `low` to `high`, both included. The points in
+/// between are rounded to twelve significant digits, to get 0.4 and not 0.39999999999999997.
 fn grid_points(parameter: &str, text: &str, range: &str, count: &str) -> Result<Values, ValueError> {
     let wrong = || ValueError::new(parameter, format!("`{text}`"), "a grid such as 0.1..1.0/10, of at least 1 point");
     let (low, high) = range.split_once("..").ok_or_else(wrong)?;
@@ -226,12 +232,13 @@ fn finite(parameter: &str, text: &str, points: Vec<f64>) -> Result<Vec<f64>, Val
     Ok(points)
 }
 
-/// Makes a set called `name` from `assignments` over `version`. With points, it is the grid of all their combinations, the
-/// first parameter varying fastest, and the other parameters of the set must have a single value.
+/// Makes a set called `name` of the parameters in `assignments`; other parameters follow `version`. If a parameter has
+/// points, the set is the grid of all combinations, and the first parameter varies fastest. Each of the grid's
+/// parameters must then have points or a single value.
 ///
 /// # Errors
-/// [`ValueError`] for a parameter that is named twice, a grid with drawn parameters, or more contexts than one server
-/// takes.
+/// [`ValueError`] if a parameter occurs twice, a grid contains a parameter that is drawn, or there are more contexts
+/// than a server accepts.
 pub fn set_of(name: &str, version: Version, assignments: Vec<Assignment>) -> Result<TestSet, ValueError> {
     let is_grid = assignments.iter().any(|assignment| matches!(assignment.values, Values::Points(_)));
     let mut drawn = Parameters::new();

@@ -1,12 +1,12 @@
-//! The error for an invalid value in a plan, a configuration, a set or a threshold.
+//! The error for an invalid value in an experiment file, a configuration, a parameter set or a threshold.
 
 use std::fmt::Display;
 
-/// A value that is not accepted.
+/// An invalid value, with the values that are accepted.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{what} is {got}, but must be {expected}")]
 pub struct ValueError {
-    /// The name of the value.
+    /// A description of the value's meaning.
     pub what: String,
     /// The given value.
     pub got: String,
@@ -15,13 +15,13 @@ pub struct ValueError {
 }
 
 impl ValueError {
-    /// The refusal of `got`, which was given for `what`.
+    /// Creates the error for the value `got` of `what`.
     pub fn new(what: impl Into<String>, got: impl Display, expected: impl Into<String>) -> Self {
         Self { what: what.into(), got: got.to_string(), expected: expected.into() }
     }
 }
 
-/// Refuses a value unless it is `accepted`.
+/// Returns an error for the value `got` of `what` unless `accepted` is true. `expected` describes the accepted values.
 pub fn require(
     accepted: bool,
     what: impl Into<String>,

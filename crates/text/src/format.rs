@@ -1,8 +1,8 @@
-//! Numbers, times and long texts as people read them, and commands as they paste them.
+//! Formatting of numbers, durations and long texts for people, and of words for shells.
 
 use std::ffi::OsStr;
 
-/// A number with its digits in groups of three.
+/// Formats a number with its digits in groups of three, e.g. "1 200".
 pub fn grouped(number: usize) -> String {
     let digits = number.to_string();
     let mut text = String::new();
@@ -15,17 +15,17 @@ pub fn grouped(number: usize) -> String {
     text
 }
 
-/// "1 cell", "1 200 cells".
+/// Formats a number with a noun, with the digits in groups of three: "1 cell", "1 200 cells".
 pub fn counted(number: usize, what: &str) -> String {
     format!("{} {what}{}", grouped(number), if number == 1 { "" } else { "s" })
 }
 
-/// "1 cell", "2 cells".
+/// Formats a number with a noun, without groups of digits: "1 cell", "1200 cells".
 pub fn count(number: usize, noun: &str) -> String {
     if number == 1 { format!("1 {noun}") } else { format!("{number} {noun}s") }
 }
 
-/// A time in two of its units.
+/// Formats a duration in its two largest units, e.g. "2 h 5 min".
 pub fn duration(seconds: f64) -> String {
     let seconds = seconds.round() as u64;
     let (minutes, hours, days) = (seconds / 60, seconds / 3600, seconds / 86_400);
@@ -38,16 +38,16 @@ pub fn duration(seconds: f64) -> String {
     }
 }
 
-/// Quotes a word, e.g. the path of a file, so that a shell takes it as one word.
+/// Quotes a text, e.g. a path, so that a shell takes it as one word.
 pub fn quoted(word: impl AsRef<OsStr>) -> String {
     let word = word.as_ref().to_string_lossy();
     shlex::try_quote(&word).map_or_else(|_| word.to_string(), |quoted| quoted.into_owned())
 }
 
-/// Length to which [`shortened`] cuts texts of unknown origin, characters.
+/// The length to which [`shortened`] cuts texts, in characters.
 const MAX_CHARS: usize = 300;
 
-/// A text, cut after 300 characters, where ` …` shows the cut.
+/// Cuts a text after 300 characters. A cut is marked by ` …`.
 pub fn shortened(text: impl Into<String>) -> String {
     let mut text = text.into();
     if let Some((end, _)) = text.char_indices().nth(MAX_CHARS) {

@@ -1,4 +1,4 @@
-//! Numbers, times and tables as people read them, and commands as they paste them.
+//! Formatting of numbers, durations and tables for people, and of words for shells.
 #![forbid(unsafe_code)]
 
 mod format;

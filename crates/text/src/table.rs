@@ -1,38 +1,39 @@
-//! Tables, and their forms as text for a terminal, Markdown and CSV. The same table gives the same bytes everywhere.
+//! Tables, which can be written as text for a terminal, as Markdown and as CSV. Equal tables give equal bytes on every
+//! machine.
 
 use std::ops::Range;
 
 use comfy_table::presets::{ASCII_MARKDOWN, NOTHING};
 use comfy_table::{CellAlignment, TableStyle};
 
-/// A table for reading, or the lines of a file.
+/// A table to be displayed or written to a file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Table {
-    /// The title, or the name of the file.
+    /// The title, or the name of the file to write.
     pub title: String,
     /// The columns, from left to right.
     pub columns: Vec<Column>,
-    /// The rows, each with an entry for each column.
+    /// The rows. Each has one entry for each column.
     pub rows: Vec<Vec<Entry>>,
 }
 
-/// The head of a column.
+/// The heading and the kind of a column.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Column {
     /// The heading.
     pub name: String,
-    /// A heading over neighbouring columns, if their own headings are not enough.
+    /// A heading above several neighbouring columns, if the columns' own headings are not sufficient.
     pub group: Option<String>,
-    /// Whether entries are numbers, which are aligned to the right; texts are aligned to the left.
+    /// Whether the entries are numbers. Numbers are aligned to the right, texts to the left.
     pub is_number: bool,
 }
 
-/// The content of one row and column.
+/// The content of one row in one column.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Entry {
-    /// The text that is shown.
+    /// The displayed text.
     pub text: String,
-    /// A share, %, that may be shown by a colour.
+    /// A percentage that may be shown as the cell's colour.
     pub heat: Option<f64>,
 }
 
@@ -42,26 +43,26 @@ impl<T: std::fmt::Display> From<T> for Entry {
     }
 }
 
-/// Builds a table column by column from values `R`, one for each row.
+/// Builds a table column by column. Each row is made from one value of type `R`.
 pub struct TableBuilder<'r, R> {
     sources: &'r [R],
     table: Table,
 }
 
 impl Table {
-    /// A table with a row for each of `sources`, and no columns yet.
+    /// Starts a table with a row for each of `sources`, and without columns.
     pub fn builder<R>(title: impl Into<String>, sources: &[R]) -> TableBuilder<'_, R> {
         let rows = vec![Vec::new(); sources.len()];
         TableBuilder { sources, table: Table { title: title.into(), columns: Vec::new(), rows } }
     }
 
-    /// Renders the table with its columns side by side, without the title.
+    /// Renders the table as aligned text, without the title.
     pub fn to_text(&self) -> String {
         self.drawn(NOTHING, str::to_owned).trim_fmt()
     }
 
-    /// Renders the table for a terminal of `width` columns. Columns that do not fit follow below, and the text columns
-    /// on the left are repeated.
+    /// Renders the table as text for a terminal that is `width` characters wide. Columns that do not fit follow below,
+    /// where the text columns on the left are repeated.
     pub fn to_text_within(&self, width: usize) -> String {
         let keys = self.columns.iter().take_while(|column| !column.is_number).count();
         let fits = |text: &str| text.lines().all(|line| line.chars().count() <= width);
@@ -72,7 +73,7 @@ impl Table {
         while first < self.columns.len() {
             let mut ends = (first + 1..=self.columns.len()).filter(|&end| self.may_begin(end));
             let with = |end: usize| (end, self.with_columns(0..keys, first..end).to_text());
-            // One part at least, however narrow the terminal.
+            // Shows at least one column, even if it does not fit.
             let narrowest = ends.next().map_or_else(|| with(self.columns.len()), with);
             let (end, block) = ends.map(with).take_while(|(_, text)| fits(text)).last().unwrap_or(narrowest);
             blocks.push(block);
@@ -81,8 +82,8 @@ impl Table {
         blocks.join("\n\n")
     }
 
-    /// Whether a break may come before the column at this place. The end may always follow a break. A column whose name
-    /// another column has, too, must stay beside those before it.
+    /// Returns whether the table may be broken before column number `place`. A break at the end is always possible. A
+    /// column that shares its name with another column must stay with the columns before it.
     fn may_begin(&self, place: usize) -> bool {
         let Some(column) = self.columns.get(place) else { return true };
         self.columns.iter().filter(|other| other.name == column.name).count() == 1
@@ -94,12 +95,12 @@ impl Table {
         Table { title: self.title.clone(), columns, rows: self.rows.iter().map(row).collect() }
     }
 
-    /// Renders the table as Markdown of GitHub's kind, without the title.
+    /// Renders the table as GitHub-flavoured Markdown, without the title.
     pub fn to_markdown(&self) -> String {
         self.drawn(ASCII_MARKDOWN, |text| text.replace('|', "\\|").replace('\n', " ")).to_string()
     }
 
-    /// Writes the table as CSV: a line of names, and a line for each row.
+    /// Encodes the table as CSV: a header line, and a line for each row.
     pub fn to_csv(&self) -> Vec<u8> {
         let names = self.columns.iter().map(|column| &column.name).collect();
         let rows = self.rows.iter().map(|row| row.iter().map(|entry| &entry.text).collect());
@@ -126,22 +127,22 @@ impl<'r, R> TableBuilder<'r, R> {
         self.sources
     }
 
-    /// A column of texts.
+    /// Adds a column of texts.
     pub fn text<E: Into<Entry>>(self, name: impl Into<String>, entry: impl Fn(&'r R) -> E) -> Self {
         self.column(Column { name: name.into(), group: None, is_number: false }, entry)
     }
 
-    /// A column of numbers.
+    /// Adds a column of numbers.
     pub fn number<E: Into<Entry>>(self, name: impl Into<String>, entry: impl Fn(&'r R) -> E) -> Self {
         self.column(Column { name: name.into(), group: None, is_number: true }, entry)
     }
 
-    /// A column under a head that may belong to a group.
+    /// Adds a column with the given heading, which may have a group.
     pub fn column<E: Into<Entry>>(self, column: Column, entry: impl Fn(&'r R) -> E) -> Self {
         self.push_column(column, &|source| entry(source).into())
     }
 
-    /// Adds a column. The code is compiled once for each type of row, not once for each column.
+    /// Adds a column. Because `entry` is a dynamic call, this code is compiled only once for each type of row.
     fn push_column(mut self, column: Column, entry: &dyn Fn(&'r R) -> Entry) -> Self {
         self.table.columns.push(column);
         for (row, source) in self.table.rows.iter_mut().zip(self.sources) {

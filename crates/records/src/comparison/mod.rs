@@ -1,5 +1,5 @@
-//! Conditions compared, such as two ways of training: over their policies, which differ by their seed, and over the episodes of
-//! their tests.
+//! Statistical comparison of conditions, such as two ways of training. It accounts for two sources of chance: the seeds
+//! of the trainings and the episodes of the tests.
 
 mod scores;
 mod verdict;
@@ -13,101 +13,106 @@ use crate::statistics::{
 };
 use scores::{EpisodeScores, share_episodes};
 
-/// A condition: policies that differ by their seeds alone.
+/// A condition to compare: a group of policies that differ only in their seed.
 #[derive(Clone, Debug)]
 pub struct ComparedCondition<'a> {
-    /// The name, free but distinct.
+    /// The condition's name. It is freely chosen, but differs from those of the other conditions.
     pub name: String,
-    /// The policies: a key that pairs those of two conditions, such as the seed of the training, and the tests.
+    /// The policies, each with a key and the recorded tests. Policies of two conditions with the same key form a pair.
+    /// The key is, for example, the seed of the training.
     pub policies: Vec<(String, &'a Records)>,
 }
 
-/// The number of each episode that is compared.
+/// The quantity of an episode whose means are compared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ComparedScore {
-    /// 100 for a success, else 0: means are success rates, %.
+    /// 100 for a success and 0 for a failure, so that means are success rates in %.
     Success,
-    /// The undiscounted return.
+    /// The undiscounted return of the episode.
     Return,
-    /// The number of steps.
+    /// The number of steps of the episode.
     Length,
 }
 
-/// The mean score of a condition in a test.
+/// The mean score of a condition on one test set.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ConditionMean {
-    /// The condition's name.
+    /// The name of the condition.
     pub condition: String,
-    /// The set that was tested on.
+    /// The name of the test set.
     pub tested_on: String,
-    /// The mean score of each policy.
+    /// The mean score of each policy, in the order of the condition's policies.
     pub by_seed: Vec<f64>,
-    /// The mean over policies.
+    /// The mean of the policies' mean scores.
     pub mean: f64,
-    /// The ends of the 95 % t interval over policies, for conclusions about other seeds. `None` with fewer than three
-    /// policies.
+    /// The 95 % t interval of the mean over policies, [low, high]. It supports conclusions about other seeds. `None`
+    /// with fewer than three policies.
     pub seeds_95: Option<[f64; 2]>,
-    /// Number of episodes of each policy; the smallest one if they differ.
+    /// Number of episodes that each policy played; the smallest number if they differ.
     pub episodes: usize,
-    /// The ends of the 95 % interval over episodes, for conclusions about these policies in other episodes. For success
-    /// rates it is Wilson's interval, with an effective number of episodes if all policies played the same ones; otherwise
-    /// it is a t interval.
+    /// The 95 % interval of the mean over episodes, [low, high]. It supports conclusions about the same policies in
+    /// other episodes. For returns and lengths it is a t interval. For success rates it is Wilson's interval; if all
+    /// policies played the same episodes, it is computed with an effective number of episodes.
     pub episodes_95: Option<[f64; 2]>,
 }
 
-/// The difference x − y of two conditions in a test.
+/// The difference x − y between the mean scores of two conditions on one test set.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ConditionDifference {
-    /// The name of the condition x.
+    /// The name of condition x.
     pub x: String,
-    /// The name of the condition y.
+    /// The name of condition y.
     pub y: String,
-    /// The set that was tested on.
+    /// The name of the test set.
     pub tested_on: String,
-    /// Numbers of policies of x and y.
+    /// The number of policies of x and of y.
     pub seeds: [usize; 2],
-    /// Whether policies of x and y with the same key are pairs.
+    /// Whether each policy of x is paired with the policy of y that has the same key.
     pub paired: bool,
-    /// The mean difference.
+    /// The mean score of x minus the mean score of y.
     pub difference: f64,
-    /// The difference of each pair; empty without pairs.
+    /// The difference of each pair, or empty if policies are not paired.
     pub by_seed: Vec<f64>,
-    /// The ends of the 95 % t interval over pairs, or without pairs Welch's over policies. `None` with fewer than three policies
-    /// of either.
+    /// The 95 % interval of the difference over policies, [low, high]: a t interval over pairs, or Welch's interval if
+    /// policies are not paired. `None` if either condition has fewer than three policies.
     pub seeds_95: Option<[f64; 2]>,
-    /// The ends of the 95 % interval over episodes.
+    /// The 95 % interval of the difference over episodes, [low, high].
     pub episodes_95: Option<[f64; 2]>,
-    /// Whether both played the same episodes, so that differences of episodes are compared.
+    /// Whether all policies of both conditions played the same episodes. If so, `episodes_95` is computed from the
+    /// difference in each episode.
     pub same_episodes: bool,
-    /// The probability, 0 … 1, that a policy of x has a higher mean score than one of y.
+    /// The probability, 0 … 1, that a random policy of x has a higher mean score than a random policy of y.
     pub improvement: f64,
-    /// The p-value of the t test over pairs, or without pairs of Welch's test. `None` if there is no interval.
+    /// The p-value of the difference: by the t test over pairs, or by Welch's test if policies are not paired. `None`
+    /// if `seeds_95` is.
     pub p: Option<f64>,
-    /// The value of `p`, corrected after Holm for all differences of the comparison.
+    /// The value of `p` after Holm's correction for all differences of the comparison.
     pub p_holm: Option<f64>,
-    /// The result in a sentence.
+    /// The result in words.
     pub verdict: String,
 }
 
-/// A comparison of conditions.
+/// The result of comparing conditions.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ConditionComparison {
-    /// The score that is compared.
+    /// The compared quantity.
     pub score: ComparedScore,
-    /// The means, ordered by test, then condition.
+    /// The mean of each condition on each test set, ordered by test set, then condition.
     pub means: Vec<ConditionMean>,
-    /// The differences, ordered by test, then pair of conditions.
+    /// The differences between pairs of conditions, ordered by test set, then pair.
     pub differences: Vec<ConditionDifference>,
-    /// The result of all differences in a sentence.
+    /// The result of the whole comparison in words.
     pub verdict: String,
 }
 
-/// Compares conditions in the tests on `sets`: every pair of conditions, or each condition with `baseline`.
+/// Compares the scores of conditions on each of the test sets `sets`. With a `baseline`, compares every other condition
+/// with the condition of this name. Otherwise compares every pair of conditions.
 ///
 /// # Errors
-/// [`ValueError`] for conditions without policies or with the same name, a set that a condition was not tested on or whose
-/// parameters differ between conditions, policies of different environments or success rules, and an unknown baseline.
+/// [`ValueError`] if a condition has no policies, two conditions have the same name, or the baseline is unknown. Also
+/// if a policy was not tested on a set of `sets`, or if environments, success rules or a set's parameters differ
+/// between policies.
 pub fn compare(
     conditions: &[ComparedCondition<'_>],
     sets: &[String],
@@ -202,7 +207,7 @@ fn check(conditions: &[ComparedCondition<'_>], sets: &[String], baseline: Option
     Ok(())
 }
 
-/// The scores of a condition in a test.
+/// The scores of a condition's policies on one test set.
 struct TestedCondition<'a> {
     name: &'a str,
     keys: Vec<&'a str>,
@@ -222,8 +227,8 @@ impl<'a> TestedCondition<'a> {
         self.policies.iter().map(|policy| mean(policy.values.iter().copied())).collect()
     }
 
-    /// Returns independent strata of scores: the mean over policies of each episode if all played the same ones, else the
-    /// scores of each policy.
+    /// Returns the scores in independent groups. If all policies played the same episodes, there is one group: the mean
+    /// score over policies for each episode. Otherwise each policy's scores are a group.
     fn strata(&self) -> Vec<Vec<f64>> {
         if share_episodes(&self.policies) {
             return vec![scores::mean_by_episode(&self.policies)];
@@ -252,8 +257,8 @@ impl<'a> TestedCondition<'a> {
     }
 }
 
-/// Returns Wilson's interval of a success rate, %, with the effective number of episodes: that of independent ones whose rate
-/// would vary as much.
+/// Returns Wilson's interval of the success rate `percent`, in %. Uses an effective number of episodes: the number of
+/// independent episodes whose success rate would have the same variance as the mean over `strata`.
 fn success_interval(percent: f64, strata: &[Vec<f64>]) -> [f64; 2] {
     let share = percent / 100.0;
     let count: usize = strata.iter().map(Vec::len).sum();
@@ -267,8 +272,8 @@ fn difference(x: &TestedCondition<'_>, y: &TestedCondition<'_>, set: &str) -> Co
     let [of_x, of_y] = [x.by_seed(), y.by_seed()];
     let pairs = pairs(&x.keys, &y.keys);
     let by_seed: Vec<f64> = pairs.iter().flatten().map(|&[x, y]| of_x[x] - of_y[y]).collect();
-    // Without pairs: the mean of both strata is half of the difference. The ends of its interval are halved in the same
-    // way.
+    // Without pairs, the two groups are the scores of x and the negated scores of y. Their mean is half of the
+    // difference, so the difference's interval is twice theirs.
     let (strata, scale) = match pairs {
         Some(_) => (vec![by_seed.clone()], 1.0),
         None => (vec![of_x.clone(), of_y.iter().map(|score| -score).collect()], 2.0),
@@ -303,8 +308,8 @@ fn difference(x: &TestedCondition<'_>, y: &TestedCondition<'_>, set: &str) -> Co
     }
 }
 
-/// Returns the indices in x and y of policies with the same key, in the order of x. `None` unless x and y have the same
-/// keys, each once.
+/// Returns pairs of indices into `x` and `y` that have the same key, in the order of `x`. Returns `None` unless both
+/// have the same keys, each only once.
 fn pairs(x: &[&str], y: &[&str]) -> Option<Vec<[usize; 2]>> {
     let distinct: std::collections::BTreeSet<&&str> = x.iter().collect();
     if x.len() != y.len() || distinct.len() != x.len() {

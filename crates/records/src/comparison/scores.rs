@@ -1,17 +1,17 @@
-//! The scores of a policy in the episodes of a test.
+//! The scores of a policy in the episodes of one test.
 
 use super::ComparedScore;
 use crate::records::Records;
 use crate::statistics::mean;
 
-/// The address of an episode within a test: the seed, the environment index and the episode index.
+/// The seed, the environment index and the episode index, which together identify an episode of a test.
 type EpisodeAddress = (u64, u32, u64);
 
-/// A policy's episodes of a test, in their order.
+/// The scores of a policy's episodes in one test, in recorded order.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct EpisodeScores {
     addresses: Vec<EpisodeAddress>,
-    /// A score for each address.
+    /// The score of each episode, in the order of `addresses`.
     pub(super) values: Vec<f64>,
 }
 
@@ -30,18 +30,19 @@ impl EpisodeScores {
     }
 }
 
-/// Whether all played the same episodes.
+/// Returns whether all policies played the same episodes.
 pub(super) fn share_episodes(policies: &[EpisodeScores]) -> bool {
     policies.windows(2).all(|two| two[0].addresses == two[1].addresses)
 }
 
-/// `[episodes]` the mean over policies, which share their episodes.
+/// Returns for each episode the mean score over `policies`, which must have played the same episodes.
 pub(super) fn mean_by_episode(policies: &[EpisodeScores]) -> Vec<f64> {
     let episodes = policies.first().map_or(0, |policy| policy.values.len());
     (0..episodes).map(|episode| mean(policies.iter().map(|policy| policy.values[episode]))).collect()
 }
 
-/// Returns the variance of the mean over strata, each of which has the same weight, with n in the denominators.
+/// Returns the variance of the mean over groups of scores. Every group has the same weight. Variances are divided by n,
+/// not by n - 1.
 pub(super) fn variance_of_mean(strata: &[Vec<f64>]) -> f64 {
     let of_stratum = |scores: &Vec<f64>| {
         let (n, center) = (scores.len() as f64, mean(scores.iter().copied()));

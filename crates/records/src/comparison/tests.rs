@@ -5,7 +5,8 @@ use super::*;
 use crate::fixture::{assessed, episode};
 use crate::records::Records;
 
-/// Records of a policy on D and R with an episode for each of these returns; one of at least 5 is a success.
+/// Returns records of a policy's tests on D and R. Each test has an episode for each of these returns; a return of at
+/// least 5 is a success.
 fn policy(returns: &[u32]) -> Records {
     let mut records = assessed("agent", "CartPole", &[Some(Version::D)], [1, 1, 1]).policies()[0].records.clone();
     let on = |set: &'static str| {
@@ -24,7 +25,8 @@ fn compared(x: &[Records], y: &[Records], score: ComparedScore) -> ConditionComp
     compare(&[condition("y", y), condition("x", x)], &["D".into()], score, None).unwrap()
 }
 
-/// By hand: the differences by seed are 3, 4 and 8, their mean 5 and its standard error √(14 / 2 / 3) = 1.5275.
+/// Expected values are computed by hand: the differences by seed are 3, 4 and 8. Their mean is 5, and its standard
+/// error √(14 / 2 / 3) = 1.5275.
 #[test]
 fn policies_with_the_same_key_are_pairs() {
     let [x, y] = [[4, 8, 9], [1, 4, 1]].map(|seeds| seeds.map(|score| policy(&[score, score + 1, score + 2])));
@@ -32,7 +34,7 @@ fn policies_with_the_same_key_are_pairs() {
     assert_eq!((it.x.as_str(), it.y.as_str(), it.paired, it.seeds), ("x", "y", true, [3, 3]));
     assert_eq!((it.difference, &it.by_seed[..]), (5.0, &[3.0, 4.0, 8.0][..]));
     let [low, high] = it.seeds_95.unwrap();
-    let half = 4.302_653 * 1.527_525; // the quantile of 2 degrees of freedom
+    let half = 4.302_653 * 1.527_525; // the t quantile for 2 degrees of freedom
     assert!((low - (5.0 - half)).abs() < 1e-4 && (high - (5.0 + half)).abs() < 1e-4, "{low} {high}");
     assert_eq!(it.episodes_95, Some([5.0, 5.0]), "each episode has the same difference");
     assert_eq!((it.improvement, it.p, it.p.map(|p| p < 0.1)), (8.5 / 9.0, it.p_holm, Some(true)));
@@ -45,7 +47,8 @@ fn unequal_numbers_of_seeds_are_compared_without_pairs() {
     let it = &compared(&x, &y, ComparedScore::Return).differences[0];
     assert_eq!((it.paired, it.seeds, it.by_seed.len()), (false, [4, 3], 0));
     assert_eq!(it.difference, 2.5);
-    // Welch's 4.03 degrees of freedom; the test is that of `p_values_are_those_of_the_textbook_tests`, moved by 1.
+    // The degrees of freedom are Welch's 4.03. The data are those of `p_values_are_those_of_the_textbook_tests`,
+    // shifted by 1.
     let [low, high] = it.seeds_95.unwrap();
     assert!((low + high - 5.0).abs() < 1e-9 && low < 0.0, "{low} {high}");
     let x = [2, 3, 5, 8].map(|score| policy(&[score; 4]));
@@ -90,13 +93,13 @@ fn success_rates_have_wilsons_interval_over_episodes() {
     assert_eq!((it.means[0].mean, it.means[0].seeds_95, it.means[0].episodes), (75.0, None, 4));
     let got = it.means[0].episodes_95.unwrap();
     assert!((got[0] - 100.0 * low).abs() < 1e-9 && (got[1] - 100.0 * high).abs() < 1e-9, "{got:?}");
-    // Four equal policies give no more information on other episodes than one.
+    // Four equal policies give no more information about other episodes than one policy.
     let four = [one[0].clone(), one[0].clone(), one[0].clone(), one[0].clone()];
     let equal = compared(&four, &four, ComparedScore::Success);
     let of_four = equal.means[0].episodes_95.unwrap();
     assert!((of_four[0] - got[0]).abs() < 1e-9, "{of_four:?}");
     assert_eq!((equal.differences[0].p, equal.differences[0].improvement), (Some(1.0), 0.5));
-    // All episodes succeed: the interval is as wide as so few episodes make it, and not a single point.
+    // Even if all episodes succeed, the interval is as wide as the small number of episodes requires.
     let all = [policy(&[9; 4])];
     let [low, high] = compared(&all, &all, ComparedScore::Success).means[0].episodes_95.unwrap();
     assert!(low < 60.0 && high == 100.0, "{low}");

@@ -1,20 +1,20 @@
-//! Comparisons in sentences that claim no more than their numbers show.
+//! Describes comparisons in sentences that claim no more than the numbers show.
 
 use super::{ComparedScore, ConditionDifference};
 use crate::statistics::MIN_RUNS_FOR_INTERVAL;
 
-/// Maximum corrected p-value of a difference that is called decided.
+/// A difference is called decided if its corrected p-value is below this limit.
 const MAX_DECIDED_P: f64 = 0.05;
 
 impl ConditionDifference {
-    /// Whether the difference is larger than chance explains: its p-value over seeds, with Holm's correction for all
-    /// compared pairs, is below the limit.
+    /// Returns whether the difference is statistically significant: whether its p-value over seeds, with Holm's
+    /// correction for all compared pairs, is below 0.05.
     pub fn is_decided(&self) -> bool {
         self.p_holm.is_some_and(|p| p < MAX_DECIDED_P)
     }
 }
 
-/// Returns a sentence on one of the comparisons, of which `compared` have a p-value.
+/// Describes one difference. `compared` is the number of differences of the comparison that have a p-value.
 pub(super) fn of_difference(it: &ConditionDifference, score: ComparedScore, compared: usize) -> String {
     let (Some(interval), Some(p), Some(corrected)) = (it.seeds_95, it.p, it.p_holm) else {
         return format!("{}: {}", few_seeds_numbers(it, score), few_seeds(it));
@@ -39,7 +39,7 @@ pub(super) fn of_difference(it: &ConditionDifference, score: ComparedScore, comp
     format!("{} − {} on {}: {numbers}: {why}", it.x, it.y, it.tested_on)
 }
 
-/// Returns a sentence on all comparisons.
+/// Describes the whole comparison in one sentence. `compared` is the number of differences that have a p-value.
 pub(super) fn of_all(all: &[ConditionDifference], score: ComparedScore, compared: usize) -> String {
     let Some(largest) = all.iter().reduce(|a, b| if b.difference.abs() > a.difference.abs() { b } else { a }) else {
         return "There is one condition, and nothing is compared".into();
@@ -67,7 +67,8 @@ pub(super) fn of_all(all: &[ConditionDifference], score: ComparedScore, compared
     }
 }
 
-/// Returns the difference with those of its pairs, or without pairs with its interval over episodes.
+/// Describes a difference for which there are too few seeds: with the differences of the single pairs, or if there are
+/// none with the interval over episodes.
 fn few_seeds_numbers(it: &ConditionDifference, score: ComparedScore) -> String {
     let head = format!("{} − {} on {}: {}", it.x, it.y, it.tested_on, points(it.difference, score));
     let over_episodes = it.episodes_95.map(|interval| format!(" {} over episodes", ends(interval)));
@@ -113,7 +114,7 @@ fn points(difference: f64, score: ComparedScore) -> String {
     format!("{}{unit}", signed(difference))
 }
 
-/// Adding 0 makes a negative zero positive.
+/// Formats a number with its sign and one decimal. Adding 0 turns -0.0 into 0.0.
 fn signed(number: f64) -> String {
     format!("{:+.1}", (10.0 * number).round() / 10.0 + 0.0)
 }

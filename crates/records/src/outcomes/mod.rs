@@ -1,4 +1,5 @@
-//! Recorded episodes by column, for success over parameters and for tail risk.
+//! Parameters and outcomes of recorded episodes, by column. Success over parameters and tail risk are computed from
+//! them.
 
 mod partition;
 mod sweeps;
@@ -12,7 +13,7 @@ use perturb_settings::sets::Contexts;
 pub use sweeps::{Bin, Counted, bins, success_within, success_within_both};
 pub use worst::{SHARE, conditional_value_at_risk, worst_contexts};
 
-/// The tests of a policy.
+/// The parameters and outcomes of all episodes of a policy's tests.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PolicyOutcomes {
     /// The parameters, in the order of [`Outcomes::parameters`].
@@ -20,34 +21,34 @@ pub struct PolicyOutcomes {
     tests: BTreeMap<String, Outcomes>,
 }
 
-/// The n episodes of a test, in their order.
+/// The parameters and outcomes of the n episodes of a test, in recorded order.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Outcomes {
-    /// `[P, n]`: requested values of each parameter.
+    /// `[P, n]` requested values of each of the P parameters.
     pub parameters: Vec<Vec<f64>>,
-    /// The context of each episode, if the set lists contexts.
+    /// `[n]` index of each episode's context, if the test set is a list of contexts (combinations of parameter values).
     pub contexts: Option<Vec<usize>>,
-    /// The undiscounted return of each episode.
+    /// `[n]` undiscounted returns.
     pub returns: Vec<f64>,
-    /// Whether each episode was a success.
+    /// `[n]` whether the episode was a success.
     pub successes: Vec<bool>,
 }
 
 impl PolicyOutcomes {
-    /// Collects the tests on the sets with these names.
+    /// Collects the episodes of the tests on the sets called `names`.
     pub fn new<'a>(records: &Records, names: impl Iterator<Item = &'a str>) -> Self {
         let tests = names.map(|name| (name.to_owned(), Outcomes::new(records, name))).collect();
         Self { parameters: records.about.parameters.clone(), tests }
     }
 
-    /// Returns the test on a set; `None` if there was none.
+    /// Returns the episodes of the test on the set called `tested_on`; `None` if there are none.
     pub fn test(&self, tested_on: &str) -> Option<&Outcomes> {
         self.tests.get(tested_on).filter(|outcomes| !outcomes.returns.is_empty())
     }
 }
 
 impl Outcomes {
-    /// Collects the test on the set called `name`; empty if there was none.
+    /// Collects the episodes of the test on the set called `name`. The result is empty if there was no such test.
     pub fn new(records: &Records, name: &str) -> Self {
         let rows = || records.episodes_on(name);
         let parameter =

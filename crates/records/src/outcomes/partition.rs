@@ -1,14 +1,15 @@
-//! Cuts the parameter space of a test into parts with about equally many episodes.
+//! Divides the parameter space of a test into regions with about the same number of episodes.
 
 use super::Outcomes;
 
-/// Intended number of episodes in a part. Half of them estimate the part's success, in steps of a twentieth.
+/// Intended number of episodes in a region. Half of them estimate the region's success rate, in steps of 1/20.
 const EPISODES: f64 = 40.0;
 
 impl Outcomes {
-    /// Returns for each episode the part of the parameter space, counted from 0, in which its parameters lie. If the set
-    /// lists contexts, each context is a part. Otherwise each parameter that varies is cut at quantiles of its own values,
-    /// into so many intervals that a part has about 40 episodes. The outcomes of episodes do not matter.
+    /// Returns the region of the parameter space to which each episode belongs, numbered from 0. If the test set is a
+    /// list of contexts, each context is a region. Otherwise the range of each varying parameter is divided at
+    /// quantiles of its own values. The number of intervals is chosen to give about 40 episodes in each region. The
+    /// outcomes of the episodes have no influence on the division.
     pub fn parts(&self) -> Vec<usize> {
         if let Some(contexts) = &self.contexts {
             return contexts.clone();
@@ -47,7 +48,8 @@ mod tests {
         #[case] count: usize,
         #[case] least: usize,
     ) {
-        // Each parameter is another permutation of the same numbers; 0.75 of a fixed one is no part of it.
+        // The parameters are different permutations of the same numbers. A fixed parameter of 0.75 does not divide the
+        // space.
         let spread = |place: usize| (0..n).map(|i| ((i * [1, 7, 49][place]) % n) as f64).collect();
         let mut parameters: Vec<Vec<f64>> = (0..varying).map(spread).collect();
         parameters.push(vec![0.75; n]);

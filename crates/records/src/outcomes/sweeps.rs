@@ -1,21 +1,21 @@
-//! Success over a parameter.
+//! Success rates over the range of a parameter.
 
 use super::Outcomes;
 use crate::statistics::wilson;
 
-/// Number of parts of a parameter's range, if it has values everywhere.
+/// Number of bins over the range of a parameter, if its values have no gaps.
 const BINS: f64 = 10.0;
 
-/// Values from `low` to `high`. `high` belongs only to the last bin of an interval.
+/// An interval of parameter values.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bin {
     /// The lower end, which belongs to the bin.
     pub low: f64,
-    /// The upper end, which belongs only to the last bin of an interval.
+    /// The upper end. It belongs to the next bin, or to this bin if no bin follows directly.
     pub high: f64,
 }
 
-/// Successes among episodes.
+/// A number of episodes and the number of successes among them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counted {
     /// The number of successful episodes.
@@ -25,18 +25,18 @@ pub struct Counted {
 }
 
 impl Counted {
-    /// The success rate, %; NaN without episodes.
+    /// Returns the success rate, in %; NaN if there are no episodes.
     pub fn rate(self) -> f64 {
         100.0 * self.successes as f64 / self.episodes as f64
     }
 
-    /// The 95 % interval of [`Counted::rate`] after Wilson (1927), [low, high], %.
+    /// Returns the 95 % interval of [`Counted::rate`] after Wilson (1927), [low, high] in %.
     pub fn interval(self) -> [f64; 2] {
         let (low, high) = wilson(self.successes, self.episodes);
         [100.0 * low, 100.0 * high]
     }
 
-    /// Returns the interval; `None` without episodes.
+    /// Returns [`Counted::interval`], or `None` if there are no episodes.
     pub fn known(self) -> Option<[f64; 2]> {
         (self.episodes > 0).then(|| self.interval())
     }
@@ -51,8 +51,8 @@ impl std::iter::Sum for Counted {
     }
 }
 
-/// Cuts the range that the parameter at `place` has in `tests` into about ten equal bins. Where a tenth of the range has no
-/// value, as between E's two intervals, one bin ends and another begins. Returns no bins if the parameter does not vary.
+/// Divides the range of parameter number `place` in `tests` into about ten equal bins. A gap wider than a tenth of the
+/// range, such as the gap between E's two intervals, belongs to no bin. Returns no bins if the parameter does not vary.
 pub fn bins<'a>(tests: impl Iterator<Item = &'a Outcomes>, place: usize) -> Vec<Bin> {
     let values = tests.filter_map(|outcomes| outcomes.parameters.get(place)).flatten();
     let mut values: Vec<f64> = values.copied().filter(|value| value.is_finite()).collect();
@@ -73,7 +73,7 @@ pub fn bins<'a>(tests: impl Iterator<Item = &'a Outcomes>, place: usize) -> Vec<
     values.chunk_by(|a, b| b - a < width).flat_map(of_interval).collect()
 }
 
-/// Counts the episodes of `outcomes` by the bin of the parameter at `place`.
+/// Counts the episodes and successes of `outcomes` in each of the `bins` of parameter number `place`.
 pub fn success_within(outcomes: &Outcomes, place: usize, bins: &[Bin]) -> Vec<Counted> {
     let mut counted = vec![Counted::default(); bins.len()];
     let values = outcomes.parameters.get(place).into_iter().flatten();
@@ -86,8 +86,8 @@ pub fn success_within(outcomes: &Outcomes, place: usize, bins: &[Bin]) -> Vec<Co
     counted
 }
 
-/// Counts the episodes of `outcomes` by the bins of two parameters, those at `x` and `y`. Returns `[Y, X]` counts in a row;
-/// none if one of the parameters does not vary.
+/// Counts the episodes and successes of `outcomes` for each pair of bins of two parameters, numbers `x` and `y`.
+/// Returns the counts `[Y, X]` as one array. It is empty if one of the parameters does not vary.
 pub fn success_within_both(outcomes: &Outcomes, [x, y]: [usize; 2], [over_x, over_y]: [&[Bin]; 2]) -> Vec<Counted> {
     let mut counted = vec![Counted::default(); over_x.len() * over_y.len()];
     let values = |place: usize| outcomes.parameters.get(place).into_iter().flatten();
@@ -100,7 +100,7 @@ pub fn success_within_both(outcomes: &Outcomes, [x, y]: [usize; 2], [over_x, ove
     counted
 }
 
-/// The index of the bin in which `value` lies.
+/// Returns the index of the bin that contains `value`.
 fn bin_of(value: f64, bins: &[Bin]) -> usize {
     bins.partition_point(|bin| bin.low <= value).saturating_sub(1)
 }
@@ -109,7 +109,8 @@ fn bin_of(value: f64, bins: &[Bin]) -> usize {
 mod tests {
     use super::*;
 
-    /// Four episodes. The first parameter is always 1, the second one varies; only the episode at 0.95 fails.
+    /// Returns four episodes. The first parameter is always 1, and the second one varies. Only the episode at 0.95
+    /// fails.
     fn outcomes() -> Outcomes {
         Outcomes {
             parameters: vec![vec![1.0; 4], vec![0.15, 0.95, 1.0, 0.0]],
@@ -124,7 +125,8 @@ mod tests {
         let spread = Outcomes { parameters: vec![(0..=100).map(f64::from).collect()], ..Outcomes::default() };
         let even = bins([&spread].into_iter(), 0);
         assert_eq!((even.len(), even[0], even[9]), (10, Bin { low: 0.0, high: 10.0 }, Bin { low: 90.0, high: 100.0 }));
-        // The values lie in two intervals, 0 … 0.3 and 0.8 … 1. Bins of a tenth each cover these and leave the gap out.
+        // The values lie in two intervals, 0 … 0.3 and 0.8 … 1. They are divided into bins of width 0.1, with no bin in
+        // the gap.
         let tenth = |from: u32, to: u32| (from..=to).map(|value| f64::from(value) / 100.0).collect::<Vec<_>>();
         let gap = Outcomes { parameters: vec![Vec::new(), [tenth(0, 30), tenth(80, 100)].concat()], ..outcomes() };
         let bins = bins([&gap].into_iter(), 1);

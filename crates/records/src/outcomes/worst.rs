@@ -1,15 +1,16 @@
-//! Tail risk: the worst tenth of episodes and of test contexts.
+//! Tail risk: results in the worst tenth of episodes and of test contexts.
 
 use std::collections::BTreeMap;
 
 use super::Outcomes;
 
-/// The share of episodes or contexts that counts as the worst.
+/// The share of episodes or contexts that are called the worst.
 pub const SHARE: f64 = 0.1;
-/// Minimum number of parts for a tenth to exist.
+/// Minimum number of regions for which the worst tenth is computed.
 const MIN_PARTS: usize = 10;
 
-/// The mean of the ⌈`share` · n⌉ lowest of n returns (Rockafellar and Uryasev, 2000); NaN if there are none.
+/// Returns the conditional value at risk: the mean of the ⌈`share` · n⌉ lowest of n returns (Rockafellar and Uryasev,
+/// 2000). NaN if there are no returns.
 pub fn conditional_value_at_risk(returns: &[f64], share: f64) -> f64 {
     let mut worst = returns.to_vec();
     worst.sort_unstable_by(f64::total_cmp);
@@ -17,7 +18,7 @@ pub fn conditional_value_at_risk(returns: &[f64], share: f64) -> f64 {
     worst.iter().sum::<f64>() / worst.len() as f64
 }
 
-/// Successes and episodes of a part, in each half.
+/// The successes and episodes of a region, in each half of its episodes.
 #[derive(Clone, Copy, Default)]
 struct ContextGroup {
     successes: [f64; 2],
@@ -30,15 +31,16 @@ impl ContextGroup {
     }
 }
 
-/// The success rate, %, in the worst tenth of contexts: in the parts of the parameter space with the lowest success rates,
-/// which together hold a tenth of the episodes.
+/// Returns the success rate, in %, in the worst tenth of contexts. These are the regions of the parameter space with
+/// the lowest success rates that together hold a tenth of the episodes.
 ///
-/// The estimate is cross-fitted. If the same episodes ranked the parts and measured their success, bad luck would look like
-/// bad contexts. So every other episode of a part belongs to one half: one half ranks the parts, the other measures their
-/// success, and the two ways round are averaged. Equally bad parts count equally. Since a half may rank parts wrongly, the
-/// true rate may be lower, but is never systematically higher.
+/// The estimate is cross-fitted: if the same episodes ranked the regions and measured their success, a region with bad
+/// luck would look like a bad region. Therefore the episodes of each region alternate between two halves. One half
+/// ranks the regions, and the other measures success in the worst of them. The result is the average over both
+/// assignments. Regions with equal rates are weighted equally. Because a half may rank regions wrongly, the true rate
+/// may be lower than the estimate, but it is never systematically higher.
 ///
-/// `None` if there are fewer than ten parts with two episodes, as where all parameters are fixed.
+/// `None` if fewer than ten regions have at least two episodes, for example because all parameters are fixed.
 pub fn worst_contexts(outcomes: &Outcomes) -> Option<f64> {
     let mut parts: BTreeMap<usize, (ContextGroup, usize)> = BTreeMap::new();
     for (part, success) in outcomes.parts().into_iter().zip(&outcomes.successes) {
@@ -59,8 +61,8 @@ pub fn worst_contexts(outcomes: &Outcomes) -> Option<f64> {
     Some(50.0 * (one_way(0) + one_way(1)))
 }
 
-/// Returns the success of the worst tenth of `parts` in the half of the episodes that did not rank them. `parts` are in
-/// the order of the half `chooses`.
+/// Returns the success rate, 0 … 1, of the worst tenth of `parts`. `parts` are sorted by their success in the half
+/// `chooses`; the rate is measured in the other half.
 fn judged(parts: &[ContextGroup], chooses: usize) -> f64 {
     let judges = 1 - chooses;
     let mut wanted = SHARE * parts.iter().map(|part| part.episodes[chooses]).sum::<f64>();
@@ -81,7 +83,8 @@ mod tests {
 
     use super::*;
 
-    /// `episodes` episodes in each of `contexts` contexts. `success` says whether the episode of a context is a success.
+    /// Returns `episodes` episodes in each of `contexts` contexts. `success` decides from the context and the episode's
+    /// number whether an episode is a success.
     fn outcomes(contexts: usize, episodes: usize, mut success: impl FnMut(usize, usize) -> bool) -> Outcomes {
         let all = || (0..episodes).flat_map(|episode| (0..contexts).map(move |context| (context, episode)));
         Outcomes {
@@ -102,20 +105,20 @@ mod tests {
 
     #[test]
     fn the_worst_contexts_are_found_and_parts_of_them_count_in_part() {
-        // Of 20 contexts two fail always: the worst tenth.
+        // Two of 20 contexts always fail. They are the worst tenth.
         assert_eq!(worst_contexts(&outcomes(20, 10, |context, _| context != 3 && context != 17)), Some(0.0));
-        // The context that fails is half of the worst tenth. The other half are contexts that succeed.
+        // One context always fails, and is half of the worst tenth. The other half are contexts that always succeed.
         assert_eq!(worst_contexts(&outcomes(20, 10, |context, _| context != 3)), Some(50.0));
-        // Context c succeeds in its first c + 1 episodes. In episodes 0, 2, … contexts 0 and 1 are equally bad; in the
-        // other episodes they have 0 and 1 successes of 5. In episodes 1, 3, … context 0 is the worst; in the other
+        // Context c succeeds in its first c + 1 episodes. In episodes 0, 2, … contexts 0 and 1 are equally bad. In the
+        // other episodes they have 0 and 1 successes of 5. In episodes 1, 3, … context 0 is the worst. In the other
         // episodes it has 1 success of 5.
         let rate = worst_contexts(&outcomes(10, 10, |context, episode| episode <= context)).unwrap();
         assert!((rate - (10.0 + 20.0) / 2.0).abs() < 1e-9, "{rate}");
     }
 
-    /// All contexts are alike. If the same episodes ranked them, the worst tenth would look far worse: with 20 episodes
-    /// each, the rates are 0.5 ± 0.11, and the two lowest of 20 lie some 0.19 below. The mean of 40 repetitions with 40
-    /// episodes has a standard error of 0.0125.
+    /// All contexts are alike. If the same episodes ranked them, the worst tenth would look far worse. With 20 episodes
+    /// each, the rates are 0.5 ± 0.11, and the two lowest of 20 lie about 0.19 below 0.5. The mean of 40 repetitions
+    /// with 40 episodes has a standard error of 0.0125.
     #[test]
     fn bad_luck_is_not_taken_for_bad_contexts() {
         let mut rng = stream(1, Purpose::TestEnvironments);

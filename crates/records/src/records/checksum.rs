@@ -5,8 +5,8 @@ use sha2::{Digest, Sha256};
 use super::{Ending, EpisodeRecord, Records};
 
 impl Records {
-    /// Returns the SHA-256 of the episodes of the test on the set called `name`, in hexadecimal digits; `None` if there
-    /// are none. `docs/results-table.md` says which bytes of an episode count.
+    /// Returns the SHA-256 of the episodes of the test on the set called `name`, in hexadecimal; `None` if there are
+    /// none. `docs/results-table.md` specifies the bytes that are hashed.
     pub fn checksum(&self, name: &str) -> Option<String> {
         let mut hash = Sha256::new();
         let mut episodes = self.episodes_on(name).peekable();
@@ -16,7 +16,7 @@ impl Records {
     }
 }
 
-/// Adds an episode, all numbers little-endian.
+/// Adds an episode to the hash. All numbers are little-endian.
 fn add(hash: &mut Sha256, episode: &EpisodeRecord) {
     let optional = |hash: &mut Sha256, number: Option<f64>| {
         hash.update([u8::from(number.is_some())]);

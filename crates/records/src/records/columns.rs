@@ -1,4 +1,4 @@
-//! Recorded episodes as a table: a row an episode, a column a quantity.
+//! Recorded episodes as a table, with a row for each episode.
 
 use perturb_files::AnyError;
 
@@ -9,12 +9,12 @@ impl Ending {
     const NAMED: [(&str, Self); 3] =
         [("terminated", Self::Terminated), ("truncated", Self::Truncated), ("diverged", Self::Diverged)];
 
-    /// Returns the name in files.
+    /// Returns the name that files use.
     pub(crate) fn name(self) -> &'static str {
         Self::NAMED[self as usize].0
     }
 
-    /// Returns the ending with this name.
+    /// Parses a name that [`Ending::name`] returned.
     pub(crate) fn from_name(name: &str) -> Result<Self, AnyError> {
         let known = Self::NAMED.into_iter().find(|(known, _)| *known == name);
         known.map(|(_, ending)| ending).ok_or_else(|| format!("an ending is `{name}`").into())
@@ -22,7 +22,7 @@ impl Ending {
 }
 
 impl Records {
-    /// The columns by their names, in order. [`Records::read`] reads them back.
+    /// Returns the columns with their names, in the order of the file that [`Records::read`] reads.
     pub fn columns(&self) -> Vec<(String, ColumnValues<'_>)> {
         let Self { about, episodes } = self;
         let rows = || episodes.iter();

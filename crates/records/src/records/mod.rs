@@ -1,7 +1,7 @@
-//! Recorded test episodes: the requested parameters of each, the applied parameters, and the outcome.
+//! Recorded test episodes, with the requested parameters, the applied parameters and the outcome of each.
 //!
-//! One Parquet file holds the tests of one policy. Every figure of a result follows from it, at any threshold of success,
-//! and each episode can be played again from its address: seed, environment index and episode index.
+//! The tests of one policy are in one Parquet file. Every figure of a test result can be computed from it, for any
+//! success threshold. Each episode can be replayed from its seed, environment index and episode index.
 
 mod checksum;
 mod columns;
@@ -20,15 +20,17 @@ use crate::results::TestResult;
 use crate::statistics::{mean, wilson};
 use crate::success::{Criterion, Rule};
 
-/// Requested and applied values may differ by this share of the requested one: physics rounds what it derives.
+/// Maximum relative difference between a requested and an applied value. The difference is not 0, because physics
+/// rounds derived quantities.
 pub const ROUNDING: f64 = 1e-9;
 
-/// The recorded tests of a policy.
+/// The recorded tests of one policy.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Records {
     /// Metadata of all episodes.
     pub about: RecordsMetadata,
-    /// The episodes, in the order of the tests. Those of a test are in the order of their environment and episode indices.
+    /// The episodes, in the order of the tests. Within a test they are ordered by environment index, then episode
+    /// index.
     pub episodes: Vec<EpisodeRecord>,
 }
 
@@ -41,102 +43,104 @@ pub struct RecordsMetadata {
     pub revision: u32,
     /// The environment's parameters, in the order of the requested values.
     pub parameters: Vec<RecordedParameter>,
-    /// The names of the quantities that were read back, in the order of the applied values.
+    /// The names of the quantities that the server read back from the physics, in the order of the applied values.
     pub applied: Vec<String>,
-    /// The id of the policy's checkpoint.
+    /// The id of the checkpoint that was tested.
     pub policy: String,
-    /// Episodes in a trial. Only the last one is recorded. 1 without trials.
+    /// The number of episodes in a trial, of which only the last one is recorded. 1 if the policy has no trials.
     pub episodes_per_trial: u32,
-    /// The success criterion; `None` if the server judged without naming one.
+    /// The success criterion; `None` if the server determined success without stating its criterion.
     pub success: Option<Criterion>,
-    /// The criterion of the paper's text; `None` in records of older programs, which knew no other criterion.
+    /// The success criterion of the paper's text. `None` in records of older programs, which had only one criterion.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub text_success: Option<Criterion>,
-    /// The criterion of the paper's published code; `None` if the server did not say.
+    /// The success criterion of the paper's published code. `None` if the server did not state it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub code_success: Option<Criterion>,
-    /// The quantity of [`EpisodeRecord::also_achieved`], if the two rules compare different quantities.
+    /// The name of the quantity in [`EpisodeRecord::also_achieved`]. `None` if the criteria of the text and of the code
+    /// compare the same quantity.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub also: Option<String>,
-    /// The tests, in order.
+    /// The tests, in the order in which they were recorded.
     pub tests: Vec<RecordedTest>,
 }
 
-/// A parameter of recorded episodes.
+/// An environment parameter of recorded episodes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RecordedParameter {
     /// The parameter's name.
     pub name: String,
     /// The unit; "1" if dimensionless.
     pub unit: String,
-    /// The quantity that reads it back; empty if its server did not say.
+    /// The name of the applied quantity that corresponds to this parameter. Empty if the server did not state it.
     pub applied: String,
 }
 
-/// A test.
+/// A recorded test.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RecordedTest {
     /// The test set.
     pub set: TestSet,
-    /// The seed of the environments and of the actions.
+    /// The seed of the test's environments and actions.
     pub seed: u64,
-    /// The axes x and y of a heatmap's test. `None` in other tests and in records of older programs.
+    /// The axes x and y, if the test is a heatmap. `None` for other tests and in records of older programs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub axes: Option<[Axis; 2]>,
 }
 
-/// The end of an episode.
+/// The reason why an episode ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ending {
-    /// The task ended it.
+    /// The task ended the episode, for example because of a fall.
     Terminated,
-    /// The step limit ended it.
+    /// The step limit ended the episode.
     Truncated,
-    /// The physics came to numbers that are not finite.
+    /// The physics computed numbers that are not finite.
     Diverged,
 }
 
-/// An episode of a test.
+/// A recorded episode of a test.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EpisodeRecord {
-    /// The name of the set that it was a test on.
+    /// The name of the test set.
     pub set: String,
-    /// The seed of the environments. With the two indices that follow it is the episode's address.
+    /// The seed of the test's environments. The seed, the environment index and the episode index identify the episode.
     pub seed: u64,
-    /// The environment's index among those that were tested together, from 0.
+    /// The index of the environment within the test, from 0.
     pub environment_index: u32,
-    /// Counts the environment's episodes from 0.
+    /// The index of the episode in its environment, from 0.
     pub episode_index: u64,
-    /// The parameters that were drawn or given, in the order of [`RecordsMetadata::parameters`].
+    /// The requested parameter values, in the order of [`RecordsMetadata::parameters`].
     pub requested: Vec<f64>,
-    /// Applied parameters, in the order of [`RecordsMetadata::applied`].
+    /// The applied values that were read back from the physics, in the order of [`RecordsMetadata::applied`].
     pub applied: Vec<f64>,
-    /// SHA-256 of the model; empty without one.
+    /// SHA-256 of the simulated model (MJCF text); empty for an environment without a model.
     pub model_hash: String,
-    /// The undiscounted sum of its rewards.
+    /// The undiscounted sum of the rewards.
     pub episode_return: f64,
     /// The number of steps.
     pub length: u32,
-    /// Whether it was a success.
+    /// Whether the episode was a success.
     pub success: bool,
-    /// The way in which the episode ended.
+    /// The reason why the episode ended.
     pub ending: Ending,
-    /// The value of the criterion's quantity; `None` if it was not reached.
+    /// The value of the quantity that the success criterion compares. `None` if the episode has no such value.
     pub achieved: Option<f64>,
-    /// The value of [`RecordsMetadata::also`]; `None` if it was not reached or there is no such quantity.
+    /// The value of the quantity [`RecordsMetadata::also`]. `None` if there is no such quantity, or the episode has no
+    /// value of it.
     pub also_achieved: Option<f64>,
 }
 
-/// Check that requested and applied parameters agree.
+/// The result of comparing requested with applied parameters.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ParameterCheck {
-    /// Episodes in which all parameters were compared.
+    /// The number of episodes in which all parameters were compared.
     pub episodes: u64,
-    /// The largest difference; `None` if nothing was compared.
+    /// The largest relative difference; `None` if no parameter was compared.
     pub largest: Option<Difference>,
 }
 
-/// A parameter that was asked for, and what the physics had instead.
+/// A requested parameter and the value that the physics used instead.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Difference {
     /// The parameter's name in the catalogue.
@@ -145,12 +149,12 @@ pub struct Difference {
     pub requested: f64,
     /// The applied value.
     pub applied: f64,
-    /// The difference divided by the requested value; the difference itself if the requested value is 0.
+    /// The absolute difference, divided by the magnitude of the requested value unless this value is 0.
     pub relative: f64,
 }
 
 impl RecordsMetadata {
-    /// Returns the metadata of a policy in `environment`, without tests so far.
+    /// Returns the metadata for a policy in `environment`, without any tests.
     pub fn new(environment: &proto::Environment, policy: String, episodes_per_trial: u32) -> Self {
         let parameter = |parameter: &proto::Parameter| RecordedParameter {
             name: parameter.name.clone(),
@@ -175,18 +179,18 @@ impl RecordsMetadata {
         }
     }
 
-    /// The criterion by `rule`.
+    /// Returns the success criterion that `rule` stands for.
     ///
     /// # Errors
-    /// [`ValueError`] for a rule by which these episodes cannot be judged.
+    /// [`ValueError`] if these episodes cannot be judged by `rule`.
     pub fn criterion(&self, rule: &Rule) -> Result<Criterion, ValueError> {
         rule.criterion(self.text_success.as_ref().or(self.success.as_ref()), self.code_success.as_ref())
     }
 
-    /// Makes `rule` the success criterion of episodes that are recorded from now on.
+    /// Sets the success criterion of episodes that are recorded from now on to `rule`.
     ///
     /// # Errors
-    /// Those of [`RecordsMetadata::criterion`].
+    /// The errors of [`RecordsMetadata::criterion`].
     pub fn judge_by(&mut self, rule: &Rule) -> Result<(), ValueError> {
         let criterion = self.criterion(rule)?;
         if self.also.as_ref() == Some(&criterion.quantity) {
@@ -196,13 +200,15 @@ impl RecordsMetadata {
         Ok(())
     }
 
-    /// Returns the values of the criterion's quantity and of the environment's other quantity, if it has two.
+    /// Returns the value of the quantity that the success criterion compares, and of the environment's other quantity
+    /// if there are two.
     fn achieved(&self, end: &EndedEpisode) -> (Option<f64>, Option<f64>) {
         let text = (end.achieved, self.also.is_some().then_some(end.code_achieved).flatten());
         if self.is_judged_by_code() { (text.1, text.0) } else { text }
     }
 
-    /// Whether [`EpisodeRecord::achieved`] is the quantity of the code's rule, which differs from that of the text's rule.
+    /// Returns whether [`EpisodeRecord::achieved`] holds the quantity of the code's criterion, where it differs from
+    /// the quantity of the text's criterion.
     pub fn is_judged_by_code(&self) -> bool {
         let quantity = |criterion: &Option<Criterion>| criterion.as_ref().map(|it| it.quantity.clone());
         self.also.is_some() && quantity(&self.success) == quantity(&self.code_success)
@@ -210,7 +216,7 @@ impl RecordsMetadata {
 }
 
 impl EpisodeRecord {
-    /// Returns the record of an episode on `set`, whose environments have `seed`.
+    /// Creates the record of an episode of the test on `set`, whose environments have the seed `seed`.
     pub fn new(about: &RecordsMetadata, set: &str, seed: u64, end: EndedEpisode) -> Self {
         let (achieved, also_achieved) = about.achieved(&end);
         Self {
@@ -236,30 +242,30 @@ impl EpisodeRecord {
 }
 
 impl Records {
-    /// Records of a policy without tests so far.
+    /// Creates records without any tests.
     pub fn new(about: RecordsMetadata) -> Self {
         Self { about, episodes: Vec::new() }
     }
 
-    /// Adds a test.
+    /// Adds a test with its episodes.
     pub fn add(&mut self, test: RecordedTest, episodes: Vec<EpisodeRecord>) {
         self.about.tests.push(test);
         self.episodes.extend(episodes);
     }
 
-    /// Adds other tests of the same policy.
+    /// Adds the tests of `other`, which must be of the same policy.
     pub fn append(&mut self, other: Self) {
         self.about.tests.extend(other.about.tests);
         self.episodes.extend(other.episodes);
     }
 
-    /// The episodes of the test on the set called `name`.
+    /// Returns the episodes of the test on the set called `name`.
     pub fn episodes_on<'a>(&'a self, name: &'a str) -> impl Iterator<Item = &'a EpisodeRecord> + Clone {
         self.episodes.iter().filter(move |episode| episode.set == name)
     }
 
-    /// The figures of the test on the set called `name`. With `criterion`, which must compare a recorded quantity,
-    /// successes are judged anew.
+    /// Computes the results of the test on the set called `name`. With `criterion`, determines success by this
+    /// criterion instead of the recorded one; its quantity must have been recorded.
     pub fn result(&self, name: &str, criterion: Option<&Criterion>) -> TestResult {
         let success =
             |episode: &EpisodeRecord| criterion.map_or(episode.success, |c| c.holds(self.achieved(episode, c)));
@@ -276,10 +282,10 @@ impl Records {
         }
     }
 
-    /// Judges the episodes by `rule` instead of the recorded rule.
+    /// Determines the success of all episodes by `rule` instead of the recorded criterion.
     ///
     /// # Errors
-    /// Those of [`RecordsMetadata::criterion`].
+    /// The errors of [`RecordsMetadata::criterion`].
     pub fn judged_by(mut self, rule: &Rule) -> Result<Self, ValueError> {
         let criterion = self.about.criterion(rule)?;
         let swaps = self.about.also.as_ref() == Some(&criterion.quantity);
@@ -293,11 +299,11 @@ impl Records {
         Ok(self)
     }
 
-    /// Judges the episodes by a criterion whose quantity was not recorded. `values` `[episodes]` holds the quantity, NaN
-    /// where it was not reached, and replaces the recorded ones.
+    /// Determines the success of all episodes by a criterion whose quantity was not recorded. `values` has the quantity
+    /// for each episode, NaN if the episode has no value. It replaces the recorded values.
     ///
     /// # Errors
-    /// [`ValueError`] for another number of values than of episodes.
+    /// [`ValueError`] if the number of values is not the number of episodes.
     pub fn judged_by_values(mut self, criterion: Criterion, values: &[f64]) -> Result<Self, ValueError> {
         let expected = format!("{}, one for each episode", self.episodes.len());
         require(
@@ -316,12 +322,12 @@ impl Records {
         Ok(self)
     }
 
-    /// Returns the value of the quantity that `criterion` compares.
+    /// Returns the episode's value of the quantity that `criterion` compares.
     pub fn achieved(&self, episode: &EpisodeRecord, criterion: &Criterion) -> Option<f64> {
         if self.about.also.as_ref() == Some(&criterion.quantity) { episode.also_achieved } else { episode.achieved }
     }
 
-    /// Compares the requested with the applied parameters of every episode.
+    /// Compares the requested with the applied parameters of all episodes.
     pub fn agreement(&self) -> ParameterCheck {
         let comparison = ParameterComparison::with(&self.about);
         let of = |episode: &EpisodeRecord| comparison.largest(&episode.requested, &episode.applied);
@@ -331,11 +337,11 @@ impl Records {
     }
 }
 
-/// Compares requested with applied parameters.
+/// Compares requested with applied parameters of episodes.
 #[derive(Clone, Debug)]
 pub struct ParameterComparison {
-    /// The parameters' names, and where the quantity that reads each back is among the applied values; `None` if the
-    /// server does not say.
+    /// The names of the parameters, and for each the index of its quantity among the applied values. `None` if the
+    /// server did not state the quantity.
     parameters: Vec<(String, Option<usize>)>,
 }
 
@@ -346,22 +352,23 @@ impl ParameterComparison {
         Self { parameters: parameters.collect() }
     }
 
-    /// A comparison for the receipts of `environment`.
+    /// Creates a comparison for episodes of `environment`.
     pub fn new(environment: &proto::Environment) -> Self {
         Self::with(&RecordsMetadata::new(environment, String::new(), 1))
     }
 
-    /// The largest difference in a receipt, if it is more than rounding.
+    /// Returns the largest difference between the parameters of an episode, if it exceeds rounding.
     pub fn difference_beyond_rounding(&self, requested: &[f64], applied: &[f64]) -> Option<Difference> {
         self.largest(requested, applied).filter(Difference::exceeds_tolerance)
     }
 
-    /// Whether every parameter is read back.
+    /// Returns whether every parameter has an applied quantity.
     fn is_complete(&self) -> bool {
         self.parameters.iter().all(|(_, place)| place.is_some())
     }
 
-    /// The largest difference in a receipt; `None` if nothing is read back. A value that is missing differs.
+    /// Returns the largest relative difference between the parameters of an episode. Returns `None` if no parameter has
+    /// an applied quantity. A missing value counts as a difference of NaN.
     fn largest(&self, requested: &[f64], applied: &[f64]) -> Option<Difference> {
         let value = |values: &[f64], place: usize| values.get(place).copied().unwrap_or(f64::NAN);
         let compared = self.parameters.iter().enumerate().filter_map(|(index, (name, place))| {
@@ -378,16 +385,16 @@ impl ParameterComparison {
     }
 }
 
-/// The difference divided by the requested value; the difference itself if the requested value is 0.
+/// Returns the absolute difference, divided by the magnitude of `requested` unless this is 0.
 fn relative(requested: f64, applied: f64) -> f64 {
     let difference = (applied - requested).abs();
-    // Positive, so that NaN counts as the largest of all.
+    // Makes every NaN positive, because `total_cmp` orders a positive NaN above all numbers.
     let relative = if requested == 0.0 { difference } else { difference / requested.abs() };
     if relative.is_nan() { f64::NAN } else { relative }
 }
 
 impl Difference {
-    /// Whether the difference is more than rounding. NaN counts as more.
+    /// Returns whether the relative difference exceeds [`ROUNDING`]. NaN does.
     pub fn exceeds_tolerance(&self) -> bool {
         self.relative.is_nan() || self.relative > ROUNDING
     }

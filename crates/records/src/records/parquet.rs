@@ -1,5 +1,4 @@
-//! Recorded episodes as a Parquet file: a row an episode, a column a quantity, and what they have in common as JSON in
-//! the file's metadata.
+//! Recorded episodes as a Parquet file, with a row for each episode and metadata as JSON.
 
 use std::path::{Path, PathBuf};
 
@@ -8,43 +7,43 @@ use perturb_files::{AnyError, FileError, read_if_there, write_atomically};
 use super::{Ending, EpisodeRecord, Records, RecordsMetadata};
 use crate::parquet_file::{ParquetFile, RowGroup, encode, one_group};
 
-/// The name of the records file beside a result.
+/// The name of the file with recorded episodes, in the folder of a test result.
 pub const FILE: &str = "episodes.parquet";
-/// The name of the schema in the file.
+/// The name of the Parquet schema.
 const MESSAGE: &str = "episodes";
 
-/// Why records cannot be read or written.
+/// A failure to read or write recorded episodes.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum RecordsError {
-    /// The operating system refused the file.
+    /// The operating system could not read or write the file.
     #[error(transparent)]
     File(#[from] FileError),
-    /// There is no such file.
+    /// The file does not exist.
     #[error("there are no recorded episodes in {}", path.display())]
     Missing { path: PathBuf },
-    /// The file is of another kind.
+    /// The file is not a Parquet file.
     #[error(
         "{} holds no recorded episodes: it is no Parquet file; give the --records of `perturb evaluate`, or a cell of \
          `perturb run`",
         path.display()
     )]
     Other { path: PathBuf },
-    /// The file is not what this program writes.
+    /// The file is damaged, or another program wrote it.
     #[error("{} does not hold recorded episodes: {reason}", path.display())]
     Damaged {
         path: PathBuf,
-        /// The fault.
+        /// A description of the fault.
         reason: String,
     },
 }
 
 impl Records {
-    /// Writes the file, complete or not at all.
+    /// Writes the file atomically.
     ///
     /// # Errors
-    /// [`RecordsError`].
+    /// [`RecordsError`] if the file cannot be written.
     pub fn write(&self, path: &Path) -> Result<(), RecordsError> {
         let failed = |error: AnyError| RecordsError::Damaged { path: path.to_owned(), reason: error.to_string() };
         Ok(write_atomically(path, &self.encode().map_err(failed)?)?)
@@ -58,7 +57,7 @@ impl Records {
     /// Reads the file.
     ///
     /// # Errors
-    /// [`RecordsError`].
+    /// [`RecordsError`] if the file does not exist, is not a Parquet file or is damaged.
     pub fn read(path: &Path) -> Result<Self, RecordsError> {
         let content = read_if_there(path)?.ok_or_else(|| RecordsError::Missing { path: path.to_owned() })?;
         if ParquetFile::is_other(&content) {
@@ -79,7 +78,7 @@ impl Records {
     }
 }
 
-/// The rows of a part of the file, whose columns are those of [`Records::columns`].
+/// Reads the episodes of a row group. Its columns are those of [`Records::columns`].
 fn episodes(about: &RecordsMetadata, group: &RowGroup<'_>) -> Result<Vec<EpisodeRecord>, AnyError> {
     let (parameters, quantities) = (about.parameters.len(), about.applied.len());
     let columns = |first: usize, count: usize| (first..first + count).map(|place| group.numbers(place));

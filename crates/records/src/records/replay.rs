@@ -1,9 +1,9 @@
-//! Compares a recorded episode with its replay.
+//! Comparison of a recorded episode with its replay.
 
 use super::EpisodeRecord;
 
 impl EpisodeRecord {
-    /// Returns a sentence on the first difference of the replay `got`; `None` if there is none.
+    /// Describes the first difference of the replayed episode `got` from this record. Returns `None` if there is none.
     pub fn difference(&self, got: &Self) -> Option<String> {
         let what = |told: fn(&Self) -> String| (told(self), told(got));
         let parts = [
@@ -15,7 +15,7 @@ impl EpisodeRecord {
             ("return", what(|it| format!("{:?}", it.episode_return))),
             ("ending", what(|it| format!("{:?}", it.ending))),
             ("achieved", what(|it| format!("{:?}", it.achieved))),
-            ("the other it achieved", what(|it| format!("{:?}", it.also_achieved))),
+            ("second achieved value", what(|it| format!("{:?}", it.also_achieved))),
         ];
         let (what, (was, is)) = parts.into_iter().find(|(_, (recorded, got))| recorded != got)?;
         let Self { set, environment_index, episode_index, .. } = self;

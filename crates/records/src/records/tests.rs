@@ -58,7 +58,8 @@ fn records_read_back_bit_for_bit_and_always_have_the_same_bytes() {
     assert_eq!(Records::read(&one).unwrap(), records());
 }
 
-/// Records of an environment whose two rules compare different quantities: steps at the end, and in a row anywhere.
+/// Returns records of an environment whose two criteria compare different quantities: steps at the end of an episode,
+/// and the longest series of successive steps.
 fn of_two_rules() -> Records {
     let rule = |quantity: &str| proto::Success {
         quantity: quantity.into(),

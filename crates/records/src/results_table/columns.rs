@@ -6,7 +6,7 @@ use super::{ResultsTable, TableRow};
 use crate::parquet_file::{ColumnValues, NamedColumn, ParquetFile, RowGroup};
 
 impl ResultsTable {
-    /// The columns by their names, in order.
+    /// Returns the columns with their names, in order.
     pub fn columns(&self) -> Vec<NamedColumn<'_>> {
         let rows = || self.rows.iter();
         let texts = |of: fn(&TableRow) -> &str| ColumnValues::Text(rows().map(of).collect());
@@ -47,10 +47,10 @@ impl ResultsTable {
 }
 
 impl ResultsTable {
-    /// Returns the table as CSV. Values that a row lacks are empty.
+    /// Returns the table as CSV. A missing value is an empty field.
     ///
     /// # Errors
-    /// Those of the CSV writer.
+    /// The errors of the CSV writer.
     pub fn to_csv(&self) -> Result<Vec<u8>, AnyError> {
         let columns = self.columns();
         let mut writer = csv::Writer::from_writer(Vec::new());
@@ -62,7 +62,7 @@ impl ResultsTable {
     }
 }
 
-/// Reads the rows. Columns are found by their names, so their order does not matter, and unknown ones are left out.
+/// Reads the rows. Columns are found by name, so their order is irrelevant and unknown columns are ignored.
 pub(super) fn decode(file: &ParquetFile) -> Result<Vec<TableRow>, AnyError> {
     let mut rows = Vec::new();
     for index in 0..file.groups() {

@@ -1,4 +1,4 @@
-//! The results of studies as one table: a row for each cell, test set and tested policy of its training.
+//! The results of several studies in one table. It has a row for each test of each cell.
 //!
 //! `docs/results-table.md` describes every column.
 
@@ -14,62 +14,63 @@ use crate::parquet_file::{ParquetFile, encode, one_group};
 use crate::results::TestResult;
 use crate::statistics::wilson;
 
-/// Version of the columns. Raised when older programs could misread a table.
+/// Version of the table's columns. Increase it when older programs could misread a table.
 pub const SCHEMA_VERSION: u32 = 1;
-/// The name of the schema in the file.
+/// The name of the Parquet schema.
 const MESSAGE: &str = "results";
 
-/// The results of studies.
+/// A table with the results of several studies.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ResultsTable {
-    /// The plans of the studies, by the studies' names.
+    /// The plan of each study, by the study's name.
     pub studies: BTreeMap<String, StudyPlan>,
-    /// The rows of a cell stand together.
+    /// The rows. Those of a cell are adjacent.
     rows: Vec<TableRow>,
 }
 
-/// The experiment file of a study, so that reports need no other file.
+/// The experiment file of a study. The table contains it so that reports need no other file.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct StudyPlan {
     /// The text of the experiment file.
     pub plan: String,
-    /// The files that it names, by their names.
+    /// The files that the experiment file refers to, by name.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub beside: BTreeMap<String, String>,
 }
 
-/// A test of a policy, or a failed cell.
+/// A row of the table: a test of a policy, or a failed cell.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TableRow {
-    /// Version of the columns when the row was written.
+    /// Version of the columns when this row was written.
     pub schema_version: u32,
     /// The study's name.
     pub study: String,
-    /// The cell's id.
+    /// The id of the cell, which is one training with its tests.
     pub cell: String,
     /// The environment's name.
     pub environment: String,
     /// The environment's revision; `None` for a failed cell.
     pub revision: Option<u64>,
-    /// SHA-256 of the environment's model; `None` without one.
+    /// SHA-256 of the environment's model (MJCF text). `None` if the environment has no model, and for a failed cell.
     pub model_hash: Option<String>,
     /// The algorithm's name.
     pub algorithm: String,
-    /// "ff" or "rc".
+    /// The policy's architecture: "ff" (feed-forward) or "rc" (recurrent).
     pub architecture: String,
-    /// The origin of the default settings.
+    /// The preset, which chooses the default settings.
     pub preset: String,
-    /// The observed quantities.
+    /// What the policy observes.
     pub observe: String,
-    /// The name of the set or version that it was trained on.
+    /// The name of the parameter set or version that the policy was trained on.
     pub trained_on: String,
-    /// The name of the set or version of the test; `None` for a failed cell.
+    /// The name of the parameter set or version of the test. `None` for a failed cell.
     pub tested_on: Option<String>,
-    /// The run, from 1.
+    /// The number of the run, i.e. of the repetition of the study, from 1.
     pub run: u32,
     /// The seed of the training and of the test.
     pub seed: u64,
-    /// Episodes of training before the test: the mark of an intermediate policy, or the length of the whole training.
+    /// Number of training episodes before the test. It is smaller than the whole training if an intermediate policy was
+    /// tested. `None` for a failed cell.
     pub after_episodes: Option<u64>,
     /// Number of test episodes.
     pub episodes: Option<u64>,
@@ -77,41 +78,41 @@ pub struct TableRow {
     pub successes: Option<u64>,
     /// Mean undiscounted return.
     pub mean_return: Option<f64>,
-    /// Mean length of episodes, in steps.
+    /// Mean number of steps of the test episodes.
     pub mean_length: Option<f64>,
-    /// Mean of the worst tenth of returns; `None` if the episodes were not recorded.
+    /// Mean of the lowest tenth of returns; `None` if the episodes were not recorded.
     pub cvar_10: Option<f64>,
-    /// Steps of training before the test, of all environments together.
+    /// Number of training steps before the test, summed over all environments.
     pub timesteps: Option<u64>,
-    /// Duration of the cell with all its tests, in s.
+    /// Duration of the cell's training and tests, in s.
     pub seconds: Option<f64>,
-    /// Versions of the programs that trained and tested, joined by "; ".
+    /// Versions of the programs that trained and tested, separated by "; ".
     pub commit: String,
     /// All settings of the training, as a JSON object.
     pub settings: String,
     /// SHA-256 of the test's episodes; `None` if they were not recorded.
     pub checksum: Option<String>,
-    /// Why the cell failed; `None` for a result.
+    /// The reason why the cell failed; `None` for a test.
     pub failure: Option<String>,
 }
 
-/// Numbers of cells that a merge added and changed.
+/// The numbers of cells that a merge added, replaced and left unchanged.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct MergeCounts {
     /// Cells that were not in the table.
     pub added: usize,
-    /// Cells whose rows were replaced by others.
+    /// Cells whose rows in the table were replaced.
     pub replaced: usize,
-    /// Cells whose rows were there already.
+    /// Cells whose rows were already in the table.
     pub unchanged: usize,
 }
 
-/// Why a table of results cannot be read.
+/// A failure to read or write a results table.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum TableError {
-    /// The operating system refused the file.
+    /// The operating system could not read or write the file.
     #[error(transparent)]
     File(#[from] FileError),
     #[error("there is no results table {}: give a file that `perturb export` wrote", path.display())]
@@ -126,7 +127,7 @@ pub enum TableError {
     Newer { path: PathBuf, version: u32 },
 }
 
-/// The JSON document in the file's metadata.
+/// The JSON document in the Parquet file's metadata.
 #[derive(Serialize, Deserialize)]
 struct TableMetadata {
     schema_version: u32,
@@ -134,18 +135,18 @@ struct TableMetadata {
 }
 
 impl ResultsTable {
-    /// Reads the table in `path`.
+    /// Reads the table at `path`.
     ///
     /// # Errors
-    /// [`TableError`].
+    /// [`TableError`] if the file is missing, damaged or too new.
     pub fn read(path: &Path) -> Result<Self, TableError> {
         Self::read_if_there(path)?.ok_or_else(|| TableError::Missing { path: path.to_owned() })
     }
 
-    /// Reads the table in `path`; `None` if there is no such file.
+    /// Reads the table at `path`. Returns `None` if the file does not exist.
     ///
     /// # Errors
-    /// [`TableError`].
+    /// [`TableError`] if the file is damaged or too new.
     pub fn read_if_there(path: &Path) -> Result<Option<Self>, TableError> {
         let Some(content) = read_if_there(path)? else { return Ok(None) };
         let damaged = |reason: String| TableError::Damaged { path: path.to_owned(), reason };
@@ -163,10 +164,10 @@ impl ResultsTable {
         Ok(Some(Self { studies, rows }))
     }
 
-    /// Writes the table, complete or not at all.
+    /// Writes the table atomically.
     ///
     /// # Errors
-    /// [`TableError`].
+    /// [`TableError`] if the file cannot be written.
     pub fn write(&self, path: &Path) -> Result<(), TableError> {
         let damaged = |reason: String| TableError::Damaged { path: path.to_owned(), reason };
         let about = TableMetadata { schema_version: SCHEMA_VERSION, studies: self.studies.clone() };
@@ -177,12 +178,12 @@ impl ResultsTable {
         Ok(write_atomically(path, &content)?)
     }
 
-    /// Returns all rows. Those of a cell stand together.
+    /// Returns all rows. Those of a cell are adjacent.
     pub fn rows(&self) -> &[TableRow] {
         &self.rows
     }
 
-    /// Returns the rows of a study by its cells' ids.
+    /// Returns the rows of a study, by the id of the cell.
     pub fn of_study(&self, study: &str) -> HashMap<&str, Vec<&TableRow>> {
         let mut cells: HashMap<&str, Vec<&TableRow>> = HashMap::new();
         for row in self.rows.iter().filter(|row| row.study == study) {
@@ -191,8 +192,8 @@ impl ResultsTable {
         cells
     }
 
-    /// Adds the rows of a study's cells. The rows of a cell replace those that the table had. A value that the new row
-    /// lacks, because a file is gone, is kept from the old one.
+    /// Adds `rows` of a study's cells to the table. They replace earlier rows of the same cells. If a new row lacks a
+    /// value because a file was deleted, the earlier value is kept.
     pub fn merge(&mut self, study: &str, plan: StudyPlan, rows: Vec<TableRow>) -> MergeCounts {
         self.studies.insert(study.to_owned(), plan);
         let mut counts = MergeCounts::default();
@@ -233,7 +234,7 @@ impl ResultsTable {
                 Some(_) => {}
             }
         }
-        // A study's new cells follow its other cells.
+        // New cells of a study are inserted after its other cells.
         let end = all.iter().rposition(|row| row.study == study).map_or(all.len(), |last| last + 1);
         all.splice(end..end, added);
         self.rows = all;
@@ -242,7 +243,7 @@ impl ResultsTable {
 }
 
 impl TableRow {
-    /// Returns the figures of the test; `None` for a failed cell.
+    /// Returns the result of the test; `None` for a failed cell.
     pub fn result(&self) -> Option<TestResult> {
         let (episodes, successes) = (self.episodes?, self.successes?);
         let (low, high) = wilson(successes, episodes);
@@ -255,7 +256,8 @@ impl TableRow {
         })
     }
 
-    /// Takes over values that follow from files that may have been deleted, if the same test has them in `earlier`.
+    /// Copies missing values from the row of the same test in `earlier`. These values are computed from files that may
+    /// have been deleted.
     fn keep_from(&mut self, earlier: &[Self]) {
         let key = |row: &Self| (row.tested_on.clone(), row.after_episodes, row.successes, row.failure.is_some());
         let Some(before) = earlier.iter().find(|row| key(row) == key(self)) else { return };

@@ -1,7 +1,8 @@
-//! Aggregate metrics over all environments after Agarwal et al. (2021, arXiv:2108.13264). Scores are by environment,
-//! then run. All scores count equally unless stated otherwise.
+//! Aggregate metrics over all environments, as recommended by Agarwal et al. (2021, arXiv:2108.13264). `strata` are the
+//! scores by environment, then run. All scores have the same weight unless stated otherwise.
 
-/// The mean without the ⌊n/4⌋ lowest and the ⌊n/4⌋ highest of n scores; NaN if there are none.
+/// Returns the interquartile mean: the mean of n scores without the ⌊n/4⌋ lowest and the ⌊n/4⌋ highest. NaN if there
+/// are no scores.
 pub fn interquartile_mean(strata: &[Vec<f64>]) -> f64 {
     let mut scores = strata.concat();
     scores.sort_unstable_by(f64::total_cmp);
@@ -10,14 +11,14 @@ pub fn interquartile_mean(strata: &[Vec<f64>]) -> f64 {
     middle.iter().sum::<f64>() / middle.len() as f64
 }
 
-/// Returns the mean distance of scores below `target`. Scores beyond the target count as the target. NaN if there are
-/// none.
+/// Returns the mean of `target` minus score, where scores above the target count as the target. NaN if there are no
+/// scores.
 pub fn optimality_gap(strata: &[Vec<f64>], target: f64) -> f64 {
     let count = strata.iter().map(Vec::len).sum::<usize>() as f64;
     target - strata.iter().flatten().map(|score| score.min(target)).sum::<f64>() / count
 }
 
-/// The performance profile, a score distribution: for each of `thresholds` the share of scores, 0 … 1, above it.
+/// Returns the performance profile: for each of `thresholds` the share of scores, 0 … 1, above it.
 pub fn profile(strata: &[Vec<f64>], thresholds: &[f64]) -> Vec<f64> {
     let mut scores = strata.concat();
     scores.sort_unstable_by(f64::total_cmp);
@@ -25,8 +26,9 @@ pub fn profile(strata: &[Vec<f64>], thresholds: &[f64]) -> Vec<f64> {
     thresholds.iter().map(|threshold| above(threshold) as f64 / scores.len() as f64).collect()
 }
 
-/// The probability, 0 … 1, that a run of X has a higher score than one of Y in the same environment, where equal scores
-/// count as one half (Mann and Whitney, 1947), averaged over environments. Both have the same environments.
+/// Returns the probability, 0 … 1, that a run of X has a higher score than a run of Y in the same environment, averaged
+/// over environments. Equal scores count as one half (Mann and Whitney, 1947). `x` and `y` must have the same
+/// environments.
 pub fn probability_of_improvement(x: &[Vec<f64>], y: &[Vec<f64>]) -> f64 {
     let of_environment = |(x, y): (&Vec<f64>, &Vec<f64>)| {
         let wins =

@@ -1,33 +1,33 @@
-//! The stratified bootstrap with percentile intervals.
+//! Stratified bootstrap with percentile intervals.
 
 use perturb_policy::random::{Purpose, stream, uniform};
 
-/// The smallest number of runs in an environment that an interval is computed from.
+/// Minimum number of runs in each environment for which an interval is computed.
 pub const MIN_RUNS_FOR_INTERVAL: usize = 3;
 
-/// A number with its 95 % interval.
+/// A statistic with its 95 % interval.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bootstrapped {
-    /// The statistic of the scores.
+    /// The value of the statistic.
     pub point: f64,
-    /// The ends of the interval; `None` with fewer than [`MIN_RUNS_FOR_INTERVAL`] runs.
+    /// The 95 % interval, [low, high]. `None` with fewer than [`MIN_RUNS_FOR_INTERVAL`] runs.
     pub interval_95: Option<[f64; 2]>,
-    /// Number of runs in each stratum; the smallest one if they differ.
+    /// Number of runs in each environment; the smallest number if they differ.
     pub runs: usize,
 }
 
 impl std::fmt::Display for Bootstrapped {
-    /// Formats with the requested number of decimals, by default 1.
+    /// Formats the value and the interval with the requested number of decimals, by default 1.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let digits = f.precision().unwrap_or(1);
-        // Adding 0 makes a negative zero positive.
+        // Adding 0 turns -0.0 into 0.0.
         write!(f, "{:.digits$}", self.point + 0.0)?;
         self.interval_95.map_or(Ok(()), |[low, high]| write!(f, " [{:.digits$}, {:.digits$}]", low + 0.0, high + 0.0))
     }
 }
 
 impl Bootstrapped {
-    /// `statistic` of `strata`, see [`bootstrap`].
+    /// Computes a single `statistic` of `strata`, see [`bootstrap`].
     pub fn new(
         strata: &[Vec<f64>],
         resamples: usize,
@@ -38,8 +38,9 @@ impl Bootstrapped {
     }
 }
 
-/// Computes the numbers that `statistic` returns for `strata`, each with its interval over `resamples`. The statistic must
-/// always return equally many numbers. `None` if there is no stratum, or a stratum without runs.
+/// Computes the numbers that `statistic` returns for `strata`, each with its percentile interval over `resamples`
+/// resamples. The statistic must always return the same number of values. Returns `None` if there are no strata, or if
+/// a stratum has no runs.
 pub fn bootstrap(
     strata: &[Vec<f64>],
     resamples: usize,
@@ -67,8 +68,8 @@ pub fn bootstrap(
     Some(points.into_iter().zip(estimates).map(with_interval).collect())
 }
 
-/// Draws runs with replacement in each stratum, as many as the stratum has. `sizes` are the numbers of runs, all above
-/// 0. Calls `each` with the indices of the drawn runs by stratum, `resamples` times. The same seed draws the same runs.
+/// Draws runs with replacement. From each stratum it draws as many runs as the stratum has: `sizes`, all above 0. Calls
+/// `each` `resamples` times, with the indices of the drawn runs by stratum. The same seed draws the same runs.
 pub fn resample(sizes: &[usize], resamples: usize, seed: u64, mut each: impl FnMut(&[Vec<usize>])) {
     let mut rng = stream(seed, Purpose::Bootstrap);
     let mut draws: Vec<Vec<usize>> = sizes.iter().map(|&size| vec![0; size]).collect();
@@ -80,13 +81,14 @@ pub fn resample(sizes: &[usize], resamples: usize, seed: u64, mut each: impl FnM
     }
 }
 
-/// The 2.5th and the 97.5th percentile of a number's estimates; NaN if there are none.
+/// Returns the 2.5th and the 97.5th percentile of `estimates`; NaN if there are none.
 pub fn percentile_interval(mut estimates: Vec<f64>) -> [f64; 2] {
     estimates.sort_unstable_by(f64::total_cmp);
     [2.5, 97.5].map(|percent| percentile(&estimates, percent))
 }
 
-/// The `percent`th percentile of sorted numbers, linear between neighbours, as numpy's default; NaN if there are none.
+/// Returns the `percent`th percentile of sorted numbers, interpolated linearly between neighbours, as numpy does by
+/// default. NaN if there are no numbers.
 fn percentile(sorted: &[f64], percent: f64) -> f64 {
     let Some(last) = sorted.len().checked_sub(1) else { return f64::NAN };
     let place = percent / 100.0 * last as f64;

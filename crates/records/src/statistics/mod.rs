@@ -1,8 +1,8 @@
-//! Figures over runs: means and deviations, paired comparisons, and the aggregates with bootstrap intervals that Agarwal et
-//! al. (2021, arXiv:2108.13264) recommend.
+//! Statistics over runs: means, standard deviations, paired comparisons, and the aggregates with bootstrap intervals
+//! that Agarwal et al. (2021, arXiv:2108.13264) recommend.
 //!
-//! Runs are grouped in strata: a stratum holds the scores of an environment's runs. All figures equal rliable's on the same
-//! data, as `rliable_tests.rs` checks.
+//! Runs are grouped in strata: a stratum holds the scores of all runs in one environment. All numbers equal those of
+//! the Python library rliable on the same data, which `rliable_tests.rs` checks.
 
 mod aggregates;
 mod bootstrap;
@@ -17,21 +17,21 @@ pub use means::{geometric_mean, mean, wilson, wilson_of_share};
 pub use paired::{holm, sign_flip_p};
 pub use t_interval::{mean_with_t_interval, t_test_p};
 
-/// Mean and deviation over runs.
+/// Mean and standard deviation over runs.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Summary {
     /// Arithmetic mean.
     pub mean: f64,
-    /// Standard deviation with n in the denominator, not n - 1, as in the paper's tables. Their 0.06 ± 0.12 % over five
-    /// runs of 1000 episodes can only be the rates 0.3, 0, 0, 0, 0, whose deviation with n - 1 would be 0.13. `None` for a
-    /// single run, and if it is not known.
+    /// Population standard deviation (divided by n, not n - 1), as in the paper's tables. This is known because 0.06 ±
+    /// 0.12 %, over five runs of 1000 episodes, can only be the rates 0.3, 0, 0, 0, 0; dividing by n - 1 would give
+    /// 0.13. `None` for a single run, or if unknown.
     pub std: Option<f64>,
     /// The number of runs.
     pub runs: usize,
 }
 
 impl Summary {
-    /// Returns the mean and deviation of `numbers`; `None` if there are none.
+    /// Returns the mean and standard deviation of `numbers`; `None` if there are none.
     pub fn from_values(numbers: &[f64]) -> Option<Self> {
         if numbers.is_empty() {
             return None;
@@ -56,7 +56,7 @@ mod tests {
 
     #[test]
     fn the_deviation_is_the_papers() {
-        // RL²-A2C on CartPole: 0.06 ± 0.12 % Interpolation over five runs of 1000 episodes.
+        // The paper's value for RL²-A2C on CartPole: 0.06 ± 0.12 % Interpolation over five runs of 1000 episodes.
         let summary = Summary::from_values(&[0.3, 0.0, 0.0, 0.0, 0.0]).unwrap();
         assert_eq!(
             (format!("{:.2} ± {:.2}", summary.mean, summary.std.unwrap()), summary.runs),

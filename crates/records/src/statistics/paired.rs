@@ -1,21 +1,25 @@
-//! Paired comparisons: the results of two methods in the same environment with the same seed.
+//! Significance tests for paired comparisons, where a pair is the results of two methods in the same environment with
+//! the same seed.
 
 use perturb_policy::random::{Purpose, stream};
 use rand::Rng;
 
-/// Maximum number of pairs for which all signs are tried.
+/// Maximum number of pairs for which all combinations of signs are counted.
 const MAX_EXACT_PAIRS: usize = 16;
-/// Number of random choices of signs for more pairs.
+/// Number of random combinations of signs that are counted if there are more pairs.
 const CHOICES: u32 = 100_000;
 
 /// Returns the p-value of Fisher's two-sided randomisation test for paired differences (The Design of Experiments,
-/// 1935): the probability that the sum of the differences is at least as far from 0 if each sign is random. Up to 16
-/// pairs that differ, all signs are tried. Beyond that, 100 000 random choices are drawn beside the observed one, after
-/// Phipson and Smyth (2010). Returns 1 if no pair differs. The smallest value with n pairs is 2¹⁻ⁿ.
+/// 1935). It is the probability that the sum of the differences is at least as far from 0 if each difference has a
+/// random sign.
+///
+/// Pairs without a difference are ignored. With up to 16 other pairs, all combinations of signs are counted. With more,
+/// 100 000 random combinations are counted besides the observed one, as in Phipson and Smyth (2010). Returns 1 if no
+/// pair differs. The smallest possible value with n ≤ 16 pairs is 2¹⁻ⁿ.
 pub fn sign_flip_p(differences: &[f64], seed: u64) -> f64 {
     let differences: Vec<f64> = differences.iter().copied().filter(|difference| *difference != 0.0).collect();
     let seen: f64 = differences.iter().sum::<f64>().abs();
-    // Sums of the same numbers in another order are equal up to rounding.
+    // Sums of the same numbers in different orders are equal only up to rounding.
     let rounding = 1e-9 * differences.iter().map(|difference| difference.abs()).sum::<f64>();
     let is_as_far = |signs: u64| {
         let sign = |place: usize| if signs >> (place % 64) & 1 == 1 { 1.0 } else { -1.0 };
@@ -31,8 +35,9 @@ pub fn sign_flip_p(differences: &[f64], seed: u64) -> f64 {
     (1 + as_far) as f64 / f64::from(1 + CHOICES)
 }
 
-/// Returns the p-values of a family of comparisons, corrected after Holm (1979), in their order. Accepting those up to
-/// α has an error of any kind with probability at most α, whatever their dependence.
+/// Returns the p-values of several comparisons after Holm's correction (1979), in the given order. If every comparison
+/// with a corrected value up to α is called significant, the probability of any false one is at most α, however the
+/// comparisons depend on each other.
 pub fn holm(p: &[f64]) -> Vec<f64> {
     let mut order: Vec<usize> = (0..p.len()).collect();
     order.sort_by(|&a, &b| p[a].total_cmp(&p[b]));
@@ -59,8 +64,8 @@ mod tests {
         assert_eq!(sign_flip_p(&[1.0; 16], 1), 2_f64.powi(-15));
     }
 
-    /// With 17 pairs the p-value is estimated from 100 001 of the 131 072 choices of signs. The estimate's standard
-    /// deviation is √(p (1 - p) / 100 000), 0.0016 at most.
+    /// With 17 pairs the p-value is estimated from 100 001 of the 131 072 combinations of signs. The estimate's
+    /// standard deviation is √(p (1 - p) / 100 000), at most 0.0016.
     #[test]
     fn of_many_pairs_random_signs_come_to_the_same() {
         let differences: Vec<f64> = (0..17).map(|i| f64::from(i % 5) - 1.2).collect();
@@ -79,7 +84,7 @@ mod tests {
     #[test]
     fn the_smallest_of_many_counts_most() {
         let corrected = holm(&[0.01, 0.04, 0.03, 0.005]);
-        let expected = [0.03, 0.06, 0.06, 0.02]; // 0.005 · 4, 0.01 · 3, 0.03 · 2; 0.04 · 1 is raised to the one before
+        let expected = [0.03, 0.06, 0.06, 0.02]; // 0.005 · 4, 0.01 · 3, 0.03 · 2; 0.04 · 1 is raised to the value before it
         assert!(corrected.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-15), "{corrected:?}");
         assert_eq!(holm(&[0.6, 0.9]), [1.0, 1.0]);
         assert!(holm(&[]).is_empty());

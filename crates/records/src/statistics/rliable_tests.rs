@@ -1,5 +1,5 @@
-//! Compares with rliable itself (`tests/fixtures/make_rliable.py`): numbers are equal, intervals are equal over the same
-//! draws, and agree over different draws.
+//! Comparison with the Python library rliable (`tests/fixtures/make_rliable.py`). Statistics are equal. Intervals are
+//! equal for the same resamples, and agree statistically for different resamples.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -16,7 +16,7 @@ struct Fixture {
 
 #[derive(Deserialize)]
 struct Case {
-    /// Scores by environment, then run. `others` are those of another method.
+    /// Scores of a method, by environment, then run. `others` are the scores of another method.
     scores: Vec<Vec<f64>>,
     others: Vec<Vec<f64>>,
     iqm: Numbers,
@@ -25,20 +25,20 @@ struct Case {
     improvement: Numbers,
 }
 
-/// A single number, or a number for each threshold.
+/// The expected value of a statistic: one number, or one for each threshold.
 #[derive(Deserialize)]
 struct Numbers {
     point: Vec<f64>,
-    /// The runs that scores were drawn from: a digit for each score, a word for each stratum.
+    /// The runs of each resample: a digit is the index of a run, and a word is a stratum.
     draws: Vec<String>,
     interval_of_draws: Vec<[f64; 2]>,
     interval_95: Vec<[f64; 2]>,
 }
 
-/// Sums of a few dozen numbers up to 100.
+/// Tolerance for rounding in sums of a few dozen numbers up to 100.
 const ROUNDING: f64 = 1e-9;
 
-/// Number of our resamples. Rliable's interval is over `theirs`.
+/// Number of resamples in this test. Rliable uses `theirs`.
 const RESAMPLES: usize = 50_000;
 
 fn compare(
@@ -74,8 +74,9 @@ fn compare(
         );
     }
 
-    // A statistic of few scores takes few values, so that the ends of intervals are not compared. Instead, 2.5 % of our
-    // estimates must lie beyond each of rliable's ends, within five standard deviations of both.
+    // A statistic of few scores has only few different values, so the ends of intervals are not compared directly.
+    // Instead, 2.5 % of this test's estimates must be beyond each end of rliable's interval, within five standard
+    // deviations of both.
     let deviation = |resamples: usize| 0.025 * 0.975 / resamples as f64;
     let uncertain = 5.0 * (deviation(RESAMPLES) + deviation(theirs)).sqrt();
     for (estimates, [low, high]) in estimates.into_inner().into_iter().zip(&expected.interval_95) {

@@ -1,17 +1,19 @@
-//! Confidence intervals of means by Student's t distribution.
+//! Confidence intervals and significance tests for means, by Student's t distribution.
 //!
-//! A percentile bootstrap of few runs is too narrow: on normal data its 95 % interval of a mean covers the true value in
-//! 73 % of the cases with three runs of one environment, and in 84 % with five. The t interval covers it in 95 %.
+//! A percentile bootstrap of few runs gives too narrow intervals. On normal data from one environment, its 95 %
+//! interval of a mean covers the true value in 73 % of the cases with three runs, and in 84 % with five. The t interval
+//! covers it in 95 %.
 
 use statrs::distribution::{ContinuousCDF, StudentsT};
 
 use super::{Bootstrapped, MIN_RUNS_FOR_INTERVAL, mean};
 
-/// The mean over `strata`, each of which has the same weight, with its 95 % t interval.
+/// Returns the mean over `strata`, all with the same weight, and its 95 % t interval.
 ///
-/// `strata` has the numbers of the runs `[environments][runs]`. The variance of the mean adds up those of the strata's
-/// means, and the degrees of freedom are Welch and Satterthwaite's (Satterthwaite, 1946). There is no interval if a
-/// stratum has fewer than [`MIN_RUNS_FOR_INTERVAL`] runs. Returns `None` if there is no stratum, or one without runs.
+/// `strata` has the scores `[environments][runs]`. The variance of the mean is the sum of the variances of the
+/// environments' means, with degrees of freedom after Welch and Satterthwaite (Satterthwaite, 1946). The interval is
+/// `None` if an environment has fewer than [`MIN_RUNS_FOR_INTERVAL`] runs. Returns `None` if there are no environments,
+/// or if one has no runs.
 pub fn mean_with_t_interval(strata: &[Vec<f64>]) -> Option<Bootstrapped> {
     let runs = strata.iter().map(Vec::len).min().filter(|runs| *runs > 0)?;
     let point = mean(strata.iter().map(|runs| mean(runs.iter().copied())));
@@ -19,10 +21,12 @@ pub fn mean_with_t_interval(strata: &[Vec<f64>]) -> Option<Bootstrapped> {
     Some(Bootstrapped { point, interval_95: half_width.map(|half| [point - half, point + half]), runs })
 }
 
-/// Returns the two-sided p-value of Student's t test that the mean over `strata` is 0, with the same standard error and
-/// degrees of freedom as [`mean_with_t_interval`]. One stratum of paired differences makes it the paired test; the scores of
-/// one condition and the negative scores of another make it Welch's. `None` where there is no interval. Without any
-/// deviation it is 1 if the mean is 0, else 0.
+/// Returns the two-sided p-value of Student's t test of the hypothesis that the mean over `strata` is 0. Standard error
+/// and degrees of freedom are those of [`mean_with_t_interval`]. `None` if there is no interval.
+///
+/// For a paired test, pass one stratum with the differences of the pairs. For Welch's test, pass the scores of one
+/// condition and the negated scores of the other. If all scores of each stratum are equal, returns 1 if the mean is 0,
+/// else 0.
 pub fn t_test_p(strata: &[Vec<f64>]) -> Option<f64> {
     let mean = mean_with_t_interval(strata).filter(|mean| mean.interval_95.is_some())?.point;
     let (error, freedom) = standard_error(strata);
@@ -65,7 +69,7 @@ mod tests {
         mean_with_t_interval(strata).unwrap().interval_95.unwrap()
     }
 
-    /// The expected ends are those of R's `t.test(c(1, 2, 4))` and `t.test(c(1, 2, 4, 7, 9))`.
+    /// The expected intervals are those of R's `t.test(c(1, 2, 4))` and `t.test(c(1, 2, 4, 7, 9))`.
     #[test]
     fn one_environment_has_the_textbook_interval() {
         for (runs, expected) in
@@ -86,8 +90,8 @@ mod tests {
         assert_eq!(ends(&[vec![100.0; 3]]), [100.0, 100.0]);
     }
 
-    /// The expected values are the areas under the t distribution's tails: 1 - t / √(2 + t²) with 2 degrees of freedom, and by
-    /// Simpson's rule with Welch's 4.03.
+    /// The expected values are the areas under the tails of the t distribution: 1 - t / √(2 + t²) with 2 degrees of
+    /// freedom, and computed by Simpson's rule with Welch's 4.03 degrees.
     #[test]
     fn p_values_are_those_of_the_textbook_tests() {
         let close = |got: Option<f64>, expected: f64| assert!((got.unwrap() - expected).abs() < 1e-5, "{got:?}");
@@ -97,8 +101,8 @@ mod tests {
         assert_eq!([t_test_p(&[vec![0.0; 3]]), t_test_p(&[vec![5.0; 3]])], [Some(1.0), Some(0.0)]);
     }
 
-    /// 4 000 samples of three runs, sums of 48 uniform numbers, which are nearly normal: the interval covers the mean in 95 ± 1.4 % (four
-    /// standard errors).
+    /// Draws 4 000 samples of three runs. Each run is the sum of 48 uniform numbers, which is nearly normal. The
+    /// interval must cover the mean in 95 ± 1.4 % of the samples (four standard errors).
     #[test]
     fn three_runs_cover_the_mean_in_95_percent() {
         let mut rng = stream(1, Purpose::Bootstrap);

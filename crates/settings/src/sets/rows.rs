@@ -1,4 +1,4 @@
-//! Sets of the rows of a CSV file.
+//! Parameter sets from CSV files.
 
 use csv::{ReaderBuilder, StringRecord};
 use perturb_protocol::Version;
@@ -6,14 +6,14 @@ use perturb_protocol::Version;
 use super::{Context, Contexts, MAX_CONTEXTS, TestSet};
 use crate::value_error::{ValueError, require};
 
-/// Maximum number of letters of a line that an error quotes.
+/// Maximum number of characters of a line that an error message quotes.
 const MAX_QUOTED_LETTERS: usize = 60;
 
-/// A set called `name` of the rows of a CSV file: a header of parameters, then a row for each context. Blank lines are
-/// passed over.
+/// Makes a set called `name` from a CSV file. Its header has the names of parameters, and each further row is a
+/// context. Blank lines are ignored.
 ///
 /// # Errors
-/// [`ValueError`], which names the line.
+/// [`ValueError`] with the number of the faulty line.
 pub fn set_of_csv(name: &str, version: Version, content: &[u8]) -> Result<TestSet, ValueError> {
     let lines = text(name, content)?.lines().zip(1..);
     let mut lines = lines.filter(|(line, _)| !line.trim().is_empty());
@@ -36,7 +36,7 @@ pub fn set_of_csv(name: &str, version: Version, content: &[u8]) -> Result<TestSe
     Ok(TestSet { name: name.into(), version, contexts: Contexts::Listed(contexts) })
 }
 
-/// Returns the text of a file without its byte order mark.
+/// Decodes the file as UTF-8, without its byte order mark.
 fn text<'a>(name: &str, content: &'a [u8]) -> Result<&'a str, ValueError> {
     let content = content.strip_prefix(b"\xef\xbb\xbf").unwrap_or(content);
     std::str::from_utf8(content).map_err(|error| {
@@ -48,7 +48,7 @@ fn text<'a>(name: &str, content: &'a [u8]) -> Result<&'a str, ValueError> {
     })
 }
 
-/// Returns the names of the columns. `what` names the header for the error.
+/// Parses the header and returns the names of the columns. `what` describes the header in error messages.
 fn header(what: &str, line: &str) -> Result<Vec<String>, ValueError> {
     if let Some(separator) = [';', '\t'].into_iter().find(|&separator| line.contains(separator)) {
         let got = format!("`{}`, with columns separated by {separator:?}", quoted(line));
@@ -68,7 +68,7 @@ fn header(what: &str, line: &str) -> Result<Vec<String>, ValueError> {
     Ok(names)
 }
 
-/// Returns the values of a row that has as many of them as the header has names.
+/// Parses a row into a context. `values` must have the same length as `header`.
 fn context(name: &str, line: u64, header: &[String], values: &StringRecord) -> Result<Context, ValueError> {
     let value = |(parameter, text): (&String, &str)| {
         let number = text.trim().parse::<f64>().ok().filter(|number| number.is_finite());
@@ -79,7 +79,7 @@ fn context(name: &str, line: u64, header: &[String], values: &StringRecord) -> R
     header.iter().zip(values).map(value).collect()
 }
 
-/// Splits a line, in which values may be quoted.
+/// Splits a line into its fields, which may be in quotation marks.
 fn fields(what: &str, line: &str) -> Result<StringRecord, ValueError> {
     let mut fields = StringRecord::new();
     let mut reader = ReaderBuilder::new().has_headers(false).from_reader(line.as_bytes());
@@ -88,7 +88,7 @@ fn fields(what: &str, line: &str) -> Result<StringRecord, ValueError> {
     Ok(fields)
 }
 
-/// Shortens a text for an error.
+/// Shortens a text for an error message.
 fn quoted(text: &str) -> String {
     match text.char_indices().nth(MAX_QUOTED_LETTERS) {
         Some((end, _)) => format!("{}…", &text[..end]),

@@ -4,21 +4,22 @@ use serde::{Deserialize, Serialize};
 
 use super::{SettingError, is_zero};
 
-/// The schedule of a learning rate.
+/// How the learning rate changes during a training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Schedule {
-    /// Stays.
+    /// The learning rate stays constant.
     Constant,
-    /// Falls linearly to 0 at the end of training.
+    /// The learning rate falls linearly, to 0 at the end of the training.
     Linear,
 }
 
 impl Schedule {
-    /// The learning rate when `progress_remaining`, 1 … 0, of the training is left.
+    /// Returns the learning rate at a point of the training. `progress_remaining` is the share of the training that is
+    /// left, from 1 at the start to 0 at the end.
     ///
     /// # Errors
-    /// A `progress_remaining` outside 1 … 0.
+    /// [`SettingError`] if `progress_remaining` is not between 0 and 1.
     pub fn at(self, learning_rate: f64, progress_remaining: f64) -> Result<f64, SettingError> {
         let in_range = (0.0..=1.0).contains(&progress_remaining);
         check("progress_remaining", progress_remaining, in_range, "between 0 and 1")?;
@@ -29,41 +30,46 @@ impl Schedule {
     }
 }
 
-/// Settings of A2C. The defaults are those of OpenAI Baselines; the paper searches `learning_rate`, `n_steps` and
-/// `ent_coef`, for which `perturb train` has defaults of its own.
+/// Settings of A2C. The defaults are those of OpenAI Baselines. The paper tunes `learning_rate`, `n_steps` and
+/// `ent_coef`; `perturb train` has other defaults for these three.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct A2cConfig {
-    /// Step size of RMSProp, above 0 (default: `7e-4`). Larger learns faster, until the policy collapses.
+    /// Step size of RMSProp, above 0 (default: `7e-4`). A larger value learns faster, but from some value on the policy
+    /// collapses.
     pub learning_rate: f64,
-    /// The schedule of the learning rate: "linear" to 0 over the training, or "constant" (default: `"linear"`).
+    /// The schedule of the learning rate: "linear", which falls to 0 over the training, or "constant" (default:
+    /// `"linear"`).
     pub learning_rate_schedule: Schedule,
-    /// T: steps of each environment between two updates, at least 1 (default: `5`). More makes returns less biased, their
-    /// variance larger and updates rarer.
+    /// T, the number of steps of each environment between two updates, at least 1 (default: `5`). A larger value makes
+    /// returns less biased but increases their variance, and makes updates rarer.
     pub n_steps: usize,
-    /// Discount factor per step, 0 … 1 (default: `0.99`). Rewards 1/(1-γ) steps ahead count for about a third.
+    /// Discount factor γ per step, 0 … 1 (default: `0.99`). A reward 1/(1-γ) steps ahead has about a third of the
+    /// weight of an immediate reward.
     pub gamma: f64,
-    /// Weight of the entropy in nats, not negative (default: `0.01`). Larger keeps actions random for longer.
+    /// Weight of the entropy (in nats) in the loss, not negative (default: `0.01`). A larger value keeps actions random
+    /// for longer.
     pub ent_coef: f64,
     /// Weight of the value loss, which is the mean squared error; not negative (default: `0.5`; paper: `0.25`, because
-    /// the authors' code gives half of the squared error the weight 0.5). Feed-forward policy and value networks share
-    /// no weights, so this weight changes the policy only through the clipping of the common gradient. Recurrent
-    /// networks share all weights except those of their heads.
+    /// the authors' code multiplies half of the squared error by 0.5). Feed-forward policy and value networks share no
+    /// weights, so this setting affects the policy only through the clipping of their common gradient. Recurrent
+    /// networks share all weights except those of the two heads.
     pub vf_coef: f64,
-    /// Global norm that longer gradients are scaled down to, above 0 (default: `0.5`).
+    /// Maximum global norm of the gradient, above 0 (default: `0.5`). A longer gradient is scaled down to this norm.
     pub max_grad_norm: f64,
-    /// λ: each gradient step reduces every weight by the share learning rate · λ, not negative and below 1 /
-    /// `learning_rate` (default: `0`). Larger keeps outputs closer to 0, and deviations of continuous actions closer to 1.
-    /// Written only if it is not the default, so that older settings stay the same.
+    /// Weight decay λ: each gradient step multiplies every weight by 1 - learning rate · λ. Not negative, and below 1 /
+    /// `learning_rate` (default: `0`). A larger value keeps outputs closer to 0, and standard deviations of continuous
+    /// actions closer to 1. It is written to files only if it is not the default, so that files of older settings do
+    /// not change.
     #[serde(skip_serializing_if = "is_zero")]
     pub weight_decay: f64,
-    /// Decay per update of RMSProp's average of squared gradients, 0 … 1 (default: `0.99`).
+    /// Decay per update of RMSProp's running average of squared gradients, at least 0 and below 1 (default: `0.99`).
     pub rms_alpha: f64,
-    /// RMSProp's ε, added to that average inside the root, above 0 (default: `1e-5`). Limits the step of weights with
-    /// small gradients.
+    /// RMSProp's ε, which is added to the average of squared gradients inside of the root, above 0 (default: `1e-5`).
+    /// It limits the step of weights with small gradients.
     pub rms_eps: f64,
-    /// Whether V(final observation) follows the last reward of a truncated episode (default: `true`; paper: `false`).
-    /// `false` treats a time limit as the task's end, as the reference does.
+    /// Whether the last reward of a truncated episode is followed by the value of the final observation (default:
+    /// `true`; paper: `false`). `false` treats the step limit as an end of the task, as the paper authors' code does.
     pub bootstrap_truncation: bool,
 }
 
@@ -86,10 +92,10 @@ impl Default for A2cConfig {
 }
 
 impl A2cConfig {
-    /// Refuses values outside their ranges, NaN included.
+    /// Checks that all values are in their ranges. NaN is not.
     ///
     /// # Errors
-    /// [`SettingError`].
+    /// [`SettingError`] with the first value that is out of range.
     pub fn validate(&self) -> Result<(), SettingError> {
         check_positive("learning_rate", self.learning_rate)?;
         check_count("n_steps", self.n_steps)?;
@@ -103,53 +109,62 @@ impl A2cConfig {
     }
 }
 
-/// Settings of PPO. The defaults are the paper's, which searches `learning_rate` and `n_steps`.
+/// Settings of PPO. The defaults are those of the paper, which tunes `learning_rate` and `n_steps`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct PpoConfig {
-    /// Step size of Adam, above 0 (default: `3e-4`). Larger learns faster, until the policy collapses.
+    /// Step size of Adam, above 0 (default: `3e-4`). A larger value learns faster, but from some value on the policy
+    /// collapses.
     pub learning_rate: f64,
-    /// The schedule of the learning rate: "constant", or "linear" to 0 over the training (default: `"constant"`).
+    /// The schedule of the learning rate: "constant", or "linear", which falls to 0 over the training (default:
+    /// `"constant"`).
     pub learning_rate_schedule: Schedule,
-    /// T: steps of each environment between two updates, at least 1 (default: `128`).
+    /// T, the number of steps of each environment between two updates, at least 1 (default: `128`).
     pub n_steps: usize,
-    /// Passes over a rollout, 1 … 1000 (default: `10`). More takes more from each sample, until clipping stops it.
+    /// The number of passes over a rollout in one update, 1 … 1000 (default: `10`). More passes learn more from each
+    /// sample, until clipping prevents further change.
     pub n_epochs: usize,
-    /// Minibatches in a pass (default: `1`). More means more and noisier steps. T·N must be a multiple of it; with a
-    /// recurrent policy, whose minibatches are of whole environments, N.
+    /// The number of minibatches in a pass (default: `1`). More minibatches give more, but noisier, gradient steps. It
+    /// must divide T·N, the number of samples. With a recurrent policy it must divide N, because a minibatch then
+    /// consists of whole environments.
     pub n_minibatches: usize,
-    /// Discount factor per step, 0 … 1 (default: `0.99`). Rewards 1/(1-γ) steps ahead count for about a third.
+    /// Discount factor γ per step, 0 … 1 (default: `0.99`). A reward 1/(1-γ) steps ahead has about a third of the
+    /// weight of an immediate reward.
     pub gamma: f64,
-    /// λ of generalised advantage estimation, 0 … 1 (default: `0.95`). Smaller trusts the values more than the returns.
+    /// λ of generalised advantage estimation, 0 … 1 (default: `0.95`). A smaller value gives more weight to the
+    /// estimated values and less to the observed rewards.
     pub gae_lambda: f64,
-    /// Clipping range of the ratio of new to old probabilities, above 0 (default: `0.2`).
+    /// Half-width of the clipping interval around 1 for the ratio of new to old probabilities, above 0 (default:
+    /// `0.2`).
     pub clip_range: f64,
-    /// Clipping range of the value's change from the rollout's, in units of the normalised reward; 0 = no clipping
+    /// Limit to the change of a value from its rollout's value, in units of the normalised reward; 0 turns clipping off
     /// (default: `0.2`).
     pub clip_range_vf: f64,
-    /// Whether advantages get mean 0 and standard deviation 1 in every minibatch (default: `true`).
+    /// Whether advantages are normalised to mean 0 and standard deviation 1 in every minibatch (default: `true`).
     pub normalize_advantage: bool,
-    /// Weight of the entropy in nats, not negative (default: `0`). Larger keeps actions random for longer.
+    /// Weight of the entropy (in nats) in the loss, not negative (default: `0`). A larger value keeps actions random
+    /// for longer.
     pub ent_coef: f64,
-    /// Weight of the KL divergence of the new from the acting policy, in nats, not negative (default: `0`). Larger holds
-    /// the policy back where clipping does not. Packer et al. (2018) search it for RL².
+    /// Weight of the KL divergence (in nats) of the new policy from the acting policy, not negative (default: `0`). A
+    /// larger value limits changes of the policy that clipping allows. Packer et al. (2018) tune it for RL².
     pub kl_coef: f64,
     /// Weight of the value loss, which is the mean squared error; not negative (default: `0.5`; paper: `0.25`, because
-    /// the authors' code gives half of the squared error the weight 0.5). Feed-forward policy and value networks share
-    /// no weights, so this weight changes the policy only through the clipping of the common gradient. Recurrent
-    /// networks share all weights except those of their heads.
+    /// the authors' code multiplies half of the squared error by 0.5). Feed-forward policy and value networks share no
+    /// weights, so this setting affects the policy only through the clipping of their common gradient. Recurrent
+    /// networks share all weights except those of the two heads.
     pub vf_coef: f64,
-    /// Global norm that longer gradients are scaled down to, above 0 (default: `0.5`).
+    /// Maximum global norm of the gradient, above 0 (default: `0.5`). A longer gradient is scaled down to this norm.
     pub max_grad_norm: f64,
-    /// λ: each gradient step reduces every weight by the share learning rate · λ, not negative and below 1 /
-    /// `learning_rate` (default: `0`). Larger keeps outputs closer to 0, and deviations of continuous actions closer to 1.
-    /// Written only if it is not the default, so that older settings stay the same.
+    /// Weight decay λ: each gradient step multiplies every weight by 1 - learning rate · λ. Not negative, and below 1 /
+    /// `learning_rate` (default: `0`). A larger value keeps outputs closer to 0, and standard deviations of continuous
+    /// actions closer to 1. It is written to files only if it is not the default, so that files of older settings do
+    /// not change.
     #[serde(skip_serializing_if = "is_zero")]
     pub weight_decay: f64,
-    /// Adam's ε, above 0 (default: `1e-5`). Limits the step of weights with small gradients.
+    /// Adam's ε, above 0 (default: `1e-5`). It limits the step of weights with small gradients.
     pub adam_eps: f64,
-    /// Whether V(final observation) follows the last reward of a truncated episode (default: `true`; paper: `false`).
-    /// `false` treats a time limit as the task's end, as the reference does.
+    /// Whether the last reward of a truncated episode is followed by the value of the final observation (default:
+    /// `true`; paper: `false`). `false` treats the step limit as an end of the task, as the paper authors' code does.
     pub bootstrap_truncation: bool,
 }
 
@@ -178,10 +193,10 @@ impl Default for PpoConfig {
 }
 
 impl PpoConfig {
-    /// Refuses values outside their ranges, NaN included.
+    /// Checks that all values are in their ranges. NaN is not.
     ///
     /// # Errors
-    /// [`SettingError`].
+    /// [`SettingError`] with the first value that is out of range.
     pub fn validate(&self) -> Result<(), SettingError> {
         check_positive("learning_rate", self.learning_rate)?;
         check_count("n_steps", self.n_steps)?;
@@ -200,22 +215,24 @@ impl PpoConfig {
     }
 }
 
-/// Settings of EPOpt. The defaults are the paper's.
+/// Settings of EPOpt. The defaults are those of the paper.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct EpoptConfig {
-    /// L: complete episodes in an iteration, 1 … 10⁶ (default: `100`).
+    /// L, the number of complete episodes in an iteration, 1 … 10⁶ (default: `100`).
     pub episodes_per_iteration: usize,
-    /// ε: the share of worst episodes that is learned from, above 0 and at most 1 (default: `0.1`).
+    /// ε, the share of episodes, those with the lowest returns, from which the policy learns, above 0 and at most 1
+    /// (default: `0.1`).
     pub epsilon: f64,
-    /// Iterations at the start that learn from all episodes, ε = 1 (default: `100`).
+    /// The number of iterations at the start that learn from all episodes, as with ε = 1 (default: `100`).
     pub full_iterations: u64,
-    /// The quantity that ranks episodes: "raw", the undiscounted return, or "normalized", the sum of the rewards that the
-    /// policy learns from (default: `"raw"`; paper: `"normalized"`). The divisor of normalised rewards changes during an
-    /// iteration, so the rank of equal episodes depends on their order.
+    /// The quantity by which episodes are ranked: "raw", the undiscounted return, or "normalized", the sum of the
+    /// normalised rewards that the policy learns from (default: `"raw"`; paper: `"normalized"`). The divisor of
+    /// normalised rewards changes during an iteration, so with "normalized" the rank of equal episodes depends on their
+    /// order.
     pub rank_by: Ranking,
-    /// Whether each kept episode has an update of its own, one after the other, in place of one update on all (default:
-    /// `false`; paper: `true` with RC). PPO takes all its epochs over the row of episodes.
+    /// Whether the policy is updated on one kept episode after the other, instead of once on all of them (default:
+    /// `false`; paper: `true` with RC). Each epoch of PPO then goes through all kept episodes.
     pub update_per_episode: bool,
 }
 
@@ -223,7 +240,7 @@ pub struct EpoptConfig {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Ranking {
-    /// The undiscounted return.
+    /// The undiscounted return of the original rewards.
     #[default]
     Raw,
     /// The undiscounted sum of normalised rewards.
@@ -243,27 +260,29 @@ impl Default for EpoptConfig {
 }
 
 impl EpoptConfig {
-    /// Refuses values outside their ranges, NaN included.
+    /// Checks that all values are in their ranges. NaN is not.
     ///
     /// # Errors
-    /// [`SettingError`].
+    /// [`SettingError`] with the first value that is out of range.
     pub fn validate(&self) -> Result<(), SettingError> {
         check_episodes("episodes_per_iteration", self.episodes_per_iteration)?;
         check("epsilon", self.epsilon, self.epsilon > 0.0 && self.epsilon <= 1.0, "above 0 and at most 1")
     }
 }
 
-/// Settings of RL², Duan et al. (2016), arXiv:1611.02779, in addition to those of the A2C or PPO that it wraps.
+/// Settings of RL², Duan et al. (2016), arXiv:1611.02779. They are added to the settings of A2C or PPO, which RL²
+/// wraps.
 ///
-/// A trial is N episodes in one drawn environment. The policy is recurrent and keeps its memory from one episode of a trial
-/// to the next. Beside the observation it gets its last action, reward and done flag (the learner's `Inputs`). Returns and
-/// advantages run across the episodes of a trial. So the best policy is one that uses a trial's first steps to find out
-/// which environment it is in. Updates are those of A2C or PPO, with [`kl_coef`](PpoConfig::kl_coef) for RL²-PPO; only the
-/// collection of rollouts differs.
+/// A trial consists of N episodes with the same drawn parameters. The policy is recurrent and keeps its memory from one
+/// episode of a trial to the next. Besides the observation, it gets its last action, reward and done flag (the
+/// learner's `Inputs`). Returns and advantages continue across the episodes of a trial. Therefore the best policy uses
+/// the first steps of a trial to find out which parameters it has. Updates are those of A2C or PPO, with
+/// [`kl_coef`](PpoConfig::kl_coef) for RL²-PPO; only the collection of rollouts differs.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Rl2Config {
-    /// N: episodes in a trial, 1 … 10⁶ (default: `2`; the paper also tries 1 and 5). Testing counts a trial's last.
+    /// N, the number of episodes in a trial, 1 … 10⁶ (default: `2`; the paper also tries 1 and 5). Tests count only the
+    /// last episode of each trial.
     pub episodes_per_trial: u32,
 }
 
@@ -274,26 +293,26 @@ impl Default for Rl2Config {
 }
 
 impl Rl2Config {
-    /// Refuses values outside their ranges.
+    /// Checks that all values are in their ranges. NaN is not.
     ///
     /// # Errors
-    /// [`SettingError`].
+    /// [`SettingError`] with the first value that is out of range.
     pub fn validate(&self) -> Result<(), SettingError> {
         check_episodes("episodes_per_trial", self.episodes_per_trial as usize)
     }
 }
 
-/// `Ok` if `value` is finite and `accepted`.
+/// Checks that `value` is finite and that `accepted` is true.
 fn check(name: &'static str, value: f64, accepted: bool, expected: &'static str) -> Result<(), SettingError> {
     if value.is_finite() && accepted { Ok(()) } else { Err(SettingError { name, got: value.to_string(), expected }) }
 }
 
-/// `Ok` if `value` is at least 1. A rollout's size limits it from above.
+/// Checks that `value` is at least 1. The maximum size of a rollout limits it from above.
 fn check_count(name: &'static str, value: usize) -> Result<(), SettingError> {
     if value > 0 { Ok(()) } else { Err(SettingError { name, got: value.to_string(), expected: "at least 1" }) }
 }
 
-/// `Ok` if `value` is a number of episodes that can be waited for.
+/// Checks a number of episodes. The upper limit keeps an iteration from taking practically forever.
 fn check_episodes(name: &'static str, value: usize) -> Result<(), SettingError> {
     if (1..=1_000_000).contains(&value) {
         return Ok(());
@@ -301,7 +320,7 @@ fn check_episodes(name: &'static str, value: usize) -> Result<(), SettingError> 
     Err(SettingError { name, got: value.to_string(), expected: "between 1 and 1000000" })
 }
 
-/// `Ok` if `value` is a number of passes over a rollout that can be waited for.
+/// Checks a number of passes over a rollout. The upper limit keeps an update from taking practically forever.
 fn check_epochs(name: &'static str, value: usize) -> Result<(), SettingError> {
     if (1..=1000).contains(&value) {
         return Ok(());
@@ -309,23 +328,23 @@ fn check_epochs(name: &'static str, value: usize) -> Result<(), SettingError> {
     Err(SettingError { name, got: value.to_string(), expected: "between 1 and 1000" })
 }
 
-/// `Ok` if `value` is a positive number.
+/// Checks that `value` is positive.
 fn check_positive(name: &'static str, value: f64) -> Result<(), SettingError> {
     check(name, value, value > 0.0, "a positive number")
 }
 
-/// `Ok` if `value` is a number that is not negative.
+/// Checks that `value` is not negative.
 fn check_not_negative(name: &'static str, value: f64) -> Result<(), SettingError> {
     check(name, value, value >= 0.0, "a number that is not negative")
 }
 
-/// `Ok` if a gradient step does not take the whole weight.
+/// Checks that weight decay takes less than the whole weight in a gradient step.
 fn check_weight_decay(weight_decay: f64, learning_rate: f64) -> Result<(), SettingError> {
     let is_decay = weight_decay >= 0.0 && weight_decay * learning_rate < 1.0;
     check("weight_decay", weight_decay, is_decay, "a number that is not negative, and below 1 / learning_rate")
 }
 
-/// `Ok` if `value` is between 0 and 1.
+/// Checks that `value` is between 0 and 1.
 fn check_fraction(name: &'static str, value: f64) -> Result<(), SettingError> {
     check(name, value, (0.0..=1.0).contains(&value), "between 0 and 1")
 }

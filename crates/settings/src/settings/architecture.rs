@@ -1,23 +1,25 @@
-//! The architectures of policies.
+//! Network architectures of policies.
 
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// The policy's network architecture.
+/// The network architecture of a policy.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Architecture {
-    /// Feed-forward: two separate multilayer perceptrons, 64-64, tanh.
+    /// Feed-forward: two separate multilayer perceptrons, for policy and value, each with two hidden layers of 64 tanh
+    /// units.
     Ff,
-    /// Recurrent: one multilayer perceptron, 256-256, tanh, an LSTM of 256, two linear heads.
+    /// Recurrent: two hidden layers of 256 tanh units, an LSTM with 256 units, and two linear heads for policy and
+    /// value.
     Rc,
 }
 
 impl Architecture {
     /// All architectures.
     pub const ALL: [Self; 2] = [Self::Ff, Self::Rc];
-    /// The names in settings and options.
+    /// The names in settings and on the command line.
     pub const NAMES: [&str; 2] = ["ff", "rc"];
 }
 

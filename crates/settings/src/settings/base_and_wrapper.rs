@@ -1,4 +1,5 @@
-//! The settings of an algorithm: those of what updates the policy, and those of what is wrapped around it.
+//! The settings of an algorithm. An algorithm consists of a base algorithm, which updates the policy, and optionally of
+//! a wrapper around it.
 
 use serde::Serialize;
 use toml::Table;
@@ -6,64 +7,66 @@ use toml::Table;
 use super::{A2cConfig, Architecture, ConfigError, EpoptConfig, PpoConfig, Rl2Config};
 use crate::value_error::{ValueError, require};
 
-/// Settings of the base algorithm that EPOpt does not use: its iterations consist of complete episodes in one batch.
+/// Settings of the base algorithm that EPOpt does not have, because each of its iterations learns from complete
+/// episodes in one batch.
 const NOT_WITH_EPISODES: [&str; 2] = ["n_steps", "n_minibatches"];
 
-/// Maximal number of samples in a rollout, which take some gigabytes.
+/// Maximal number of samples in a rollout. That many samples take some gigabytes.
 const MAX_SAMPLES: u128 = 1 << 26;
 
-/// Minimal number of steps of each environment in a long rollout. With fewer, sending a policy's weights takes longer than
-/// sending the observations and actions of several trainings together.
+/// Minimal number of steps of each environment in a rollout that counts as long. Below it, sending a policy's weights
+/// to the server takes longer than sending the observations and actions of several trainings together.
 const LONG_ROLLOUT: usize = 64;
 
-/// The settings of an algorithm, which say which one it is.
+/// The settings of an algorithm. The variants of both fields determine the algorithm.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
     /// The algorithm that updates the policy.
     pub base: Base,
-    /// The algorithm around the base algorithm.
+    /// The wrapper around the base algorithm.
     pub wrapper: Wrapper,
 }
 
-/// An algorithm that updates the policy.
+/// A base algorithm, which updates the policy, with its settings.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(untagged)]
 pub enum Base {
-    /// Advantage actor-critic.
+    /// A2C, advantage actor-critic.
     A2c(A2cConfig),
-    /// Proximal policy optimisation.
+    /// PPO, proximal policy optimisation.
     Ppo(PpoConfig),
-    /// A random policy, which learns nothing: all actions are equally likely. Serves as a baseline.
+    /// No learning: a random policy whose actions are all equally likely. It serves as a baseline.
     Random,
 }
 
-/// An algorithm around a base algorithm.
+/// A wrapper, which changes the episodes that a base algorithm learns from, with its settings.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(untagged)]
 pub enum Wrapper {
     /// No wrapper.
     Plain,
-    /// EPOpt: learning from the worst of many episodes.
+    /// EPOpt, which learns from the worst of many episodes.
     Epopt(EpoptConfig),
-    /// RL²: trials of several episodes.
+    /// RL², which learns over trials of several episodes.
     Rl2(Rl2Config),
 }
 
-/// The way in which rollouts are collected. Trainings in one batch must collect alike.
+/// How a training collects rollouts. Trainings whose environments share a batch must have the same mode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum CollectionMode {
-    /// No rollouts: a random policy learns nothing.
+    /// The training collects no rollouts, because a random policy learns nothing.
     None,
-    /// Few steps. Several trainings share the messages.
+    /// Rollouts have few steps. Several trainings share the messages to the server.
     Short,
-    /// Many steps, or complete episodes. The server can be sent the weights for each rollout.
+    /// Rollouts have many steps, or complete episodes. The server can choose the actions if it gets the weights for
+    /// each rollout.
     Long,
-    /// Rollouts with noise on observations, which the learner adds when it chooses actions.
+    /// Rollouts have noise on observations. The learner chooses the actions, because it adds the noise.
     Noisy,
 }
 
 impl Settings {
-    /// All algorithms, each part with its own defaults, in the order in which they are listed.
+    /// Returns all algorithms with the default settings of their parts, in the order in which they are listed.
     pub fn all() -> [Self; 7] {
         let (a2c, ppo) = (|| Base::A2c(A2cConfig::default()), || Base::Ppo(PpoConfig::default()));
         let epopt = || Wrapper::Epopt(EpoptConfig::default());
@@ -80,12 +83,12 @@ impl Settings {
         .map(|(wrapper, base)| Self { base, wrapper })
     }
 
-    /// The names of all algorithms.
+    /// Returns the names of all algorithms.
     pub fn names() -> [&'static str; 7] {
         Self::all().map(|settings| settings.name())
     }
 
-    /// Returns how rollouts are collected.
+    /// Returns how rollouts are collected, apart from noise on observations.
     pub(super) fn rollouts(&self) -> CollectionMode {
         let n_steps = match (&self.wrapper, &self.base) {
             (_, Base::Random) => return CollectionMode::None,
@@ -96,7 +99,7 @@ impl Settings {
         if n_steps < LONG_ROLLOUT { CollectionMode::Short } else { CollectionMode::Long }
     }
 
-    /// Returns the algorithm's name in settings and options.
+    /// Returns the algorithm's name in settings and on the command line.
     pub fn name(&self) -> &'static str {
         match (&self.wrapper, &self.base) {
             (_, Base::Random) => "random",
@@ -109,33 +112,33 @@ impl Settings {
         }
     }
 
-    /// Whether the policy learns nothing.
+    /// Returns whether the policy is random and learns nothing.
     pub fn is_random(&self) -> bool {
         matches!(self.base, Base::Random)
     }
 
-    /// Whether the policy learns over trials.
+    /// Returns whether the policy learns over trials of several episodes (RL²).
     pub fn has_trials(&self) -> bool {
         matches!(self.wrapper, Wrapper::Rl2(_))
     }
 
-    /// The architecture that is trained if none is named. A policy that learns over trials needs a memory.
+    /// Returns the default architecture: recurrent for RL², which needs a memory, otherwise feed-forward.
     pub(super) fn default_architecture(&self) -> Architecture {
         if self.has_trials() { Architecture::Rc } else { Architecture::Ff }
     }
 
-    /// The settings as a flat table.
+    /// Returns the settings as a flat table, without a distinction of base and wrapper.
     pub(super) fn table(&self) -> Table {
         // Serialisation of plain numbers, booleans and names cannot fail.
         let mut table = Table::try_from(&self.base).unwrap_or_default();
         if let Wrapper::Epopt(_) = self.wrapper {
             table.retain(|key, _| !NOT_WITH_EPISODES.contains(&key));
         }
-        table.extend(Table::try_from(&self.wrapper).unwrap_or_default()); // nothing is no table
+        table.extend(Table::try_from(&self.wrapper).unwrap_or_default()); // a wrapper without settings is not serialised as a table
         table
     }
 
-    /// The settings of this algorithm in `table`, where they stand among others.
+    /// Reads the settings of this algorithm from `table`, which may also contain other settings.
     pub(super) fn read(&self, table: &Table) -> Result<Self, toml::de::Error> {
         let table = || table.clone();
         Ok(Self {
@@ -152,7 +155,7 @@ impl Settings {
         })
     }
 
-    /// γ, per step; 1 for a random policy.
+    /// Returns the discount factor γ per step; 1 for a random policy.
     pub fn gamma(&self) -> f64 {
         match &self.base {
             Base::A2c(settings) => settings.gamma,
@@ -161,7 +164,7 @@ impl Settings {
         }
     }
 
-    /// Episodes in a trial; 1 without trials.
+    /// Returns the number of episodes in a trial; 1 if the algorithm has no trials.
     pub fn episodes_per_trial(&self) -> u32 {
         match &self.wrapper {
             Wrapper::Rl2(settings) => settings.episodes_per_trial,
@@ -169,7 +172,7 @@ impl Settings {
         }
     }
 
-    /// Refuses values outside their ranges, and values that contradict each other.
+    /// Checks that all values are in their ranges and do not contradict each other.
     pub(super) fn validate(&self, architecture: Architecture, num_envs: usize) -> Result<(), ConfigError> {
         match &self.base {
             Base::A2c(settings) => {
@@ -199,14 +202,14 @@ impl Settings {
     }
 }
 
-/// Checks that a machine can hold the rollout.
+/// Checks that a rollout fits into the memory of a usual machine.
 fn check_size(n_steps: usize, num_envs: usize) -> Result<(), ValueError> {
     let fits = n_steps as u128 * num_envs as u128 <= MAX_SAMPLES;
     let expected = format!("at most {} with {num_envs} environments", MAX_SAMPLES / num_envs as u128);
     require(fits, "n_steps", n_steps, expected)
 }
 
-/// Checks that a pass over a rollout can be cut into equal minibatches.
+/// Checks that a rollout can be divided into equal minibatches.
 fn check_minibatches(settings: &PpoConfig, architecture: Architecture, num_envs: usize) -> Result<(), ValueError> {
     let PpoConfig { n_steps, n_minibatches, .. } = *settings;
     let (whole, count) = match architecture {

@@ -1,12 +1,12 @@
-//! The defaults of every pair of algorithm and architecture in each preset. docs/algorithms.md has the reasons, with
-//! numbers. The defaults were chosen on seed 1.
+//! The default settings of every pair of algorithm and architecture, in each preset. docs/algorithms.md has the
+//! reasons, with numbers. The defaults were chosen in trainings with seed 1.
 
 use perturb_protocol::Version;
 
 use super::preset::{self, Preset};
 use super::{Architecture, Base, Common, Settings, TrainConfig, Wrapper};
 
-/// The defaults for the algorithm of `settings`, without an environment.
+/// Returns the default configuration for the algorithm of `settings`. It has no environment yet.
 pub(super) fn defaults_for(mut settings: Settings, architecture: Architecture, preset: Preset) -> TrainConfig {
     tune(&mut settings, architecture);
     let num_envs = match (&settings.wrapper, &settings.base, architecture) {
@@ -49,7 +49,7 @@ fn tune(settings: &mut Settings, architecture: Architecture) {
     match &mut settings.base {
         Base::A2c(a2c) => {
             (a2c.learning_rate, a2c.n_steps, a2c.ent_coef) = match (&settings.wrapper, architecture) {
-                // The whole training has only a few hundred updates.
+                // The learning rate is high, because a whole training has only a few hundred updates.
                 (Wrapper::Epopt(_), Architecture::Ff) => (7e-2, a2c.n_steps, 1e-4),
                 (Wrapper::Epopt(_) | Wrapper::Rl2(_), _) => (7e-3, 15, 1e-4),
                 (Wrapper::Plain, _) => (7e-3, 15, 1e-3),
@@ -62,7 +62,7 @@ fn tune(settings: &mut Settings, architecture: Architecture) {
                 Wrapper::Rl2(_) => (ppo.gae_lambda, ppo.kl_coef) = (0.97, 0.2),
             }
             if architecture == Architecture::Rc {
-                ppo.n_epochs = 4; // an epoch costs five times as much as that of a feed-forward policy
+                ppo.n_epochs = 4; // an epoch takes five times as long as with a feed-forward policy
             }
         }
         Base::Random => {}

@@ -1,4 +1,4 @@
-//! Methods: algorithms with their architecture.
+//! A method: an algorithm with its architecture.
 
 use std::fmt;
 
@@ -6,34 +6,36 @@ use serde::{Deserialize, Serialize};
 
 use super::{Observe, Preset};
 
-/// An algorithm with its architecture and, of RL², the episodes in a trial: a row of the paper's tables.
+/// A method, which is a row of the paper's tables: an algorithm with its architecture and, for RL², the number of
+/// episodes in a trial.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Method {
-    /// E.g. "ppo".
+    /// The name of the algorithm, e.g. "ppo".
     pub algorithm: String,
-    /// "ff" or "rc".
+    /// The architecture: "ff" (feed-forward) or "rc" (recurrent).
     pub architecture: String,
-    /// `None` for algorithms without trials.
+    /// The number of episodes in a trial; `None` if the algorithm has no trials.
     pub episodes_per_trial: Option<u32>,
-    /// The preset, which decides about the default settings.
+    /// The preset, which chooses the default settings.
     #[serde(default, skip_serializing_if = "Preset::is_default")]
     pub preset: Preset,
-    /// The observation of the policies.
+    /// What the policies observe.
     #[serde(default, skip_serializing_if = "Observe::is_default")]
     pub observe: Observe,
-    /// Whether the method is an agent that no cell trained. `algorithm` is then its name in the assessment, and nothing
-    /// else is known.
+    /// Whether the method is an external agent, which was not trained by an experiment. Then `algorithm` is the agent's
+    /// name, and the other fields have no information.
     #[serde(alias = "elsewhere", default, skip_serializing_if = "std::ops::Not::not")]
     pub external: bool,
 }
 
 impl Method {
-    /// Whether the method learns nothing.
+    /// Returns whether the method is the random policy.
     pub fn is_random(&self) -> bool {
         self.algorithm == "random" && !self.external
     }
 
-    /// Tells whether the method is a reference: it learns nothing, or observes what others have to infer.
+    /// Returns whether the method only serves as a reference: it learns nothing, or its policies observe parameters
+    /// that others have to infer.
     pub fn is_reference(&self) -> bool {
         self.is_random() || self.observe.sees_parameters()
     }

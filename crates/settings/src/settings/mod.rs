@@ -1,8 +1,9 @@
-//! The configuration of a training: flat, by the field's names.
+//! The configuration of a training: a flat table of settings.
 //!
-//! The algorithm's defaults in the preset come first, over them `--config FILE.toml`, over that the command line: flags and
-//! `--set key=value`, which may not contradict each other. The result is written to `config.toml` of the run; given back with
-//! `--config` it repeats the run.
+//! Settings are merged from three layers, each of which overrides those before it: the algorithm's defaults in the
+//! preset, the file of `--config FILE.toml`, and the command line (flags and `--set key=value`, which must not
+//! contradict each other). The result is written to `config.toml` in the run's directory. A training with this file as
+//! `--config` repeats the run.
 
 mod algorithms;
 mod architecture;
@@ -36,17 +37,17 @@ use perturb_protocol::{Distribution, Version, names};
 use crate::sets::Parameters;
 use crate::value_error::{ValueError, require};
 
-/// The most environments of one training.
+/// Maximal number of environments of one training.
 const MAX_ENVS: usize = 65_536;
-/// The key of [`Common::parameters`].
+/// The key of [`Common::parameters`] in a configuration.
 const PARAMETERS: &str = "parameters";
-/// The key of [`Settings::name`].
+/// The key of the algorithm, [`Settings::name`], in a configuration.
 const ALGORITHM: &str = "algorithm";
-/// The key of [`Common::preset`].
+/// The key of [`Common::preset`] in a configuration.
 const PRESET: &str = "preset";
-/// The key of [`Common::observe`].
+/// The key of [`Common::observe`] in a configuration.
 const OBSERVE: &str = "observe";
-/// The key of [`Common::architecture`].
+/// The key of [`Common::architecture`] in a configuration.
 const ARCHITECTURE: &str = "architecture";
 
 impl Common {
@@ -60,66 +61,65 @@ impl Common {
     }
 }
 
-/// Everything that decides what a training does. Two trainings with equal configurations give equal bytes.
+/// The complete configuration of a training. Two trainings with equal configurations produce the same bytes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Table", into = "Table")]
 pub struct TrainConfig {
-    /// The settings that every training has.
+    /// The settings that are independent of the algorithm.
     pub common: Common,
     /// The settings of the algorithm.
     pub settings: Settings,
 }
 
-/// Settings that every training has.
+/// The settings that are independent of the algorithm.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Common {
-    /// The preset, which decides about the defaults of the other settings: "perturb" or "paper" (default: `"perturb"`).
+    /// The preset, which chooses the defaults of the other settings: "perturb" or "paper" (default: `"perturb"`).
     pub preset: Preset,
-    /// The environment's name in the catalogue. Has no default.
+    /// The environment's name in the catalogue. It has no default.
     pub environment: String,
-    /// The distribution of the environment's parameters in training.
+    /// The version from which the environment's parameters are drawn in training: D, R, E or R+E.
     pub version: Version,
-    /// Distributions in training that replace those of the version, e.g. `length = "0.8..1.0"` in the table
-    /// `[parameters]` (default: nothing).
+    /// Distributions of single parameters in training that replace those of the version, e.g. `length = "0.8..1.0"` in
+    /// the table `[parameters]` (default: nothing).
     #[serde(default, skip_serializing_if = "Parameters::is_empty")]
     pub parameters: Parameters,
     /// The network architecture of the policy.
     pub architecture: Architecture,
-    /// The policy's observation: "state", or "parameters" for the state and the environment's present parameters, in
-    /// training and in tests (default: `"state"`). The setting is written only if it is not the default, so that older
-    /// settings keep their bytes.
+    /// What the policy observes: "state", or "parameters" for the state and the current parameters of the environment,
+    /// in training and in tests (default: `"state"`). It is written to files only if it is not the default, so that
+    /// files of older settings do not change.
     #[serde(default, skip_serializing_if = "Observe::is_default")]
     pub observe: Observe,
-    /// Training ends after the iteration in which this many episodes have ended, at least 1 (default: `15000`). EPOpt
-    /// counts those that it learned from.
+    /// The number of episodes after which training ends, at least 1 (default: `15000`). The last iteration is
+    /// completed. EPOpt counts only the episodes that it learned from.
     pub episodes: u64,
-    /// Fixes all randomness, 0 … 2⁶³-1 (default: `1`).
+    /// The seed of all random numbers, 0 … 2⁶³-1 (default: `1`).
     pub seed: u64,
-    /// N: environments that are stepped together, 1 … 65536 (default: `16`, `8` with PPO FF, `25` with EPOpt; paper:
-    /// `1`).
-    /// More makes a step cheaper and updates rarer.
+    /// N, the number of environments that are stepped together, 1 … 65536 (default: `16`, `8` with PPO FF, `25` with
+    /// EPOpt; paper: `1`). A larger number makes each step cheaper and updates rarer.
     pub num_envs: usize,
     /// Whether observations are normalised by their running mean and variance (default: `true`).
     pub normalize_observations: bool,
-    /// Standard deviation of normal noise that is added to every number of an observation in training, after normalisation
-    /// if there is any, 0 … 100 (default: `0`). Tests have none. Written only if it is not the default, so that older
-    /// settings stay the same.
+    /// Standard deviation of normally distributed noise that is added to every number of an observation in training,
+    /// after normalisation if there is any, 0 … 100 (default: `0`). Tests have no noise. It is written to files only if
+    /// it is not the default, so that files of older settings do not change.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub observation_noise: f64,
-    /// Whether rewards are divided by the running deviation of the discounted return (default: `true`).
+    /// Whether rewards are divided by the running standard deviation of the discounted return (default: `true`).
     pub normalize_rewards: bool,
-    /// Whether that discounted return runs on over the ends of episodes, as in the reference, instead of starting again from 0
-    /// (default: `false`; paper: `true`).
+    /// Whether the discounted return for normalising rewards continues across the ends of episodes, as in the code of
+    /// the paper's authors, instead of starting again from 0 (default: `false`; paper: `true`).
     pub reward_return_runs_on: bool,
-    /// Iterations between two lines of progress.csv, at least 1 (default: `100` with A2C and RL²-A2C, else `1`). A line has the
-    /// figures of the last update, and means over the last 100 ended episodes.
+    /// The number of iterations between two lines of progress.csv, at least 1 (default: `100` with A2C and RL²-A2C,
+    /// else `1`). A line contains the figures of the last update, and means over the last 100 ended episodes.
     pub log_interval: u64,
-    /// Ended episodes between two checkpoints, at least 1 (default: `500`). The first iteration and the last always
-    /// write one.
+    /// The number of ended episodes between two checkpoints, at least 1 (default: `500`). The first and the last
+    /// iteration always write a checkpoint.
     pub checkpoint_interval: u64,
-    /// Training also ends after the iteration in which the last 100 ended episodes have this success rate, 0 … 100 %
-    /// (default: `0`, which is never). Longer training can lose what generalises. Written only if it is not the default, so
-    /// that older settings stay the same.
+    /// A success rate in %, 0 … 100, at which training ends early: after the iteration in which the last 100 ended
+    /// episodes reach it (default: `0`, which is never). Longer training can impair generalisation. It is written to
+    /// files only if it is not the default, so that files of older settings do not change.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub stop_at_success: f64,
 }
@@ -129,10 +129,11 @@ fn is_zero(number: &f64) -> bool {
 }
 
 impl TrainConfig {
-    /// Merges and checks a TOML file and, over it, the command line: pairs `key=value`, and flags by the keys of the file.
+    /// Merges and checks a configuration. The values of the command line override those of the TOML file `file`: `sets`
+    /// are pairs `key=value`, and `flags` are flags by the setting's key.
     ///
     /// # Errors
-    /// [`ConfigError`], which names the key and what is accepted.
+    /// [`ConfigError`] with the key and the accepted values.
     pub fn load(file: Option<&Path>, sets: &[String], flags: Table) -> Result<Self, ConfigError> {
         let mut layers: Vec<(String, Table)> = Vec::new();
         if let Some(path) = file {
@@ -157,14 +158,15 @@ impl TrainConfig {
         resolve(layers)
     }
 
-    /// The configuration as TOML, with every setting.
+    /// Returns the configuration as TOML text with every setting.
     pub fn to_toml(&self) -> String {
         // Serialisation of plain numbers, booleans and names cannot fail.
         toml::to_string(&self.full_table()).unwrap_or_default()
     }
 
-    /// The configuration as a flat table, which [`TrainConfig::from_table`] reads back. With the default preset it lacks
-    /// settings that are younger than some results, if they have the values with which these results were made.
+    /// Returns the configuration as a flat table, which [`TrainConfig::from_table`] reads. With the default preset, the
+    /// table omits some settings that were introduced later, if they have the values that trainings had before. Results
+    /// of older versions therefore keep their configuration.
     pub fn table(&self) -> Table {
         let mut table = self.full_table();
         if self.common.preset.is_default() {
@@ -180,15 +182,16 @@ impl TrainConfig {
         table
     }
 
-    /// Reads a flat table. Settings that it lacks have their defaults.
+    /// Reads a configuration from a flat table. Missing settings get their defaults.
     ///
     /// # Errors
-    /// [`ConfigError`], which names the key and what is accepted.
+    /// [`ConfigError`] with the key and the accepted values.
     pub fn from_table(origin: &str, table: Table) -> Result<Self, ConfigError> {
         resolve(vec![(origin.to_owned(), spelled(origin, table)?)])
     }
 
-    /// The configuration with every key that a training with this algorithm may have, as reports compare configurations.
+    /// Returns the configuration with every key that a training with this algorithm may have. Reports compare
+    /// configurations in this form.
     pub fn complete_table(&self) -> Table {
         let mut table = defaults_of(self);
         table.extend(self.full_table());
@@ -200,7 +203,7 @@ impl TrainConfig {
         if self.common.observation_noise > 0.0 { CollectionMode::Noisy } else { self.settings.rollouts() }
     }
 
-    /// Returns the method.
+    /// Returns the method that the configuration trains.
     pub fn method(&self) -> Method {
         let Self { common, settings } = self;
         Method {
@@ -239,7 +242,7 @@ impl TrainConfig {
     }
 }
 
-/// Names the training in a few words, e.g. "Hopper R ppo ff".
+/// Describes the training in a few words, e.g. "Hopper R ppo ff".
 impl std::fmt::Display for TrainConfig {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Common { environment, version, .. } = &self.common;
@@ -261,7 +264,7 @@ impl From<TrainConfig> for Table {
     }
 }
 
-/// Returns a flag as it was typed. The values of tables are left out.
+/// Returns a flag as the user typed it, but without the value if it is a table.
 fn flag(key: &str, value: &Value) -> String {
     let name = if key == "environment" { "env".to_owned() } else { key.replace('_', "-") };
     match value {
@@ -271,7 +274,8 @@ fn flag(key: &str, value: &Value) -> String {
     }
 }
 
-/// Refuses a command line that gives one setting two values, because the intended one cannot be known.
+/// Returns an error if the command line has two different values for one setting, because it is unknown which was
+/// intended.
 fn refuse_contradictions(typed: &[(String, Table)]) -> Result<(), ConfigError> {
     let same = |a: &Value, b: &Value| match (a, b) {
         (Value::String(a), Value::String(b)) => names::is_spelled(a, b),
@@ -286,10 +290,10 @@ fn refuse_contradictions(typed: &[(String, Table)]) -> Result<(), ConfigError> {
     Ok(())
 }
 
-/// Returns a table with the usual spelling of its keys. Unknown keys stay as they are.
+/// Returns a table whose keys have their usual spelling. Unknown keys are not changed.
 ///
 /// # Errors
-/// [`ConfigError::Contradiction`] for a key that occurs in two spellings.
+/// [`ConfigError::Contradiction`] if a key occurs in two spellings.
 pub fn spelled(origin: &str, table: Table) -> Result<Table, ConfigError> {
     let known = &*ALL_KEYS;
     let mut spelled = Table::new();
@@ -305,17 +309,17 @@ pub fn spelled(origin: &str, table: Table) -> Result<Table, ConfigError> {
     Ok(spelled)
 }
 
-/// The keys of all algorithms.
+/// The keys of all settings of all algorithms, sorted.
 static ALL_KEYS: LazyLock<Vec<String>> = LazyLock::new(|| {
     let of = |settings| defaults_of(&defaults::defaults_for(settings, Architecture::Rc, Preset::default()));
     let keys: BTreeSet<String> = Settings::all().into_iter().flat_map(of).map(|(key, _)| key).collect();
     keys.into_iter().collect()
 });
 
-/// Every key that a configuration of this kind may have, with its default.
+/// Returns every key that a configuration with this algorithm may have, with its default.
 fn defaults_of(config: &TrainConfig) -> Table {
     let mut defaults = config.full_table();
-    // These are written only if they are not the default.
+    // These settings are written only if they are not the default.
     defaults.insert(PARAMETERS.into(), Value::Table(Table::new()));
     defaults.insert("stop_at_success".into(), 0.0.into());
     if !config.settings.is_random() {
@@ -326,7 +330,7 @@ fn defaults_of(config: &TrainConfig) -> Table {
     defaults
 }
 
-/// The names that the setting `key` may have; `None` if it has other values than names.
+/// Returns the permitted values of the setting `key`, or `None` if its values are not names.
 fn choices(key: &str) -> Option<Vec<&'static str>> {
     Some(match key {
         ALGORITHM => Settings::names().to_vec(),
@@ -340,9 +344,9 @@ fn choices(key: &str) -> Option<Vec<&'static str>> {
     })
 }
 
-/// Merges `layers` over the defaults of the algorithm that they name.
+/// Merges `layers` over the defaults of the algorithm that they name, and checks the result.
 fn resolve(mut layers: Vec<(String, Table)>) -> Result<TrainConfig, ConfigError> {
-    // From here on, names have their usual spelling.
+    // Replaces the values that are names by their usual spelling.
     for (key, value) in layers.iter_mut().flat_map(|(_, table)| table.iter_mut()) {
         let known = choices(key).unwrap_or_default();
         if let Some(place) = value.as_str().and_then(|written| names::find(written, known.iter().copied())) {
@@ -383,7 +387,7 @@ fn resolve(mut layers: Vec<(String, Table)>) -> Result<TrainConfig, ConfigError>
     Ok(config)
 }
 
-/// Parses `key=value` with the value in TOML. A value that is not TOML is a text.
+/// Parses `key=value`, where the value is TOML. A value that is not valid TOML is taken as a string.
 fn parse_set(set: &str) -> Result<Table, ConfigError> {
     let Some((key, value)) = set.split_once('=') else {
         let reason = "expected key=value, e.g. --set learning_rate=3e-4".into();
@@ -395,12 +399,12 @@ fn parse_set(set: &str) -> Result<Table, ConfigError> {
     Ok(Table::from_iter([(key.to_owned(), value)]))
 }
 
-/// A layer for the `config` crate.
+/// Converts a table to a source of the crate `config`.
 fn source(table: &Table) -> File<config::FileSourceString, FileFormat> {
     File::from_str(&toml::to_string(table).unwrap_or_default(), FileFormat::Toml)
 }
 
-/// Whether `key` exists and `value` has the type of its default.
+/// Checks that `key` exists and that `value` has the type of the setting.
 fn check(origin: &str, key: &str, value: &Value, defaults: &Table, algorithm: &'static str) -> Result<(), ConfigError> {
     let Some(default) = defaults.get(key) else {
         let keys = || defaults.keys().map(String::as_str);
@@ -428,7 +432,7 @@ fn check(origin: &str, key: &str, value: &Value, defaults: &Table, algorithm: &'
     Err(ValueError::new(key, value, expected).into())
 }
 
-/// A hint such as "; it is a setting of rl2-a2c, rl2-ppo"; `None` if no algorithm has the setting.
+/// Returns a hint such as "; it is a setting of rl2-a2c, rl2-ppo", or `None` if no algorithm has the setting.
 fn others_setting(key: &str) -> Option<String> {
     let has = |settings: &Settings| {
         defaults_of(&defaults::defaults_for(settings.clone(), Architecture::Rc, Preset::default())).contains_key(key)
@@ -448,7 +452,7 @@ fn check_parameters(parameters: &Table) -> Result<(), ConfigError> {
     Ok(())
 }
 
-/// The index of a value among its permitted names.
+/// Returns the index of a value in the list of permitted names.
 fn choice(key: &str, value: &Value, known: &[&str]) -> Result<usize, ConfigError> {
     known.iter().position(|name| value.as_str() == Some(name)).ok_or_else(|| {
         let hint = names::did_you_mean(value.as_str().unwrap_or_default(), known.iter().copied());

@@ -1,35 +1,36 @@
-//! The observation of a policy.
+//! What a policy observes.
 
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// The observation of a policy.
+/// The quantities that a policy observes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Observe {
-    /// The environment's observation.
+    /// Only the environment's observation.
     #[default]
     State,
-    /// The parameters of the running episode, too. Serves as a reference for policies that have to infer their environment.
+    /// The environment's observation and the parameters of the current episode. It serves as a reference for policies
+    /// that have to infer the parameters.
     Parameters,
 }
 
 impl Observe {
-    /// The names in settings and options.
+    /// The names in settings and on the command line.
     pub const NAMES: [&'static str; 2] = ["state", "parameters"];
 
-    /// Whether this is the default observation.
+    /// Returns whether this is the default.
     pub fn is_default(&self) -> bool {
         *self == Self::default()
     }
 
-    /// Whether parameters are observed.
+    /// Returns whether the policy observes the parameters.
     pub fn sees_parameters(self) -> bool {
         self == Self::Parameters
     }
 
-    /// A note for reports; `None` for the default observation.
+    /// Returns a note for reports; `None` for the default.
     pub fn note(self) -> Option<&'static str> {
         self.sees_parameters().then_some("sees parameters")
     }

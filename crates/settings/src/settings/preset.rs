@@ -1,4 +1,4 @@
-//! Presets of default settings: our recommendation, or the paper's published settings.
+//! Presets of default settings: the recommended ones, or the paper's published ones.
 
 use std::fmt;
 
@@ -7,26 +7,26 @@ use toml::Table;
 
 use super::{Architecture, Base, Ranking, TrainConfig, Wrapper};
 
-/// The preset, which decides about default settings. Every setting in which presets differ can also be given alone.
-/// docs/algorithms.md lists them, with their places in the authors' code.
+/// A preset, which chooses the default settings. Each setting that differs between presets can also be given
+/// individually. docs/algorithms.md lists them, with their locations in the authors' code.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Preset {
     /// The recommended settings.
     #[default]
     Perturb,
-    /// The settings of Packer et al. (2018) as far as they were published: sunblaze-ucb/rl-generalization at 5e05aa1
-    /// with openai/baselines at 2b0283b.
+    /// The settings of Packer et al. (2018), as far as they are published in their code: sunblaze-ucb/rl-generalization
+    /// at 5e05aa1 with openai/baselines at 2b0283b.
     Paper,
 }
 
 impl Preset {
     /// Both presets.
     pub const ALL: [Self; 2] = [Self::Perturb, Self::Paper];
-    /// The presets' names in settings and options.
+    /// The names of the presets in settings and on the command line.
     pub const NAMES: [&'static str; 2] = ["perturb", "paper"];
 
-    /// Whether this is the default preset.
+    /// Returns whether this is the default preset.
     pub fn is_default(&self) -> bool {
         *self == Self::default()
     }
@@ -38,7 +38,7 @@ impl fmt::Display for Preset {
     }
 }
 
-/// Puts the authors' values into the defaults of an algorithm.
+/// Replaces the defaults of an algorithm by the values of the paper's authors.
 pub(super) fn apply_paper(TrainConfig { common, settings }: &mut TrainConfig) {
     common.preset = Preset::Paper;
     common.num_envs = 1;
@@ -47,7 +47,8 @@ pub(super) fn apply_paper(TrainConfig { common, settings }: &mut TrainConfig) {
         Base::A2c(a2c) => (a2c.bootstrap_truncation, a2c.vf_coef) = (false, HALF * a2c.vf_coef),
         Base::Ppo(ppo) => {
             (ppo.bootstrap_truncation, ppo.vf_coef, ppo.n_epochs) = (false, HALF * ppo.vf_coef, 10);
-            // Rollouts are an eighth as long, so a line of the log covers about as many steps. Nothing else depends on it.
+            // Rollouts are an eighth as long as with the preset "perturb", so a line of the log covers about the same
+            // number of steps. Nothing else depends on this setting.
             common.log_interval = if let Wrapper::Epopt(_) = settings.wrapper { 1 } else { 10 };
         }
         Base::Random => {}
@@ -58,11 +59,11 @@ pub(super) fn apply_paper(TrainConfig { common, settings }: &mut TrainConfig) {
     }
 }
 
-/// The authors' value loss is half of the squared error.
+/// Factor by which the authors' value loss differs: it is half of the squared error.
 const HALF: f64 = 0.5;
 
-/// Leaves out settings that are younger than some results if they have the values with which these results were made. The
-/// names of cells depend on the remaining settings, so older cells keep their names.
+/// Removes settings that were introduced later, if they have the values that trainings had before. The names of cells
+/// are derived from the remaining settings, so older cells keep their names.
 pub(super) fn leave_out_younger(table: &mut Table) {
     let is_older = |key: &str, value: &toml::Value| match key {
         "preset" => value.as_str() == Some("perturb"),

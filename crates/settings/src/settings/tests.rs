@@ -101,7 +101,7 @@ fn of(preset: &str, algorithm: &str, architecture: Architecture, sets: &[&str]) 
     load(None, sets, &flags).unwrap()
 }
 
-/// A table in docs/algorithms.md has these settings.
+/// The expected settings are those of a table in docs/algorithms.md.
 #[test]
 fn the_presets_differ_in_named_settings_and_in_nothing_else() {
     for (algorithm, architecture) in pairs() {
@@ -126,11 +126,12 @@ fn the_presets_differ_in_named_settings_and_in_nothing_else() {
     }
 }
 
-/// Checks both columns of that table. The test above checks only which settings differ.
+/// Checks the values in both columns of the table in docs/algorithms.md. The test above checks only which settings
+/// differ.
 #[test]
 fn each_preset_has_the_documents_values() {
     let (ff, rc) = (Architecture::Ff, Architecture::Rc);
-    // Environments of ours; epochs and iterations between two lines of the log, of ours and of the paper's.
+    // Columns: `num_envs` of the preset "perturb", then `n_epochs` and `log_interval` of both presets, "perturb" first.
     for (algorithm, architecture, num_envs, n_epochs, log_interval) in [
         ("a2c", ff, 16, None, [100, 100]),
         ("a2c", rc, 16, None, [100, 100]),
@@ -159,13 +160,13 @@ fn each_preset_has_the_documents_values() {
         let of_epopt = |values: [Value; 2]| algorithm.starts_with("epopt").then_some(values);
         has("rank_by", of_epopt(["raw", "normalized"].map(Value::from)));
         has("update_per_episode", of_epopt([false, architecture == rc].map(Value::from)));
-        // The reference has this penalty and does not apply it.
+        // The authors' code has this penalty but does not apply it.
         let penalty = if algorithm == "rl2-ppo" { 0.2 } else { 0.0 };
         has("kl_coef", n_epochs.map(|_| [penalty, penalty].map(Value::from)));
     }
 }
 
-/// Checks the values that were found on seed 1, and the settings of single algorithms, in both presets.
+/// Checks the values that were tuned on seed 1, and the settings of single algorithms, in both presets.
 #[test]
 fn each_algorithm_has_its_recommended_rates_and_lengths() {
     let (ff, rc) = (Architecture::Ff, Architecture::Rc);
@@ -217,8 +218,8 @@ fn the_command_lines_preset_beats_the_files() {
     assert_eq!(loaded(&format!("{file}\npreset = 'perturb'"), "preset = 'paper'"), loaded(&paper, ""));
 }
 
-/// The names of cells depend on the settings that are written. A setting that was added later is left out if it has its
-/// old value, so that the names stay the same and results of earlier programs are found.
+/// The names of cells depend on the settings that are written. A setting that was introduced later is omitted if it has
+/// the value that trainings had before. So names do not change, and results of earlier programs are found.
 #[test]
 fn default_preset_omits_younger_settings_with_old_values() {
     for (algorithm, architecture) in pairs() {
@@ -287,7 +288,7 @@ fn what_is_observed_is_written_only_where_it_is_not_the_default() {
     assert!(message.contains("observe is \"everything\", but must be one of \"state\", \"parameters\""), "{message}");
 }
 
-/// The paper's ten pairs.
+/// Returns the paper's ten pairs of algorithm and architecture.
 fn pairs() -> impl Iterator<Item = (&'static str, Architecture)> {
     let all = Settings::names().into_iter().flat_map(|name| Architecture::ALL.map(|architecture| (name, architecture)));
     all.filter(|(name, architecture)| {
