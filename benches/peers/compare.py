@@ -1,9 +1,9 @@
-"""Compares the speed of perturb's training with its peers', in alternating rounds with new weights.
+"""Compares the training speed of perturb and other libraries (peers), in alternating rounds with new weights.
 
 compare.py [--rounds N] [--perturb PROGRAM] [--purejaxrl CLONE] [PART OF A CONTEST'S NAME]
 
-Prints environment steps per second, medians of the rounds, and perturb's ratio to each peer. README.md describes what
-is equal in all and what is not.
+Prints environment steps per second, the medians over the rounds, and the ratio of perturb's median to each peer's.
+README.md describes what is equal in all libraries and what is not.
 """
 
 import argparse
@@ -36,7 +36,7 @@ def started(peer: Peer, index: int, purejaxrl: Path) -> Iterator[subprocess.Pope
 
 
 def answer(process: subprocess.Popen[str]) -> str:
-    """Return the next line of a peer."""
+    """Return the next output line of a peer."""
     line = process.stdout.readline()
     if not line:
         raise SystemExit(f"{' '.join(process.args)} ended early; its error is above")
@@ -64,7 +64,7 @@ def compare(index: int, rounds: int, program: Path, purejaxrl: Path) -> None:
 
 
 def report(rates: dict[str, list[float]]) -> None:
-    """Print medians, the ratios of perturb's to the others, and the smallest and largest ratio of a round."""
+    """Print the medians, the ratios of perturb's median to the peers', and the range of the rounds' ratios."""
     ours = rates["perturb"]
     for name, measured in rates.items():
         line = f"  {name}: median {statistics.median(measured):,.0f} steps/s"
@@ -78,7 +78,7 @@ def report(rates: dict[str, list[float]]) -> None:
 def main() -> None:
     """Compare in every selected contest."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("contest", nargs="?", default="", help="a part of its name")
+    parser.add_argument("contest", nargs="?", default="", help="a part of the contest's name")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--perturb", type=Path, default=Path("target/release/perturb"))
     parser.add_argument("--purejaxrl", type=Path, default=Path("target/peers/purejaxrl"))

@@ -1,4 +1,4 @@
-"""The contests: trainings that do the same work in perturb and in its peers."""
+"""The contests: trainings that do the same work in perturb and in other libraries (peers)."""
 
 import json
 import sys
@@ -32,7 +32,7 @@ A2C = {
 
 @dataclass(frozen=True)
 class Peer:
-    """A program of this folder. Its first argument is the index of the contest for which it trains."""
+    """A library to compare with. `script` is a program of this folder that takes the index of a contest."""
 
     name: str
     script: str
@@ -60,28 +60,29 @@ class Contest:
     n_steps: int
     iterations: int
     peers: tuple[Peer, ...]
-    # Minimum mean length of the last episodes, in steps. CartPole's last about 20 without learning. HalfCheetah's end
-    # early in perturb, where it can fall, and never in Gymnasium.
+    # Minimum mean length of the last episodes, in steps, which shows that the training learned. CartPole's episodes
+    # last about 20 steps without learning. HalfCheetah's end early in perturb, where it can fall, and never in
+    # Gymnasium.
     min_length: float
 
     @property
     def name(self) -> str:
-        """Id of the contest, in the form of the other benchmarks' ids."""
+        """The id of the contest, in the format of the other benchmarks' ids."""
         return f"{self.algorithm}_ff/{self.environment}/{self.num_envs}x{self.n_steps}"
 
     @property
     def settings(self) -> dict[str, float]:
-        """Settings of the algorithm."""
+        """The settings of the algorithm."""
         return PPO if self.algorithm == "ppo" else A2C
 
     @property
     def steps(self) -> int:
-        """Number of steps of all environments in one training."""
+        """The number of steps in one training, summed over all environments."""
         return self.iterations * self.num_envs * self.n_steps
 
     @property
     def updates(self) -> int:
-        """Number of optimiser steps in one training."""
+        """The number of optimiser steps in one training."""
         return self.iterations * (PPO["n_epochs"] * PPO["n_minibatches"] if self.algorithm == "ppo" else 1)
 
 
@@ -95,7 +96,7 @@ CONTESTS = [
 
 @dataclass(frozen=True)
 class Training:
-    """Result of a training."""
+    """The result of a training."""
 
     steps: int
     updates: int
@@ -104,7 +105,7 @@ class Training:
     seconds: float
 
     def rate(self, contest: Contest) -> float:
-        """Return environment steps per second. Fail if the training did other work or did not learn."""
+        """Return environment steps per second. Fail if the training did different work or did not learn."""
         assert self.steps == contest.steps, f"{self.steps} steps in place of {contest.steps}"
         assert self.updates == contest.updates, f"{self.updates} updates in place of {contest.updates}"
         assert self.episode_length >= contest.min_length, (
@@ -114,7 +115,7 @@ class Training:
 
 
 def serve(remark: str, train: Callable[[int], Training]) -> None:
-    """Train once for every seed on standard input, so that a peer is imported and compiled once for all rounds."""
+    """Train once for every seed read from standard input. Imports and compilation happen only once for all rounds."""
     print(remark, flush=True)
     for seed in sys.stdin:
         print(json.dumps(asdict(train(int(seed)))), flush=True)

@@ -1,4 +1,4 @@
-"""Trains with perturb as users run it, with a private server, logs and checkpoints."""
+"""Trains with perturb as users do, with its own server process, logs and checkpoints."""
 
 import csv
 import io
@@ -17,7 +17,7 @@ TRAINING_TIMEOUT = 300.0
 
 
 def train(program: Path, contest: Contest, seed: int) -> Training:
-    """Train until progress.csv has the contest's last step, then stops the program."""
+    """Train until progress.csv reaches the contest's number of steps, then stop the program."""
     settings = {"num_envs": contest.num_envs, "n_steps": contest.n_steps, **contest.settings}
     settings["learning_rate_schedule"] = '"constant"'
     with tempfile.TemporaryDirectory() as directory:
@@ -46,12 +46,12 @@ def train(program: Path, contest: Contest, seed: int) -> Training:
 
 
 def wait_for(process: subprocess.Popen[bytes], path: Path, steps: int) -> dict[str, str]:
-    """Return the line of progress.csv at `steps`."""
+    """Wait until progress.csv reaches `steps` steps, and return this line."""
     deadline = time.monotonic() + TRAINING_TIMEOUT
     while time.monotonic() < deadline:
         if process.poll() is not None:
             raise RuntimeError("perturb ended before the contest did")
-        # Polling is rare enough to cost the training nothing. The training measures its own seconds.
+        # Polling is too rare to slow the training down. The training measures its own time.
         time.sleep(0.1)
         if not path.exists():
             continue

@@ -12,7 +12,7 @@ from contests import CONTESTS, PPO, Training, serve
 
 contest = CONTESTS[int(sys.argv[1])]
 sys.path.insert(0, str(Path(sys.argv[2]) / "purejaxrl"))
-# PureJaxRL's wrappers import these large packages for environments that are not Gymnax's.
+# PureJaxRL imports these large packages for environments that are not measured here. Empty modules replace them.
 for name in ("brax", "brax.envs", "brax.envs.wrappers", "brax.envs.wrappers.training", "navix"):
     sys.modules[name] = ModuleType(name)
 sys.modules["brax.envs.wrappers.training"].EpisodeWrapper = None
@@ -49,7 +49,7 @@ compiled = jax.jit(
 
 
 def train(seed: int) -> Training:
-    """Trains once; the first call compiles."""
+    """Train once. The first call also compiles."""
     key = jax.random.PRNGKey(seed)
     start = time.perf_counter()
     outcome = jax.block_until_ready(compiled(key))

@@ -1,6 +1,6 @@
 """Trains with stable-baselines3's A2C or PPO in one process, with the fastest number of PyTorch threads.
 
-The environments are in the same process, which is its default and faster than separate processes.
+The environments run in the same process. This is the library's default, and faster than separate processes.
 with_stable_baselines3.py CONTEST: the contest's index.
 """
 

@@ -1,4 +1,4 @@
-//! Cost of acting on the server, compared with computing the policy's actions alone.
+//! The cost of a policy that acts on the server, compared with computing its actions alone.
 
 use super::{
     Failure, ROUNDS,
@@ -12,20 +12,21 @@ use perturb_policy::{
 };
 use std::time::Instant;
 
-/// Number of environments.
+/// The number of environments.
 const BATCH: usize = 8;
-/// Size of CartPole's observation.
+/// The number of elements in CartPole's observation.
 const OBSERVATION: usize = 4;
 const ACTION: ActionKind = ActionKind::Discrete { n: 2 };
-/// Number of steps in a reply.
+/// The number of steps for each request; a sixteenth of it for a recurrent policy.
 const STEPS: u32 = 1024;
 
-/// Returns the figure's name.
+/// Returns the id of the measurement.
 pub(crate) fn id(lstm: Option<usize>) -> &'static str {
     if lstm.is_some() { "act/CartPole/8/RC" } else { "act/CartPole/8/FF" }
 }
 
-/// Measures a policy of the paper's size in 8 CartPoles.
+/// Measures a policy of the paper's size in 8 CartPole environments. `lstm` is the width of its LSTM, if it is
+/// recurrent.
 pub(crate) async fn measure(lstm: Option<usize>) -> Result<(), Failure> {
     let spec = match lstm {
         None => PolicySpec::feed_forward(OBSERVATION, ACTION),
@@ -72,7 +73,7 @@ fn local_player(spec: &PolicySpec, weights: &[f32]) -> Result<Player, Failure> {
     Ok(player)
 }
 
-/// Acts and observes repeatedly, always the same observation. Returns the seconds.
+/// Runs `steps` steps of the player alone, always with the same observation. Returns the elapsed time in seconds.
 fn compute(player: &mut Player, steps: u32) -> Result<f64, Failure> {
     let outcome = StepOutcome {
         observations: &[0.02; BATCH * OBSERVATION],

@@ -15,10 +15,10 @@ use std::{
     time::Instant,
 };
 
-/// Seed of every session.
+/// The seed of every session.
 pub(crate) const SEED: u64 = 1;
 
-/// A session that steps with random actions.
+/// A session on a server, which is stepped with random actions.
 pub(crate) struct Client {
     spec: &'static EnvironmentSpec,
     batch: usize,
@@ -35,7 +35,7 @@ impl Client {
         Self::with_spec(connection, tasks::catalogue().find(name)?, batch, &[]).await
     }
 
-    /// Opens an environment with these values of disturbances.
+    /// Opens an environment with fixed values of disturbances, given by name.
     pub(crate) async fn open_disturbed(
         socket: &Path,
         name: &str,
@@ -47,7 +47,7 @@ impl Client {
         Self::with_spec(&connection, tasks::catalogue().find(name)?, batch, &fixed).await
     }
 
-    /// Opens an environment that need not be built in.
+    /// Opens any environment, given by its specification.
     #[cfg(feature = "mujoco")]
     pub(crate) async fn open_spec(
         socket: &Path,
@@ -57,7 +57,7 @@ impl Client {
         Self::open_drawn(socket, spec, batch, &[]).await
     }
 
-    /// Opens an environment that need not be built in, with parameters from these distributions.
+    /// Opens any environment, given by its specification, and draws parameters from these distributions.
     #[cfg(feature = "mujoco")]
     pub(crate) async fn open_drawn(
         socket: &Path,
@@ -88,7 +88,7 @@ impl Client {
         Ok(Self { spec, batch, session, noise: Noise(7) })
     }
 
-    /// Takes `trips` steps, each after the reply to the last. Returns the seconds.
+    /// Makes `trips` steps, each after the reply to the previous one. Returns the elapsed time in seconds.
     pub(crate) async fn run(&mut self, trips: usize) -> Result<f64, Failure> {
         let actions: Vec<Bytes> = (0..trips).map(|_| self.actions()).collect();
         let start = Instant::now();
@@ -96,7 +96,8 @@ impl Client {
         Ok(start.elapsed().as_secs_f64())
     }
 
-    /// Steps with these actions and up to `in_flight` requests without a reply. Returns the last observations.
+    /// Steps with these actions, with up to `in_flight` requests at a time that have no reply yet. Returns the last
+    /// observations.
     pub(crate) async fn play(&mut self, actions: &[Bytes], in_flight: usize) -> Result<Bytes, Failure> {
         let mut sent = 0;
         let mut last = Bytes::new();
@@ -113,7 +114,7 @@ impl Client {
         Ok(last)
     }
 
-    /// Lets the server act for `steps` steps. Returns the seconds.
+    /// Makes the server act for `steps` steps. Returns the elapsed time in seconds.
     pub(crate) async fn act(&mut self, request: proto::Act, steps: u32) -> Result<f64, Failure> {
         let start = Instant::now();
         let acted = self.session.ask(request).await?;
@@ -121,14 +122,14 @@ impl Client {
         Ok(start.elapsed().as_secs_f64())
     }
 
-    /// Requests a picture and waits for it.
+    /// Requests a rendered picture and waits for it.
     pub(crate) async fn draw(&mut self) -> Result<(), Failure> {
         let picture = self.session.ask(proto::Render::default()).await?;
         assert_eq!((picture.width, picture.height, picture.pixels.len()), (480, 480, 480 * 480 * 3));
         Ok(())
     }
 
-    /// Returns the random actions of the next step.
+    /// Returns random actions of all environments for the next step, in the protocol's encoding.
     pub(crate) fn actions(&mut self) -> Bytes {
         let mut bytes = Vec::with_capacity(4 * self.batch * width(self.spec));
         for _ in 0..self.batch * width(self.spec) {
@@ -143,7 +144,7 @@ impl Client {
     }
 }
 
-/// Returns the number of values in an action.
+/// Returns the number of elements of an action.
 pub(crate) fn width(spec: &EnvironmentSpec) -> usize {
     match spec.action {
         ActionSpace::Discrete(_) => 1,
@@ -151,7 +152,7 @@ pub(crate) fn width(spec: &EnvironmentSpec) -> usize {
     }
 }
 
-/// A small random number generator for actions. Its quality does not matter here.
+/// A simple random number generator for actions. Its quality does not matter here.
 struct Noise(u64);
 
 impl Noise {
@@ -169,7 +170,7 @@ impl Noise {
 pub(crate) struct ServerProcess {
     child: Child,
     pub(crate) socket: PathBuf,
-    /// Address that the server has printed.
+    /// The address that the server has printed.
     pub(crate) address: String,
     _directory: tempfile::TempDir,
 }
@@ -179,19 +180,19 @@ impl ServerProcess {
         Self::with_flags(workers, &[])
     }
 
-    /// A server with more flags.
+    /// Starts a server with additional flags.
     pub(crate) fn with_flags(workers: usize, flags: &[&Path]) -> Result<Self, Failure> {
         Self::program(env!("CARGO_BIN_EXE_perturb-server").as_ref(), workers, flags)
     }
 
-    /// Starts another program of the server.
+    /// Starts another executable of the server.
     pub(crate) fn program(program: &Path, workers: usize, flags: &[&Path]) -> Result<Self, Failure> {
         let mut command = Command::new(program);
         command.args(["--log", "warn", "--workers", &workers.to_string()]).args(flags);
         Self::start(command, |socket| vec!["--listen".into(), format!("unix:{}", socket.display())])
     }
 
-    /// Starts a server with a TCP port in place of a socket.
+    /// Starts a server that listens on a TCP port instead of a Unix socket.
     pub(crate) fn tcp(workers: usize, flags: &[(&str, &Path)]) -> Result<Self, Failure> {
         let mut command = Command::new(env!("CARGO_BIN_EXE_perturb-server"));
         command.args(["--log", "warn", "--workers", &workers.to_string()]);
@@ -216,12 +217,12 @@ impl ServerProcess {
         Ok(Self { child, socket, address, _directory: directory })
     }
 
-    /// Returns the process's folder in /proc.
+    /// Returns the path of the process's folder in /proc.
     pub(crate) fn proc(&self) -> PathBuf {
         format!("/proc/{}", self.child.id()).into()
     }
 
-    /// Returns the resident memory, in bytes.
+    /// Returns the resident memory of the process, in bytes.
     pub(crate) fn resident(&self) -> Result<f64, Failure> {
         let status = fs::read_to_string(self.proc().join("status"))?;
         let line = status.lines().find(|line| line.starts_with("VmRSS:")).ok_or("no VmRSS")?;

@@ -1,6 +1,6 @@
-//! Compares this server with another program of it, for instance that of the commit before:
-//! `cargo bench --bench serving -- compare PROGRAM`. Both serve the same steps by turns, in short rounds, so that a busy
-//! neighbour disturbs both; the medians over pairs of rounds are printed. Both must give the same observations.
+//! Compares this server with another executable of it, for example one of the previous commit: `cargo bench --bench
+//! serving -- compare PROGRAM`. Both serve the same steps in alternating short rounds, so that other load affects both.
+//! The output has medians over pairs of rounds. Both must give the same observations.
 
 use crate::{
     Failure,
@@ -10,18 +10,19 @@ use crate::{
 use bytes::Bytes;
 use std::{path::Path, time::Instant};
 
-/// Pairs of servers for each figure. Which of two equal servers is faster depends on where the system places their
-/// threads, so each pair is started anew, and the other program first in every second pair.
+/// Number of pairs of servers for each measurement. Which of two equal servers is faster depends on where the system
+/// places their threads. Therefore each pair is a new start, and the other program starts first in every second pair.
 const PAIRS: usize = 6;
-/// Rounds with each pair.
+/// Number of rounds with each pair.
 const ROUNDS: usize = 7;
-/// Environment steps of a round, and workers: CartPole takes less than a microsecond.
+/// Environment steps in a round, and the number of workers. CartPole has more steps, because one takes less than a
+/// microsecond.
 const CART_POLE: (usize, usize) = (1 << 18, 1);
 const HOPPER: (usize, usize) = (1 << 13, 2);
-/// Round trips of a round with one environment.
+/// Number of round trips in a round with one environment.
 const TRIPS: usize = 2000;
 
-/// Two sessions of the same environments: with this server, and with the other program.
+/// Two sessions with the same environments: on this server, and on the other program.
 struct Pair {
     clients: [Client; 2],
     _servers: [ServerProcess; 2],
@@ -41,7 +42,7 @@ impl Pair {
     }
 }
 
-/// Prints how much faster this server is than the other program.
+/// Measures both programs, and prints the ratios of their speeds.
 pub(crate) async fn compared(other: &Path) -> Result<(), Failure> {
     round_trip(other).await?;
     for (name, batch, (steps, workers)) in
@@ -55,7 +56,7 @@ pub(crate) async fn compared(other: &Path) -> Result<(), Failure> {
                     let mut rounds = [const { (0.0, Bytes::new()) }; 2];
                     let actions: Vec<Bytes> = (0..steps / batch).map(|_| pair.clients[0].actions()).collect();
                     for turn in 0..2 {
-                        let which = (round + turn) % 2; // the first is at a disadvantage
+                        let which = (round + turn) % 2; // alternates the order, because the first one is slower
                         let start = Instant::now();
                         let last = pair.clients[which].play(&actions, in_flight).await?;
                         rounds[which] = (start.elapsed().as_secs_f64(), last);
@@ -72,7 +73,7 @@ pub(crate) async fn compared(other: &Path) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The round trip of one environment.
+/// Compares the round-trip times of one environment.
 async fn round_trip(other: &Path) -> Result<(), Failure> {
     let mut p50s = [const { Vec::new() }; 2];
     for number in 0..PAIRS {

@@ -1,4 +1,4 @@
-//! Cost of disturbances: the steps of a batch with a delay and noise, and without.
+//! The cost of disturbances: the steps of a batch with delays and noise, compared with the same batch without.
 
 use super::{
     Failure, ROUNDS,
@@ -8,17 +8,17 @@ use super::{
 use perturb::env::ActionSpace;
 use perturb::tasks;
 
-/// Environments of each batch.
+/// The number of environments in a batch.
 const BATCH: usize = 64;
-/// Simulated time of a round, roughly, in µs.
+/// The approximate computing time of a round's steps, in µs.
 const ROUND_US: f64 = 100_000.0;
 
-/// The figure's name.
+/// Returns the id of the measurement.
 pub(crate) fn id(name: &str) -> String {
     format!("disturbed/{name}/{BATCH}")
 }
 
-/// Measures an environment with late and noisy observations and late actions, noisy if they are numbers.
+/// Measures an environment with delayed and noisy observations and delayed actions. Continuous actions are also noisy.
 pub(crate) async fn measure(name: &str) -> Result<(), Failure> {
     let spec = tasks::catalogue().find(name)?;
     let all = [("action_delay", 2.0), ("sensor_delay", 1.0), ("sensor_noise", 0.05), ("action_noise", 0.05)];
@@ -31,7 +31,7 @@ pub(crate) async fn measure(name: &str) -> Result<(), Failure> {
     for round in 0..ROUNDS {
         let mut seconds = [0.0; 2];
         for turn in 0..2 {
-            let which = (round + turn) % 2; // the first is at a disadvantage
+            let which = (round + turn) % 2; // alternates the order, because the first one is slower
             let client = if which == 0 { &mut plain } else { &mut disturbed };
             seconds[which] = client.run(trips).await?;
         }

@@ -1,4 +1,4 @@
-//! An echo server, for the cost of a round trip without a real server.
+//! An echo server, which measures the cost of a round trip without environments.
 
 use super::Failure;
 use bytes::Bytes;
@@ -13,7 +13,7 @@ use tokio::net::UnixListener;
 use tokio_stream::{Stream, StreamExt, wrappers::UnixListenerStream};
 use tonic::{Request, Response, Status, Streaming, transport::Server};
 
-/// Answers every step with a prepared reply of the same size as the server's.
+/// Answers every step with a prepared reply that has the size of a real reply.
 struct Echo;
 
 #[tonic::async_trait]
@@ -49,7 +49,7 @@ impl Perturb for Echo {
     }
 }
 
-/// Serves at the socket until the process is killed.
+/// Serves on the Unix socket until the process is killed.
 pub(crate) async fn serve(socket: &Path) -> Result<(), Failure> {
     let listener = UnixListener::bind(socket)?;
     println!("listening");

@@ -1,4 +1,4 @@
-//! Cost of encryption: the steps of a batch over TCP, with TLS and without.
+//! The cost of encryption: the steps of a batch over TCP with TLS, compared with TCP alone.
 
 use super::{
     Failure, ROUNDS,
@@ -9,9 +9,9 @@ use perturb_faults::certificates::{Authority, CertificateFiles};
 use perturb_protocol::{Address, Connection, Timeouts, credentials::Credentials};
 use std::path::Path;
 
-/// Measures CartPole in batches of `batch`.
+/// Measures CartPole with `batch` environments.
 pub(crate) async fn measure(batch: usize) -> Result<(), Failure> {
-    /// Number of steps of a round.
+    /// The number of steps in a round.
     const TRIPS: usize = 400;
     let directory = tempfile::tempdir()?;
     let CertificateFiles { cert, key } = certificates(directory.path());
@@ -35,7 +35,7 @@ pub(crate) async fn measure(batch: usize) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Makes the certificate of a server on this machine.
+/// Creates a certificate for a server on this machine.
 pub(crate) fn certificates(directory: &Path) -> CertificateFiles {
     Authority::new("bench").issue(directory, "server", &["127.0.0.1"], 2200)
 }

@@ -1,13 +1,15 @@
-//! The cost of tasks that are folders, beside the built-in Hopper and beside MuJoCo's functions alone.
+//! The cost of tasks that are loaded from folders, compared with the built-in Hopper and with MuJoCo's functions alone.
 //!
-//! - `step/folder/Hopper`: the built-in Hopper's model as a folder, with terms like its own, against the built-in one:
-//!   steps a second of 64 environments on one server of two workers.
-//! - `step/folder/Walker2d`, `Ant` and `Humanoid`: Gymnasium's tasks, 64 environments, the server's CPU time against a bare
-//!   loop that calls the same MuJoCo functions as often: mj_step, and mj_rnePostConstraint where contact forces are read.
-//! - `step/folder/lengths`: Walker2d on R, 64 environments, with a length that is drawn at each reset, against the same
-//!   length fixed; and the memory of an environment.
+//! - `step/folder/Hopper`: the built-in Hopper's model as a folder with similar reward terms, compared with the
+//!   built-in task. Measures the steps per second of 64 environments, on one server with two workers.
+//! - `step/folder/Walker2d`, `Ant` and `Humanoid`: Gymnasium's tasks with 64 environments. Compares the server's CPU
+//!   time with a bare loop that makes the same number of calls to MuJoCo's functions: mj_step, and mj_rnePostConstraint
+//!   if contact forces are read.
+//! - `step/folder/lengths`: Walker2d on R with 64 environments. Compares a length that is drawn at each reset with a
+//!   fixed length, also in memory for each environment.
 //!
-//!   All but the first need Gymnasium's models; `PERTURB_TEST_GYMNASIUM_ASSETS` names their folder.
+//! All measurements except the first need Gymnasium's models, in the folder that the environment variable
+//! `PERTURB_TEST_GYMNASIUM_ASSETS` names.
 
 use crate::{
     Failure,
@@ -26,14 +28,15 @@ use tempfile::TempDir;
 
 const BATCH: usize = 64;
 const ROUNDS: usize = 11;
-/// Environment steps of a round, by the estimated cost of one: Humanoid's round would take three seconds otherwise.
+/// Returns the number of environment steps in a round, by the estimated cost of one step. With a fixed number,
+/// Humanoid's round would take three seconds.
 fn steps_of_a_round(spec: &EnvironmentSpec) -> usize {
     const ROUND_US: f64 = 500_000.0;
     ((ROUND_US / spec.step_cost) as usize / BATCH).clamp(16, 128) * BATCH
 }
 
-/// The built-in Hopper's task, as far as a folder can say it: roboschool's terms, and its observation without the
-/// clipping of single entries.
+/// The built-in Hopper's task as a `task.toml`, as far as the format allows: roboschool's reward terms, and the
+/// observation without the clipping of single elements.
 const HOPPER: &str = r#"
 format = 1
 name = "FolderHopper"
@@ -66,11 +69,11 @@ actions = { range = [-1.0, 1.0] }
 reset = { joints = [{ joint = ["thigh", "leg", "foot"], position = { uniform = 0.1 } }] }
 "#;
 
-/// Gymnasium's tasks that are measured: the name, the task's file, and whether contact forces are read.
+/// Gymnasium's tasks that are measured: the name, the name of the task file, and whether contact forces are read.
 const GYMNASIUM: [(&str, &str, bool); 3] =
     [("Walker2d", "walker2d_v5", false), ("Ant", "ant_v5", true), ("Humanoid", "humanoid_v5", true)];
 
-/// The identifiers of the figures.
+/// Returns the ids of all measurements.
 pub(crate) fn ids() -> impl Iterator<Item = String> {
     std::iter::once("Hopper")
         .chain(GYMNASIUM.map(|(name, ..)| name))
@@ -78,7 +81,7 @@ pub(crate) fn ids() -> impl Iterator<Item = String> {
         .map(|name| format!("step/folder/{name}"))
 }
 
-/// Prints the figures of one identifier.
+/// Makes the measurement `id` and prints its results.
 pub(crate) async fn served(id: &str) -> Result<(), Failure> {
     let name = id.rsplit('/').next().unwrap_or_default();
     if name == "Hopper" {
@@ -109,7 +112,7 @@ pub(crate) async fn served(id: &str) -> Result<(), Failure> {
     Ok(())
 }
 
-/// A length of Walker2d.
+/// A parameter for Walker2d's task file: the length of its thighs.
 const LENGTH: &str = r#"
 [[parameter]]
 name = "thigh_length"
@@ -212,10 +215,10 @@ async fn beside_mujoco(id: &str, path: &Path, mjcf: &str, external_forces: bool)
     Ok(())
 }
 
-/// An environment's state before the round, and the steps after which an episode began, with its state.
+/// The state of an environment before a round, and its state after each step of the round at which a new episode began.
 type RoundStart = (Vec<f64>, Vec<(usize, Vec<f64>)>);
 
-/// Environments of the same seed in this process, and their physics alone.
+/// Environments with the same seed as the server's, in this process, and a simulation that repeats their physics alone.
 struct Bare {
     spec: &'static EnvironmentSpec,
     episodes: Vec<Episodes>,
@@ -241,11 +244,11 @@ impl Bare {
 
     fn state(&self, i: usize) -> Vec<f64> {
         let n = self.simulation.model().n_state();
-        // The flag of divergence stands before the state of MuJoCo.
+        // The first element is the flag of divergence. MuJoCo's state follows.
         self.episodes[i].physics_state()[1..=n].to_vec()
     }
 
-    /// Steps the environments; returns the CPU time, s.
+    /// Steps the environments without a server. Returns the CPU time, in s.
     fn environments(&mut self, actions: &[Bytes]) -> Result<f64, Failure> {
         let n = width(self.spec);
         let mut terms = vec![0.0; self.spec.reward_terms.len()];
@@ -268,7 +271,8 @@ impl Bare {
         Ok(thread_cpu(this)? - start - apart)
     }
 
-    /// The physics of the last [`Bare::environments`], one environment after the other; returns the CPU time, s.
+    /// Repeats only the physics of the last call of [`Bare::environments`], one environment after the other. Returns
+    /// the CPU time, in s.
     fn run(&mut self, actions: &[Bytes]) -> Result<f64, Failure> {
         let n = width(self.spec);
         let this = Path::new("/proc/thread-self");

@@ -1,17 +1,19 @@
-//! Cost of serving. Each figure has a reference from the same run:
+//! The cost of serving. Each result has a reference that is measured in the same run:
 //!
-//! - CartPole, batch 256, over a Unix socket, against a plain tonic echo server with the same payload;
-//! - Hopper and HalfCheetah, batches of 64, 256 and 1024, two workers, against MuJoCo's timesteps alone ([`robots`]);
-//! - tasks that are folders, against the built-in Hopper and against MuJoCo's functions alone ([`folder`]);
-//! - CartPole over TCP with TLS, against without ([`encrypted`]);
-//! - many sessions at a time, with several transport threads, if asked for by name ([`sessions`]);
-//! - the round trip of one environment, and the memory of one Hopper;
-//! - CartPole, 8 environments in which the server acts with a policy, against computing the actions alone ([`acting`]);
-//! - each environment, a batch of 64, with late and noisy actions and observations, against without ([`disturbed`]);
-//! - this server against another program of it ([`compare`]);
-//! - pictures of each environment, 480 × 480 pixels, and the server's memory growth by them.
+//! - CartPole, batch of 256, over a Unix socket; reference: a plain tonic echo server with replies of the same size;
+//! - Hopper and HalfCheetah, batches of 64, 256 and 1024, two workers; reference: only MuJoCo's timesteps ([`robots`]);
+//! - tasks that are loaded from folders; reference: the built-in Hopper, and only MuJoCo's functions ([`folder`]);
+//! - CartPole over TCP with TLS; reference: without TLS ([`encrypted`]);
+//! - many concurrent sessions with several transport threads, only if requested by name ([`sessions`]);
+//! - the round-trip time of one environment, and the memory of one Hopper;
+//! - CartPole, 8 environments in which the server acts with a policy; reference: only computing the actions
+//!   ([`acting`]);
+//! - each environment, batch of 64, with delayed and noisy actions and observations; reference: without
+//!   ([`disturbed`]);
+//! - this server, compared with another executable of it ([`compare`]);
+//! - rendered pictures of each environment, 480 × 480 pixels, and the growth of the server's memory.
 //!
-//! Servers are separate processes: `perturb-server`, and this program with the argument `echo` and a socket.
+//! Servers are separate processes: `perturb-server`, or this program with the arguments `echo` and a socket path.
 
 mod acting;
 mod client;
@@ -31,8 +33,8 @@ use std::{env, time::Instant};
 
 type Failure = Box<dyn std::error::Error>;
 
-/// Number of rounds. Reference and server alternate in short rounds, so that other load disturbs both. Medians are
-/// printed.
+/// Number of rounds. Reference and server are measured in alternating short rounds, so that other load affects both.
+/// The output has medians over the rounds.
 const ROUNDS: usize = 25;
 
 fn main() -> Result<(), Failure> {
@@ -47,7 +49,7 @@ fn main() -> Result<(), Failure> {
         let program = arguments.get(place + 1).ok_or("compare needs the path of another perturb-server")?;
         return runtime.block_on(compare::compared(program.as_ref()));
     }
-    // Cargo adds --bench; any other argument selects figures by a part of their name.
+    // Cargo passes --bench. Any other argument selects measurements whose id contains it.
     let filter = arguments.iter().skip(1).find(|argument| !argument.starts_with('-'));
     let wanted = |id: &str| filter.is_none_or(|filter| id.contains(filter.as_str()));
     if filter.is_some() {
@@ -104,7 +106,7 @@ fn main() -> Result<(), Failure> {
     })
 }
 
-/// Measures CartPole in batches of 256 against the echo server.
+/// Measures CartPole with 256 environments, and the echo server.
 async fn classic() -> Result<(), Failure> {
     const BATCH: usize = 256;
     const TRIPS: usize = 800;
@@ -125,7 +127,7 @@ async fn classic() -> Result<(), Failure> {
     Ok(())
 }
 
-/// Measures the round trip of one environment.
+/// Measures the round-trip time of one environment.
 async fn round_trip() -> Result<(), Failure> {
     const TRIPS: usize = 20_000;
     let server = ServerProcess::server(1)?;
@@ -141,7 +143,7 @@ async fn round_trip() -> Result<(), Failure> {
     Ok(())
 }
 
-/// Measures the resident memory of a Hopper, after steps that use all its pages.
+/// Measures the resident memory of one Hopper, after enough steps to touch all its pages.
 async fn memory() -> Result<(), Failure> {
     const BATCH: usize = 2000;
     if tasks::catalogue().find("Hopper").is_err() {
@@ -157,14 +159,14 @@ async fn memory() -> Result<(), Failure> {
     Ok(())
 }
 
-/// Measures pictures of one environment, one request at a time.
+/// Measures rendered pictures of one environment, with one request at a time.
 async fn pictures(name: &'static str) -> Result<(), Failure> {
     const PICTURES: usize = 10;
     let server = ServerProcess::server(1)?;
     let mut client = Client::open(&server.socket, name, 1).await?;
     client.run(10).await?;
     let before = server.resident()?;
-    // The first picture loads the driver.
+    // The first picture loads the graphics driver.
     client.draw().await?;
     let mut rates = Vec::new();
     for _ in 0..ROUNDS {

@@ -1,12 +1,12 @@
-//! Cost of serving Hopper and HalfCheetah in addition to physics.
+//! The cost of serving Hopper and HalfCheetah, in addition to their physics.
 //!
-//! The figures are the server's CPU time for each environment step and its steps per second. The reference is the bare
+//! The results are the server's CPU time for each environment step, and its steps per second. The reference is a bare
 //! loop: MuJoCo's timesteps (mj_step) of the same environments with the same actions, one environment after the other.
-//! The environments' own timesteps are shorter, because they skip a search and visit bodies in one pass.
+//! The environments' own timesteps take less time, because they skip a search and visit bodies in one pass.
 //!
-//! A server of two workers is measured in a closed loop, where each request waits for the previous reply, and with two
-//! requests in flight. Server and bare loops alternate in rounds of the same steps. The medians over the rounds are
-//! printed.
+//! A server with two workers is measured in a closed loop, where each request waits for the previous reply, and with
+//! two requests in flight. Server and bare loops are measured in alternating rounds with the same steps. The output has
+//! medians over the rounds.
 
 use crate::{
     Failure,
@@ -22,17 +22,17 @@ use perturb::{
 use perturb_mujoco::Simulation;
 use std::{fs, ops::Range, path::Path, thread, time::Instant};
 
-/// Number of rounds.
+/// The number of rounds.
 const ROUNDS: usize = 15;
-/// Environment steps of a round.
+/// The number of environment steps in a round.
 const STEPS: usize = 1 << 14;
-/// MuJoCo's timesteps of an environment step.
+/// The number of MuJoCo's timesteps in an environment step.
 const N_SUBSTEPS: usize = 4;
 
-/// A function that makes one of the robots.
+/// A function that creates one of the robots.
 pub(crate) type MakeRobot = fn() -> Result<Walker, perturb::env::Error>;
 
-/// Prints the figures of one robot and batch size.
+/// Measures one robot with one batch size and prints the results.
 pub(crate) async fn measure(spec: &'static EnvironmentSpec, make: MakeRobot, batch: usize) -> Result<(), Failure> {
     let server = ServerProcess::server(2)?;
     let mut client = Client::open(&server.socket, spec.name, batch).await?;
@@ -82,34 +82,34 @@ pub(crate) async fn measure(spec: &'static EnvironmentSpec, make: MakeRobot, bat
     Ok(())
 }
 
-/// Costs of the same steps in each way.
+/// The costs of the same steps, computed in different ways.
 struct RoundCosts {
     bare: Cost,
     /// Two bare loops at the same time, with half of the environments each.
     at_once: Cost,
-    /// The environments one after the other, without a server.
+    /// The complete environments one after the other, in this process without a server.
     in_process: Cost,
     served: Cost,
 }
 
-/// CPU time and elapsed time, in seconds.
+/// CPU time and elapsed time, in s.
 struct Cost {
     cpu: f64,
     wall: f64,
 }
 
-/// Returns the CPU seconds of a process, given by its folder in /proc.
+/// Returns the CPU time of a process in seconds. `process` is its folder in /proc.
 pub(crate) fn process_cpu(process: &Path) -> Result<f64, Failure> {
     fs::read_dir(process.join("task"))?.map(|thread| thread_cpu(&thread?.path())).sum()
 }
 
-/// Returns the CPU seconds of a thread, given by its folder in /proc.
+/// Returns the CPU time of a thread in seconds. `thread` is its folder in /proc.
 pub(crate) fn thread_cpu(thread: &Path) -> Result<f64, Failure> {
     let nanoseconds = fs::read_to_string(thread.join("schedstat"))?;
     Ok(nanoseconds.split(' ').next().ok_or("no schedstat")?.parse::<f64>()? * 1e-9)
 }
 
-/// Measures the cost of `work` on this thread.
+/// Runs `work` on this thread and measures its cost.
 fn timed(work: impl FnOnce() -> Result<(), Failure>) -> Result<Cost, Failure> {
     let this = Path::new("/proc/thread-self");
     let start = Instant::now();
@@ -138,18 +138,18 @@ fn at_once(halves: &mut [LocalEnvironments; 2], actions: &[Bytes]) -> Result<Cos
     Ok(Cost { cpu: a? + b?, wall: start.elapsed().as_secs_f64() })
 }
 
-/// Some environments of a batch in this process, with their bare loop.
+/// Some of a batch's environments in this process, and the simulation of their bare loop.
 struct LocalEnvironments {
     spec: &'static EnvironmentSpec,
     first: usize,
     environments: Vec<Episodes>,
     observations: Vec<f32>,
-    /// Simulation of the bare loop.
+    /// The simulation of the bare loop.
     simulation: Simulation,
-    /// State of each environment before the round, and after it.
+    /// The states of each environment before and after the round.
     states: Vec<(Vec<f64>, Vec<f64>)>,
     initial: Vec<f64>,
-    /// Episodes that began in the round: environment, step and state.
+    /// The episodes that began in the round: index of the environment, step, and initial state.
     begun: Vec<(usize, usize, Vec<f64>)>,
 }
 
@@ -181,14 +181,14 @@ impl LocalEnvironments {
         })
     }
 
-    /// Returns the action of an environment at a step.
+    /// Returns the action of an environment in step `trip`.
     fn action<'a>(&self, actions: &'a [Bytes], environment: usize, trip: usize) -> impl Iterator<Item = f32> + use<'a> {
         let width = width(self.spec);
         let own = &actions[trip][4 * width * (self.first + environment)..][..4 * width];
         own.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes))
     }
 
-    /// Steps the environments, one after the other.
+    /// Steps the complete environments, one after the other.
     fn step(&mut self, actions: &[Bytes]) -> Result<(), Failure> {
         let mut terms = vec![0.0; self.spec.reward_terms.len()];
         let n = self.spec.observation.len();
@@ -209,7 +209,7 @@ impl LocalEnvironments {
         Ok(())
     }
 
-    /// Runs MuJoCo's timesteps of the preceding [`Self::step`].
+    /// Runs only MuJoCo's timesteps for the steps of the preceding [`Self::step`].
     fn bare(&mut self, actions: &[Bytes]) -> Result<(), Failure> {
         let power = self.spec.parameters[0].default;
         let mut begun = self.begun.iter().peekable();
@@ -230,8 +230,8 @@ impl LocalEnvironments {
         Ok(())
     }
 
-    /// Checks that environments, bare loop and server, which sent the observations `seen`, agree. Then begins the next
-    /// round.
+    /// Checks that the environments, the bare loop and the server agree. `seen` are the server's observations. Then
+    /// prepares the next round.
     fn check(&mut self, seen: &[u8]) {
         let own: Vec<u8> = self.observations.iter().flat_map(|value| value.to_le_bytes()).collect();
         assert!(
@@ -246,7 +246,7 @@ impl LocalEnvironments {
     }
 }
 
-/// Returns the state of an environment at the start of an episode, at rest.
+/// Returns MuJoCo's state of an environment at the start of an episode, with all velocities 0.
 fn started(initial: &[f64], environment: &Episodes) -> Vec<f64> {
     let mut state = initial.to_vec();
     let qpos = positions(environment);

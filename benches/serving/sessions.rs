@@ -1,6 +1,7 @@
-//! Many sessions at a time, each on a connection of its own and with one request at a time, over TCP with TLS and
-//! without: `cargo bench --bench serving -- sessions`, or a part of an id such as `sessions/CartPole/plain`. Clients run
-//! on the same machine, on as many threads as it has cores, and take more of them than the server's transport does.
+//! Many concurrent sessions, each on its own connection and with one request at a time, over TCP with and without TLS.
+//! Run `cargo bench --bench serving -- sessions`, or give a part of an id such as `sessions/CartPole/plain`. The
+//! clients run on the same machine, on as many threads as it has cores, and take more CPU time than the server's
+//! transport threads.
 
 use super::{
     Failure,
@@ -19,16 +20,16 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Environments of a session.
+/// The number of environments in a session.
 const BATCH: usize = 16;
 const SESSIONS: [usize; 5] = [1, 4, 16, 64, 256];
 const TRANSPORT_THREADS: [usize; 3] = [1, 2, 4];
-/// The time that clients step before it counts.
+/// The time at the start that is not measured.
 const WARM_UP: Duration = Duration::from_millis(500);
-/// The time that counts.
+/// The time that is measured.
 const MEASURED: Duration = Duration::from_secs(2);
 
-/// Measures each combination whose id is wanted.
+/// Measures each combination for whose id `wanted` returns true.
 pub(crate) fn measure(wanted: impl Fn(&str) -> bool) -> Result<(), Failure> {
     let directory = tempfile::tempdir()?;
     let files = certificates(directory.path());
@@ -49,7 +50,8 @@ pub(crate) fn measure(wanted: impl Fn(&str) -> bool) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Measures so many sessions with a server that has so many transport threads. Returns a line.
+/// Measures `sessions` concurrent sessions, with a server that has `threads` transport threads. Returns a line of
+/// output.
 fn served(name: &str, tls: Option<&CertificateFiles>, threads: usize, sessions: usize) -> Result<String, Failure> {
     let cores = thread::available_parallelism().map_or(1, usize::from);
     let threads = threads.to_string();
@@ -89,7 +91,7 @@ fn served(name: &str, tls: Option<&CertificateFiles>, threads: usize, sessions: 
     ))
 }
 
-/// Opens sessions and steps with all of them at a time. Returns the times of the requests that count, µs.
+/// Opens sessions and steps all of them concurrently. Returns the durations of the measured requests, in µs.
 fn drive(
     address: &str,
     certificate: Option<&Path>,
@@ -105,7 +107,7 @@ fn drive(
             Ok::<_, Failure>((Client::on(&connection, name, BATCH).await?, connection))
         }));
         let opened = opened.await;
-        begin.wait(); // also after an error, which others would wait for
+        begin.wait(); // even after an error, because other threads wait here
         let mut clients = opened?;
         let from = Instant::now() + WARM_UP;
         let times = try_join_all(clients.iter_mut().map(|(client, _)| async move {
@@ -122,7 +124,8 @@ fn drive(
     })
 }
 
-/// The processor time of a server's transport threads: its first thread, and those with the name.
+/// Returns the CPU time of a server's transport threads, in seconds. These are its first thread and all threads whose
+/// name begins with `transport-`.
 fn transport_seconds(server: &ServerProcess) -> Result<f64, Failure> {
     let mut nanos = 0;
     for task in fs::read_dir(server.proc().join("task"))? {

@@ -1,21 +1,22 @@
-//! Generates the Rust code of the protocols from `proto`, and the bindings of MuJoCo from its headers, below `OUT_DIR` at the
-//! paths that the files have in the repository.
+//! Generates the Rust code of the protocols from `proto`, and the bindings of MuJoCo from its headers. Writes them
+//! below `OUT_DIR`, with the same paths as in the repository.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::{env, fs, panic};
 
-/// The .proto files that have services, and those whose messages are sent inside `google.protobuf.Any`, below `proto`.
+/// The .proto files with services, and those with messages that are sent inside `google.protobuf.Any`. Paths are
+/// relative to `proto`.
 const PROTOCOLS: [&str; 3] =
     ["perturb/v1/perturb.proto", "dm_env_rpc/v1/dm_env_rpc.proto", "dm_env_rpc/v1/extensions/properties.proto"];
-/// Messages of `perturb.v1` that the JSON catalogue contains.
+/// Messages of `perturb.v1` that the JSON catalogue contains, and that need a serialiser.
 const SERIALIZED: [&str; 3] = ["Channel", "RewardTerm", "Quantity"];
 
 fn main() -> Result<(), Box<dyn Error>> {
     let root = Path::new("../..");
     let out = PathBuf::from(env::var("OUT_DIR")?);
     if out.join("crates").exists() {
-        fs::remove_dir_all(out.join("crates"))?; // files of an earlier build that are generated no more
+        fs::remove_dir_all(out.join("crates"))?; // also deletes files that are no longer generated
     }
     let protocols = out.join("crates/protocol/src/generated");
     fs::create_dir_all(&protocols)?;
@@ -25,13 +26,13 @@ fn main() -> Result<(), Box<dyn Error>> {
     generate_bindings(root, &mujoco.join("bindings.rs"))
 }
 
-/// Generates messages, clients and servers, one file for each package, and the descriptors for server reflection.
+/// Generates messages, clients and servers, with one file for each package, and the descriptors for server reflection.
 fn generate_protocols(proto: &Path, out: &Path) -> Result<(), Box<dyn Error>> {
     println!("cargo:rerun-if-changed={}", proto.display());
     let mut compiler = protox::Compiler::new([proto])?;
     compiler.include_source_info(true).include_imports(true).open_files(PROTOCOLS)?;
     fs::write(out.join("descriptors.bin"), compiler.encode_file_descriptor_set())?;
-    // Messages with ordered maps are encoded to the same bytes each time.
+    // Ordered maps make the encoding of messages deterministic.
     let mut builder = tonic_prost_build::configure().bytes(".").btree_map(".dm_env_rpc");
     for message in SERIALIZED {
         builder = builder.type_attribute(format!(".perturb.v1.{message}"), "#[derive(serde::Serialize)]");
@@ -39,7 +40,7 @@ fn generate_protocols(proto: &Path, out: &Path) -> Result<(), Box<dyn Error>> {
     Ok(builder.out_dir(out).compile_fds(compiler.file_descriptor_set())?)
 }
 
-/// Generates the declarations of the functions and types of MuJoCo that `crates/mujoco` uses.
+/// Generates declarations of the MuJoCo functions and types that `crates/mujoco` uses.
 fn generate_bindings(root: &Path, out: &Path) -> Result<(), Box<dyn Error>> {
     let shim = root.join("crates/mujoco/src/shim.h");
     let prefix = PathBuf::from(env::var_os("MUJOCO_PREFIX").unwrap_or_else(|| "/usr".into()));
@@ -56,7 +57,7 @@ fn generate_bindings(root: &Path, out: &Path) -> Result<(), Box<dyn Error>> {
         .allowlist_var("mjVERSION_HEADER|mjNGAIN|mjNBIAS")
         .generate_comments(false)
         .rustfmt_configuration_file(Some(root.join("rustfmt.toml").canonicalize()?));
-    // bindgen panics where libclang is missing. The hook keeps its backtrace out of the message.
+    // bindgen panics if libclang is missing. The hook suppresses the backtrace.
     panic::set_hook(Box::new(|_| {}));
     let generated = panic::catch_unwind(panic::AssertUnwindSafe(|| builder.generate()));
     drop(panic::take_hook());

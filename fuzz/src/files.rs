@@ -13,12 +13,12 @@ use sha2::{Digest, Sha256};
 
 use crate::seeds::{stored_policy, stored_records};
 
-/// Maximum size of an experiment file. Larger ones would only take more time.
+/// Maximum size of an experiment file, in bytes. Larger files would only take more time.
 const MAX_PLAN_BYTES: usize = 4096;
 
-/// Loads a checkpoint: two bytes for the length of its `checkpoint.json`, the file, and the weights.
+/// Loads a checkpoint. The input is the length of `checkpoint.json` in two bytes, this file, and the weights.
 ///
-/// Checksums are corrected, as an attacker would do. A checkpoint that loads is played.
+/// Corrects the checksums, as an attacker would do. If the checkpoint loads, creates a player from it.
 pub fn checkpoints(data: &[u8]) {
     let Some((length, rest)) = data.split_first_chunk::<2>() else { return };
     let (document, weights) = rest.split_at(usize::from(u16::from_le_bytes(*length)).min(rest.len()));
@@ -39,7 +39,7 @@ pub fn checkpoints(data: &[u8]) {
     }
 }
 
-/// Reads recorded episodes, and computes the success rates if that succeeds.
+/// Reads recorded episodes. If they are valid, computes the success rates.
 pub fn records(data: &[u8]) {
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("episodes.parquet");
@@ -51,8 +51,7 @@ pub fn records(data: &[u8]) {
     }
 }
 
-/// Reads the lines of a ledger, whose digests are added. If that succeeds, it checks a stored policy against the
-/// ledger.
+/// Reads the lines of a ledger, after adding valid digests. If the ledger is valid, audits a stored policy with it.
 pub fn ledgers(data: &[u8]) {
     static POLICY_WITH_RECORDS: LazyLock<(Checkpoint, Records)> = LazyLock::new(|| (stored_policy(), stored_records()));
     let Ok(text) = std::str::from_utf8(data) else { return };
@@ -73,7 +72,7 @@ pub fn ledgers(data: &[u8]) {
     }
 }
 
-/// Returns an environment of the catalogue.
+/// Returns the environment called `name` from the catalogue.
 fn find_environment(name: &str) -> perturb::proto::Environment {
     let listing = perturb::server::listing(&tasks::catalogue(), &Config::default()).expect("models load");
     listing.environments.into_iter().find(|environment| environment.name == name).expect("it is there")

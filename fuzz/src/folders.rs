@@ -1,4 +1,4 @@
-//! Folders of tasks: `task.toml` and MJCF, up to what MuJoCo is given.
+//! Fuzz targets for task folders: `task.toml` and MJCF files, before MuJoCo compiles them.
 
 use perturb::env::{Action, Environment};
 use perturb::tasks::folder;
@@ -6,7 +6,7 @@ use perturb::tasks::folder;
 /// A model with a joint, a body, a geom, a site, an actuator and a sensor.
 const MODEL: &str = include_str!("../../examples/tasks/reaching_arm/arm.xml");
 
-/// The file of a task. A task that is accepted is stepped.
+/// Loads a task with this `task.toml`. If the task is valid, steps it.
 pub fn tasks(data: &[u8]) {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::write(folder.path().join("task.toml"), data).expect("a file");
@@ -22,7 +22,7 @@ pub fn tasks(data: &[u8]) {
     environment.load(&state).expect("what was saved");
 }
 
-/// A model, as far as it is read here: MuJoCo's own compiler may abort, and runs in a process of its own.
+/// Reads a model up to the call of MuJoCo's compiler. The compiler may abort, and therefore runs in a separate process.
 pub fn models(data: &[u8]) {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::write(folder.path().join("task.toml"), "").expect("a file");

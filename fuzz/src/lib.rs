@@ -1,7 +1,7 @@
-//! Fuzz targets: functions of the bytes that untrusted clients send or that files contain.
+//! Fuzz targets: functions that process bytes which untrusted clients send or which files contain.
 //!
-//! No input may panic, hang, or change what another client gets. libFuzzer runs them (`make fuzz`, with
-//! AddressSanitizer), and so does a test, for a few seconds and with any compiler.
+//! No input may cause a panic or a hang, or change the replies to another client. libFuzzer runs the targets (`make
+//! fuzz`, with AddressSanitizer). A test also runs them for a few seconds, with any compiler.
 
 mod files;
 mod folders;
@@ -13,11 +13,11 @@ pub use folders::{models, tasks};
 pub use seeds::{replies, seeds};
 pub use server::{connections, requests, snapshots, worlds};
 
-/// A function of untrusted bytes.
+/// A fuzz target: a function that processes untrusted bytes.
 pub struct FuzzTarget {
-    /// Name of its program and of its folder in `corpus/`.
+    /// The name of its program and of its folder in `corpus/`.
     pub name: &'static str,
-    /// Runs it on an input.
+    /// Runs the target on one input.
     pub run: fn(&[u8]),
 }
 

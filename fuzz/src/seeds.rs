@@ -1,4 +1,4 @@
-//! Valid inputs, which fuzzers mutate.
+//! Valid inputs of the fuzz targets, which a fuzzer mutates.
 
 use std::path::Path;
 
@@ -21,23 +21,23 @@ use prost::Message;
 
 use crate::server::{client_bytes, frame, framed, open, replies_to, steps};
 
-/// A stored policy with a recorded test.
+/// The name of a stored policy that has a recorded test.
 const POLICY: &str = "CartPole-ppo-ff-R-9bd6546b-s7";
 
-/// Returns a stored policy.
+/// Returns the stored policy [`POLICY`].
 pub(crate) fn stored_policy() -> Checkpoint {
     let file = repository_path("results/policies").join(format!("{POLICY}.safetensors"));
     Checkpoint::load(&file).expect("a policy")
 }
 
-/// Returns the recorded episodes of the stored policy.
+/// Returns the recorded episodes of the policy [`POLICY`].
 pub(crate) fn stored_records() -> Records {
     let path = StudyEpisodes::path(&repository_path("results"), "beyond/confirm-2");
     let episodes = StudyEpisodes::read_if_there(&path).expect("readable").expect("a file");
     episodes.of_cell(POLICY).expect("the policy's episodes").clone()
 }
 
-/// Returns the valid inputs of a target by its name.
+/// Returns the valid inputs of the target called `name`.
 pub fn seeds(name: &str) -> Vec<Vec<u8>> {
     let environments = tasks::catalogue();
     let names = || environments.names();
@@ -88,12 +88,12 @@ pub fn seeds(name: &str) -> Vec<Vec<u8>> {
     }
 }
 
-/// Returns the path of a file of the repository.
+/// Returns the path of a file, given relative to the repository's root.
 pub(crate) fn repository_path(path: &str) -> std::path::PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
 }
 
-/// Returns sessions with a request of each kind.
+/// Returns the inputs of three sessions that together contain a request of each kind.
 fn sessions(environment: &str) -> [Vec<u8>; 3] {
     let environments = tasks::catalogue();
     let spec = environments.find(environment).expect("it has one");
@@ -135,7 +135,8 @@ fn sessions(environment: &str) -> [Vec<u8>; 3] {
     [usual.concat(), [groups, steps(environment, 4, 2)].concat(), acting]
 }
 
-/// Returns snapshots of the start and of a few steps later.
+/// Returns two inputs of the target `snapshots`: the state at the start, and a few steps later. `choice` is the number
+/// of the environment in the catalogue.
 fn snapshots(choice: usize, environment: &str) -> Vec<Vec<u8>> {
     let snapshot = || framed(Request::Snapshot(Snapshot::default()));
     let body = [open(environment, 1), snapshot(), steps(environment, 1, 5), snapshot()].concat();
@@ -153,7 +154,7 @@ fn snapshots(choice: usize, environment: &str) -> Vec<Vec<u8>> {
     found
 }
 
-/// Returns requests that create, join, step, reset, leave and destroy a world.
+/// Returns requests of dm_env_rpc that create, join, step, reset, leave and destroy a world.
 fn world(environment: &str) -> Vec<u8> {
     let text = |text: &str| rpc::Tensor {
         payload: Some(rpc::tensor::Payload::Strings(rpc::tensor::StringArray { array: vec![text.into()] })),
@@ -175,7 +176,7 @@ fn world(environment: &str) -> Vec<u8> {
     messages.iter().flat_map(|message| frame(message)).collect()
 }
 
-/// Returns the number of replies to a session's input, and the messages of those that are errors.
+/// Sends a session's input to the server. Returns the number of replies, and the messages of the error replies.
 pub fn replies(seed: &[u8]) -> (usize, Vec<String>) {
     let replies = replies_to(seed.to_vec());
     let refusal = |reply: &Vec<u8>| match SessionResponse::decode(&reply[..]).expect("a reply").response {

@@ -1,6 +1,7 @@
-//! Fuzz targets for the server, which runs in this process and listens at a socket.
+//! Fuzz targets for the server. It runs in this process and listens on a Unix socket.
 //!
-//! After each input a bystander runs the same sessions of both robots and a classic task, and must get the same bytes.
+//! After each input, another client, the bystander, runs fixed sessions of both robots and a classic task. It must
+//! always get the same bytes.
 
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -18,24 +19,24 @@ use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::UnixStream;
 use tokio::runtime::{Builder, Runtime};
 
-/// Upper bound of an answer's time on a busy machine with a sanitizer.
+/// Maximum time until the server replies, for a busy machine and a sanitizer.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
-/// Silence after which a client has sent everything.
+/// Time without output after which a client is taken to have sent everything.
 const CLIENT_SILENCE: Duration = Duration::from_millis(300);
-/// Path of the calls that open sessions.
+/// The path of the gRPC method that opens sessions.
 const SESSION: &str = "/perturb.v1.Perturb/Session";
-/// Path of dm_env_rpc's calls.
+/// The path of dm_env_rpc's gRPC method.
 const PROCESS: &str = "/dm_env_rpc.v1.Environment/Process";
-/// The gRPC code of internal errors.
+/// The gRPC status code of internal errors.
 const INTERNAL: &str = "13";
 
-/// Sends the body of a session's stream: frames with requests.
+/// Opens a session and sends `data` as its body, which consists of framed requests.
 pub fn requests(data: &[u8]) {
     attack(|socket| exchange(socket, SESSION, data.to_vec()));
 }
 
-/// Restores a snapshot: a byte that selects an environment, and a snapshot without its checksum, which is added. A
-/// restored environment is stepped.
+/// Restores a snapshot. The input is a byte that selects an environment, and a snapshot without its checksum, which is
+/// added. Then steps the restored environment.
 pub fn snapshots(data: &[u8]) {
     let Some((&choice, snapshot)) = data.split_first() else { return };
     let environments = tasks::catalogue();
@@ -47,12 +48,12 @@ pub fn snapshots(data: &[u8]) {
     attack(|socket| exchange(socket, SESSION, body));
 }
 
-/// Sends the body of a dm_env_rpc stream.
+/// Opens a stream of dm_env_rpc and sends `data` as its body.
 pub fn worlds(data: &[u8]) {
     attack(|socket| exchange(socket, PROCESS, data.to_vec()));
 }
 
-/// Sends all bytes of a connection.
+/// Opens a connection and sends `data` as all its bytes.
 pub fn connections(data: &[u8]) {
     attack(async |socket| {
         let mut connection = UnixStream::connect(socket).await.expect("the server listens");
@@ -65,18 +66,18 @@ pub fn connections(data: &[u8]) {
     });
 }
 
-/// Returns a request in its frame.
+/// Encodes a request as a gRPC message, with its header.
 pub(crate) fn framed(request: Request) -> Vec<u8> {
     frame(&SessionRequest { request: Some(request) }.encode_to_vec())
 }
 
-/// Returns a message in its frame.
+/// Adds the gRPC header to a message: a flag and the length.
 pub(crate) fn frame(message: &[u8]) -> Vec<u8> {
     let length = u32::try_from(message.len()).expect("a short message");
     [&[0][..], &length.to_be_bytes(), message].concat()
 }
 
-/// Returns the request that opens a session of `n` environments.
+/// Returns the framed request that opens a session of `n` environments.
 pub(crate) fn open(environment: &str, n: u32) -> Vec<u8> {
     framed(Request::Open(Open {
         environment: environment.into(),
@@ -88,7 +89,7 @@ pub(crate) fn open(environment: &str, n: u32) -> Vec<u8> {
     }))
 }
 
-/// Returns `count` steps of a session of `n` environments.
+/// Returns `count` framed requests, each of which steps a session of `n` environments.
 pub(crate) fn steps(environment: &str, n: usize, count: usize) -> Vec<u8> {
     let width = match environment {
         "Hopper" => 3,
@@ -98,7 +99,7 @@ pub(crate) fn steps(environment: &str, n: usize, count: usize) -> Vec<u8> {
     framed(Request::Step(Step { actions: vec![0; 4 * width * n].into() })).repeat(count)
 }
 
-/// Runs an attack, and checks that a bystander gets the same replies as before.
+/// Runs an attack on the server, and checks that the bystander gets the same replies as before any attack.
 fn attack<F: AsyncFnOnce(&'static Path) -> Vec<u8>>(attack: F) {
     thread_local! {
         static CLIENT: Runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
@@ -113,7 +114,7 @@ fn attack<F: AsyncFnOnce(&'static Path) -> Vec<u8>>(attack: F) {
     });
 }
 
-/// Returns the server's socket. The first call starts the server.
+/// Returns the path of the server's socket. The first call starts the server.
 fn socket() -> &'static Path {
     static SOCKET: OnceLock<PathBuf> = OnceLock::new();
     SOCKET.get_or_init(|| {
@@ -139,7 +140,7 @@ fn socket() -> &'static Path {
     })
 }
 
-/// Returns the replies to a bystander before any attack.
+/// Returns the bytes that the bystander got before any attack.
 fn expected() -> &'static Vec<u8> {
     static EXPECTED: OnceLock<Vec<u8>> = OnceLock::new();
     EXPECTED.get_or_init(|| {
@@ -160,7 +161,7 @@ async fn bystander(socket: &Path) -> Vec<u8> {
     seen
 }
 
-/// Returns the replies to a session's stream with this body.
+/// Opens a session with this body, and returns the messages of the replies.
 pub(crate) fn replies_to(body: Vec<u8>) -> Vec<Vec<u8>> {
     let runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
     let bytes = runtime.block_on(exchange(socket(), SESSION, body));
@@ -175,7 +176,7 @@ pub(crate) fn replies_to(body: Vec<u8>) -> Vec<Vec<u8>> {
     replies
 }
 
-/// Returns all bytes that a client sends for a session's stream with this body, before it receives anything.
+/// Returns all bytes that a client sends on a connection for a session with this body, before it receives anything.
 pub(crate) fn client_bytes(body: &[u8]) -> Vec<u8> {
     let runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
     runtime.block_on(async {
@@ -184,7 +185,7 @@ pub(crate) fn client_bytes(body: &[u8]) -> Vec<u8> {
         tokio::spawn(async move { call(ours, SESSION, body).await });
         let mut sent = vec![0; 1 << 16];
         let mut length = 0;
-        // The client has sent everything when it waits.
+        // When the client waits, it has sent everything.
         while let Ok(Ok(more)) = tokio::time::timeout(CLIENT_SILENCE, theirs.read(&mut sent[length..])).await {
             length += more;
         }
@@ -193,7 +194,7 @@ pub(crate) fn client_bytes(body: &[u8]) -> Vec<u8> {
     })
 }
 
-/// Returns the bytes of the replies to a call with this body.
+/// Connects to the server and calls the method `path` with this body. Returns the bytes of the replies.
 async fn exchange(socket: &Path, path: &str, body: Vec<u8>) -> Vec<u8> {
     let connection = loop {
         match UnixStream::connect(socket).await {
@@ -214,7 +215,7 @@ async fn call<T: AsyncRead + AsyncWrite + Unpin + Send + 'static>(connection: T,
         .header("te", "trailers");
     let (response, mut upwards) = client.send_request(request.body(()).expect("a request"), false).expect("a stream");
     let mut replies = Vec::new();
-    // The server may end the call before it has the whole body.
+    // The server may end the call before it has received the whole body.
     let _ = upwards.send_data(body.into(), true);
     if let Ok(response) = response.await {
         let mut downwards = response.into_body();

@@ -1,3 +1,3 @@
-//! libFuzzer's way to `perturb_fuzz::tasks`.
+//! The program with which libFuzzer runs `perturb_fuzz::tasks`.
 #![no_main]
 libfuzzer_sys::fuzz_target!(|data: &[u8]| perturb_fuzz::tasks(data));

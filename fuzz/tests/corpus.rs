@@ -1,5 +1,5 @@
-//! Runs every fuzz target for some seconds, on the valid inputs, on the corpus, and on random mutations from a printed
-//! seed.
+//! Runs every fuzz target for some seconds: on the valid inputs, on the corpus, and on random mutations of both. The
+//! seeds of the mutations are printed.
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -11,19 +11,20 @@ use perturb_fuzz::{FuzzTarget, TARGETS, replies, seeds};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
-/// Default number of mutated inputs of each target; `PERTURB_FUZZ_INPUTS` changes it.
+/// The default number of mutated inputs for each target. The environment variable `PERTURB_FUZZ_INPUTS` changes it.
 const DEFAULT_INPUTS: u64 = 200;
-/// Environment variable with the maximum memory growth after the first tenth of all inputs, in MB. It needs a process
-/// in which nothing else runs: `make attack-test`.
+/// The environment variable with the maximum memory growth after the first tenth of the inputs, in MB. It needs a
+/// process that runs nothing else: `make attack-test`.
 const MAX_GROWTH_VARIABLE: &str = "PERTURB_FUZZ_MOST_GROWN_MB";
 
-/// Seed of the current input of each target.
+/// The seed of each target's current input.
 static SEEDS: Mutex<BTreeMap<String, u64>> = Mutex::new(BTreeMap::new());
 
 fn attack(name: &str) {
     static HOOK: Once = Once::new();
     HOOK.call_once(|| {
-        // A panic on a thread of the server would end that thread only. Tests' output is lost when the process aborts.
+        // Aborts the process at any panic, because a panic in a server thread would end only that thread. Writes to
+        // stderr directly, because a test's captured output is lost in an abort.
         std::panic::set_hook(Box::new(|panic| {
             let seeds = SEEDS.lock().unwrap_or_else(PoisonError::into_inner);
             let again = "each is repeated by PERTURB_FUZZ_SEED=SEED PERTURB_FUZZ_INPUTS=1";
@@ -68,7 +69,7 @@ fn memory() -> u64 {
     line.trim_end_matches("kB").trim().parse::<u64>().expect("kB") << 10
 }
 
-/// Returns one of the inputs with a few changes.
+/// Returns a copy of one of the inputs with a few random changes.
 fn mutated(inputs: &[Vec<u8>], random: &mut ChaCha8Rng) -> Vec<u8> {
     let below = |random: &mut ChaCha8Rng, end: usize| random.next_u64() as usize % end.max(1);
     let mut input = inputs[below(random, inputs.len())].clone();
@@ -95,12 +96,13 @@ fn mutated(inputs: &[Vec<u8>], random: &mut ChaCha8Rng) -> Vec<u8> {
     input
 }
 
-/// Mutations of what is refused at once reach little.
+/// Checks that the valid inputs are really valid: mutations of an input that the server rejects at once would test
+/// little.
 #[test]
 fn seeds_of_sessions_are_answered_without_a_refusal() {
     for seed in seeds("requests") {
         let (number, mut refused) = replies(&seed);
-        refused.retain(|refusal| !refusal.contains("OpenGL")); // not every machine has it
+        refused.retain(|refusal| !refusal.contains("OpenGL")); // not every machine has OpenGL
         assert!(number > 2 && refused.is_empty(), "{number} replies, {refused:?}");
     }
 }

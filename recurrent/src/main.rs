@@ -1,4 +1,5 @@
-//! The program `perturb-recurrent`: `perturb` with libtorch. `perturb` becomes this program to train recurrent policies.
+//! The program `perturb-recurrent`: `perturb` with libtorch. `perturb` executes this program to train recurrent
+//! policies.
 #![forbid(unsafe_code)]
 
 use std::process::ExitCode;

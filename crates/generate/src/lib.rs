@@ -1,32 +1,32 @@
-//! The generated files of the repository: the Rust code of the protocols, and the bindings of MuJoCo.
+//! The generated files of the repository: the Rust code of the protocols and the bindings of MuJoCo.
 //!
-//! The repository contains these files, so that a build of perturb compiles no generator and needs no libclang. This
-//! package's build script generates them; `make generate` copies them into the repository, and a test fails where a copy is
-//! out of date.
+//! The repository contains these files so that building perturb needs neither a generator nor libclang. This package's
+//! build script generates them, `make generate` copies them into the repository, and a test fails if a copy is out of
+//! date.
 #![forbid(unsafe_code)]
 
 use std::path::{Path, PathBuf};
 use std::{fs, io};
 
-/// Folders that contain generated files, from the repository's root.
+/// Folders with generated files, relative to the repository's root.
 const FOLDERS: [&str; 2] = ["crates/protocol/src/generated", "crates/mujoco/src"];
 
-/// A generated file.
+/// A generated file with its intended content.
 #[derive(Debug)]
 pub struct GeneratedFile {
-    /// Path from the repository's root.
+    /// Path relative to the repository's root.
     pub path: PathBuf,
-    /// Bytes that the file should have.
+    /// The bytes that the file should contain.
     pub content: Vec<u8>,
 }
 
 impl GeneratedFile {
-    /// Path of the file's copy in the repository.
+    /// Returns the path of the file's copy in the repository.
     pub fn copy(&self) -> PathBuf {
         Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(&self.path)
     }
 
-    /// Whether the repository's copy has these bytes.
+    /// Returns whether the copy in the repository has this content.
     pub fn is_up_to_date(&self) -> bool {
         fs::read(self.copy()).is_ok_and(|content| content == self.content)
     }
@@ -35,7 +35,7 @@ impl GeneratedFile {
 /// Returns the files that the build script has generated.
 ///
 /// # Errors
-/// A file cannot be read.
+/// An error if a file cannot be read.
 pub fn generated() -> io::Result<Vec<GeneratedFile>> {
     let out = Path::new(env!("OUT_DIR"));
     let mut files = Vec::new();

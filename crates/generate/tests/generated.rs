@@ -1,4 +1,4 @@
-//! The generated files in the repository must be those that their sources give.
+//! Test that the generated files in the repository are up to date.
 
 #[test]
 fn generated_files_are_up_to_date() {

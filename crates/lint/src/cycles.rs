@@ -1,39 +1,39 @@
 //! Import cycles between sibling modules.
 //!
-//! An import of `a::b` from `a::c::d` is an edge from `a::c` to `a::b`: each of two modules stands for everything below
-//! it, at the level at which their paths part. A module and its parent count as one, so imports between them are no
-//! edges.
+//! The imports form a graph of sibling modules. An import of `a::b` from `a::c::d` is an edge from `a::c` to `a::b`:
+//! both paths are shortened to the first level at which they differ. Imports between a module and its own parent are
+//! not edges.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt;
 
 use crate::imports::{ModulePath, PackageImports};
 
-/// Sibling modules of which each imports every other one, directly or through others.
+/// A cycle: sibling modules that all import each other, directly or through others.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Cycle {
-    /// Folder of the package.
+    /// The folder of the package.
     pub folder: String,
-    /// Path of the modules' parent; empty for the crate's root.
+    /// The path of the modules' common parent; empty for the crate's root.
     pub parent: ModulePath,
-    /// Number of the parent's children that take part in imports.
+    /// The number of the parent's child modules that import each other at all.
     pub siblings: usize,
-    /// Names of all modules of the cycle, in alphabetical order.
+    /// The names of all modules of the cycle, in alphabetical order.
     pub modules: Vec<String>,
-    /// A shortest path of imports from one of these modules back to itself.
+    /// A shortest series of imports from one of these modules back to itself.
     pub path: Vec<Edge>,
 }
 
-/// An import between siblings, with the first place of it.
+/// An import between sibling modules, at its first location.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Edge {
-    /// The importing module's name.
+    /// The name of the importing module.
     pub from: String,
-    /// The imported module's name.
+    /// The name of the imported module.
     pub to: String,
-    /// File of the import.
+    /// The file with the import.
     pub file: String,
-    /// Line of the import, counted from 1.
+    /// The line of the import, from 1.
     pub line: usize,
 }
 
@@ -55,7 +55,7 @@ impl fmt::Display for Cycle {
     }
 }
 
-/// Finds every cycle of a package, the outermost modules first.
+/// Finds all cycles of a package. Cycles of outer modules come first.
 pub fn find(package: &PackageImports) -> Vec<Cycle> {
     let mut levels: BTreeMap<(usize, &[String]), SiblingGraph> = BTreeMap::new();
     for import in &package.imports {
@@ -105,7 +105,7 @@ impl SiblingGraph {
         found
     }
 
-    /// Returns the strongly connected components of more than one module.
+    /// Returns the strongly connected components that have more than one module.
     fn cycles(&self) -> Vec<Vec<String>> {
         let reachable: BTreeMap<_, _> = self.names.iter().map(|name| (name.as_str(), self.reachable(name))).collect();
         let mut done: BTreeSet<&str> = BTreeSet::new();
@@ -120,7 +120,8 @@ impl SiblingGraph {
         cycles
     }
 
-    /// Returns a shortest cycle among `modules`, the alphabetically first of equally short ones.
+    /// Returns a shortest cycle among `modules`. Of several, it is the one whose start comes first in alphabetical
+    /// order.
     fn shortest_cycle(&self, modules: &[String]) -> Vec<Edge> {
         modules.iter().filter_map(|start| self.shortest_path_back(start)).min_by_key(Vec::len).unwrap_or_default()
     }

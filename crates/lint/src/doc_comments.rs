@@ -1,34 +1,34 @@
 //! Doc comments that open without a subject.
 //!
-//! A comment such as "What became of the request" has to be read to its end before one knows what it describes. A doc
-//! comment opens with its subject, or with a verb whose subject is the documented item: "Returns the result of the
+//! A comment such as "What became of the request" must be read to its end to find out what it describes. A doc comment
+//! should open with its subject, or with a verb whose subject is the documented item: "Returns the result of the
 //! request".
 
 use crate::source::{SourceTree, folder_of, is_generated, is_test};
 
-/// Openings that leave the subject open.
+/// First words of comments that do not name a subject.
 pub const OPENINGS: [&str; 22] = [
     "What", "Whatever", "Who", "Whoever", "Whose", "Which", "Of", "That", "Those", "The same", "So many", "As many",
     "Where", "When", "How", "Its", "None", "It", "One", "As", "So", "Likewise",
 ];
 
-/// A doc comment's first line.
+/// The first line of a doc comment.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DocComment {
-    /// The folder for which it is counted.
+    /// The folder in whose count the comment is included.
     pub folder: String,
-    /// File of the comment.
+    /// The file with the comment.
     pub file: String,
-    /// Line of the file, counted from 1.
+    /// The line in the file, from 1.
     pub line: usize,
-    /// The comment's first line.
+    /// The text of the first line.
     pub text: String,
-    /// Whether it opens without a subject.
+    /// Whether the comment opens without a subject.
     pub lacks_subject: bool,
 }
 
-/// Reads the first line of every doc comment of Rust code and of every comment of `.proto` files. Tests and generated
-/// code are left out.
+/// Reads the first line of every doc comment in Rust files and of every comment in `.proto` files. Skips tests and
+/// generated code.
 pub fn read(tree: &SourceTree) -> Vec<DocComment> {
     let mut comments = Vec::new();
     let files = tree.with_extension(".rs").chain(tree.with_extension(".proto"));
@@ -59,7 +59,7 @@ pub fn read(tree: &SourceTree) -> Vec<DocComment> {
     comments
 }
 
-/// Tells whether a comment opens with one of [`OPENINGS`] as a whole word.
+/// Returns whether a comment opens with one of [`OPENINGS`] as a whole word.
 pub fn lacks_subject(text: &str) -> bool {
     OPENINGS.into_iter().any(|opening| {
         text.strip_prefix(opening).is_some_and(|rest| !rest.starts_with(|c: char| c.is_alphanumeric() || c == '_'))

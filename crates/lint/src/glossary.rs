@@ -1,20 +1,21 @@
-//! The glossary: every public type of the server, the pool and the learner is explained there, or is a commonplace.
+//! Check of the glossary: it must explain every public type of the server, the pool and the learner, except those that
+//! are listed as commonplace.
 
 use std::collections::BTreeSet;
 
 use crate::names::Definition;
 
-/// Folders whose public types the glossary explains.
+/// Folders whose public types the glossary must explain.
 pub const FOLDERS: [&str; 3] = ["src/server/", "src/pool/", "learner/src/"];
 
-/// Returns the types that the glossary's tables explain: the names in backquotes in the first column, such as `Pool`.
+/// Returns the types that the glossary's tables explain: names in backquotes in the first column, such as `Pool`.
 pub fn explained_types(glossary: &str) -> BTreeSet<&str> {
     let first_columns = glossary.lines().filter_map(|line| line.strip_prefix('|')?.split('|').next());
     first_columns.flat_map(|column| column.split('`').skip(1).step_by(2)).filter(|name| is_type_name(name)).collect()
 }
 
-/// Returns the public types without an explanation: those of [`FOLDERS`] that are neither in the glossary nor
-/// commonplace, and whose names do not end in `Error`.
+/// Returns the public types that lack an explanation: types in [`FOLDERS`] that are neither in the glossary nor
+/// commonplace. Types whose names end in `Error` need none.
 pub fn unexplained<'a>(
     public_types: &'a [Definition],
     glossary: &str,
@@ -31,7 +32,7 @@ pub fn unexplained<'a>(
     public_types.iter().filter(needs_entry).collect()
 }
 
-/// Whether a text is written like a type: `ReplayBuffer`, and not `n_steps` or `DE`.
+/// Returns whether a text looks like the name of a type: `ReplayBuffer`, but not `n_steps` or `DE`.
 fn is_type_name(text: &str) -> bool {
     text.starts_with(|c: char| c.is_ascii_uppercase())
         && text.contains(|c: char| c.is_ascii_lowercase())

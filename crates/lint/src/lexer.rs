@@ -1,39 +1,39 @@
-//! Cuts Rust source into tokens, so that comments and strings are never taken for code.
+//! A lexer for Rust. It divides source text into tokens, so that comments and strings are not mistaken for code.
 
-/// A token with the line on which it starts.
+/// A token with the line where it starts.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SourceToken {
-    /// The token itself.
+    /// The kind and the content of the token.
     pub kind: TokenKind,
-    /// Line of the file, counted from 1.
+    /// The line in the file, from 1.
     pub line: usize,
 }
 
-/// Kind and content of a token.
+/// The kind and the content of a token.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum TokenKind {
-    /// An identifier, a keyword or a number. `r#` and the `$` of `$crate` are removed.
+    /// An identifier, a keyword or a number, without a prefix `r#` and without the `$` of `$crate`.
     Word(String),
-    /// The content of a string literal, with escapes as they are written.
+    /// The content of a string literal. Escape sequences are not decoded.
     Text(String),
     /// `::`
     PathSeparator,
-    /// Any other character of the source.
+    /// Any other character.
     Symbol(char),
 }
 
 impl SourceToken {
-    /// Tells whether the token is the identifier or keyword `word`.
+    /// Returns whether the token is the identifier or keyword `word`.
     pub fn is_word(&self, word: &str) -> bool {
         matches!(&self.kind, TokenKind::Word(found) if found == word)
     }
 
-    /// Tells whether the token is the character `symbol`.
+    /// Returns whether the token is the character `symbol`.
     pub fn is_symbol(&self, symbol: char) -> bool {
         self.kind == TokenKind::Symbol(symbol)
     }
 
-    /// Returns the identifier, keyword or number that the token is.
+    /// Returns the token's text if it is an identifier, a keyword or a number.
     pub fn word(&self) -> Option<&str> {
         match &self.kind {
             TokenKind::Word(word) => Some(word),
@@ -42,12 +42,12 @@ impl SourceToken {
     }
 }
 
-/// Cuts Rust source into tokens. Comments, character literals and lifetimes give none.
+/// Divides Rust source into tokens. Skips comments, character literals and lifetimes.
 pub fn tokens(source: &str) -> Vec<SourceToken> {
     Lexer { chars: source.chars().collect(), position: 0, line: 1, tokens: Vec::new() }.run()
 }
 
-/// Tells whether the attribute marks a test function: `test`, `rstest`, or a path that ends in `test`.
+/// Returns whether an attribute marks a test function: `test`, `rstest`, or a path that ends in one of them.
 pub fn is_test_attribute(content: &[SourceToken]) -> bool {
     let mut name = None;
     for token in content.iter().skip_while(|token| token.word().is_none()) {
@@ -117,7 +117,7 @@ impl Lexer {
         self.tokens.push(SourceToken { kind, line: self.line });
     }
 
-    /// Skips a block comment. Rust's block comments nest.
+    /// Skips a block comment. Block comments can be nested in Rust.
     fn block_comment(&mut self) {
         let mut depth = 0;
         while self.peek(0).is_some() {
@@ -135,7 +135,7 @@ impl Lexer {
         }
     }
 
-    /// Reads a string whose escapes start with a backslash.
+    /// Reads a string literal with escape sequences.
     fn string(&mut self) {
         let line = self.line;
         self.advance();
@@ -155,7 +155,7 @@ impl Lexer {
         self.tokens.push(SourceToken { kind: TokenKind::Text(text), line });
     }
 
-    /// Reads a raw string, at whose first `#` or `"` the lexer stands.
+    /// Reads a raw string. The current character is its first `#` or its `"`.
     fn raw_string(&mut self) {
         let line = self.line;
         let mut end = String::from("\"");
@@ -196,7 +196,8 @@ impl Lexer {
         }
     }
 
-    /// Reads an identifier, a keyword or a number, or the string that such a prefix introduces.
+    /// Reads an identifier, a keyword or a number. If the word is the prefix of a string literal, such as `r` or `b`,
+    /// reads the string instead.
     fn word(&mut self) {
         let start = self.position;
         while self.peek(0).is_some_and(|c| c.is_alphanumeric() || c == '_') {
@@ -216,7 +217,7 @@ impl Lexer {
         }
     }
 
-    /// Tells whether a `"` follows after one or more `#`.
+    /// Returns whether the next characters are one or more `#` and then a `"`.
     fn raw_string_follows(&self) -> bool {
         self.chars[self.position..].iter().find(|&&c| c != '#') == Some(&'"')
     }

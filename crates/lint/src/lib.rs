@@ -1,11 +1,12 @@
-//! Checks of the workspace's source text that neither rustc nor clippy makes.
+//! Checks of the source text of the workspace that neither rustc nor clippy makes:
 //!
 //! - [`cycles`]: import cycles between sibling modules, in each crate and in the Python package;
 //! - [`doc_comments`]: doc comments that open without a subject;
-//! - [`names`]: type names defined twice, superlative constants, constructors called `of`, long test names.
+//! - [`names`]: type names with two definitions, constants with superlative names, constructors called `of`, long test
+//!   names;
 //! - [`glossary`]: public types of the server, the pool and the learner that the glossary does not explain.
 //!
-//! [`limits`] compares the counts with the file `crates/lint/limits.toml`.
+//! [`limits`] compares the number of findings with the limits in `crates/lint/limits.toml`.
 
 pub mod cycles;
 pub mod doc_comments;

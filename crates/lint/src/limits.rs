@@ -1,7 +1,7 @@
-//! Limits of every check by folder, and the exemptions of types that share a name.
+//! The limits of every check by folder, and the names that are exempt from a check.
 //!
-//! Both files are written in the part of TOML that they need: `[section]`, `key = value`, and comments on lines of
-//! their own.
+//! The files with limits and exemptions use a small part of TOML: `[section]`, `key = value`, and comments on separate
+//! lines.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::{self, Write as _};
@@ -13,33 +13,33 @@ use crate::imports;
 use crate::names::{self, Definition};
 use crate::source::{GLOSSARY, SourceTree, folder_of};
 
-/// Share of doc comments without a subject that every folder may have, in percent.
+/// The default limit for the share of doc comments without a subject in a folder, in percent.
 pub const SHARE_LIMIT: f64 = 2.0;
 
-/// Most findings that a failed check prints for each folder, unless all are asked for.
+/// Maximum number of findings that a failed check prints for each folder.
 const MAX_EXAMPLES: usize = 10;
 
-/// A check with limits of its own, which are the section of this name in the file of limits.
+/// A check. Each has its own section in the file of limits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Check {
-    /// Number of modules in import cycles, by package.
+    /// The number of modules in import cycles, by package.
     ImportCycles,
-    /// Share of doc comments that open without a subject, in percent, by folder.
+    /// The share of doc comments that open without a subject, in percent, by folder.
     DocComments,
-    /// Number of type names defined in more than one file and not exempt, in the whole repository.
+    /// The number of type names that are defined in more than one file and are not exempt, in the whole repository.
     TypesDefinedTwice,
-    /// Number of constants with superlative names, by folder.
+    /// The number of constants with superlative names, by folder.
     SuperlativeConstants,
-    /// Number of functions called `of`, by folder.
+    /// The number of functions called `of`, by folder.
     FunctionsCalledOf,
-    /// Number of tests with names of more than 60 characters, by folder.
+    /// The number of tests whose names have more than 60 characters, by folder.
     LongTestNames,
-    /// Number of public types that the glossary does not explain, by folder.
+    /// The number of public types that the glossary does not explain, by folder.
     TypesWithoutGlossaryEntry,
 }
 
 impl Check {
-    /// All checks in the order in which they are reported.
+    /// All checks, in the order in which they are reported.
     pub const ALL: [Self; 7] = [
         Self::ImportCycles,
         Self::DocComments,
@@ -50,7 +50,7 @@ impl Check {
         Self::TypesWithoutGlossaryEntry,
     ];
 
-    /// Returns the section's name.
+    /// Returns the name of the check's section in the file of limits.
     pub fn section(self) -> &'static str {
         match self {
             Self::ImportCycles => "import-cycles",
@@ -63,12 +63,12 @@ impl Check {
         }
     }
 
-    /// Returns the limit of a folder that the file of limits does not name.
+    /// Returns the limit of folders that are not in the file of limits.
     pub fn default_limit(self) -> f64 {
         if self == Self::DocComments { SHARE_LIMIT } else { 0.0 }
     }
 
-    /// Returns what the number counts, and how to mend it.
+    /// Describes the counted findings and how to remove them, for error messages.
     fn explanation(self) -> &'static str {
         match self {
             Self::ImportCycles => "modules in import cycles; move what both need to a module below them",
@@ -89,29 +89,29 @@ impl Check {
     }
 }
 
-/// Result of one check in one folder.
+/// The result of one check in one folder.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Finding {
-    /// The check that found it.
+    /// The check.
     pub check: Check,
-    /// The folder, or `all`.
+    /// The folder, or `all` for the whole repository.
     pub folder: String,
     /// The number that is compared with the limit.
     pub count: f64,
-    /// Each place with what stands there.
+    /// The findings, each with its location.
     pub places: Vec<String>,
 }
 
-/// Numbers by section and key, as the file of limits has them.
+/// Limits by section and folder, as in the file of limits.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LimitTable(BTreeMap<String, BTreeMap<String, f64>>);
 
-/// Names that a check leaves out, each with its reason.
+/// Names that are exempt from a check, each with a reason.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Exemptions {
-    /// Type names that may be defined more than once.
+    /// Type names that may have several definitions, with reasons.
     duplicates: BTreeMap<String, String>,
-    /// Public types that need no entry in the glossary.
+    /// Public types that need no entry in the glossary, with reasons.
     commonplaces: BTreeMap<String, String>,
 }
 
@@ -120,7 +120,7 @@ impl LimitTable {
     ///
     /// # Errors
     ///
-    /// A sentence that names the line which is not `key = number`, or whose section no check has.
+    /// An error message with the number of the line that is not `key = number`, or whose section is not a check's.
     pub fn parse(text: &str) -> Result<Self, String> {
         let mut limits = Self::default();
         for entry in entries(text)? {
@@ -141,7 +141,8 @@ impl LimitTable {
         limit.unwrap_or(0.0).max(check.default_limit())
     }
 
-    /// Returns these limits lowered to the present numbers. No limit rises, and limits that every folder has are left out.
+    /// Returns these limits, lowered to the current number of findings where that is smaller. No limit rises. Omits
+    /// limits that equal the default.
     pub fn lowered_to(&self, findings: &[Finding]) -> Self {
         let mut limits = Self::default();
         for finding in findings {
@@ -178,26 +179,26 @@ impl fmt::Display for LimitTable {
 }
 
 impl Exemptions {
-    /// Parses the file of type names that may be defined more than once.
+    /// Parses the file of type names that may have several definitions.
     ///
     /// # Errors
     ///
-    /// A sentence that names the line which is not `Name = "reason"`, or whose reason is empty.
+    /// An error message with the number of the line that is not `Name = "reason"`, or whose reason is empty.
     pub fn parse(text: &str) -> Result<Self, String> {
         Ok(Self { duplicates: reasons(text)?, commonplaces: BTreeMap::new() })
     }
 
-    /// Adds the file of public types that need no entry in the glossary.
+    /// Adds the names in the file of public types that need no entry in the glossary.
     ///
     /// # Errors
     ///
-    /// Those of [`Exemptions::parse`].
+    /// The errors of [`Exemptions::parse`].
     pub fn with_commonplaces(self, text: &str) -> Result<Self, String> {
         Ok(Self { commonplaces: reasons(text)?, ..self })
     }
 }
 
-/// Reads names with their reasons.
+/// Parses names with their reasons.
 fn reasons(text: &str) -> Result<BTreeMap<String, String>, String> {
     let mut reasons = BTreeMap::new();
     for entry in entries(text)? {
@@ -216,7 +217,7 @@ struct KeyValue {
     line: usize,
 }
 
-/// Reads `key = value` lines with their sections. Quotation marks around keys and values are removed.
+/// Parses lines `key = value`, with the section of each. Removes quotation marks around keys and values.
 fn entries(text: &str) -> Result<Vec<KeyValue>, String> {
     let mut section = String::new();
     let mut entries = Vec::new();
@@ -237,7 +238,7 @@ fn entries(text: &str) -> Result<Vec<KeyValue>, String> {
     Ok(entries)
 }
 
-/// Runs all checks.
+/// Runs all checks on the source files.
 pub fn check(tree: &SourceTree, exemptions: &Exemptions) -> Vec<Finding> {
     let mut findings = Vec::new();
     for package in imports::read(tree) {
@@ -309,16 +310,16 @@ fn by_folder<'a>(check: Check, definitions: impl IntoIterator<Item = &'a Definit
     findings.collect()
 }
 
-/// The comparison of findings with limits.
+/// The result of comparing findings with limits.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Verdict {
-    /// Messages about findings over their limits.
+    /// Error messages for findings that exceed their limits.
     pub errors: Vec<String>,
-    /// Messages about limits and exemptions that are no longer needed.
+    /// Warnings for limits and exemptions that are no longer needed.
     pub warnings: Vec<String>,
 }
 
-/// Compares findings with limits, and exemptions with the types that need them.
+/// Compares findings with limits, and looks for exemptions that are no longer needed.
 pub fn judge(tree: &SourceTree, findings: &[Finding], limits: &LimitTable, exemptions: &Exemptions) -> Verdict {
     let mut verdict = Verdict::default();
     for finding in findings {

@@ -1,4 +1,4 @@
-//! `perturb-lint [--list FOLDER | --lower-limits]`, run in the repository's root by `make lint`.
+//! The program `perturb-lint [--list FOLDER | --lower-limits]`. `make lint` runs it in the repository's root.
 
 use std::io::Write as _;
 use std::path::Path;
@@ -47,7 +47,7 @@ fn exemptions() -> Result<Exemptions, String> {
     exemptions.with_commonplaces(&read(COMMONPLACES)?).map_err(|error| format!("{COMMONPLACES}, {error}"))
 }
 
-/// Prints errors and warnings; returns whether there was no error.
+/// Runs all checks and prints errors and warnings. Returns whether there were no errors.
 fn check() -> Result<bool, String> {
     let limits = limits()?;
     let exemptions = exemptions()?;
@@ -72,7 +72,7 @@ fn list(folder: &str) -> Result<(), String> {
             text += &format!("  {place}\n");
         }
     }
-    // Whoever closes the pipe early has read enough.
+    // An error means that the reader has closed the pipe and needs no more output.
     let _ = std::io::stdout().write_all(text.as_bytes());
     Ok(())
 }

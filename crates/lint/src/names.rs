@@ -1,44 +1,44 @@
-//! Names: types defined twice, superlative constants, constructors called `of`, and long test names.
+//! Checks of names: types with two definitions, superlative constants, constructors called `of`, and long test names.
 
 use std::collections::BTreeMap;
 
 use crate::lexer::{SourceToken, TokenKind, is_test_attribute, tokens};
 use crate::source::{SourceTree, is_benchmark_or_example, is_generated, is_test};
 
-/// Longest name of a test, in characters.
+/// Maximum length of a test's name, in characters.
 pub const MAX_TEST_NAME: usize = 60;
 
-/// First words of constants that have a standard name: `MAX_*`, `MIN_*`, `*_TIMEOUT` or `*_INTERVAL`.
+/// First words of constants that should have a standard name instead: `MAX_*`, `MIN_*`, `*_TIMEOUT` or `*_INTERVAL`.
 pub const SUPERLATIVES: [&str; 12] =
     ["MOST", "LEAST", "LONGEST", "SHORTEST", "GREATEST", "FEW", "MANY", "TINY", "LITTLE", "REST", "LOOK", "AGAIN"];
 
-/// A name with the place of its definition.
+/// A name with the location of its definition.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Definition {
-    /// The name that is defined.
+    /// The defined name.
     pub name: String,
-    /// File of the definition.
+    /// The file with the definition.
     pub file: String,
-    /// Line of the file, counted from 1.
+    /// The line in the file, from 1.
     pub line: usize,
 }
 
-/// Every name that the checks look at.
+/// All names that the checks need.
 #[derive(Clone, Debug, Default)]
 pub struct NameDefinitions {
-    /// Structs, enums, traits, classes and type aliases of modules, without tests, benchmarks and examples.
+    /// Structs, enums, traits, classes and type aliases of modules, except in tests, benchmarks and examples.
     pub types: Vec<Definition>,
-    /// The Rust types among `types` that are `pub` without a restriction.
+    /// The Rust types among `types` that are `pub`, not for example `pub(crate)`.
     pub public_types: Vec<Definition>,
-    /// Constants and statics whose first word is one of [`SUPERLATIVES`], without tests.
+    /// Constants and statics whose first word is one of [`SUPERLATIVES`], except in tests.
     pub superlatives: Vec<Definition>,
-    /// Functions called `of`, without tests.
+    /// Functions called `of`, except in tests.
     pub called_of: Vec<Definition>,
-    /// Test functions with names of more than [`MAX_TEST_NAME`] characters.
+    /// Test functions whose names have more than [`MAX_TEST_NAME`] characters.
     pub long_tests: Vec<Definition>,
 }
 
-/// Reads the names of all Rust and Python files without generated ones.
+/// Reads the names in all Rust and Python files, except generated ones.
 pub fn read(tree: &SourceTree) -> NameDefinitions {
     let mut names = NameDefinitions::default();
     for (file, source) in tree.with_extension(".rs").filter(|(path, _)| !is_generated(path)) {
@@ -50,9 +50,9 @@ pub fn read(tree: &SourceTree) -> NameDefinitions {
     names
 }
 
-/// Returns the types that are defined in more than one file of the same language, by name, with all their definitions.
+/// Returns the types that are defined in more than one file of the same language. For each name, lists all definitions.
 ///
-/// Names of Rust and Python are not compared, because a class often stands for the struct of the same name.
+/// Rust and Python types may have the same name, because a class often corresponds to a struct.
 pub fn defined_twice(types: &[Definition]) -> BTreeMap<&str, Vec<&Definition>> {
     let mut by_name: BTreeMap<(&str, bool), Vec<&Definition>> = BTreeMap::new();
     for definition in types {
@@ -75,9 +75,9 @@ fn read_rust(file: &str, source: &str, names: &mut NameDefinitions) {
     let tokens = tokens(source);
     let is_test_code = is_test(file);
     let mut is_test_function = false;
-    // For each open brace: whether items of a module stand in it.
+    // For each open brace, whether it contains the items of a module.
     let mut braces: Vec<bool> = Vec::new();
-    // For a test module: the number of braces that are open around it.
+    // The number of open braces around the current test module, if there is one.
     let mut test_module = None;
     let mut opens_module = false;
     let mut position = 0;
@@ -142,7 +142,7 @@ fn read_rust(file: &str, source: &str, names: &mut NameDefinitions) {
     }
 }
 
-/// Returns the tokens of an attribute, from its `#` to its `]`; only the `#` if it is none.
+/// Returns the tokens of an attribute, from `#` to `]`. If the `#` does not start an attribute, returns only the `#`.
 fn attribute(tokens: &[SourceToken]) -> &[SourceToken] {
     let mut depth = 0;
     for (index, token) in tokens.iter().enumerate() {

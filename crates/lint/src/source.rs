@@ -1,29 +1,30 @@
-//! The files that are checked: every text file that git tracks or would track.
+//! The source files that are checked: all that git tracks, or would track because it does not ignore them.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
 
-/// Path of the glossary, which is read beside the sources.
+/// The path of the glossary.
 pub const GLOSSARY: &str = "docs/glossary.md";
 
-/// Source files by their path from the repository's root, with `/` as separator.
+/// The source files, by their path relative to the repository's root, with `/` as separator.
 #[derive(Clone, Debug, Default)]
 pub struct SourceTree {
     files: BTreeMap<String, String>,
 }
 
 impl SourceTree {
-    /// Makes a tree from pairs of path and text.
+    /// Creates a tree from pairs of path and text.
     pub fn from_files<P: Into<String>, T: Into<String>>(files: impl IntoIterator<Item = (P, T)>) -> Self {
         Self { files: files.into_iter().map(|(path, text)| (path.into(), text.into())).collect() }
     }
 
-    /// Reads the Rust, Python, `.proto` and `Cargo.toml` files of a git checkout, and the glossary. Files that git ignores are left out.
+    /// Reads the Rust, Python, `.proto` and `Cargo.toml` files of a git checkout, and the glossary. Skips files that
+    /// git ignores.
     ///
     /// # Errors
     ///
-    /// A sentence for the terminal if `root` is not a git checkout or a file cannot be read.
+    /// An error message if `root` is not a git checkout, or if a file cannot be read.
     pub fn read(root: &Path) -> Result<Self, String> {
         let output = Command::new("git")
             .args(["ls-files", "-z", "--cached", "--others", "--exclude-standard"])
@@ -49,7 +50,7 @@ impl SourceTree {
         Ok(Self { files })
     }
 
-    /// Returns the text of the file at `path`.
+    /// Returns the text of the file at `path`, or `None` if there is no such file.
     pub fn get(&self, path: &str) -> Option<&str> {
         self.files.get(path).map(String::as_str)
     }
@@ -65,10 +66,10 @@ impl SourceTree {
     }
 }
 
-/// Tells whether a file holds tests or fixtures.
+/// Returns whether a file contains tests or fixtures.
 ///
-/// These are files below `tests`, `test` and `fixtures`, and files called `tests.rs`, `*_test.rs`, `*_tests.rs` or
-/// `test_*.py`.
+/// These are the files in folders called `tests`, `test` or `fixtures`, and files called `tests.rs`, `*_test.rs`,
+/// `*_tests.rs` or `test_*.py`.
 pub fn is_test(path: &str) -> bool {
     let (folders, name) = path.rsplit_once('/').unwrap_or(("", path));
     folders.split('/').any(|folder| matches!(folder, "tests" | "test" | "fixtures"))
@@ -78,21 +79,22 @@ pub fn is_test(path: &str) -> bool {
         || (name.starts_with("test_") && name.ends_with(".py"))
 }
 
-/// Tells whether a file was generated from other files of the repository, such as `.proto` files.
+/// Returns whether a file was generated from other files of the repository, such as `.proto` files.
 ///
-/// These are the files below folders called `generated`, and the bindings of MuJoCo.
+/// These are the files in folders called `generated`, and the bindings of MuJoCo.
 pub fn is_generated(path: &str) -> bool {
     path.contains("/generated/") || path.ends_with("/bindings.rs")
 }
 
-/// Tells whether a file belongs to a benchmark or an example, which are programs of their own.
+/// Returns whether a file belongs to a benchmark or an example, which are separate programs.
 pub fn is_benchmark_or_example(path: &str) -> bool {
     path.split('/').any(|folder| matches!(folder, "benches" | "benchmarks" | "examples"))
 }
 
-/// Returns the folder for which a file is counted: two levels for `src`, `crates` and `python`, else the top level.
+/// Returns the folder in whose count a file is included: the first two levels in `src`, `crates` and `python`,
+/// otherwise only the top level.
 ///
-/// Files of the repository's root are counted for `.`.
+/// Files in the repository's root are counted for `.`.
 pub fn folder_of(path: &str) -> &str {
     let mut ends = path.match_indices('/').map(|(index, _)| index);
     let first = ends.next().unwrap_or(0);

@@ -1,4 +1,4 @@
-//! Each check on small source trees, each seen to pass and to fail.
+//! Runs each check on small source trees that pass and that fail.
 
 use perturb_lint::cycles::{self, Cycle};
 use perturb_lint::doc_comments;

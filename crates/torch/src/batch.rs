@@ -1,4 +1,4 @@
-//! The samples of an update, as tensors.
+//! The samples of an update as tensors.
 
 use perturb_policy::{PolicySpec, SequenceSamples};
 use tch::Tensor;
@@ -7,27 +7,26 @@ use super::loss::LossTargets;
 use super::{Distributions, Sequences, TorchPolicy};
 use crate::error::{Error, Result};
 
-/// A rollout, or a minibatch of it: M sequences of L steps. Arrays `[V]` are over its V samples in order, those of
-/// padding left out.
+/// A rollout or a minibatch: M sequences of L steps. Without padding it has V samples.
 pub(crate) struct TensorBatch {
-    /// The sequences that the policy is evaluated on.
+    /// The observations and the memory on which the policy is evaluated.
     pub(crate) sequences: Sequences,
-    /// `[L, M, A]`.
+    /// `[L, M, A]` actions.
     pub(crate) actions: Tensor,
-    /// `[L, M]`.
+    /// `[L, M]` log-probabilities of the actions under the policy that acted.
     old_log_probs: Tensor,
-    /// `[L, M]`.
+    /// `[L, M]` values V that the policy computed when it acted.
     old_values: Tensor,
-    /// `[L, M]`.
+    /// `[L, M]` advantages.
     advantages: Tensor,
-    /// `[L, M]`.
+    /// `[L, M]` target values for V.
     returns: Tensor,
-    /// `[L, M]` the acting policy's action distributions; `None` if no KL divergence is computed.
+    /// `[L, M]` action distributions of the policy that acted; `None` if the loss has no KL divergence.
     acting: Option<Distributions>,
 }
 
 impl TensorBatch {
-    /// A copy of `sequences`.
+    /// Copies `sequences` into tensors.
     pub(crate) fn new(spec: &PolicySpec, sequences: &SequenceSamples<'_>) -> Result<Self> {
         let SequenceSamples { samples, n_steps, starts, memory, lengths } = *sequences;
         let sequences = Sequences::new(spec, n_steps, samples.observations, starts, memory)?;
@@ -49,7 +48,7 @@ impl TensorBatch {
         })
     }
 
-    /// The sequences at `indices`.
+    /// Returns a minibatch of the sequences at `indices`.
     pub(crate) fn select(&self, indices: &[u32]) -> Result<Self> {
         let indices: Vec<i64> = indices.iter().map(|&index| i64::from(index)).collect();
         let indices = Tensor::f_of_slice(&indices)?;
@@ -65,13 +64,13 @@ impl TensorBatch {
         })
     }
 
-    /// Stores the distributions of `policy` with its present weights as those of the policy that acted. The KL divergence
-    /// is measured from them.
+    /// Stores the action distributions of `policy` with its current weights, as those of the policy that acted. The KL
+    /// divergence is measured from these distributions.
     pub(crate) fn remember_acting(&mut self, policy: &TorchPolicy) {
         self.acting = Some(policy.distributions(&self.sequences));
     }
 
-    /// The targets of a loss over the V samples.
+    /// Returns the inputs of a loss over the V samples, without padding.
     pub(crate) fn targets(&self) -> Result<LossTargets> {
         let samples = |tensor: &Tensor| self.sequences.samples(tensor);
         Ok(LossTargets {

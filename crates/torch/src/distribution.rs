@@ -1,8 +1,8 @@
-//! The two action distributions on tensors.
+//! The two kinds of action distributions, on tensors:
 //!
-//! Categorical over logits l_j, j = 0 … n-1: log π(a) = l_a - log Σ_j exp l_j.
-//! Diagonal Gaussian with means μ_i and log standard deviations log σ_i, i = 0 … A-1:
-//! log π(a) = -½ Σ_i ((a_i - μ_i)/σ_i)² - Σ_i log σ_i - ½ A log 2π.
+//! - Categorical distribution with logits l_j, j = 0 … n-1: log π(a) = l_a - log Σ_j exp l_j.
+//! - Diagonal Gaussian with means μ_i and log standard deviations log σ_i, i = 0 … A-1: log π(a) = -½ Σ_i ((a_i -
+//!   μ_i)/σ_i)² - Σ_i log σ_i - ½ A log 2π.
 
 use tch::{Kind, Tensor};
 
@@ -14,19 +14,20 @@ const LOG_TAU: f64 = 1.837_877_066_409_345_3;
 /// Action distributions, one for each of B samples.
 #[derive(Debug)]
 pub struct Distributions {
-    /// `[B, n]` logits, or `[B, A]` means; other axes may stand in place of B.
+    /// `[B, n]` logits, or `[B, A]` means. Several axes may take the place of B.
     pub(super) outputs: Tensor,
     /// `[A]` log standard deviations of continuous actions.
     pub(super) log_std: Option<Tensor>,
 }
 
 impl Distributions {
-    /// Distributions with the same log standard deviations and other outputs.
+    /// Returns distributions with the same log standard deviations, and with outputs changed by `change`.
     pub(crate) fn map(&self, change: impl FnOnce(&Tensor) -> Result<Tensor>) -> Result<Self> {
         Ok(Distributions { outputs: change(&self.outputs)?, log_std: self.log_std.as_ref().map(Tensor::shallow_clone) })
     }
 
-    /// Distributions of the same kind with these outputs, `[B, n]` or `[B, A]` in a row, and log standard deviations.
+    /// Creates distributions of the same kind. `outputs` are the logits `[B, n]` or means `[B, A]` as one array, and
+    /// `log_std` the log standard deviations.
     pub fn with(&self, outputs: &[f32], log_std: &[f32]) -> Self {
         let width = self.outputs.size().last().copied().unwrap_or(1);
         Distributions {
@@ -35,8 +36,8 @@ impl Distributions {
         }
     }
 
-    /// KL(self ‖ other) `[B]` in nats, with the gradient in both: of categorical distributions Σ_j p_j (log p_j - log q_j), of
-    /// Gaussians Σ_i (log σ_q - log σ_p + (σ_p² + (μ_p - μ_q)²)/(2 σ_q²) - ½).
+    /// Returns KL(self ‖ other) `[B]` in nats, differentiable in both. For categorical distributions it is Σ_j p_j (log
+    /// p_j - log q_j), for Gaussians Σ_i (log σ_q - log σ_p + (σ_p² + (μ_p - μ_q)²)/(2 σ_q²) - ½).
     pub fn divergence_to(&self, other: &Distributions) -> Tensor {
         let sum = |terms: Tensor| terms.sum_dim_intlist(Some([-1i64].as_slice()), false, Kind::Float);
         match (&self.log_std, &other.log_std) {
@@ -54,7 +55,8 @@ impl Distributions {
     }
 }
 
-/// Log-probabilities `[B]` of `actions` `[B, 1]` and entropies `[B]` of the categorical distributions of `logits` [B, n].
+/// Returns the log-probabilities `[B]` of `actions` `[B, 1]` and the entropies `[B]`, for the categorical distributions
+/// with `logits` `[B, n]`.
 pub(super) fn categorical(logits: &Tensor, actions: &Tensor) -> (Tensor, Tensor) {
     let log_probs = logits.log_softmax(-1, Kind::Float);
     let chosen = log_probs.gather(1, &actions.to_kind(Kind::Int64), false).squeeze_dim(1);
@@ -62,8 +64,8 @@ pub(super) fn categorical(logits: &Tensor, actions: &Tensor) -> (Tensor, Tensor)
     (chosen, entropy)
 }
 
-/// Log-densities `[B]` of `actions` `[B, A]` and differential entropies `[B]` of the Gaussians of `means` `[B, A]` and
-/// `log_std` `[A]`.
+/// Returns the log-densities `[B]` of `actions` `[B, A]` and the differential entropies `[B]`, for the Gaussians with
+/// `means` `[B, A]` and log standard deviations `log_std` `[A]`.
 pub(super) fn gaussian(means: &Tensor, log_std: &Tensor, actions: &Tensor) -> (Tensor, Tensor) {
     let batch = means.size()[0];
     let size = means.size()[1] as f64;
@@ -80,7 +82,7 @@ mod tests {
     use super::*;
     use crate::fixture::{assert_close, fixture, tensor};
 
-    /// Tolerance of results around 10 in f32, from up to ten roundings of 2⁻²⁴ each.
+    /// Tolerance for results of about 10 in f32, after up to ten roundings of 2⁻²⁴ each.
     const TOLERANCE: f64 = 5e-6;
 
     #[test]
@@ -115,7 +117,7 @@ mod tests {
             ("divergence_gaussian", gaussian("means", "log_std"), gaussian("other_means", "other_log_std")),
         ] {
             assert_close(&own.divergence_to(&other), &fixture(case, "divergence"), TOLERANCE);
-            // For Gaussians σ² · σ⁻² is 1 up to two roundings of 2⁻²⁴ in each of three elements.
+            // For Gaussians, σ² · σ⁻² is 1 up to two roundings of 2⁻²⁴ in each of three elements.
             assert_close(&own.divergence_to(&own), &[0.0; 11], 5e-7);
         }
     }

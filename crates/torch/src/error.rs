@@ -6,10 +6,10 @@ use perturb_policy::Error as PolicyError;
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A policy's arrays do not fit.
+    /// A policy's arrays have the wrong length.
     #[error(transparent)]
     Policy(#[from] PolicyError),
-    /// libtorch refused an operation.
+    /// libtorch reported an error.
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),
 }

@@ -4,10 +4,11 @@ use tch::Tensor;
 
 use perturb_policy::PolicySpec;
 
-/// Two separate multilayer perceptrons with tanh between layers: one gives logits or means, the other V(s).
+/// Computes a feed-forward policy: two separate multilayer perceptrons with tanh between layers, one for logits or
+/// means and one for V(s).
 ///
-/// `leaves` are the weights in the order of [`PolicySpec::layout`]. Gives the policy's outputs [B, n or A] and the values
-/// `[B]` at `observations` `[B, O]`.
+/// `leaves` are the weights in the order of [`PolicySpec::layout`]. Returns the policy's outputs, `[B, n]` or `[B, A]`,
+/// and the values `[B]` at `observations` `[B, O]`.
 pub(super) fn forward(spec: &PolicySpec, leaves: &[Tensor], observations: &Tensor) -> (Tensor, Tensor) {
     let depth = 2 * (spec.hidden.len() + 1);
     let outputs = perceptron(&leaves[..depth], observations, false);
@@ -15,8 +16,9 @@ pub(super) fn forward(spec: &PolicySpec, leaves: &[Tensor], observations: &Tenso
     (outputs, values)
 }
 
-/// Runs `observations` `[B, O]` through the layers whose weights and biases alternate in `leaves`, with tanh between them
-/// and, if `squash_last`, after the last; gives [B, outputs].
+/// Computes a multilayer perceptron at `observations` `[B, O]`, with tanh between layers and, if `squash_last`, after
+/// the last layer. `leaves` contains the weights and the biases of each layer in turn. Returns the outputs `[B,
+/// outputs]`.
 pub(super) fn perceptron(leaves: &[Tensor], observations: &Tensor, squash_last: bool) -> Tensor {
     let n_layers = leaves.len() / 2;
     let mut x = observations.shallow_clone();

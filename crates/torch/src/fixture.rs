@@ -1,8 +1,8 @@
-//! Numbers that numpy computed (`tests/fixtures/make_losses.py`), for unit tests.
+//! Expected numbers for unit tests. `tests/fixtures/make_losses.py` computed them with numpy.
 
 use tch::{Kind, Tensor};
 
-/// The array `name` of `case`.
+/// Returns the array called `name` of `case`.
 pub(crate) fn fixture(case: &str, name: &str) -> Vec<f64> {
     let cases: serde_json::Value =
         serde_json::from_str(include_str!("../tests/fixtures/losses.json")).expect("the fixture is JSON");
@@ -10,17 +10,17 @@ pub(crate) fn fixture(case: &str, name: &str) -> Vec<f64> {
     numbers.iter().map(|x| x.as_f64().expect("a number")).collect()
 }
 
-/// The array `name` of `case`, as f32.
+/// Returns the array called `name` of `case` as f32.
 pub(crate) fn fixture_f32(case: &str, name: &str) -> Vec<f32> {
     fixture(case, name).iter().map(|&x| x as f32).collect()
 }
 
-/// The array `name` of `case`, as a flat tensor.
+/// Returns the array called `name` of `case` as a one-dimensional tensor.
 pub(crate) fn tensor(case: &str, name: &str) -> Tensor {
     Tensor::of_slice(&fixture_f32(case, name))
 }
 
-/// Whether every element of `got` is within `tolerance` of `expected`.
+/// Asserts that every element of `got` is within `tolerance` of `expected`.
 #[track_caller]
 pub(crate) fn assert_close(got: &Tensor, expected: &[f64], tolerance: f64) {
     let got: Vec<f64> = got.detach().contiguous().view((-1,)).to_kind(Kind::Double).into();

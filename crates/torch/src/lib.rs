@@ -1,5 +1,5 @@
-//! Policies on libtorch: the gradient of a recurrent policy, which a program that is to train them [registers](register),
-//! and a reference for the feed-forward one.
+//! Policies on libtorch. A program that trains recurrent policies must [`register`] this crate, which then computes
+//! their gradients. For feed-forward policies it is a reference implementation for tests.
 #![forbid(unsafe_code)]
 
 mod batch;
@@ -24,12 +24,12 @@ pub use loss::{LossTargets, evaluate};
 pub use policy::{Evaluated, TorchPolicy};
 pub use sequences::Sequences;
 
-/// Registers libtorch for the gradients of recurrent policies in this process.
+/// Makes this process compute the gradients of recurrent policies with libtorch.
 pub fn register() {
     register_recurrent(|spec| Ok(Box::new(TorchDifferentiator(Rc::new(TorchPolicy::zeros(spec)?)))));
 }
 
-/// The networks that all batches of a policy share.
+/// Computes gradients of recurrent policies. All batches share its networks.
 struct TorchDifferentiator(Rc<TorchPolicy>);
 
 impl RecurrentDifferentiator for TorchDifferentiator {

@@ -1,4 +1,4 @@
-//! [`Objective`] on libtorch. Tensors are f32 `[B]` over the samples of a batch, b = 0 … B-1; results have no axes.
+//! The loss of an [`Objective`] on libtorch. Tensors are f32 `[B]` over the samples of a batch; results are scalars.
 
 use perturb_policy::{Losses, Objective, Surrogate};
 use tch::{Kind, Tensor};
@@ -6,25 +6,26 @@ use tch::{Kind, Tensor};
 use super::{Distributions, Evaluated};
 use crate::error::Result;
 
-/// Added to the standard deviation that advantages are divided by.
+/// Number that is added to the standard deviation of advantages before they are divided by it.
 const EPSILON: f64 = 1e-8;
 
-/// The inputs of a loss that do not come from the policy that is being trained.
+/// The inputs of a loss that do not depend on the policy being trained.
 #[derive(Debug)]
 pub struct LossTargets {
-    /// Log-probabilities under the acting policy.
+    /// Log-probabilities of the actions under the policy that acted.
     pub old_log_probs: Tensor,
-    /// Values of the acting policy.
+    /// Values V that the policy computed when it acted.
     pub old_values: Tensor,
-    /// Advantages.
+    /// The advantages.
     pub advantages: Tensor,
-    /// Value targets.
+    /// Target values for V.
     pub returns: Tensor,
-    /// The acting policy's distributions, for their divergence.
+    /// The action distributions of the policy that acted, if the loss has a KL divergence.
     pub acting: Option<Distributions>,
 }
 
-/// Returns the total of `objective`, from which gradients flow back through `evaluated`, and the losses.
+/// Computes the loss of `objective`. Returns the total loss as a tensor, which is differentiable through `evaluated`,
+/// and all terms of the loss.
 pub fn evaluate(objective: &Objective, evaluated: &Evaluated, targets: &LossTargets) -> Result<(Tensor, Losses)> {
     let Objective { ent_coef, vf_coef, kl_coef, .. } = *objective;
     let normalised = objective.normalize_advantages.then(|| normalise(&targets.advantages));
@@ -50,7 +51,8 @@ pub fn evaluate(objective: &Objective, evaluated: &Evaluated, targets: &LossTarg
     Ok((total, Losses { policy, value, entropy, total: sum, approx_kl, clip_fraction, kl_divergence }))
 }
 
-/// PPO's surrogate; without gradient, the approximate divergence and the share of clipped samples.
+/// Returns PPO's clipped surrogate, the approximate KL divergence and the share of clipped samples. Only the first is
+/// differentiable.
 fn clipped_surrogate(log_probs: &Tensor, targets: &LossTargets, advantages: &Tensor, range: f64) -> [Tensor; 3] {
     let log_ratio = log_probs - &targets.old_log_probs;
     let ratio = log_ratio.exp();
@@ -80,7 +82,7 @@ mod tests {
     use super::*;
     use crate::fixture::{assert_close, fixture, tensor};
 
-    /// Results of order 1 in f32, from means over 11 samples: some ten roundings of 2⁻²⁴.
+    /// Tolerance for results of about 1 in f32: means over 11 samples have about ten roundings of 2⁻²⁴.
     const TOLERANCE: f64 = 2e-6;
 
     fn targets() -> LossTargets {
@@ -110,14 +112,14 @@ mod tests {
 
     #[test]
     fn the_surrogate_has_no_gradient_where_moving_on_would_gain() {
-        // Ratios 1.5 and 0.5: clipped for a positive and a negative advantage, free for the opposite ones.
+        // The ratios are 1.5 and 0.5. The first is clipped if the advantage is positive, the second if it is negative.
         let advantages = Tensor::of_slice(&[1.0f32, -1.0, 1.0, -1.0]);
         let targets = LossTargets { old_log_probs: Tensor::of_slice(&[0.0f32; 4]), ..targets() };
         let log_probs = [1.5f32.ln(), 1.5f32.ln(), 0.5f32.ln(), 0.5f32.ln()];
         let log_probs = Tensor::of_slice(&log_probs).set_requires_grad(true);
         let [loss, _, clip_fraction] = clipped_surrogate(&log_probs, &targets, &advantages, 0.2);
         loss.backward();
-        // d/dlogπ of -A ρ is -A ρ, over 4 samples.
+        // The derivative of -A ρ with respect to log π is -A ρ, divided by 4 samples.
         assert_close(&log_probs.grad(), &[0.0, 1.5 / 4.0, -0.5 / 4.0, 0.0], 1e-7);
         assert_eq!(clip_fraction.double_value(&[]), 1.0);
     }

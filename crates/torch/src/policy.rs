@@ -8,44 +8,44 @@ use super::distribution::{Distributions, categorical, gaussian};
 use super::{Sequences, ff, rc};
 use crate::error::Result;
 
-/// A policy of either architecture: feed-forward, two separate multilayer perceptrons of which one gives logits or means
-/// and the other V(s); or recurrent, hidden layers, an LSTM, and two linear heads. Continuous actions have one more weight
-/// each, log_std, the same in every state.
+/// A policy of either architecture. A feed-forward policy consists of two separate multilayer perceptrons, one for
+/// logits or means and one for V(s). A recurrent policy consists of hidden layers, an LSTM and two linear heads. For
+/// continuous actions there is one more weight for each element, log_std, which does not depend on the state.
 ///
-/// All weights lie in one tensor `[P]`, of which those of the layers are views.
+/// All weights are stored in one tensor `[P]`; the layers' weights are views of it.
 pub struct TorchPolicy {
     spec: PolicySpec,
-    /// `[P]`, without gradient; shares its storage with `leaves`.
+    /// `[P]` all weights. They are not differentiable, and share their storage with `leaves`.
     all: Tensor,
-    /// The weights in order of [`PolicySpec::layout`], with gradients.
+    /// The weights in the order of [`PolicySpec::layout`], differentiable.
     leaves: Vec<Tensor>,
-    /// Whether libtorch differentiates the recurrence.
+    /// Whether libtorch's autograd differentiates the LSTM, instead of this crate.
     plain_autograd: bool,
 }
 
-/// A policy's view of B observations and actions.
+/// The results of evaluating a policy at B observations and actions.
 #[derive(Debug)]
 pub struct Evaluated {
     /// `[B]` log-probabilities (densities, if continuous) of the actions.
     pub log_probs: Tensor,
     /// `[B]` entropies of the action distributions, in nats.
     pub entropy: Tensor,
-    /// `[B]` values.
+    /// `[B]` values V of the observations.
     pub values: Tensor,
-    /// B action distributions.
+    /// The action distributions of the B samples.
     pub distributions: Distributions,
-    /// The intermediate results for the gradient of a recurrence.
+    /// Intermediate results of the LSTM, for its gradient; `None` if libtorch differentiates everything.
     tape: Option<rc::Tape>,
 }
 
 impl TorchPolicy {
-    /// A policy with the given weights `[P]`.
+    /// Creates a policy with the given weights `[P]`.
     ///
-    /// Sets libtorch to one thread, for the whole process: these networks are too small to share, and sums stay in one
-    /// order.
+    /// Sets libtorch to one thread in the whole process. These networks are too small to gain from several threads, and
+    /// sums keep a fixed order.
     ///
     /// # Errors
-    /// Another number of weights.
+    /// An error if the number of weights is wrong.
     pub fn new(spec: &PolicySpec, weights: &[f32]) -> Result<Self> {
         check_length("weights [P]", weights.len(), spec.n_weights())?;
         tch::set_num_threads(1);
@@ -62,28 +62,32 @@ impl TorchPolicy {
         Ok(TorchPolicy { spec: spec.clone(), all, leaves, plain_autograd: false })
     }
 
-    /// A policy whose weights are all 0.
+    /// Creates a policy whose weights are all 0.
     pub(crate) fn zeros(spec: &PolicySpec) -> Result<Self> {
         TorchPolicy::new(spec, &vec![0.0; spec.n_weights()])
     }
 
-    /// Leaves the gradient through a recurrence to libtorch, to compare with: the same but for rounding, and slower.
+    /// Makes libtorch's autograd differentiate the LSTM. The results are the same except for rounding, but slower.
+    /// Tests compare both.
     pub fn with_plain_autograd(self) -> Self {
         TorchPolicy { plain_autograd: true, ..self }
     }
 
-    /// The shape.
+    /// Returns the shape of the policy.
     pub fn spec(&self) -> &PolicySpec {
         &self.spec
     }
 
-    /// Log-probabilities of `actions` `[L, M, A]` (a discrete action is its index, A = 1), entropies, and values over
-    /// `sequences`, all f32 `[B]` and, by [`TorchPolicy::gradient`], differentiable in the weights. A recurrent policy begins with
-    /// the sequences' memory, and with none at the start of every episode; nothing flows back to what was before.
+    /// Evaluates the policy at all samples of `sequences`: log-probabilities of `actions` `[L, M, A]`, entropies and
+    /// values. A discrete action is its index, with A = 1. All results are f32 `[B]` and can be differentiated with
+    /// [`TorchPolicy::gradient`].
+    ///
+    /// A recurrent policy starts from the memory of the sequences, and from 0 at the start of each episode. Nothing is
+    /// differentiated with respect to that memory.
     ///
     /// # Panics
     ///
-    /// If a shape is another, or a discrete action is not in 0 … n-1.
+    /// If a shape is wrong, or a discrete action is not in 0 … n-1.
     pub fn evaluate(&self, sequences: &Sequences, actions: &Tensor) -> Evaluated {
         let (outputs, values, tape) = self.forward(sequences);
         let outputs = sequences.without_padding(outputs);
@@ -97,18 +101,19 @@ impl TorchPolicy {
         Evaluated { log_probs, entropy, values, distributions, tape }
     }
 
-    /// `[L, M]` the action distributions at all steps of `sequences`, padding included, without gradient.
+    /// Returns the action distributions `[L, M]` at all steps of `sequences`, including padding. They are not
+    /// differentiable.
     pub(crate) fn distributions(&self, sequences: &Sequences) -> Distributions {
         tch::no_grad(|| {
             let (outputs, _, _) = self.forward(sequences);
             let outputs = outputs.view((sequences.n_steps(), sequences.count(), self.spec.action.outputs() as i64));
             let Distributions { outputs, log_std } = self.distributions_of(outputs);
-            // The deviations are copied, since the weights will change.
+            // Copies the log standard deviations, because the weights will change.
             Distributions { outputs, log_std: log_std.map(|log_std| log_std.detach().copy()) }
         })
     }
 
-    /// The policy's outputs and values over all L·M steps.
+    /// Computes the policy's outputs and values at all L·M steps.
     fn forward(&self, sequences: &Sequences) -> (Tensor, Tensor, Option<rc::Tape>) {
         if self.spec.lstm.is_some() {
             return rc::forward(&self.spec, &self.leaves, sequences, self.plain_autograd);
@@ -125,15 +130,16 @@ impl TorchPolicy {
         Distributions { outputs, log_std }
     }
 
-    /// Replaces the weights by `weights` `[P]`.
+    /// Replaces all weights by `weights` `[P]`.
     pub(crate) fn load(&self, weights: &[f32]) -> Result<()> {
         check_length("weights [P]", weights.len(), self.all.numel())?;
         let mut all = self.all.shallow_clone();
         Ok(tch::no_grad(|| all.f_copy_(&Tensor::f_of_slice(weights)?))?)
     }
 
-    /// Writes the gradient of `loss`, which was computed from `evaluated` and from nothing else of this policy, in the
-    /// weights to `gradient` `[P]`. Uses up the graph: there is one gradient an evaluation.
+    /// Computes the gradient of `loss` with respect to the weights and writes it to `gradient` `[P]`. `loss` must have
+    /// been computed from `evaluated`, and from nothing else of this policy. This frees libtorch's graph, so an
+    /// evaluation has only one gradient.
     pub fn gradient(&self, evaluated: &Evaluated, loss: &Tensor, gradient: &mut [f32]) -> Result<()> {
         check_length("gradient [P]", gradient.len(), self.all.numel())?;
         let gradients = match &evaluated.tape {

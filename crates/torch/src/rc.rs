@@ -1,26 +1,29 @@
-//! The recurrent network on libtorch, with its own back-propagation through time.
+//! The recurrent network on libtorch, with this crate's own back-propagation through time.
 //!
-//! For step t = 0 … L-1 of each of M sequences, with x_t the last hidden layer's output and (h_{-1}, c_{-1}) the initial
-//! memory:
+//! The LSTM computes, for step t = 0 … L-1 of each of M sequences, with the last hidden layer's output x_t and the
+//! initial memory (h_{-1}, c_{-1}):
 //!
 //! (h', c') = (h_{t-1}, c_{t-1}), or 0 where an episode starts at t,
-//! (i, f, g, o) = W_x x_t + W_h h' + b, four blocks of H rows in this order, which is torch's,
+//! (i, f, g, o) = W_x x_t + W_h h' + b, four blocks of H rows in PyTorch's order,
 //! c_t = σ(f) c' + σ(i) tanh g,
 //! h_t = σ(o) tanh c_t.
 //!
-//! Hochreiter and Schmidhuber (1997), with the forget gate of Gers et al. (2000). Torch has two biases, of which only the
-//! sum matters; here is one. Two linear heads give logits or means, and V(s), from h_t.
+//! This is the LSTM of Hochreiter and Schmidhuber (1997) with the forget gate of Gers et al. (2000). PyTorch has two
+//! biases, of which only the sum matters; this network has one. Two linear heads compute logits or means, and V(s),
+//! from h_t.
 //!
-//! **Two stages.** libtorch would multiply out the gradients of W_h and W_x once a step, with M rows each time. Instead
-//! the loop over time runs without libtorch's graph and keeps the gates; h becomes an input of the heads' graph. Back
-//! through that graph comes ∂loss/∂h_t; then one loop backwards in time makes of it the gates' deltas
-//! D_t = ∂loss/∂(W_x x_t + W_h h' + b), with δ_t = ∂loss/∂h_t + W_hᵀ D_{t+1} and e_t = ∂loss/∂c_t in all:
+//! **Two stages.** libtorch's autograd would compute the gradients of W_h and W_x by one product for each step, with
+//! only M rows. Instead, the loop over time runs without autograd and stores the gates. Its result h is an input of a
+//! separate graph for the heads, and back-propagation through this graph gives ∂loss/∂h_t of the heads alone. A second
+//! loop, backwards in time, turns it into the derivatives with respect to the gates' sums, D_t = ∂loss/∂(W_x x_t + W_h
+//! h' + b). With δ_t = ∂loss/∂h_t + W_hᵀ D_{t+1} and the total derivative e_t = ∂loss/∂c_t:
 //!
 //! e_t = δ_t σ(o) (1 - tanh² c_t) + e_{t+1} σ(f)_{t+1},
-//! D_t = (e_t tanh g σ'(i), e_t c' σ'(f), e_t σ(i) tanh'(g), δ_t tanh c_t σ'(o)),
+//! D_t = (e_t tanh g σ'(i), e_t c' σ'(f), e_t σ(i) tanh'(g), δ_t tanh c_t σ'(o)).
 //!
-//! where nothing flows back over an episode's start. The gradient of W_h is then one product Dᵀ h' over all L·M rows,
-//! and those of W_x, b and the layers below come from libtorch, as the gradient of Σ D · (W_x x + b) with D constant.
+//! Nothing is propagated back across the start of an episode. The gradient of W_h is then a single product Dᵀ h' over
+//! all L·M rows. libtorch computes the gradients of W_x, b and the layers below, as those of Σ D · (W_x x + b) with
+//! constant D.
 
 use tch::{Kind, Tensor};
 
@@ -30,15 +33,16 @@ use super::Sequences;
 use super::ff::perceptron;
 use crate::error::Result;
 
-/// The weights by their places, in the order of [`PolicySpec::layout`].
+/// The indices of weights in the order of [`PolicySpec::layout`].
 struct WeightIndices {
-    /// W_x `[4H, X]`; all before it are hidden layers.
+    /// W_x `[4H, X]`. All weights before it belong to hidden layers.
     input: usize,
     /// W_h `[4H, H]`.
     recurrent: usize,
     /// b `[4H]`.
     bias: usize,
-    /// Weight and bias of the policy's head, then of the value's; all after it belongs to the heads' graph too.
+    /// The first weight of the heads: weights and biases of the policy head, then of the value head, then log_std if
+    /// actions are continuous.
     heads: usize,
 }
 
@@ -49,27 +53,28 @@ impl WeightIndices {
     }
 }
 
-/// The results of the first stage that the second needs.
+/// The results of the forward pass that the backward pass needs.
 #[derive(Debug)]
 pub(super) struct Tape {
-    /// W_x x + b `[L·M, 4H]`, with a graph to the layers below.
+    /// W_x x + b `[L·M, 4H]`, differentiable through the layers below.
     driven: Tensor,
-    /// h `[L·M, H]`, where the heads' graph begins.
+    /// h `[L·M, H]`, the input of the heads' graph.
     hidden: Tensor,
-    /// σ(i), σ(f), tanh g, σ(o) `[L, M, 4H]`.
+    /// σ(i), σ(f), tanh g and σ(o), `[L, M, 4H]`.
     gates: Tensor,
     /// c `[L, M, H]`.
     cells: Tensor,
-    /// h' `[L, M, H]`.
+    /// h' `[L, M, H]`: h before the step.
     hidden_before: Tensor,
-    /// c' `[L, M, H]`.
+    /// c' `[L, M, H]`: c before the step.
     cells_before: Tensor,
-    /// `[L, M, 1]`: 0 where an episode starts, else 1.
+    /// `[L, M, 1]`: 0 at the start of an episode, else 1.
     keep: Tensor,
 }
 
-/// Gives the policy's outputs [B, n or A] and the values `[B]` over `sequences`, B = L·M, and the tape; `plain` leaves all
-/// to libtorch, for comparison, and gives none.
+/// Computes the network over `sequences`. Returns the policy's outputs, `[B, n]` or `[B, A]` with B = L·M, the values
+/// `[B]`, and the results for the backward pass. With `plain`, libtorch differentiates everything, and the last result
+/// is `None`.
 pub(super) fn forward(
     spec: &PolicySpec,
     leaves: &[Tensor],
@@ -94,7 +99,7 @@ pub(super) fn forward(
     (outputs, values, tape)
 }
 
-/// The loop over time, for autograd: h `[L·M, H]`.
+/// Computes h `[L·M, H]` by the loop over time, differentiable by libtorch.
 fn unrolled(driven: &Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tensor {
     let steps = sequences.n_steps();
     let count = sequences.count();
@@ -115,7 +120,7 @@ fn unrolled(driven: &Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tenso
     Tensor::cat(&hidden, 0)
 }
 
-/// The loop over time, without a graph.
+/// Computes the loop over time without autograd, and stores the results for the backward pass.
 fn run(driven: Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tape {
     let steps = sequences.n_steps();
     let count = sequences.count();
@@ -156,7 +161,7 @@ fn run(driven: Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tape {
     }
 }
 
-/// The gradients of `loss` in all `leaves`, in order.
+/// Returns the gradients of `loss` with respect to all `leaves`, in order.
 pub(super) fn backward(spec: &PolicySpec, leaves: &[Tensor], loss: &Tensor, tape: &Tape) -> Result<Vec<Tensor>> {
     let places = WeightIndices::new(spec);
     let heads: Vec<&Tensor> = leaves[places.heads..].iter().chain([&tape.hidden]).collect();
@@ -177,7 +182,7 @@ pub(super) fn backward(spec: &PolicySpec, leaves: &[Tensor], loss: &Tensor, tape
     Ok(gradients)
 }
 
-/// D `[L·M, 4H]` from ∂loss/∂h `[L·M, H]`, the loop backwards in time.
+/// Computes D `[L·M, 4H]` from ∂loss/∂h `[L·M, H]` by the loop backwards in time.
 fn deltas(recurrent: &Tensor, of_hidden: &Tensor, tape: &Tape) -> Tensor {
     let [steps, count, width] = [0, 1, 2].map(|axis: usize| tape.cells.size()[axis]);
     let of_hidden = of_hidden.view((steps, count, width));
@@ -189,7 +194,7 @@ fn deltas(recurrent: &Tensor, of_hidden: &Tensor, tape: &Tape) -> Tensor {
     let tanh_c = tape.cells.tanh();
     let slope = |sigmoid: &Tensor| sigmoid * (1f64 - sigmoid);
     let tanh_slope = |tanh: &Tensor| 1f64 - tanh.square();
-    // D_t = factors_t times (e_t, e_t, e_t, δ_t); becomes D in place.
+    // D_t = factors_t times (e_t, e_t, e_t, δ_t). The loop multiplies in place.
     let factors = [&g * slope(&i), &tape.cells_before * slope(&f), &i * tanh_slope(&g), &tanh_c * slope(&o)];
     let deltas = Tensor::stack(&factors, 2); // [L, M, 4, H]
     let hidden_to_cell = o * tanh_slope(&tanh_c);

@@ -1,4 +1,4 @@
-//! The sequences that a policy is evaluated on.
+//! The sequences of steps on which a policy is evaluated.
 
 use tch::{Device, Kind, Tensor};
 
@@ -6,35 +6,35 @@ use crate::error::Result;
 use perturb_policy::PolicySpec;
 use perturb_policy::check_length;
 
-/// M sequences of L steps, on libtorch. Flattened to B = L·M samples, sample l·M + m is step l of sequence m. Shorter
-/// sequences are padded; padding is no sample, so B is then less.
+/// M sequences of L steps, as tensors. Sample l·M + m is step l of sequence m, and there are B = L·M samples. Shorter
+/// sequences are padded; padding is not a sample, so B is then smaller.
 ///
-/// A sequence is what a policy must see whole. A recurrent policy needs the steps of an environment in order: M = N, L = T.
-/// A feed-forward policy takes every step by itself: M = T·N, L = 1. In both cases the samples have the rollout's order,
-/// and a minibatch is a set of sequences.
+/// A sequence is a series of steps that a minibatch cannot split. A recurrent policy needs the steps of an environment
+/// in order: M = N, L = T. For a feed-forward policy each step is a sequence: M = T·N, L = 1. In both cases the samples
+/// have the order of the rollout, and a minibatch is a set of sequences.
 #[derive(Debug)]
 pub struct Sequences {
-    /// `[L, M, O]`.
+    /// `[L, M, O]` normalised observations.
     observations: Tensor,
-    /// `[L, M]`: 1 where an episode starts, else 0.
+    /// `[L, M]`: 1 at the start of an episode, else 0.
     starts: Tensor,
-    /// `[M, S]`, S = [`PolicySpec::memory_size`].
+    /// `[M, S]` memory before the first step, with S = [`PolicySpec::memory_size`].
     memory: Tensor,
-    /// The mask of the samples; `None` if all L·M steps are samples.
+    /// The mask that excludes padding; `None` if there is no padding.
     padding: Option<Padding>,
 }
 
-/// A mask of the steps, L·M, that are samples.
+/// A mask of the L·M steps that are samples rather than padding.
 #[derive(Debug)]
 struct Padding {
     /// `[L, M]`: 1 for samples, 0 for padding.
     mask: Tensor,
-    /// `[B]`: places of the samples in the flattened mask.
+    /// `[B]` indices of the samples in the flattened mask.
     samples: Tensor,
 }
 
 impl Padding {
-    /// The first `lengths` `[M]` steps of every sequence are samples.
+    /// Creates the mask in which the first `lengths` `[M]` steps of each sequence are samples.
     fn new(n_steps: i64, lengths: &[usize]) -> Result<Self> {
         let lengths: Vec<i64> = lengths.iter().map(|&length| length as i64).collect();
         let steps = Tensor::f_arange(n_steps, (Kind::Int64, Device::Cpu))?.f_unsqueeze(1)?;
@@ -47,11 +47,12 @@ impl Padding {
 }
 
 impl Sequences {
-    /// The sequences of T steps of N environments: normalised `observations` `[T, N, O]`, `starts` `[T, N]`, whether an
-    /// episode starts with that step, and `memory` `[N, S]` before the first. N is the length of `starts` / `n_steps`.
+    /// Creates the sequences of T steps of N environments. `observations` `[T, N, O]` are normalised, `starts` `[T, N]`
+    /// says whether an episode starts with the step, and `memory` `[N, S]` is the policy's memory before the first
+    /// step. N is the length of `starts` divided by `n_steps`.
     ///
     /// # Errors
-    /// Lengths that do not fit.
+    /// An error if an array has the wrong length.
     pub fn new(
         spec: &PolicySpec,
         n_steps: usize,
@@ -74,27 +75,27 @@ impl Sequences {
         })
     }
 
-    /// Makes only the first `lengths[m]` steps of sequence m samples; the others are padding.
+    /// Makes all steps of sequence m after its first `lengths[m]` padding.
     ///
     /// # Errors
-    /// A number of lengths other than M.
+    /// An error if the number of lengths is not M.
     pub fn with_lengths(self, lengths: &[usize]) -> Result<Self> {
         check_length("lengths [M]", lengths.len(), self.count() as usize)?;
         let padding = Some(Padding::new(self.n_steps(), lengths)?);
         Ok(Sequences { padding, ..self })
     }
 
-    /// L, the number of steps.
+    /// Returns L, the number of steps.
     pub fn n_steps(&self) -> i64 {
         self.starts.size()[0]
     }
 
-    /// M, the number of sequences.
+    /// Returns M, the number of sequences.
     pub fn count(&self) -> i64 {
         self.starts.size()[1]
     }
 
-    /// The sequences at `indices`.
+    /// Returns the sequences at `indices`.
     pub(crate) fn select(&self, indices: &Tensor) -> Result<Self> {
         Ok(Sequences {
             observations: self.observations.f_index_select(1, indices)?,
@@ -107,7 +108,7 @@ impl Sequences {
         })
     }
 
-    /// The samples' rows of `rows` `[L, M, …]`: `[B, …]`.
+    /// Returns the rows of `rows` `[L, M, …]` that are samples, `[B, …]`.
     pub(crate) fn samples(&self, rows: &Tensor) -> Result<Tensor> {
         let flat = rows.f_flatten(0, 1)?;
         Ok(match &self.padding {
@@ -116,7 +117,7 @@ impl Sequences {
         })
     }
 
-    /// The samples' rows of `rows` `[L·M, …]`: `[B, …]`.
+    /// Returns the rows of `rows` `[L·M, …]` that are samples, `[B, …]`.
     pub(super) fn without_padding(&self, rows: Tensor) -> Tensor {
         match &self.padding {
             Some(padding) => rows.index_select(0, &padding.samples),
@@ -124,23 +125,23 @@ impl Sequences {
         }
     }
 
-    /// The observations of all samples `[B, O]`.
+    /// Returns the observations of all L·M steps, `[L·M, O]`.
     pub(super) fn flat_observations(&self) -> Tensor {
         self.observations.flatten(0, 1)
     }
 
-    /// `[L, M, 1]`: 0 where an episode starts, else 1.
+    /// Returns a tensor `[L, M, 1]` with 0 at the start of an episode, else 1.
     pub(super) fn keep(&self) -> Tensor {
         (1f64 - &self.starts).unsqueeze(2)
     }
 
-    /// `[L]`: whether an episode starts in any sequence.
+    /// Returns for each step `[L]` whether an episode starts there in any sequence.
     pub(super) fn steps_with_starts(&self) -> Vec<bool> {
         let counts = self.starts.sum_dim_intlist(Some([1i64].as_slice()), false, Kind::Float);
         Vec::<f32>::from(counts).into_iter().map(|count| count > 0.0).collect()
     }
 
-    /// The memory's halves before the first step, h and c, `[M, H]` each.
+    /// Returns the two halves of the memory before the first step: h and c, `[M, H]` each.
     pub(super) fn initial_memory(&self, width: i64) -> (Tensor, Tensor) {
         (self.memory.narrow(1, 0, width), self.memory.narrow(1, width, width))
     }

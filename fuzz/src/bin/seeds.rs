@@ -1,4 +1,4 @@
-//! `seeds DIR`: writes the valid inputs of each target to a folder of its name in DIR.
+//! The program `seeds DIR`: writes the valid inputs of each fuzz target to a folder in DIR that has the target's name.
 
 use std::path::Path;
 

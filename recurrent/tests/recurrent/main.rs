@@ -1,5 +1,5 @@
-//! The tests of the program `perturb-recurrent`: which program loads libtorch, and the error where the other one is missing.
-//! They need the programs `perturb` and `perturb-server`: run `cargo build --workspace --release` first.
+//! Tests of the program `perturb-recurrent`: only it loads libtorch, and the error is helpful if it is missing. The
+//! tests need the programs `perturb` and `perturb-server`; run `cargo build --workspace --release` first.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 
 const RECURRENT: &str = env!("CARGO_BIN_EXE_perturb-recurrent");
 
-/// The program `perturb`, which must have been built before: `cargo build --workspace --release`.
+/// Returns the path of the program `perturb`, which must be built already: `cargo build --workspace --release`.
 fn perturb() -> PathBuf {
     Path::new(RECURRENT).with_file_name("perturb")
 }
@@ -16,7 +16,7 @@ fn train(program: &Path, architecture: &str, out: &Path) -> Command {
     let mut command = Command::new(program);
     let options = ["--env", "CartPole", "--algorithm", "a2c", "--episodes", "20", "--architecture", architecture];
     command.arg("train").args(options).arg("--out").arg(out);
-    // The program's copy has no server beside it, so it gets the server's path.
+    // The copied program finds no server in its folder, so it gets the server's path.
     command.env("PERTURB_SERVER", Path::new(RECURRENT).with_file_name("perturb-server"));
     command
 }
@@ -55,8 +55,8 @@ fn missing_perturb_recurrent_is_reported_with_a_remedy() {
     assert_eq!(said, expected);
     assert!(!out.exists());
 
-    // `perturb` trains with `perturb-recurrent` beside it, and either program gives the same weights. Without
-    // `perturb-recurrent` a trained policy can still be tested.
+    // `perturb` trains with the `perturb-recurrent` in its folder, and both programs produce the same weights. Without
+    // `perturb-recurrent`, `perturb` can still test a trained policy.
     fs::copy(RECURRENT, folder.path().join("perturb-recurrent")).expect("copied");
     let (out, other) = (folder.path().join("one"), folder.path().join("other"));
     for (program, out) in [("perturb", &out), ("perturb-recurrent", &other)] {
@@ -75,7 +75,7 @@ fn missing_perturb_recurrent_is_reported_with_a_remedy() {
     assert_eq!(tested.stdout, tested_there.stdout);
 }
 
-/// The bytes of a run's weights.
+/// Returns the bytes of the weights of the run in `out`.
 fn weights(out: &Path) -> Vec<u8> {
     let is_weights = |path: &Path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("weights"));
     let files = fs::read_dir(out.join("checkpoint")).expect("a checkpoint").map(|entry| entry.expect("a file").path());
@@ -93,7 +93,7 @@ fn programs_of_two_builds_are_refused() {
     let said = stderr(&output);
     assert!(said.contains("perturb is 0.0.1 (other), but perturb-recurrent is "), "{said}");
     assert!(said.contains("install both from one clone with `make install-recurrent`"), "{said}");
-    // The builds need not agree for other tasks than training a recurrent policy.
+    // The two programs need not be of the same build for tasks other than training a recurrent policy.
     let output = run(Command::new(perturb()).arg("--version").env("PERTURB_STARTED_BY", "0.0.1 (other)"));
     assert!(output.status.success());
 }

@@ -6,42 +6,42 @@ mod scan;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Longest chain of re-exports that is followed.
+/// Maximum length of a chain of re-exports that is followed.
 const MAX_REEXPORTS: usize = 16;
 
-/// A module's names from the crate's root downwards. The root itself has none.
+/// The path of a module: its names from the crate's root downwards. The root's path is empty.
 pub type ModulePath = Vec<String>;
 
-/// A place at which a module names another one of the same package.
+/// An import: a place in one module where another module of the same package is named.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Import {
-    /// The module in which the name stands.
+    /// The module that contains the import.
     pub from: ModulePath,
-    /// The module that is named. Re-exports are followed to the module that defines the item.
+    /// The imported module. For a re-exported item, it is the module that defines the item.
     pub to: ModulePath,
-    /// File in which the name stands.
+    /// The file with the import.
     pub file: String,
-    /// Line of the file, counted from 1.
+    /// The line in the file, from 1.
     pub line: usize,
 }
 
 /// The imports of one crate, one program or one Python package.
 #[derive(Clone, Debug)]
 pub struct PackageImports {
-    /// Folder of its `Cargo.toml`, or of its Python modules; `.` for the repository's root.
+    /// The folder of the `Cargo.toml` or of the Python modules; `.` for the repository's root.
     pub folder: String,
-    /// Imports of the package, in the order of files and lines.
+    /// The imports, ordered by file and line.
     pub imports: Vec<Import>,
 }
 
-/// Reads the imports of every crate and Python package of `tree`, without their tests.
+/// Reads the imports of every crate and every Python package in `tree`, except in tests.
 pub fn read(tree: &crate::source::SourceTree) -> Vec<PackageImports> {
     let mut packages = rust::packages(tree);
     packages.extend(python::packages(tree));
     packages
 }
 
-/// A path as it is written, with where it stands. The first name may be `crate`, `self` or `super`.
+/// A path as it is written in the source, with its location. The first name may be `crate`, `self` or `super`.
 #[derive(Clone, Debug)]
 struct WrittenPath {
     module: ModulePath,
@@ -50,19 +50,19 @@ struct WrittenPath {
     line: usize,
 }
 
-/// The names that a `use` or an `import` makes in a module.
+/// A name that a `use` or an `import` defines in a module.
 #[derive(Clone, Debug)]
 struct Binding {
-    /// `None` stands for all public names of the target: `use target::*`.
+    /// The name, or `None` for all public names of the target: `use target::*`.
     name: Option<String>,
     target: Vec<String>,
 }
 
-/// The end of a path within the package.
+/// The module or item in the package to which a path leads.
 #[derive(Clone, Debug)]
 enum ResolvedPath {
     Module(ModulePath),
-    /// An item that the module defines, or imports from another package.
+    /// An item that this module defines, or imports from another package.
     ItemOf(ModulePath),
 }
 
@@ -74,7 +74,7 @@ impl ResolvedPath {
     }
 }
 
-/// Everything that is known of a package's modules before paths are resolved.
+/// The modules of a package, with their imports before paths are resolved.
 #[derive(Debug, Default)]
 struct Modules {
     modules: BTreeSet<ModulePath>,
@@ -83,14 +83,14 @@ struct Modules {
 }
 
 impl Modules {
-    /// Returns the path of `parent`'s module `name`, if there is one.
+    /// Returns the path of the child module `name` of `parent`, if it exists.
     fn child(&self, parent: &[String], name: &str) -> Option<ModulePath> {
         let mut path = parent.to_vec();
         path.push(name.to_owned());
         self.modules.contains(&path).then_some(path)
     }
 
-    /// Resolves every written path. Paths that lead out of the package give no import.
+    /// Resolves all paths to imports. Ignores paths that lead out of the package.
     fn imports(&self) -> Vec<Import> {
         let mut imports = BTreeSet::new();
         for path in &self.paths {
@@ -106,8 +106,8 @@ impl Modules {
         imports.into_iter().map(|(_, _, import)| import).collect()
     }
 
-    /// Finds the module that `names` names, or that defines the item which `names` names, seen from `module`.
-    /// Returns `None` if it is outside the package.
+    /// Resolves the path `names` as seen from `module`: returns the module, or the item with the module that defines
+    /// it. Returns `None` if the path leads out of the package.
     fn resolve(&self, module: &[String], names: &[String], reexports: usize) -> Option<ResolvedPath> {
         if reexports > MAX_REEXPORTS {
             return None;
@@ -136,7 +136,7 @@ impl Modules {
         Some(current)
     }
 
-    /// Finds what `module` imports as `name`.
+    /// Resolves the name `name` that `module` imports from elsewhere.
     fn reexport(&self, module: &[String], name: &str, reexports: usize) -> Option<ResolvedPath> {
         let bindings = self.bindings.get(module)?;
         if let Some(binding) = bindings.iter().find(|binding| binding.name.as_deref() == Some(name)) {

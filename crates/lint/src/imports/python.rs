@@ -1,9 +1,10 @@
-//! Imports of Python packages: every `import` statement, also those inside functions and for type checkers only.
+//! The imports of Python packages: every `import` statement, including those in functions and those for type checkers
+//! only.
 
 use super::{Binding, ModulePath, Modules, PackageImports, WrittenPath};
 use crate::source::{SourceTree, is_test};
 
-/// Reads the imports of every Python package: a folder with an `__init__.py` whose parent has none.
+/// Reads the imports of every Python package, which is a folder with an `__init__.py` whose parent has none.
 pub(super) fn packages(tree: &SourceTree) -> Vec<PackageImports> {
     let mut folders: Vec<_> = tree
         .iter()
@@ -54,7 +55,7 @@ struct Statement {
     line: usize,
 }
 
-/// Returns the import statements of a file, each on one line, without comments and parentheses.
+/// Returns the import statements of a file, each joined to one line, without comments and parentheses.
 fn statements(source: &str) -> Vec<Statement> {
     let mut statements = Vec::new();
     let mut lines = code_lines(source).into_iter().enumerate();
@@ -73,7 +74,7 @@ fn statements(source: &str) -> Vec<Statement> {
     statements
 }
 
-/// Returns the lines of a file without comments and without the content of strings.
+/// Returns the lines of a file without comments and without the content of string literals.
 fn code_lines(source: &str) -> Vec<String> {
     let mut code = String::new();
     let mut quote: Option<&str> = None;
@@ -103,7 +104,8 @@ fn code_lines(source: &str) -> Vec<String> {
     code.lines().map(str::to_owned).collect()
 }
 
-/// Returns what an import statement binds: each name with the path of its target, which starts with `crate`.
+/// Returns the names that an import statement defines, each with the path of its target, which starts with `crate`. The
+/// name is `None` for `*`.
 fn bindings(text: &str, package: &str, module: &[String], is_package: bool) -> Vec<(Option<String>, Vec<String>)> {
     let mut words = text.split_whitespace();
     match words.next() {
@@ -139,7 +141,8 @@ fn bindings(text: &str, package: &str, module: &[String], is_package: bool) -> V
     }
 }
 
-/// Returns the path of a module from the package's root on, which is written `crate`; `None` for other packages.
+/// Returns the path of a module from the package's root, which is called `crate`. Returns `None` for modules of other
+/// packages.
 fn absolute(source: &str, package: &str, module: &[String], is_package: bool) -> Option<Vec<String>> {
     let dots = source.chars().take_while(|&c| c == '.').count();
     let mut path = vec!["crate".to_owned()];

@@ -1,10 +1,10 @@
-//! Imports of crates: the module tree from `mod` items on, and every path in it.
+//! The imports of crates: follows `mod` items to find all modules, and reads every path in them.
 
 use super::scan::{self, Item};
 use super::{Binding, ModulePath, Modules, PackageImports, WrittenPath};
 use crate::source::SourceTree;
 
-/// Reads the imports of every crate of the workspace: its library and each of its programs.
+/// Reads the imports of every crate of the workspace, in its library and in each of its programs.
 pub(super) fn packages(tree: &SourceTree) -> Vec<PackageImports> {
     let manifests = tree.iter().filter(|(path, _)| *path == "Cargo.toml" || path.ends_with("/Cargo.toml"));
     manifests
@@ -17,7 +17,7 @@ pub(super) fn packages(tree: &SourceTree) -> Vec<PackageImports> {
         .collect()
 }
 
-/// Returns the files at which a package's library and programs begin.
+/// Returns the root files of a package's library and programs.
 fn crate_roots(tree: &SourceTree, folder: &str, manifest: &str) -> Vec<String> {
     let mut roots = vec![join(folder, "src/lib.rs"), join(folder, "src/main.rs")];
     let programs = join(folder, "src/bin/");
@@ -48,7 +48,7 @@ fn folder_part(path: &str) -> &str {
     path.rsplit_once('/').map_or("", |(folder, _)| folder)
 }
 
-/// Removes each `..` with the folder before it.
+/// Removes each `..` together with the folder before it.
 fn normalise(path: &str) -> String {
     let mut parts = Vec::new();
     for part in path.split('/') {
@@ -67,7 +67,7 @@ fn crate_imports(tree: &SourceTree, root: &str) -> Vec<super::Import> {
     modules.imports()
 }
 
-/// Reads one file and the files of its modules. `children` is the folder in which these are looked for.
+/// Reads one file and, recursively, the files of its child modules, which are searched in the folder `children`.
 fn read_file(tree: &SourceTree, file: &str, children: &str, module: ModulePath, modules: &mut Modules) {
     let Some(source) = tree.get(file) else { return };
     modules.modules.insert(module.clone());

@@ -1,15 +1,16 @@
-//! Finds modules, `use` items and paths in one file of Rust. Tests are left out.
+//! Finds modules, `use` items and paths in one Rust file, except in tests.
 
 use crate::lexer::{SourceToken, TokenKind, is_test_attribute, tokens};
 
-/// Something that the file says about modules. `inside` names the inline modules around it, outermost first.
+/// A module, a `use` item or a path in the file. `inside` are the names of the inline modules around it, outermost
+/// first.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Item {
-    /// `mod name { … }`; the last name of `inside` is its own.
+    /// `mod name { … }`. The last name of `inside` is the module's own.
     InlineModule { inside: Vec<String> },
-    /// `mod name;`, with the value of its `#[path = "…"]` attribute.
+    /// `mod name;`. `path` is the value of its attribute `#[path = "…"]`, if there is one.
     Module { inside: Vec<String>, name: String, path: Option<String> },
-    /// A name that a `use` item makes; `None` for `*`.
+    /// A name that a `use` item defines; `None` for `*`.
     Use { inside: Vec<String>, name: Option<String>, target: Vec<String>, line: usize },
     /// A path of at least two names, outside `use` items.
     Path { inside: Vec<String>, names: Vec<String>, line: usize },
@@ -22,7 +23,7 @@ pub(super) fn items(source: &str) -> Vec<Item> {
     scanner.items
 }
 
-/// Content of the attributes before an item.
+/// The content of the attributes before an item.
 #[derive(Default)]
 struct Attributes {
     is_test: bool,
@@ -33,9 +34,9 @@ struct Scanner {
     tokens: Vec<SourceToken>,
     position: usize,
     items: Vec<Item>,
-    /// Number of open braces.
+    /// The number of open braces.
     depth: usize,
-    /// Names of the open inline modules, each with the depth of its content.
+    /// The names of the current inline modules, each with the depth of its content.
     inside: Vec<(String, usize)>,
 }
 
@@ -80,7 +81,7 @@ impl Scanner {
                 self.position += 1;
                 self.use_item();
             } else if token.is_symbol('(') && self.is_word(1, "in") {
-                // The path of `pub(in path)` gives a right to name this item and names nothing itself.
+                // Skips `pub(in path)`: its path only restricts visibility and is not an import.
                 self.skip_past(')');
             } else if token.word().is_some() {
                 self.path();
@@ -98,7 +99,7 @@ impl Scanner {
         }
     }
 
-    /// Reads an attribute, at whose `#` the scanner stands.
+    /// Reads an attribute. The current token is its `#`.
     fn attribute(&mut self, attributes: &mut Attributes) {
         let start = self.position;
         self.skip_past_matching('[', ']');
@@ -117,7 +118,7 @@ impl Scanner {
         }
     }
 
-    /// Skips everything up to and with the next `end`.
+    /// Skips all tokens up to and including the next `end`.
     fn skip_past(&mut self, end: char) {
         while self.peek(0).is_some_and(|token| !token.is_symbol(end)) {
             self.position += 1;
@@ -125,7 +126,7 @@ impl Scanner {
         self.position += 1;
     }
 
-    /// Skips everything up to the next `open`, and from there to the `close` that belongs to it.
+    /// Skips all tokens up to the next `open`, and from there up to the matching `close`.
     fn skip_past_matching(&mut self, open: char, close: char) {
         let mut depth = 0_usize;
         while let Some(token) = self.peek(0) {
@@ -143,7 +144,7 @@ impl Scanner {
         }
     }
 
-    /// Skips what a test attribute stands before: an item, a statement, a field or a match arm.
+    /// Skips the item, statement, field or match arm after a test attribute.
     fn skip_item(&mut self) {
         let is_field = {
             let mut ahead = 0;
@@ -197,7 +198,7 @@ impl Scanner {
         }
     }
 
-    /// Reads `mod name;` or the head of `mod name { … }`.
+    /// Reads `mod name;` or the beginning of `mod name { … }`.
     fn module(&mut self, path: Option<String>) {
         let Some(name) = self.word(1) else {
             self.position += 1;
@@ -216,7 +217,7 @@ impl Scanner {
     /// Reads a `use` item after its keyword.
     fn use_item(&mut self) {
         if self.peek(0).is_some_and(|token| token.kind == TokenKind::PathSeparator) {
-            // `use ::name` names another crate.
+            // `use ::name` imports from another crate.
             self.skip_past(';');
             return;
         }
@@ -224,7 +225,7 @@ impl Scanner {
         self.skip_past(';');
     }
 
-    /// Reads one tree of a `use` item: a path, and then nothing, `as name`, `*`, or a group of trees.
+    /// Reads one tree of a `use` item: a path, followed by nothing, `as name`, `*` or a group of trees.
     fn use_tree(&mut self, prefix: &[String]) {
         let mut target = prefix.to_vec();
         let line = self.peek(0).map_or(0, |token| token.line);
@@ -246,7 +247,7 @@ impl Scanner {
                 return;
             }
             let Some(word) = self.word(0) else {
-                // Nothing that a `use` item may have: give up on this token.
+                // This token cannot be part of a `use` item. Skips it.
                 self.position += 1;
                 return;
             };
@@ -269,7 +270,7 @@ impl Scanner {
         }
     }
 
-    /// Reads a path outside `use` items. A path of one name says nothing about modules.
+    /// Reads a path outside of `use` items. A path with a single name is ignored, because it does not tell the module.
     fn path(&mut self) {
         let line = self.peek(0).map_or(0, |token| token.line);
         let follows = self.position > 0
@@ -291,7 +292,7 @@ impl Scanner {
         }
     }
 
-    /// Tells whether the `.` at `position` is the second of `..`.
+    /// Returns whether the `.` at `position` is the second one of `..`.
     fn is_range(&self, position: usize) -> bool {
         position > 0 && self.tokens[position - 1].is_symbol('.')
     }
