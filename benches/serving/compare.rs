@@ -11,7 +11,8 @@ use bytes::Bytes;
 use std::{path::Path, time::Instant};
 
 /// Number of pairs of servers for each measurement. Which of two equal servers is faster depends on where the system
-/// places their threads. Therefore each pair is a new start, and the other program starts first in every second pair.
+/// places their threads. Therefore both servers are restarted for each pair, and the other program starts first in
+/// every second pair.
 const PAIRS: usize = 6;
 /// Number of rounds with each pair.
 const ROUNDS: usize = 7;

@@ -5,8 +5,8 @@
 //! - `step/folder/Walker2d`, `Ant` and `Humanoid`: Gymnasium's tasks with 64 environments. Compares the server's CPU
 //!   time with a bare loop that makes the same number of calls to MuJoCo's functions: mj_step, and mj_rnePostConstraint
 //!   if contact forces are read.
-//! - `step/folder/lengths`: Walker2d on R with 64 environments. Compares a length that is drawn at each reset with a
-//!   fixed length, also in memory for each environment.
+//! - `step/folder/lengths`: Walker2d on version R (random) with 64 environments. Compares a length that is drawn at
+//!   each reset with a fixed length, also in memory for each environment.
 //!
 //! All measurements except the first need Gymnasium's models, in the folder that the environment variable
 //! `PERTURB_TEST_GYMNASIUM_ASSETS` names.
@@ -215,7 +215,8 @@ async fn beside_mujoco(id: &str, path: &Path, mjcf: &str, external_forces: bool)
     Ok(())
 }
 
-/// The state of an environment before a round, and its state after each step of the round at which a new episode began.
+/// The state of an environment before a round. For each episode that began in the round follow the number of steps
+/// before it and its initial state.
 type RoundStart = (Vec<f64>, Vec<(usize, Vec<f64>)>);
 
 /// Environments with the same seed as the server's, in this process, and a simulation that repeats their physics alone.

@@ -104,7 +104,7 @@ pub(super) fn remove_others(directory: &Path, prefixes: &[&str], current: &[&str
     Ok(())
 }
 
-/// Returns the error that the file at `path` is unusable because of `reason`.
+/// Creates the error for an unusable file with its `path` and the `reason`.
 pub fn damaged(path: &Path, reason: String) -> CheckpointError {
     CheckpointError::Damaged { path: path.to_owned(), reason }
 }

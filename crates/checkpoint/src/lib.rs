@@ -81,7 +81,7 @@ pub struct State {
 /// The state from which a training resumes, in addition to its policy.
 #[derive(Clone, Debug)]
 pub struct Resume {
-    /// The entry of the file with the state's arrays, whose name begins with [`RESUME_PREFIX`].
+    /// The file of the state's arrays. Its name begins with [`RESUME_PREFIX`].
     pub arrays: ArraysFile,
     /// The entry `resume` of `checkpoint.json`.
     pub document: serde_json::Value,
@@ -189,8 +189,9 @@ impl Checkpoint {
     }
 
     /// Reads a checkpoint. `path` may be its directory, the directory above the folder `checkpoint`, or a policy file.
-    /// Otherwise `path` is taken as the id of a cell, or as the beginning of exactly one id. Cells are searched below
-    /// `results/`, or below the folder in the environment variable `PERTURB_RESULTS`.
+    /// Otherwise `path` is taken as the id of an experiment's cell (a training with its tests), or as the beginning of
+    /// exactly one id. Cells are searched below `results/`, or below the folder in the environment variable
+    /// `PERTURB_RESULTS`.
     ///
     /// # Errors
     /// [`CheckpointError`] with the path of the file.

@@ -1,5 +1,5 @@
-//! Finds policies by name, or by the folder of their cell. It searches policy files in folders called `policies` below
-//! `results/`, and cells below `results/` whose trainings were kept.
+//! Finds policies by name. It searches policy files in folders called `policies` below `results/`, and the folders of
+//! cells below `results/` whose trainings were kept. A cell is a training of an experiment with its tests.
 
 use std::path::{Component, Path, PathBuf};
 
@@ -19,9 +19,9 @@ const DEPTH: usize = 3;
 /// Maximum difference in length between a name and a suggested id, in characters.
 const MAX_LENGTH_DIFFERENCE: usize = 3;
 
-/// Finds the checkpoint that `path` refers to, if `path` is not a checkpoint itself. `path` may be the folder of a cell
-/// or a policy file, also relative to `results/`. It may also be the id of a cell, or the unique beginning of an id.
-/// Upper and lower case are not distinguished.
+/// Finds the checkpoint that `path` refers to, if `path` is not a checkpoint itself. `path` may be a policy file or the
+/// folder of a cell (a training with its tests), also relative to `results/`. It may also be the id of a cell, or the
+/// unique beginning of an id. Upper and lower case are not distinguished.
 ///
 /// # Errors
 /// [`CheckpointError::Several`] with the cells whose ids begin with the name or, if there are none, whose ids resemble

@@ -1,9 +1,9 @@
 //! Checksums of files. They turn a changed byte into an error, instead of a different result.
 //!
 //! In a JSON document, the entry `crc32c` is the CRC-32C of the rest of the document, as compact JSON with sorted keys.
-//! So spaces and the order of entries do not matter. Any other file contains `perturb.crc32c=` followed by eight
-//! hexadecimal digits: the CRC-32C of all bytes before and after this text. Files of earlier programs have no checksum,
-//! and are read without a check.
+//! This makes the checksum independent of spaces and of the order of entries. Any other file contains `perturb.crc32c=`
+//! followed by eight hexadecimal digits: the CRC-32C of all bytes before and after this text. Files of earlier programs
+//! have no checksum, and are read without a check.
 
 use serde::Serialize;
 use serde_json::Value;

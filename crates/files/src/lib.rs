@@ -28,7 +28,7 @@ pub const TEMPORARY_PREFIX: &str = ".tmp-";
 /// Maximum size of a TOML file, in bytes. The parser's memory can be about 200 times the size of the file.
 pub const MAX_TOML_BYTES: u64 = 256 << 10;
 
-/// A boxed error that is only displayed.
+/// A boxed error of any type, for callers that only display it.
 pub type AnyError = Box<dyn std::error::Error + Send + Sync>;
 
 /// An error of the operating system, with the path of the file.

@@ -17,7 +17,8 @@ pub(crate) struct Recurrent {
     /// H, the number of units of the LSTM.
     width: usize,
     hidden: Perceptron,
-    /// Maps the concatenation of x and h, `[X + H]`, to the sums of the LSTM's gates i, f, g and o, `[4H]`.
+    /// Maps the LSTM's input x and previous output h, `[X + H]`, to the pre-activations of its gates i, f, g and o,
+    /// `[4H]`.
     gates: Layer,
     policy: Layer,
     value: Layer,
@@ -28,9 +29,9 @@ pub(crate) struct Recurrent {
     observations: Rows,
     /// Outputs of each hidden layer, one element for each layer.
     hidden_layers: Vec<Rows>,
-    /// `[max_batch, X + H]` inputs of the LSTM: x, then h.
+    /// `[max_batch, X + H]` inputs of the LSTM: x, then the previous output h.
     inputs: Rows,
-    /// `[max_batch, 4H]` sums of the LSTM's gates.
+    /// `[max_batch, 4H]` pre-activations of the LSTM's gates.
     sums: Rows,
     /// `[max_batch, 2H]` memory after the step.
     next: Rows,
@@ -153,7 +154,7 @@ impl Kernel for RecurrentStep<'_> {
 }
 
 /// Computes the LSTM of one environment. Replaces the cell states `c` and the outputs `h` by those after the step.
-/// `sums` holds the sums of the gates i, f, g and o before their nonlinearities, and is overwritten.
+/// `sums` holds the pre-activations of the gates i, f, g and o, and is overwritten.
 #[inline(always)]
 fn cell(sums: &mut [f32], h: &mut [f32], c: &mut [f32]) {
     let width = c.len();

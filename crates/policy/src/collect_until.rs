@@ -22,8 +22,8 @@ pub enum RemainingRollout {
 /// The number of episodes that each environment still has to play.
 ///
 /// The L episodes are divided among the environments in advance, as evenly as possible. Taking the first L episodes to
-/// end would favour short episodes. An environment that has played its number is still stepped with the batch, but its
-/// further steps are not stored and do not enter statistics.
+/// end would favour short episodes. An environment that has played all its episodes is still stepped with the batch,
+/// but its further steps are not stored and do not enter statistics.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct EpisodeQuotas {
     /// `[N]` episodes left to play.

@@ -213,8 +213,9 @@ impl ObservationNormaliser {
 /// deviation of all discounted returns R_t = γ R_{t-1} + r_t seen so far (Engstrom et al., 2020, arXiv:2005.12729). The
 /// mean is not subtracted.
 ///
-/// Normally R starts from 0 in every episode, or with RL² in every trial, as in stable-baselines3. With `runs_on` it is
-/// not reset at these ends, as in the reference implementation (OpenAI Baselines).
+/// Normally R starts from 0 in every episode, or with RL² in every trial, as in stable-baselines3. If
+/// [`RewardNormaliser::runs_on`] is true, R is not reset at these ends, as in the reference implementation (OpenAI
+/// Baselines).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RewardNormaliser {
@@ -245,12 +246,14 @@ impl RewardNormaliser {
         RewardNormaliser { gamma, returns, moments, runs_on: false }
     }
 
-    /// Sets whether R runs on, instead of being reset, at the ends of episodes and trials.
+    /// Sets whether the discounted return R continues across the ends of episodes and trials, instead of starting again
+    /// from 0.
     pub fn running_on(self, runs_on: bool) -> Self {
         RewardNormaliser { runs_on, ..self }
     }
 
-    /// Returns whether R runs on, instead of being reset, at the ends of episodes and trials.
+    /// Returns whether the discounted return R continues across the ends of episodes and trials, instead of starting
+    /// again from 0.
     pub fn runs_on(&self) -> bool {
         self.runs_on
     }
@@ -266,7 +269,7 @@ impl RewardNormaliser {
     }
 
     /// Checks that this normaliser belongs to a training with `n_envs` environments, the discount factor `gamma` and
-    /// this setting of `runs_on`. The error describes the difference.
+    /// this value of [`RewardNormaliser::runs_on`]. The error describes the difference.
     pub fn fits(&self, n_envs: usize, gamma: f64, runs_on: bool) -> std::result::Result<(), String> {
         if self.returns.len() != n_envs {
             return Err(format!("returns has {} numbers, expected {n_envs}", self.returns.len()));
@@ -295,8 +298,8 @@ impl RewardNormaliser {
     }
 
     /// Adds a step's `rewards` `[N]` to the statistics. `done` `[N]` is true at the end of an episode, or with RL² of a
-    /// trial; the discounted return then starts again from 0 in the next step, unless it runs on. Returns an error for
-    /// infinite numbers and NaN, and then changes nothing.
+    /// trial. The discounted return then starts again from 0 in the next step, unless [`RewardNormaliser::runs_on`] is
+    /// true. Returns an error for infinite numbers and NaN, and then changes nothing.
     pub fn update(&mut self, rewards: &[f32], done: &[bool]) -> Result<()> {
         self.update_active(rewards, done, None)
     }
@@ -325,8 +328,8 @@ impl RewardNormaliser {
         Ok(())
     }
 
-    /// Resets the discounted returns of all environments to 0, unless they run on. Call it after the environments were
-    /// reset before the ends of their episodes. Does not change the statistics.
+    /// Resets the discounted returns of all environments to 0, unless [`RewardNormaliser::runs_on`] is true. Call it
+    /// after the environments were reset before the ends of their episodes. Does not change the statistics.
     pub fn reset_returns(&mut self) {
         if !self.runs_on {
             self.returns.fill(0.0);

@@ -23,8 +23,8 @@ pub enum Statistics {
 }
 
 impl Normalisers {
-    /// Normalises `observations` `[N, O]`. If `statistics` are running, first adds the observations of the environments
-    /// where `active` `[N]` is true, or of all if it is `None`.
+    /// Normalises `observations` `[N, O]`. With [`Statistics::Running`], first adds the observations of the
+    /// environments where `active` `[N]` is true, or of all if it is `None`, to the statistics.
     pub(crate) fn take_observations(
         &mut self,
         observations: &mut [f32],
@@ -38,8 +38,9 @@ impl Normalisers {
         normaliser.normalise(observations)
     }
 
-    /// Normalises a step's `rewards` `[N]`. If `statistics` are running, first adds the rewards of the environments
-    /// where `active` `[N]` is true, or of all if it is `None`. `done` `[N]` is true where the discounted return ends.
+    /// Normalises a step's `rewards` `[N]`. With [`Statistics::Running`], first adds the rewards of the environments
+    /// where `active` `[N]` is true, or of all if it is `None`, to the statistics. `done` `[N]` is true where the
+    /// discounted return ends.
     pub(crate) fn take_rewards(
         &mut self,
         rewards: &mut [f32],

@@ -1,4 +1,4 @@
-//! Optimisers. A policy's P weights are one array.
+//! Optimisers, which change a policy's P weights by gradient steps. The weights are one array.
 
 use pulp::Simd;
 
@@ -22,7 +22,7 @@ pub enum UpdateRule {
 /// gradient g and the learning rate η:
 ///
 /// s_i ← α s_i + (1 - α) g_i²,
-/// w_i ← w_i - η g_i/√(s_i + ε),
+/// w_i ← w_i - η g_i/√(s_i + ε).
 ///
 /// The averages s start at 1, and ε is inside of the root. libtorch starts s at 0 and adds ε outside of the root. This
 /// makes its first steps ten times as long, and A2C is known to be less stable with it.
@@ -103,9 +103,9 @@ impl UpdateRule {
 /// The inputs of one gradient step.
 struct GradientStep<'a> {
     learning_rate: f64,
-    /// `[P]`
+    /// `[P]` weights, which the step changes.
     weights: &'a mut [f32],
-    /// `[P]`
+    /// `[P]` gradient of the loss, not clipped.
     gradient: &'a [f32],
     /// Factor by which the gradient is multiplied to clip its norm, 0 … 1.
     scale: f32,

@@ -1,8 +1,9 @@
 //! Products of small matrices, written as loops that the compiler vectorises.
 //!
-//! Every result is a single sum in a fixed order. It depends neither on the width of the vectors nor on the other rows
-//! of the batch, because a vector holds independent sums. Multiplications and additions are separate instructions: a
-//! fused multiply-add rounds differently, and some processors lack it. Therefore all processors compute the same bytes.
+//! Numbers are processed in lanes, groups of 16 successive outputs or inputs. Every result is a single sum in a fixed
+//! order. It depends neither on the width of the vectors nor on the other rows of the batch, because a vector holds
+//! independent sums. Multiplications and additions are separate instructions: a fused multiply-add rounds differently,
+//! and some processors lack it. Therefore all processors compute the same bytes.
 //!
 //! Loops use indices where an iterator would be easier to read: the compiler did not inline iterators and `from_fn`
 //! over arrays into the kernels, and their calls took a third of the time of a small gradient.
@@ -17,8 +18,8 @@ use crate::kernel::{Kernel, LANES, Lane, Rows, call, lanes};
 /// The initial value of sums without biases.
 const ZERO: Lane = [0.0; LANES];
 
-/// A weight matrix in the order in which a product reads it: for each lane of outputs and each input, the weights from
-/// this input to these outputs.
+/// A weight matrix in the order in which a product reads it: for each lane (16 outputs) and each input, the weights
+/// from this input to these outputs.
 #[derive(Clone, Debug)]
 pub(crate) struct Matrix {
     inputs: usize,
@@ -58,7 +59,7 @@ pub(crate) struct Factor<'a> {
     numbers: &'a [f32],
     inputs: usize,
     outputs: usize,
-    /// Distance in `numbers` from a lane of outputs to the next lane.
+    /// Distance in `numbers` from one lane (16 outputs) to the next.
     per_column: usize,
     /// Distance in `numbers` from an input to the next input.
     per_input: usize,
@@ -123,8 +124,8 @@ impl<'a> Factor<'a> {
         }
     }
 
-    /// Computes one lane of outputs, `column`, for `rows`: eight rows at once, and the last four to seven together.
-    /// `WHOLE` says that all [`LANES`] numbers of the lane are outputs.
+    /// Computes one lane (16 outputs) for `rows`: eight rows at once, and the last four to seven together. `column` is
+    /// the number of the lane. `WHOLE` says that all [`LANES`] numbers of the lane are outputs.
     #[inline(always)]
     fn columns<S: Simd, const WHOLE: bool>(
         self,
@@ -149,8 +150,8 @@ impl<'a> Factor<'a> {
         }
     }
 
-    /// Returns the weights of one lane of outputs, from the first input's to the last input's. These slices are equally
-    /// long for all whole lanes, so the compiler can omit repeated bounds checks.
+    /// Returns the weights of lane number `column` (16 outputs), from the first input's to the last input's. These
+    /// slices are equally long for all whole lanes, so the compiler can omit repeated bounds checks.
     #[inline(always)]
     fn column<const WHOLE: bool>(self, column: usize) -> &'a [f32] {
         let last = if WHOLE { LANES } else { self.outputs % LANES };
@@ -169,8 +170,8 @@ impl<'a> Factor<'a> {
         S::as_simd_f32s(&lane).0[vector]
     }
 
-    /// Computes one lane of outputs for `R` rows at once, so that each vector of weights is loaded only once for all of
-    /// them.
+    /// Computes one lane (16 outputs) for `R` rows at once, so that each vector of weights is loaded only once for all
+    /// of them.
     #[inline(always)]
     fn product<S: Simd, const R: usize, const WHOLE: bool>(
         self,
@@ -201,7 +202,7 @@ impl<'a> Factor<'a> {
         }
     }
 
-    /// Computes `C` lanes of outputs for one row. The sums are independent, so the processor can compute them in
+    /// Computes `C` lanes (16 outputs each) for one row. The sums are independent, so the processor can compute them in
     /// parallel.
     #[inline(always)]
     fn row_product<S: Simd, const C: usize, const WHOLE: bool>(
@@ -352,8 +353,8 @@ fn outer_here<S: Simd, const ADD: bool>(
     }
 }
 
-/// Computes the rows of `sums` of `R` outputs, starting at output `first`, for one lane of inputs, `column`. `WHOLE`
-/// says that all [`LANES`] numbers of the lane are inputs.
+/// Computes the rows of `sums` of `R` outputs, starting at output `first`, for one lane (16 inputs). `column` is the
+/// number of the lane. `WHOLE` says that all [`LANES`] numbers of the lane are inputs.
 #[inline(always)]
 fn outers<S: Simd, const R: usize, const ADD: bool, const WHOLE: bool>(
     simd: S,

@@ -10,15 +10,15 @@ pub struct Axis {
     pub name: String,
     /// The unit; "1" if dimensionless.
     pub unit: String,
-    /// The default value, which version D uses.
+    /// The default value of the parameter.
     pub default: f64,
-    /// The lowest value that version R or E draws.
+    /// The lowest value that version R (random) or version E (extreme) draws.
     pub low: f64,
-    /// The highest value that version R or E draws.
+    /// The highest value that version R (random) or version E (extreme) draws.
     pub high: f64,
-    /// The intervals from which version R draws, as pairs (low, high).
+    /// The intervals from which version R (random) draws, as pairs (low, high).
     pub random: Vec<(f64, f64)>,
-    /// The intervals from which version E draws, as pairs (low, high).
+    /// The intervals from which version E (extreme) draws, as pairs (low, high).
     pub extreme: Vec<(f64, f64)>,
 }
 

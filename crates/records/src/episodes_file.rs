@@ -1,8 +1,8 @@
 //! A file with the recorded episodes of all policies of a study. Each policy has a row group of its own.
 //!
 //! The file omits the applied parameters, because they follow from the requested parameters and the environment. It
-//! therefore takes a third of the space of the separate files of the cells. Each row still has the episode's address
-//! (seed and indices) and all its results.
+//! therefore takes a third of the space of the separate files that the trainings wrote. Each row still has the
+//! episode's address (seed and indices) and all its results.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ use crate::records::{Ending, EpisodeRecord, Records, RecordsError, RecordsMetada
 /// The name of the Parquet schema.
 const MESSAGE: &str = "study_episodes";
 
-/// The recorded episodes of a study, by the id of the cell that trained the policy. Applied parameters are omitted.
+/// The recorded episodes of a study, by the id of the cell (a training with its tests). Applied parameters are omitted.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StudyEpisodes {
     cells: BTreeMap<String, Records>,
@@ -62,7 +62,7 @@ impl StudyEpisodes {
         Ok(write_atomically(path, &self.encode().map_err(damaged)?)?)
     }
 
-    /// Returns the episodes of the policy that the cell with id `cell` trained.
+    /// Returns the episodes of the policy that was trained in the cell with the id `cell`.
     pub fn of_cell(&self, cell: &str) -> Option<&Records> {
         self.cells.get(cell)
     }

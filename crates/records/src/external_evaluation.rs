@@ -69,7 +69,7 @@ pub struct PolicyMetadata {
     pub seed: u64,
     /// Number of episodes requested for each test.
     pub episodes: u64,
-    /// What the policy observes.
+    /// The quantities that the policy observes.
     pub observe: Observe,
     /// Whether actions were the mode of the policy's distribution instead of samples. `None` if the evaluation did not
     /// control this.

@@ -52,9 +52,9 @@ pub fn heatmap(grid: usize, figures: impl Fn(f64, f64) -> (f64, f64)) -> Heatmap
     Heatmap { environment, base: Version::D, fixed: Default::default(), grid, episodes: 20, points, axes }
 }
 
-/// Returns an agent in `environment` with one policy for each element of `trained_on`. `steps` are the lengths of the
-/// first episodes of its tests on D, R and E; each of the ten episodes of a test is one step longer than the one
-/// before. 195 steps are a success.
+/// Returns an agent in `environment` with one policy for each element of `trained_on`. Each policy has tests of ten
+/// episodes on the versions D, R and E, and `steps` are the lengths of their first episodes. Each further episode of a
+/// test is one step longer. 195 steps are a success.
 pub fn assessed(agent: &str, environment: &str, trained_on: &[Option<Version>], steps: [u32; 3]) -> ExternalEvaluation {
     let criterion = |threshold| Criterion {
         quantity: "steps".into(),

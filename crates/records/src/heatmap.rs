@@ -19,8 +19,8 @@ pub const MAX_POINTS: usize = 100;
 pub struct HeatmapOptions {
     /// The names of the parameters along x and along y.
     pub parameters: [String; 2],
-    /// The version from which all other parameters are drawn. In D they have their defaults. In R and E they are drawn
-    /// for each episode, or with RL² for each trial.
+    /// The version from which all other parameters are drawn. In version D (deterministic) they have their defaults. In
+    /// R (random) and E (extreme) they are drawn for each episode, or with RL² for each trial.
     pub base: Version,
     /// The number of points along each axis, 1 … 100.
     pub grid: usize,

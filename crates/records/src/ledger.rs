@@ -21,7 +21,7 @@ use crate::records::{RecordedTest, Records};
 #[derive(Debug, Default)]
 pub struct Ledgers {
     heads: Vec<Head>,
-    /// The draws of each environment.
+    /// The parameter draws of each environment.
     drawn: Vec<Drawn>,
     /// The environments of each session, seed and environment index.
     at: BTreeMap<(SessionId, u64, u32), EnvironmentAddress>,
@@ -99,7 +99,7 @@ impl Moment {
     }
 }
 
-/// The draws of an environment from one region.
+/// The draws of an environment from one region of the parameter space.
 #[derive(Debug)]
 struct Drawn {
     line: Arc<LedgerLine>,
@@ -122,7 +122,7 @@ enum LastDraw {
     Unknown,
 }
 
-/// A session's request to draw from a region, which the server refused.
+/// A session's request to draw parameters from a region of the parameter space, which the server refused.
 #[derive(Debug)]
 struct Refused {
     line: LedgerLine,
@@ -197,7 +197,7 @@ impl Ledgers {
         }
     }
 
-    /// Stores a record of draws. Its ends precede its beginnings.
+    /// Stores a record of draws. In a record, the ends of environments happened before the beginnings.
     fn take_draws(&mut self, line: LedgerLine, DrawRecord { regions, begins, ends, .. }: DrawRecord) {
         let named = begins.iter().map(|begin| begin.count).chain(ends.iter().map(|end| end.count));
         if named.fold(0, u32::saturating_add) > MAX_ENVS {

@@ -25,8 +25,8 @@ fn environment() -> proto::Environment {
     proto::Environment { name: "CartPole".into(), parameters: vec![length], ..Default::default() }
 }
 
-/// Audits a training on R with seed 1, 100 episodes and two environments. The policy's tests on R and E have seed 7,
-/// and one episode each: environment 0, episode 5.
+/// Audits a training on version R with seed 1, 100 episodes and two environments. The policy's tests on R and E have
+/// seed 7, and one episode each: environment 0, episode 5.
 fn prove(ledgers: &Ledgers) -> Proof {
     let table: Table = toml::from_str("environment = 'CartPole'\nversion = 'R'\nseed = 1\nnum_envs = 2").unwrap();
     let training = TrainConfig::load(None, &[], table).unwrap().common;

@@ -8,7 +8,8 @@ use crate::statistics::geometric_mean;
 
 use perturb_protocol::Version;
 
-/// Returns the paper's versions D, R and E, and every other version for which `is_there` returns true.
+/// Returns the paper's versions D (deterministic), R (random) and E (extreme), and every other version for which
+/// `is_there` returns true.
 pub fn versions(is_there: impl Fn(Version) -> bool) -> Vec<Version> {
     Version::KNOWN.into_iter().filter(|version| Version::ALL.contains(version) || is_there(*version)).collect()
 }
@@ -16,7 +17,7 @@ pub fn versions(is_there: impl Fn(Version) -> bool) -> Vec<Version> {
 /// The parameter distribution on which a policy was trained.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum TrainedOn<'a> {
-    /// A version: D, R, E or R+E.
+    /// A version: D (deterministic), R (random), E (extreme) or R+E.
     Version(Version),
     /// A parameter set of the experiment file, by its name.
     Set(&'a str),
@@ -49,7 +50,8 @@ impl std::fmt::Display for TrainedOn<'_> {
     }
 }
 
-/// A pair of a training version and a testing version. "DR", for example, is trained on D and tested on R.
+/// A pair of a training version and a testing version. The scenario "DR", for example, is trained on version D
+/// (deterministic) and tested on version R (random).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Scenario {
     /// The version of the training.
@@ -75,9 +77,9 @@ impl fmt::Display for Scenario {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Metric {
-    /// The success rate of scenario DD.
+    /// The success rate of policies trained on D and tested on D.
     Default,
-    /// The success rate of scenario RR.
+    /// The success rate of policies trained on R and tested on R.
     Interpolation,
     /// The geometric mean of the success rates of scenarios DR, DE and RE.
     Extrapolation,

@@ -30,10 +30,11 @@ pub enum NotRecorded {
 
 /// Returns the seed of a test's environments on `version`.
 ///
-/// It is the first, second, third or fourth number, for D, R, E or R+E, of the random stream of `seed` for `purpose`.
-/// The purpose is [`Purpose::TestEnvironments`] or [`Purpose::SelectionEnvironments`]. A test therefore never repeats
-/// episodes of the training or of the selection, whatever their seeds, and the versions are independent. A parameter
-/// set uses the seed of its base version, so two sets of the same version have the same initial states.
+/// The seed is a number of the random stream of `seed` for `purpose`: the first, second, third or fourth for the
+/// version D, R, E or R+E. The purpose is [`Purpose::TestEnvironments`] or [`Purpose::SelectionEnvironments`]. A test
+/// therefore never repeats episodes of the training or of the selection, whatever their seeds, and the versions are
+/// independent. A parameter set uses the seed of its base version, so two sets of the same version have the same
+/// initial states.
 pub fn environment_seed(purpose: Purpose, seed: u64, version: Version) -> u64 {
     let mut rng = stream(seed, purpose);
     let drawn: [u64; Version::KNOWN.len()] = std::array::from_fn(|_| rng.next_u64());
@@ -41,8 +42,8 @@ pub fn environment_seed(purpose: Purpose, seed: u64, version: Version) -> u64 {
 }
 
 /// Returns for each environment `[N]` the number of its trials that count. Environment i has context i modulo
-/// `contexts`. Every context gets the same number of episodes, at least 1, and in all at least `episodes`. `contexts`
-/// must be at least 1.
+/// `contexts`. Every context gets the same number of episodes, at least 1. In total there are at least `episodes`.
+/// `contexts` must be at least 1.
 fn quotas(episodes: u64, contexts: usize) -> Vec<u64> {
     let each = episodes.div_ceil(contexts as u64).max(1);
     // One context gets as many environments as it can use. Several contexts divide the environments equally.
@@ -50,8 +51,8 @@ fn quotas(episodes: u64, contexts: usize) -> Vec<u64> {
     (0..copies).flat_map(|i| vec![each / copies + u64::from(i < each % copies); contexts]).collect()
 }
 
-/// Collects the episodes of a running test. Of each environment, a number of trials fixed in advance counts, and of
-/// each trial the last episode. Taking the first episodes to end would favour short episodes.
+/// Collects the episodes of a running test. It counts a number of trials of each environment that is fixed in advance,
+/// and of each trial only the last episode. Taking the first episodes to end would favour short episodes.
 #[derive(Clone, Debug)]
 pub struct TestCollector {
     test: RecordedTest,
@@ -120,8 +121,8 @@ impl TestCollector {
     }
 }
 
-/// Returns the permitted values of each parameter in one context of a set. R+E permits either all values of R or all
-/// values of E, so it has two elements; other versions have one.
+/// Returns the permitted values of each parameter in one context of a set, for each alternative. Version R+E has two
+/// alternatives, because all parameters of a trial are from R or all are from E; other versions have one.
 fn asked(environment: &proto::Environment, set: &TestSet, context: &Context) -> Vec<Vec<Distribution>> {
     let region = Region::from_version(environment, set.version, &set.parameters(context));
     let in_order = |values: &region::ParameterBox| {
@@ -130,7 +131,8 @@ fn asked(environment: &proto::Environment, set: &TestSet, context: &Context) -> 
     region.boxes().iter().map(in_order).collect()
 }
 
-/// Checks that the server's requested parameters are those of the test, and for R+E that all are from R or all from E.
+/// Checks that the parameters that the server reports as requested are those of the test. In version R+E, all must be
+/// from R or all from E.
 fn check_requested(
     environment: &proto::Environment,
     set: &TestSet,
@@ -147,8 +149,8 @@ fn check_requested(
     })
 }
 
-/// Returns the index of a parameter outside its permitted values, or `None` if all parameters are inside those of one
-/// element of `asked`.
+/// Returns the index of a parameter outside of its permitted values, or `None` if one alternative of `asked` permits
+/// all of them.
 fn wrong(asked: &[Vec<Distribution>], requested: &[f64]) -> Option<usize> {
     let in_part = |asked: &Vec<Distribution>| {
         let requested = requested.iter().copied().chain(std::iter::repeat(f64::NAN));

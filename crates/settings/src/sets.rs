@@ -1,5 +1,5 @@
-//! Parameter sets: the parameter values that a policy is tested on. A set is a version of an environment (D, R, E or
-//! R+E), possibly with values of the user for some parameters.
+//! Parameter sets: the parameter values that a policy is tested on. A set is one of an environment's versions D
+//! (deterministic), R (random), E (extreme) and R+E, possibly with other values for some parameters.
 
 mod rows;
 
@@ -28,13 +28,13 @@ const MAX_CONTEXTS: usize = DEFAULT_MAX_ENVS;
 pub struct TestSet {
     /// The name of the set in results.
     pub name: String,
-    /// The version, from which parameters are drawn that `contexts` does not list.
+    /// The version. It has the distributions of all parameters that `contexts` does not list.
     pub version: Version,
     /// The parameters whose values the set determines itself.
     pub contexts: Contexts,
 }
 
-/// How the parameters that a set lists get their values.
+/// The parameters that a set lists, with their values.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Contexts {

@@ -6,7 +6,7 @@ use std::fmt::Display;
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{what} is {got}, but must be {expected}")]
 pub struct ValueError {
-    /// A description of the value's meaning.
+    /// A name for the value in the message, e.g. "num_envs".
     pub what: String,
     /// The given value.
     pub got: String,

@@ -33,7 +33,7 @@ pub struct Column {
 pub struct Entry {
     /// The displayed text.
     pub text: String,
-    /// A percentage that may be shown as the cell's colour.
+    /// A percentage that may be shown by the background colour.
     pub heat: Option<f64>,
 }
 

@@ -14,9 +14,9 @@
 //!
 //! **Two stages.** libtorch's autograd would compute the gradients of W_h and W_x by one product for each step, with
 //! only M rows. Instead, the loop over time runs without autograd and stores the gates. Its result h is an input of a
-//! separate graph for the heads, and back-propagation through this graph gives ∂loss/∂h_t of the heads alone. A second
-//! loop, backwards in time, turns it into the derivatives with respect to the gates' sums, D_t = ∂loss/∂(W_x x_t + W_h
-//! h' + b). With δ_t = ∂loss/∂h_t + W_hᵀ D_{t+1} and the total derivative e_t = ∂loss/∂c_t:
+//! separate graph for the heads, and back-propagation through this graph gives the derivatives ∂loss/∂h_t of the heads
+//! alone. A second loop, backwards in time, turns them into the derivatives with respect to the gates' pre-activations,
+//! D_t = ∂loss/∂(W_x x_t + W_h h' + b). With δ_t = ∂loss/∂h_t + W_hᵀ D_{t+1} and the total derivative e_t = ∂loss/∂c_t:
 //!
 //! e_t = δ_t σ(o) (1 - tanh² c_t) + e_{t+1} σ(f)_{t+1},
 //! D_t = (e_t tanh g σ'(i), e_t c' σ'(f), e_t σ(i) tanh'(g), δ_t tanh c_t σ'(o)).

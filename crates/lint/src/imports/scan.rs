@@ -270,7 +270,7 @@ impl Scanner {
         }
     }
 
-    /// Reads a path outside of `use` items. A path with a single name is ignored, because it does not tell the module.
+    /// Reads a path outside of `use` items. A path with a single name is ignored, because it does not name a module.
     fn path(&mut self) {
         let line = self.peek(0).map_or(0, |token| token.line);
         let follows = self.position > 0

@@ -52,7 +52,8 @@ impl std::iter::Sum for Counted {
 }
 
 /// Divides the range of parameter number `place` in `tests` into about ten equal bins. A gap wider than a tenth of the
-/// range, such as the gap between E's two intervals, belongs to no bin. Returns no bins if the parameter does not vary.
+/// range belongs to no bin; version E (extreme) has such a gap between its two intervals. Returns no bins if the
+/// parameter does not vary.
 pub fn bins<'a>(tests: impl Iterator<Item = &'a Outcomes>, place: usize) -> Vec<Bin> {
     let values = tests.filter_map(|outcomes| outcomes.parameters.get(place)).flatten();
     let mut values: Vec<f64> = values.copied().filter(|value| value.is_finite()).collect();

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::Outcomes;
 
-/// The share of episodes or contexts that are called the worst.
+/// The share of episodes or contexts that count as the worst: a tenth.
 pub const SHARE: f64 = 0.1;
 /// Minimum number of regions for which the worst tenth is computed.
 const MIN_PARTS: usize = 10;

@@ -1,4 +1,5 @@
-//! The results of several studies in one table. It has a row for each test of each cell.
+//! The results of several studies in one table. It has a row for each test of each cell, where a cell is one training
+//! with its tests.
 //!
 //! `docs/results-table.md` describes every column.
 
@@ -24,7 +25,7 @@ const MESSAGE: &str = "results";
 pub struct ResultsTable {
     /// The plan of each study, by the study's name.
     pub studies: BTreeMap<String, StudyPlan>,
-    /// The rows. Those of a cell are adjacent.
+    /// The rows. All rows of a cell are adjacent.
     rows: Vec<TableRow>,
 }
 
@@ -38,20 +39,20 @@ pub struct StudyPlan {
     pub beside: BTreeMap<String, String>,
 }
 
-/// A row of the table: a test of a policy, or a failed cell.
+/// A row of the table: the result of a test, or the failure of a cell, which is a training with its tests.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TableRow {
     /// Version of the columns when this row was written.
     pub schema_version: u32,
     /// The study's name.
     pub study: String,
-    /// The id of the cell, which is one training with its tests.
+    /// The id of the cell.
     pub cell: String,
     /// The environment's name.
     pub environment: String,
-    /// The environment's revision; `None` for a failed cell.
+    /// The environment's revision; `None` for a failure.
     pub revision: Option<u64>,
-    /// SHA-256 of the environment's model (MJCF text). `None` if the environment has no model, and for a failed cell.
+    /// SHA-256 of the environment's model (MJCF text). `None` if the environment has no model, and for a failure.
     pub model_hash: Option<String>,
     /// The algorithm's name.
     pub algorithm: String,
@@ -59,18 +60,18 @@ pub struct TableRow {
     pub architecture: String,
     /// The preset, which chooses the default settings.
     pub preset: String,
-    /// What the policy observes.
+    /// The quantities that the policy observes: "state" or "parameters".
     pub observe: String,
     /// The name of the parameter set or version that the policy was trained on.
     pub trained_on: String,
-    /// The name of the parameter set or version of the test. `None` for a failed cell.
+    /// The name of the parameter set or version of the test. `None` for a failure.
     pub tested_on: Option<String>,
     /// The number of the run, i.e. of the repetition of the study, from 1.
     pub run: u32,
     /// The seed of the training and of the test.
     pub seed: u64,
     /// Number of training episodes before the test. It is smaller than the whole training if an intermediate policy was
-    /// tested. `None` for a failed cell.
+    /// tested. `None` for a failure.
     pub after_episodes: Option<u64>,
     /// Number of test episodes.
     pub episodes: Option<u64>,
@@ -92,11 +93,11 @@ pub struct TableRow {
     pub settings: String,
     /// SHA-256 of the test's episodes; `None` if they were not recorded.
     pub checksum: Option<String>,
-    /// The reason why the cell failed; `None` for a test.
+    /// The error message of a failure; `None` for a result.
     pub failure: Option<String>,
 }
 
-/// The numbers of cells that a merge added, replaced and left unchanged.
+/// The numbers of cells (trainings with their tests) that a merge added, replaced and left unchanged.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct MergeCounts {
     /// Cells that were not in the table.
@@ -178,7 +179,7 @@ impl ResultsTable {
         Ok(write_atomically(path, &content)?)
     }
 
-    /// Returns all rows. Those of a cell are adjacent.
+    /// Returns all rows. The rows of one training and its tests are adjacent.
     pub fn rows(&self) -> &[TableRow] {
         &self.rows
     }
@@ -243,7 +244,7 @@ impl ResultsTable {
 }
 
 impl TableRow {
-    /// Returns the result of the test; `None` for a failed cell.
+    /// Returns the result of the test; `None` if the row is a failure.
     pub fn result(&self) -> Option<TestResult> {
         let (episodes, successes) = (self.episodes?, self.successes?);
         let (low, high) = wilson(successes, episodes);

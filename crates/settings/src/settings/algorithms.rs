@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{SettingError, is_zero};
 
-/// How the learning rate changes during a training.
+/// The schedule of the learning rate over a training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Schedule {
@@ -35,7 +35,7 @@ impl Schedule {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct A2cConfig {
-    /// Step size of RMSProp, above 0 (default: `7e-4`). A larger value learns faster, but from some value on the policy
+    /// Step size of RMSProp, above 0 (default: `7e-4`). A larger value learns faster, but if it is too large the policy
     /// collapses.
     pub learning_rate: f64,
     /// The schedule of the learning rate: "linear", which falls to 0 over the training, or "constant" (default:
@@ -66,10 +66,11 @@ pub struct A2cConfig {
     /// Decay per update of RMSProp's running average of squared gradients, at least 0 and below 1 (default: `0.99`).
     pub rms_alpha: f64,
     /// RMSProp's ε, which is added to the average of squared gradients inside of the root, above 0 (default: `1e-5`).
-    /// It limits the step of weights with small gradients.
+    /// This limits the step of weights with small gradients.
     pub rms_eps: f64,
-    /// Whether the last reward of a truncated episode is followed by the value of the final observation (default:
-    /// `true`; paper: `false`). `false` treats the step limit as an end of the task, as the paper authors' code does.
+    /// Whether returns of truncated episodes are bootstrapped: whether the value of the final observation follows the
+    /// last reward (default: `true`; paper: `false`). `false` treats the step limit as an end of the task, as the paper
+    /// authors' code does.
     pub bootstrap_truncation: bool,
 }
 
@@ -92,7 +93,7 @@ impl Default for A2cConfig {
 }
 
 impl A2cConfig {
-    /// Checks that all values are in their ranges. NaN is not.
+    /// Checks that all values are in their ranges, which exclude NaN.
     ///
     /// # Errors
     /// [`SettingError`] with the first value that is out of range.
@@ -113,7 +114,7 @@ impl A2cConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct PpoConfig {
-    /// Step size of Adam, above 0 (default: `3e-4`). A larger value learns faster, but from some value on the policy
+    /// Step size of Adam, above 0 (default: `3e-4`). A larger value learns faster, but if it is too large the policy
     /// collapses.
     pub learning_rate: f64,
     /// The schedule of the learning rate: "constant", or "linear", which falls to 0 over the training (default:
@@ -161,10 +162,11 @@ pub struct PpoConfig {
     /// not change.
     #[serde(skip_serializing_if = "is_zero")]
     pub weight_decay: f64,
-    /// Adam's ε, above 0 (default: `1e-5`). It limits the step of weights with small gradients.
+    /// Adam's ε, above 0 (default: `1e-5`). This limits the step of weights with small gradients.
     pub adam_eps: f64,
-    /// Whether the last reward of a truncated episode is followed by the value of the final observation (default:
-    /// `true`; paper: `false`). `false` treats the step limit as an end of the task, as the paper authors' code does.
+    /// Whether returns of truncated episodes are bootstrapped: whether the value of the final observation follows the
+    /// last reward (default: `true`; paper: `false`). `false` treats the step limit as an end of the task, as the paper
+    /// authors' code does.
     pub bootstrap_truncation: bool,
 }
 
@@ -193,7 +195,7 @@ impl Default for PpoConfig {
 }
 
 impl PpoConfig {
-    /// Checks that all values are in their ranges. NaN is not.
+    /// Checks that all values are in their ranges, which exclude NaN.
     ///
     /// # Errors
     /// [`SettingError`] with the first value that is out of range.
@@ -221,8 +223,8 @@ impl PpoConfig {
 pub struct EpoptConfig {
     /// L, the number of complete episodes in an iteration, 1 … 10⁶ (default: `100`).
     pub episodes_per_iteration: usize,
-    /// ε, the share of episodes, those with the lowest returns, from which the policy learns, above 0 and at most 1
-    /// (default: `0.1`).
+    /// ε, the share of episodes from which the policy learns, above 0 and at most 1 (default: `0.1`). These are the
+    /// episodes with the lowest returns.
     pub epsilon: f64,
     /// The number of iterations at the start that learn from all episodes, as with ε = 1 (default: `100`).
     pub full_iterations: u64,
@@ -260,7 +262,7 @@ impl Default for EpoptConfig {
 }
 
 impl EpoptConfig {
-    /// Checks that all values are in their ranges. NaN is not.
+    /// Checks that all values are in their ranges, which exclude NaN.
     ///
     /// # Errors
     /// [`SettingError`] with the first value that is out of range.
@@ -293,7 +295,7 @@ impl Default for Rl2Config {
 }
 
 impl Rl2Config {
-    /// Checks that all values are in their ranges. NaN is not.
+    /// Checks that all values are in their ranges, which exclude NaN.
     ///
     /// # Errors
     /// [`SettingError`] with the first value that is out of range.

@@ -51,7 +51,7 @@ pub enum Wrapper {
     Rl2(Rl2Config),
 }
 
-/// How a training collects rollouts. Trainings whose environments share a batch must have the same mode.
+/// The way in which a training collects rollouts. Trainings whose environments share a batch must have the same mode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum CollectionMode {
     /// The training collects no rollouts, because a random policy learns nothing.

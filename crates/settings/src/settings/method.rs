@@ -19,7 +19,7 @@ pub struct Method {
     /// The preset, which chooses the default settings.
     #[serde(default, skip_serializing_if = "Preset::is_default")]
     pub preset: Preset,
-    /// What the policies observe.
+    /// The quantities that the policies observe.
     #[serde(default, skip_serializing_if = "Observe::is_default")]
     pub observe: Observe,
     /// Whether the method is an external agent, which was not trained by an experiment. Then `algorithm` is the agent's

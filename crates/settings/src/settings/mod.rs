@@ -51,7 +51,8 @@ const OBSERVE: &str = "observe";
 const ARCHITECTURE: &str = "architecture";
 
 impl Common {
-    /// Describes the training distribution, e.g. "D", or "D with length [0.3, 0.4]".
+    /// Describes the parameters of the training: the version, and the parameters that replace the version's, e.g. "D"
+    /// or "D with length [0.3, 0.4]".
     pub fn trained_on(&self) -> String {
         let own = self.parameters.iter().map(|(name, values)| format!("{name} {values}"));
         match own.collect::<Vec<_>>() {
@@ -78,7 +79,8 @@ pub struct Common {
     pub preset: Preset,
     /// The environment's name in the catalogue. It has no default.
     pub environment: String,
-    /// The version from which the environment's parameters are drawn in training: D, R, E or R+E.
+    /// The version from which the environment's parameters are drawn in training: D (deterministic), R (random), E
+    /// (extreme) or R+E.
     pub version: Version,
     /// Distributions of single parameters in training that replace those of the version, e.g. `length = "0.8..1.0"` in
     /// the table `[parameters]` (default: nothing).
@@ -86,9 +88,9 @@ pub struct Common {
     pub parameters: Parameters,
     /// The network architecture of the policy.
     pub architecture: Architecture,
-    /// What the policy observes: "state", or "parameters" for the state and the current parameters of the environment,
-    /// in training and in tests (default: `"state"`). It is written to files only if it is not the default, so that
-    /// files of older settings do not change.
+    /// The observation of the policy in training and in tests: "state", or "parameters" for the state and the current
+    /// parameters of the environment (default: `"state"`). This setting is written to files only if it is not the
+    /// default, so that files of older settings do not change.
     #[serde(default, skip_serializing_if = "Observe::is_default")]
     pub observe: Observe,
     /// The number of episodes after which training ends, at least 1 (default: `15000`). The last iteration is
@@ -242,7 +244,7 @@ impl TrainConfig {
     }
 }
 
-/// Describes the training in a few words, e.g. "Hopper R ppo ff".
+/// Describes the training in a few words: environment, version, algorithm and architecture, e.g. "Hopper R ppo ff".
 impl std::fmt::Display for TrainConfig {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Common { environment, version, .. } = &self.common;

@@ -1,4 +1,4 @@
-//! What a policy observes.
+//! The quantities that a policy observes.
 
 use std::fmt;
 

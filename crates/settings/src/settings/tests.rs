@@ -218,8 +218,9 @@ fn the_command_lines_preset_beats_the_files() {
     assert_eq!(loaded(&format!("{file}\npreset = 'perturb'"), "preset = 'paper'"), loaded(&paper, ""));
 }
 
-/// The names of cells depend on the settings that are written. A setting that was introduced later is omitted if it has
-/// the value that trainings had before. So names do not change, and results of earlier programs are found.
+/// The names of an experiment's trainings depend on the settings that are written. A setting that was introduced later
+/// is omitted if it has the value that trainings had before. So names do not change, and results of earlier programs
+/// are found.
 #[test]
 fn default_preset_omits_younger_settings_with_old_values() {
     for (algorithm, architecture) in pairs() {
