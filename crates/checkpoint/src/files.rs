@@ -60,7 +60,8 @@ impl ArraysFile {
     pub fn read(&self, directory: &Path) -> Result<Vec<u8>> {
         let path = self.path(directory);
         let mut content = Vec::new();
-        let mut file = self.open(directory)?.take(self.bytes.saturating_add(1)); // another process may append to it meanwhile
+        // Another process may append to the file meanwhile, so no more than one extra byte is read.
+        let mut file = self.open(directory)?.take(self.bytes.saturating_add(1));
         file.read_to_end(&mut content).map_err(files::io("read", &path))?;
         self.require_content(&content).map_err(|reason| damaged(&path, reason))?;
         Ok(content)

@@ -162,6 +162,7 @@ impl Differentiator {
         if indices.is_empty() {
             return Err(Error::NoSamples);
         }
+        // The division into parts depends only on the size of the minibatch.
         let n_parts = indices.len().div_ceil(BLOCK).min(MAX_PARTS);
         self.make_parts(n_parts);
         let is_computed = self.has_computed(samples, indices);
@@ -175,6 +176,8 @@ impl Differentiator {
         let gaussian = &*gaussian;
         let n = indices.len();
         let size = n.div_ceil(n_parts);
+        // Differentiates part number `place`. The first part writes to the caller's gradient, the others to their own
+        // buffers.
         let work = |place: usize, part: &mut MinibatchPart, gradient: Option<&mut [f32]>| {
             let MinibatchPart { block, gradient: own, losses } = part;
             let sums = gradient.unwrap_or(own);
@@ -186,7 +189,7 @@ impl Differentiator {
         };
         let parts = &mut parts[..n.div_ceil(size)];
         match threads {
-            // Waking a thread takes about as long as computing a part.
+            // Each thread gets at least two parts, because waking a thread takes about as long as computing a part.
             Some(pool) if parts.len() > 2 => {
                 let share = parts.len().div_ceil(pool.current_num_threads() + 1).max(2);
                 pool.in_place_scope(|scope| {
@@ -345,6 +348,7 @@ impl Differentiation<'_> {
             &self.context;
         let size = spec.observation_size;
         let n = indices.len();
+        // Forward pass, unless an actor has cached its results.
         if !is_computed {
             for (b, &i) in indices.iter().enumerate() {
                 observations.row_mut(b)[..size].copy_from_slice(&samples.observations[i as usize * size..][..size]);
@@ -354,6 +358,7 @@ impl Differentiation<'_> {
             call(simd, Forward { network: &networks.policy, inputs, rows: rows.clone(), outputs: policy_layers });
             call(simd, Forward { network: &networks.value, inputs, rows, outputs: value_layers });
         }
+        // The losses, and their derivatives with respect to the networks' outputs.
         let heads = &policy_layers[policy_layers.len() - 1];
         let values = &value_layers[value_layers.len() - 1];
         let n_outputs = spec.action.outputs();
@@ -383,6 +388,7 @@ impl Differentiation<'_> {
             };
             *self.losses += objective.differentiate(spec.action, &sample, outputs, *of);
         }
+        // Backward pass.
         let (policy_weights, rest) = weights.split_at(policy_sums.len());
         let value_weights = &rest[..value_sums.len()];
         through_policy.sum::<S, ADD>(simd, policy_weights, policy_sums, observations, policy_layers, n);

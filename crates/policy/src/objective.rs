@@ -137,11 +137,13 @@ impl Objective {
         let mut losses = Losses { value: f64::from(value_loss), ..Losses::default() };
         match kind {
             ActionKind::Discrete { .. } => {
+                // The log-probability of the chosen action, and the surrogate's derivative with respect to it.
                 let (greatest, total) = greatest_and_total(head);
                 let log_total = ln(total);
                 let log_prob = |logit: f32| logit - greatest - log_total;
                 let chosen = sample.action[0] as usize;
                 let by_log_prob = share * self.policy_loss(log_prob(head[chosen]), sample, &mut losses);
+                // `by_head` first holds the probabilities, then the derivatives of surrogate and entropy.
                 by_head.iter_mut().zip(head).for_each(|(p, &logit)| *p = exp(log_prob(logit)));
                 let entropy = -by_head.iter().zip(head).map(|(p, &logit)| p * log_prob(logit)).sum::<f32>();
                 losses.entropy = f64::from(entropy);
@@ -150,6 +152,7 @@ impl Objective {
                     let hit = if j == chosen { 1.0 } else { 0.0 };
                     *by = by_log_prob * (hit - p) - by_entropy * p * (log_prob(logit) + entropy);
                 }
+                // KL divergence from the acting policy, with its derivatives.
                 if let Some((acting, _)) = sample.acting {
                     let (greatest, total) = greatest_and_total(acting);
                     let log_total = ln(total);
@@ -161,6 +164,7 @@ impl Objective {
                 }
             }
             ActionKind::Continuous { .. } => {
+                // Log-density and entropy of the Gaussian.
                 let size = head.len() as f32;
                 let mut log_prob = -0.5 * LOG_TAU * size;
                 let mut entropy = 0.5 * (1.0 + LOG_TAU) * size;
@@ -172,6 +176,7 @@ impl Objective {
                 }
                 let by_log_prob = share * self.policy_loss(log_prob, sample, &mut losses);
                 losses.entropy = f64::from(entropy);
+                // Derivatives with respect to each mean and log standard deviation.
                 for i in 0..head.len() {
                     let action = sample.action[i];
                     let mean = head[i];

@@ -97,6 +97,7 @@ impl<'a> Factor<'a> {
         start: Option<&[Lane]>,
         to: &mut Rows,
     ) {
+        // Rows `many` are computed in blocks, rows `few` singly.
         let whole = self.outputs / LANES;
         let few = if rows.len() % 8 < 4 { rows.len() % 8 } else { 0 };
         let many = rows.start..rows.end - few;
@@ -368,6 +369,7 @@ fn outers<S: Simd, const R: usize, const ADD: bool, const WHOLE: bool>(
     let deltas = deltas.lanes(n).as_flattened();
     let sums = &mut sums[first * size + column * LANES..];
     let left = if WHOLE { LANES } else { size % LANES };
+    // `lanes` holds sums of a lane with fewer than `LANES` inputs, or the earlier sums with `ADD`.
     let mut lanes = [ZERO; R];
     if ADD {
         for r in 0..R {

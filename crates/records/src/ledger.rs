@@ -227,11 +227,11 @@ impl Ledgers {
         let address = self.at.entry(address).or_default();
         address.ends.push(end);
         // If no environment was in use, those that ended last had continued to draw.
-        let continued = address.open.is_empty();
+        let went_on = address.open.is_empty();
         if address.ends.len() < address.open.len() {
             return;
         }
-        if !continued {
+        if !went_on {
             address.closed = std::mem::take(&mut address.open);
         }
         let ends = std::mem::take(&mut address.ends);
@@ -242,7 +242,7 @@ impl Ledgers {
             .unwrap_or(LastDraw::None);
         for &which in &address.closed {
             let drawn = &mut self.drawn[which];
-            drawn.last = if continued { drawn.last.max(last) } else { last };
+            drawn.last = if went_on { drawn.last.max(last) } else { last };
             drawn.ended = Some(end.1);
         }
     }
@@ -266,6 +266,7 @@ impl Ledgers {
                 && drawn.region.is_within([&claimed])
                 && claimed.is_within([&*drawn.region])
         };
+        // Finds the draws of the training, its sessions and its tokens, and compares the number of episodes.
         let own: Vec<&Drawn> = self.drawn.iter().filter(is_own).collect();
         let sessions: BTreeSet<SessionId> = own.iter().map(|drawn| drawn.line.session).collect();
         let tokens = own.iter().map(|drawn| drawn.line.who.token.clone()).collect();
@@ -286,6 +287,7 @@ impl Ledgers {
                 && proof.tokens.contains(&line.who.token)
                 && ends.iter().any(|end| end.is_none_or(|end| line.at.is_before(end)))
         };
+        // Looks for draws of these tokens from the test sets before the training ended.
         for test in &records.about.tests {
             let set = &test.set.name;
             let others = tested(environment, test, &claimed);

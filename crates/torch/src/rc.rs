@@ -135,10 +135,12 @@ fn run(driven: Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tape {
     let mut cells = Vec::with_capacity(starts.len());
     let mut cells_before = Vec::with_capacity(starts.len());
     for (t, &any_start) in (0..steps).zip(&starts) {
+        // Clears the memory of sequences in which an episode starts.
         if any_start {
             let keep = keep.select(0, t);
             (h, c) = (h * &keep, c * keep);
         }
+        // Computes the gates in place: their pre-activations first, then the nonlinearities.
         let gate = |from: i64, blocks: i64| gates.select(0, t).narrow(1, from * width, blocks * width);
         let _ = gates.select(0, t).addmm_(&h, &transposed);
         let _ = gate(0, 2).sigmoid_();

@@ -52,8 +52,8 @@ pub struct ConditionMean {
     /// Number of episodes that each policy played; the smallest number if they differ.
     pub episodes: usize,
     /// The 95 % interval of the mean over episodes, [low, high]. It supports conclusions about the same policies in
-    /// other episodes. For returns and lengths it is a t interval. For success rates it is Wilson's interval; if all
-    /// policies played the same episodes, it is computed with an effective number of episodes.
+    /// other episodes. For returns and lengths it is a t interval. For success rates it is Wilson's interval with an
+    /// effective number of episodes, because policies that play the same episodes are not independent.
     pub episodes_95: Option<[f64; 2]>,
 }
 
@@ -131,6 +131,7 @@ pub fn compare(
         };
         differences.extend(pairs.into_iter().map(|[x, y]| difference(&tested[x], &tested[y], set)));
     }
+    // Holm's correction, for all differences that have a p-value.
     let known: Vec<f64> = differences.iter().filter_map(|it| it.p).collect();
     let mut corrected = holm(&known).into_iter();
     for it in &mut differences {
@@ -172,6 +173,7 @@ fn check(conditions: &[ComparedCondition<'_>], sets: &[String], baseline: Option
             format!("one of {expected}"),
         )?;
     }
+    // All policies must have the environment, the success rule and the sets of the first policy.
     let first = conditions[0].policies[0].1;
     for ComparedCondition { name, policies } in conditions {
         for (_, records) in policies {
@@ -279,6 +281,7 @@ fn difference(x: &TestedCondition<'_>, y: &TestedCondition<'_>, set: &str) -> Co
         None => (vec![of_x.clone(), of_y.iter().map(|score| -score).collect()], 2.0),
     };
     let interval = mean_with_t_interval(&strata).and_then(|it| it.interval_95);
+    // Over episodes: a t interval of the differences if both played the same episodes, else a normal interval.
     let all: Vec<EpisodeScores> = x.policies.iter().chain(&y.policies).cloned().collect();
     let same_episodes = share_episodes(&all);
     let difference = mean(of_x.iter().copied()) - mean(of_y.iter().copied());

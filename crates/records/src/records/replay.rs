@@ -15,7 +15,7 @@ impl EpisodeRecord {
             ("return", what(|it| format!("{:?}", it.episode_return))),
             ("ending", what(|it| format!("{:?}", it.ending))),
             ("achieved", what(|it| format!("{:?}", it.achieved))),
-            ("second achieved value", what(|it| format!("{:?}", it.also_achieved))),
+            ("the other it achieved", what(|it| format!("{:?}", it.also_achieved))),
         ];
         let (what, (was, is)) = parts.into_iter().find(|(_, (recorded, got))| recorded != got)?;
         let Self { set, environment_index, episode_index, .. } = self;

@@ -198,6 +198,7 @@ impl ResultsTable {
     pub fn merge(&mut self, study: &str, plan: StudyPlan, rows: Vec<TableRow>) -> MergeCounts {
         self.studies.insert(study.to_owned(), plan);
         let mut counts = MergeCounts::default();
+        // The new rows and the present rows, by cell.
         let mut blocks: Vec<Vec<TableRow>> = Vec::new();
         for row in rows {
             match blocks.last_mut().filter(|block| block[0].cell == row.cell) {
@@ -209,6 +210,7 @@ impl ResultsTable {
         for row in self.rows.iter().filter(|row| row.study == study) {
             earlier.entry(row.cell.clone()).or_default().push(row.clone());
         }
+        // Sorts the new rows into cells to add and cells to replace.
         let mut replacements: HashMap<String, Vec<TableRow>> = HashMap::new();
         let mut added = Vec::new();
         for mut block in blocks {
@@ -226,6 +228,7 @@ impl ResultsTable {
                 replacements.insert(cell, block);
             }
         }
+        // Puts the replacing rows in the place of the present rows.
         let mut written = HashSet::new();
         let mut all = Vec::with_capacity(self.rows.len() + added.len());
         for row in std::mem::take(&mut self.rows) {

@@ -84,7 +84,8 @@ mod tests {
     #[test]
     fn the_smallest_of_many_counts_most() {
         let corrected = holm(&[0.01, 0.04, 0.03, 0.005]);
-        let expected = [0.03, 0.06, 0.06, 0.02]; // 0.005 · 4, 0.01 · 3, 0.03 · 2; 0.04 · 1 is raised to the value before it
+        // 0.005 · 4, 0.01 · 3 and 0.03 · 2; 0.04 · 1 is raised to the value before it.
+        let expected = [0.03, 0.06, 0.06, 0.02];
         assert!(corrected.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-15), "{corrected:?}");
         assert_eq!(holm(&[0.6, 0.9]), [1.0, 1.0]);
         assert!(holm(&[]).is_empty());

@@ -134,7 +134,8 @@ impl Settings {
         if let Wrapper::Epopt(_) = self.wrapper {
             table.retain(|key, _| !NOT_WITH_EPISODES.contains(&key));
         }
-        table.extend(Table::try_from(&self.wrapper).unwrap_or_default()); // a wrapper without settings is not serialised as a table
+        // Without a wrapper, the conversion fails and adds no settings.
+        table.extend(Table::try_from(&self.wrapper).unwrap_or_default());
         table
     }
 

@@ -355,6 +355,7 @@ fn resolve(mut layers: Vec<(String, Table)>) -> Result<TrainConfig, ConfigError>
             *value = known[place].into();
         }
     }
+    // The algorithm, the architecture and the preset determine the defaults. The last layer that names them counts.
     let named = |key: &str| layers.iter().rev().find_map(|(_, table)| table.get(key));
     let algorithm = named(ALGORITHM).cloned().unwrap_or_else(|| "ppo".into());
     let algorithm = Settings::all()[choice(ALGORITHM, &algorithm, &Settings::names())?].clone();
@@ -374,6 +375,7 @@ fn resolve(mut layers: Vec<(String, Table)>) -> Result<TrainConfig, ConfigError>
             check(origin, key, value, &defaults, name)?;
         }
     }
+    // Each layer overrides the layers before it.
     let mut builder = Config::builder().add_source(source(&defaults));
     for (_, table) in &layers {
         builder = builder.add_source(source(table));
