@@ -5,25 +5,25 @@ use std::path::{Path, PathBuf};
 
 const EXPECT: &str = "certificates can be made and written";
 
-/// A certificate authority.
+/// A certificate authority that issues certificates for tests.
 pub struct Authority {
     issuer: Issuer<'static, KeyPair>,
     pem: String,
 }
 
-/// Files of a certificate and its key.
+/// The paths of a certificate and its private key.
 pub struct CertificateFiles {
-    /// Certificate in PEM format.
+    /// The file of the certificate, in PEM format.
     pub cert: PathBuf,
-    /// Private key in PEM format.
+    /// The file of the private key, in PEM format.
     pub key: PathBuf,
 }
 
 impl Authority {
-    /// Makes an authority. Two authorities of the same name do not trust each other.
+    /// Creates an authority with a new key. Authorities with the same name do not trust each other's certificates.
     ///
     /// # Panics
-    /// Every function here panics if a certificate or a file cannot be made.
+    /// If the certificate cannot be created.
     pub fn new(name: &str) -> Self {
         let mut params = CertificateParams::new(Vec::new()).expect(EXPECT);
         params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
@@ -34,14 +34,21 @@ impl Authority {
         Self { issuer: Issuer::new(params, key), pem }
     }
 
-    /// Writes the authority's own certificate to a file.
+    /// Writes the authority's own certificate to the file `name`, and returns the file's path.
+    ///
+    /// # Panics
+    /// If the file cannot be written.
     pub fn file(&self, directory: &Path, name: &str) -> PathBuf {
         let path = directory.join(name);
         std::fs::write(&path, &self.pem).expect(EXPECT);
         path
     }
 
-    /// Writes a certificate for these names, valid from 2020 until `until_year`. Replaces existing files.
+    /// Issues a certificate for these names, valid from the start of 2020 to the start of `until_year`. Writes it and
+    /// its key to `file.pem` and `file.key`, and replaces existing files.
+    ///
+    /// # Panics
+    /// If the certificate cannot be created or a file cannot be written.
     pub fn issue(&self, directory: &Path, file: &str, names: &[&str], until_year: i32) -> CertificateFiles {
         let mut params =
             CertificateParams::new(names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>()).expect(EXPECT);

@@ -1,9 +1,9 @@
 //! Fault injection for tests and benchmarks:
 //!
-//! - [`proxy`]: a proxy that delays, closes, drops and changes bytes.
+//! - [`proxy`]: a proxy that delays, drops and changes bytes, and closes connections.
 //! - [`certificates`]: valid and invalid certificates.
-//! - [`rng`]: random positions and times from a printed seed.
-//! - [`disk`]: commands on full disks.
+//! - [`rng`]: random faults and pauses from a seed, which is printed.
+//! - [`disk`]: commands that run with a full disk.
 
 pub mod certificates;
 pub mod disk;

@@ -1,4 +1,4 @@
-//! A proxy between a client and a server that injects faults.
+//! A proxy that injects faults into the connections between clients and a server.
 
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -10,14 +10,14 @@ use std::sync::mpsc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// Kind of a fault.
+/// The kind of a fault.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FaultKind {
     /// Flips the lowest bit of the byte.
     BitFlip,
     /// Closes both directions before the byte.
     Close,
-    /// Drops all bytes from this one on, without closing the connection.
+    /// Drops this byte and all later bytes of this direction, without closing the connection.
     Blackhole,
     /// Closes this direction before the byte. The other direction stays open.
     HalfClose,
@@ -26,27 +26,27 @@ pub enum FaultKind {
 impl FaultKind {
     /// Every kind of fault.
     pub const ALL: [Self; 4] = [Self::BitFlip, Self::Close, Self::Blackhole, Self::HalfClose];
-    /// Kinds that lose bytes but change none.
+    /// The kinds of faults that lose bytes but do not change any.
     pub const LOSSES: [Self; 3] = [Self::Close, Self::Blackhole, Self::HalfClose];
 }
 
 /// A fault in the bytes of one direction of a connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ByteFault {
-    /// Position of the byte at which the fault happens, from 0.
+    /// The index of the byte at which the fault happens, from 0.
     pub at: usize,
-    /// Kind of the fault.
+    /// The kind of the fault.
     pub kind: FaultKind,
 }
 
-/// Faults of one connection.
+/// The faults of one connection.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct FaultPlan {
-    /// Delay of all bytes in both directions.
+    /// The delay of all bytes, in both directions.
     pub delay: Duration,
-    /// Fault of the server's bytes.
+    /// The fault in the bytes that the server sends.
     pub from_server: Option<ByteFault>,
-    /// Fault of the client's bytes.
+    /// The fault in the bytes that the client sends.
     pub from_client: Option<ByteFault>,
 }
 
@@ -63,8 +63,9 @@ struct ProxyCounts {
 }
 
 impl FaultyProxy {
-    /// Listens at a port of this machine for the server at `address`: `unix:/PATH`, or host and port after any scheme.
-    /// `plan` returns the faults of a connection by its number, counted from 0.
+    /// Starts a proxy on a free port of this machine. It forwards connections to the server at `address`: `unix:/PATH`,
+    /// or `HOST:PORT` with or without a scheme. `plan` returns the faults of each connection; its argument is the
+    /// connection's number, from 0.
     ///
     /// # Errors
     /// [`io::Error`] if no port is free.
@@ -77,24 +78,24 @@ impl FaultyProxy {
         thread::spawn(move || {
             for client in listener.incoming().flatten() {
                 let number = counts.connections.fetch_add(1, Ordering::Relaxed);
-                // If the server does not accept, the client's connection is closed.
+                // On an error, for instance if the server does not accept, the client's connection is closed.
                 let _ = server.connect().and_then(|server| connect(client, server, plan(number), &counts));
             }
         });
         Ok(proxy)
     }
 
-    /// Returns the proxy's host and port.
+    /// Returns the proxy's address, as `HOST:PORT`.
     pub fn address(&self) -> String {
         format!("127.0.0.1:{}", self.port)
     }
 
-    /// Returns the number of connections so far.
+    /// Returns the number of connections that the proxy has accepted.
     pub fn connections(&self) -> usize {
         self.counts.connections.load(Ordering::Relaxed)
     }
 
-    /// Returns the number of faults that have happened. A fault after the last byte does not happen.
+    /// Returns the number of faults that have happened. A planned fault does not happen if too few bytes are sent.
     pub fn faults(&self) -> usize {
         self.counts.faults.load(Ordering::Relaxed)
     }
@@ -123,9 +124,9 @@ impl Upstream {
 
 /// A TCP or Unix socket.
 trait Socket: Read + Write + Send {
-    /// Returns another handle of the socket.
+    /// Returns another handle to the same socket.
     fn duplicate(&self) -> io::Result<Box<dyn Socket>>;
-    /// Shuts the socket down, unless it is closed already.
+    /// Shuts down reading, writing or both. Does nothing if the socket is closed already.
     fn end(&self, how: Shutdown);
 }
 
@@ -145,7 +146,7 @@ macro_rules! socket {
 socket!(TcpStream);
 socket!(UnixStream);
 
-/// Forwards both directions of a connection.
+/// Forwards both directions of a connection, with the faults of `plan`.
 fn connect(client: TcpStream, server: Box<dyn Socket>, plan: FaultPlan, counts: &Arc<ProxyCounts>) -> io::Result<()> {
     client.set_nodelay(true)?;
     let client: Box<dyn Socket> = Box::new(client);
@@ -153,7 +154,7 @@ fn connect(client: TcpStream, server: Box<dyn Socket>, plan: FaultPlan, counts: 
     forward(server, client, plan.delay, plan.from_server, counts)
 }
 
-/// Forwards the bytes of one direction, each `delay` after its arrival.
+/// Forwards the bytes of one direction, each after `delay`, and injects `fault`. Runs on two new threads.
 fn forward(
     from: Box<dyn Socket>,
     mut to: Box<dyn Socket>,
@@ -202,7 +203,7 @@ fn forward(
                 FaultKind::HalfClose => to.end(Shutdown::Write),
                 FaultKind::Blackhole => {}
             }
-            // The sender must not notice, so its bytes are read and dropped.
+            // The rest is read and dropped, so that the sender does not notice the fault.
             for _ in &chunks {}
             return;
         }
@@ -215,7 +216,7 @@ fn forward(
 mod tests {
     use super::*;
 
-    /// Upper bound of a wait.
+    /// Maximal time to wait for delayed bytes.
     const DEADLINE: Duration = Duration::from_secs(60);
     /// Time without bytes after which the connection counts as silent.
     const SILENCE: Duration = Duration::from_millis(300);

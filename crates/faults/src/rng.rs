@@ -1,4 +1,4 @@
-//! Random numbers from a printed seed.
+//! Random numbers for tests, from a seed that is printed so that a failure can be repeated.
 
 use std::thread;
 use std::time::{Duration, SystemTime};
@@ -8,7 +8,7 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 
 use crate::proxy::{ByteFault, FaultKind};
 
-/// Environment variable with the seed.
+/// The environment variable that sets the seed.
 pub const SEED_VARIABLE: &str = "PERTURB_SEED";
 
 /// A random number generator for tests. The same seed gives the same numbers.
@@ -21,8 +21,8 @@ impl Default for SeededRng {
 }
 
 impl SeededRng {
-    /// Takes the seed from the variable [`SEED_VARIABLE`], or from the clock. Prints it, so that a failure can be
-    /// repeated.
+    /// Creates a generator with the seed in the environment variable [`SEED_VARIABLE`], or otherwise a seed from the
+    /// clock. Prints the seed, so that a failure can be repeated.
     ///
     /// # Panics
     /// If the variable is not a number.
@@ -34,25 +34,25 @@ impl SeededRng {
         Self::from_seed(seed)
     }
 
-    /// Makes the generator of this seed.
+    /// Creates a generator with this seed.
     pub fn from_seed(seed: u64) -> Self {
         Self(ChaCha8Rng::seed_from_u64(seed))
     }
 
-    /// Returns a number below `end`, which is at least 1.
+    /// Returns a random number below `end`, which must be at least 1.
     pub fn below(&mut self, end: u64) -> u64 {
         self.0.next_u64() % end
     }
 
-    /// Sleeps for `from` to `to` milliseconds.
+    /// Sleeps for a random time from `from` to `to` ms.
     pub fn wait(&mut self, from: u64, to: u64) {
         thread::sleep(Duration::from_millis(from + self.below(to - from)));
     }
 
-    /// Returns a fault of one of these kinds at a byte before `end`.
+    /// Returns a random fault of one of these kinds, at a byte before `end`.
     ///
-    /// It is as likely between bytes 100 and 1000 as between 1000 and 10 000, because the first bytes of a connection
-    /// negotiate most.
+    /// Early bytes are more likely, roughly by the logarithm of their index: bytes 100 to 1000 together are as likely
+    /// as bytes 1000 to 10 000. The reason is that most of the negotiation happens in the first bytes of a connection.
     pub fn fault(&mut self, kinds: &[FaultKind], end: u64) -> ByteFault {
         let kind = kinds[self.below(kinds.len() as u64) as usize];
         let digits = u64::from(end.max(2).ilog2());

@@ -1,4 +1,4 @@
-//! A session without environments. It counts its steps, and each step's action is a number.
+//! A session without environments. It counts its steps. The action of a step is a number that the client chooses.
 
 use bytes::Bytes;
 use perturb::proto::{self, session_request::Request, session_response::Response};
@@ -11,7 +11,7 @@ use perturb::server::transport::precheck::Field;
 
 use super::{MAX_BYTES, StepLog};
 
-/// A counting session.
+/// A session that counts its steps.
 pub(super) struct CountingSession {
     leases: Leases<proto::SessionResponse>,
     ledger: StepLog,
@@ -20,7 +20,7 @@ pub(super) struct CountingSession {
 }
 
 impl CountingSession {
-    /// Makes a session that is not open yet.
+    /// Creates a session that is not open yet. Steps are recorded in `ledger`.
     pub(super) fn new(leases: Leases<proto::SessionResponse>, ledger: StepLog) -> Self {
         Self { leases, ledger, is_open: false, steps: 0 }
     }
@@ -34,7 +34,7 @@ impl CountingSession {
         Ok(Reply { handover: grant.map(StreamHandover::Lease), ..reply(Response::Opened(opened)) })
     }
 
-    /// Replies with the number of the request and with the number of steps so far.
+    /// Records a step. The reply has the number in the request, and the number of steps so far.
     fn step(&mut self, step: &proto::Step) -> Result<CountingReply, Error> {
         let number = step.actions[..].try_into().map(u64::from_le_bytes);
         let number = number.map_err(|_| Error::value("step.actions", step.actions.len(), "8 bytes"))?;
@@ -51,7 +51,7 @@ impl CountingSession {
     }
 }
 
-/// A reply of this protocol.
+/// A reply of the protocol `perturb.v1`.
 type CountingReply = Reply<proto::SessionResponse>;
 
 fn reply(response: Response) -> CountingReply {
@@ -89,12 +89,12 @@ impl SessionHandler for CountingSession {
         SessionStats { steps: self.steps, ..SessionStats::default() }
     }
 
-    /// A step costs nothing, since no token has a rate limit.
+    /// Returns 0: a step costs nothing, since the server has no rate limits.
     fn price(&self, _request: &Self::Request) -> u64 {
         0
     }
 
-    /// No environments are freed.
+    /// Does nothing, since there are no environments to free.
     async fn close(&mut self) {}
 
     async fn answer(&mut self, request: Self::Request) -> Result<CountingReply, Error> {
@@ -106,7 +106,7 @@ impl SessionHandler for CountingSession {
         }
     }
 
-    /// Returns `None`: steps run without a pool, so none is pipelined.
+    /// Returns `None`, since steps run without a worker pool and cannot be pipelined.
     fn pipeline(&self, _request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<>> {
         None::<fn(Self::Request)>
     }

@@ -1,7 +1,7 @@
-//! A server with counting sessions, for tests in simulated time.
+//! A server for tests in simulated time. Its sessions have no environments: they only count steps.
 //!
-//! gRPC, the transport of sessions and their leases are the real ones, in client and server. Time and network are
-//! simulated by [turmoil](https://docs.rs/turmoil). There is no physics, because its threads would use real time.
+//! Client and server use the real code of gRPC, the transport, sessions and leases. Time and network are simulated by
+//! [turmoil](https://docs.rs/turmoil). There is no physics, because its threads would use real time.
 #![cfg(feature = "turmoil")]
 
 mod counting;
@@ -32,27 +32,27 @@ use tonic::{Request, Response, Status, Streaming};
 
 use counting::CountingSession;
 
-/// Name of the server's machine.
+/// The host name of the server in the simulated network.
 pub const SERVER: &str = "server";
-/// Time for which the server holds a session without a stream.
+/// Time for which the server keeps a session whose connection is lost.
 pub const LEASE: Duration = Duration::from_secs(60);
 
 const PORT: u16 = 7471;
-/// Silence after which a peer sends a keepalive ping, and time for the answer to it.
+/// Interval of keepalive pings on a silent connection, and timeout of their answers.
 pub const KEEPALIVE: Duration = Duration::from_secs(1);
-/// Time that a client waits for its connection.
+/// Time after which a client's attempt to connect over a cut network fails.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
-/// Time that a client has for opening a session.
+/// Time after which the server closes a stream that has not opened a session.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
-/// Maximum number of sessions.
+/// Maximal number of sessions on the server.
 const MAX_SESSIONS: usize = 4;
-/// Memory budget of the server, and maximum size of a request.
+/// Memory budget of the server, and maximal size of a request, in bytes.
 const MAX_BYTES: usize = 1 << 20;
 
-/// Steps and state of the server's sessions. Clones share them.
+/// A record of the steps that the server took, with counters of its sessions. Clones share the same data.
 #[derive(Clone)]
 pub struct StepLog {
-    /// Numbers of the steps, in the order of the server.
+    /// The numbers in the requests to step, in the order in which the server took them.
     done: Arc<Mutex<Vec<u64>>>,
     numbers: LeaseCounters,
     limiter: PeerLimiter,
@@ -67,22 +67,22 @@ impl Default for StepLog {
 }
 
 impl StepLog {
-    /// Returns the numbers that clients stepped with, in the order of the server.
+    /// Returns the numbers in all requests to step, in the order in which the server took them.
     pub fn done(&self) -> Vec<u64> {
         self.done.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Returns the number of resumed sessions.
+    /// Returns how often a session was resumed.
     pub fn resumed(&self) -> u64 {
         self.numbers.resumed()
     }
 
-    /// Returns the number of requests to resume a session that does not exist.
+    /// Returns how often a client tried to resume a session that did not exist any more.
     pub fn unknown(&self) -> u64 {
         self.counters.counts().filter(|(kind, _)| *kind == ErrorKind::UnknownLease).map(|(_, count)| count).sum()
     }
 
-    /// Tells whether no session is left, with or without a stream.
+    /// Whether the server has no sessions, connected or waiting to be resumed.
     pub fn is_idle(&self) -> bool {
         self.limiter.in_use() == 0 && self.numbers.detached() == 0
     }
@@ -92,10 +92,10 @@ impl StepLog {
     }
 }
 
-/// Serves on this machine of the simulation until the simulation ends.
+/// Runs the server on the current host of the simulation, until the simulation ends. Steps are recorded in `ledger`.
 ///
 /// # Errors
-/// If the port is taken, or the transport fails.
+/// An error if the port is taken or the transport fails.
 pub async fn serve(ledger: StepLog) -> turmoil::Result {
     let (_controller, drain) = Controller::new();
     let budget = Budget::new(MAX_BYTES);
@@ -125,18 +125,18 @@ pub async fn serve(ledger: StepLog) -> turmoil::Result {
     Ok(())
 }
 
-/// Connects to the server from another machine of the simulation.
+/// Connects to the server from another host of the simulation.
 ///
 /// # Errors
-/// [`ClientError::Connect`].
+/// [`ClientError::Connect`] if the server does not answer.
 pub async fn connect() -> Result<Connection, ClientError> {
     let address = Address::Tcp { host: SERVER.into(), port: PORT, tls: None };
     let patience = Timeouts { keepalive_interval: KEEPALIVE, keepalive_limit: KEEPALIVE, ..Timeouts::default() };
     Connection::open_by(&address, patience, stream).await
 }
 
-/// Connects to the server. A cut connection is refused at once in the simulation, but times out in reality, so this
-/// function waits first.
+/// Opens a byte stream to the server. turmoil refuses a connection over a cut network at once. In reality it times out,
+/// so this function waits before it returns the error.
 async fn stream() -> io::Result<turmoil::net::TcpStream> {
     let stream = turmoil::net::TcpStream::connect((SERVER, PORT)).await;
     if stream.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::ConnectionRefused) {
@@ -146,7 +146,7 @@ async fn stream() -> io::Result<turmoil::net::TcpStream> {
     stream
 }
 
-/// The service of `perturb.v1` with counting sessions.
+/// The gRPC service of the protocol `perturb.v1`, whose sessions only count steps.
 #[derive(Clone)]
 struct CountingService {
     sessions: Sessions,

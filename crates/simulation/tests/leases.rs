@@ -1,6 +1,7 @@
-//! Leases over a connection that is cut and held at random, in simulated time.
+//! Tests leases over a connection that is randomly cut or delayed, in simulated time.
 //!
-//! `PERTURB_SEED` is the first seed, `PERTURB_SIMULATIONS` the number of seeds. A failure prints its seed.
+//! The environment variable `PERTURB_SEED` sets the first seed, `PERTURB_SIMULATIONS` the number of seeds. A failure
+//! prints its seed.
 
 use std::cell::RefCell;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
@@ -16,23 +17,23 @@ use turmoil::{Builder, Sim};
 const CLIENT: &str = "client";
 /// Number of steps of a session.
 const STEPS: u64 = 200;
-/// Maximum number of requests without a reply.
+/// Maximal number of requests without a reply.
 const MAX_IN_FLIGHT: u64 = 5;
-/// Maximum pause between two steps, in milliseconds.
+/// Maximal pause between two steps, in ms.
 const MAX_PAUSE_MS: u64 = 100;
-/// Maximum time between two changes of the connection, in milliseconds.
+/// Maximal time between two changes of the network, in ms.
 const MAX_CHANGE_INTERVAL_MS: u64 = 8_000;
 /// Default number of simulations of each test.
 const SIMULATIONS: u64 = 50;
 
-/// Replies that a client received: the simulation's time, and the numbers of each reply.
+/// The replies that a client received, each with the simulated time of its arrival and the two numbers in it.
 type Replies = Rc<RefCell<Vec<(Duration, [u64; 2])>>>;
 
 fn number(name: &str, default: u64) -> u64 {
     std::env::var(name).map_or(default, |text| text.parse().expect("a number"))
 }
 
-/// Runs `simulate` with each seed.
+/// Calls `simulate` with each seed. Prints the seed of a failure.
 fn simulations(simulate: impl Fn(u64)) {
     let first = number(SEED_VARIABLE, 1);
     for seed in first..first + number("PERTURB_SIMULATIONS", SIMULATIONS) {
@@ -68,7 +69,7 @@ async fn receive_step(session: &mut Stream) -> Result<[u64; 2], ClientError> {
     Ok([0, 1].map(|i| u64::from_le_bytes(numbers[i])))
 }
 
-/// Takes all steps with some requests in flight and random pauses.
+/// Simulates a client that takes all steps, with several requests in flight and random pauses.
 async fn play(seed: u64, replies: Replies) -> turmoil::Result {
     let mut rng = SeededRng::from_seed(seed);
     let mut session = open().await?;
@@ -87,8 +88,8 @@ async fn play(seed: u64, replies: Replies) -> turmoil::Result {
     Ok(())
 }
 
-/// Runs the simulation to its end while the connection is interrupted at random. Returns whether the client's last
-/// message certainly arrived: a cut that nobody has noticed yet may swallow it.
+/// Runs the simulation until the client ends, and interrupts the network at random. Returns whether the client's last
+/// message certainly arrived. A recent interruption that neither side noticed may have lost it.
 fn disturb(simulation: &mut Sim<'_>, seed: u64) -> bool {
     let mut rng = SeededRng::from_seed(!seed);
     let mut change = Duration::from_secs(1);
@@ -117,7 +118,7 @@ fn disturb(simulation: &mut Sim<'_>, seed: u64) -> bool {
     }
 }
 
-/// Returns the replies of a client over an interrupted connection, and how often it resumed its session.
+/// Simulates a client over an interrupted network. Returns its replies, and how often it resumed its session.
 fn disturbed(seed: u64) -> (Vec<(Duration, [u64; 2])>, u64) {
     let ledger = StepLog::default();
     let replies = Replies::default();
@@ -127,7 +128,7 @@ fn disturbed(seed: u64) -> (Vec<(Duration, [u64; 2])>, u64) {
     assert_eq!(ledger.done(), (0..STEPS).collect::<Vec<_>>(), "each step is done once, in its order");
     let numbers: Vec<_> = replies.borrow().iter().map(|(_, numbers)| *numbers).collect();
     assert_eq!(numbers, (0..STEPS).map(|step| [step, step + 1]).collect::<Vec<_>>(), "and each reply comes once");
-    // The client has closed the session. If that message was lost, the session ends with its lease.
+    // The client has closed the session. If that message was lost, the session ends when its lease ends.
     let timeout = Duration::from_secs(5) + if is_heard { Duration::ZERO } else { LEASE };
     let end = simulation.elapsed() + timeout;
     while simulation.elapsed() < end {
@@ -152,7 +153,7 @@ fn equal_seeds_give_equal_times() {
     assert_ne!(disturbed(seed), disturbed(seed + 1));
 }
 
-/// Simulates a client that steps once, and again after `gap`. The connection is cut in between.
+/// Simulates a client that steps once, and again after `gap`. The network is cut in between. Returns the second reply.
 fn cut_off(seed: u64, gap: Duration) -> (Result<[u64; 2], ClientError>, StepLog) {
     let ledger = StepLog::default();
     let outcome = Rc::new(RefCell::new(None));
@@ -170,7 +171,7 @@ fn cut_off(seed: u64, gap: Duration) -> (Result<[u64; 2], ClientError>, StepLog)
         Ok(())
     });
     simulation.run().expect("the client ends");
-    // The server notices that the client is gone, and holds its session until the lease ends.
+    // The server notices the end of the client, and keeps its session until the lease ends.
     let end = simulation.elapsed() + 2 * LEASE;
     while !ledger.is_idle() && simulation.elapsed() < end {
         simulation.step().expect("the server goes on");
@@ -178,8 +179,8 @@ fn cut_off(seed: u64, gap: Duration) -> (Result<[u64; 2], ClientError>, StepLog)
     (outcome.take().expect("the client was answered"), ledger)
 }
 
-/// Checks that only the client's first step was taken, and that the server no longer knew its session when the client tried
-/// to resume it.
+/// Checks that the server took only the client's first step, and no longer had the session when the client tried to
+/// resume it.
 #[track_caller]
 fn assert_gone(reply: &Result<[u64; 2], ClientError>, ledger: &StepLog) {
     assert!(matches!(reply, Err(ClientError::Lost { request: "a step", .. })), "{reply:?}");

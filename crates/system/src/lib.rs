@@ -1,9 +1,9 @@
-//! Services of the operating system for all programs, each with a safe default:
+//! Safe uses of the operating system, for all programs:
 //!
-//! - [`plain`]: opens and reads plain files. A pipe or a device is refused without waiting for it.
-//! - [`signals`]: a write beyond the limit of file sizes fails instead of ending the program.
-//! - [`threads`]: the reason why no thread can be started.
-//! - [`terminal`]: text of other parties, without what a terminal would obey.
+//! - [`plain`]: opens and reads plain files. Pipes and devices are refused without waiting.
+//! - [`signals`]: makes a write beyond the limit of file sizes fail, instead of ending the program.
+//! - [`threads`]: explains why a thread cannot be started.
+//! - [`terminal`]: removes control characters from untrusted text.
 #![forbid(unsafe_code)]
 
 pub mod plain;

@@ -1,4 +1,4 @@
-//! Plain files: opened without waiting, measured before they are read.
+//! Opens and reads plain files, without ever waiting for a pipe or reading an endless device.
 
 use std::fs::{File, Metadata};
 use std::io::{Error, ErrorKind, Read, Result};
@@ -7,24 +7,25 @@ use std::path::Path;
 
 use rustix::fs::OFlags;
 
-/// Opens a plain file for reading. A pipe or a device is refused: a pipe would be waited for, a device might never end.
+/// Opens a plain file for reading. Refuses pipes, because opening one may wait for ever, and devices, because they may
+/// be endless. Also returns the file's metadata.
 ///
 /// # Errors
-/// The operating system's; [`ErrorKind::InvalidInput`] for a pipe, a device or a socket, [`ErrorKind::IsADirectory`]
-/// for a folder.
+/// [`ErrorKind::IsADirectory`] for a folder, [`ErrorKind::InvalidInput`] for a pipe, a device or a socket, and errors
+/// of the operating system.
 pub fn open_plain(path: &Path) -> Result<(File, Metadata)> {
-    require_plain(&std::fs::metadata(path)?)?; // a device may do something when it is opened
+    require_plain(&std::fs::metadata(path)?)?; // checked before, because opening a device may have an effect
     let file = File::options().read(true).custom_flags(nonblocking_flag()).open(path)?;
     let metadata = file.metadata()?;
-    require_plain(&metadata)?; // another file may be at the path meanwhile
+    require_plain(&metadata)?; // checked again, because the path may have been replaced
     Ok((file, metadata))
 }
 
-/// Reads a plain file of at most `max_bytes` bytes. Its size is compared before anything is read, and no more is read
-/// if the file grows meanwhile.
+/// Reads a plain file of at most `max_bytes` bytes. Checks the size first, so a file that is too large is not read at
+/// all. A file that grows while it is read is read only up to the limit.
 ///
 /// # Errors
-/// As those of [`open_plain`]; [`ErrorKind::InvalidData`] for a longer file.
+/// The errors of [`open_plain`], and [`ErrorKind::InvalidData`] for a file that is too large.
 pub fn read_plain(path: &Path, max_bytes: u64) -> Result<Vec<u8>> {
     let (file, metadata) = open_plain(path)?;
     let mut content = Vec::new();
@@ -40,10 +41,10 @@ pub fn read_plain(path: &Path, max_bytes: u64) -> Result<Vec<u8>> {
     Ok(content)
 }
 
-/// Refuses all but plain files.
+/// Checks that metadata belong to a plain file.
 ///
 /// # Errors
-/// [`ErrorKind::IsADirectory`] for a folder, [`ErrorKind::InvalidInput`] for anything else that is no plain file.
+/// [`ErrorKind::IsADirectory`] for a folder, [`ErrorKind::InvalidInput`] for a pipe, a device or a socket.
 pub fn require_plain(metadata: &Metadata) -> Result<()> {
     match metadata.is_file() {
         true => Ok(()),
@@ -55,7 +56,7 @@ pub fn require_plain(metadata: &Metadata) -> Result<()> {
     }
 }
 
-/// The flag with which opening a pipe does not wait for its other end.
+/// Returns the flag `O_NONBLOCK` for opening a file. With it, opening a pipe does not wait for its other end.
 pub fn nonblocking_flag() -> i32 {
     OFlags::NONBLOCK.bits().cast_signed()
 }
@@ -92,7 +93,7 @@ mod tests {
         let sparse = File::create(&path).unwrap();
         sparse.set_len(1 << 40).unwrap(); // reading it would take minutes
         assert!(read_plain(&path, 1 << 20).is_err());
-        // The length of what /proc has is 0.
+        // Files in /proc have content, although their size is reported as 0.
         assert!(read_plain(Path::new("/proc/self/status"), 10).is_err());
     }
 }

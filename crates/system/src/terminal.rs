@@ -1,9 +1,10 @@
-//! Escapes text that another party wrote, before it goes to a terminal or a log.
+//! Escapes untrusted text before it is written to a terminal or a log.
 
 use std::borrow::Cow;
 
-/// The text with control characters escaped, newlines and tabs included, and the characters that reorder a line. A terminal
-/// would obey such characters: they can colour, move, delete and paste text. In a log a newline would forge an entry.
+/// Escapes all control characters in a text, including newlines and tabs, and characters that change the direction of
+/// text. A terminal would interpret such characters: they can colour, move, delete and paste text. In a log, a newline
+/// could forge an entry.
 pub fn escape_terminal(text: &str) -> Cow<'_, str> {
     if !text.chars().any(is_obeyed) {
         return Cow::Borrowed(text);
@@ -18,7 +19,7 @@ pub fn escape_terminal(text: &str) -> Cow<'_, str> {
     Cow::Owned(shown)
 }
 
-/// Whether terminals or viewers act on a character instead of showing it.
+/// Whether terminals or text viewers interpret a character instead of showing it.
 fn is_obeyed(character: char) -> bool {
     character.is_control()
         || matches!(character, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')

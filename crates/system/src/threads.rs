@@ -1,10 +1,10 @@
-//! Threads that the system does not start.
+//! Explains why the operating system cannot start a thread.
 
 use std::io::Error;
 
 use rustix::process::{Resource, getrlimit};
 
-/// Explains why the system starts no further thread or process: the limit of the user, or of a container.
+/// Adds an explanation to the error of starting a thread or process: the limits of the user and of a container.
 pub fn explain_no_thread(error: &Error) -> Error {
     let limit = getrlimit(Resource::Nproc).current.map_or_else(|| "unlimited".into(), |limit| limit.to_string());
     let words = format!(
