@@ -17,7 +17,8 @@ fn plan() -> Plan {
     Plan::parse("test", PLAN.into()).unwrap()
 }
 
-/// Records of tests on D, R and E with ten episodes each, of which the first ones are successes.
+/// Returns records of tests on D, R and E with ten episodes each. The first episodes of a test are successes;
+/// `successes` gives their numbers.
 fn records(successes: [u32; 3]) -> Records {
     let about = RecordsMetadata::new(&Default::default(), "policy".into(), 1);
     let mut records = Records::new(about);
@@ -32,7 +33,8 @@ fn records(successes: [u32; 3]) -> Records {
     records
 }
 
-/// Writes four cells: one with marks and episodes, one with results alone, a failed one, and a missing one.
+/// Writes three of the plan's four cells: a result with marks and recorded episodes, a result without them, and a
+/// failure. The fourth cell is missing.
 fn write(plan: &Plan, folder: &Folder) {
     let [first, second, third, _] = &plan.cells[..] else { panic!("{} cells", plan.cells.len()) };
     let of = |records: &Records| {
@@ -59,7 +61,7 @@ fn write(plan: &Plan, folder: &Folder) {
     folder.cell(&third.id).write_failure(&failure).unwrap();
 }
 
-/// Writes the cells, and returns the table of them, after it was written to a file and read.
+/// Writes the cells and exports them to a table. Returns the table after writing it to a file and reading it again.
 fn exported(plan: &Plan, folder: &Folder) -> ResultsTable {
     write(plan, folder);
     let mut table = ResultsTable::default();
@@ -111,7 +113,7 @@ fn a_table_has_the_results_of_its_folder() {
         (done.collect::<Vec<_>>(), failures)
     };
     let (mut of_folder, of_table) = (figures(&folder), figures(&results));
-    // The fixture's interval is none of Wilson's.
+    // The interval in the fixture is not a Wilson interval, so it is replaced.
     for (name, result) in &mut of_folder.0[1].0 {
         result.success_percent_95 = of_table.0[1].0[name].success_percent_95;
     }

@@ -15,7 +15,7 @@ fn external_agents_follow_their_environment_as_rows() {
     let mut selections = results.select();
     let assessed = [
         fixture::assessed("PPO", "CartPole", &[Some(D)], [200; 3]),
-        fixture::assessed("PPO", "CartPole", &[Some(R)], [200; 3]), // the same run: nothing else has R
+        fixture::assessed("PPO", "CartPole", &[Some(R)], [200; 3]), // the same run, because no other assessment in it has R
         fixture::assessed("PPO", "CartPole", &[Some(D), Some(R)], [190; 3]),
         fixture::assessed("SAC", "Acrobot", &[None], [200; 3]),
     ];
@@ -32,11 +32,11 @@ fn external_agents_follow_their_environment_as_rows() {
     };
     assert_eq!(trained(&selections[1]), [(1, "DR".to_owned()), (2, "DR".to_owned())]);
     assert_eq!(trained(&selections[3]), [(1, "unknown".to_owned())]);
-    // Of ten episodes with 190 steps and one more each, five have 195.
+    // Ten episodes have 190, 191 … 199 steps, so five have at least 195.
     assert_eq!(selections[1].metric(perturb_records::Metric::Default), [(1, 100.0), (2, 50.0)].into());
 }
 
-/// Each letter is the training distribution of a policy.
+/// Assessments, and expected runs, are separated by commas. Each letter is the training distribution of a policy.
 #[rstest]
 #[case("D,DRE", "D,DRE")]
 #[case("DR,RE", "DR,RE")]

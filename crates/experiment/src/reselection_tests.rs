@@ -7,7 +7,7 @@ use crate::selection::scores;
 
 const RESAMPLES: usize = 2000;
 
-/// Two configurations (A: 7e-3, B: 7e-4).
+/// A plan with two configurations: learning rates 7e-3 (A) and 7e-4 (B).
 const PLAN: &str = "
 environments = ['CartPole', 'Pendulum']
 versions = ['D', 'R']
@@ -26,7 +26,7 @@ fn is_a(cell: &Cell) -> bool {
     cell.config.table()["learning_rate"].as_float() == Some(7e-3)
 }
 
-/// Returns the intervals of a metric's interquartile mean, without and with selection inside the bootstrap.
+/// Returns two intervals of a metric's interquartile mean: from a bootstrap without and with repeated selection.
 fn intervals(results: &Results<'_>, metric: Metric) -> [[f64; 2]; 2] {
     let selections = results.select();
     let both: Vec<_> = selections.iter().collect();
@@ -37,8 +37,8 @@ fn intervals(results: &Results<'_>, metric: Metric) -> [[f64; 2]; 2] {
     [without, with].map(|number| number.interval_95.unwrap())
 }
 
-/// Returns [`intervals`] for two configurations. On D and R, A has a success rate of 60 % or more, and the rate of B is
-/// lower by `behind`. On E, A has 50 % and B 0 %.
+/// Returns [`intervals`] for two configurations with the paper's rule. On D and R, A has a success rate above 60 %, and
+/// the rate of B is lower by `behind`. On E, A has 50 % and B has 0 %.
 fn by_paper(behind: f64, metric: Metric) -> [[f64; 2]; 2] {
     let plan = plan("");
     let results = fixture::results(&plan, |cell| {
@@ -58,7 +58,8 @@ fn a_selection_without_doubt_leaves_the_interval_as_it_is() {
 
 #[test]
 fn doubtful_selection_widens_the_interval() {
-    // Ranks are 0.1 apart, with a deviation of some 1.5: B is selected about as often, and extrapolates to nothing.
+    // Rates of A and B are 0.1 apart, with a standard deviation of some 1.5. So resamples select B almost as often as
+    // A, and the Extrapolation of B is 0.
     let [without, with] = by_paper(0.1, Metric::Extrapolation);
     assert!(without[0] > 50.0 && with[0] == 0.0 && with[1] <= without[1], "{without:?} {with:?}");
     // Redrawn rates are not reported, so no number is better than the best measured one.
@@ -68,9 +69,9 @@ fn doubtful_selection_widens_the_interval() {
 
 const CLEAN: &str = "selection = 'clean'\ntuning_runs = 2\nselection_episodes = 1000\n";
 
-/// Returns [`intervals`] with the clean rule. `selecting` gives the success rates in selection episodes, for A or not A
-/// and the tuning run. In reported tests the tuning cells of A have 90 %, those of B 10 %, and cells trained after the
-/// selection 80 %.
+/// Returns [`intervals`] with the clean rule. `selecting` returns the success rate in a selection test; its arguments
+/// are whether the configuration is A, and the tuning run. In reported tests, tuning cells of A have 90 %, tuning cells
+/// of B 10 %, and cells trained after the selection some 80 %.
 fn by_clean(selecting: fn(bool, u32) -> f64) -> [[f64; 2]; 2] {
     let mut plan = plan(CLEAN);
     let tuning = plan.cells.len();
@@ -99,11 +100,12 @@ fn by_clean(selecting: fn(bool, u32) -> f64) -> [[f64; 2]; 2] {
 
 #[test]
 fn tuning_cells_replace_missing_final_cells() {
-    // A is better on both seeds, so it is selected in every resample, and only its cells from after the selection are
-    // reported.
+    // A is better with both seeds, so every resample selects A and reports only cells that were trained after the
+    // selection.
     let [without, with] = by_clean(|is_a, _| if is_a { 70.0 } else { 30.0 });
     assert_eq!(without, with);
-    // A is better only in the mean over both seeds. If the second seed is drawn twice, B is selected, which has 10 %.
+    // A is better only in the mean over both seeds. If a resample draws the second seed twice, it selects B, which has
+    // 10 %.
     let [without, with] = by_clean(|is_a, run| {
         if is_a == (run == 1) {
             70.0
@@ -137,7 +139,7 @@ fn redrawn_successes_are_binomial() {
         mean_length: 0.0,
     };
     let quarter = Binomial::new(&test(25.0, 4));
-    // (3/4)⁴ = 0.3164, and 0.4219 more with one success.
+    // The probability of no success is (3/4)⁴ = 0.3164, and of one success 0.4219.
     for (place, percent) in [(0.0, 0.0), (0.316, 0.0), (0.317, 25.0), (0.738, 25.0), (0.739, 50.0), (0.9999, 100.0)] {
         assert_eq!(quarter.draw_percent(place), percent, "{place}");
     }
@@ -146,6 +148,6 @@ fn redrawn_successes_are_binomial() {
         assert!([0.0, 0.5, 0.999_999].into_iter().all(|place| sure_of.draw_percent(place) == sure));
     }
     let many = Binomial::new(&test(40.0, 1000));
-    // The 2.5th percentile: 40 - 1.96 · √(0.4 · 0.6 / 1000) · 100 = 37.0.
+    // The 2.5th percentile is 40 - 1.96 · √(0.4 · 0.6 / 1000) · 100 = 37.0.
     assert!((many.draw_percent(0.025) - 37.0).abs() < 0.11, "{}", many.draw_percent(0.025));
 }

@@ -1,7 +1,7 @@
 use super::*;
 use crate::fixture;
 
-/// Two configurations (A: 7e-3, B: 7e-4) of one method, on two environments, in two runs.
+/// A plan with two configurations, learning rates 7e-3 (A) and 7e-4 (B), in two environments and two runs.
 const PLAN: &str = "
 environments = ['CartPole', 'Pendulum']
 runs = 2
@@ -15,10 +15,11 @@ fn plan() -> Plan {
     Plan::parse("test", PLAN.into()).unwrap()
 }
 
-/// Success rates on D, R and E and a mean return, by environment, training version, configuration ("A" or "B") and run.
+/// A function that returns success rates on D, R and E, and a mean return. Its arguments are the environment, the
+/// training version, the configuration ("A" or "B") and the run.
 type PolicyMetadata<'f> = &'f dyn Fn(&str, Version, &str, u32) -> Option<([f64; 3], f64)>;
 
-/// Returns the results of the cells for which `rates` gives numbers. All others are missing.
+/// Returns the results of the cells for which `rates` returns numbers. All other cells are missing.
 fn results<'a>(plan: &'a Plan, rates: PolicyMetadata<'_>) -> Results<'a> {
     fixture::results(plan, |cell| {
         let common = &cell.config.common;
@@ -30,7 +31,8 @@ fn is_a(cell: &Cell) -> bool {
     cell.config.table()["learning_rate"].as_float() == Some(7e-3)
 }
 
-/// Returns made-up rates on D, R and E. A * marks the configuration that is best on its training version.
+/// Returns made-up success rates on D, R and E. A `*` marks the configuration with the highest rate on its training
+/// version.
 fn synthetic(environment: &str, version: Version, name: &str, run: u32) -> Option<([f64; 3], f64)> {
     use Version::{D, E, R};
     let rates = match (environment, version, name, run) {
@@ -60,7 +62,7 @@ fn close(got: f64, expected: f64) {
     assert!((got - expected).abs() < 1e-9, "{got} is not {expected}");
 }
 
-/// A scenario's success rate over runs, %.
+/// Returns the success rate of a scenario, summarized over runs, %.
 fn success(row: &MethodResults<'_>, train: Version, test: &str) -> Option<Summary> {
     row.test(TrainedOn::Version(train), test, |test| test.success_percent)
 }
@@ -101,16 +103,17 @@ fn metrics_are_those_computed_by_hand() {
     let cart_pole = &selections[0];
     assert_summary(cart_pole.summary(Metric::Default), 85.0, 5.0, 2);
     assert_summary(cart_pole.summary(Metric::Interpolation), 65.0, 5.0, 2);
-    // Run 1: ∛(20 · 40 · 10) = 20. Run 2: ∛(50 · 20 · 64) = 40.
+    // Run 1 has ∛(20 · 40 · 10) = 20, and run 2 has ∛(50 · 20 · 64) = 40.
     assert_summary(cart_pole.summary(Metric::Extrapolation), 30.0, 10.0, 2);
     assert_summary(success(cart_pole, Version::E, "E"), 21.5, 11.5, 2);
     let pendulum = &selections[1];
-    // Run 1 has a 0 among its three: 0. Run 2: ∛(100 · 25 · 40) = 46.415888….
+    // Run 1 has 0, because one of its three scenarios has 0. Run 2 has ∛(100 · 25 · 40) = 46.415888….
     let second = 100_000.0_f64.cbrt();
     assert_summary(pendulum.summary(Metric::Extrapolation), second / 2.0, second / 2.0, 2);
 
     let both: Vec<&MethodResults<'_>> = selections.iter().collect();
-    // Run 1: (90 + 50) / 2 = 70, run 2: (80 + 60) / 2 = 70. Deviations of environments do not add up.
+    // Run 1 has (90 + 50) / 2 = 70, and run 2 has (80 + 60) / 2 = 70. So the deviation of the average is 0, although
+    // each environment has one.
     assert_summary(average(&both, Metric::Default), 70.0, 0.0, 2);
     assert_summary(average(&both, Metric::Interpolation), 52.5, 7.5, 2);
     let [first, second] = [20.0 / 2.0, (40.0 + second) / 2.0];
@@ -124,7 +127,7 @@ fn metrics_are_those_computed_by_hand() {
 #[test]
 fn return_breaks_ties_and_the_rest_is_averaged() {
     let plan = plan();
-    // A and B are told apart by their rates on R.
+    // The rates on R show whether A or B was selected.
     let on_r = |name: &str| [100.0, if name == "A" { 1.0 } else { 2.0 }, 0.0];
     let chosen = |rates: PolicyMetadata<'_>| {
         let results = results(&plan, rates);
@@ -147,7 +150,7 @@ fn return_breaks_ties_and_the_rest_is_averaged() {
 #[test]
 fn what_is_missing_is_missing_and_never_zero() {
     let plan = plan();
-    // Run 2 has no training on R, and of CartPole no run at all on D.
+    // Run 2 has no training on R, and CartPole has no training on D in any run.
     let gaps = |environment: &str, version: Version, name: &str, run: u32| match (environment, version, run) {
         (_, Version::R, 2) | ("CartPole", Version::D, _) => None,
         _ => synthetic(environment, version, name, run),
@@ -167,8 +170,8 @@ fn what_is_missing_is_missing_and_never_zero() {
     assert_eq!(average(&[], Metric::Default), None);
 }
 
-/// Returns rates of configurations that tie: equal rates and returns on the training version, different rates
-/// elsewhere.
+/// Returns rates of configurations that tie: they have equal rates and returns on the training version, and different
+/// rates on other versions.
 fn tied(_: &str, version: Version, name: &str, _: u32) -> Option<([f64; 3], f64)> {
     let rates = match (version, name) {
         (Version::D, "A") => [100.0, 40.0, 10.0],

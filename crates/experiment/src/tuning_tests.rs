@@ -8,7 +8,8 @@ use crate::folder::Folder;
 use crate::plan::Selection;
 use crate::selection::Results;
 
-/// Two configurations (A: 7e-3, B: 7e-4), two tuning seeds (4 and 5), three runs (seeds 6 to 8).
+/// A plan with two configurations, learning rates 7e-3 (A) and 7e-4 (B), two tuning seeds (4 and 5) and three runs
+/// (seeds 6 to 8).
 const PLAN: &str = "
 environments = ['CartPole', 'Pendulum']
 versions = ['D', 'E']
@@ -31,8 +32,8 @@ fn is_a(cell: &Cell) -> bool {
     cell.config.table()["learning_rate"].as_float() == Some(7e-3)
 }
 
-/// The success rate and the mean return in selection episodes of a configuration, "A" or "B", with a seed. In ordinary tests
-/// the order of A and B is reversed.
+/// A function that returns the success rate and the mean return in selection tests. Its arguments are the configuration
+/// ("A" or "B") and the seed. In ordinary tests, the order of A and B is reversed.
 type PolicyMetadata = fn(&str, u64) -> Option<(f64, f64)>;
 
 /// Writes the results that `known` returns. Cells for which it returns `None` have failed if `failed` is set, and are
@@ -77,7 +78,7 @@ fn tuning_and_reporting_share_neither_seeds_nor_cells() {
     assert_eq!(seeds(&plan.candidates), [(1, 6), (2, 7), (3, 8)]);
     assert!(plan.cells.iter().all(|cell| cell.tests.selection == Some(70) && cell.tuned_as.is_none()));
     assert!(plan.candidates.iter().all(|cell| cell.tests.selection.is_none() && cell.tuned_as.is_some()));
-    // The factors are environments, versions, configurations and runs.
+    // The factors are the numbers of environments, versions, configurations and runs.
     assert_eq!((plan.cells.len(), plan.candidates.len()), (2 * 2 * 2 * 2, 2 * 2 * 2 * 3));
     for (index, cell) in plan.cells.iter().chain(&plan.candidates).enumerate() {
         assert_eq!((cell.index, plan.find(&index.to_string()), plan.find(&cell.id)), (index, Some(cell), Some(cell)));
@@ -98,8 +99,7 @@ fn selection_episodes_have_the_parameters_that_were_trained_on() {
     assert!(plan.candidates.iter().all(|cell| cell.selection_test().is_none()));
 }
 
-/// Cells that are trained after the selection have the same ids as in a plan without selection episodes. Tuning cells have
-/// other ids.
+/// Cells that are trained after the selection have the same ids as with the paper's rule. Tuning cells have other ids.
 #[test]
 fn cell_id_without_selection_matches_the_papers_rule() {
     let papers = PLAN.replace("'clean'", "'paper'").replace("runs = 3\nseed = 4", "runs = 5\nseed = 4");
@@ -176,12 +176,12 @@ fn reported_cells_depend_on_the_rule() {
     assert_eq!((selections[0].cells, selections[0].done), (14, 14));
     let rates =
         |selections: &[crate::selection::MethodResults<'_>]| selections[0].metric(perturb_records::Metric::Default);
-    // These are rates of A in ordinary tests with seeds 6 to 8.
+    // These are the rates of A in ordinary tests with seeds 6 to 8.
     assert_eq!(rates(&selections), [(1, 34.0), (2, 33.0), (3, 32.0)].into());
 
     let papers = plan.with_rule(Selection::Paper).unwrap().with_selected_cells(&folder).unwrap();
     let results = Results::read(&papers, &folder).unwrap();
-    // These are rates of B with seeds 4 and 5. In ordinary tests B is better.
+    // These are the rates of B with seeds 4 and 5, because B is better in ordinary tests.
     assert_eq!(rates(&results.select()), [(1, 46.0), (2, 45.0)].into());
 }
 

@@ -7,7 +7,7 @@ use rand::Rng;
 
 use super::*;
 
-/// A checkpoint of a shipped experiment, with its own counters and a weight of its own.
+/// Returns a checkpoint of a shipped policy, with changed counters and a changed weight.
 fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
     let policies = Path::new(env!("CARGO_MANIFEST_DIR")).join("../results/policies");
     let mut checkpoint = Checkpoint::load(&policies.join("Acrobot-ppo-ff-D-9bd6546b-s10.safetensors")).unwrap();
@@ -16,11 +16,12 @@ fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
     checkpoint
 }
 
-/// The resume state of two environments. Snapshots differ in length, and floats need all their digits.
+/// Returns the resume state of a training with two environments. Its snapshots differ in length, and its floats need
+/// all their digits.
 fn resume_state(seed: u64) -> ResumeState {
     let mut rng = stream(seed, Purpose::Actions);
     for _ in 0..seed {
-        rng.next_u32(); // within a block
+        rng.next_u32(); // the stream's position is within a block
     }
     let array = |name: &str| NamedArray { name: name.into(), shape: vec![3], data: vec![0.1, -1e-38, 1.0 / 3.0] };
     let recurrent = seed.is_multiple_of(2);
@@ -99,7 +100,7 @@ fn only_the_current_arrays_are_kept() {
     assert_eq!(Checkpoint::load(directory.path()).unwrap(), checkpoint(2, 2));
 }
 
-/// Goes through every state of the directory that a crash during a save can leave.
+/// Tries every state of the directory that a crash during a save can leave.
 #[test]
 fn a_crash_at_any_moment_leaves_a_whole_checkpoint() {
     let old = (checkpoint(1, 1), resume_state(1));

@@ -1,4 +1,4 @@
-//! Tests a checkpoint on sets of its environment's parameters, and records every episode.
+//! Tests a checkpoint on parameter sets of its environment, and records every episode.
 
 use perturb_files::interrupt::StopFlag;
 use perturb_policy::random::Purpose;
@@ -17,13 +17,13 @@ use crate::client::{Backoff, EndedEpisode, OpenOptions, Reconnect, Servers, Sess
 /// Options of a test.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TestOptions {
-    /// Episodes on each set, at least 1. On a set of contexts at least one episode is played in each context.
+    /// Number of episodes on each set, at least 1. On a set of contexts, each context gets at least one episode.
     pub episodes: u64,
-    /// Fixes all randomness.
+    /// The seed of environments and actions.
     pub seed: u64,
-    /// Whether to use the held-out selection episodes, which no other test has.
+    /// Whether to play selection episodes: their random streams are used by no other test.
     pub selects: bool,
-    /// The success rule; `None` for the environment's own.
+    /// The success rule; `None` for the environment's own rule.
     pub success: Option<Rule>,
 }
 
@@ -33,7 +33,7 @@ impl TestOptions {
     }
 }
 
-/// Tests a checkpoint.
+/// Tests a checkpoint on one or more parameter sets.
 pub struct Tester<'a> {
     servers: &'a Servers,
     checkpoint: &'a Checkpoint,
@@ -44,10 +44,11 @@ pub struct Tester<'a> {
 }
 
 impl<'a> Tester<'a> {
-    /// Checks that the served environment is the one that the policy was trained in, and that the success rule fits it.
+    /// Prepares tests of `checkpoint`. Checks that the served environment is the one that the policy was trained in,
+    /// and that the success rule fits it.
     ///
     /// # Errors
-    /// [`TestError`].
+    /// [`TestError`] if a check fails.
     pub fn new(servers: &'a Servers, checkpoint: &'a Checkpoint, options: TestOptions) -> Result<Self, TestError> {
         let state = &checkpoint.state;
         let environment = servers.environment_seen(&state.config.common)?;
@@ -71,11 +72,12 @@ impl<'a> Tester<'a> {
         Ok(about)
     }
 
-    /// Records the disturbances of all episodes if one of `sets` names a disturbance. So all records that stand together
-    /// have the same columns.
+    /// Makes all tests record the same parameters as tests on `sets` do: if one of `sets` names a disturbance, all
+    /// episodes are recorded with their disturbances. So records of several tests have the same columns.
     ///
     /// # Errors
-    /// [`TestError`] for a policy that sees parameters and was trained without disturbances.
+    /// [`TestError`] if the policy observes parameters and was trained without disturbances, so its observations would
+    /// not fit.
     pub fn recording_for(mut self, sets: &[TestSet]) -> Result<Self, TestError> {
         let common = &self.checkpoint.state.config.common;
         let environment = self.servers.environment_seen_with(common, sets.iter().flat_map(TestSet::names))?;
@@ -90,16 +92,16 @@ impl<'a> Tester<'a> {
         Ok(self)
     }
 
-    /// The environment, as it is served and recorded.
+    /// Returns the served environment, with the parameters that are recorded.
     pub fn environment(&self) -> &proto::Environment {
         &self.environment
     }
 
-    /// Tests on each of `sets` and records every episode. Calls `report` with the set and its number of episodes done.
-    /// The sets are checked before anything is played.
+    /// Tests the policy on each of `sets`, and returns the records of all episodes. Checks all sets before it plays.
+    /// Calls `report` with the current set and its number of finished episodes.
     ///
     /// # Errors
-    /// [`TestError`], also if an episode did not run with the requested parameters.
+    /// [`TestError`] if a set is invalid, playing fails, or an episode ran with other parameters than requested.
     pub fn test(
         self,
         sets: &[TestSet],
@@ -132,8 +134,8 @@ impl<'a> Tester<'a> {
         Ok(records)
     }
 
-    /// Plays the episodes of a test, with sampled actions and frozen statistics. The result depends only on the checkpoint,
-    /// the set, the number of episodes and the seed.
+    /// Plays the episodes of a test, with sampled actions and unchanging normalisers. The result depends only on the
+    /// checkpoint, the set, the number of episodes and the seed.
     fn play(
         &self,
         counting: &mut TestCollector,
@@ -164,7 +166,7 @@ impl<'a> Tester<'a> {
             }
         }
         let player = self.checkpoint.player(num_envs, test.seed, 0)?;
-        // Servers do not know the random policy's distribution of continuous actions.
+        // Servers cannot play the random policy, because its continuous actions are uniform.
         let mut trials: Box<dyn FnMut() -> Result<Vec<EndedEpisode>, TestError>> =
             if session.acts() && !self.checkpoint.state.config.settings.is_random() {
                 let mut remote = RemoteTrials::new(session, &player, self.checkpoint);
@@ -182,14 +184,16 @@ impl<'a> Tester<'a> {
             if let Some(signal) = stop.signal() {
                 return Err(TestError::Stopped { signal });
             }
-            // Environments that are done are stepped on, unrecorded: a smaller batch would save less than it costs.
+            // Environments that have finished their episodes are still stepped, without being recorded. Shrinking the
+            // batch would cost more than it saves.
             counting.take(trials()?);
         }
     }
 }
 
-/// Gives the first disturbance its default value if disturbances are among the `environment`'s parameters and `parameters`
-/// gives it none. A session has disturbances only if its parameters name one.
+/// Adds a disturbance with its default value to `parameters`, if disturbances are among the `environment`'s parameters
+/// and `parameters` has no value for the first one. A session has disturbances only if its parameters name at least
+/// one.
 pub(super) fn with_disturbances(mut parameters: Parameters, environment: &proto::Environment) -> Parameters {
     let first = environment.disturbances.first();
     let is_own = |parameter: &&proto::Parameter| environment.parameters.iter().any(|own| own.name == parameter.name);
@@ -200,7 +204,7 @@ pub(super) fn with_disturbances(mut parameters: Parameters, environment: &proto:
     parameters
 }
 
-/// Runs `work`. If servers were lost and have come back, runs it again from its beginning. The result of `work` must not
+/// Runs `work`. If servers are lost, waits for them and runs `work` again from its start. The result of `work` must not
 /// depend on the number of attempts.
 pub(super) fn retry_on_disconnect<T>(
     servers: &Servers,
@@ -221,10 +225,10 @@ pub(super) fn retry_on_disconnect<T>(
     }
 }
 
-/// Tests on one version and returns the figures, see [`Tester::test`].
+/// Tests `checkpoint` on one version, and returns success rate, mean return and mean length. See [`Tester::test`].
 ///
 /// # Errors
-/// [`TestError`].
+/// [`TestError`] if the test fails.
 pub fn test(
     servers: &Servers,
     checkpoint: &Checkpoint,
@@ -240,7 +244,8 @@ pub fn test(
     Ok(records.result(&version.to_string(), None))
 }
 
-/// The environment that a test of a policy with this configuration opens, with a single slot.
+/// Returns the options with which a test on `set` opens environments, for a policy with this configuration. The number
+/// of environments is 1.
 pub fn open_options(TrainConfig { common, settings }: &TrainConfig, set: &TestSet, seed: u64) -> OpenOptions {
     OpenOptions {
         environment: common.environment.clone(),

@@ -1,4 +1,4 @@
-//! Helpers of the tests of EPOpt and of RL².
+//! Helpers for tests with a server.
 
 use perturb_learner::algorithm::{A2c, BaseAlgorithm, Ppo};
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers};
@@ -9,19 +9,19 @@ use perturb_policy::random::{Purpose, normal, stream};
 use perturb_protocol::Version;
 use perturb_settings::{A2cConfig, PpoConfig};
 
-/// A server with one physics thread.
+/// Starts a server with one physics thread.
 pub fn server() -> PrivateServer {
-    perturb_torch::register(); // for what trains on it
+    perturb_torch::register(); // for recurrent policies that train on this server
     PrivateServer::start(Some(1)).unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// Connections to all of `servers`.
+/// Connects to all of `servers`.
 pub fn connect(servers: &[PrivateServer]) -> Servers {
     let addresses: Vec<Address> = servers.iter().map(|server| server.address().clone()).collect();
     Servers::connect(&addresses).expect("connections")
 }
 
-/// Environments of version R.
+/// Returns options for environments of version R.
 pub fn options(environment: &str, num_envs: usize, episodes_per_trial: u32) -> OpenOptions {
     OpenOptions {
         environment: environment.into(),
@@ -34,7 +34,7 @@ pub fn options(environment: &str, num_envs: usize, episodes_per_trial: u32) -> O
     }
 }
 
-/// A policy whose every number, biases and log_std too, differs from its initial one by about 0.1.
+/// Returns a policy in which every number, including biases and log_std, differs from its initial value by about 0.1.
 pub fn moved(spec: &PolicySpec) -> Policy {
     perturb_torch::register();
     let mut rng = stream(9, Purpose::Weights);
@@ -43,7 +43,7 @@ pub fn moved(spec: &PolicySpec) -> Policy {
     Policy::from_weights(spec.clone(), &weights).expect("a policy")
 }
 
-/// A2C and PPO.
+/// Returns A2C and PPO with these settings.
 pub fn bases(n_steps: usize, n_minibatches: usize, policy: &Policy) -> [Box<dyn BaseAlgorithm>; 2] {
     let a2c = A2cConfig { n_steps, learning_rate: 7e-3, ..A2cConfig::default() };
     let ppo =

@@ -1,4 +1,5 @@
-//! EPOpt: complete episodes are collected without bias, packed without loss, and the worst of them are learned from.
+//! Tests of EPOpt: complete episodes are collected without bias and packed without loss, and only the worst are learned
+//! from.
 
 use std::collections::{BTreeMap, HashSet};
 
@@ -36,9 +37,9 @@ fn noise(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
     (0..count).map(|_| normal(rng) as f32).collect()
 }
 
-/// Fills `rollout` with episodes of noise. Those of environment n follow one another and have `lengths[n]` steps and the
-/// returns `returns[n]`. An environment that has played all its episodes is stepped on, in no episode, until the others
-/// have ended. The task ends about half of the episodes, the time limit the others.
+/// Fills `rollout` with episodes of random numbers. Successive episodes of environment n have the lengths `lengths[n]`
+/// and the returns `returns[n]`. An environment that has played all its episodes is stepped further, outside of any
+/// episode, until the others have ended. The task ends about half of the episodes, and the step limit ends the others.
 fn play(policy: &Policy, lengths: &[Vec<usize>], returns: &[Vec<f64>], mut rollout: Rollout) -> Rollout {
     let action = policy.spec().action;
     let n_envs = lengths.len();
@@ -78,11 +79,11 @@ fn play(policy: &Policy, lengths: &[Vec<usize>], returns: &[Vec<f64>], mut rollo
             actor.forget(n);
         }
     }
-    rollout.finish(&vec![9.0; n_envs]).expect("values that fit"); // no estimate may use them
+    rollout.finish(&vec![9.0; n_envs]).expect("values that fit"); // estimates must not depend on these values
     rollout
 }
 
-/// Returns that do not matter.
+/// Gives all episodes the return 0, for tests in which returns do not matter.
 fn zeros(lengths: &[Vec<usize>]) -> Vec<Vec<f64>> {
     lengths.iter().map(|lengths| vec![0.0; lengths.len()]).collect()
 }
@@ -122,7 +123,7 @@ fn epopt_with_epsilon_1_equals_its_base() {
     }
 }
 
-/// Eight episodes of unequal lengths; the worse half has the returns -1, 0, 1 and 2.
+/// Returns lengths and returns of eight episodes of unequal lengths. The worst four have the returns -1, 0, 1 and 2.
 fn eight() -> (Vec<Vec<usize>>, Vec<Vec<f64>>) {
     let lengths = vec![vec![3, 7], vec![9, 2], vec![4, 4], vec![1, 6]];
     let returns = vec![vec![5.0, -1.0], vec![0.0, 3.0], vec![8.0, 2.0], vec![1.0, 7.0]];
@@ -133,7 +134,7 @@ fn eight() -> (Vec<Vec<usize>>, Vec<Vec<f64>>) {
 fn epopt_learns_only_from_the_worst_episodes() {
     let (lengths, returns) = eight();
     let span = |environment, start, length, episode_return| EpisodeSlice { environment, start, length, episode_return };
-    // In the order in which they ended.
+    // The episodes are in the order in which they ended.
     let worst = [span(3, 0, 1, 1.0), span(2, 4, 4, 2.0), span(1, 0, 9, 0.0), span(0, 3, 7, -1.0)];
     for lstm in [None, Some(8)] {
         let spec = spec(DISCRETE, lstm);
@@ -171,7 +172,7 @@ fn epopt_can_rank_by_normalised_rewards() {
     let rollout = play(&policy, &lengths, &returns, of_episodes(&spec, 4));
     let learned = rollout.normalized_returns();
     let rewards = rollout.trajectories().expect("a finished rollout").rewards;
-    let last = rollout.episodes()[7]; // the second one of environment 1
+    let last = rollout.episodes()[7]; // the second episode of environment 1
     let sum: f64 = (9..11).map(|t| f64::from(rewards[4 * t + 1])).sum();
     assert_eq!((last.environment, last.length, learned[7]), (1, 2, sum));
     let mut ranked: Vec<usize> = (0..8).collect();
@@ -222,7 +223,8 @@ fn each_kept_episode_can_have_an_update_of_its_own() {
 
             let figures: [fn(&UpdateStats) -> f64; 4] =
                 [|it| it.entropy_loss, |it| it.value_loss, |it| it.loss, |it| it.grad_norm];
-            // PPO's figures belong to other weights in the other order of steps; only the entropy hardly changes.
+            // PPO takes its steps in another order, so its losses are for other weights. Only the entropy hardly
+            // changes.
             let (count, share) = [(4, 1e-9), (1, 0.1)][which];
             for figure in &figures[..count] {
                 let mean = steps.iter().map(figure).sum::<f64>() / 4.0;
@@ -298,8 +300,8 @@ fn epsilon_falls_after_full_iterations_also_when_resumed() {
     }
 }
 
-/// A rollout in which every number shows its origin: the sample with index p = t·N + n has the observation (p, -p), and its
-/// other numbers are functions of p.
+/// Returns a rollout in which every number encodes its position: the sample with index p = t·N + n has the observation
+/// (p, -p), and its other numbers are functions of p.
 fn coded(lengths: &[Vec<usize>]) -> Rollout {
     let n_envs = lengths.len();
     let mut rollout = Rollout::of_episodes(n_envs, 2, 1);
@@ -334,7 +336,7 @@ fn coded(lengths: &[Vec<usize>]) -> Rollout {
     rollout
 }
 
-/// The numbers and the flags of sample `p` of a rollout of [`coded`], or of a rollout selected from it.
+/// Returns the numbers and the flags of sample `p` of a rollout made by [`coded`], or selected from such a rollout.
 fn at(rollout: &Rollout, p: usize) -> (Vec<f32>, [bool; 2]) {
     let trajectories = rollout.trajectories().expect("a finished rollout");
     let numbers = [
@@ -349,7 +351,7 @@ fn at(rollout: &Rollout, p: usize) -> (Vec<f32>, [bool; 2]) {
     (numbers.to_vec(), [trajectories.terminated[p], trajectories.truncated[p]])
 }
 
-/// A rollout with episodes of up to six environments, and some of these episodes.
+/// Generates a rollout with episodes in up to six environments, and a selection of these episodes.
 fn some_episodes() -> impl Strategy<Value = (Rollout, Vec<EpisodeSlice>)> {
     let lengths = prop::collection::vec(prop::collection::vec(1usize..12, 1..6), 1..7);
     (lengths, prop::collection::vec(any::<bool>(), 36)).prop_map(|(lengths, choice)| {
@@ -365,7 +367,7 @@ fn some_episodes() -> impl Strategy<Value = (Rollout, Vec<EpisodeSlice>)> {
     })
 }
 
-/// The estimates for an episode of a rollout, as if the rollout held nothing else.
+/// Computes the estimates of an episode as if it were alone in the rollout.
 fn alone(rollout: &Rollout, episode: &EpisodeSlice, estimate: &dyn Fn(&Trajectories<'_>) -> Estimates) -> Estimates {
     let whole = rollout.trajectories().expect("finished");
     let places = || (0..episode.length).map(|t| (episode.start + t) * rollout.n_envs() + episode.environment);
@@ -392,7 +394,7 @@ proptest! {
         prop_assert_eq!(packed.n_steps(), chosen.iter().map(|e| e.length).max().expect("one"));
         prop_assert_eq!(packed.memory(), vec![0.0; 2 * columns]);
 
-        // For each step of the chosen episodes: its index in the rollout, and whether it begins an episode.
+        // The expected steps: index in the original rollout, and whether the step starts an episode.
         let mut expected = BTreeMap::new();
         for episode in &chosen {
             for step in 0..episode.length {
@@ -424,7 +426,7 @@ proptest! {
         }
     }
 
-    /// The bytes are equal, since the sums are the same in the same order.
+    /// The bytes are equal, because the same sums are computed in the same order.
     #[test]
     fn advantages_of_chosen_episodes_are_those_of_each_alone(
         (rollout, chosen) in some_episodes(), bootstrap in any::<bool>()
@@ -476,7 +478,8 @@ fn episodes_that_a_rollout_does_not_hold_are_refused() {
     assert!(matches!(result, Err(Error::RolloutLength { .. })), "{result:?}");
 }
 
-/// A loss in which every output of the policy counts: its mean over the samples of a packed `rollout`, and its gradient.
+/// Returns a loss that depends on every output of the policy, as the mean over the samples of a packed `rollout`, and
+/// its gradient.
 fn loss_of(policy: &TorchPolicy, rollout: &Rollout) -> (f64, Vec<f32>) {
     let sequences =
         Sequences::new(policy.spec(), rollout.n_steps(), rollout.observations(), rollout.starts(), rollout.memory())
@@ -493,7 +496,7 @@ fn loss_of(policy: &TorchPolicy, rollout: &Rollout) -> (f64, Vec<f32>) {
     (loss.double_value(&[]), gradient)
 }
 
-/// Lengths of episodes by environment, thirty steps in all.
+/// Returns lengths of episodes by environment, thirty steps in total.
 fn unequal() -> Vec<Vec<usize>> {
     vec![vec![6, 2], vec![9], vec![1, 3, 5], vec![4]]
 }
@@ -529,7 +532,7 @@ fn padding_does_not_count_in_recurrent_gradients() {
                 let norm = |numbers: &mut dyn Iterator<Item = f64>| numbers.map(|x| x * x).sum::<f64>().sqrt();
                 let size = norm(&mut mean_gradient[range.clone()].iter().copied());
                 let difference = norm(&mut range.map(|i| f64::from(gradient[i]) - mean_gradient[i]));
-                // Sums of 30 products in another order, each rounded to 2⁻²⁴.
+                // The tolerance covers sums of 30 products in another order, each rounded to 2⁻²⁴.
                 assert!(size > 0.0 && difference < 1e-5 * size, "{}: {difference} of {size}", array.name);
             }
         }
@@ -563,7 +566,8 @@ fn padding_does_not_count_in_updates() {
             let ppo = Ppo::new(config, &moved(&spec), 1).expect("valid settings");
             let stats = update(Box::new(ppo), rollout.episodes());
             assert_eq!(stats.clip_fraction, Some(0.0));
-            // As in the tests of PPO: half the square of errors of 1e-6, its terms rounded to 2⁻²⁴; and the errors.
+            // As in the tests of PPO, the divergences are half the square of errors of 1e-6, with terms rounded to
+            // 2⁻²⁴. The loss has the order of these errors.
             assert!(stats.approx_kl.is_some_and(|kl| kl.abs() < 2e-7), "{stats:?}");
             assert!(stats.policy_gradient_loss.abs() < 1e-5, "{stats:?}");
             assert!(stats.kl_divergence.is_some_and(|kl| kl.abs() < 5e-7), "{stats:?}");
@@ -572,10 +576,10 @@ fn padding_does_not_count_in_updates() {
 }
 
 const CARTPOLES: usize = 4;
-/// Number of episodes. It is not divisible by the number of environments, which play 3, 3, 2 and 2.
+/// Number of episodes. It is not divisible by the four environments, which play 3, 3, 2 and 2 episodes.
 const COUNT: usize = 10;
 
-/// A recurrent policy that pushes to either side with equal probability, whatever it observes.
+/// Returns a recurrent policy that ignores observations and pushes to either side with equal probability.
 fn blind(input_size: usize) -> Policy {
     perturb_torch::register();
     let spec = PolicySpec {
@@ -589,7 +593,8 @@ fn blind(input_size: usize) -> Policy {
     Policy::from_weights(spec, &weights).expect("a policy")
 }
 
-/// Two rollouts of complete episodes, with the episodes that ended, and the statistics after them.
+/// Collects two rollouts of complete episodes. Returns each with the episodes that ended in it, and the final
+/// normalisers.
 fn collect(servers: &[PrivateServer], normalised: bool) -> (Vec<(Rollout, Vec<EndedEpisode>)>, Normalisers) {
     let servers = connect(servers);
     let mut observations = Vec::new();
@@ -634,8 +639,8 @@ fn collected_episodes_are_fixed_beforehand() {
             let first = own[0].episode_index;
             assert!(own.iter().zip(first..).all(|(episode, index)| episode.episode_index == index), "its first ones");
             assert!(iteration > 0 || first == 1, "what was opened is broken off");
-            // Episodes follow one another from the rollout's first step on. Each has an end at its last step and nowhere
-            // else.
+            // Episodes follow one another from the rollout's first step on. Only the last step of an episode has an end
+            // flag.
             let mut t = 0;
             for span in rollout.episodes().iter().filter(|span| span.environment == slot) {
                 assert_eq!(span.start, t);
@@ -662,7 +667,7 @@ fn unseen_steps_are_no_part_of_the_statistics() {
     let server = [server()];
     let (raw, _) = collect(&server, false);
     let (normalised, normalisers) = collect(&server, true);
-    let mut rows = Vec::new(); // first the session's first observations, later all that were acted on
+    let mut rows = Vec::new(); // the session's first observations, later all observations that the policy acted on
     Session::open(&connect(&server), &options("CartPole", CARTPOLES, 1), &mut rows).expect("a session");
     let size = rows.len() / CARTPOLES;
     let mut seen = 0;
@@ -687,7 +692,7 @@ fn unseen_steps_are_no_part_of_the_statistics() {
         let count = (rows.len() / size) as f64;
         let mean = column().sum::<f64>() / count;
         let variance = column().map(|x| (x - mean).powi(2)).sum::<f64>() / count;
-        // Sums of some hundred numbers in f64 in another order.
+        // The tolerance covers sums of some hundred f64 numbers in another order.
         assert!((moments.mean()[i] - mean).abs() < 1e-12, "{} {mean}", moments.mean()[i]);
         assert!((moments.variance(i) - variance).abs() < 1e-12, "{} {variance}", moments.variance(i));
     }
@@ -709,8 +714,8 @@ fn complete_episodes_are_the_same_on_one_server_and_on_two() {
 const SAFE: f32 = 0.0;
 const ENVS: usize = 16;
 
-/// Episodes of one step with two arms. The safe one pays 0. The risky one pays 1, but -2.5 in a fifth of the drawn
-/// environments, so its mean is higher by 0.3.
+/// Plays episodes of one step with a choice of two arms. The safe arm always pays 0. The risky arm pays 1, but -2.5 in
+/// a fifth of the environments, so its mean is 0.3.
 fn pull(policy: &Policy, rng: &mut ChaCha8Rng, episodes: usize) -> Rollout {
     let mut rollout = Rollout::of_episodes(ENVS, 1, 1);
     let mut actor = Actor::new(policy.spec(), ENVS);
@@ -754,8 +759,8 @@ fn ppo(policy: &Policy) -> Box<dyn BaseAlgorithm> {
     Box::new(Ppo::new(config, policy, 5).expect("valid settings"))
 }
 
-/// A policy that takes both arms with probability ½ has a catastrophe in a tenth of its episodes. The worst fifth of the
-/// episodes consists of these and of safe ones.
+/// At first the policy takes each arm with probability ½, so a tenth of the episodes are catastrophes. The worst fifth
+/// of the episodes then consists of these catastrophes and of episodes with the safe arm.
 #[rstest]
 #[case::a2c(a2c, 1500)]
 #[case::ppo(ppo, 100)]
@@ -774,7 +779,7 @@ fn epopt_avoids_catastrophes_that_its_base_accepts(
     }
     let last = pull(&policy, &mut rng, 1024);
     let safe = last.actions().iter().filter(|&&action| action == SAFE).count() as f64 / 1024.0;
-    // Each base prefers one arm almost surely in the end; at first the share is ½.
+    // In the end, the policy takes one arm almost always; at first the share is ½.
     let expected = if epsilon < 1.0 { 0.9..=1.0 } else { 0.0..=0.1 };
     assert!(expected.contains(&safe), "{safe}");
 }

@@ -1,4 +1,4 @@
-//! Policies as plain arithmetic against libtorch: acting, gradients, updates.
+//! Compares feed-forward policies with libtorch: acting, gradients and updates.
 
 use perturb_learner::policy::Policy;
 use perturb_policy::random::{Purpose, normal, stream, uniform};
@@ -14,14 +14,14 @@ use super::common::moved;
 
 const DISCRETE: ActionKind = ActionKind::Discrete { n: 3 };
 const CONTINUOUS: ActionKind = ActionKind::Continuous { size: 6 };
-/// Numbers in an observation.
+/// Length of an observation.
 const O: usize = 17;
 
 fn spec(action: ActionKind, hidden: &[usize]) -> PolicySpec {
     PolicySpec { observation_size: O, action, hidden: hidden.to_vec(), lstm: None }
 }
 
-/// `n` numbers with this standard deviation.
+/// Returns `n` random numbers with this standard deviation.
 fn numbers(n: usize, deviation: f64, seed: u64) -> Vec<f32> {
     let mut rng = stream(seed, Purpose::Weights);
     (0..n).map(|_| (deviation * normal(&mut rng)) as f32).collect()
@@ -38,13 +38,13 @@ fn weights_survive_a_round_trip() {
     assert_eq!(Policy::from_weights(spec, &weights).expect("a policy").weights(), weights);
 }
 
-/// Acting and learning compute the same function in different ways: they add in another order, and acting's tanh is off by
-/// up to 3e-7. Over two layers of 64 that grows to about 1e-6 for values and logits of order 1 to 10.
+/// Tolerance for outputs. Acting and libtorch add in different orders, and acting's tanh has an error of up to 3e-7.
+/// Over two layers of 64 units, this grows to about 1e-6 for values and logits of order 1 to 10.
 const TOLERANCE: f32 = 1e-5;
 
 #[test]
 fn the_actor_agrees_with_libtorch() {
-    // Odd sizes too: layers and batches that are no multiples of the blocks.
+    // Some sizes of layers and batches are not multiples of the block size.
     for hidden in [vec![64, 64], vec![13], vec![], vec![9, 70, 5]] {
         for action in [DISCRETE, CONTINUOUS] {
             let spec = spec(action, &hidden);
@@ -74,7 +74,7 @@ fn the_actor_agrees_with_libtorch() {
     }
 }
 
-/// Samples of a policy whose weights differ a little from those to be updated, as after some gradient steps.
+/// Samples from an older policy, whose weights differ a little from the weights to be updated.
 struct Data {
     observations: Vec<f32>,
     actions: Vec<f32>,
@@ -87,7 +87,7 @@ struct Data {
 }
 
 impl Data {
-    /// `n` samples of a policy whose weights differ from `weights` by some hundredths.
+    /// Returns `n` samples of a policy whose weights differ from `weights` by some hundredths.
     fn new(spec: &PolicySpec, weights: &[f32], n: usize) -> Self {
         let old: Vec<f32> = weights.iter().zip(numbers(weights.len(), 0.02, 3)).map(|(w, x)| w + x).collect();
         let observations = numbers(n * spec.observation_size, 1.0, 5);
@@ -128,7 +128,7 @@ impl Data {
         }
     }
 
-    /// Losses and gradient by libtorch, of the samples at `indices`.
+    /// Computes losses and gradient of the samples at `indices` with libtorch.
     fn torch(&self, policy: &TorchPolicy, indices: &[u32], objective: &Objective) -> (Losses, Vec<f32>) {
         let spec = policy.spec();
         let pick = |data: &[f32], width: usize| -> Vec<f32> {
@@ -168,7 +168,7 @@ fn a2c() -> Objective {
 
 fn ppo() -> Objective {
     Objective {
-        surrogate: Surrogate::Clipped { range: 0.02 }, // so near that many samples are clipped
+        surrogate: Surrogate::Clipped { range: 0.02 }, // so narrow that many samples are clipped
         normalize_advantages: true,
         value_clip_range: Some(0.05),
         kl_coef: 0.3,
@@ -176,7 +176,7 @@ fn ppo() -> Objective {
     }
 }
 
-/// Whether each array's difference is at most 1e-5 of its norm, or the rounding of sums of order 1 that cancel out.
+/// Asserts that each array differs by at most 1e-5 of its norm, or by the rounding of sums of order 1 that cancel out.
 #[track_caller]
 fn assert_arrays_close(spec: &PolicySpec, got: &[f32], expected: &[f32]) {
     let norm = |numbers: &mut dyn Iterator<Item = f64>| numbers.map(|x| x * x).sum::<f64>().sqrt();
@@ -202,7 +202,7 @@ fn gradients_agree_with_libtorch(
     let spec = spec(action, hidden);
     let policy = moved(&spec);
     let data = Data::new(&spec, policy.flat_weights(), n);
-    // Some of the samples, in another order.
+    // The indices are a part of the samples, in reverse order.
     let indices: Vec<u32> = (0..n as u32).rev().filter(|i| n < 10 || i % 7 != 0).collect();
     let mut network = Differentiator::new(&spec, 2).expect("threads");
     network.load(policy.flat_weights()).expect("weights that fit");
@@ -222,7 +222,7 @@ fn gradients_agree_with_libtorch(
         (losses.kl_divergence, expected.kl_divergence),
     ];
     for (i, (got, expected)) in pairs.into_iter().enumerate() {
-        // libtorch's losses are f32 of order 1 to 10.
+        // libtorch's losses are f32 numbers of order 1 to 10.
         assert!((got - expected).abs() < 1e-5 * (1.0 + expected.abs()), "loss {i}: {got} {expected}");
     }
     assert!(objective == a2c() || n < 300 || losses.clip_fraction > 0.01, "some are clipped: {losses:?}");

@@ -1,4 +1,4 @@
-//! Tests that the algorithms learn, on tasks of seconds, and that their updates keep their guarantees.
+//! Tests that algorithms learn small tasks within seconds, and tests of single updates.
 
 use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Ppo};
 use perturb_learner::error::Error;
@@ -16,10 +16,11 @@ const N_ENVS: usize = 16;
 const DISCRETE: ActionKind = ActionKind::Discrete { n: 4 };
 const CONTINUOUS: ActionKind = ActionKind::Continuous { size: 2 };
 
-/// Stable-baselines3's identity task: the best action is the observation. Every step is an episode.
+/// The identity task of stable-baselines3: the best action equals the observation. Every step is an episode.
 ///
-/// Discrete: one of four observations, one-hot; reward 1 for its index, else 0. Continuous: two numbers from [-1, 1];
-/// reward minus the squared distance.
+/// With discrete actions, the observation is one-hot with four entries, and the reward is 1 for the action with the
+/// same index, otherwise 0. With continuous actions, the observation has two numbers in [-1, 1], and the reward is
+/// minus the squared distance of the action.
 struct Identity {
     action: ActionKind,
     rng: ChaCha8Rng,
@@ -83,7 +84,7 @@ impl Training {
         }
     }
 
-    /// Fills the rollout. Returns the mean reward.
+    /// Collects a rollout. Returns its mean reward.
     fn collect(&mut self) -> f64 {
         self.actor.load(&self.policy.weights()).expect("weights that fit");
         self.rollout.clear();
@@ -111,7 +112,7 @@ impl Training {
         sum / (self.rollout.n_steps() * N_ENVS) as f64
     }
 
-    /// Collects and updates `updates` times. Returns the mean reward of the last rollout.
+    /// Collects a rollout and updates the policy, `updates` times. Returns the mean reward of one more rollout.
     fn train(&mut self, algorithm: &mut dyn Algorithm, updates: usize) -> f64 {
         for update in 0..updates {
             self.collect();
@@ -134,7 +135,8 @@ fn ppo(training: &Training, n_minibatches: usize) -> Ppo {
     Ppo::new(config, &training.policy, 5).expect("valid settings")
 }
 
-// Chance is 0.25; the best discrete policy gets 1, the best continuous one of deviation σ gets -2σ² (at first -2.7).
+// Expected rewards: a uniform discrete policy gets 0.25, and the best one gets 1. The best continuous policy with
+// standard deviation σ gets -2σ², and the initial policy gets -2.7.
 
 #[rstest]
 #[case(DISCRETE, 1500, 0.95)]
@@ -168,7 +170,7 @@ fn ppo_begins_with_ratio_1_and_clips_nothing(
 ) {
     let mut training = Training::new(action, 32);
     training.collect();
-    // The learning rate is so small that no weight changes. So each of four minibatches is like a first one.
+    // The learning rate is so small that no weight changes, so all minibatches see the initial policy.
     let config = PpoConfig {
         n_steps: 32,
         n_epochs: 1,
@@ -180,15 +182,16 @@ fn ppo_begins_with_ratio_1_and_clips_nothing(
     let mut first = Ppo::new(config.clone(), &training.policy, 1).expect("valid settings");
     let stats = first.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
     assert_eq!(stats.clip_fraction, Some(0.0));
-    // The actor's log-probabilities are off by 1e-6 at most, and the divergence by half the square of that. But its f32
-    // terms are rounded to 2⁻²⁴ each.
+    // The actor's log probabilities have errors of at most 1e-6, which change the divergence only by half their square.
+    // The tolerance is for the rounding of its f32 terms to 2⁻²⁴.
     assert!(stats.approx_kl.expect("PPO's").abs() < 2e-7, "{stats:?}");
-    // The divergence of a policy from itself is 0. The outputs of a minibatch may differ from those of the whole batch by
+    // A policy's divergence from itself is 0. The outputs of a minibatch may differ from those of the whole batch by
     // rounding.
     assert!(stats.kl_divergence.expect("a penalty").abs() < 2e-7, "{stats:?}");
-    // With ratio 1, the surrogate is minus the mean of the normalised advantages, which is 0 up to the error of the ratios.
+    // With ratio 1, the surrogate is the negative mean of the normalised advantages. This is 0 up to the error of the
+    // ratios.
     assert!(stats.policy_gradient_loss.abs() < 1e-5, "{stats:?}");
-    // The rollout's own values lie inside any clipping interval.
+    // The current values equal the rollout's, so value clipping changes nothing.
     let mut unclipped =
         Ppo::new(PpoConfig { clip_range_vf: 0.0, ..config.clone() }, &training.policy, 1).expect("valid settings");
     let value_loss = unclipped.update(&mut training.policy, &training.rollout, 1.0).expect("an update").value_loss;
@@ -344,7 +347,7 @@ fn the_learning_rate_falls_linearly_or_stays() {
         assert_eq!(stats.learning_rate, expected);
         assert!(algorithm.update(&mut training.policy, &training.rollout, 1.5).is_err());
     }
-    // A2C's last learning rate is 0, so the last update moves no weight.
+    // A2C's last learning rate is 0, so the last update changes no weight.
     let mut algorithm = a2c(&training);
     let before = training.policy.weights();
     algorithm.update(&mut training.policy, &training.rollout, 0.0).expect("an update");

@@ -1,10 +1,11 @@
-//! Advantages against numbers from numpy (`crates/torch/tests/fixtures/make_losses.py`), and against identities.
+//! Compares advantages and returns with numbers from numpy (`crates/torch/tests/fixtures/make_losses.py`), and checks
+//! identities between them.
 
 use perturb_learner::algorithm::{gae, n_step_returns};
 use perturb_learner::rollout::{Trajectories, explained_variance};
 use proptest::prelude::*;
 
-/// Results of order 1 in f32, from means over 11 samples: some ten roundings of 2⁻²⁴.
+/// Tolerance for means over 11 samples of order 1 in f32: some ten roundings of 2⁻²⁴.
 const TOLERANCE: f64 = 2e-6;
 
 fn fixture(case: &str, name: &str) -> Vec<f32> {
@@ -35,7 +36,7 @@ fn explained_variance_has_its_limits() {
     assert_eq!(explained_variance(&[1.0, 2.0], &[3.0, 3.0]), None);
 }
 
-/// Arrays of the fixture's 7 steps of 3 environments, with a termination, truncations, and both at once.
+/// The fixture has 7 steps of 3 environments, with a termination, truncations, and a step with both flags.
 #[test]
 fn advantages_and_returns_agree_with_sums_from_the_definitions() {
     for (case, bootstrap) in [("advantages_bootstrap", true), ("advantages_reference", false)] {
@@ -55,7 +56,7 @@ fn advantages_and_returns_agree_with_sums_from_the_definitions() {
             truncation_values: &get("truncation_values"),
             last_values: &last_values,
         };
-        // Sums are in f64; only the result is rounded.
+        // Sums are computed in f64, and only the result is rounded to f32.
         assert_close(&gae(&trajectories, 0.9, 0.8, bootstrap).advantages, &get("gae"), 1e-6);
         let estimates = n_step_returns(&trajectories, 0.9, bootstrap);
         assert_close(&estimates.returns, &get("n_step"), 1e-6);
@@ -64,7 +65,7 @@ fn advantages_and_returns_agree_with_sums_from_the_definitions() {
     }
 }
 
-/// A rollout of one environment in which no episode ends.
+/// Returns the trajectories of one environment in which no episode ends.
 fn endless<'a>(rewards: &'a [f32], values: &'a [f32], last_values: &'a [f32]) -> Trajectories<'a> {
     const NEVER: [bool; 64] = [false; 64];
     const ZEROS: [f32; 64] = [0.0; 64];
@@ -83,7 +84,7 @@ fn endless<'a>(rewards: &'a [f32], values: &'a [f32], last_values: &'a [f32]) ->
 #[test]
 fn n_step_returns_of_a_hand_computed_case() {
     let estimates = n_step_returns(&endless(&[1.0, 2.0, 4.0], &[0.5, 0.5, 0.5], &[8.0]), 0.5, true);
-    // 4 + 8/2 = 8, 2 + 8/2 = 6, 1 + 6/2 = 4.
+    // The returns are 4 + 8/2 = 8, 2 + 8/2 = 6 and 1 + 6/2 = 4.
     assert_eq!(estimates.returns, [4.0, 6.0, 8.0]);
     assert_eq!(estimates.advantages, [3.5, 5.5, 7.5]);
 }
@@ -104,7 +105,7 @@ fn last_value_depends_on_the_kind_of_end() {
     for bootstrap in [true, false] {
         assert_eq!(ended(true, false, bootstrap), (1.0 - 10.0, 1.0));
         assert_eq!(ended(true, true, bootstrap), (1.0 - 10.0, 1.0), "termination wins");
-        // δ_1 = 2 + 20 - 20 = 2, δ_0 = 1 + 10 - 10 = 1; R_1 = 2 + 20 = 22, R_0 = 1 + 11.
+        // By hand: δ_1 = 2 + 20 - 20 = 2, δ_0 = 1 + 10 - 10 = 1, R_1 = 2 + 20 = 22 and R_0 = 1 + 11 = 12.
         assert_eq!(ended(false, false, bootstrap), (1.0 + 0.25 * 2.0, 12.0));
     }
     assert_eq!(ended(false, true, true), (1.0 + 15.0 - 10.0, 16.0));
@@ -113,7 +114,7 @@ fn last_value_depends_on_the_kind_of_end() {
 
 #[test]
 fn bootstrapping_removes_the_time_limit_from_values() {
-    // Value iteration on returns, with an episode of 10 steps that the time limit ends: V ← R_0, and so for every state.
+    // Iterates V ← R_0 for all states, with an episode of 10 steps that the step limit ends.
     let fixed_point = |bootstrap| {
         let mut value = 0.0f32;
         for _ in 0..200 {
@@ -127,7 +128,7 @@ fn bootstrapping_removes_the_time_limit_from_values() {
         }
         f64::from(value)
     };
-    // What is left of the start is 0.9²⁰⁰⁰; f32 rounds 10 to 1e-6.
+    // The influence of the initial value has shrunk to 0.9²⁰⁰⁰. Near 10, f32 rounds to 1e-6.
     assert!((fixed_point(true) - 10.0).abs() < 1e-5);
     assert!((fixed_point(false) - (1.0 - 0.9f64.powi(10)) / 0.1).abs() < 1e-5);
 }
@@ -146,7 +147,7 @@ proptest! {
         for t in 0..size {
             let sum: f64 = (t..size).map(|k| gamma.powi((k - t) as i32) * f64::from(rewards[k])).sum();
             let tail = gamma.powi((size - t) as i32) * f64::from(last);
-            // f32 rounding of numbers up to 5·(1-0.97⁴⁰)/0.03 + 10 < 130.
+            // The tolerance is the f32 rounding of numbers up to 5·(1-0.97⁴⁰)/0.03 + 10 < 130.
             prop_assert!((f64::from(advantages[t]) - (sum + tail - f64::from(values[t]))).abs() < 1e-5);
         }
         for (a, b) in advantages.iter().zip(n_step_returns(&trajectories, gamma, true).advantages) {

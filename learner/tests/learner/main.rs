@@ -1,5 +1,5 @@
-//! The learner's tests, one program, so that libtorch is linked once. They need the program `perturb-server`: run
-//! `cargo build --release` first.
+//! The tests of the learner in one program, so that libtorch is linked only once. They need the program
+//! `perturb-server`: run `cargo build --release` first.
 
 mod common;
 

@@ -1,5 +1,5 @@
-//! Differences between the presets in trainings and updates. docs/algorithms.md has the table, the tests of settings have the
-//! values.
+//! Tests how the presets differ in trainings and updates. docs/algorithms.md lists the differences, and tests of
+//! `perturb-settings` check the values.
 
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
@@ -30,20 +30,20 @@ fn trained(settings: &str) -> (TempDir, Vec<Progress>) {
 
 const N_STEPS: usize = 6;
 const N_ENVS: usize = 3;
-/// Half of a number like 1.5 has no rounding error.
+/// The discount factor. Multiplying by 0.5 causes no rounding errors.
 const GAMMA: f64 = 0.5;
 
-/// The way in which the task reports its time limit.
+/// The way in which a task reports that its step limit ended an episode.
 #[derive(Clone, Copy)]
 enum Limit {
-    /// A truncation.
+    /// As a truncation.
     Truncation,
-    /// An end of the task, with a bonus on the reward.
+    /// As a termination, with a bonus added to the reward.
     Termination { bonus: f32 },
 }
 
-/// Noise in two of whose episodes the time limit is reached: one ends in the middle of the rollout, one in its last step.
-/// The value of every final observation is 1.5.
+/// Returns a rollout of random numbers in which the step limit ends two episodes: one in the middle of the rollout, one
+/// in its last step. The value of every final observation is 1.5.
 fn rollout(spec: &PolicySpec, limit: Limit) -> Rollout {
     let mut rng = stream(7, Purpose::Actions);
     let mut numbers = |count: usize| (0..count).map(|_| normal(&mut rng) as f32).collect::<Vec<f32>>();
@@ -57,7 +57,7 @@ fn rollout(spec: &PolicySpec, limit: Limit) -> Rollout {
             Limit::Truncation => (ended, [false; N_ENVS], 0.0),
             Limit::Termination { bonus } => ([false; N_ENVS], ended, bonus),
         };
-        // Quarters, so that the bonus is added without rounding.
+        // Rewards are multiples of ¼, so that adding the bonus causes no rounding.
         let reward = |n: usize| (t * N_ENVS + n) as f32 / 4.0 - 2.0 + if ended[n] { bonus } else { 0.0 };
         let step = RolloutStep {
             observations: &numbers(N_ENVS * spec.observation_size),
@@ -104,8 +104,8 @@ fn updates_bootstrap_truncation_if_set(
     assert_ne!(weights(true, Limit::Truncation), weights(false, Limit::Truncation));
 }
 
-/// Counts what EPOpt learns from, as the reference does: steps; or, if each episode has an update, episodes, because the
-/// reference then pads each episode to the step limit.
+/// The schedule counts only steps that EPOpt learns from. If each episode has an update, it counts episodes instead,
+/// because the paper's published code then pads each episode to the step limit.
 #[rstest]
 fn epopts_linear_learning_rate_falls_by_the_kept_episodes(#[values(true, false)] update_per_episode: bool) {
     let settings = "preset = 'paper'\nalgorithm = 'epopt-a2c'\nepisodes = 9\nepisodes_per_iteration = 4\nepsilon = 0.4\n\
@@ -125,7 +125,8 @@ fn epopts_linear_learning_rate_falls_by_the_kept_episodes(#[values(true, false)]
     assert!(progress.len() > 2 && episodes < 4 * progress.len() as u64, "some are not kept: {progress:?}");
 }
 
-/// The preset "paper" has one environment and logs every tenth rollout, "perturb" has eight and logs every rollout.
+/// The preset "paper" has one environment and logs every tenth rollout. The preset "perturb" has eight environments and
+/// logs every rollout.
 #[rstest]
 #[case("perturb", 8, 1)]
 #[case("paper", 1, 10)]
@@ -149,8 +150,8 @@ fn ppos_log_has_a_line_for_so_many_rollouts_and_for_the_last(
     assert_eq!(logged, (1..=last).filter(due).collect::<Vec<_>>());
 }
 
-/// Tests see the last weights, whatever `checkpoint_interval` is. In contrast, the reference tests the weights that it
-/// saved last, which can be a hundred updates old.
+/// Tests use the final weights, regardless of `checkpoint_interval`. In contrast, the paper's published code tests the
+/// weights that it saved last, which can be a hundred updates old.
 #[test]
 fn tested_policy_has_the_last_weights() {
     let checkpoint = |checkpoint_interval: u64| {

@@ -1,5 +1,5 @@
-//! Recurrent policies: acting and learning see the same function of the past, its gradient is right, and it can be used
-//! to remember.
+//! Tests of recurrent policies: acting and learning compute the same function of past observations, its gradient is
+//! right, and policies learn to remember.
 
 use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Ppo};
 use perturb_learner::error::Error;
@@ -22,7 +22,7 @@ fn spec(action: ActionKind, hidden: &[usize], width: usize) -> PolicySpec {
     PolicySpec { observation_size: O, action, hidden: hidden.to_vec(), lstm: Some(width) }
 }
 
-/// Weights that differ from the initial ones everywhere: every number, also of biases and log_std, moves by about 0.1.
+/// Returns weights in which every number, including biases and log_std, differs from its initial value by about 0.1.
 fn moved(spec: &PolicySpec) -> Weights {
     let mut rng = stream(9, Purpose::Weights);
     let mut weights = Policy::new(spec.clone(), 1).expect("a policy").weights();
@@ -30,12 +30,13 @@ fn moved(spec: &PolicySpec) -> Weights {
     weights
 }
 
-/// Some steps of a policy that acts on noise. It remembers earlier steps, and episodes start in between.
+/// Some steps of a policy that acts on random observations. At the first step it already has a memory, and episodes
+/// start at later steps.
 struct Window {
     n_envs: usize,
     observations: Vec<f32>,
     starts: Vec<bool>,
-    /// The memory before the first step.
+    /// The policy's memory before the first step.
     memory: Vec<f32>,
     acts: Vec<ActorOutput>,
 }
@@ -57,8 +58,8 @@ impl Window {
                     n_envs,
                 };
             }
-            // About every sixth step of an environment starts an episode: 30 % of the odd steps and no even one. The
-            // window's first step is odd.
+            // About every sixth step of an environment starts an episode: 30 % of the odd steps, and none of the even
+            // steps. The window's first step is odd.
             for n in 0..n_envs {
                 let start = t % 2 == 1 && uniform(&mut rng) < 0.3;
                 if start {
@@ -84,8 +85,8 @@ impl Window {
     }
 }
 
-/// Acting and learning compute the same function in different ways: they add in another order, and acting's tanh is off by
-/// up to 3e-7. Over layers of at most 256 that grows to about 1e-6 for values and logits of order 1.
+/// Tolerance for outputs. Acting and learning add in different orders, and acting's tanh has an error of up to 3e-7.
+/// Over layers of at most 256 units, this grows to about 1e-6 for values and logits of order 1.
 const TOLERANCE: f32 = 1e-5;
 
 fn torch(spec: &PolicySpec, weights: &Weights) -> TorchPolicy {
@@ -95,7 +96,7 @@ fn torch(spec: &PolicySpec, weights: &Weights) -> TorchPolicy {
 
 #[test]
 fn evaluating_a_window_equals_acting_step_by_step() {
-    // Odd sizes too: layers and batches that are no multiples of the blocks.
+    // Some sizes of layers and batches are not multiples of the block size.
     for (hidden, width) in [(vec![256, 256], 256), (vec![9, 17], 13), (vec![], 16), (vec![7], 1)] {
         for action in [DISCRETE, CONTINUOUS] {
             let spec = spec(action, &hidden, width);
@@ -127,7 +128,7 @@ fn the_two_stage_gradient_equals_autograds() {
             let window = Window::new(&spec, &weights, 12, 7);
             let gradient = |policy: TorchPolicy| {
                 let evaluated = window.evaluate(&policy);
-                let weighting = Tensor::of_slice(&window.observations[..12 * 7]); // any numbers
+                let weighting = Tensor::of_slice(&window.observations[..12 * 7]); // arbitrary numbers
                 let loss = (&evaluated.log_probs * &weighting + evaluated.values.square() + &evaluated.entropy * 0.3)
                     .mean(Kind::Float);
                 let mut gradient = vec![0.0; policy.spec().n_weights()];
@@ -145,7 +146,7 @@ fn the_two_stage_gradient_equals_autograds() {
                     |numbers: &mut dyn Iterator<Item = f32>| numbers.map(|x| f64::from(x).powi(2)).sum::<f64>().sqrt();
                 let size = norm(&mut plain[range.clone()].iter().copied());
                 let difference = norm(&mut range.map(|i| two_stage[i] - plain[i]));
-                // Sums of 84 products in another order, each rounded to 2⁻²⁴.
+                // The tolerance covers sums of 84 products in another order, each rounded to 2⁻²⁴.
                 assert!(size > 0.0 && difference < 1e-5 * size, "{hidden:?} {}: {difference} of {size}", array.name);
             }
             assert_eq!(start, plain.len());
@@ -203,7 +204,8 @@ fn a_policy_begins_with_orthogonal_weights_and_zero_biases() {
         ]
     );
     for array in &weights {
-        // The shorter side holds that many orthogonal vectors of length gain: their squares add up to count·gain².
+        // An orthogonal matrix has as many orthogonal vectors as its shorter side. Each has the length gain, so the
+        // squares of all entries add up to count·gain².
         let squares: f64 = array.data.iter().map(|&x| f64::from(x).powi(2)).sum();
         let count = array.shape.iter().min().copied().unwrap_or(0) as f64;
         let expected = match array.name.as_str() {
@@ -230,14 +232,15 @@ fn nan_is_an_error_not_an_action() {
 }
 
 const N_ENVS: usize = 16;
-/// Steps of an episode of [`Recall`].
+/// Number of steps in an episode of [`Recall`].
 const LENGTH: usize = 4;
 
-/// A task that needs a memory: the first observation of an episode is (±1, 0), the next are (0, 0), the last is (0, 1). In
-/// the last step the action must name the sign of the first observation, for a reward of 1, else 0. Without memory the best
-/// mean reward is ½.
+/// A task that needs a memory. The first observation of an episode is (±1, 0), the next ones are (0, 0), and the last
+/// is (0, 1). In the last step, the reward is 1 if the action names the sign of the first observation, otherwise 0.
+/// Without memory, the best mean reward is ½.
 ///
-/// Neighbouring environments start their episodes one step apart, so that windows begin in the middle of some episodes.
+/// Neighbouring environments start their episodes one step apart, so that rollouts begin in the middle of some
+/// episodes.
 struct Recall {
     rng: ChaCha8Rng,
     cues: [usize; N_ENVS],
@@ -291,7 +294,7 @@ impl Training {
         }
     }
 
-    /// Fills the rollout. Returns the share of episodes whose action named the sign.
+    /// Collects a rollout. Returns the share of episodes in which the action named the right sign.
     fn collect(&mut self) -> f64 {
         self.actor.load(&self.policy.weights()).expect("weights that fit");
         self.rollout.begin(self.actor.memory());
@@ -328,7 +331,8 @@ impl Training {
         told / episodes
     }
 
-    /// Collects and updates `updates` times. Returns the mean share of right signs in four more rollouts.
+    /// Collects a rollout and updates the policy, `updates` times. Returns the mean share of right signs in four more
+    /// rollouts.
     fn train(&mut self, algorithm: &mut dyn Algorithm, updates: usize) -> f64 {
         for _ in 0..updates {
             self.collect();
@@ -350,8 +354,8 @@ fn ppo(training: &Training, n_minibatches: usize) -> Ppo {
     Ppo::new(config, &training.policy, 5).expect("valid settings")
 }
 
-/// Checks the final share of right signs. Chance gives ½. Four standard deviations of a mean over 128 episodes, those of
-/// A2C's last four rollouts, are 0.18.
+/// Checks the share of right signs after the training. Without memory it is ½ by chance. The tolerance is 0.18: four
+/// standard deviations of a mean over the 128 episodes of A2C's last four rollouts.
 fn assert_recalls(lstm: Option<usize>, share: f64) {
     let expected = if lstm.is_some() { 0.95..=1.0 } else { 0.0..=0.68 };
     assert!(expected.contains(&share), "{share}");
@@ -380,7 +384,7 @@ fn only_a_recurrent_policy_of_a2c_recalls(#[case] lstm: Option<usize>) {
 fn ppo_begins_with_ratio_1_and_clips_nothing(#[values(1, 4)] n_minibatches: usize) {
     let mut training = Training::new(Some(16), 30);
     let mut algorithm = ppo(&training, n_minibatches);
-    training.train(&mut algorithm, 20); // ends with a rollout of a policy that uses its memory
+    training.train(&mut algorithm, 20); // after this, the rollout is of a policy that uses its memory
     assert!(training.rollout.memory().iter().any(|&x| x != 0.0));
     let config = PpoConfig {
         n_steps: 30,
@@ -393,12 +397,14 @@ fn ppo_begins_with_ratio_1_and_clips_nothing(#[values(1, 4)] n_minibatches: usiz
     let mut first = Ppo::new(config.clone(), &training.policy, 1).expect("valid settings");
     let stats = first.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
     assert_eq!(stats.clip_fraction, Some(0.0));
-    // The divergence is half the square of the log-probabilities' errors of 1e-6, and its f32 terms are rounded to 2⁻²⁴.
+    // The log probabilities have errors of 1e-6, which change the divergence by half their square. The tolerance is for
+    // the rounding of its f32 terms to 2⁻²⁴.
     assert!(stats.approx_kl.expect("PPO's").abs() < 2e-7, "{stats:?}");
-    // The divergence of a policy from itself is 0. The outputs of a minibatch may differ from those of the whole batch by
+    // A policy's divergence from itself is 0. The outputs of a minibatch may differ from those of the whole batch by
     // rounding.
     assert!(stats.kl_divergence.expect("a penalty").abs() < 2e-7, "{stats:?}");
-    // With ratio 1, the surrogate is minus the mean of the normalised advantages, which is 0 up to the error of the ratios.
+    // With ratio 1, the surrogate is the negative mean of the normalised advantages. This is 0 up to the error of the
+    // ratios.
     assert!(stats.policy_gradient_loss.abs() < 1e-5, "{stats:?}");
     let config = PpoConfig { n_epochs: 10, learning_rate: 1e-2, ..config };
     let mut later = Ppo::new(config, &training.policy, 1).expect("valid settings");

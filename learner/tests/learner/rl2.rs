@@ -1,4 +1,4 @@
-//! Tests of RL²: inputs and memories in a trial, updates, tests of policies, and whether a policy learns within a trial.
+//! Tests of RL²: inputs and memories within a trial, updates, tests of policies, and learning within a trial.
 
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::algorithm::{A2c, Algorithm, Ppo, gae};
@@ -20,7 +20,8 @@ const TWO: ActionKind = ActionKind::Discrete { n: 2 };
 const ONE: ActionKind = ActionKind::Continuous { size: 1 };
 const N_ENVS: usize = 3;
 
-/// A small recurrent policy for inputs with outcomes.
+/// Returns a small recurrent policy whose inputs contain the outcome of the previous step: last action, last reward,
+/// and whether an episode ended.
 fn policy(observation_size: usize, action: ActionKind) -> Policy {
     let observation_size = Inputs::new(observation_size, action, 1, true).size();
     moved(&PolicySpec { observation_size, action, hidden: vec![8], lstm: Some(6) })
@@ -42,7 +43,8 @@ fn as_bits(flag: bool) -> f32 {
     f32::from(u8::from(flag))
 }
 
-/// The numbers that follow the observation in an input: last action, last reward, and 0, because no episode has ended.
+/// Returns the numbers that follow the observation in an input: last action, last reward, and 0, because no episode has
+/// ended.
 fn beside(action: ActionKind, taken: f32, reward: f32) -> Vec<f32> {
     let mut beside: Vec<f32> = match action {
         ActionKind::Discrete { n } => (0..n).map(|j| as_bits(taken == j as f32)).collect(),
@@ -52,8 +54,8 @@ fn beside(action: ActionKind, taken: f32, reward: f32) -> Vec<f32> {
     beside
 }
 
-/// The rollout of a plain recurrent policy whose observations are extended by hand: `[s, a, r, 0]`, or `[s, 0, 0, 0]` at the
-/// start of an episode.
+/// Returns the rollout of a plain recurrent policy whose observations this function extends itself: to `[s, a, r, 0]`,
+/// or to `[s, 0, 0, 0]` at the start of an episode.
 fn extended_by_hand(servers: &Servers, options: &OpenOptions, policy: &Policy, n_steps: usize) -> Rollout {
     let spec = policy.spec();
     let n = options.num_envs;
@@ -119,7 +121,7 @@ fn extended_by_hand(servers: &Servers, options: &OpenOptions, policy: &Policy, n
 fn trial_of_one_episode_equals_longer_inputs() {
     let server = [server()];
     let servers = connect(&server);
-    // Falls end CartPole's episodes, the limit of 200 steps Pendulum's.
+    // Falls end episodes of CartPole, and the limit of 200 steps ends episodes of Pendulum.
     for (environment, size, action, n_steps) in [("CartPole", 4, TWO, 60), ("Pendulum", 3, ONE, 210)] {
         let options = options(environment, N_ENVS, 1);
         let policy = policy(size, action);
@@ -143,8 +145,8 @@ fn trial_of_one_episode_equals_longer_inputs() {
     }
 }
 
-/// Rollouts of one step each, whose `memory` is thus the one before every step, and the episodes that ended, with their
-/// steps.
+/// Rollouts of one step each, so that their `memory` is the memory before each step; and the ended episodes with the
+/// steps in which they ended.
 struct Steps {
     rollouts: Vec<Rollout>,
     ended: Vec<(usize, EndedEpisode)>,
@@ -167,7 +169,7 @@ impl Steps {
         steps
     }
 
-    /// The episode of environment n that ended in step t.
+    /// Returns the episode of environment n that ended in step t, if any.
     fn ended(&self, t: usize, n: usize) -> Option<&EndedEpisode> {
         self.ended.iter().find(|(at, episode)| (*at, episode.slot) == (t, n)).map(|(_, episode)| episode)
     }
@@ -253,8 +255,8 @@ fn advantages_run_across_the_episodes_of_a_trial() {
                 continue; // the next value is in the next rollout
             }
             let value = f64::from(values[place]);
-            let reward = 1.0; // CartPole pays 1 a step
-            // f32 rounding of numbers below 16.
+            let reward = 1.0; // CartPole pays 1 per step
+            // The tolerance is the f32 rounding of numbers below 16.
             let close = |got: f32, expected: f64| (f64::from(got) - expected).abs() < 2e-6;
             if episode_in_trial == 0 {
                 inner += 1;
@@ -270,15 +272,15 @@ fn advantages_run_across_the_episodes_of_a_trial() {
     assert!(inner >= N_ENVS && outer >= N_ENVS, "{inner} {outer}");
 }
 
-/// A checkpoint of RL² on CartPole. Its policy has four cells:
+/// Returns a checkpoint of RL² on CartPole whose LSTM has four hand-made cells:
 ///
-/// - the first counts the episodes n whose end follows a remembered step: h = tanh n;
-/// - the second tells to which side the pole leans and falls;
+/// - the first counts the ended episodes n of the trial: h = tanh n;
+/// - the second has the side to which the pole leans and falls;
 /// - the third holds the last reward r: h = tanh tanh r;
-/// - the fourth tells whether there was an earlier step.
+/// - the fourth is on if the trial has an earlier step.
 ///
-/// The policy balances the pole if n = 1 and r = 0.1, which is a reward of 1 normalised. Otherwise it pushes to one side
-/// until the pole falls.
+/// The policy balances the pole if n = 1 and r = 0.1, which is a normalised reward of 1. Otherwise it pushes to one
+/// side until the pole falls.
 fn balancing_in_the_second_episode(servers: &Servers) -> Checkpoint {
     let settings = "environment = 'CartPole'\nalgorithm = 'rl2-a2c'\nepisodes = 1\nnum_envs = 2";
     let config = TrainConfig::from_table("the test", settings.parse().expect("TOML")).expect("a configuration");
@@ -294,15 +296,16 @@ fn balancing_in_the_second_episode(servers: &Servers) -> Checkpoint {
     for array in &mut weights {
         array.data.fill(0.0);
         match array.name.as_str() {
-            // Rows i, f, g, o of four cells each; inputs x, v, θ, ω, two actions, r, d.
+            // Rows are the gates i, f, g and o, with four cells each. Columns are the inputs x, v, θ, ω, two actions, r
+            // and d.
             "lstm.input.weight" => {
                 array.data[8 * 8 + 7] = 20.0;
                 array.data[9 * 8..][..4].copy_from_slice(&[0.0, 0.0, 5.0, 5.0]);
                 array.data[10 * 8 + 6] = 1.0;
             }
-            // The first cell's input opens where the last one remembers a step.
+            // The first cell's input gate opens if the fourth cell remembers a step.
             "lstm.recurrent.weight" => array.data[3] = 40.0,
-            // All others are open; the two in the middle forget.
+            // All other input gates are open, and the second and third cell forget.
             "lstm.bias" => {
                 let i = [-20.0, 20.0, 20.0, 20.0];
                 let f = [20.0, -20.0, -20.0, 20.0];
@@ -316,7 +319,7 @@ fn balancing_in_the_second_episode(servers: &Servers) -> Checkpoint {
     checkpoint.weights = weights;
     checkpoint.policy = spec;
     checkpoint.state.observation_normaliser = None;
-    // A variance of 100.
+    // The variance of rewards is 100, so a reward of 1 is normalised to 0.1.
     let moments = serde_json::json!({ "count": 2, "mean": [0.0], "squares": [200.0] });
     let normaliser = serde_json::json!({ "gamma": 0.99, "returns": [0.0, 0.0], "moments": moments });
     checkpoint.state.reward_normaliser = Some(serde_json::from_value(normaliser).expect("a normaliser"));
@@ -330,12 +333,12 @@ fn tests_count_the_last_episode_of_each_trial() {
     let two = connect(&both);
     let checkpoint = balancing_in_the_second_episode(&one);
     let figures_of = |servers: &Servers, checkpoint: &Checkpoint, seed| {
-        // More than 100 trials, so that environments play more than one trial each.
+        // There are more than 100 trials, so that environments play more than one trial each.
         test(servers, checkpoint, Version::D, 250, seed, &StopFlag::default(), |_| {}).expect("a test")
     };
     let figures = |servers: &Servers, checkpoint: &Checkpoint| figures_of(servers, checkpoint, 1);
     let result = figures(&one, &checkpoint);
-    // A trial's first episode ends within a dozen steps, its second lasts for nearly 200.
+    // The first episode of a trial ends within a dozen steps, and the second lasts for nearly 200 steps.
     assert!(result.mean_length > 150.0, "{result:?}");
     assert_eq!(result.episodes, 250);
     assert_eq!(figures(&two, &checkpoint), result);
@@ -343,7 +346,7 @@ fn tests_count_the_last_episode_of_each_trial() {
     let raw = &mut checkpoint.clone();
     raw.state.reward_normaliser = None;
     assert!(figures(&one, raw).mean_length < 15.0, "the reward is no longer what the policy knows");
-    // How soon a pole falls depends on the start of the episode, and so on the seed.
+    // The time until a pole falls depends on the start of the episode, and so on the seed.
     assert_eq!(figures(&two, raw), figures(&one, raw));
     assert_ne!(figures_of(&one, raw, 2), figures(&one, raw));
     let single = &mut checkpoint.clone();
@@ -352,16 +355,17 @@ fn tests_count_the_last_episode_of_each_trial() {
 }
 
 const ARMS: usize = 16;
-/// Steps of an episode, each with a choice of one arm.
+/// Number of steps in an episode. Each step is a choice of one arm.
 const EPISODE: usize = 3;
 const TRIAL: usize = 2 * EPISODE;
 
-/// Two arms: one pays 1, the other nothing. The paying arm is drawn for every trial, and the observation does not show it.
+/// A bandit task with two arms: one pays 1, the other pays nothing. The paying arm is drawn for every trial, and the
+/// observation does not show it.
 struct Bandits {
     policy: Policy,
     actor: Actor,
     inputs: Inputs,
-    /// Whether memories last for a trial, as with RL², or for an episode.
+    /// Whether the policy's memory lasts for a whole trial, as with RL². If not, it lasts for an episode.
     by_trial: bool,
     paying: [f32; ARMS],
     start: bool,
@@ -385,7 +389,7 @@ impl Bandits {
         }
     }
 
-    /// Fills the rollout with whole trials. Returns the share of steps that paid in the trials' last episodes.
+    /// Collects a rollout of complete trials. Returns the share of paying steps in the last episodes of the trials.
     fn collect(&mut self) -> f64 {
         self.actor.load(&self.policy.weights()).expect("weights that fit");
         self.rollout.begin(self.actor.memory());
@@ -428,7 +432,7 @@ impl Bandits {
         paid / pulls
     }
 
-    /// Updates the policy `updates` times. Returns the share of steps that paid in some 400 further trials.
+    /// Updates the policy `updates` times. Returns the share of paying steps in some 400 more trials.
     fn train(&mut self, algorithm: &mut dyn Algorithm, updates: usize) -> f64 {
         for _ in 0..updates {
             self.collect();
@@ -444,7 +448,8 @@ fn bandits_a2c(policy: &Policy) -> A2c {
     A2c::new(config, policy).expect("valid settings")
 }
 
-// The best share is 1: the first step shows which arm pays. A policy that does not see its reward reaches ½ at best.
+// The best share is 1, because the first step of a trial shows which arm pays. A policy that does not see its reward
+// reaches at most ½.
 
 #[test]
 fn a2c_adapts_within_a_trial() {
@@ -469,7 +474,7 @@ fn without_rl2_it_does_not_adapt() {
     let mut bandits = Bandits::new(false, 1);
     let mut a2c = bandits_a2c(&bandits.policy);
     let share = bandits.train(&mut a2c, 1500);
-    // Four standard deviations of a mean of 400 numbers that are 0 or 1, for the case that all choices of a trial are the
-    // same arm.
+    // The tolerance is four standard deviations of the mean of 400 numbers that are 0 or 1. It assumes the worst case,
+    // that all steps of a trial choose the same arm.
     assert!((share - 0.5).abs() < 0.1, "{share}");
 }

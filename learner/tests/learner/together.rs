@@ -1,5 +1,5 @@
-//! A training gives the same bytes alone and in any group, stopped and resumed in another group, and wherever actions are
-//! chosen.
+//! Tests that a training gives the same bytes alone, in any group, after resuming in another group, and with actions
+//! chosen in the server or the client.
 
 use std::path::Path;
 
@@ -15,7 +15,7 @@ use rstest::rstest;
 
 use crate::common::{connect, server};
 
-/// Trainings with all algorithms: batches of different sizes, versions and parameters, long rollouts and short ones.
+/// Settings of trainings with all algorithms. They differ in batch size, version, parameters and length of rollouts.
 const TRAININGS: [&str; 11] = [
     "algorithm = 'a2c'\nnum_envs = 1\nn_steps = 5\nseed = 3",
     "algorithm = 'ppo'\nversion = 'R'\nnum_envs = 3\nn_steps = 16\nn_minibatches = 2\nn_epochs = 2\nseed = 3",
@@ -28,7 +28,7 @@ const TRAININGS: [&str; 11] = [
      full_iterations = 1\nseed = 4",
     "preset = 'paper'\nalgorithm = 'epopt-ppo'\narchitecture = 'rc'\nepisodes_per_iteration = 3\nepsilon = 0.5
      full_iterations = 1\nn_epochs = 2\nseed = 4",
-    // Trainings with observation noise choose their actions at the learner.
+    // Trainings with observation noise choose their actions in the client.
     "algorithm = 'ppo'\nversion = 'R'\nnum_envs = 3\nn_steps = 64\nn_epochs = 2\nobservation_noise = 0.5
      weight_decay = 0.1\nseed = 8",
     "algorithm = 'epopt-a2c'\nversion = 'E'\nnum_envs = 2\nepisodes_per_iteration = 3\nepsilon = 0.5
@@ -37,7 +37,7 @@ const TRAININGS: [&str; 11] = [
     "algorithm = 'ppo'\nversion = 'R'\nnum_envs = 65\nn_steps = 64\nn_minibatches = 2\nn_epochs = 1\nseed = 7",
 ];
 
-/// Environments and budgets; the policies of the last one also see parameters.
+/// Environment and budget of trainings in CartPole.
 const CART_POLE: &str = "environment = 'CartPole'\nepisodes = 12";
 const PENDULUM: &str = "environment = 'Pendulum'\nepisodes = 5";
 const SEEN_PENDULUM: &str = "environment = 'Pendulum'\nepisodes = 5\nobserve = 'parameters'";
@@ -47,7 +47,7 @@ fn config(task: &str, training: &str) -> TrainConfig {
     TrainConfig::from_table("the test", text.parse().expect("TOML")).expect("a configuration")
 }
 
-/// The whole state of a run: everything that its next step depends on, and everything that it has done.
+/// Returns the state of a run as text: counters, weights, statistics, and everything else that later steps depend on.
 fn kept(directory: &Path) -> String {
     let (checkpoint, resume) = ResumeState::load(directory).expect("a checkpoint");
     let state = checkpoint.state;
@@ -64,8 +64,8 @@ fn kept(directory: &Path) -> String {
     )
 }
 
-/// Trains the runs with these `numbers`, each in its folder, from their last checkpoints. Stops when all have ended, or
-/// when one has had `most_iterations` iterations.
+/// Trains the runs with these `numbers` together, each from its last checkpoint in its own folder. Stops when all have
+/// ended, or when one has had `most_iterations` iterations.
 fn together(servers: &Servers, base: &Path, task: &str, numbers: &[usize], most_iterations: u64) {
     let directories: Vec<(RunDirectory, Start)> = numbers
         .iter()
@@ -132,7 +132,7 @@ fn training_bytes_do_not_depend_on_the_group(#[values(CART_POLE, PENDULUM, SEEN_
     let base = tempfile::tempdir().expect("a directory");
     together(&one, base.path(), task, &[3, 1, 7, 0], 1);
     together(&connect(&private), base.path(), task, &[2, 6, 4, 5, 8, 9], 1);
-    let expected = &expected[..10]; // the last one has ended after its first iteration
+    let expected = &expected[..10]; // the last run has ended after its first iteration
     assert!(all(base.path(), 10) != expected, "all are stopped before their ends");
     together(&connect(&private), base.path(), task, &[0, 4, 3, 6], u64::MAX);
     together(&one, base.path(), task, &[1, 5, 8], u64::MAX);
@@ -140,8 +140,8 @@ fn training_bytes_do_not_depend_on_the_group(#[values(CART_POLE, PENDULUM, SEEN_
     assert!(all(base.path(), 10) == expected, "resumed in other groups");
 }
 
-/// With an update per episode, counts every kept episode with the maximal number of steps, as the reference does, which
-/// pads episodes to the step limit.
+/// With an update per episode, the schedule counts every kept episode with the full step limit, because the paper's
+/// published code pads episodes to this length.
 #[rstest]
 fn learning_rate_falls_by_episodes_with_update_per_episode(#[values(true, false)] update_per_episode: bool) {
     let private = [server()];

@@ -35,7 +35,7 @@ fn refusal(from: &str, to: &str) -> String {
 #[test]
 fn a_file_expands_to_the_product_of_its_lists() {
     let plan = parse(SMALL).unwrap();
-    // (2 architectures × 6 grid points + 1) configurations × 2 environments × 2 versions.
+    // There are (2 architectures × 6 grid points + 1) configurations × 2 environments × 2 versions.
     let expected = Counts { configurations: 13, trainings: 52, pairs: 156, all_pairs: 312, runs: 2 };
     assert_eq!(plan.counts(), expected);
     assert!(plan.cells.iter().enumerate().all(|(index, cell)| cell.index == index));
@@ -123,7 +123,7 @@ fn an_id_names_a_cell_whatever_else_the_plan_has() {
     assert_eq!(plan.find("104"), None);
 }
 
-/// The tests are the same, whichever version the file lists first.
+/// The order of `test_versions` and of other lists without a meaningful order does not affect cell ids.
 #[test]
 fn the_order_of_a_list_without_order_changes_no_id() {
     let with = |versions: &str| parse(&SMALL.replacen("runs = 2", &format!("runs = 2\ntest_versions = {versions}"), 1));
@@ -328,7 +328,7 @@ fn preset_of_plan_or_table_decides_success_rule() {
     }
 }
 
-/// Cells of the preset "perturb" have the ids that they had before there were presets.
+/// Cells of the preset "perturb" keep their ids from before presets existed.
 #[test]
 fn cells_of_the_usual_preset_keep_their_names() {
     let names = |text: &str| -> Vec<String> { parse(text).unwrap().cells.into_iter().map(|cell| cell.id).collect() };

@@ -1,25 +1,25 @@
-//! Tests of the state machine, with a backend that follows a script and a simulated clock.
+//! Tests of the scheduler, with a simulated clock and a backend that follows a script.
 
 use rstest::rstest;
 use tempfile::TempDir;
 
 use super::*;
 
-/// Four cells.
+/// A plan with four cells.
 const PLAN: &str = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 2
     [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
 
-/// Act of an attempt. Each takes a second.
+/// An action of an attempt in a script. Each takes one simulated second.
 #[derive(Clone, Debug)]
 enum Act {
     Say(CellEvent),
     Wait(u64),
-    /// The result appears.
+    /// The cell's result is written.
     Result,
-    /// A failure is recorded.
+    /// A failure of the cell is written.
     Failure,
     End(CellEvent),
-    /// The cell is given back before it was started.
+    /// The backend hands the cell back without starting it.
     Return,
 }
 use Act::{Failure as Fails, Result as Succeeds, Return, Say, Wait};
@@ -48,16 +48,17 @@ fn done() -> Vec<Act> {
     vec![Succeeds, ends(CellEvent::Done)]
 }
 
-/// Backend that follows a script, which gives the acts of the nth attempt at a cell, n from 1.
+/// A backend that follows a script. `script` returns the actions for a cell and the number of the attempt at it, from
+/// 1.
 struct Fake<'a, const CONVICTS: bool> {
     place: &'a Place,
     script: &'a dyn Fn(usize, usize) -> Vec<Act>,
     grouping: Grouping,
     start: Instant,
     now: Instant,
-    /// The running groups: each cell with its remaining acts.
+    /// The running groups: each cell with its remaining actions.
     running: Vec<Vec<(usize, VecDeque<Act>)>>,
-    /// For each attempt its cell, the time of its start, s, and the number of servers that the cell had lost.
+    /// For each attempt: the cell, the start time in seconds, and the number of servers that the cell had lost before.
     begun: Vec<(usize, u64, usize)>,
     groups: Vec<Vec<usize>>,
     most_at_a_time: usize,
@@ -106,7 +107,7 @@ impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
         for group in groups {
             let mut running = Vec::new();
             for offer in group {
-                // A worker does the same.
+                // A real worker also clears the failure.
                 if let Some(failure) = offer.retry {
                     self.place.folder.cell(self.place.id(offer.cell)).clear_failure_if(failure).unwrap();
                 }
@@ -130,14 +131,14 @@ impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
     }
 }
 
-/// A folder for the plan.
+/// A plan with a temporary folder.
 struct Place {
     _directory: TempDir,
     folder: Folder,
     plan: Plan,
 }
 
-/// Result of a run.
+/// The result of a run, with everything that it reported.
 #[derive(Debug)]
 struct Ran {
     end: Result<Vec<String>, String>,
@@ -146,7 +147,7 @@ struct Ran {
     most_at_a_time: usize,
     notes: Vec<String>,
     statuses: Vec<RunStatus>,
-    /// Cells that were reported as done.
+    /// The ids of the cells that were reported as done.
     told: Vec<String>,
 }
 
@@ -156,7 +157,7 @@ impl Ran {
         (0..4).map(|cell| self.begun.iter().filter(|(begun, ..)| *begun == cell).count()).collect()
     }
 
-    /// Returns the times at which cell 0 was started, s.
+    /// Returns the times at which cell 0 was started, in seconds.
     fn times(&self) -> Vec<u64> {
         self.begun.iter().filter(|(cell, ..)| *cell == 0).map(|(_, time, _)| *time).collect()
     }
@@ -197,7 +198,7 @@ impl Place {
         Ok(failed.iter().map(|&cell| self.id(cell).to_owned()).collect())
     }
 
-    /// Runs to the end, one job at a time.
+    /// Runs the plan to its end, one cell at a time.
     fn run(&self, script: &dyn Fn(usize, usize) -> Vec<Act>) -> Ran {
         self.run_on::<true>(1, false, script)
     }
@@ -211,7 +212,7 @@ impl Place {
         self.run_in::<CONVICTS>(Grouping { max_cells: 1, at_a_time: jobs }, retry_failed, script)
     }
 
-    /// Runs to the end, in groups.
+    /// Runs the plan to its end, in groups.
     fn run_in<const CONVICTS: bool>(
         &self,
         grouping: Grouping,
@@ -295,7 +296,7 @@ fn server_waits_double_and_end() {
     let ran = place.run(&|_, _| vec![lost()]);
     let message = format!("the run cannot go on without a server: {}: gone; finished work is kept", place.id(0));
     assert!(ran.end.as_ref().is_err_and(|error| error.starts_with(&message)), "{:?}", ran.end);
-    // Each loss is reported a second after the start. The pauses are 1, 2, 4 and 8 s.
+    // Each loss is reported one second after the start. The pauses are 1, 2, 4 and 8 s.
     assert_eq!(ran.times(), [0, 2, 5, 10, 19], "at the front of the queue");
     assert_eq!(ran.attempts(), [5, 0, 0, 0]);
     assert_eq!(ran.begun.iter().map(|(.., lost)| *lost).collect::<Vec<_>>(), [0, 1, 2, 3, 4], "for their turns");
@@ -313,7 +314,7 @@ fn full_disk_ends_the_run_without_a_failed_cell() {
     let message = format!("the run cannot go on: {}: no space left; correct this, and resume", place.id(0));
     assert!(ran.end.as_ref().is_err_and(|error| error.starts_with(&message)), "{:?}", ran.end);
     assert!((0..4).all(|cell| !place.folder.cell(place.id(cell)).is_settled(true)), "no cell is blamed");
-    // A disk failure after losses of servers counts as the first in its row.
+    // Lost servers and file faults are counted separately.
     let place = Place::new();
     let ran = place.run(&|cell, attempt| match (cell, attempt) {
         (0, 1..=4) => vec![lost()],
@@ -321,7 +322,7 @@ fn full_disk_ends_the_run_without_a_failed_cell() {
         _ => done(),
     });
     assert_eq!(ran.end, place.finished(&[]));
-    // A cell that makes progress in each attempt may continue.
+    // A cell that makes progress in each attempt may be retried without a limit.
     let place = Place::new();
     let ran = place.run(&|cell, attempt| match (cell, attempt) {
         (0, 1..=7) => vec![saved(100 * attempt as u64), saved(100 * attempt as u64 + 50), full()],
@@ -350,7 +351,7 @@ fn an_earlier_failure_counts_unless_it_is_forgiven() {
     let place = Place::new();
     place.fail(2);
     assert_eq!(place.run(&|_, _| done()).end, place.finished(&[2]));
-    // A retried failure does not count, even if the first attempt loses its server.
+    // The old failure does not count, even if the first new attempt loses its server.
     let ran = place.run_on::<true>(1, true, &|_, attempt| if attempt == 1 { vec![lost()] } else { done() });
     assert_eq!((ran.end, ran.begun.len()), (place.finished(&[]), 2));
 }
@@ -379,7 +380,7 @@ fn a_cell_that_others_work_on_is_waited_for_and_taken_over() {
     let script = |cell, attempt| match (cell, attempt) {
         (1, 1) => vec![ends(CellEvent::Busy)],
         (3, 1) => {
-            // Another process gives up cell 1 while cell 3 runs.
+            // Another process releases cell 1 while cell 3 runs.
             drop(lock.take());
             vec![Wait(30), Succeeds, ends(CellEvent::Done)]
         }
@@ -464,9 +465,10 @@ fn the_status_says_what_is_done_with_each_cell() {
     assert_eq!(running, [1, 2].map(|cell| format!("{}: 1 episode of training", place.id(cell))));
 }
 
-/// Six cells of one kind, in groups of three.
+/// A plan with six cells of one kind.
 const GROUPS: &str = "environments = ['CartPole']\nversions = ['D']\nruns = 6
     [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+/// Groups of three cells, one group at a time.
 const THREES: Grouping = Grouping { max_cells: 3, at_a_time: 1 };
 
 #[test]
@@ -499,7 +501,7 @@ fn what_is_left_is_grouped_anew() {
 #[test]
 fn a_cell_that_kills_its_process_convicts_only_itself() {
     let place = Place::of(GROUPS);
-    // No cell made progress, so the cell that ends the process is not known.
+    // No cell made progress, so it is unknown which cell killed the process.
     let script = |cell, attempt| if cell == 1 || (cell < 3 && attempt == 1) { vec![killed()] } else { done() };
     let ran = place.run_in::<true>(THREES, false, &script);
     assert_eq!(ran.groups, [vec![0, 1, 2], vec![3, 4, 5], vec![0], vec![1], vec![2], vec![1]]);
@@ -511,7 +513,7 @@ fn interrupted_cells_with_progress_stay_together() {
     let place = Place::of(GROUPS);
     let script = |cell, attempt| match (cell, attempt) {
         (0 | 2, 1) => vec![saved(0), saved(50), killed()],
-        (1, 1) => vec![saved(40), Wait(1), killed()], // where it began
+        (1, 1) => vec![saved(40), Wait(1), killed()], // no progress since the start of the attempt
         _ => done(),
     };
     let ran = place.run_in::<true>(THREES, false, &script);
@@ -555,13 +557,13 @@ fn cells_of_a_group_share_the_time_of_its_process() {
         0..3 => done(),
         _ => vec![server(), Wait(9), Succeeds, ends(CellEvent::Done)],
     };
-    // Each cell took 10 s of its process.
+    // Each finished cell took 10 s of process time.
     place.plan.cells[..3].iter().for_each(|cell| {
         place.folder.cell(&cell.id).write_timing(&crate::folder::Timing { seconds: 10.0 }).unwrap();
     });
     let ran = place.run_in::<true>(THREES, false, &script);
     let left = |second: usize| ran.statuses[second].remaining.map(|left| left.time.as_secs());
-    // The second group starts at 2 s, and its first event arrives a second later. After another 6 s, each of its cells has
-    // had 2 s.
+    // The second group starts at 2 s, and its first event arrives one second later. After another 6 s, each of its
+    // three cells has had 2 s of process time.
     assert_eq!((left(2), left(3), left(9)), (Some(30), Some(30), Some(24)));
 }

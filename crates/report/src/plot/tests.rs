@@ -28,7 +28,7 @@ fn a_text_is_broken_where_a_line_ends() {
     assert!((text_width("0000000000") / 10.0 - 0.636 * 14.6).abs() < 0.2, "{}", text_width("0000000000"));
 }
 
-/// A picture of each kind.
+/// Returns an SVG of each kind of picture.
 fn pictures() -> Vec<String> {
     let point = |x: f64| PanelPoint { x, y: x, low: x - 5.0, high: x + 5.0 };
     let panel = PlotPanel {
@@ -88,7 +88,7 @@ fn attribute<'a>(element: &'a str, name: &str) -> Option<&'a str> {
     element.split_once(&format!(" {name}=\""))?.1.split_once('"').map(|(value, _)| value)
 }
 
-/// A picture is printed 85 mm wide, which is 241 pt.
+/// The font sizes hold for pictures that are printed 85 mm wide, which is 241 pt.
 #[test]
 fn texts_have_nine_points_and_stay_inside() {
     for picture in pictures() {
@@ -114,7 +114,7 @@ fn texts_have_nine_points_and_stay_inside() {
     }
 }
 
-/// The colours that `style.css` replaces on a dark page are written in the SVG as its selectors expect.
+/// The SVG writes the colours that `style.css` replaces on a dark page in the form that its selectors expect.
 #[rstest]
 #[case("[fill=\"#FFFFFF\"]", "fill=\"#FFFFFF\"")]
 #[case("[fill=\"#222222\"]", "fill=\"#222222\"")]

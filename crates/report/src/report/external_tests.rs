@@ -10,7 +10,7 @@ use crate::report::{Report, ReportError, ReportInputs};
 const PLAN: &str = "environments = ['CartPole', 'Pendulum']\nruns = 2
     [[algorithm]]\nname = 'ppo'\narchitectures = ['ff', 'rc']";
 
-/// Makes a report of `plan`'s results and of `assessed`, and returns what `of` reads from it.
+/// Makes a report of made-up results of `plan` and of `assessed`, and returns the result of `of` for it.
 fn report<T>(plan: &Plan, assessed: &[ExternalEvaluation], of: impl Fn(&Report<'_>) -> T) -> T {
     let results = fixture::results(plan, |cell| Some(([f64::from(cell.run) + 90.0, 70.0, 50.0], 1.0)));
     let mut selections = results.select();
@@ -36,7 +36,7 @@ fn an_agent_stands_in_the_tables_and_changes_no_other_row() {
     assert!(!cells(&without).is_empty());
     assert_eq!(cells(&with), cells(&without));
     let rows = lines_of(&with, "| PPO (trained elsewhere)");
-    // One row of metrics, and a row for each of two training distributions.
+    // There is one row of metrics, and a row for each of two training distributions.
     assert_eq!(rows.len(), 1 + 2, "{rows:#?}");
     let metrics: Vec<&str> = rows[0].split('|').map(str::trim).collect();
     assert_eq!(metrics[2..5], ["100.0", "–", "–"], "the paper has no such method: {}", rows[0]);

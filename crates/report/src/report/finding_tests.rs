@@ -10,7 +10,7 @@ use super::*;
 use crate::fixture;
 use crate::report::{HeatmapPictures, ReportBundle};
 
-/// Two methods in two environments; the second method fails in one of them.
+/// Returns a plan with two methods.
 fn plan(environments: &str, runs: u32) -> Plan {
     let text = format!(
         "# Does it help?\n# We asked.\n\nenvironments = [{environments}]\nruns = {runs}\npreset = 'paper'\n[[algorithm]]\nname = 'a2c'\n\
@@ -32,7 +32,7 @@ fn with_report<T>(plan: &Plan, make: impl FnOnce(&Report<'_>) -> T) -> T {
     make(&Report::new(&results, &selections, &Recorded::default(), &[]))
 }
 
-/// Returns the texts of `columns` in each row, after those of its environment, algorithm and metric, sorted.
+/// Returns the texts of each row of a table, sorted: environment, algorithm and metric, then `columns`.
 fn written(table: &Table, columns: &[&str]) -> Vec<Vec<String>> {
     let place = |name: &&str| table.columns.iter().position(|column| column.name == *name).unwrap();
     let names = ["environment", "algorithm", "metric"].iter().chain(columns);
@@ -97,8 +97,8 @@ fn too_few_seeds_have_no_interval_and_it_says_so(#[case] runs: u32, #[case] said
     });
 }
 
-/// Returns the finding's sentence for five runs of each method. A row has a method's name, Default, Extrapolation and
-/// the interval of Extrapolation.
+/// Returns the finding's sentence for methods with five runs each. A row has a method's name, Default, Extrapolation
+/// and the interval of Extrapolation. `missing` is the number of further methods without numbers.
 fn said_of(rows: &[(&str, f64, f64, Option<[f64; 2]>)], missing: usize) -> Option<String> {
     said_of_runs(rows, &vec![5; rows.len()], missing)
 }
@@ -179,7 +179,7 @@ fn of_one_run_nothing_is_claimed(#[case] rows: &[(&str, f64, f64)], #[case] runs
     assert_eq!(said_of_runs(&rows, runs, 0).as_deref(), Some(said));
 }
 
-/// Each case has two rows of PPO's rates on D, R and E: trained on D, and trained on R or E. A2C's rates are all 0.
+/// Each case has PPO's rates on D, R and E in two rows: trained on D, and trained on R or E. All rates of A2C are 0.
 #[rstest]
 #[case::by_one([[90.0, 20.0, 0.0], [90.0, 60.0, 2.0]], "CartPole: of 2 methods none extrapolates: each has Extrapolation of 0.0 %. \
     Extrapolation less Default is -90.0 to +0.0 points. Extrapolation is a geometric mean, and 0 in a run where one of its three \

@@ -11,7 +11,8 @@ use crate::plot::svg;
 const PLAN: &str = "environments = ['Pendulum', 'Elsewhere']\nruns = 2
     [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
 
-/// Returns a folder in which every cell has a result, and the heatmap that `heatmap` returns for it.
+/// Returns a folder in which every cell has a result. A cell also has the heatmap that `heatmap` returns for it, if
+/// any.
 fn folder(plan: &Plan, heatmap: impl Fn(&Cell) -> Option<Heatmap>) -> tempfile::TempDir {
     let directory = tempfile::tempdir().unwrap();
     let folder = Folder::new(directory.path());
@@ -45,8 +46,8 @@ fn is_of(cell: &Cell, environment: &str, algorithm: &str) -> bool {
     (cell.config.common.environment.as_str(), cell.method().algorithm.as_str()) == (environment, algorithm)
 }
 
-/// Returns a heatmap whose success is higher near the default and reaches further for wider training distributions. The
-/// second run is 40 points worse.
+/// Returns a heatmap with higher success rates near the default. The region of success is larger for wider training
+/// distributions. The second run is 40 points worse.
 fn trained(cell: &Cell) -> Heatmap {
     let of_run = 20.0 * f64::from(cell.run * 2 - 1);
     let reach = [0.3, 0.5, 0.9][cell.config.common.version as usize];
@@ -60,7 +61,7 @@ fn trained(cell: &Cell) -> Heatmap {
 #[test]
 fn a_picture_is_of_the_mean_over_runs_and_says_how_many() {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
-    // A2C has heatmaps of both runs on D, of the first run on R, and of none on E.
+    // A2C has heatmaps of both runs on D, of the first run on R, and none on E.
     let version = |cell: &Cell| cell.config.common.version;
     let is_there = |cell: &Cell| version(cell) == Version::D || (version(cell) == Version::R && cell.run == 1);
     let made = |cell: &Cell| (is_of(cell, "Pendulum", "a2c") && is_there(cell)).then(|| trained(cell));
@@ -115,7 +116,7 @@ fn returns_use_the_environments_scale() {
     };
     let directory = folder(&plan, |cell| Some(fixture::heatmap(2, |mass, _| (of(cell) + mass, 0.0))));
     let folder = Folder::new(directory.path());
-    // One cell also has a heatmap whose other parameters come from R.
+    // One cell also has a heatmap of another kind: its other parameters are drawn from R.
     let cell = plan.cells.iter().find(|cell| is_of(cell, "Pendulum", "ppo")).unwrap();
     store(&folder, cell, &Heatmap { base: Version::R, ..fixture::heatmap(3, |_, _| (-9000.0, 0.0)) });
     let pictures = pictures(&plan, &folder);
@@ -164,8 +165,8 @@ fn of_an_experiment_without_heatmaps_it_is_said_why() {
     assert_eq!(advice[1], "Heatmaps that wait for the results of their trainings: 18 of 24.");
 }
 
-/// Returns an agent whose policies were tested over mass and length with four episodes a point. `policies` has the
-/// training version of each, and its number of successes among the four.
+/// Returns an agent whose policies were tested on a grid over mass and length, with four episodes per point. `policies`
+/// has each policy's training version and its number of successes among the four episodes.
 fn agent(policies: &[(Version, u32)]) -> ExternalEvaluation {
     let trained_on: Vec<_> = policies.iter().map(|(version, _)| Some(*version)).collect();
     let tested = fixture::assessed("pushes", "Pendulum", &trained_on, [1; 3]);
@@ -203,11 +204,11 @@ fn external_agents_have_heatmap_pictures() {
     assert!(elsewhere[0].caption.contains("2 × 2 points of 4 episodes of each policy, test seed 1."));
     assert!(!elsewhere[0].caption.contains("perturb"), "whose program it was is not known");
 
-    // The same agent without an experiment.
+    // The pictures of an agent are the same without an experiment.
     let mut selections = Vec::new();
     add_assessed(&mut selections, &assessed);
     assert_eq!(heatmap_pictures(&selections, None).unwrap().pictures, elsewhere);
-    // A policy that was tested on other sets has no heatmap.
+    // A policy that was not tested on a grid has no heatmap.
     let mut others = assessed[1].policies()[0].clone();
     others.records.about.tests.iter_mut().for_each(|test| test.axes = None);
     let others = [ExternalEvaluation::new(String::new(), "other".into(), vec![others]).unwrap()];

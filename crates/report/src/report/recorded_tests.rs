@@ -10,7 +10,7 @@ use super::*;
 use crate::fixture;
 use crate::plot::svg;
 
-/// Two methods that are trained on D and R, in two runs.
+/// A plan with two methods, trained on D and R in two runs.
 const PLAN: &str = "
 environments = ['CartPole']
 versions = ['D', 'R']
@@ -22,10 +22,10 @@ architectures = ['ff']
 name = 'ppo'
 architectures = ['ff']
 ";
-/// Episodes of each test: forty in each of ten parts of the parameter's range.
+/// Number of episodes in each test: forty in each of ten bins of the parameter's range.
 const EPISODES: u32 = 400;
 
-/// Returns the pole length of an episode. Lengths of R are 0.25 … 0.75, those of E lie on either side.
+/// Returns the pole length of an episode. Lengths on R are 0.25 … 0.75. Lengths on E are below and above this range.
 fn length(version: Version, index: u32) -> f64 {
     let place = (f64::from(index) + 0.5) / f64::from(EPISODES);
     match version {
@@ -36,8 +36,8 @@ fn length(version: Version, index: u32) -> f64 {
     }
 }
 
-/// Returns an episode. A2C balances a pole of length l for 200 l steps. PPO balances it for 45 steps more in the first
-/// run, and 40 fewer in the second. An episode with 100 steps is a success.
+/// Returns an episode. A2C balances a pole of length l for 200 l steps. PPO balances it for 45 more steps in the first
+/// run, and for 40 fewer steps in the second. An episode of at least 100 steps is a success.
 fn episode(cell: &Cell, version: Version, index: u32) -> EpisodeRecord {
     let length = length(version, index);
     let more = match (cell.config.settings.name(), cell.run) {
@@ -71,7 +71,7 @@ fn records(cell: &Cell) -> Records {
     records
 }
 
-/// Returns results with the success rates of the recorded episodes.
+/// Returns results whose success rates agree with the recorded episodes.
 fn results(plan: &Plan) -> Results<'_> {
     fixture::results(plan, |cell| {
         let records = records(cell);

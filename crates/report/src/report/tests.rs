@@ -20,7 +20,7 @@ architectures = ['rc']
 versions = ['D', 'R']
 ";
 
-/// One method, which is trained on D and on a set of the plan, and tested on D, R, E and two sets.
+/// A plan with one method. It is trained on D and on a parameter set, and tested on D, R, E and two parameter sets.
 const SETS: &str = "
 environments = ['CartPole']
 versions = ['D', 'long']
@@ -57,7 +57,7 @@ fn results(plan: &Plan) -> Results<'_> {
     results
 }
 
-/// Snapshots are named after their files alone, so that the files can move with the module.
+/// Snapshot names contain no module path, so that the files can move with the module.
 #[rstest]
 #[case("text", |report: &Report<'_>| report.text(usize::MAX))]
 #[case("csv", |report: &Report<'_>| {
@@ -148,7 +148,7 @@ fn clean_report_names_rule_seeds_and_selection() {
     }
     let table = |title: &str| report.files().into_iter().find(|table| table.title == title).unwrap();
     let metrics = String::from_utf8(table("metrics.csv").to_csv()).unwrap();
-    // The mean of 13 and 14, the results of the selected configuration with seeds 3 and 4.
+    // 13.5 is the mean of 13 and 14, the results of the selected configuration with seeds 3 and 4.
     assert!(metrics.contains("CartPole,ppo,ff,,Default,2,13.5,0.5"), "{metrics}");
     let selected = String::from_utf8(table("selected.csv").to_csv()).unwrap();
     assert_eq!(selected.matches("\nCartPole,ppo,ff,,D,").count(), 2, "{selected}");
@@ -202,8 +202,8 @@ fn what_is_not_done_is_missing_and_has_no_colour() {
     let entries: Vec<_> =
         with_no_result(&plan, |report| report.tables().flat_map(|table| table.rows.into_iter().flatten()).collect());
     assert!(entries.iter().all(|entry| entry.heat.is_none()));
-    // Three tables of metrics, then the scenarios of three and two training distributions in two environments, then the
-    // interquartile means and optimality gaps.
+    // The summands are: three tables of metrics; scenarios of two environments with three and two training
+    // distributions; interquartile means and optimality gaps.
     let expected = 3 * 2 * 3 + 3 * (3 + 2) * 2 + 2 * 3 * 2;
     assert_eq!(entries.iter().filter(|entry| entry.text == MISSING).count(), expected);
 }
@@ -259,16 +259,16 @@ fn files_tell_two_presets_of_a_method_apart() {
         let selections = results.select();
         let recorded = Recorded::default();
         for file in Report::new(&results, &selections, &recorded, &[]).files() {
-            // In a comparison of two methods, only one of them has another preset, so only one has the column.
+            // In a comparison of two methods, only one has a non-default preset, so only one has the column.
             let columns = file.columns.iter().filter(|column| column.name.ends_with(name)).count();
-            // Reference lines are not compared in pairs.
+            // Reference methods are not compared in pairs.
             let compared = file.columns.iter().any(|column| column.name.starts_with("x_"));
             assert_eq!(columns, usize::from(expected && !(name == "observe" && compared)), "{}", file.title);
         }
     }
 }
 
-/// A browser reads everything after an unclosed rule as part of this rule, without a warning.
+/// A browser would read everything after an unclosed CSS rule as a part of this rule, without a warning.
 #[test]
 fn every_rule_of_the_style_is_closed() {
     let depths: Vec<i32> = super::html::STYLE

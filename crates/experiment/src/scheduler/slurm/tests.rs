@@ -1,4 +1,4 @@
-//! The state machine over jobs, with a simulated clock and fake Slurm commands. Tests with a real Slurm are in
+//! Tests of the Slurm backend with a simulated clock and fake Slurm commands. Tests with a real Slurm are in
 //! `cli/tests/cli/slurm`.
 
 use std::cell::Cell;
@@ -18,7 +18,7 @@ use super::{JobCommand, Jobs, Slurm, SlurmOptions};
 use crate::folder::{Failure, Folder};
 use crate::plan::Plan;
 
-/// Four cells.
+/// A plan with four cells of two kinds.
 const PLAN: &str = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 2
     [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
 
@@ -27,8 +27,9 @@ fn of_one_kind() -> Plan {
     Plan::parse("test", PLAN.replace(", 'Hopper'", "").replace("runs = 2", "runs = 4")).unwrap()
 }
 
-/// Counts submissions, and puts their jobs into `queue`. `hook.sh`, if a test has written it, then knows the script as
-/// $script, the number as $number, and may change results and queue.
+/// The fake `sbatch`. It numbers submissions and adds their jobs to the file `queue`. Then it runs the test's
+/// `hook.sh`, if there is one, which may change results and the queue. In it, $script is the job script and $number the
+/// array's number.
 const SBATCH: &str = r#"
 [ ! -f refusal ] || { cat refusal >&2; exit 1; }
 for argument in "$@"; do
@@ -45,7 +46,7 @@ submission=$(dirname "$script")
 [ ! -f hook.sh ] || . ./hook.sh
 echo $number"#;
 
-/// Options for tests.
+/// Returns options for tests: one cell per job.
 pub(super) fn options() -> SlurmOptions {
     SlurmOptions {
         partition: None,
@@ -72,12 +73,13 @@ struct Fake {
     options: SlurmOptions,
     limit: Duration,
     retry_failed: bool,
-    /// Number of calls of the estimate of costs.
+    /// Number of times that the backend has asked for estimated costs.
     costs: Cell<u32>,
 }
 
-/// Writes a program with a child process. This process must not have it open for writing, because a child that another test
-/// starts at that moment would keep it open, and such a file cannot be executed.
+/// Writes an executable script with the help of a child process. If this process had the file open for writing, a child
+/// process that another test starts at the same moment would inherit the open file, and Linux would refuse to execute
+/// it.
 pub(super) fn install(path: &Path, text: &str) {
     let mut shell = Command::new("sh")
         .args(["-c", "cat >\"$0.new\" && chmod +x \"$0.new\" && mv \"$0.new\" \"$0\""])
@@ -124,7 +126,7 @@ impl Fake {
         Slurm::in_directory(self.bin(), self.limit)
     }
 
-    /// Runs with steps of a second. Calls `watch` for every progress event.
+    /// Runs the scheduler with simulated steps of one second. Calls `watch` for every progress event.
     fn run_with(&self, stop: &StopFlag, watch: &mut dyn FnMut(ProgressEvent<'_>)) -> Result<RunEnd, RunError> {
         let costs = || {
             self.costs.set(self.costs.get() + 1);
@@ -150,7 +152,7 @@ impl Fake {
         self.run_with(&StopFlag::default(), &mut |_| {})
     }
 
-    /// Runs until a note has these words.
+    /// Runs until a note contains these words.
     fn run_until(&self, words: &str) -> Result<RunEnd, RunError> {
         let stop = StopFlag::default();
         let raised = stop.clone();
@@ -218,8 +220,8 @@ fn what_slurm_lost_is_submitted_again() {
     let mut fake = Fake::new();
     (fake.options.cells_per_job, fake.plan) = (None, of_one_kind());
     let ids = fake.ids();
-    // Each cell may take 100 s, so a job has three cells. The first job loses its node after one cell, and the other job
-    // vanishes.
+    // Each cell takes an estimated 100 s, so a job gets three cells. The first job loses its node after one cell, and
+    // the second job vanishes.
     fake.hook(&format!(
         "if [ $number = 1 ]; then done_ {0}; says 0 {0} done; echo \"1|0|NODE_FAIL|NodeDown|n1|$name\" >queue
          else for cells in $(cat \"$submission/cells.txt\"); do done_ $cells; done; fi",
@@ -290,7 +292,7 @@ fn cell_without_progress_is_given_up() {
         "{message}"
     );
     assert_eq!(fake.submissions().len(), 3);
-    // Another call tries again.
+    // A second run tries again.
     fake.hook(&format!("rm queue; done_ {}", ids[1]));
     assert_eq!(fake.run().unwrap(), finished());
     assert_eq!(fake.submissions().len(), 4);
@@ -301,7 +303,7 @@ fn a_training_that_gets_further_each_time_is_not_given_up() {
     let fake = Fake::new();
     let ids = fake.ids();
     ids[1..].iter().for_each(|id| fake.finish(id));
-    // A time limit ends the job five times.
+    // The time limit ends the job five times, each time after a new checkpoint.
     fake.hook(&format!(
         "echo \"$number|0|TIMEOUT|TimeLimit|n1|$name\" >queue
          says 0 {0} training ',\"episodes\":1,\"timesteps\":1,\"saved\":'$number
@@ -320,7 +322,7 @@ fn slurms_refusal_is_shown_and_leaves_nothing_behind() {
     assert_eq!(message, "sbatch refused: sbatch: error: invalid partition specified: x");
     assert!(fake.submissions().is_empty());
 
-    // While jobs are in the queue, the cause of a refusal may be a limit on their number.
+    // While other jobs are in the queue, a limit on their number may be the cause of a refusal.
     fs::remove_file(fake.bin().join("refusal")).unwrap();
     assert_eq!(fake.run_until("submitted 4 cells").unwrap(), stopped(&["1"]));
     fake.plan = Plan::parse("test", PLAN.replace("runs = 2", "runs = 3")).unwrap();
@@ -345,11 +347,11 @@ fn a_silent_slurm_is_no_reason_to_submit_again() {
     assert_eq!(message, "squeue refused: slurm_load_jobs error: Unable to contact slurm controller");
     let silent = "exec sleep 60";
     fake.command("squeue", silent);
-    fake.limit = Duration::from_secs(2); // enough to refuse or to answer, also on a busy machine
+    fake.limit = Duration::from_secs(2); // enough for the fake commands to answer, even on a busy machine
     let message = fake.run().unwrap_err().to_string();
     assert!(message.contains("squeue did not answer within 2 s; is Slurm's controller up?"), "{message}");
 
-    // Slurm stops answering during the run. Results are found all the same.
+    // If Slurm stops answering during the run, results are still found.
     fake.command("squeue", "cat queue");
     let end = fake.run_with(&StopFlag::default(), &mut |report| match report {
         ProgressEvent::Note(sentence) if sentence.contains("is in the queue") => fake.command("squeue", silent),
@@ -383,7 +385,7 @@ fn a_submission_whose_number_nobody_heard_is_found_by_its_name() {
     fake.write("queue", &(0..4).map(line).collect::<String>());
     assert_eq!(fake.run_until("Slurm job 7 is in the queue").unwrap(), stopped(&["7"]));
     assert_eq!(fake.submissions()[0].names.job.as_deref(), Some("7"));
-    // An array with the same name and another number belongs to a deleted folder.
+    // An array with the same name but another number is from a deleted folder, so it is ignored.
     fake.write("queue", &(0..4).map(line).collect::<String>().replace("7|", "8|"));
     assert_eq!(fake.run_until("submitted 4 cells").unwrap(), stopped(&["1"]));
 }

@@ -9,7 +9,7 @@ fn panels(heatmaps: &[Heatmap]) -> HeatmapPanels {
     HeatmapPanels { title, axes, returns, columns: heatmaps.iter().map(column).collect() }
 }
 
-/// Returns the surfaces' paths with rectangles of this width: their colour and the rest of the element.
+/// Returns the heatmaps' SVG paths that have rectangles of this width: the colour and the rest of the element.
 fn surfaces(shown: &str, width: i32) -> Vec<(&str, &str)> {
     let lines = shown.lines().filter_map(|line| line.strip_prefix("<path fill=\"")?.split_once('"'));
     lines.filter(|(_, rest)| rest.contains(&format!("h{width}v"))).collect()
@@ -20,7 +20,7 @@ fn perfect_and_worst_policies_have_the_end_colours() {
     for (figures, colour) in [((-120.0, 100.0), "#FDE725"), ((-1700.0, 0.0), "#440154")] {
         let panels = panels(&[fixture::heatmap(5, |_, _| figures)]);
         let shown = svg(&panels).unwrap();
-        // All points have the same colour, so each of a surface's five lines is one rectangle, as wide as the panel.
+        // All points have the same colour, so each of a heatmap's five rows is one rectangle, as wide as the panel.
         let whole_lines = surfaces(&shown, (panels.size().0 * 4.0).round() as i32);
         assert_eq!(whole_lines.len(), 2, "mean return and success");
         for (got, path) in whole_lines {
@@ -31,7 +31,7 @@ fn perfect_and_worst_policies_have_the_end_colours() {
 
 #[test]
 fn a_point_has_the_colour_of_its_share_of_the_scale() {
-    // On the scale from -1600 to -200, a return of -1250 is a quarter, and -200 the whole.
+    // On the scale from -1600 to -200, a return of -1250 is at a quarter, and -200 at the end.
     let heatmap = fixture::heatmap(2, |mass, length| {
         (if mass < 1.0 { -1250.0 } else { -200.0 }, if length > 1.0 { 75.0 } else { 0.0 })
     });
@@ -65,7 +65,7 @@ fn d_r_e_share_one_scale_and_whole_boxes() {
     assert!(three.frame(2, 0.0).right() <= f64::from(WIDTH) - MARGIN);
     let shown = svg(&three).unwrap();
     for (name, boxes) in [("#C81E1E", 4), ("#FFFFFF", 1)] {
-        // The boxes of six panels and of the legend have four solid sides each.
+        // Each box in six panels and in the legend has four solid sides.
         let lines =
             shown.lines().filter(|line| line.contains("<polyline") && line.contains(&format!("stroke=\"{name}\"")));
         let core = lines.filter(|line| line.contains("stroke-width=\"8\"")).count();
@@ -78,7 +78,8 @@ fn d_r_e_share_one_scale_and_whole_boxes() {
     }
 }
 
-/// Each pixel of a PNG along the sides of a box has the colour of its inner line.
+/// In a PNG, each pixel along the sides of a box has the colour of its inner line, and pixels beside it have the outer
+/// colour.
 #[test]
 fn boxes_are_whole_in_a_png() {
     const SIZE: (u32, u32) = (60, 50);
