@@ -30,7 +30,7 @@ const PROCESS: &str = "/dm_env_rpc.v1.Environment/Process";
 /// The gRPC status code of internal errors.
 const INTERNAL: &str = "13";
 
-/// Opens a session and sends `data` as its body, which consists of framed requests.
+/// Calls the session method with `data` as the body, which should consist of framed requests.
 pub fn requests(data: &[u8]) {
     attack(|socket| exchange(socket, SESSION, data.to_vec()));
 }
@@ -48,7 +48,7 @@ pub fn snapshots(data: &[u8]) {
     attack(|socket| exchange(socket, SESSION, body));
 }
 
-/// Opens a stream of dm_env_rpc and sends `data` as its body.
+/// Calls dm_env_rpc's method with `data` as the body.
 pub fn worlds(data: &[u8]) {
     attack(|socket| exchange(socket, PROCESS, data.to_vec()));
 }
@@ -99,7 +99,7 @@ pub(crate) fn steps(environment: &str, n: usize, count: usize) -> Vec<u8> {
     framed(Request::Step(Step { actions: vec![0; 4 * width * n].into() })).repeat(count)
 }
 
-/// Runs an attack on the server, and checks that the bystander gets the same replies as before any attack.
+/// Runs an attack on the server. Checks that the bystander, another client, gets the same replies as before any attack.
 fn attack<F: AsyncFnOnce(&'static Path) -> Vec<u8>>(attack: F) {
     thread_local! {
         static CLIENT: Runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
@@ -140,7 +140,7 @@ fn socket() -> &'static Path {
     })
 }
 
-/// Returns the bytes that the bystander got before any attack.
+/// Returns the bytes that the bystander (another client) got before any attack.
 fn expected() -> &'static Vec<u8> {
     static EXPECTED: OnceLock<Vec<u8>> = OnceLock::new();
     EXPECTED.get_or_init(|| {
@@ -161,7 +161,7 @@ async fn bystander(socket: &Path) -> Vec<u8> {
     seen
 }
 
-/// Opens a session with this body, and returns the messages of the replies.
+/// Calls the session method with this body of framed requests, and returns the messages of the replies.
 pub(crate) fn replies_to(body: Vec<u8>) -> Vec<Vec<u8>> {
     let runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
     let bytes = runtime.block_on(exchange(socket(), SESSION, body));

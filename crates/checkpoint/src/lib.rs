@@ -116,7 +116,7 @@ pub enum CheckpointError {
         /// The given path.
         path: PathBuf,
     },
-    /// The name is not unique: several policies begin with it or resemble it.
+    /// The given name is not unique: the ids of several policies begin with it or resemble it.
     #[error("`{name}` could be any of these policies in {}, give the name or the path of one: {}", folder.display(), names.join(", "))]
     Several {
         /// The given name.

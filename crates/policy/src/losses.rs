@@ -15,8 +15,8 @@ pub struct Losses {
     /// in stable-baselines3. It is never negative, apart from rounding. OpenAI Baselines logs 1/B Σ_b ½ log² ρ_b, which
     /// is equal to second order. 0 for losses without probability ratios.
     pub approx_kl: f64,
-    /// Share of samples, 0 … 1, whose probability ratio is outside of 1 ± `range`. 0 for losses without probability
-    /// ratios.
+    /// Share of samples, 0 … 1, whose probability ratio is outside of 1 ± [`range`](crate::Surrogate::Clipped). 0 for
+    /// losses without probability ratios.
     pub clip_fraction: f64,
     /// KL(π_old ‖ π), in nats, computed from the distributions. 0 if the distributions of the acting policy are not
     /// given.

@@ -223,7 +223,7 @@ pub struct RewardNormaliser {
     /// `[N]` discounted return R of each environment.
     returns: Vec<f64>,
     moments: RunningMoments,
-    /// Whether R is not reset at the ends of episodes.
+    /// Whether the discounted return R continues across the ends of episodes and trials.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     runs_on: bool,
 }

@@ -6,8 +6,8 @@
 //! DIR/episodes.parquet       the recorded tests of a policy; with several policies episodes-D.parquet and so on
 //! ```
 //!
-//! Every number in a report is computed from the records. The training of an agent is not known here, so it has no
-//! settings.
+//! Every number in a report is computed from the records. The training of an agent is not known here, so the agent has
+//! no settings.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

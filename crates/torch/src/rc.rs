@@ -35,14 +35,14 @@ use crate::error::Result;
 
 /// The indices of weights in the order of [`PolicySpec::layout`].
 struct WeightIndices {
-    /// W_x `[4H, X]`. All weights before it belong to hidden layers.
+    /// The index of W_x `[4H, X]`, the LSTM's weights for x. All weights before it belong to hidden layers.
     input: usize,
-    /// W_h `[4H, H]`.
+    /// The index of W_h `[4H, H]`, the LSTM's recurrent weights.
     recurrent: usize,
-    /// b `[4H]`.
+    /// The index of the LSTM's biases b `[4H]`.
     bias: usize,
-    /// The first weight of the heads: weights and biases of the policy head, then of the value head, then log_std if
-    /// actions are continuous.
+    /// The index of the first weight of the heads: weights and biases of the policy head, then of the value head, then
+    /// log_std if actions are continuous.
     heads: usize,
 }
 
@@ -56,19 +56,19 @@ impl WeightIndices {
 /// The results of the forward pass that the backward pass needs.
 #[derive(Debug)]
 pub(super) struct Tape {
-    /// W_x x + b `[L·M, 4H]`, differentiable through the layers below.
+    /// The part W_x x + b `[L·M, 4H]` of the gates' pre-activations, differentiable through the layers below.
     driven: Tensor,
-    /// h `[L·M, H]`, the input of the heads' graph.
+    /// The LSTM's outputs h `[L·M, H]`, the input of the heads' graph.
     hidden: Tensor,
-    /// σ(i), σ(f), tanh g and σ(o), `[L, M, 4H]`.
+    /// The gates σ(i), σ(f), tanh g and σ(o), `[L, M, 4H]`.
     gates: Tensor,
-    /// c `[L, M, H]`.
+    /// The cell states c `[L, M, H]` after each step.
     cells: Tensor,
-    /// h' `[L, M, H]`: h before the step.
+    /// The outputs h' `[L, M, H]` before each step.
     hidden_before: Tensor,
-    /// c' `[L, M, H]`: c before the step.
+    /// The cell states c' `[L, M, H]` before each step.
     cells_before: Tensor,
-    /// `[L, M, 1]`: 0 at the start of an episode, else 1.
+    /// A mask `[L, M, 1]`: 0 at the start of an episode, else 1.
     keep: Tensor,
 }
 

@@ -85,7 +85,7 @@ pub struct ConditionDifference {
     /// The probability, 0 … 1, that a random policy of x has a higher mean score than a random policy of y.
     pub improvement: f64,
     /// The p-value of the difference: by the t test over pairs, or by Welch's test if policies are not paired. `None`
-    /// if `seeds_95` is.
+    /// if `seeds_95` is `None`.
     pub p: Option<f64>,
     /// The value of `p` after Holm's correction for all differences of the comparison.
     pub p_holm: Option<f64>,

@@ -72,7 +72,8 @@ pub struct RecordedParameter {
     pub name: String,
     /// The unit; "1" if dimensionless.
     pub unit: String,
-    /// The name of the applied quantity that corresponds to this parameter. Empty if the server did not state it.
+    /// The name of the applied quantity that holds this parameter's value in the physics. Empty if the server did not
+    /// state it.
     pub applied: String,
 }
 
@@ -187,7 +188,7 @@ impl RecordsMetadata {
         rule.criterion(self.text_success.as_ref().or(self.success.as_ref()), self.code_success.as_ref())
     }
 
-    /// Sets the success criterion of episodes that are recorded from now on to `rule`.
+    /// Uses `rule` as the success criterion of all episodes that are recorded from now on.
     ///
     /// # Errors
     /// The errors of [`RecordsMetadata::criterion`].

@@ -7,7 +7,7 @@ use perturb_files::{AnyError, FileError, read_if_there, write_atomically};
 use super::{Ending, EpisodeRecord, Records, RecordsMetadata};
 use crate::parquet_file::{ParquetFile, RowGroup, encode, one_group};
 
-/// The name of the file with recorded episodes, in the folder of a test result.
+/// The name of the file with recorded episodes, in the folder that has the test's results.
 pub const FILE: &str = "episodes.parquet";
 /// The name of the Parquet schema.
 const MESSAGE: &str = "episodes";

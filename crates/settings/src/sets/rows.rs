@@ -9,8 +9,8 @@ use crate::value_error::{ValueError, require};
 /// Maximum number of characters of a line that an error message quotes.
 const MAX_QUOTED_LETTERS: usize = 60;
 
-/// Makes a set called `name` from a CSV file. Its header has the names of parameters, and each further row is a
-/// context. Blank lines are ignored.
+/// Makes a set called `name` from a CSV file. Its header has the names of parameters, and each further row has their
+/// values in one context. Blank lines are ignored.
 ///
 /// # Errors
 /// [`ValueError`] with the number of the faulty line.
@@ -68,7 +68,7 @@ fn header(what: &str, line: &str) -> Result<Vec<String>, ValueError> {
     Ok(names)
 }
 
-/// Parses a row into a context. `values` must have the same length as `header`.
+/// Parses a row into a context, the values of the parameters by name. `values` must have the same length as `header`.
 fn context(name: &str, line: u64, header: &[String], values: &StringRecord) -> Result<Context, ValueError> {
     let value = |(parameter, text): (&String, &str)| {
         let number = text.trim().parse::<f64>().ok().filter(|number| number.is_finite());

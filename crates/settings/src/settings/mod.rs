@@ -104,8 +104,8 @@ pub struct Common {
     /// Whether observations are normalised by their running mean and variance (default: `true`).
     pub normalize_observations: bool,
     /// Standard deviation of normally distributed noise that is added to every number of an observation in training,
-    /// after normalisation if there is any, 0 … 100 (default: `0`). Tests have no noise. It is written to files only if
-    /// it is not the default, so that files of older settings do not change.
+    /// after normalisation if there is any, 0 … 100 (default: `0`). Tests have no noise. This setting is written to
+    /// files only if it is not the default, so that files of older settings do not change.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub observation_noise: f64,
     /// Whether rewards are divided by the running standard deviation of the discounted return (default: `true`).
@@ -120,8 +120,8 @@ pub struct Common {
     /// iteration always write a checkpoint.
     pub checkpoint_interval: u64,
     /// A success rate in %, 0 … 100, at which training ends early: after the iteration in which the last 100 ended
-    /// episodes reach it (default: `0`, which is never). Longer training can impair generalisation. It is written to
-    /// files only if it is not the default, so that files of older settings do not change.
+    /// episodes reach it (default: `0`, which is never). Longer training can impair generalisation. This setting is
+    /// written to files only if it is not the default, so that files of older settings do not change.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub stop_at_success: f64,
 }
