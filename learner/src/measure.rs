@@ -98,6 +98,7 @@ pub fn measure(
     })
 }
 
+/// Measures one job: trains the group in the folder `scratch`, then tests one policy. The random policy is only tested.
 fn measure_one(
     servers: &Servers,
     group: &[&Cell],

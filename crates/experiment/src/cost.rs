@@ -29,7 +29,7 @@ pub struct Measurement {
     pub environment: String,
     /// The measured method.
     pub method: Method,
-    /// The number of trainings in the group.
+    /// The number of cells in the group.
     pub cells: usize,
     /// The measured speed.
     pub speed: Speed,
@@ -91,6 +91,7 @@ pub fn benchmark_cells<'a>(plan: &'a Plan, cells: &[usize], grouping: Grouping) 
     chosen.iter().map(group_of).collect()
 }
 
+/// Returns the environment and the method of a cell.
 fn pair(cell: &Cell) -> (&str, Method) {
     (&cell.config.common.environment, cell.method())
 }
@@ -209,7 +210,7 @@ mod tests {
         assert_eq!((of("Hopper", a2c), of("Hopper", rc), of("Hopper", ppo)), (8.0, 16.0, 9.0));
         let limits = [("Hopper", 1000), ("CartPole", 200)].into();
         let total: Estimate = estimates(&plan, &measurements, &limits).into_iter().sum();
-        // 3 runs of 3, 3 and 1 configurations; 100 training episodes each.
+        // There are 3 runs of 3 + 3 + 1 configurations, with 100 training episodes each.
         let steps = 3.0 * 7.0 * 100.0 * (200.0 + 1000.0);
         assert_eq!((total.training_steps, total.testing_steps), (steps, steps * 0.3));
         let cart_pole = 3.0 * 100.0 * 200.0 * (3.0 * 3.0 + 3.0 * 11.0 + 4.0);

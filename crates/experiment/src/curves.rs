@@ -47,19 +47,19 @@ impl std::fmt::Display for BudgetAxis {
     }
 }
 
-/// The curves of all methods in an environment.
+/// The training curves of all methods in one environment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EnvironmentCurves {
     /// The environment's name.
     pub environment: String,
-    /// A curve for each method and training version that has a finished training.
+    /// A curve for each method and training version with a finished training.
     pub curves: Vec<Curve>,
 }
 
 /// The curve of one method that was trained on one version.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Curve {
-    /// The method.
+    /// The method: algorithm, architecture and kind of observation.
     pub method: Method,
     /// The version (D, R, E or R+E) that the policies were trained on.
     pub version: Version,
@@ -97,6 +97,7 @@ struct MonitorEpisode {
 }
 
 impl Curve {
+    /// Computes the curve of a method from the episodes of its runs.
     fn from_runs(method: &Method, version: Version, runs: &[Vec<MonitorEpisode>]) -> Self {
         Self { method: method.clone(), version, lines: BudgetAxis::ALL.map(|footing| line(runs, footing)) }
     }

@@ -19,7 +19,7 @@ pub enum ExportError {
     /// A file of a cell cannot be read.
     #[error(transparent)]
     Folder(#[from] FolderError),
-    /// A result does not follow from its recorded episodes.
+    /// A result contradicts its recorded episodes.
     #[error(transparent)]
     Verify(#[from] VerifyError),
 }

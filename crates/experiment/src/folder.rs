@@ -1,19 +1,19 @@
-//! The folder of an experiment.
+//! Reads and writes the files in the folder of an experiment.
 //!
 //! ```text
-//! DIR/plan.toml              the experiment file
-//! DIR/cells/ID/result.json   appears complete, when all is done
-//! DIR/cells/ID/failure.json  why it failed
-//! DIR/cells/ID/timing.json   how long it took; everything that differs from run to run
-//! DIR/cells/ID/training/     what `perturb train --out` writes; marks/ in it, the policies of earlier moments
-//! DIR/cells/ID/marks/        their recorded episodes
+//! DIR/plan.toml              a copy of the experiment file
+//! DIR/cells/ID/result.json   the cell's result, written last
+//! DIR/cells/ID/failure.json  the reason why the cell failed
+//! DIR/cells/ID/timing.json   the duration of the cell, which differs from run to run
+//! DIR/cells/ID/training/     the output of `perturb train --out`; its subfolder marks/ has intermediate policies
+//! DIR/cells/ID/marks/        the recorded test episodes of intermediate policies
 //! DIR/cells/ID/log.txt       warnings of worker processes
-//! DIR/cells/ID/lock          locked while someone works on the cell
-//! DIR/heatmaps/              what `perturb heatmap DIR` writes
-//! DIR/report/                what `perturb report` writes
+//! DIR/cells/ID/lock          locked while a process works on the cell
+//! DIR/heatmaps/              the output of `perturb heatmap DIR`
+//! DIR/report/                the output of `perturb report`
 //! ```
 //!
-//! Every file appears complete.
+//! Files are written atomically, so a file that exists is complete.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs;
@@ -41,7 +41,7 @@ const MAX_BYTES: u64 = 64 << 20;
 #[derive(Clone, Debug)]
 pub struct Folder {
     path: PathBuf,
-    /// The folder for new heatmaps; `None` if they go into the experiment's folder.
+    /// The folder to which new heatmaps are written; `None` for the experiment's own folder `heatmaps`.
     new_heatmaps: Option<PathBuf>,
 }
 
@@ -65,7 +65,7 @@ pub struct FailureId {
 pub enum CellState {
     /// The cell has a result.
     Done(Box<CellResult>),
-    /// The cell failed.
+    /// The cell failed, and has no result.
     Failed(Failure),
     /// The cell has neither a result nor a failure.
     Missing,
@@ -80,7 +80,7 @@ pub struct CellResult {
     pub format_version: u32,
     /// The id of the cell.
     pub id: String,
-    /// The training.
+    /// The training that made the policy.
     pub training: Training,
     /// Success rate, mean return and mean length by test set: "D", "R", "E", "R+E" or the name of one of the plan's
     /// parameter sets.
@@ -127,10 +127,10 @@ pub struct Training {
     /// The name of the plan's parameter set that the policy was trained on; `None` if it was trained on a version.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub set: Option<String>,
-    /// The method.
+    /// The method: algorithm, architecture and kind of observation.
     #[serde(flatten)]
     pub method: Method,
-    /// Hash of the settings, see [`Cell::configuration`](crate::plan::Cell::configuration).
+    /// A hash of settings and tests, see [`Cell::configuration`](crate::plan::Cell::configuration).
     pub configuration: String,
     /// The number of the run, from 1.
     pub run: u32,
@@ -146,7 +146,7 @@ pub struct Training {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Failure {
-    /// The cell.
+    /// The id of the cell.
     pub id: String,
     /// The error with its causes.
     pub reason: String,
@@ -180,7 +180,7 @@ pub enum FolderError {
     /// The operating system could not read or write a file.
     #[error(transparent)]
     File(#[from] FileError),
-    /// A file is damaged, or a program with another format wrote it.
+    /// A file is damaged, or was written in another format.
     #[error("{} is not understood: {reason}; delete it to run the cell again", path.display())]
     Damaged {
         path: PathBuf,
@@ -258,7 +258,7 @@ impl Folder {
     /// different experiment file.
     ///
     /// # Errors
-    /// [`FileError`].
+    /// [`FileError`] if a file cannot be written.
     pub fn keep_plan(&self, plan: &Plan) -> files::Result<bool> {
         let earlier = files::read_if_there(&self.plan_path())?;
         let same = earlier.as_deref() == Some(plan.text.as_bytes());
@@ -302,7 +302,7 @@ impl Folder {
     /// Returns the identity of every failure record in the folder by cell id, including cells that are in no plan.
     ///
     /// # Errors
-    /// [`FileError`].
+    /// [`FileError`] if the folder cannot be read.
     pub fn failures(&self) -> files::Result<HashMap<String, FailureId>> {
         let places = files::list(&self.path.join("cells"))?.into_iter().map(|path| CellFolder { path });
         let marked = |place: CellFolder| {
@@ -365,7 +365,7 @@ impl CellFolder {
     /// Tries to lock the cell for this process. Returns `None` if another process holds the lock.
     ///
     /// # Errors
-    /// [`FileError`].
+    /// [`FileError`] if the lock file cannot be created.
     pub fn try_lock(&self) -> files::Result<Option<Lock>> {
         files::create_folder(&self.path)?;
         Lock::try_take(&self.path)
@@ -374,15 +374,15 @@ impl CellFolder {
     /// Writes the result atomically.
     ///
     /// # Errors
-    /// [`FileError`].
+    /// [`FileError`] if the file cannot be written.
     pub fn write_result(&self, result: &CellResult) -> files::Result<()> {
         write(&self.path.join("result.json"), result)
     }
 
-    /// Records a failure.
+    /// Writes the failure of the cell.
     ///
     /// # Errors
-    /// [`FileError`].
+    /// [`FileError`] if the file cannot be written.
     pub fn write_failure(&self, failure: &Failure) -> files::Result<()> {
         write(&self.path.join("failure.json"), failure)
     }
@@ -407,7 +407,7 @@ impl CellFolder {
     /// another process has locked the cell.
     ///
     /// # Errors
-    /// [`FileError`].
+    /// [`FileError`] if the files cannot be deleted.
     pub fn clear_failure_if(&self, mark: FailureId) -> files::Result<bool> {
         let lock = self.try_lock()?;
         if lock.is_some() && self.failure_id() == Some(mark) {
@@ -416,10 +416,10 @@ impl CellFolder {
         Ok(lock.is_some())
     }
 
-    /// Records how long the cell took.
+    /// Writes the duration of the cell.
     ///
     /// # Errors
-    /// [`FileError`].
+    /// [`FileError`] if the file cannot be written.
     pub fn write_timing(&self, timing: &Timing) -> files::Result<()> {
         files::write_json(&self.path.join("timing.json"), timing)
     }
@@ -440,7 +440,7 @@ impl CellResult {
     }
 }
 
-/// Reads a JSON file and verifies its checksum, if it has one. Returns `None` if there is no file.
+/// Reads a JSON file, and verifies its checksum if it has one. Returns `None` if the file does not exist.
 pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
     let Some(text) = files::read_plain(path, MAX_BYTES)? else { return Ok(None) };
     let damaged = |reason: String| FolderError::Damaged { path: path.to_owned(), reason };

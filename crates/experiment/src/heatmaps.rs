@@ -32,7 +32,7 @@ const FORMAT_VERSION: u32 = 2;
 pub struct HeatmapPlace<'a> {
     /// The environment's name.
     pub environment: &'a str,
-    /// The method.
+    /// The method: algorithm, architecture and kind of observation.
     pub method: &'a Method,
     /// The training distribution.
     pub trained_on: TrainedOn<'a>,
@@ -42,7 +42,8 @@ pub struct HeatmapPlace<'a> {
     pub selected: Option<Selected<'a>>,
 }
 
-/// `ID-X-Y.json`: describes a heatmap. It depends only on the results, the program and the settings.
+/// The content of `ID-X-Y.json`, which describes a heatmap. It depends only on the cell's result, the program and the
+/// options.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct HeatmapRecord {
     /// The format version of the file.
@@ -160,7 +161,7 @@ impl HeatmapPlace<'_> {
         Ok(Err(missing))
     }
 
-    /// Reads the heatmap at `path`, which has no extension.
+    /// Reads the heatmap whose files are `path` with the extensions `csv` and `json`.
     fn read_at(
         &self,
         path: &Path,
@@ -202,6 +203,7 @@ pub fn heatmap_path(folder: &Folder, cell: &Cell, kind: &HeatmapKind) -> PathBuf
     folder.heatmaps().swap_remove(0).join(heatmap_name(cell, kind))
 }
 
+/// Returns the name of a heatmap's files, without extension.
 fn heatmap_name(cell: &Cell, kind: &HeatmapKind) -> String {
     format!("{}-{kind}", cell.id)
 }
@@ -242,6 +244,7 @@ fn result_checksum(folder: &Folder, cell: &Cell) -> files::Result<Option<String>
     Ok(read_if_there(&folder.cell(&cell.id).path().join("result.json"))?.map(|content| checksum(&content)))
 }
 
+/// Returns the CRC-32C of `content` in hexadecimal.
 fn checksum(content: &[u8]) -> String {
     format!("{:08x}", crc32c::crc32c(content))
 }

@@ -42,6 +42,7 @@ struct Candidates<'a> {
     candidates: Vec<SelectableCell<'a>>,
 }
 
+/// A configuration that can be selected, with the selection tests of its cells.
 struct SelectableCell<'a> {
     configuration: &'a str,
     tests: Vec<SelectionTest>,
@@ -158,6 +159,7 @@ fn key(cell: &Cell, rule: Selection, run: u32) -> (&str, Method, TrainedOn<'_>, 
 }
 
 impl<'a> Candidates<'a> {
+    /// Adds the test of a cell to the candidate with the cell's configuration.
     fn add(&mut self, cell: &'a Cell, test: SelectionTest) {
         if !self.seeds.contains(&test.seed) {
             self.seeds.push(test.seed);
@@ -243,6 +245,7 @@ impl DrawnPolicy<'_> {
     }
 }
 
+/// Returns a random element of `all`.
 fn draw<'t, T>(all: &'t [T], uniform: &mut impl FnMut() -> f64) -> &'t T {
     &all[(uniform() * all.len() as f64) as usize]
 }

@@ -35,7 +35,7 @@ pub struct Results<'a> {
 pub struct MethodResults<'a> {
     /// The environment's name.
     pub environment: &'a str,
-    /// The method.
+    /// The method: algorithm, architecture and kind of observation.
     pub method: Method,
     /// Number of cells of this method and environment, including cells that will be trained after the selection. Cells
     /// that are trained on parameter sets of the plan do not count.
@@ -47,7 +47,7 @@ pub struct MethodResults<'a> {
     pub runs: BTreeMap<u32, SelectedRun<'a>>,
 }
 
-/// The reported policies of a run.
+/// The selected policies of one run.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SelectedRun<'a> {
     /// The selected policy for each training version or set; `None` while there is no result.
@@ -133,7 +133,7 @@ impl<'a> Results<'a> {
         })
     }
 
-    /// Returns the configurations that the tuning cells select.
+    /// Returns the state of all selections among tuning cells, see [`tuned`](crate::tuned).
     pub fn tuned(&self) -> Vec<Tuned<'_>> {
         tuned(self.plan, &self.states)
     }

@@ -100,7 +100,7 @@ impl CellStates for DoneCells<'_> {
 
 /// Two sources, of which the second provides the states of cells that are missing in the first.
 pub struct LayeredStates<'a> {
-    /// The first source.
+    /// The source that is asked first.
     pub first: &'a dyn CellStates,
     /// The source for cells that are missing in the first one; `None` for no second source.
     pub then: Option<&'a dyn CellStates>,
@@ -186,11 +186,13 @@ fn state_of(cell: &Cell, rows: &[&TableRow]) -> Result<CellState, String> {
     })))
 }
 
+/// Returns the test of a row: the name of its set, and its result.
 fn tested(row: &TableRow) -> Result<(String, TestResult), String> {
     let figures = row.tested_on.clone().zip(row.result());
     figures.ok_or_else(|| "a row has neither a test nor a failure".into())
 }
 
+/// Returns the episodes and steps of a row's policy.
 fn counters(row: &TableRow) -> Counters {
     let (episodes, timesteps) = (row.after_episodes.unwrap_or_default(), row.timesteps.unwrap_or_default());
     Counters { episodes, timesteps, ..Counters::default() }

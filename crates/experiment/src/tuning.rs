@@ -21,7 +21,7 @@ use crate::states::CellStates;
 pub struct Tuned<'a> {
     /// The environment's name.
     pub environment: &'a str,
-    /// The method.
+    /// The method: algorithm, architecture and kind of observation.
     pub method: Method,
     /// The training distribution. The selection tests use it too.
     pub trained_on: TrainedOn<'a>,
@@ -135,6 +135,8 @@ impl Plan {
         self.with_chosen(states, true)
     }
 
+    /// Appends the selected cells to the plan. With `stand_ins`, the first candidates take the places of cells that are
+    /// not selected yet.
     fn with_chosen(&self, states: Option<&dyn CellStates>, stand_ins: bool) -> Result<Self, FolderError> {
         let mut plan = self.clone();
         if self.candidates.is_empty() {

@@ -1,4 +1,4 @@
-//! Advantage actor-critic.
+//! Advantage actor-critic (A2C).
 
 use perturb_policy::{CollectUntil, Losses, Objective, Optimiser, Surrogate, UpdateRule};
 use perturb_settings::A2cConfig;
@@ -74,6 +74,7 @@ impl BaseAlgorithm for A2c {
         let mut losses = Losses::default();
         let mut norms = 0.0;
         let mut watch = UpdateWatch::new(&policy.stop, rollouts.len());
+        // Takes one gradient step on each rollout.
         for rollout in rollouts {
             check_rollout(rollout, policy, self.config.n_steps)?;
             let estimated = n_step_returns(&rollout.trajectories()?, gamma, bootstrap_truncation);

@@ -61,7 +61,7 @@ pub struct AlgorithmState {
     pub iterations: u64,
     /// The optimiser's running averages.
     pub optimiser: Vec<NamedArray>,
-    /// The random stream of minibatch orders; PPO only.
+    /// The random stream that draws minibatches; `None` except with PPO.
     pub rng: Option<ChaCha8Rng>,
 }
 

@@ -1,4 +1,4 @@
-//! Proximal policy optimisation.
+//! Proximal policy optimisation (PPO).
 
 use perturb_policy::random::{Purpose, stream, uniform};
 use perturb_policy::{CollectUntil, GradientBatch, Losses, Objective, Optimiser, Surrogate, UpdateRule};
@@ -37,6 +37,7 @@ impl Ppo {
         Ok(Ppo { config, optimiser, rng: stream(seed, Purpose::Minibatches) })
     }
 
+    /// Returns the loss of the configured settings.
     fn objective(&self) -> Objective {
         let PpoConfig { clip_range, clip_range_vf, ent_coef, kl_coef, vf_coef, .. } = self.config;
         Objective {
@@ -82,11 +83,13 @@ impl BaseAlgorithm for Ppo {
         progress_remaining: f64,
     ) -> Result<UpdateStats> {
         let PpoConfig { gamma, gae_lambda, n_epochs, n_minibatches, kl_coef, bootstrap_truncation, .. } = self.config;
+        // Estimates advantages and returns of all rollouts before the first gradient step.
         let mut estimates: Vec<Estimates> = Vec::with_capacity(rollouts.len());
         for rollout in rollouts {
             check_rollout(rollout, policy, self.config.n_steps)?;
             estimates.push(gae(&rollout.trajectories()?, gamma, gae_lambda, bootstrap_truncation));
         }
+        // Prepares a batch for each rollout. The KL penalty also needs the distributions of the policy that acted.
         let mut batches: Vec<(GradientBatch<'_>, Vec<u32>)> = Vec::with_capacity(rollouts.len());
         for (rollout, estimates) in rollouts.iter().zip(&estimates) {
             let mut batch = policy.backend.batch(&rollout.sequences(estimates))?;
@@ -102,6 +105,7 @@ impl BaseAlgorithm for Ppo {
         let objective = self.objective();
         let mut losses = Losses::default();
         let mut norms = 0.0;
+        // Each epoch takes a gradient step on every minibatch of every rollout.
         let mut watch = UpdateWatch::new(&policy.stop, n_epochs * batches.len() * n_minibatches);
         for _ in 0..n_epochs {
             for (batch, sequences) in &mut batches {

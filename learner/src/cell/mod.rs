@@ -65,14 +65,14 @@ enum Fault {
     Files,
     /// The numbers of the training, for example NaN: resuming from its checkpoint would fail in the same way.
     Training,
-    /// Anything else.
+    /// Any other cause.
     Other,
 }
 
 /// A cell to run, with its folder.
 #[derive(Clone, Debug)]
 pub struct CellJob<'a> {
-    /// The cell.
+    /// The cell in the plan.
     pub cell: &'a Cell,
     /// The folder of the cell's files in the experiment's folder.
     pub folder: CellFolder,

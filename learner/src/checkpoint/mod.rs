@@ -93,6 +93,7 @@ impl ResumeState {
         Ok((checkpoint, state))
     }
 
+    /// Encodes the large arrays for the separate file.
     fn encode(&self) -> std::result::Result<Vec<u8>, String> {
         let CollectorState { snapshots, player } = &self.collector;
         let PlayerState { observations, starts, previous_steps, memory, actions: _ } = player;

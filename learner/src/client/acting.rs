@@ -147,7 +147,7 @@ pub fn policy(spec: &PolicySpec, player: &Player) -> proto::Policy {
 pub fn for_server(policy: &proto::Policy, n_envs: usize) -> proto::Policy {
     let mut policy = policy.clone();
     if let Some(rewards) = &mut policy.rewards {
-        rewards.returns = doubles(&vec![0.0; n_envs]); // unused while statistics are frozen
+        rewards.returns = doubles(&vec![0.0; n_envs]); // a test does not update statistics, so these zeros are never used
     }
     policy
 }

@@ -74,6 +74,7 @@ impl Backoff {
         error.is_absence() || ((self.attempts > 0 || self.has_begun) && is_full(error))
     }
 
+    /// Tries to reconnect until it succeeds or the time limit is reached.
     async fn retry(&mut self, servers: &Servers) -> Reconnect {
         let ServerWait { limit, tell } = servers.wait();
         let begun = Instant::now();

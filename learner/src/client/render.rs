@@ -163,6 +163,7 @@ impl<'a> RenderSession<'a> {
         servers.wait_for(part.stream.receive::<A>())
     }
 
+    /// Converts the start of an episode from a reply to the request `A`.
     fn begun_of<A: TypedRequest>(&self, started: Vec<proto::EpisodeStart>) -> Result<BegunEpisode, ClientError> {
         let count = started.len();
         let start = started.into_iter().next().and_then(|start| Some((start.episode?, start.receipt?)));

@@ -63,6 +63,7 @@ impl StepReply {
         }
     }
 
+    /// Resizes the arrays for N environments, and removes ended episodes.
     pub(super) fn resize(&mut self, num_envs: usize, observation_size: usize) {
         self.observations.resize(num_envs * observation_size, 0.0);
         self.rewards.resize(num_envs, 0.0);

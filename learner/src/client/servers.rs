@@ -367,6 +367,7 @@ impl Servers {
         }
     }
 
+    /// Returns the entry `name` of one server's catalogue.
     fn environment_of(&self, connection: &Connection, name: &str) -> Result<proto::Environment, ClientError> {
         let catalogue = self.catalogue_of(connection)?.environments;
         let known = catalogue.iter().map(|environment| (environment.name.as_str(), environment.revision));
@@ -388,6 +389,7 @@ impl Servers {
     }
 }
 
+/// Creates the runtime that drives connections on the thread of the caller.
 fn runtime() -> Result<Runtime, ClientError> {
     Builder::new_current_thread()
         .enable_all()

@@ -169,6 +169,7 @@ impl<'a> Session<'a> {
         self.reset_slot(slot, proto::Reset::default(), observation)
     }
 
+    /// Resets one environment, and writes its first observation `[O]`.
     fn reset_slot(&mut self, slot: usize, request: proto::Reset, observation: &mut [f32]) -> Result<(), ClientError> {
         let Self { servers, parts, .. } = self;
         let Some(part) = parts.iter_mut().find(|part| part.range.contains(&slot)) else { return Ok(()) };

@@ -62,6 +62,8 @@ pub fn audit(
     Ok(retry_on_disconnect(servers, stop, || replay(servers, checkpoint, records, max_episodes, stop, report))?)
 }
 
+/// Replays the chosen episodes. An environment replays its recorded episodes one after another, while other
+/// environments step too.
 fn replay(
     servers: &Servers,
     checkpoint: &Checkpoint,
@@ -123,6 +125,7 @@ struct Replay<'a> {
 }
 
 impl<'a> Replay<'a> {
+    /// Opens `num_envs` environments with the recorded parameters.
     fn open(
         servers: &'a Servers,
         checkpoint: &'a Checkpoint,

@@ -1,4 +1,4 @@
-//! Tests a policy over a grid of two parameters.
+//! Makes heatmaps: tests a policy on a grid of two parameters.
 
 use perturb_files::interrupt::StopFlag;
 use perturb_protocol::disturbance::is_disturbance;
@@ -101,6 +101,7 @@ pub fn heatmap_again(
     Heatmap::from_records(records, axes).ok_or(HeatmapError::NotOfAxes)
 }
 
+/// Returns the axes of two parameters. Returns an error if they are equal, unknown or disturbances.
 fn axes(environment: &proto::Environment, names: &[String; 2]) -> Result<[Axis; 2], HeatmapError> {
     // Disturbances cannot be axes, because they have no range in R and E.
     let ranged = environment.parameters.iter().filter(|parameter| !is_disturbance(&parameter.name));

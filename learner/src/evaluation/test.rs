@@ -58,6 +58,7 @@ impl<'a> Tester<'a> {
         Ok(Self { servers, checkpoint, options, about, environment, policy })
     }
 
+    /// Returns the description of the test in its records.
     fn about(
         environment: &proto::Environment,
         policy: &str,
@@ -113,6 +114,7 @@ impl<'a> Tester<'a> {
         self.recording_for(sets)?.test_recorded(sets, stop, report)
     }
 
+    /// Plays all sets, which have been checked, and returns the records.
     fn test_recorded(
         &self,
         sets: &[TestSet],

@@ -63,7 +63,7 @@ impl Logs {
     /// Creates the log files in `directory`.
     ///
     /// # Errors
-    /// [`FileError`].
+    /// [`FileError`] if a file cannot be created.
     pub fn create(directory: &Path, environment: &str, spec: &EnvironmentSummary, clock: Clock) -> files::Result<Self> {
         let path = directory.join(MONITOR);
         let monitor = Monitor::create(&path, environment, spec, clock).map_err(io("create", &path))?;
@@ -96,10 +96,10 @@ impl Logs {
         Ok(Self { directory: directory.to_owned(), monitor: Monitor::resume(monitor, spec, clock), progress })
     }
 
-    /// Adds an episode to `monitor.csv`.
+    /// Adds the line of an episode to `monitor.csv`. The line is buffered.
     ///
     /// # Errors
-    /// [`FileError`].
+    /// [`FileError`] if the file cannot be written.
     pub fn episode(&mut self, episode: &EndedEpisode) -> files::Result<()> {
         self.monitor.write(episode).map_err(io("write", &self.directory.join(MONITOR)))
     }
@@ -108,7 +108,7 @@ impl Logs {
     /// `monitor.csv`.
     ///
     /// # Errors
-    /// [`FileError`].
+    /// [`FileError`] if a file cannot be written.
     pub fn progress(&mut self, progress: &Progress) -> files::Result<()> {
         self.monitor.flush().map_err(io("write", &self.directory.join(MONITOR)))?;
         self.progress.write(progress).map_err(io("write", &self.directory.join(PROGRESS)))
@@ -117,7 +117,7 @@ impl Logs {
     /// Flushes all logs to the disk, and returns their lengths.
     ///
     /// # Errors
-    /// [`FileError`].
+    /// [`FileError`] if a file cannot be written.
     pub fn sync(&mut self) -> files::Result<LogLengths> {
         let monitor = self.monitor.sync().map_err(io("write", &self.directory.join(MONITOR)))?;
         let [progress, events] = self.progress.sync().map_err(io("write", &self.directory.join(PROGRESS)))?;
@@ -201,7 +201,7 @@ mod tests {
         assert_eq!(lengths.monitor, read(directory.path(), MONITOR).len() as u64, "all that was written");
         let kept = read(directory.path(), MONITOR);
         logs.episode(&episode(2)).unwrap();
-        logs.progress(&Progress::default()).unwrap(); // writes the lines of the iteration
+        logs.progress(&Progress::default()).unwrap(); // also writes the buffered lines of `monitor.csv`
         drop(logs);
         assert!(read(directory.path(), MONITOR).len() > kept.len());
 

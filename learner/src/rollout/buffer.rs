@@ -58,6 +58,7 @@ impl Rollout {
         Self::with_capacity(None, 0, n_envs, observation_size, action_width)
     }
 
+    /// Returns an empty rollout with room for `capacity` steps. `fixed_steps` is T; `None` for complete episodes.
     fn with_capacity(
         fixed_steps: Option<usize>,
         capacity: usize,

@@ -65,6 +65,7 @@ impl DecodedRollout {
     }
 }
 
+/// Decodes an array of 4-byte numbers. `name` names it in the error.
 fn read(out: &mut Vec<f32>, name: &str, bytes: &[u8], number: impl Fn([u8; 4]) -> f32) -> Result<(), String> {
     let (words, rest) = bytes.as_chunks::<4>();
     out.clear();
@@ -72,6 +73,7 @@ fn read(out: &mut Vec<f32>, name: &str, bytes: &[u8], number: impl Fn([u8; 4]) -
     if rest.is_empty() { Ok(()) } else { Err(format!("{} bytes of {name}", bytes.len())) }
 }
 
+/// Decodes an array of flags, one byte each.
 fn flags(out: &mut Vec<bool>, bytes: &[u8]) {
     out.clear();
     out.extend(bytes.iter().map(|&flag| flag != 0));

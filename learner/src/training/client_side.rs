@@ -112,6 +112,7 @@ impl<'a> ClientSide<'a> {
         Ok(())
     }
 
+    /// Returns the lane of the run with this index.
     fn lane(&mut self, index: usize) -> Option<&mut ClientLane> {
         self.lanes.iter_mut().find(|lane| lane.index == index)
     }
@@ -205,6 +206,7 @@ impl ClientLane {
     }
 }
 
+/// Returns the items in order or, if `is_reversed` is set, in reverse order.
 fn in_order<T>(mut items: impl DoubleEndedIterator<Item = T>, is_reversed: bool) -> impl Iterator<Item = T> {
     std::iter::from_fn(move || if is_reversed { items.next_back() } else { items.next() })
 }

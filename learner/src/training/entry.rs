@@ -60,7 +60,7 @@ impl Start {
     pub(super) fn resume_point(directory: &RunDirectory, config: &TrainConfig) -> Result<Self> {
         Ok(match directory.last_checkpoint()? {
             Some((mut checkpoint, state)) => {
-                checkpoint.state.config = config.clone(); // a larger budget may not have been saved yet
+                checkpoint.state.config = config.clone(); // the checkpoint may still have an older, smaller budget
                 Self::Checkpoint(Box::new((checkpoint, state)))
             }
             None => Self::Fresh(Box::new(config.clone())),

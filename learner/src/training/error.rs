@@ -72,7 +72,7 @@ pub enum TrainError {
     Changed {
         /// The environment's name.
         environment: String,
-        /// The property that differs.
+        /// The name of the property that differs, e.g. "revision".
         what: &'static str,
         /// The property's value in training.
         trained: String,
@@ -84,7 +84,7 @@ pub enum TrainError {
     Restore {
         /// The name of the part.
         what: &'static str,
-        /// The reason.
+        /// The underlying error.
         source: Box<TrainError>,
     },
     /// A signal stopped the program while it waited for a lost server.
@@ -106,7 +106,7 @@ pub enum TrainError {
     Failed {
         /// The last checkpoint; `None` if there is none.
         last: Option<LastCheckpoint>,
-        /// The reason.
+        /// The underlying error.
         source: Box<TrainError>,
     },
 }
@@ -187,6 +187,7 @@ impl From<CollectError> for TrainError {
     }
 }
 
+/// Describes the last checkpoint of a failed training, for the error message.
 fn what_is_left(last: Option<&LastCheckpoint>, error: &TrainError) -> String {
     let Some(LastCheckpoint { episodes, run }) = last else { return "there was no checkpoint yet".into() };
     let advice = if let TrainError::Numbers(_) = error { ": resumed, it would fail with the same numbers" } else { "" };

@@ -161,7 +161,7 @@ pub fn train_together(
     train_loop(servers, &mut client_side, runs, stop, report, ended)
 }
 
-/// A run in the training loop.
+/// A training run in the training loop.
 struct Run<'a> {
     /// The index among the runs that were started together.
     index: usize,
@@ -320,6 +320,7 @@ fn finish_iteration(
     Ok(())
 }
 
+/// Returns the run with this index.
 fn find<'r, 'a>(runs: &'r mut [Run<'a>], index: usize) -> Option<&'r mut Run<'a>> {
     runs.iter_mut().find(|run| run.index == index)
 }

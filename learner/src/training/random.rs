@@ -32,6 +32,7 @@ pub(super) fn make(servers: &Servers, entry: &TrainRequest<'_>) -> Result<TrainO
     Ok(TrainOutcome { checkpoint, progress: Progress::default(), signal: None })
 }
 
+/// Returns the checkpoint of the random policy in `environment`.
 fn checkpoint(config: &TrainConfig, environment: &Environment) -> Result<Checkpoint> {
     let Common { normalize_rewards, num_envs, reward_return_runs_on, .. } = config.common;
     let summary = EnvironmentSummary::from_environment(environment).ok_or(TrainError::NoActions)?;
@@ -51,6 +52,7 @@ fn checkpoint(config: &TrainConfig, environment: &Environment) -> Result<Checkpo
     Ok(Checkpoint { state, policy, weights })
 }
 
+/// Returns the weights of the random policy. Returns an error if an action has no finite bounds.
 fn weights(policy: &PolicySpec, environment: &Environment) -> Result<Weights> {
     let channels: &[Channel] = match environment.action.as_ref().and_then(|action| action.kind.as_ref()) {
         Some(Kind::Continuous(continuous)) => &continuous.channels,

@@ -20,7 +20,7 @@ use crate::logging::{Clock, EpisodeFigures, Logs, Progress, TimeShares};
 use crate::policy::{GradientWorkspace, Policy};
 use crate::rollout::{CollectorState, Rollout};
 
-/// Owns a run's policy, algorithm, logs and checkpoint.
+/// Holds the policy, algorithm, rollout, logs and checkpoint of a run.
 pub(super) struct Trainer<'a> {
     pub(super) directory: &'a RunDirectory,
     pub(super) policy: Policy,
@@ -119,6 +119,7 @@ impl Trainer<'_> {
         progress
     }
 
+    /// Updates the policy with its current gradient workspace, see [`Trainer::update`].
     fn update_policy(
         &mut self,
         mut player: Option<&mut Player>,
@@ -146,6 +147,7 @@ impl Trainer<'_> {
         self.shares.waiting += waiting.as_secs_f64();
         self.shares.updating += elapsed.as_secs_f64();
 
+        // EPOpt's selection decides which episodes and steps count as learned.
         let (learned_episodes, learned_steps) = match update.selection {
             Some(selection) => (selection.kept, selection.kept_steps),
             None => (ended, steps),
@@ -179,8 +181,9 @@ impl Trainer<'_> {
     }
 
     /// Returns the remaining share of the training, which falls from 1 to 0. It reaches 0 when the policy has learned
-    /// from the maximum number of steps: the budget's episodes times the step limit. With an update for each episode,
-    /// every episode counts with the full step limit, because the paper's published code pads episodes to this length.
+    /// from the maximum number of steps: the budget's episodes times the step limit. With EPOpt's `update_per_episode`,
+    /// every episode counts as if it had as many steps as the step limit, because the paper's published code pads
+    /// episodes to this length.
     fn progress_remaining(&self) -> f64 {
         let State { config, environment_spec, counters, .. } = &self.checkpoint.state;
         if let Wrapper::Epopt(EpoptConfig { update_per_episode: true, .. }) = config.settings.wrapper {
@@ -275,6 +278,7 @@ impl Trainer<'_> {
         TrainError::Failed { last, source: Box::new(error) }
     }
 
+    /// Returns the progress after an update.
     fn progress(&self, update: UpdateStats) -> Progress {
         let Counters { iterations, timesteps, episodes, generated_episodes, .. } = self.checkpoint.state.counters;
         Progress {

@@ -36,9 +36,9 @@ const GAMMA: f64 = 0.5;
 /// The way in which a task reports that its step limit ended an episode.
 #[derive(Clone, Copy)]
 enum Limit {
-    /// As a truncation.
+    /// The episode is truncated.
     Truncation,
-    /// As a termination, with a bonus added to the reward.
+    /// The episode terminates, and a bonus is added to the reward.
     Termination { bonus: f32 },
 }
 

@@ -140,8 +140,8 @@ fn training_bytes_do_not_depend_on_the_group(#[values(CART_POLE, PENDULUM, SEEN_
     assert!(all(base.path(), 10) == expected, "resumed in other groups");
 }
 
-/// With an update per episode, the schedule counts every kept episode with the full step limit, because the paper's
-/// published code pads episodes to this length.
+/// With `update_per_episode`, the schedule counts every kept episode as if it had as many steps as the step limit,
+/// because the paper's published code pads episodes to this length.
 #[rstest]
 fn learning_rate_falls_by_episodes_with_update_per_episode(#[values(true, false)] update_per_episode: bool) {
     let private = [server()];

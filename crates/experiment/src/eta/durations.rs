@@ -1,4 +1,4 @@
-//! Durations of finished cells.
+//! Mean durations of finished cells.
 
 use std::collections::HashMap;
 

@@ -38,7 +38,7 @@ impl TrainingProgress {
             let share = (1.0 - (-new / RECENT_EPISODES).exp()).max(new / (episodes - self.first_episodes()));
             self.length = Some(self.length.map_or(length, |known| known + share * (length - known)));
         } else {
-            return; // the steps count with the next episode
+            return; // no episode has ended; these steps are counted when the next one ends
         }
         self.last = (episodes, steps);
     }

@@ -1,4 +1,4 @@
-//! The remaining time of an experiment.
+//! Estimates the remaining time of an experiment.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -8,7 +8,7 @@ use perturb_settings::Method;
 use super::durations::CellDurations;
 use crate::plan::Cell;
 
-/// The remaining time of an experiment.
+/// The estimated remaining time of an experiment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RemainingTime {
     /// The estimated time.

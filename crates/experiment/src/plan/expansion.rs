@@ -28,6 +28,7 @@ pub(super) fn expand(file: &File, sets: &BTreeMap<String, TestSet>) -> Result<(V
     Ok((cells, candidates))
 }
 
+/// The state of the expansion of an experiment file.
 struct Expansion<'a> {
     file: &'a File,
     sets: &'a BTreeMap<String, TestSet>,
@@ -37,6 +38,7 @@ struct Expansion<'a> {
 }
 
 impl Expansion<'_> {
+    /// Returns the version or parameter set with this name.
     fn set(&self, name: &str) -> Result<&TestSet, ValueError> {
         self.sets.get(name).ok_or_else(|| {
             let known: Vec<&str> = self.sets.keys().map(String::as_str).collect();
@@ -45,6 +47,7 @@ impl Expansion<'_> {
         })
     }
 
+    /// Adds the cells of a table `[[algorithm]]`.
     fn add_block(&mut self, name: &str, block: &Block) -> Result<()> {
         let file = self.file;
         file.check_block(name, block, self.cells.len())?;
@@ -62,6 +65,8 @@ impl Expansion<'_> {
         Ok(())
     }
 
+    /// Returns the settings of a training. Settings of the grid point override those of the block, which override those
+    /// of the file.
     fn config(
         &self,
         name: &str,
@@ -117,6 +122,7 @@ impl Expansion<'_> {
         self.add_cells(name, &config, trained_on, &tests, (seed, file.runs), tuned_as)
     }
 
+    /// Adds a cell for each run. Run 1 has the seed `seed`, and each further run the next seed.
     fn add_cells(
         &mut self,
         name: &str,

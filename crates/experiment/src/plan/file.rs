@@ -24,9 +24,9 @@ const MAX_CELLS: usize = 1_000_000;
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct File {
-    /// Heading of reports (default: methods and environments).
+    /// Heading of reports (default: a heading with the methods and environments).
     pub(super) title: Option<String>,
-    /// Date of reports, e.g. `2026-11-23`; reports read no clock (default: none).
+    /// Date that reports show, e.g. `2026-11-23` (default: none). Reports never use the current date.
     pub(super) date: Option<toml::value::Datetime>,
     /// Preset that provides default settings: "perturb" or "paper" (default: `"perturb"`).
     #[serde(default, deserialize_with = "preset")]
@@ -40,7 +40,7 @@ pub(super) struct File {
     /// Training distributions: "D", "R", "E", "R+E", or names of `sets` (default: `["D", "R", "E"]`).
     #[serde(default = "all_versions")]
     pub(super) versions: Vec<String>,
-    /// Selection from a grid: "paper" selects by the reported tests, "clean" by separate trainings and episodes
+    /// Rule that selects configurations: "paper" by the reported tests, "clean" by separate trainings and test episodes
     /// (default: `"paper"`).
     #[serde(default, deserialize_with = "selection")]
     pub(super) selection: Selection,
@@ -71,14 +71,14 @@ pub(super) struct File {
     /// environment (default: `"code"` for the preset "paper", otherwise `"text"`).
     #[serde(default)]
     success: SuccessRules,
-    /// Settings of every training.
+    /// Settings of all trainings, by name.
     #[serde(default)]
     pub(super) settings: Table,
-    /// Algorithms: tables `[[algorithm]]`.
+    /// The tables `[[algorithm]]`, each with an algorithm and its settings.
     pub(super) algorithm: Vec<Block>,
 }
 
-/// The success rule of a plan.
+/// The key `success`: a rule, or rules by environment.
 #[derive(Deserialize)]
 #[serde(untagged, expecting = "\"text\", \"code\", or a table of environments with \"text\", \"code\" or thresholds")]
 enum SuccessRules {
@@ -94,20 +94,20 @@ impl Default for SuccessRules {
     }
 }
 
-/// A table `[[algorithm]]`.
+/// A table `[[algorithm]]` of an experiment file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Block {
-    /// Replaces the file's preset.
+    /// Preset of this table (default: the file's preset).
     #[serde(default, deserialize_with = "preset")]
     preset: Option<Preset>,
     /// The algorithm's name, as in `perturb train --algorithm`.
     pub(super) name: String,
     /// Architectures: "ff", "rc" or both. RL² allows only "rc".
     pub(super) architectures: Vec<String>,
-    /// Replaces the file's environments.
+    /// Environments of this table (default: the file's environments).
     environments: Option<Vec<String>>,
-    /// Replaces the file's versions.
+    /// Training distributions of this table (default: the file's versions).
     versions: Option<Vec<String>>,
     /// Settings of these trainings. They override the file's `[settings]`.
     #[serde(default)]
@@ -262,6 +262,7 @@ impl File {
         }
     }
 
+    /// Checks the keys that belong to `selection = "clean"`.
     fn check_selection(&self) -> Result<(), ValueError> {
         for (key, given) in
             [("tuning_runs", self.tuning_runs.map(u64::from)), ("selection_episodes", self.selection_episodes)]

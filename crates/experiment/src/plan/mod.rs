@@ -45,7 +45,7 @@ pub struct Plan {
     pub revisions: BTreeMap<String, u32>,
     /// The rule that selects the reported configurations.
     pub selection: Selection,
-    /// Number of reported repetitions, each with another seed.
+    /// Number of reported runs: repetitions with different seeds.
     pub runs: u32,
     /// Number of tuning runs, which have separate seeds and only select configurations; 0 if the reported tests select.
     pub tuning_runs: u32,
@@ -92,7 +92,7 @@ impl std::str::FromStr for Selection {
 /// The name, in results and records, of the test that selects configurations. No parameter set may have this name.
 pub const SELECTION_TEST: &str = "selection";
 
-/// A training and its tests.
+/// A cell of the experiment: one training and its tests.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cell {
     /// The index in the plan, from 0.
@@ -109,7 +109,7 @@ pub struct Cell {
     pub tuned_as: Option<String>,
     /// The name of the plan's parameter set that the policy is trained on; `None` if it is trained on a version.
     pub set: Option<String>,
-    /// The configuration of the training.
+    /// All settings of the training.
     pub config: TrainConfig,
     /// The tests of the policy.
     pub tests: Tests,
@@ -118,7 +118,7 @@ pub struct Cell {
 /// The tests of a policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Tests {
-    /// Episodes of each test.
+    /// Number of episodes in each test.
     pub episodes: u64,
     /// The test sets: versions in the order D, R, E, R+E, then the plan's parameter sets in the plan's order.
     pub sets: Vec<TestSet>,
@@ -227,6 +227,7 @@ impl Plan {
         Self::expand(text, folder, beside).map_err(|reason| PlanError::Refused { path: path.to_owned(), reason })
     }
 
+    /// Parses `text`, checks it, and expands it to cells.
     fn expand(text: String, folder: &Path, read_beside: &ReadBeside<'_>) -> Result<Self, AnyError> {
         let mut file: File = toml::from_str(&text).map_err(|error| words(&error))?;
         let revisions = file.spell()?;
@@ -346,7 +347,7 @@ impl Cell {
         self.tests.selection.map(|episodes| (set, episodes))
     }
 
-    /// Returns the method.
+    /// Returns the method: algorithm, architecture and kind of observation.
     pub fn method(&self) -> Method {
         self.config.method()
     }

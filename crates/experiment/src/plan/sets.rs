@@ -1,4 +1,4 @@
-//! The tables `[sets.NAME]` of an experiment file.
+//! Reads the parameter sets of an experiment file: its tables `[sets.NAME]`.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -41,6 +41,7 @@ pub(super) fn read(
     Ok(sets)
 }
 
+/// Reads the table of one parameter set.
 fn read_set(
     name: &str,
     table: &Table,

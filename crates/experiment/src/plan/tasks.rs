@@ -1,4 +1,4 @@
-//! The folders of tasks that an experiment file names.
+//! Resolves the task folders that an experiment file names.
 
 use std::path::{Path, PathBuf};
 

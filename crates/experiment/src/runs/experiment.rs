@@ -53,7 +53,7 @@ pub enum CellStatus {
     },
 }
 
-/// The stamps of `result.json` and `failure.json`.
+/// The stamps of `result.json` and `failure.json`; `None` for a missing file.
 type RecordStamps = [Option<Stamp>; 2];
 const RECORDS: [&str; 2] = ["result.json", "failure.json"];
 
@@ -75,6 +75,7 @@ impl ExperimentStatus {
         Self::with(path, Some(root.to_owned()))
     }
 
+    /// Reads the status of an experiment. `within` is the folder that links must not lead out of.
     fn with(path: &Path, within: Option<PathBuf>) -> Result<Self, AnyError> {
         let folder = Folder::new(path);
         let stamp = Stamp::read(&folder.plan_path());
@@ -152,7 +153,8 @@ impl ExperimentStatus {
         CellDurations::read(&self.plan, &self.folder)
     }
 
-    /// Returns "in work", "finished", "with failures" or "broken off".
+    /// Returns the state of the experiment: "in work" if a cell is running, otherwise "with failures" if a cell has
+    /// failed, "finished" if all cells are done, or else "broken off".
     pub fn state(&self) -> &'static str {
         let any = |is: fn(&CellStatus) -> bool| self.cells.iter().any(is);
         match () {
@@ -189,6 +191,8 @@ impl CellStatus {
     }
 }
 
+/// Reads the plan, with the cells that its selection has added so far. With `within`, refuses links that lead out of
+/// this folder, and plans with too many cells.
 fn read_plan(folder: &Folder, within: Option<&Path>) -> Result<Plan, AnyError> {
     let path = folder.require_plan()?;
     if let Some(root) = within {
@@ -225,11 +229,13 @@ fn require_within(folder: &Folder, cell: &Cell, root: &Path) -> Result<(), Strin
     out.map_or(Ok(()), |name| Err(format!("{} is {LEADS_OUT}", place.join(name).display())))
 }
 
+/// Returns the current stamps of a cell's result and failure files.
 fn records(folder: &Folder, cell: &Cell) -> RecordStamps {
     let place = folder.cell(&cell.id);
     RECORDS.map(|name| Stamp::read(&place.path().join(name)))
 }
 
+/// Reads the stamps and the status of a cell.
 fn known(folder: &Folder, cell: &Cell, within: Option<&Path>) -> (RecordStamps, CellStatus) {
     let records = records(folder, cell);
     (records, status(folder, cell, records, within))

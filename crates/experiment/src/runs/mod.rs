@@ -136,7 +136,7 @@ struct FolderSearch {
 }
 
 impl FolderSearch {
-    /// Marks a folder as searched. Returns whether it is new.
+    /// Marks a folder as searched. Returns false if it was already searched, or cannot be read.
     fn is_new(&mut self, path: &Path) -> bool {
         let Ok(metadata) = path.metadata() else { return false };
         let is_new = self.seen.insert((metadata.dev(), metadata.ino()));

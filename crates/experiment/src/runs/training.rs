@@ -85,6 +85,7 @@ impl TrainingStatus {
     }
 }
 
+/// Reads the configuration of a training from its `config.toml`.
 fn read_config(path: &Path) -> Result<TrainConfig, AnyError> {
     let origin = path.display().to_string();
     let table = read_toml(path)?.parse().map_err(|error: toml::de::Error| ConfigError::Syntax {

@@ -90,7 +90,7 @@ impl CellEvent {
         !matches!(self, Self::Server { .. })
     }
 
-    /// Returns whether the event ends an attempt.
+    /// Returns whether the event ends the worker's attempt at the cell, so that no other event of the cell follows.
     pub fn is_last(&self) -> bool {
         !matches!(self, Self::Server { .. } | Self::Training { .. } | Self::Testing { .. })
     }

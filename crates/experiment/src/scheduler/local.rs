@@ -62,6 +62,7 @@ impl<'a> Local<'a> {
         Self { max_seconds, ..self }
     }
 
+    /// Starts a worker process for a group, and sends it its job. Returns `None` for an empty group.
     fn start(&self, group: &[PendingCell]) -> Result<Option<Worker>> {
         let Some(first) = group.first() else { return Ok(None) };
         let cells: Vec<JobCell> =
@@ -73,7 +74,7 @@ impl<'a> Local<'a> {
         let mut command = (self.command)(slot);
         let program = PathBuf::from(command.get_program());
         let mut start = || {
-            // Events go to a file. A pipe would block the worker while nobody reads it.
+            // Events go to a file, because a full pipe would block the worker while nobody reads it.
             let events = temporary_file()?;
             let spawned = command.stdin(Stdio::piped()).stdout(events.try_clone()?).stderr(log.try_clone()?).spawn();
             let failed = |error: std::io::Error| std::io::Error::new(error.kind(), spawn_failure(&error));
@@ -314,7 +315,7 @@ mod tests {
         let (_directory, folder, _) = place();
         let plan = Plan::parse("test", PLAN.replace("runs = 2", "runs = 3")).unwrap();
         let [first, second, third] = [0, 1, 2].map(|cell: usize| plan.cells[cell].id.clone());
-        // The second cell runs until the others are done. The third one loses its first server.
+        // The second cell runs until the others are done. The third cell loses its first server.
         let script = format!(
             r#"case "$id" in
                 {second}) for _ in $(seq 2000); do

@@ -89,7 +89,7 @@ pub trait Backend {
 /// A cell that is waiting to be started.
 #[derive(Clone, Copy, Debug)]
 pub struct PendingCell {
-    /// The index in the plan.
+    /// The index of the cell in the plan.
     pub cell: usize,
     /// The recorded failure that this attempt may delete; `None` if there is none.
     pub retry: Option<FailureId>,
@@ -153,7 +153,7 @@ pub enum RunEnd {
         /// The ids of the failed cells.
         failed: Vec<String>,
     },
-    /// A signal ended the run. The same command resumes it.
+    /// A signal stopped the run. The same command resumes it.
     Stopped {
         /// The signal's number.
         signal: i32,
@@ -175,7 +175,7 @@ pub enum RunError {
     /// The servers have ended.
     #[error("the run cannot go on without a server: {0}; finished work is kept")]
     NoServer(String),
-    /// Files of a cell cannot be read or written.
+    /// Files of a cell repeatedly could not be read or written.
     #[error("the run cannot go on: {0}; correct this, and resume with the same command")]
     FileFault(String),
     /// Several attempts at a cell ended without progress.
@@ -316,6 +316,7 @@ impl<'a> Scheduler<'a> {
             server_wait: Duration::ZERO,
             next_poll: None,
         };
+        // Divides the unfinished cells into groups, and queues them.
         let left: Vec<usize> = (0..plan.cells.len()).filter(|&cell| !scheduler.settled(cell)).collect();
         let groups = plan.groups(&left, scheduler.backend.grouping());
         for (number, group) in groups.into_iter().enumerate() {
@@ -350,6 +351,7 @@ impl<'a> Scheduler<'a> {
         end
     }
 
+    /// Handles an event of a cell: reports it, and updates the cell's state.
     fn on_event(&mut self, cell: usize, event: CellEvent, now: Instant) -> Result<()> {
         let line = EventLine { cell: self.id(cell).to_owned(), event: event.clone() };
         (self.report)(ProgressEvent::Line(&line));
@@ -497,6 +499,8 @@ impl<'a> Scheduler<'a> {
         Ok(())
     }
 
+    /// Offers waiting cells to the backend in groups, at most as many groups as it has free slots. Starts nothing
+    /// during a pause.
     fn begin(&mut self, now: Instant) -> Result<()> {
         let room = self.backend.free_slots();
         if self.paused_until.is_some_and(|end| now < end) {
@@ -536,6 +540,7 @@ impl<'a> Scheduler<'a> {
         Ok(())
     }
 
+    /// Puts a cell at the end of the queue.
     fn wait(&mut self, cell: usize) {
         self.cells[cell].phase = CellPhase::Waiting;
         self.queue.push_back(cell);
@@ -555,6 +560,7 @@ impl<'a> Scheduler<'a> {
         Err(RunError::GaveUp { ids: ids(CellPhase::GivenUp), words })
     }
 
+    /// Returns the current status of the run, for display.
     fn status(&self, now: Instant) -> RunStatus {
         let (doing, at_a_time) = self.backend.load();
         let number = |phase| self.cells.iter().filter(|cell| cell.phase == phase).count();

@@ -152,7 +152,7 @@ struct Ran {
 }
 
 impl Ran {
-    /// Returns the number of attempts at each cell.
+    /// Returns the number of attempts at each of the four cells.
     fn attempts(&self) -> Vec<usize> {
         (0..4).map(|cell| self.begun.iter().filter(|(begun, ..)| *begun == cell).count()).collect()
     }

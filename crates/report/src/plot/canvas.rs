@@ -76,6 +76,7 @@ pub(super) fn wrapped(text: &str, width: f64) -> Vec<String> {
     lines
 }
 
+/// Returns the text style at this scale.
 fn font(scale: u32) -> TextStyle<'static> {
     (FAMILY, TEXT * scale).into_font().color(&INK)
 }
@@ -113,6 +114,7 @@ impl<'a, DB: DrawingBackend> PlotCanvas<'a, DB> {
         self.styled(text, turned.pos(Pos::new(HPos::Center, VPos::Center)), at)
     }
 
+    /// Writes a text with a plotters style.
     fn styled(&self, text: &str, style: TextStyle<'_>, at: CanvasPoint) -> Result<(), PlotError> {
         self.area.draw_text(text, &style, self.at(at)).map_err(drawing)
     }
@@ -144,6 +146,7 @@ impl<'a, DB: DrawingBackend> PlotCanvas<'a, DB> {
         }
     }
 
+    /// Draws a solid line.
     fn whole_line(&self, points: &[CanvasPoint], style: LineStyle) -> Result<(), PlotError> {
         let points: Vec<_> = points.iter().map(|point| self.at(*point)).collect();
         self.area.draw(&PathElement::new(points, self.stroke(style.colour, style.width))).map_err(drawing)

@@ -73,6 +73,7 @@ pub fn draw_curves(curves: &EnvironmentCurves, quantity: CurveQuantity, by: Budg
     }
 }
 
+/// Returns the line of a curve, with its standard deviation as a band.
 fn line(curve: &Curve, quantity: CurveQuantity, by: BudgetAxis, methods: &[Method]) -> PanelLine {
     let point = |point: &CurvePoint| {
         let Summary { mean, std, .. } = quantity.summary(point);

@@ -94,6 +94,7 @@ impl Frame {
     }
 }
 
+/// Returns the ticks, of which those with `has_number` keep their text.
 fn numbered(ticks: &[(f64, String)], has_number: impl Fn(usize) -> bool) -> Vec<(f64, Option<String>)> {
     let of = |(index, (value, number)): (usize, &(f64, String))| (*value, has_number(index).then(|| number.clone()));
     ticks.iter().enumerate().map(of).collect()
@@ -105,6 +106,7 @@ pub(super) fn y_numbers_width(y: &Range<f64>, height: f64) -> f64 {
     frame.y_ticks().iter().map(|(_, number)| text_width(number)).fold(0.0, f64::max) + 6.0
 }
 
+/// Returns the relative position of a value in a range (0 to 1).
 fn share(range: &Range<f64>, value: f64) -> f64 {
     let span = range.end - range.start;
     if span > 0.0 { (value - range.start) / span } else { 0.5 }

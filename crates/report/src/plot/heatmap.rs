@@ -130,6 +130,7 @@ fn most(texts: &[Vec<String>]) -> f64 {
     texts.iter().map(Vec::len).max().unwrap_or(0) as f64
 }
 
+/// Returns the name of an axis with its unit.
 fn label(axis: &Axis) -> String {
     if axis.unit == "1" { axis.name.clone() } else { format!("{}, {}", axis.name, axis.unit) }
 }
@@ -218,6 +219,7 @@ impl HeatmapPanels {
         (places, y + LINE)
     }
 
+    /// Draws the legend at `top`.
     fn key<DB: DrawingBackend>(&self, canvas: &PlotCanvas<'_, DB>, top: f64) -> Result<(), PlotError> {
         for (index, (name, (x, y))) in KEY.into_iter().zip(self.key_places().0).enumerate() {
             let (left, above) = (x, top + y + (LINE - SAMPLE.1) / 2.0);

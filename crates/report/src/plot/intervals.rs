@@ -127,6 +127,7 @@ impl IntervalPlot {
         Frame { left, top, width, height, x: self.x.clone(), y: 0.0..0.0 }
     }
 
+    /// Draws a row at the height `y`: the interval, the number and the second number. A missing number becomes a text.
     fn draw_row<DB: DrawingBackend>(
         &self,
         canvas: &PlotCanvas<'_, DB>,
@@ -158,6 +159,7 @@ impl IntervalPlot {
         entries.map(|(which, text)| (which, text.as_str())).collect()
     }
 
+    /// Draws a legend entry: 0 is a number, 1 an interval, 2 the second number.
     fn draw_entry<DB: DrawingBackend>(
         &self,
         canvas: &PlotCanvas<'_, DB>,
@@ -176,6 +178,7 @@ impl IntervalPlot {
     }
 }
 
+/// Draws an interval with caps at its ends.
 fn draw_interval<DB: DrawingBackend>(
     canvas: &PlotCanvas<'_, DB>,
     [low, high]: [f64; 2],

@@ -176,6 +176,7 @@ impl Panels {
 }
 
 impl PlotPanel {
+    /// Returns the caption and the names of both axes.
     fn clone_names(&self) -> [String; 3] {
         [self.caption.clone(), self.x_name.clone(), self.y_name.clone()]
     }

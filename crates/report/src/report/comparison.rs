@@ -29,6 +29,7 @@ pub(super) fn comparisons_of(assessed: &[ExternalEvaluation]) -> Vec<Environment
     environments.into_iter().filter_map(|environment| comparison_in(environment, assessed)).collect()
 }
 
+/// Compares the agents in one environment. Returns `None` if there are fewer than two, or they cannot be compared.
 fn comparison_in(environment: &str, assessed: &[ExternalEvaluation]) -> Option<EnvironmentComparison> {
     let here = assessed.iter().filter(|one| one.environment() == environment);
     let policies: Vec<(&str, &ExternalPolicy)> =
@@ -60,6 +61,7 @@ impl EnvironmentComparison {
         std::iter::once(self.means_table()).chain(differences).collect()
     }
 
+    /// Returns the table of each condition's mean in each test.
     fn means_table(&self) -> Table {
         let score = match self.comparison.score {
             ComparedScore::Success => "success, %",
@@ -77,6 +79,7 @@ impl EnvironmentComparison {
             .build()
     }
 
+    /// Returns the table of differences between conditions in each test.
     fn differences_table(&self) -> Table {
         let unit = match self.comparison.score {
             ComparedScore::Success => "points",
@@ -100,6 +103,7 @@ impl EnvironmentComparison {
     }
 }
 
+/// Formats an interval; an empty text if there is none.
 fn interval(ends: Option<[f64; 2]>) -> String {
     ends.map_or_else(String::new, |[low, high]| format!("[{:.1}, {:.1}]", low + 0.0, high + 0.0))
 }

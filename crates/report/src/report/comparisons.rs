@@ -127,6 +127,7 @@ impl Report<'_> {
         Some(table)
     }
 
+    /// Returns the file `comparisons.csv`.
     pub(super) fn comparisons_file(&self) -> Table {
         let end = |number: &Bootstrapped, end: usize| {
             number.interval_95.map(|interval| interval[end].to_string()).unwrap_or_default()

@@ -22,6 +22,7 @@ impl Report<'_> {
         files.into_iter().chain(more).collect()
     }
 
+    /// Returns the file `iqm.csv`: interquartile means and optimality gaps over all environments.
     fn iqm_file(&self) -> Table {
         let rows = self.averages.iter().flat_map(|row| Metric::ALL.map(|metric| (row, metric)));
         let lines: Vec<(&MethodMetrics<'_>, Metric)> = rows.collect();
@@ -47,6 +48,7 @@ impl Report<'_> {
         table.build()
     }
 
+    /// Returns the file `scenarios.csv`: success and return in each test.
     fn scenarios_file(&self) -> Table {
         let lines: Vec<_> = self.scenario_rows().into_iter().flat_map(|row| self.tests_of(row)).collect();
         Table::builder("scenarios.csv", &lines)
@@ -64,6 +66,7 @@ impl Report<'_> {
             .build()
     }
 
+    /// Returns the file `selected.csv`: the selected cells.
     fn selected_file(&self) -> Table {
         Table::builder("selected.csv", &self.selected())
             .text("environment", |selected| &selected.result.training.environment)

@@ -35,14 +35,17 @@ impl<'a> Report<'a> {
         self.each_environment().map(|rows| self.finding_picture(rows)).collect()
     }
 
+    /// Returns the rows of each picture at the start of the page.
     fn opening_rows(&self) -> Vec<&[MethodMetrics<'a>]> {
         if self.has_average() { vec![&self.averages] } else { self.each_environment().collect() }
     }
 
+    /// Returns whether there is an average over several environments.
     fn has_average(&self) -> bool {
         self.scope.averaged.len() > 1 && self.averages.iter().any(|row| !row.ours.is_empty())
     }
 
+    /// Returns the rows of each environment.
     fn each_environment(&self) -> impl Iterator<Item = &[MethodMetrics<'a>]> {
         self.metrics.chunk_by(|a, b| a.environment == b.environment)
     }
@@ -59,6 +62,8 @@ impl<'a> Report<'a> {
         format!("Average over {environments}")
     }
 
+    /// Returns the picture of the methods in `rows`, which are all in one environment or all averages. It has a group
+    /// of rows for each metric.
     fn finding_picture(&self, rows: &[MethodMetrics<'_>]) -> Picture {
         let is_average = rows[0].environment == AVERAGE;
         let of = self.finding_of(rows);
@@ -103,6 +108,7 @@ impl<'a> Report<'a> {
         }
     }
 
+    /// Returns a method's row in the group of `metric`.
     fn finding_row(&self, row: &MethodMetrics<'_>, metric: Metric) -> IntervalRow {
         IntervalRow {
             name: row.method.to_string(),
@@ -119,6 +125,7 @@ impl<'a> Report<'a> {
 /// they share the first place and none is called best. Numbers of a single run are marked, and then no method is called
 /// best either. The random policy is left out, because it has learned nothing.
 fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
+    // Ranks the methods by Extrapolation.
     let learned: Vec<_> = rows.iter().filter(|row| !row.method.is_random()).collect();
     let mean = |row: &MethodMetrics<'_>, metric| row.means.get(&metric).copied();
     let both = |row: &MethodMetrics<'_>| Some((mean(row, Metric::Default)?, mean(row, Metric::Extrapolation)?));
@@ -133,6 +140,7 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     }
     let written = |its: &Bootstrapped| format!("{:.1}", its.point);
     let number = written(&extrapolation);
+    // `first` are the best methods: several if their rounded numbers are equal.
     let (first, others) = ranked.split_at(ranked.partition_point(|(.., its)| written(its) == number));
     let some_of_one_run = ranked.iter().any(|(.., its)| its.runs == 1);
     let claimed = if some_of_one_run { "comes out first" } else { "generalises best" };
@@ -145,6 +153,7 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
             listed(&distinct(first.iter().map(|(.., its)| shown(*its)))),
         ),
     };
+    // Compares with the next method by intervals, if both have one.
     let next = others.first().map(|(row, _, its)| {
         let lowest = first.iter().map(|(.., its)| Some(its.interval_95?[0])).reduce(|a, b| Some(a?.min(b?)));
         let intervals = match (lowest.flatten(), its.interval_95) {
@@ -178,6 +187,7 @@ fn zero_sentence<'a, 'm: 'a>(rows: impl Iterator<Item = &'a MethodMetrics<'m>>) 
     format!(" Extrapolation is a geometric mean, and 0 in a run where one of its three is: {}.", methods.join(", "))
 }
 
+/// Formats a mean with its interval, e.g. "8.0 % [6.5, 9.0]". A mean of one run is marked.
 fn shown(mean: Bootstrapped) -> String {
     match mean.interval_95 {
         Some([low, high]) => format!("{:.1} % [{:.1}, {:.1}]", mean.point, low + 0.0, high + 0.0), // no negative zero

@@ -199,6 +199,7 @@ impl<'a> Draft<'a> {
         })
     }
 
+    /// Returns the caption: what the picture shows, its runs, its test seeds and programs.
     fn caption(&self, of: &str, tested: &str) -> String {
         let origins = || self.columns.iter().flat_map(|column| &column.origins);
         let seeds: BTreeSet<u64> = origins().map(|origin| origin.seed).collect();
@@ -226,6 +227,7 @@ impl<'a> Draft<'a> {
 }
 
 impl PictureColumn<'_> {
+    /// Returns the column for drawing.
     fn panel(&self) -> HeatmapColumn {
         let content = self.mean.clone().ok_or_else(|| said(self.missing.iter()));
         HeatmapColumn { caption: format!("trained on {}, {}", self.trained_on, self.runs()), content }
@@ -239,6 +241,7 @@ impl PictureColumn<'_> {
         }
     }
 
+    /// Describes the column's runs, with the reasons for missing heatmaps.
     fn told(&self) -> String {
         let told = format!("{} trained on {}", self.runs(), self.trained_on);
         let why = |(run, why): &(u32, NoHeatmap)| format!("run {run}: {why}");
@@ -286,6 +289,7 @@ fn said<'a>(missing: impl Iterator<Item = &'a (u32, NoHeatmap)>) -> String {
     distinct(missing.map(|(_, why)| why.to_string())).join("; ")
 }
 
+/// Joins items with commas.
 fn listed(items: impl IntoIterator<Item = impl ToString>) -> String {
     items.into_iter().map(|item| item.to_string()).collect::<Vec<_>>().join(", ")
 }

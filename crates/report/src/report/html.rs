@@ -87,6 +87,7 @@ impl ReportBundle<'_> {
         self.report.metrics_tables().into_iter().map(with_figure).collect()
     }
 
+    /// Returns the pictures of training curves: return and success of each environment, over episodes and over steps.
     fn curve_pictures(&self) -> Vec<Picture> {
         let mut pictures = Vec::new();
         for curves in self.curves.iter().filter(|of| !of.curves.is_empty()) {
@@ -147,6 +148,7 @@ fn page(report: &Report<'_>, finding: &[Markup], sections: &[&Section], missing:
     }
 }
 
+/// Renders the head of a page, with the style sheet.
 fn head(title: &str) -> Markup {
     html! {
         head {
@@ -175,6 +177,7 @@ pub fn comparison_page(of: &EnvironmentComparison) -> String {
     page.into_string()
 }
 
+/// Renders a comparison: its verdict, its tables, and a note on the intervals.
 fn comparison_subsection(of: &EnvironmentComparison) -> Subsection {
     let tables = of.tables().into_iter().map(|table| table_subsection(&table, false).content);
     let content = html! {
@@ -202,10 +205,12 @@ fn plan(report: &Report<'_>) -> Markup {
 }
 
 impl Section {
+    /// Returns the HTML id of a subsection.
     fn subsection_id(&self, index: usize) -> String {
         format!("{}-{}", self.id, index + 1)
     }
 
+    /// Renders the section's entry in the list of contents, with links to its subsections.
     fn contents(&self) -> Markup {
         html! {
             li {
@@ -224,6 +229,7 @@ impl Section {
         }
     }
 
+    /// Renders the section.
     fn body(&self) -> Markup {
         html! {
             section id=(self.id) {
@@ -237,6 +243,7 @@ impl Section {
     }
 }
 
+/// Renders a table. With `shaded`, numbers have a background colour, and a line separates methods.
 fn table_subsection(table: &Table, shaded: bool) -> Subsection {
     let groups: Vec<&[Column]> = table.columns.chunk_by(|a, b| a.group == b.group).collect();
     // Whether a column starts a group of columns, except the first group.
@@ -285,6 +292,7 @@ fn table_subsection(table: &Table, shaded: bool) -> Subsection {
     Subsection { title: table.title.clone(), content }
 }
 
+/// Renders an entry of a table. `starts` marks the first column of a group.
 fn cell(entry: &Entry, column: &Column, starts: bool, shaded: bool) -> Markup {
     let style = entry.heat.filter(|_| shaded).map(|percent| {
         let colour = plot::shade(percent / 100.0);
@@ -306,6 +314,7 @@ fn classes(names: &[(&str, bool)]) -> Option<String> {
     (!applying.is_empty()).then(|| applying.join(" "))
 }
 
+/// Renders pictures as subsections, one for each environment. Pictures of an environment must follow each other.
 fn by_environment(pictures: &[Picture]) -> Result<Vec<Subsection>, PlotError> {
     let subsection = |of: &[Picture]| {
         let (title, figures) = (of[0].environment.clone(), figures(of)?);
@@ -321,6 +330,7 @@ fn figures(pictures: &[Picture]) -> Result<Markup, PlotError> {
     Ok(html! { @if !figures.is_empty() { div.figures { @for one in figures { (one) } } } })
 }
 
+/// Renders a picture with its caption, and links to download it as SVG and as CSV.
 fn figure(Picture { file, name, caption, drawing, data, .. }: &Picture) -> Result<Markup, PlotError> {
     let svg = svg(drawing)?;
     Ok(html! {
@@ -344,6 +354,7 @@ fn data_uri(media_type: &str, content: &[u8]) -> String {
     format!("data:{media_type};charset=utf-8,{}", percent_encode(content, ENCODED))
 }
 
+/// Renders notes as a list; nothing if there are none.
 fn list(notes: &[String]) -> Markup {
     html! { @if !notes.is_empty() { ul.missing { @for note in notes { li { (prose(note)) } } } } }
 }

@@ -144,6 +144,7 @@ pub(super) fn or_empty(number: Option<impl ToString>) -> String {
     number.map(|number| number.to_string()).unwrap_or_default()
 }
 
+/// Collects a value for each metric that has one.
 fn known<T>(of: impl Fn(Metric) -> Option<T>) -> BTreeMap<Metric, T> {
     Metric::ALL.into_iter().filter_map(|metric| Some((metric, of(metric)?))).collect()
 }
@@ -168,6 +169,7 @@ fn zeros(selections: &[&MethodResults<'_>]) -> BTreeSet<Scenario> {
     selections.iter().flat_map(|selection| selection.runs.values()).flat_map(of_run).collect()
 }
 
+/// Returns the minimum over all metrics; a missing metric counts as 0.
 fn least(runs: impl Fn(Metric) -> Option<usize>) -> usize {
     Metric::ALL.into_iter().map(|metric| runs(metric).unwrap_or(0)).min().unwrap_or(0)
 }

@@ -26,7 +26,8 @@ pub(super) struct Profile {
     shares: Vec<Bootstrapped>,
 }
 
-/// Returns the profiles of the methods in `averages` by every metric for which a method has an interquartile mean.
+/// Computes the performance profiles: one for each method in `averages` and each of its metrics that has an
+/// interquartile mean.
 pub(super) fn profiles(
     scope: &ReportIndex<'_>,
     selections: &[MethodResults<'_>],
@@ -46,6 +47,7 @@ pub(super) fn profiles(
 }
 
 impl Report<'_> {
+    /// Returns the file `profiles.csv`: the share of runs above each threshold.
     pub(super) fn profiles_file(&self) -> Table {
         let of = |profile| (0..=THRESHOLDS as usize).map(move |threshold| (profile, threshold));
         let lines: Vec<(&Profile, usize)> = self.profiles.iter().flat_map(of).collect();

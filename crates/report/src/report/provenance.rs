@@ -98,6 +98,7 @@ fn rule(plan: &Plan) -> String {
     }
 }
 
+/// Describes the seeds of cells, e.g. "seeds 1 to 5".
 fn seeds<'a>(cells: impl Iterator<Item = &'a Cell>) -> String {
     let seeds: BTreeSet<u64> = cells.map(|cell| cell.config.common.seed).collect();
     match (seeds.first(), seeds.last()) {

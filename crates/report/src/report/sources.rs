@@ -234,6 +234,7 @@ impl StudySource {
         Ok(Some(Self { table, name, path: path.to_owned(), episodes }))
     }
 
+    /// Returns the plan of the study, expanded.
     fn plan(&self) -> Result<Plan, PlanError> {
         self.table.studies.get(&self.name).map_or_else(
             || Ok(Plan::without_cells()), // unreachable: `find` has checked that the table has the study

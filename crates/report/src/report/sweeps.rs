@@ -89,6 +89,7 @@ pub(super) fn over_parameters<'a>(
 }
 
 impl Report<'_> {
+    /// Returns the file `parameters.csv`: success in each bin of each parameter.
     pub(super) fn parameters_file(&self) -> Table {
         Table::builder("parameters.csv", &self.over_parameters)
             .text("environment", |row| row.environment)
@@ -126,6 +127,7 @@ impl Report<'_> {
         pictures
     }
 
+    /// Returns the picture of an environment and a training distribution. `rows` are all its points.
     fn parameter_picture(&self, environment: &str, trained_on: TrainedOn<'_>, rows: &[&SweepPoint<'_>]) -> Picture {
         let trained = match trained_on {
             TrainedOn::Unknown => "whose training's parameters are not known".to_owned(),

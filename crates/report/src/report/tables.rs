@@ -30,6 +30,7 @@ impl Report<'_> {
             .collect()
     }
 
+    /// Returns a table of metrics with a row for each method.
     fn metrics_table(&self, title: String, rows: &[MethodMetrics<'_>]) -> Table {
         let mut table = Table::builder(title, rows).text("method", |row| &row.method);
         for metric in Metric::ALL {
@@ -112,12 +113,14 @@ impl Report<'_> {
         self.scope.tested_on.iter().copied().filter(is_there).map(|name| (row, train, name)).collect()
     }
 
+    /// Formats a number of runs. Adds the plan's number if it is higher.
     fn runs(&self, method: &Method, runs: usize) -> String {
         let all = self.plan.runs;
         if method.external || runs == all as usize { runs.to_string() } else { format!("{runs} of {all}") }
     }
 }
 
+/// Returns the text of `shown`, or `otherwise` if it is `None`.
 fn or(otherwise: &str, shown: Option<impl ToString>) -> Entry {
     shown.map_or_else(|| otherwise.to_owned(), |shown| shown.to_string()).into()
 }

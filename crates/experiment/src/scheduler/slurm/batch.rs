@@ -19,7 +19,7 @@ pub(super) enum JobSize {
 /// A cell to submit, with its estimated duration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct CellLoad {
-    /// The index in the plan.
+    /// The index of the cell in the plan.
     pub(super) cell: usize,
     /// The estimated duration in seconds.
     pub(super) seconds: f64,
@@ -42,6 +42,7 @@ pub(super) fn batches(groups: &[Vec<CellLoad>], mut size: JobSize, max_jobs: usi
     }
 }
 
+/// Divides the cells of one group into jobs of at most `size`, in order.
 fn cut(group: &[CellLoad], size: JobSize) -> Vec<Vec<usize>> {
     let mut jobs: Vec<Vec<usize>> = Vec::new();
     let mut filling = 0.0;

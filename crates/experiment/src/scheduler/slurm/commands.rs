@@ -107,7 +107,7 @@ impl Slurm {
     ) -> Result<String, SlurmError> {
         let program = self.directory.as_ref().map_or_else(|| PathBuf::from(name), |directory| directory.join(name));
         let failed = |source| SlurmError::System { program: name, source };
-        // Output goes to files. Pipes would block the command while nobody reads them.
+        // Output goes to files, because a full pipe would block the command while nobody reads it.
         let (mut output, mut errors) = (temporary_file().map_err(failed)?, temporary_file().map_err(failed)?);
         let mut command = Command::new(program);
         command.args(arguments).stdin(Stdio::null());
@@ -152,6 +152,7 @@ fn content(file: &mut File) -> std::io::Result<String> {
     Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
+/// Returns the arguments of `sbatch` for a submission.
 fn sbatch_arguments(submission: &Submission, options: &SlurmOptions) -> Result<Vec<String>, OptionError> {
     let limit = options.array_limit.map_or_else(String::new, |limit| format!("%{limit}"));
     let path = text_of(&submission.path)?;
@@ -183,6 +184,7 @@ pub(super) struct QueueAnswer {
 }
 
 impl QueueAnswer {
+    /// Parses the output of squeue. Separates jobs from other lines.
     fn parse(text: &str) -> Result<Self, SlurmError> {
         let mut answer = Self::default();
         for line in text.lines().map(str::trim).filter(|line| !line.is_empty()) {
@@ -196,6 +198,7 @@ impl QueueAnswer {
     }
 }
 
+/// Parses a line of squeue in the format [`FIELDS`].
 fn parse_job(line: &str) -> Result<QueuedJob, SlurmError> {
     let fields: Vec<&str> = line.trim().split(SEPARATOR).map(str::trim).collect();
     let [array, index, state, reason, node, name] = fields[..] else {

@@ -1,4 +1,4 @@
-//! A job in Slurm's queue.
+//! The entry of a job in Slurm's queue.
 
 /// States of jobs that have ended and will not run again. A job in any other state is still in the queue.
 const ENDED: [&str; 10] = [
@@ -17,7 +17,7 @@ const ENDED: [&str; 10] = [
 /// A job of an array, as squeue lists it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct QueuedJob {
-    /// The array's number.
+    /// The number of the job's array.
     pub array: String,
     /// The job's index in the array.
     pub index: usize,
@@ -27,7 +27,7 @@ pub struct QueuedJob {
     pub reason: String,
     /// The node that runs or ran the job; empty while the job waits.
     pub node: String,
-    /// The array's name.
+    /// The name of the job's array.
     pub name: String,
 }
 

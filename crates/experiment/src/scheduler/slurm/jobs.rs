@@ -238,6 +238,7 @@ impl<'a> Jobs<'a> {
         Err(SlurmError::Cancelled { arrays, missing: missing.len() }.into())
     }
 
+    /// Tells the user which cells left the queue without a result, with the states of their jobs.
     fn say_lost(&mut self, cells: &[usize]) {
         let mut how =
             distinct(cells.iter().map(|&cell| self.end_of(cell)).map(|(job, state)| format!("{job} {state}")));
@@ -314,6 +315,7 @@ impl<'a> Jobs<'a> {
         Ok(Vec::new())
     }
 
+    /// Returns the maximum size of a job. An estimated duration is at most half of the time limit.
     fn size(&self) -> JobSize {
         let limit = self.options.time.as_ref().map_or(f64::INFINITY, |limit| limit.seconds() as f64 / 2.0);
         match self.options.cells_per_job {
@@ -337,6 +339,7 @@ impl<'a> Jobs<'a> {
         Ok(groups.iter().map(|group| group.iter().map(load).collect()).collect())
     }
 
+    /// Returns the jobs that are running or waiting.
     fn live(&self) -> impl Iterator<Item = &QueuedJob> {
         self.queue.iter().filter(|job| job.is_live())
     }

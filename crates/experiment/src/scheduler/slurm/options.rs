@@ -98,7 +98,7 @@ pub(super) fn text_of(path: &Path) -> Result<&str, OptionError> {
     if !path.is_absolute() {
         return Err(refuse("it does not begin with /"));
     }
-    // Slurm reads a backslash in the name of a log as the start of literal text.
+    // In the name of a log file, Slurm gives a backslash a special meaning.
     if text.contains(|character: char| character.is_control() || character == '\\') {
         return Err(refuse("it has a control character or a backslash"));
     }

@@ -146,7 +146,7 @@ mod tests {
         let plan = Plan::parse("test", plan.into()).unwrap();
         let script = |_: &Path| Ok("#!/bin/sh\n".to_owned());
         let mut first = create(&folder, &plan, jobs(&[&["a", "b"], &["c"]]), &script).unwrap();
-        // The preparation of this submission was interrupted. Its number is not used again.
+        // The preparation of submission 2 was interrupted. Its number is not used again.
         fs::create_dir(super::directory(&folder).join("2")).unwrap();
         let third = create(&folder, &plan, jobs(&[&["d"]]), &script).unwrap();
         assert_eq!(third.number, 3);

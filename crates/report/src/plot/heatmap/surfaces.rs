@@ -4,8 +4,8 @@
 
 use std::collections::BTreeMap;
 
-/// Replaces each run of successive filled rectangles in `svg` by a path for each colour. The rectangles of a run must
-/// not overlap.
+/// Merges each sequence of successive filled rectangles in `svg` into one path per colour. The rectangles of a sequence
+/// must not overlap.
 pub(super) fn as_paths(svg: &str) -> String {
     let mut shown = String::new();
     let mut surface: BTreeMap<&str, String> = BTreeMap::new();

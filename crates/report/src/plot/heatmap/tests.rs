@@ -51,7 +51,7 @@ fn a_point_has_the_colour_of_its_share_of_the_scale() {
     // Small masses are on the left.
     assert!(path_of(0.25, half).unwrap().contains(&format!("M{left} ")));
     assert!(!path_of(1.0, half).unwrap().contains(&format!("M{left} ")));
-    // Great lengths are at the top, over the whole width of the panel.
+    // Large lengths are at the top, over the whole width of the panel.
     assert_eq!(path_of(0.75, 2 * half).unwrap().matches('M').count(), 1);
 }
 
