@@ -102,7 +102,7 @@ impl CellStates for DoneCells<'_> {
 pub struct LayeredStates<'a> {
     /// The source that is asked first.
     pub first: &'a dyn CellStates,
-    /// The source for cells that are missing in the first one; `None` for no second source.
+    /// The source of cells that are missing in the first source, if there is a second one.
     pub then: Option<&'a dyn CellStates>,
 }
 

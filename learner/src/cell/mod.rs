@@ -57,13 +57,14 @@ impl CellError {
 /// The class of a failure's cause. It decides whether the failure is recorded, and how the cell is tried again.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Fault {
-    /// The server, or the connection to it.
+    /// The server or the connection to it has failed.
     Server,
     /// The server has no room for this many environments.
     Room,
     /// A file could not be read or written.
     Files,
-    /// The numbers of the training, for example NaN: resuming from its checkpoint would fail in the same way.
+    /// The training or its policy has numbers that are not valid, for example NaN. Resuming from the checkpoint would
+    /// fail in the same way.
     Training,
     /// Any other cause.
     Other,
