@@ -146,6 +146,7 @@ fn state_of(cell: &Cell, rows: &[&TableRow]) -> Result<CellState, String> {
         let (id, reason, commit) = (cell.id.clone(), reason.clone(), commit.clone());
         return Ok(CellState::Failed(Failure { id, reason, commit, requires_restart: true }));
     }
+    // The rows of the final policy are the last ones with the same number of episodes and without a repeated test set.
     let first_of_final = rows.iter().enumerate().rposition(|(place, row)| {
         let repeats = rows[place + 1..].iter().any(|later| later.tested_on == row.tested_on);
         row.after_episodes != last.after_episodes || repeats

@@ -45,6 +45,7 @@ pub(super) fn tested(
             records => records.map(Some),
         }
     };
+    // Test the intermediate policies, saved after given numbers of training episodes (marks).
     let mut of_marks = BTreeMap::new();
     for &mark in marks {
         let kept = Checkpoint::load(&mark_in(&folder.training(), mark)).map_err(TrainError::from)?;
@@ -55,6 +56,7 @@ pub(super) fn tested(
         let agreement = records.agreement();
         of_marks.insert(mark, IntermediateEvaluation { counters: kept.state.counters, results, agreement });
     }
+    // Test the final policy. If configurations are selected by a separate test, it has its own episodes.
     let Some(mut records) = test(&checkpoint, sets, episodes, false, "")? else { return Ok(None) };
     if let Some((set, episodes)) = selection {
         let Some(selecting) = test(&checkpoint, &[set], episodes, true, "")? else { return Ok(None) };
@@ -118,6 +120,7 @@ fn parameters(parameters: &Parameters) -> String {
 /// TASK for the folder of a task that is not built in.
 fn command(cell: &Cell) -> String {
     let common = &cell.config.common;
+    // The command of the training: the main settings have flags, all others are passed with `--set`.
     let mut text = format!(
         "perturb train --out RUN --env {} --version {} --algorithm {} --architecture {} --episodes {} --seed {}",
         common.environment,
@@ -137,6 +140,7 @@ fn command(cell: &Cell) -> String {
         let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
         let _ = write!(text, " --set {key}={value}"); // writing to a String cannot fail
     }
+    // The commands of the tests: one for all sets that are plain versions, then one for each other set.
     let Tests { episodes, sets, success, .. } = &cell.tests;
     let success = success.as_ref().map(|threshold| format!(" --success {threshold}")).unwrap_or_default();
     let mut evaluate = |how: String, episodes: u64| {

@@ -80,12 +80,15 @@ impl<'a> ServerSide<'a> {
         for (index, entry) in entries {
             let config = entry.start.config();
             let rollouts = config.rollouts();
+            // The learner chooses the actions where it adds observation noise, and where several trainings with short
+            // rollouts share each message.
             if rollouts == CollectionMode::Noisy || (!is_one && rollouts != CollectionMode::Long) {
                 others.push((index, entry));
                 continue;
             }
             let mut observations = Vec::new();
             let mut session = Session::open(servers, &options(config), &mut observations)?;
+            // A server chooses actions only if it has all environments of the training.
             if !session.plays_together() {
                 others.push((index, entry));
                 continue;

@@ -152,6 +152,7 @@ impl File {
     /// request, by environment. Keeps names of environments that are not in the paper as written, because only servers
     /// know them.
     pub(super) fn spell(&mut self) -> Result<BTreeMap<String, u32>, AnyError> {
+        // Names of settings.
         self.settings = spelled("[settings]", std::mem::take(&mut self.settings))?;
         for (index, block) in self.algorithm.iter_mut().enumerate() {
             let name = format!("[[algorithm]] {} ({})", index + 1, block.name);
@@ -159,6 +160,7 @@ impl File {
             block.settings = spelled(&place("settings"), std::mem::take(&mut block.settings))?;
             block.grid = spelled(&place("grid"), std::mem::take(&mut block.grid))?;
         }
+        // Requested revisions. All names of an environment must request the same one.
         let mut revisions = BTreeMap::new();
         let blocks = || self.algorithm.iter().flat_map(|block| block.environments.iter().flatten());
         for written in self.environments.iter().chain(blocks()) {
@@ -168,6 +170,7 @@ impl File {
             let expected = format!("as above, perturb/{name}-v{first}");
             require(first == revision, "environments", format!("`{written}`"), expected)?;
         }
+        // Names of environments and versions.
         let spell_environments =
             |names: &mut Vec<String>| names.iter_mut().for_each(|name| *name = environment(name).0);
         let spell_versions = |names: &mut Vec<String>| {

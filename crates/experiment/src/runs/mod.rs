@@ -84,6 +84,7 @@ pub fn places(folder: &Path, most: usize, within: Option<&Path>) -> files::Resul
     let mut left = vec![folder.to_owned()];
     files::require_folder(folder)?;
     loop {
+        // Follow a symbolic link only when no other folders are left.
         let Some(path) = left.pop() else {
             let Some(link) = search.links.pop_front() else { break };
             let parent = link.parent().unwrap_or(folder);
@@ -104,6 +105,7 @@ pub fn places(folder: &Path, most: usize, within: Option<&Path>) -> files::Resul
             found.more = true;
             break;
         }
+        // A run is not searched for further runs. Any other folder is.
         if let Some(kind) = RunKind::detect(&path) {
             found.runs.push(RunFolder { path, kind });
             continue;

@@ -382,6 +382,7 @@ impl<'a> Scheduler<'a> {
             CellEvent::Refused { reason } => return Err(RunError::Refused(reason)),
             CellEvent::Failed { reason } => self.record_failure(cell, reason)?,
             CellEvent::LostServer { .. } => {
+                // A connection that lasted starts a new count of losses in a row.
                 if tracked.served.is_some_and(|since| now - since >= STABLE_CONNECTION) {
                     (tracked.lost_in_a_row, tracked.waited) = (0, Duration::ZERO);
                 }
@@ -400,6 +401,7 @@ impl<'a> Scheduler<'a> {
                 self.pause(cell, now + pause);
             }
             CellEvent::FileFault { .. } => {
+                // A checkpoint since the last fault starts a new count of faults in a row.
                 if tracked.saved_before.is_some_and(|before| tracked.saved > before) {
                     tracked.faults_in_a_row = 0;
                 }
@@ -411,6 +413,8 @@ impl<'a> Scheduler<'a> {
                 self.pause(cell, now + pause);
             }
             end => {
+                // Any other end, such as a crash. If the attempt saved no checkpoint, the next attempt runs the cell
+                // alone.
                 tracked.attempts += 1;
                 tracked.alone = tracked.saved_before.is_none_or(|before| tracked.saved <= before);
                 if tracked.attempts < MAX_ATTEMPTS {
@@ -508,6 +512,7 @@ impl<'a> Scheduler<'a> {
         }
         let mut offers: Vec<Vec<PendingCell>> = Vec::new();
         let mut places: HashMap<usize, usize> = HashMap::new();
+        // Cells of the same group are offered together, except cells that must run alone.
         for cell in self.queue.clone() {
             let Tracked { retryable: retry, group, alone, lost_servers, .. } = self.cells[cell];
             let place = places.get(&group).copied().filter(|_| !alone);
@@ -529,6 +534,7 @@ impl<'a> Scheduler<'a> {
         }
         offers.iter_mut().for_each(|group| group.sort_by_key(|offer| offer.cell));
         if !offers.is_empty() {
+            // The backend returns the cells that it has started; the others stay in the queue.
             for cell in self.backend.begin(&offers)? {
                 let tracked = &mut self.cells[cell];
                 tracked.phase = CellPhase::Running;

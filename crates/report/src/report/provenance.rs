@@ -28,6 +28,7 @@ pub(super) fn sentences(
 ) -> Vec<String> {
     let (cells, done, failed) = (results.plan.cells.len(), results.done().count(), results.failures().count());
     let mut lines = Vec::new();
+    // How many cells are done, why cells failed, and how configurations were selected.
     if cells > 0 {
         lines
             .push(format!("{done} of {cells} cells are done, {failed} failed, {} are missing.", cells - done - failed));
@@ -43,6 +44,7 @@ pub(super) fn sentences(
         lines.push(settings(results.plan));
     }
     lines.extend(external::sentences(results, selections));
+    // Rows of the tables that lack cells.
     let incomplete = selections.iter().filter(|selection| selection.done < selection.cells).count();
     if incomplete > 0 {
         let rows = selections.iter().filter(|row| !row.method.external).count();
@@ -58,6 +60,7 @@ pub(super) fn sentences(
             count(rows, "row")
         ));
     }
+    // The versions of the program, and the checks of the data.
     let commits: BTreeSet<&str> = results.done().flat_map(|result| result.commits()).collect();
     if !commits.is_empty() {
         lines.push(format!("Done by perturb {}.", commits.into_iter().collect::<Vec<_>>().join(", ")));
