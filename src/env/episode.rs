@@ -99,10 +99,10 @@ pub(super) struct Progress {
     pub(super) total_reward: f64,
     /// The number of the first step, from 1, after which the task's goal was met; 0 if it was not met yet.
     pub(super) reached_at: u32,
-    /// The number of steps in a row, up to the last step, after each of which the task's goal was met.
+    /// The number of consecutive steps, up to the last one, after which the task's goal was met.
     pub(super) held_for: u32,
-    /// The maximal number of steps in a row after each of which the task's goal was met. Snapshots store it after the
-    /// other fields, because older snapshots lack it.
+    /// The maximal number of consecutive steps after which the task's goal was met. Snapshots store it after the other
+    /// fields, because older snapshots lack it.
     #[serde(skip)]
     pub(super) held_longest: u32,
     pub(super) ended: bool,
@@ -127,7 +127,7 @@ pub(super) fn boxes(distributions: usize, n: usize) -> Option<usize> {
 }
 
 impl Episodes {
-    /// Takes an environment, and begins its first episode.
+    /// Begins the first episode of an environment.
     ///
     /// # Panics
     /// If `settings` does not have one distribution for each parameter in each box.

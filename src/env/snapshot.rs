@@ -132,7 +132,8 @@ pub(crate) fn distributions_bytes(distributions: &[Distribution]) -> usize {
     distributions.iter().map(|distribution| 1 + size_of::<(f64, f64)>() * distribution.intervals().len()).sum()
 }
 
-/// The random draws of the environment in a snapshot: from what it draws, and what it has drawn.
+/// The seed, parameter distributions and current parameters of the environment in a snapshot. They show from which
+/// regions it draws.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SavedDraw {
     /// The numbers that determine its random numbers.

@@ -23,9 +23,9 @@ pub enum Achievement {
     Length,
     /// The number of the first step, from 1, after which the task's goal was met. No value if it was never met.
     FirstGoal,
-    /// The number of steps in a row, up to the last step of the episode, after each of which the task's goal was met.
+    /// The number of consecutive steps at the end of the episode after which the task's goal was met.
     LastGoals,
-    /// The maximal number of steps in a row after each of which the task's goal was met.
+    /// The maximal number of consecutive steps after which the task's goal was met.
     LongestGoals,
     /// A quantity of the environment's own, which [`Environment::achieved`](super::Environment::achieved) returns.
     Own(Quantity),

@@ -37,8 +37,8 @@ const STDERR_TIMEOUT: Duration = Duration::from_secs(1);
 /// Receives the lines that private servers write to standard error; set by [`PrivateServer::set_stderr_handler`].
 static STDERR_HANDLER: OnceLock<fn(String)> = OnceLock::new();
 
-/// A `perturb-server` that this process starts for itself. It ends when this value is dropped. It also ends when this
-/// process ends, even if it is killed: closing the server's standard input ends the server.
+/// A `perturb-server` that this process starts for itself. It ends when this value is dropped, or when this process
+/// ends in any way, even if this process is killed: the server ends when its standard input is closed.
 ///
 /// The server runs in its own process group. So Ctrl-C reaches only this process, which can finish its work with the
 /// server.
@@ -225,6 +225,7 @@ fn spawn(
         .process_group(0)
         .spawn()
         .map_err(|error| fail(spawn_failure(&error)))?;
+    // Standard error goes to the handler, if there is one. Standard output tells when the server listens.
     let (sender, stderr_done) = channel();
     let stderr = STDERR_HANDLER.get().zip(child.stderr.take());
     let forwarded = stderr.map(|(handler, stderr)| {
@@ -244,6 +245,7 @@ fn spawn(
     match ready {
         Ok(()) => Ok(process),
         Err(not_ready) => {
+            // The exit status distinguishes a refused task folder from other failures.
             let is_refusal = process.exit_code() == Some(REFUSED_STATUS) && !tasks.is_empty();
             process.kill();
             Err(match not_ready {

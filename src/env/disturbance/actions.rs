@@ -53,6 +53,7 @@ impl ActionPath {
                 &choice
             }
         };
+        // `held` becomes the action that arrives now, unless the previous one is repeated.
         let width = self.neutral.len();
         let is_held = values.action_hold > 0.0
             && step > 0
@@ -69,6 +70,7 @@ impl ActionPath {
             place.copy_from_slice(action);
             self.oldest = next_place(self.oldest, width, self.late.len());
         }
+        // Noise and scale apply to the acting action only, not to `held`.
         self.acting.copy_from_slice(&self.held);
         match self.space {
             ActionSpace::Discrete(_) => Action::Discrete(self.acting[0] as u32),

@@ -60,8 +60,7 @@ pub fn disturbed(spec: &'static EnvironmentSpec) -> &'static EnvironmentSpec {
     twin(spec).disturbed
 }
 
-/// Returns the environment without disturbances: the environment of which `spec` is the disturbed twin, otherwise
-/// `spec` itself.
+/// Returns the original environment if `spec` is a disturbed twin, otherwise `spec` itself.
 pub fn undisturbed(spec: &EnvironmentSpec) -> &EnvironmentSpec {
     let twins = TWINS.lock().unwrap_or_else(PoisonError::into_inner);
     twins.iter().find(|twin| std::ptr::eq(twin.disturbed, spec)).map_or(spec, |twin| twin.base)

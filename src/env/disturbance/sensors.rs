@@ -6,8 +6,8 @@ use crate::env::{Channel, Draw, Error, Purpose, Stream};
 /// Disturbs the observations of one environment on their way to the policy. O is the length of an observation.
 pub(super) struct SensorPath {
     channels: &'static [Channel],
-    /// A ring buffer of exact observations, `[sensor_delay + 1, O]`: the oldest is the basis of what the policy sees
-    /// now; the others are delayed.
+    /// A ring buffer of exact observations, `[sensor_delay + 1, O]`: the policy sees the oldest one now, with noise and
+    /// dropout; the others are still delayed.
     exact: Vec<f32>,
     /// The index in `exact` of the first number of the newest observation.
     newest: usize,

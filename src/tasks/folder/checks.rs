@@ -124,6 +124,7 @@ fn friction(
     field: &str,
 ) -> Result<()> {
     let geoms = &edit.targets.ids;
+    // The geoms must have contacts, and the contacts must have this kind of friction.
     let contacts: Vec<Contact> = geoms.iter().flat_map(|&geom| contacts_of(model, geom)).collect();
     if contacts.is_empty() {
         let name = escaped(edit.targets.names.first().map_or("", String::as_str));
@@ -148,7 +149,7 @@ fn friction(
             ),
         ));
     }
-    // A geom whose friction is edited, too, is not compared with.
+    // The comparison below skips geoms whose friction is edited, too.
     let edited: Vec<usize> = parameters
         .iter()
         .flat_map(EditedParameter::places)

@@ -252,6 +252,7 @@ impl FolderEnvironment {
         if task.needs.external_forces {
             simulation.external_forces()?;
         }
+        // Health, reward terms, goal and observation are computed from the same state, in this order.
         let (mut previous, mut remembered) = (std::mem::take(&mut self.action), std::mem::take(&mut self.remembered));
         let context = Context { action, previous_action: &previous };
         let healthy = is_finite(simulation.qpos())

@@ -189,6 +189,7 @@ fn compile(mjcf: &Mjcf, main: &str) -> Result<Model> {
 
 /// Builds the task from the parsed file and the compiled model. `hash` is the hash of the folder's files.
 fn assemble(top: &Table<'_>, about: Header, (mjcf, model, main): (Mjcf, Model, &str), hash: String) -> Result<Task> {
+    // The parts that only read the model.
     let elements = Elements::new(&model);
     let observation = top.require("observation", "[{ joint = \"*\", get = \"position\" }]")?.tables()?;
     let observation =
@@ -206,6 +207,7 @@ fn assemble(top: &Table<'_>, about: Header, (mjcf, model, main): (Mjcf, Model, &
     let picture = top.get("picture").map(|value| value.table()).transpose()?;
     let view = picture::view(picture.as_ref(), &model, &elements)?;
     let (controls, scaled) = controls(top, &model, &elements)?;
+    // The parameters, and the template that applies their edits.
     let (parameters, applied) = parameters(top, &model, &elements)?;
     let recompilation = Recompilation::new(&top.tables("parameter")?, &parameters, &mjcf, &model)?;
     let heatmap_axes = heatmap_axes(top, &parameters)?;
@@ -215,6 +217,7 @@ fn assemble(top: &Table<'_>, about: Header, (mjcf, model, main): (Mjcf, Model, &
     let push = top.get("push").map(|value| value.table()).transpose()?;
     let push = Push::new(push.as_ref(), &template.model, &elements)?;
     let needs = Needs::new(&observation, &reward, &healthy, &goal);
+    // The description. Its closure `make` is set in `load`, when the task has its final address.
     let quantities =
         parameters.iter().map(|edited| Quantity { name: edited.parameter.name, unit: edited.parameter.unit });
     let spec = EnvironmentSpec {

@@ -313,6 +313,7 @@ impl<'a, 'input> Editor<'a, 'input> {
                 _ => {}
             }
         }
+        // An explicit inertia grows with the square of the size, at constant mass.
         let (Some(inertial), Some(slot)) = (inertial, scaling.along) else { return Ok(()) };
         if scaling.size.is_none() {
             let problem =
@@ -348,6 +349,7 @@ impl<'a, 'input> Editor<'a, 'input> {
             return Err((self.refuse)(slot, "another edit sets the radius of one of its geoms, too; edit one of both"));
         }
         let Some(slot) = along.or(radius) else { return Ok(()) };
+        // An edit must have an effect on contacts or on the inertia.
         let kind = self.attributes.get(node, "type").unwrap_or("sphere");
         let (none, touches) = (along.is_none() && has_inertial, geom.is_some_and(|geom| can_touch(self.model, geom)));
         if none && !touches {
@@ -362,6 +364,7 @@ impl<'a, 'input> Editor<'a, 'input> {
             }
             return self.scale(node, "pos", &[], along);
         }
+        // Position and length follow `along`. Radii and other sizes follow `size`, or an edit of the radius.
         let has_ends = self.attributes.get(node, "fromto").is_some();
         self.scale(node, if has_ends { "fromto" } else { "pos" }, &[], along)?;
         let wide = size.or(radius);

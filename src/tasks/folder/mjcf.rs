@@ -27,7 +27,7 @@ const FILE_ATTRIBUTES: [(&str, &[&str], bool); 4] = [
     ("skin", &["file"], false),
 ];
 
-/// The texts of a model that MuJoCo compiles, and what else is known about it.
+/// The MJCF texts of a model, for the physics and for pictures, and some of the model's properties.
 #[derive(Debug)]
 pub(super) struct Mjcf {
     /// The text for the physics.

@@ -277,7 +277,7 @@ impl AppliedQuantity {
         Ok(Self { quantity, target })
     }
 
-    /// Returns the number in a model.
+    /// Returns the quantity's value in a model.
     pub(super) fn read(&self, model: &Model) -> f64 {
         self.target.value(model)
     }

@@ -8,7 +8,7 @@ use super::{
 };
 use perturb_mujoco::{Field, Flags, Index, Kind, Model, Reading as Array};
 
-/// The values of the key `get` for each kind of element.
+/// The values of the key `get` for a joint. The constants below are those for other kinds of elements.
 const OF_A_JOINT: &[&str] = &["position", "velocity", "sin", "cos", "scaled", "actuation", "constraint"];
 const OF_A_BODY: &[&str] = &[
     "position",
@@ -44,9 +44,11 @@ const FREE_VELOCITY: [&str; 6] = ["vx", "vy", "vz", "wx", "wy", "wz"];
 const SPATIAL: [&str; 6] = ["rx", "ry", "rz", "tx", "ty", "tz"];
 const INERTIA: [&str; 10] = ["xx", "yy", "zz", "xy", "xz", "yz", "mx", "my", "mz", "m"];
 
-/// MuJoCo's number for each type of joint.
+/// MuJoCo's number of the joint type `free`.
 const FREE: i32 = 0;
+/// MuJoCo's number of the joint type `ball`.
 const BALL: i32 = 1;
+/// MuJoCo's number of the joint type `slide`.
 const SLIDE: i32 = 2;
 
 impl Source<'_> {
@@ -114,6 +116,7 @@ impl Source<'_> {
                 BALL => &FREE_VELOCITY[3..],
                 _ => &[""],
             };
+            // A free or ball joint has several positions and velocities, which have names. Other joints have one of each.
             let (parts, first) = if get == "position" { (positions, position) } else { (velocities, velocity) };
             if matches!(get, "sin" | "cos" | "scaled") && parts.len() > 1 {
                 let problem =

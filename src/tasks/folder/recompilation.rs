@@ -67,6 +67,7 @@ impl Recompilation {
         let physics = EditedText::new(&mjcf.physics, model, &slots, mjcf.leaves_out, &refuse)?;
         let picture = EditedText::new(&mjcf.picture, model, &slots, mjcf.leaves_out, &refuse)?;
         let own = Self { slots, physics, picture, files: mjcf.physics.files.clone(), cache: Mutex::default() };
+        // The model is compiled with extreme values, so that impossible lengths are found when the folder is loaded.
         let defaults: Vec<f64> = parameters.iter().map(|edited| edited.parameter.default).collect();
         for (i, parameter) in parameters.iter().map(|edited| &edited.parameter).enumerate() {
             if own.slots.iter().all(|slot| slot.parameter != i) {

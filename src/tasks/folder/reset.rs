@@ -68,6 +68,7 @@ impl Reset {
             base[..n_q].copy_from_slice(&model.field(Field::KeyPositions)[key * n_q..][..n_q]);
             base[n_q..].copy_from_slice(&model.field(Field::KeyVelocities)[key * n_v..][..n_v]);
         }
+        // Joints that are placed by rules. `taken` marks their numbers.
         let mut placed = Vec::new();
         let mut taken = vec![false; n_q + n_v];
         for joints in table.tables("joints")? {
@@ -90,6 +91,7 @@ impl Reset {
                 placed.push((numbers, placement));
             }
         }
+        // Noise applies to all numbers that are not placed by a rule.
         let mut noise = Vec::new();
         for (key, numbers) in [("position", 0..n_q), ("velocity", n_q..n_q + n_v)] {
             let Some(value) = table.get(key) else { continue };
@@ -215,6 +217,8 @@ fn positive(value: &Value<'_>) -> Result<f64> {
 /// 241 (1988), which Python's `statistics.NormalDist` uses, too. Probability 0 counts as 2^-54.
 #[expect(clippy::excessive_precision, reason = "the published coefficients")]
 fn normal_quantile(p: f64) -> f64 {
+    // Coefficients (numerator, denominator) of the rational approximations for three ranges of the probability, highest
+    // power first.
     const CENTRE: ([f64; 8], [f64; 8]) = (
         [
             2.5090809287301226727e+3,
@@ -285,6 +289,7 @@ fn normal_quantile(p: f64) -> f64 {
         let polynomial = |factors: [f64; 8]| factors.into_iter().reduce(|sum, factor| sum * x + factor).unwrap_or(0.0);
         polynomial(above) / polynomial(below)
     };
+    // Near 1/2 the quantile is a function of q, otherwise of the logarithm of the tail's probability.
     let p = p.max(1.0 / (1u64 << 54) as f64);
     let q = p - 0.5;
     if q.abs() <= 0.425 {

@@ -105,6 +105,7 @@ impl Term {
         table.only(&[&KINDS[..], &OPTIONS].concat())?;
         let (key, value) = table.one_of(&KINDS)?;
         let reading = || Reading::new(&value.table()?, model, elements);
+        // Options that do not fit the kind of term are refused.
         for (option, kinds) in [
             ("target", &["squared", "norm", "near"][..]),
             ("range", &["within"]),
@@ -118,6 +119,7 @@ impl Term {
                 return Err(value.error(format_args!("{option} goes with {}, not with {key}", kinds.join(", "))));
             }
         }
+        // The kinds `healthy` and `constant` have their value in place of a weight.
         let mut weight = table.number("weight")?;
         let kind = match key {
             "value" => TermKind::Value(reading()?),
@@ -173,6 +175,7 @@ impl Term {
             at_least: table.number("at_least")?,
             at_most: table.number("at_most")?,
         };
+        // The limits hold for the absolute value, so they must not be negative.
         for (key, limit) in [("at_least", term.at_least), ("at_most", term.at_most)] {
             if let Some(limit) = limit.filter(|&limit| limit < 0.0) {
                 return Err(

@@ -117,6 +117,7 @@ impl Goal {
             (None, Some(threshold)) => (Comparison::AtMost, threshold),
             _ => return Err(table.error("give at_least or at_most: the number that the achieved one is compared with")),
         };
+        // The key says what the rule compares: steps, steps at which ranges hold, or the best value of a reading.
         let ranges = |value: &Value<'_>| Range::list(&value.tables()?, model, elements);
         let mut goal = Self {
             achieved: None,
@@ -156,6 +157,7 @@ impl Goal {
                 Achievement::Own(quantity)
             }
         };
+        // A number of steps has no unit, and must be possible within the step limit.
         if goal.achieved.is_none() {
             if let Some(unit) = table.get("unit").or_else(|| table.get("quantity")) {
                 return Err(unit.error("steps are counted here, which have neither unit nor quantity; leave it out"));

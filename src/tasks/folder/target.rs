@@ -93,6 +93,7 @@ impl Targets {
             .iter()
             .find(|(key, ..)| *key == subject)
             .ok_or_else(|| value.error(format_args!("{subject} cannot be edited")))?;
+        // The field must be editable for this kind of element, and `axis` and `end` must fit the field.
         let field_value = table.require("field", &format!("{:?}", fields[0]))?;
         let name = field_value.text()?;
         let field = fields.iter().copied().find(|&field| field == name).ok_or_else(|| {
@@ -105,6 +106,7 @@ impl Targets {
         if let Some(end) = table.get("end").filter(|_| !matches!(field, "range" | "forcerange")) {
             return Err(end.error("end goes with the fields range and forcerange"));
         }
+        // Each element adds one target; a joint may add one for each of its degrees of freedom.
         let ids = elements.select(kind, &value)?;
         let mut all = Vec::new();
         for &id in &ids {
@@ -215,10 +217,13 @@ fn axis(table: &Table<'_>, of: &str) -> Result<usize> {
     found.ok_or_else(|| axis.error(format_args!("{:?} is no axis; expected x, y or z", escaped(text))))
 }
 
-/// MuJoCo's number for each type of geom.
+/// MuJoCo's number of the geom type `sphere`.
 const SPHERE: i32 = 2;
+/// MuJoCo's number of the geom type `capsule`.
 const CAPSULE: i32 = 3;
+/// MuJoCo's number of the geom type `cylinder`.
 const CYLINDER: i32 = 5;
+/// MuJoCo's number of the geom type `box`.
 const BOX: i32 = 6;
 
 /// Returns the geoms of a body, each with its type.

@@ -5,7 +5,7 @@ use crate::tasks::shared;
 use perturb_mujoco::{Error, Field, Model, Simulation};
 use std::sync::Arc;
 
-/// The compiled model of a folder, which is never modified, and what is needed to edit simulations of it.
+/// The compiled model of a folder, which is never modified, and the data for editing simulations of it.
 #[derive(Debug)]
 pub(super) struct Template {
     pub(super) model: Arc<Model>,

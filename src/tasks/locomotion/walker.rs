@@ -381,6 +381,7 @@ impl Environment for Walker {
         if !state.iter().all(|value| value.is_finite()) {
             return refuse("its state is not finite".into());
         }
+        // The numbers have the order of `save`.
         let mut rest = state;
         let mut take = |n: usize| rest.split_off(..n).unwrap_or_default();
         let diverged = take(1) != [0.0];

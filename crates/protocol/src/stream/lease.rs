@@ -26,7 +26,7 @@ pub(super) const MAX_RESUMES_WITHOUT_REPLY: u32 = 8;
 /// more.
 const MAX_REFUSED: u32 = 4;
 
-/// The right to resume a session over a new connection, with what the client needs for it.
+/// The right to resume a session over a new connection, and the unanswered requests to send again.
 pub(super) struct ClientLease {
     name: Bytes,
     time: Duration,
