@@ -9,8 +9,8 @@
 //! <https://doi.org/10.1007/s10994-018-5714-4>).
 //!
 //! With the paper's rule, every configuration was tested in every run. With the clean rule, a configuration that was
-//! not selected has no reported runs. If such a configuration wins in a resample, the tests of one of its tuning cells,
-//! drawn at random, stand in for each run.
+//! not selected has no reported runs. If such a configuration wins in a resample, each run uses the tests of a tuning
+//! cell of this configuration, drawn at random.
 
 use std::collections::HashMap;
 
@@ -212,6 +212,7 @@ impl SelectableCell<'_> {
 }
 
 impl SelectionTest {
+    /// Returns the selection test of a finished cell.
     fn new(cell: &Cell, result: &CellResult, test: &TestResult) -> Self {
         Self {
             seed: cell.config.common.seed,
@@ -258,6 +259,7 @@ struct Binomial {
 }
 
 impl Binomial {
+    /// Returns the distribution for the measured rate of `test`.
     fn new(test: &TestResult) -> Self {
         let n = test.episodes as usize;
         let k = ((test.success_percent * n as f64 / 100.0).round() as usize).min(n);

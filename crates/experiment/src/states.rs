@@ -98,7 +98,7 @@ impl CellStates for DoneCells<'_> {
     }
 }
 
-/// Two sources, of which the second provides the states of cells that are missing in the first.
+/// Two sources of cell states. The second one provides the states of cells that are missing in the first one.
 pub struct LayeredStates<'a> {
     /// The source that is asked first.
     pub first: &'a dyn CellStates,

@@ -93,7 +93,7 @@ pub fn tuned<'a>(plan: &'a Plan, states: &'a [CellState]) -> Vec<Tuned<'a>> {
 type Candidate<'a> = (&'a Cell, &'a TestResult);
 
 impl<'a> Chosen<'a> {
-    /// Averages the selection tests of a configuration's tuning cells, of which there must be at least one.
+    /// Averages the selection tests of a configuration's tuning cells. There must be at least one cell.
     fn new(tests: &[Candidate<'a>]) -> Self {
         let over_seeds = |figure: fn(&TestResult) -> f64| mean(tests.iter().map(|(_, test)| figure(test)));
         Self {
@@ -126,8 +126,8 @@ impl Plan {
         self.with_chosen(Some(states), false)
     }
 
-    /// Returns the plan with as many cells as it will finally have. Where nothing is selected yet, the first candidates
-    /// stand in for the cells to come.
+    /// Returns the plan with its final number of cells, for estimates. If a configuration is not selected yet, the
+    /// first candidates take the place of the cells that the selection will add.
     ///
     /// # Errors
     /// [`FolderError`] if a state cannot be read.

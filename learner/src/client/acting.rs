@@ -11,8 +11,8 @@ use super::session::Session;
 use super::shard::ServerShard;
 use crate::proto;
 
-/// A server's reply with the T steps that it played in each of its N environments, and the episodes that ended
-/// meanwhile.
+/// A server's reply with the T steps that it played in each of its N environments, and the episodes that ended in these
+/// steps.
 #[derive(Clone, Debug, Default)]
 pub struct RolloutReply {
     /// The steps in the protocol's encoding, as arrays `[T, N, …]`.
@@ -98,6 +98,7 @@ impl Session<'_> {
     }
 }
 
+/// Returns the error of a call that needs a session with one server.
 fn not_played_together() -> ClientError {
     ClientError::System { action: "play a batch of several servers as a whole", source: ErrorKind::Unsupported.into() }
 }

@@ -153,11 +153,13 @@ impl<'a> RenderSession<'a> {
         Ok(RenderedPicture { width, height, pixels })
     }
 
+    /// Sends a request without waiting for its reply.
     fn request(&mut self, request: impl TypedRequest) -> Result<(), ClientError> {
         let Self { servers, part, .. } = self;
         servers.wait_for(part.stream.send(request))
     }
 
+    /// Receives the reply to the oldest request without a reply, which must be an `A`.
     fn reply<A: TypedRequest>(&mut self) -> Result<A::Reply, ClientError> {
         let Self { servers, part, .. } = self;
         servers.wait_for(part.stream.receive::<A>())

@@ -95,7 +95,8 @@ impl Servers {
     }
 
     /// Connects to all servers in `addresses`, which must not be empty. Each batch is divided among the servers. A host
-    /// name that resolves to several machines counts as one server: any of them. Proxy settings are ignored.
+    /// name that resolves to several machines counts as one server: only one of the machines is used. Proxy settings
+    /// are ignored.
     ///
     /// # Errors
     /// [`ClientError::Connect`] if a server does not answer within some seconds, or is shutting down.
@@ -219,6 +220,7 @@ impl Servers {
         self.locked().clone()
     }
 
+    /// Locks the list of connections.
     fn locked(&self) -> MutexGuard<'_, Vec<Connection>> {
         self.connections.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -299,6 +301,7 @@ impl Servers {
             .map_or_else(|| Ok(proto::ListEnvironmentsResponse::default()), |first| self.catalogue_of(first))
     }
 
+    /// Requests the catalogue of one server.
     fn catalogue_of(&self, connection: &Connection) -> Result<proto::ListEnvironmentsResponse, ClientError> {
         self.wait_for(connection.catalogue())
     }

@@ -80,10 +80,12 @@ impl ServerShard {
         Ok(())
     }
 
+    /// Decodes a field of a reply to `Step`.
     fn decode(&self, field: &'static str, bytes: &Bytes, out: &mut [f32]) -> Result<(), ClientError> {
         self.stream.decode::<proto::Step>(field, bytes, out)
     }
 
+    /// Returns the error for a malformed reply to `Step`.
     fn mismatch(&self, got: String, expected: String) -> ClientError {
         self.stream.mismatch::<proto::Step>(got, expected)
     }

@@ -42,8 +42,8 @@ pub enum AuditError {
 }
 
 /// Replays at most `max_episodes` of the recorded episodes, evenly spread over all of them, and compares each with its
-/// record. An episode is replayed from its seed, its environment and episode indices and its requested parameters
-/// alone. Calls `report` with the number of episodes done so far.
+/// record. The replay uses only the episode's seed, environment index, episode index and requested parameters. Calls
+/// `report` with the number of episodes done so far.
 ///
 /// # Errors
 /// [`AuditError`] if `checkpoint` is not the recorded policy, or if playing fails.

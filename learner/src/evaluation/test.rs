@@ -28,6 +28,7 @@ pub struct TestOptions {
 }
 
 impl TestOptions {
+    /// Returns the purpose that derives the seeds of the test's environments.
     fn purpose(&self) -> Purpose {
         if self.selects { Purpose::SelectionEnvironments } else { Purpose::TestEnvironments }
     }

@@ -13,7 +13,9 @@ use serde::{Deserialize, Serialize};
 use super::{Clock, Monitor, Progress, ProgressLog};
 use crate::client::EndedEpisode;
 
+/// The name of the log of episodes.
 const MONITOR: &str = "monitor.csv";
+/// The name of the log of updates.
 const PROGRESS: &str = "progress.csv";
 
 /// The log files of a training.

@@ -46,8 +46,8 @@ pub struct Collector {
     ended: Vec<SlotEnd>,
 }
 
-/// The state of a training's environments and of its player, from which it resumes exactly. Normalisers are stored
-/// elsewhere.
+/// The state of a training's environments and of its player, from which it resumes exactly. It does not contain the
+/// normalisers, which the checkpoint stores separately.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CollectorState {
     /// Snapshots of the N environments.

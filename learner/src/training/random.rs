@@ -133,7 +133,7 @@ mod tests {
     fn reward_statistics_follow_the_preset() {
         let choices = || Kind::Discrete(Discrete { names: vec![String::new(); 3] });
         assert!(checkpoint_with("preset = 'paper'", choices()).unwrap().state.reward_normaliser.is_none());
-        // `runs_on` tells whether the discounted return of the reward statistics continues over the end of an episode.
+        // `runs_on` says whether the discounted return of the reward statistics continues over the end of an episode.
         for (preset, num_envs, runs_on) in [("perturb", 1, false), ("paper", 1, true)] {
             let settings = format!("preset = '{preset}'\nnormalize_rewards = true");
             let made = checkpoint_with(&settings, choices()).unwrap();

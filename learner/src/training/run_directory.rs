@@ -149,6 +149,7 @@ impl RunDirectory {
         }
     }
 
+    /// Returns a directory that is not locked yet.
     fn new(path: &Path, overwrite: bool, is_own: bool) -> Self {
         Self { path: path.to_owned(), overwrite, lock: OnceCell::new(), is_own: Cell::new(is_own) }
     }

@@ -115,6 +115,7 @@ impl<'a> ServerSide<'a> {
         Ok((server_side, runs, others))
     }
 
+    /// Returns the idle lane of the run with this index.
     fn lane(&mut self, index: usize) -> Option<&mut ServerLane<'a>> {
         self.idle.iter_mut().map(Box::as_mut).find(|lane| lane.index == index)
     }

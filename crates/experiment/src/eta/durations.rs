@@ -14,6 +14,7 @@ pub struct CellDurations<'a> {
     count: usize,
 }
 
+/// A sum of process times, and their number.
 #[derive(Clone, Copy, Debug, Default)]
 struct Sum {
     seconds: f64,

@@ -117,10 +117,12 @@ pub(super) struct Block {
     pub(super) grid: Table,
 }
 
+/// Reads the name of a preset.
 fn preset<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Preset>, D::Error> {
     one_of(deserializer, &Preset::NAMES).map(Some)
 }
 
+/// Reads the name of a selection rule.
 fn selection<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Selection, D::Error> {
     one_of(deserializer, &Selection::NAMES)
 }
@@ -135,14 +137,17 @@ fn one_of<'de, T: DeserializeOwned, D: Deserializer<'de>>(
     T::deserialize(known[place.ok_or_else(|| D::Error::unknown_variant(&written, known))?].into_deserializer())
 }
 
+/// The default of lists of versions: D, R and E.
 fn all_versions() -> Vec<String> {
     Version::ALL.map(|version| version.to_string()).to_vec()
 }
 
+/// The default 1 for counts.
 fn one<T: From<u8>>() -> T {
     T::from(1)
 }
 
+/// The default 1000 for counts.
 fn a_thousand() -> u64 {
     1000
 }
@@ -201,10 +206,12 @@ impl File {
         distinct(self.environments.iter().chain(own).map(String::as_str))
     }
 
+    /// Returns the environments of `block`: its own, or else the file's.
     pub(super) fn environments_of<'a>(&'a self, block: &'a Block) -> &'a [String] {
         block.environments.as_ref().unwrap_or(&self.environments)
     }
 
+    /// Returns the training versions of `block`: its own, or else the file's.
     pub(super) fn versions_of<'a>(&'a self, block: &'a Block) -> &'a [String] {
         block.versions.as_ref().unwrap_or(&self.versions)
     }

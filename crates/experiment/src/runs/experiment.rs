@@ -55,6 +55,7 @@ pub enum CellStatus {
 
 /// The stamps of `result.json` and `failure.json`; `None` for a missing file.
 type RecordStamps = [Option<Stamp>; 2];
+/// The names of the files with a cell's result and failure.
 const RECORDS: [&str; 2] = ["result.json", "failure.json"];
 
 impl ExperimentStatus {

@@ -79,7 +79,7 @@ pub enum CellEvent {
     /// The job contains a cell that is not in the worker's plan.
     Refused { reason: String },
     /// The worker ended without a last line about the cell. The process that started the worker writes this event;
-    /// `reason` tells how the worker ended.
+    /// `reason` describes how the worker ended.
     Killed { reason: String },
 }
 

@@ -27,6 +27,7 @@ pub struct Local<'a> {
     max_seconds: Vec<Option<f64>>,
 }
 
+/// A worker process and the cells of its group.
 struct Worker {
     /// The unfinished cells: index in the plan by cell id.
     cells: BTreeMap<String, usize>,

@@ -264,6 +264,7 @@ struct Tracked {
     last: Option<CellEvent>,
 }
 
+/// The phase of a cell in this run.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 enum CellPhase {
     #[default]
@@ -277,6 +278,7 @@ enum CellPhase {
     GivenUp,
 }
 
+/// The state of a run: decides which cells the backend starts, and handles its events.
 struct Scheduler<'a> {
     plan: &'a Plan,
     folder: &'a Folder,
@@ -288,8 +290,11 @@ struct Scheduler<'a> {
     queue: VecDeque<usize>,
     durations: CellDurations<'a>,
     rates: Rates,
+    /// No cell is started before this time, see [`Scheduler::pause`].
     paused_until: Option<Instant>,
+    /// Maximum time that a cell waits for lost servers, see [`run()`].
     server_wait: Duration,
+    /// The time of the next search for results in the folder.
     next_poll: Option<Instant>,
 }
 

@@ -39,6 +39,7 @@ impl Rates {
         }
     }
 
+    /// Returns the rates in the plan's order.
     pub(crate) fn list(&self) -> Vec<Rate> {
         self.0.values().map(|(rate, _)| rate.clone()).collect()
     }

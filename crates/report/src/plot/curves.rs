@@ -24,6 +24,7 @@ impl CurveQuantity {
     /// Both quantities.
     pub const ALL: [CurveQuantity; 2] = [CurveQuantity::Return, CurveQuantity::Success];
 
+    /// Returns the quantity at a point of a curve.
     fn summary(self, point: &CurvePoint) -> Summary {
         match self {
             CurveQuantity::Return => point.episode_return,

@@ -50,10 +50,12 @@ impl Frame {
         (self.left + self.width / 2.0, self.top + self.height / 2.0)
     }
 
+    /// Returns the x position of a value on the x axis, in units.
     pub(super) fn x(&self, value: f64) -> f64 {
         self.left + self.width * share(&self.x, value)
     }
 
+    /// Returns the y position of a value on the y axis, in units.
     pub(super) fn y(&self, value: f64) -> f64 {
         self.bottom() - self.height * share(&self.y, value)
     }
@@ -89,12 +91,13 @@ impl Frame {
         self.x(value).clamp(self.left + half, (self.right() - half).max(self.left + half))
     }
 
+    /// Returns the values of the y ticks, with their numbers as text.
     fn y_ticks(&self) -> Vec<(f64, String)> {
         round_ticks(&self.y, ((self.height / (LINE + 2.0)) as usize).clamp(2, MAX_TICKS))
     }
 }
 
-/// Returns the ticks, of which those with `has_number` keep their text.
+/// Returns the ticks. A tick keeps its text if `has_number` is true for its index.
 fn numbered(ticks: &[(f64, String)], has_number: impl Fn(usize) -> bool) -> Vec<(f64, Option<String>)> {
     let of = |(index, (value, number)): (usize, &(f64, String))| (*value, has_number(index).then(|| number.clone()));
     ticks.iter().enumerate().map(of).collect()

@@ -39,6 +39,7 @@ const WITHIN: f64 = 2.0;
 /// Width and height of a symbol in the legend, in units.
 const SAMPLE: (f64, f64) = (24.0, 14.0);
 
+/// Returns the style of a solid line.
 const fn outline(colour: RGBColor, width: u32) -> LineStyle {
     LineStyle { colour, width, dashes: None }
 }
@@ -140,10 +141,12 @@ impl HeatmapPanels {
         self.title.iter().flat_map(|title| wrapped(title, INSIDE)).collect()
     }
 
+    /// Returns the number of columns in each row of the picture.
     fn per_row(&self) -> usize {
         if self.columns.len() > MAX_COLUMNS { FEWER } else { self.columns.len().max(1) }
     }
 
+    /// Returns the columns by row of the picture.
     fn rows(&self) -> std::slice::Chunks<'_, HeatmapColumn> {
         self.columns.chunks(self.per_row())
     }
@@ -166,19 +169,23 @@ impl HeatmapPanels {
         Frame { left, top, width, height, x: x.low..x.high, y: y.low..y.high }
     }
 
+    /// Returns the width of a full row, in units.
     fn row_width(&self) -> f64 {
         let columns = self.per_row().min(self.columns.len().max(1)) as f64;
         columns * self.size().0 + (columns - 1.0) * GAP
     }
 
+    /// Returns the lines of each caption of a row.
     fn caption_lines(&self, row: &[HeatmapColumn]) -> Vec<Vec<String>> {
         row.iter().map(|of| wrapped(&of.caption, self.size().0)).collect()
     }
 
+    /// Returns the height of a row with captions, panels and tick numbers, in units.
     fn row_height(&self, row: &[HeatmapColumn]) -> f64 {
         LINE * most(&self.caption_lines(row)) + self.size().1 + NUMBERS + GAP
     }
 
+    /// Draws a heatmap into its frame.
     fn panel<DB: DrawingBackend>(
         &self,
         canvas: &PlotCanvas<'_, DB>,

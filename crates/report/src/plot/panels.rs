@@ -57,6 +57,7 @@ pub(crate) struct PanelLine {
     pub(crate) points: Vec<PanelPoint>,
 }
 
+/// A point of a line, with its band.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct PanelPoint {
     pub(crate) x: f64,

@@ -1,4 +1,4 @@
-//! The main result of an experiment: a picture of Default, Interpolation and Extrapolation with intervals beside the
+//! The main result of an experiment: a picture of Default, Interpolation and Extrapolation with their intervals and the
 //! paper's numbers, and a sentence about it.
 
 use perturb_experiment::{Selection, distinct};

@@ -37,6 +37,7 @@ struct Section {
     subsections: Vec<Subsection>,
 }
 
+/// A part of a section with its own heading.
 struct Subsection {
     title: String,
     content: Markup,

@@ -22,6 +22,7 @@ pub(super) struct ReportIndex<'a> {
 }
 
 impl<'a> ReportIndex<'a> {
+    /// Collects the names from the plan and the selections.
     pub(super) fn new(plan: &'a Plan, selections: &[MethodResults<'a>]) -> Self {
         let environments = distinct(selections.iter().map(|row| row.environment));
         let averaged = if plan.cells.is_empty() { environments.clone() } else { plan.environments() };

@@ -1,4 +1,4 @@
-//! The report of an experiment: its results beside the paper's numbers.
+//! The report of an experiment: its results, compared with the paper's numbers.
 //!
 //! [`Report::new`] computes the numbers. [`Report::text`], [`Report::markdown`] and [`ReportBundle::page`] render them
 //! as documents, and [`Report::files`] as CSV files. The output depends only on the results: not on when, where or in
@@ -105,6 +105,7 @@ impl<'a> Report<'a> {
         self.finding_sentences().into_iter().chain(self.provenance.iter().cloned()).collect()
     }
 
+    /// Returns the tables that the report shows as text.
     fn tables(&self) -> impl Iterator<Item = Table> {
         let numbers = self.metrics_tables().into_iter().chain(self.scenario_tables());
         numbers.chain(self.iqm_table()).chain(self.comparisons_table())

@@ -219,6 +219,7 @@ fn parse_setting<'a>(text: &'a str, key: &str) -> Option<&'a str> {
     })
 }
 
+/// Returns the error for unexpected output of a Slurm program, with the first 200 characters of the output.
 fn not_understood(program: &'static str, expected: &'static str, got: &str) -> SlurmError {
     let got: String = got.trim().chars().take(200).collect();
     SlurmError::NotUnderstood { program, expected, got }

@@ -15,8 +15,8 @@ pub struct SlurmOptions {
     pub time: Option<TimeLimit>,
     /// Maximum number of jobs of an array that run at the same time, at least 1; `None` for no limit.
     pub array_limit: Option<u32>,
-    /// Number of cells in a job, 1 to [`MAX_CELLS_PER_JOB`]. If `None`, a job gets as many cells as take an estimated
-    /// five minutes.
+    /// Number of cells in a job, 1 to [`MAX_CELLS_PER_JOB`]. If `None`, a job gets cells that take five minutes
+    /// together, by estimate.
     pub cells_per_job: Option<usize>,
     /// The command that each job runs.
     pub task: JobCommand,

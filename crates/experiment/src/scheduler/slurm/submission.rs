@@ -11,7 +11,9 @@ use crate::folder;
 use crate::folder::{Folder, FolderError};
 use crate::plan::Plan;
 
+/// The file with the cell ids of each job, one job per line.
 const CELLS: &str = "cells.txt";
+/// The file with the names that Slurm knows the submission by.
 const DOCUMENT: &str = "submission.json";
 
 /// A job array that was submitted to Slurm, or prepared for it.

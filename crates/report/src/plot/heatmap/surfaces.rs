@@ -26,6 +26,7 @@ pub(super) fn as_paths(svg: &str) -> String {
     shown
 }
 
+/// Appends a path for each colour of `surface` to `shown`, and empties `surface`.
 fn flush(surface: &mut BTreeMap<&str, String>, shown: &mut String) {
     for (colour, path) in std::mem::take(surface) {
         shown.push_str(&format!("<path fill=\"{colour}\" shape-rendering=\"crispEdges\" d=\"{path}\"/>\n"));
@@ -42,6 +43,7 @@ struct Rectangle<'a> {
 }
 
 impl<'a> Rectangle<'a> {
+    /// Parses a line of the SVG. Returns `None` unless it is an opaque rectangle without outline.
     fn parse(line: &'a str) -> Option<Self> {
         let attributes = line.trim_end().strip_prefix("<rect ")?.strip_suffix("/>")?;
         let is_whole = attributes.contains("stroke=\"none\"") && attributes.contains("opacity=\"1\"");
