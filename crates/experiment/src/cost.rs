@@ -31,7 +31,7 @@ pub struct Measurement {
     pub method: Method,
     /// The number of cells in the group.
     pub cells: usize,
-    /// The measured speed.
+    /// The measured times per step.
     pub speed: Speed,
 }
 

@@ -184,7 +184,7 @@ pub enum FolderError {
     #[error("{} is not understood: {reason}; delete it to run the cell again", path.display())]
     Damaged {
         path: PathBuf,
-        /// The fault.
+        /// Description of what is wrong in the file.
         reason: String,
     },
     /// The server's model of the environment differs from the model of a stored result.
@@ -203,7 +203,7 @@ pub enum FolderError {
     #[error("the rows of cell {cell} are not understood: {reason}; export the cell's folder again")]
     Row {
         cell: String,
-        /// The fault.
+        /// Description of what is wrong in the rows.
         reason: String,
     },
     /// The folder has no `plan.toml`, so it holds no experiment.

@@ -32,12 +32,12 @@ pub struct OpenOptions {
 /// the byte.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ActorLocation {
-    /// In the server, if it supports this. The network's latency then occurs once per rollout, not at each step. Some
-    /// trainings always choose actions in the client: trainings over several servers, groups of trainings with
-    /// [short](perturb_settings::CollectionMode) rollouts, and trainings with observation noise.
+    /// The server chooses the actions, if it supports this. The network's latency then occurs once per rollout, not at
+    /// each step. Some trainings always choose actions in the client: trainings over several servers, groups of
+    /// trainings with [short](perturb_settings::CollectionMode) rollouts, and trainings with observation noise.
     #[default]
     Server,
-    /// In the client.
+    /// The client chooses the actions.
     Client,
 }
 

@@ -30,11 +30,11 @@ pub struct Logs {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LogLengths {
-    /// Length of `monitor.csv`.
+    /// Length of `monitor.csv` in bytes.
     pub monitor: u64,
-    /// Length of `progress.csv`.
+    /// Length of `progress.csv` in bytes.
     pub progress: u64,
-    /// Length of the TensorBoard events file.
+    /// Length of the TensorBoard events file in bytes.
     pub events: u64,
     /// Name of the TensorBoard events file.
     pub events_file: String,

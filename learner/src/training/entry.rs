@@ -32,9 +32,9 @@ pub struct TrainRequest<'a> {
 /// The start of a training: initial weights or a checkpoint.
 #[derive(Clone, Debug)]
 pub enum Start {
-    /// From initial weights, with this configuration.
+    /// The training starts from initial weights, with this configuration.
     Fresh(Box<TrainConfig>),
-    /// From this checkpoint.
+    /// The training continues from this checkpoint.
     Checkpoint(Box<(Checkpoint, ResumeState)>),
 }
 

@@ -44,7 +44,8 @@ pub(super) struct File {
     /// (default: `"paper"`).
     #[serde(default, deserialize_with = "selection")]
     pub(super) selection: Selection,
-    /// Only with `selection = "clean"`: number of tuning seeds, which start at `seed` and only select (default: `1`).
+    /// Only with `selection = "clean"`: number of tuning seeds, starting at `seed` (default: `1`). Trainings with
+    /// tuning seeds only serve the selection.
     tuning_runs: Option<u32>,
     /// Only with `selection = "clean"`: episodes of each test that selects a configuration (default: `test_episodes`).
     selection_episodes: Option<u64>,

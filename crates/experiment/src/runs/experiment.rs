@@ -48,7 +48,7 @@ pub enum CellStatus {
     InWork,
     /// No process is working on the cell, and it has neither a result nor a failure.
     Waiting {
-        /// Whether the cell was started before: it has a folder.
+        /// Whether the cell has a folder, which means that it was started before.
         begun: bool,
     },
 }

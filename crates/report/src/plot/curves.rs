@@ -21,7 +21,7 @@ pub enum CurveQuantity {
 }
 
 impl CurveQuantity {
-    /// Both quantities.
+    /// All quantities, in the order of the pictures.
     pub const ALL: [CurveQuantity; 2] = [CurveQuantity::Return, CurveQuantity::Success];
 
     /// Returns the quantity at a point of a curve.

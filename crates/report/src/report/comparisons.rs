@@ -150,7 +150,7 @@ impl Report<'_> {
     }
 }
 
-/// Formats a p-value with three decimals. Smaller ones become "< 0.001".
+/// Formats a p-value with three decimals. A p-value that would be rounded to 0.000 becomes "< 0.001".
 pub(super) fn shown(p: f64) -> String {
     if p < 0.0005 {
         "< 0.001".into()

@@ -3,7 +3,7 @@
 use super::Report;
 use super::finding::listed;
 
-/// Maximum number of methods that a title names. For more methods it has only their number.
+/// Maximum number of methods that a title lists by name. If there are more, the title has only their number.
 const MAX_NAMED: usize = 3;
 
 impl Report<'_> {

@@ -70,7 +70,7 @@ pub enum OptionError {
     #[error("{path:?} cannot be handed to Slurm: {reason}; use another folder")]
     Path {
         path: PathBuf,
-        /// The fault.
+        /// Description of what is wrong in the path.
         reason: &'static str,
     },
 }
