@@ -37,7 +37,7 @@ pub struct Servers {
     act: ActorLocation,
     wait: ServerWait,
     stop: StopFlag,
-    /// Set when a server gave no sign of life after a stop signal. No call waits for servers any more.
+    /// Set when a server did not respond after a stop signal. No call waits for servers any more.
     has_given_up: AtomicBool,
 }
 
@@ -105,7 +105,7 @@ impl Servers {
     }
 
     /// Connects like [`Servers::connect`], unless `stop` is raised first. If `stop` is raised later, a request to a
-    /// server that gives no sign of life ends within about a second.
+    /// server that does not respond ends within about a second.
     ///
     /// # Errors
     /// The errors of [`Servers::connect`], and [`ClientError::Stopped`] if `stop` is raised first.
@@ -230,11 +230,11 @@ impl Servers {
         self.runtime.block_on(future)
     }
 
-    /// Waits for the reply to a request. After a stop signal, waits only as long as all servers give signs of life.
+    /// Waits for the reply to a request. After a stop signal, waits only while all servers still respond.
     ///
     /// # Errors
-    /// The errors of the request, as changed by [`Servers::explain`], and [`ClientError::Stopped`] if a server gives no
-    /// sign of life after a stop signal.
+    /// The errors of the request, as changed by [`Servers::explain`], and [`ClientError::Stopped`] if a server does not
+    /// respond after a stop signal.
     pub(crate) fn wait_for<T>(&self, request: impl Future<Output = Result<T, ClientError>>) -> Result<T, ClientError> {
         let done = self.block_on(async {
             tokio::select! {
@@ -246,7 +246,7 @@ impl Servers {
         done.map_err(|error| self.explain(error))
     }
 
-    /// Waits for a stop signal, and then until a server gives no sign of life. Returns the error to report.
+    /// Waits for a stop signal, and then until some server does not respond. Returns the error to report.
     async fn silent_after_stop(&self) -> ClientError {
         let signal = self.stop.raised().await;
         loop {
@@ -268,7 +268,7 @@ impl Servers {
         }
     }
 
-    /// Returns whether a server gave no sign of life after a stop signal, so that no call should wait any more.
+    /// Returns whether a server did not respond after a stop signal, so that no call should wait any more.
     pub(super) fn has_given_up(&self) -> bool {
         self.has_given_up.load(Ordering::Relaxed)
     }

@@ -214,8 +214,8 @@ impl Rollout {
         self.fixed_steps.unwrap_or(self.len)
     }
 
-    /// Records that an episode of `length` steps ended before step `end`, which is an index from 0. All steps of the
-    /// episode must be in the rollout.
+    /// Records that an episode of `length` steps has ended. `end` is the index, from 0, of the step after its last
+    /// step. All steps of the episode must be in the rollout.
     ///
     /// # Errors
     /// [`Error::Episode`] if the episode has no steps, starts before the rollout or ends after it, or if there is no

@@ -29,8 +29,8 @@ pub(crate) struct UnfinishedCell<'a> {
 }
 
 /// Estimates the remaining time of `cells` when `at_a_time` processes run in parallel. The duration of a waiting cell
-/// is the first known of these: the mean of finished cells with its environment and method, the mean of running ones,
-/// the measured upper bound. Returns `None` if none of these is known for some cell.
+/// is the first known of these: the mean of finished cells with its environment and method, the mean of such running
+/// cells, the measured upper bound. Returns `None` if none of these is known for some cell.
 pub(crate) fn remaining_time(
     durations: &CellDurations<'_>,
     cells: &[UnfinishedCell<'_>],
@@ -40,6 +40,7 @@ pub(crate) fn remaining_time(
     // Cells of one group share the time of their process.
     let share = (at_a_time as f64 / under_way.max(1) as f64).min(1.0);
     let kind = |cell: &'_ Cell| (cell.config.common.environment.clone(), cell.method());
+    // Sum and number of the expected durations of running cells, by environment and method.
     let mut running: HashMap<(String, Method), (f64, f64)> = HashMap::new();
     for one in cells {
         if let (Some(elapsed), Some(ratio)) = (one.elapsed_seconds, one.remaining_ratio) {
@@ -47,6 +48,7 @@ pub(crate) fn remaining_time(
             (*sum, *count) = (*sum + elapsed * share * (1.0 + ratio), *count + 1.0);
         }
     }
+    // Add the remaining process times. The estimate is never below the remaining time of the longest cell.
     let (mut seconds, mut longest, mut at_most) = (0.0, 0.0_f64, false);
     for one in cells {
         let elapsed = one.elapsed_seconds.unwrap_or_default();

@@ -63,8 +63,8 @@ pub enum Selection {
     /// The paper's rule: the tests that are reported also select. This biases the reported results upwards.
     #[default]
     Paper,
-    /// Separate test episodes of trainings with tuning seeds select. The selected configurations are trained again with
-    /// other seeds and tested on other episodes.
+    /// Configurations are selected by separate test episodes, in trainings with tuning seeds. The selected
+    /// configurations are trained again with other seeds and tested on other episodes.
     Clean,
 }
 

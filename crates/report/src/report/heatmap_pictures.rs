@@ -84,6 +84,7 @@ pub fn heatmap_pictures(
         let places: Vec<_> = places.iter().filter(|place| place.environment == environment).collect();
         let elsewhere: Vec<_> = rows.iter().map(|row| (&row.method, shown_elsewhere(row))).collect();
         let kinds_elsewhere = elsewhere.iter().flat_map(|(_, shown)| shown.iter().map(|(kind, _)| kind));
+        // The pairs of parameters that any heatmap in this environment has.
         let kinds: BTreeSet<&HeatmapKind> =
             of_cells.get(environment).into_iter().flatten().chain(kinds_elsewhere).collect();
         let mut kinds: Vec<Option<&HeatmapKind>> = kinds.into_iter().map(Some).collect();
@@ -101,6 +102,7 @@ pub fn heatmap_pictures(
                 drafts.push(Draft::new((environment, method), kind, shown.collect()));
             }
         }
+        // All pictures of an environment have the same colour scale for returns.
         drafts.retain(|draft| !draft.columns.is_empty());
         let means = drafts.iter().flat_map(|draft| &draft.columns).filter_map(|column| column.mean.as_ref());
         let returns = common_returns(environment, means);

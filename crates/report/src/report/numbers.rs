@@ -61,7 +61,7 @@ impl MethodMetrics<'_> {
         least(|metric| self.ours.get(&metric).map(|summary| summary.runs))
     }
 
-    /// Returns the number of runs in the interquartile mean with the fewest; 0 if one is missing.
+    /// Returns the smallest number of runs in an interquartile mean; 0 if a mean is missing.
     pub(super) fn iqm_runs(&self) -> usize {
         least(|metric| self.iqms.get(&metric).map(|iqm| iqm.runs))
     }
