@@ -111,7 +111,7 @@ fn measure_one(
         let made = train(servers, &group[0].config, &directory, 1, &StopFlag::default(), |_| {})?;
         return Ok(Speed { training: 0.0, testing: measure_test(servers, group[0], &made.checkpoint, stop)? });
     }
-    // Train without a budget until the time limit, as an experiment trains its cells.
+    // Trains without a budget until the time limit, as an experiment trains its cells.
     let endless = |cell: &&Cell| {
         let mut cell = Cell::clone(cell);
         cell.config.common.episodes = UNLIMITED_EPISODES;

@@ -45,7 +45,7 @@ pub(super) fn tested(
             records => records.map(Some),
         }
     };
-    // Test the intermediate policies, saved after given numbers of training episodes (marks).
+    // Tests the intermediate policies, saved after given numbers of training episodes (marks).
     let mut of_marks = BTreeMap::new();
     for &mark in marks {
         let kept = Checkpoint::load(&mark_in(&folder.training(), mark)).map_err(TrainError::from)?;
@@ -56,7 +56,7 @@ pub(super) fn tested(
         let agreement = records.agreement();
         of_marks.insert(mark, IntermediateEvaluation { counters: kept.state.counters, results, agreement });
     }
-    // Test the final policy. If configurations are selected by a separate test, it has its own episodes.
+    // Tests the final policy. If configurations are selected by a separate test, it has its own episodes.
     let Some(mut records) = test(&checkpoint, sets, episodes, false, "")? else { return Ok(None) };
     if let Some((set, episodes)) = selection {
         let Some(selecting) = test(&checkpoint, &[set], episodes, true, "")? else { return Ok(None) };

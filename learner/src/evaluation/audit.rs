@@ -73,7 +73,7 @@ fn replay(
     report: &mut dyn FnMut(u64),
 ) -> Result<Audit, TestError> {
     let mut queues: BTreeMap<usize, VecDeque<&EpisodeRecord>> = BTreeMap::new();
-    // Queue the chosen episodes by the index of their environment.
+    // Queues the chosen episodes by the index of their environment.
     let chosen = spread(&records.episodes, max_episodes);
     for episode in chosen {
         queues.entry(episode.environment_index as usize).or_default().push_back(episode);
@@ -83,7 +83,7 @@ fn replay(
     let mut audit = Audit::default();
     let mut running = BTreeMap::new();
     loop {
-        // Begin the next episode in each environment that has none running.
+        // Begins the next episode in each environment that has none running.
         let idle: Vec<usize> = queues.keys().copied().filter(|slot| !running.contains_key(slot)).collect();
         for slot in idle {
             if let Some(episode) = queues.get_mut(&slot).and_then(VecDeque::pop_front) {
@@ -97,7 +97,7 @@ fn replay(
         if let Some(signal) = stop.signal() {
             return Err(TestError::Stopped { signal });
         }
-        // Compare each ended episode with its record.
+        // Compares each ended episode with its record.
         for end in replay.trials.step()? {
             let Some(recorded) = running.remove(&end.slot) else { continue };
             audit.episodes += 1;

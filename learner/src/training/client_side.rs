@@ -94,7 +94,7 @@ impl<'a> ClientSide<'a> {
     fn step(&mut self, runs: &mut [Run<'_>]) -> Result<()> {
         let Self { session, lanes, is_reversed, actions, reply, times } = self;
         let start = Instant::now();
-        // Choose the actions of all runs.
+        // Chooses the actions of all runs.
         for (lane, run) in in_order(lanes.iter_mut().zip(runs.iter_mut()), *is_reversed) {
             let acted = lane.act(session, &mut run.trainer, *times);
             run.store_error(acted, true)?;
@@ -106,7 +106,7 @@ impl<'a> ClientSide<'a> {
         session.step(actions, reply)?;
         let received = Instant::now();
         times.waiting += received - sent;
-        // Append the step to the rollout of each run.
+        // Appends the step to the rollout of each run.
         for (lane, run) in lanes.iter_mut().zip(runs.iter_mut()).filter(|(_, run)| run.end.is_none()) {
             let taken = lane.take(reply, &mut run.trainer);
             run.store_error(taken, true)?;

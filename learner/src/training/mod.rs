@@ -247,7 +247,7 @@ fn train_loop(
     let mut workspace = if let [first, _, ..] = runs.as_slice() { first.trainer.workspace()? } else { None };
     while !runs.is_empty() {
         let iteration = train_iteration(servers, collector, &mut runs, &mut workspace, stop, report);
-        // Remove runs that have ended, and report their outcomes.
+        // Removes runs that have ended, and reports their outcomes.
         let mut released = Vec::new();
         while let Some(place) = runs.iter().position(|run| run.end.is_some()) {
             let Run { index, end, .. } = runs.remove(place);

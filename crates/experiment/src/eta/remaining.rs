@@ -48,7 +48,7 @@ pub(crate) fn remaining_time(
             (*sum, *count) = (*sum + elapsed * share * (1.0 + ratio), *count + 1.0);
         }
     }
-    // Add the remaining process times. The estimate is never below the remaining time of the longest cell.
+    // Adds the remaining process times. The estimate is never below the remaining time of the longest cell.
     let (mut seconds, mut longest, mut at_most) = (0.0, 0.0_f64, false);
     for one in cells {
         let elapsed = one.elapsed_seconds.unwrap_or_default();

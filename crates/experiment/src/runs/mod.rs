@@ -84,7 +84,7 @@ pub fn places(folder: &Path, most: usize, within: Option<&Path>) -> files::Resul
     let mut left = vec![folder.to_owned()];
     files::require_folder(folder)?;
     loop {
-        // Follow a symbolic link only when no other folders are left.
+        // Follows a symbolic link only when no other folders are left.
         let Some(path) = left.pop() else {
             let Some(link) = search.links.pop_front() else { break };
             let parent = link.parent().unwrap_or(folder);

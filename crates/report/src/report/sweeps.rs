@@ -49,7 +49,7 @@ pub(super) fn over_parameters<'a>(
     let mut all = Vec::new();
     for rows in selections.chunk_by(|a, b| a.environment == b.environment) {
         let environment = rows[0].environment;
-        // Collect the selected policies that have recorded episodes, by method and training distribution.
+        // Collects the selected policies that have recorded episodes, by method and training distribution.
         let group = |row: &'a MethodResults<'a>, trained_on: TrainedOn<'a>| {
             let selected = row.runs.values().filter_map(|run| run.trained_on(trained_on));
             let policies = selected.filter_map(|selected| recorded.policy(&selected)).collect();
@@ -60,7 +60,7 @@ pub(super) fn over_parameters<'a>(
         let groups: Vec<_> = groups.filter(|group| !group.policies.is_empty()).collect();
         let Some(parameters) = groups.first().map(|group| &group.policies[0].parameters) else { continue };
         for &tested_on in &scope.tested_on {
-            // Divide the range of each parameter into bins, and count the successes of each group of policies in each
+            // Divides the range of each parameter into bins, and counts the successes of each group of policies in each
             // bin.
             for (place, parameter) in parameters.iter().enumerate() {
                 let bins = bins(groups.iter().flat_map(|group| group.tests(tested_on)), place);

@@ -277,13 +277,13 @@ impl<'a> Jobs<'a> {
             Ok(number) => number,
             Err(error) => return self.put_off(error.into()),
         };
-        // Divide the cells into jobs, and write the files of the submission.
+        // Divides the cells into jobs, and writes the files of the submission.
         let jobs = batches(&self.loads(groups)?, self.size(), max_jobs);
         let cells = jobs.concat();
         let ids = jobs.iter().map(|job| job.iter().map(|&cell| self.id(cell).to_owned()).collect()).collect();
         let text = |path: &Path| Ok(script(&self.options.task, self.folder.path(), path)?);
         let mut submission = submission::create(self.folder, self.plan, ids, &text)?;
-        // Send the job array to Slurm.
+        // Sends the job array to Slurm.
         let array = match self.slurm.submit(&submission, self.options) {
             Ok(array) => array,
             Err(error @ (SlurmError::Refused { .. } | SlurmError::NotInstalled { .. } | SlurmError::Option(_))) => {
@@ -293,7 +293,7 @@ impl<'a> Jobs<'a> {
             Err(error) => return Err(error.into()),
         };
         submission.accepted(&array)?;
-        // Tell the user, and follow the jobs from now on.
+        // Informs the user, and follows the jobs from now on.
         let most = jobs.iter().map(Vec::len).max().unwrap_or_default();
         self.news.push(BackendEvent::Note(format!(
             "submitted {} as Slurm job {array}: {} of at most {}",
