@@ -24,7 +24,7 @@ impl Channel {
         Self { name, unit, low, high, scale }
     }
 
-    /// Sets [`Channel::scale`].
+    /// Sets the field `scale`.
     pub const fn scale(mut self, scale: f64) -> Self {
         self.scale = scale;
         self

@@ -1,5 +1,5 @@
-//! Reads the files of a task's folder: each once, within limits of size, and never outside of the folder. All of them
-//! enter the hash of the task.
+//! Reads the files of a task's folder: each once, within limits of size, and never outside of the folder. The hash of
+//! the task covers all of them.
 
 use super::error::{Error, Result, escaped};
 use sha2::{Digest, Sha256};

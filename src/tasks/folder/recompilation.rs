@@ -32,7 +32,7 @@ pub(super) struct Recompilation {
 
 #[derive(Debug, Default)]
 struct CompiledModels {
-    /// The models, by the bits of the amounts of all slots.
+    /// The compiled models. A key has the bits of [`Slot::amount`] for each slot.
     models: HashMap<Box<[u64]>, Arc<Model>>,
     /// The keys of `models`, oldest first.
     order: VecDeque<Box<[u64]>>,

@@ -2,19 +2,20 @@
 /// The description of a property.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct PropertySpec {
-    /// The key is the name. The type is missing if the property only holds other properties.
+    /// The spec of the value; its name is the property's key. It has no type if the property only contains other
+    /// properties.
     #[prost(message, optional, tag = "1")]
     pub spec: ::core::option::Option<super::super::TensorSpec>,
-    /// Whether it can be read.
+    /// Whether the property can be read.
     #[prost(bool, tag = "2")]
     pub is_readable: bool,
-    /// Whether it can be written.
+    /// Whether the property can be written.
     #[prost(bool, tag = "3")]
     pub is_writable: bool,
-    /// Whether it holds other properties.
+    /// Whether the property contains other properties.
     #[prost(bool, tag = "4")]
     pub is_listable: bool,
-    /// The meaning.
+    /// The meaning of the property.
     #[prost(string, tag = "5")]
     pub description: ::prost::alloc::string::String,
 }
@@ -32,31 +33,31 @@ pub struct ListPropertyResponse {
     #[prost(message, repeated, tag = "1")]
     pub values: ::prost::alloc::vec::Vec<PropertySpec>,
 }
-/// Asks for a value.
+/// Requests the value of a property.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ReadPropertyRequest {
-    /// The property.
+    /// The key of the property.
     #[prost(string, tag = "1")]
     pub key: ::prost::alloc::string::String,
 }
-/// The value.
+/// The value of a property.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ReadPropertyResponse {
     /// The value, of the type and shape of the property's spec.
     #[prost(message, optional, tag = "1")]
     pub value: ::core::option::Option<super::super::Tensor>,
 }
-/// Sets a value.
+/// Sets the value of a property.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct WritePropertyRequest {
-    /// The property.
+    /// The key of the property.
     #[prost(string, tag = "1")]
     pub key: ::prost::alloc::string::String,
-    /// In force from the next episode on.
+    /// The value, which holds from the next episode on.
     #[prost(message, optional, tag = "2")]
     pub value: ::core::option::Option<super::super::Tensor>,
 }
-/// The value was taken.
+/// The value was accepted.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct WritePropertyResponse {}
 /// A request, packed into `EnvironmentRequest.extension`.
@@ -69,18 +70,18 @@ pub struct PropertyRequest {
 pub mod property_request {
     #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Payload {
-        /// Reads one.
+        /// Reads a property.
         #[prost(message, tag = "1")]
         ReadProperty(super::ReadPropertyRequest),
-        /// Writes one.
+        /// Writes a property.
         #[prost(message, tag = "2")]
         WriteProperty(super::WritePropertyRequest),
-        /// Lists some.
+        /// Lists properties.
         #[prost(message, tag = "3")]
         ListProperty(super::ListPropertyRequest),
     }
 }
-/// A response, packed into `EnvironmentResponse.extension`. Errors are those of the stream.
+/// A response, packed into `EnvironmentResponse.extension`. Errors are sent as `EnvironmentResponse.error`.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct PropertyResponse {
     #[prost(oneof = "property_response::Payload", tags = "1, 2, 3")]
@@ -90,13 +91,13 @@ pub struct PropertyResponse {
 pub mod property_response {
     #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Payload {
-        /// To `read_property`.
+        /// The response to `read_property`.
         #[prost(message, tag = "1")]
         ReadProperty(super::ReadPropertyResponse),
-        /// To `write_property`.
+        /// The response to `write_property`.
         #[prost(message, tag = "2")]
         WriteProperty(super::WritePropertyResponse),
-        /// To `list_property`.
+        /// The response to `list_property`.
         #[prost(message, tag = "3")]
         ListProperty(super::ListPropertyResponse),
     }

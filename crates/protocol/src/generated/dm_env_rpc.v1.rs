@@ -2,10 +2,11 @@
 /// An array in row-major order.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Tensor {
-    /// The length of each dimension; none for a scalar. One may be negative: it is inferred from the number of elements.
+    /// The length of each dimension; empty for a scalar. One length may be negative: it is inferred from the number of
+    /// elements.
     #[prost(int32, repeated, tag = "15")]
     pub shape: ::prost::alloc::vec::Vec<i32>,
-    /// The elements; a single one stands for all elements of the shape.
+    /// The elements. If there is only one, all elements of the shape have its value.
     #[prost(oneof = "tensor::Payload", tags = "1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11")]
     pub payload: ::core::option::Option<tensor::Payload>,
 }
@@ -67,7 +68,7 @@ pub mod tensor {
         #[prost(uint64, repeated, tag = "1")]
         pub array: ::prost::alloc::vec::Vec<u64>,
     }
-    /// Truth values.
+    /// Booleans.
     #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
     pub struct BoolArray {
         /// The elements.
@@ -81,14 +82,14 @@ pub mod tensor {
         #[prost(string, repeated, tag = "1")]
         pub array: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
     }
-    /// Messages.
+    /// Protobuf messages.
     #[derive(Clone, PartialEq, ::prost::Message)]
     pub struct ProtoArray {
         /// The elements.
         #[prost(message, repeated, tag = "1")]
         pub array: ::prost::alloc::vec::Vec<::prost_types::Any>,
     }
-    /// The elements; a single one stands for all elements of the shape.
+    /// The elements. If there is only one, all elements of the shape have its value.
     #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Payload {
         /// FLOAT
@@ -129,13 +130,13 @@ pub mod tensor {
 /// The shape, type and bounds of a tensor.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct TensorSpec {
-    /// Unique among the actions, the observations or the properties.
+    /// The name, unique among the actions, the observations or the properties.
     #[prost(string, tag = "1")]
     pub name: ::prost::alloc::string::String,
-    /// The length of each dimension; none for a scalar.
+    /// The length of each dimension; empty for a scalar.
     #[prost(int32, repeated, tag = "2")]
     pub shape: ::prost::alloc::vec::Vec<i32>,
-    /// The elements' type.
+    /// The type of the elements.
     #[prost(enumeration = "DataType", tag = "3")]
     pub dtype: i32,
     /// The minimum, inclusive; not set if unbounded.
@@ -147,16 +148,16 @@ pub struct TensorSpec {
 }
 /// Nested message and enum types in `TensorSpec`.
 pub mod tensor_spec {
-    /// A bound: one element for all, or one for each element of the shape.
+    /// A bound: one number for all elements, or one for each element of the shape.
     #[derive(Clone, PartialEq, ::prost::Message)]
     pub struct Value {
-        /// The bound, of the spec's type.
+        /// The bound, of the type `dtype`.
         #[prost(oneof = "value::Payload", tags = "9, 10, 11, 12, 13, 14, 15, 16")]
         pub payload: ::core::option::Option<value::Payload>,
     }
     /// Nested message and enum types in `Value`.
     pub mod value {
-        /// The bound, of the spec's type.
+        /// The bound, of the type `dtype`.
         #[derive(Clone, PartialEq, ::prost::Oneof)]
         pub enum Payload {
             /// FLOAT
@@ -186,24 +187,24 @@ pub mod tensor_spec {
         }
     }
 }
-/// Makes a world.
+/// Creates a world.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct CreateWorldRequest {
-    /// `env_id`, and settings that differ from their defaults.
+    /// The setting `env_id`, and settings that differ from their defaults.
     #[prost(btree_map = "string, message", tag = "1")]
     pub settings: ::prost::alloc::collections::BTreeMap<
         ::prost::alloc::string::String,
         Tensor,
     >,
 }
-/// The world is made.
+/// The world is created.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct CreateWorldResponse {
-    /// The name, unique on this server; any stream may join the world by it.
+    /// The name of the world, unique on this server. Any stream may join the world by this name.
     #[prost(string, tag = "1")]
     pub world_name: ::prost::alloc::string::String,
 }
-/// The actions and observations of an agent, by uids that never change.
+/// The actions and observations of an agent, by unique ids that never change.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ActionObservationSpecs {
     /// The actions.
@@ -213,10 +214,11 @@ pub struct ActionObservationSpecs {
     #[prost(btree_map = "uint64, message", tag = "2")]
     pub observations: ::prost::alloc::collections::BTreeMap<u64, TensorSpec>,
 }
-/// Makes the stream the world's agent. A world has one agent at a time, a stream is the agent of one world at a time.
+/// Makes the stream the agent of a world. A world has at most one agent at a time, and a stream is the agent of at most
+/// one world.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct JoinWorldRequest {
-    /// The world.
+    /// The name of the world.
     #[prost(string, tag = "1")]
     pub world_name: ::prost::alloc::string::String,
     /// Must be empty: there are no settings.
@@ -233,13 +235,13 @@ pub struct JoinWorldResponse {
     #[prost(message, optional, tag = "1")]
     pub specs: ::core::option::Option<ActionObservationSpecs>,
 }
-/// Advances the environment by one step, or begins an episode if none is running: then the actions are ignored.
+/// Advances the environment by one step. If no episode is running, ignores the actions and begins an episode.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct StepRequest {
-    /// Every action, within its bounds.
+    /// The value of every action, within its bounds.
     #[prost(btree_map = "uint64, message", tag = "1")]
     pub actions: ::prost::alloc::collections::BTreeMap<u64, Tensor>,
-    /// The observations to return; others are not.
+    /// The ids of the observations to return.
     #[prost(uint64, repeated, tag = "2")]
     pub requested_observations: ::prost::alloc::vec::Vec<u64>,
 }
@@ -253,10 +255,11 @@ pub struct StepResponse {
     #[prost(btree_map = "uint64, message", tag = "2")]
     pub observations: ::prost::alloc::collections::BTreeMap<u64, Tensor>,
 }
-/// Makes the agent's next step begin an episode. Does nothing if it does already and no settings are given.
+/// Makes the agent's next step begin an episode. Does nothing if the next step begins an episode anyway and no settings
+/// are given.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ResetRequest {
-    /// `seed`, `version` and parameters, from the next episode on.
+    /// The settings `seed`, `version` and parameters, which hold from the next episode on.
     #[prost(btree_map = "string, message", tag = "1")]
     pub settings: ::prost::alloc::collections::BTreeMap<
         ::prost::alloc::string::String,
@@ -266,15 +269,15 @@ pub struct ResetRequest {
 /// The next step begins an episode.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ResetResponse {
-    /// The actions and observations, as in the response to the join.
+    /// The actions and observations, as in `JoinWorldResponse`.
     #[prost(message, optional, tag = "1")]
     pub specs: ::core::option::Option<ActionObservationSpecs>,
 }
-/// Resets a world, which need not be the stream's. If it has another agent, that agent's next step is carried out and
-/// ends its episode, INTERRUPTED; the response does not wait for it.
+/// Resets any world. If another stream is its agent, that agent's next step is carried out, and ends its episode with
+/// INTERRUPTED. The response does not wait for this step.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ResetWorldRequest {
-    /// The world.
+    /// The name of the world.
     #[prost(string, tag = "1")]
     pub world_name: ::prost::alloc::string::String,
     /// The settings, as in `ResetRequest`.
@@ -284,19 +287,19 @@ pub struct ResetWorldRequest {
         Tensor,
     >,
 }
-/// The world is, or will be, reset.
+/// The world is reset, or its agent's next step will reset it.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ResetWorldResponse {}
-/// Leaves the world. Legal without a world, too.
+/// Leaves the joined world. Does nothing if the stream has not joined a world.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct LeaveWorldRequest {}
-/// The stream is not an agent.
+/// The stream is not the agent of a world any more.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct LeaveWorldResponse {}
 /// Frees a world, which must not have an agent.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct DestroyWorldRequest {
-    /// The world.
+    /// The name of the world.
     #[prost(string, tag = "1")]
     pub world_name: ::prost::alloc::string::String,
 }
@@ -313,7 +316,7 @@ pub struct EnvironmentRequest {
 pub mod environment_request {
     #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Payload {
-        /// Makes a world.
+        /// Creates a world.
         #[prost(message, tag = "1")]
         CreateWorld(super::CreateWorldRequest),
         /// Joins a world.
@@ -334,7 +337,7 @@ pub mod environment_request {
         /// Frees a world.
         #[prost(message, tag = "7")]
         DestroyWorld(super::DestroyWorldRequest),
-        /// A PropertyRequest; others are not known here.
+        /// A PropertyRequest; other extensions are refused.
         #[prost(message, tag = "15")]
         Extension(::prost_types::Any),
     }
@@ -376,12 +379,12 @@ pub mod environment_response {
         /// The response to `extension`: a PropertyResponse.
         #[prost(message, tag = "15")]
         Extension(::prost_types::Any),
-        /// The response to any request that was refused; the request changed nothing.
+        /// The response to any request that is refused. The request changed nothing.
         #[prost(message, tag = "16")]
         Error(super::super::super::google::rpc::Status),
     }
 }
-/// The type of a tensor's elements. The numbers are those of `Tensor.payload`.
+/// The type of a tensor's elements. Its number is the field number in `Tensor.payload`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum DataType {
@@ -403,11 +406,11 @@ pub enum DataType {
     Uint32 = 7,
     /// 64-bit unsigned.
     Uint64 = 8,
-    /// Truth values.
+    /// Booleans.
     Bool = 9,
     /// UTF-8 text.
     String = 10,
-    /// Messages.
+    /// Protobuf messages.
     Proto = 11,
 }
 impl DataType {
@@ -450,7 +453,7 @@ impl DataType {
         }
     }
 }
-/// The place of an agent in its sequence (its episode).
+/// The state of an agent's sequence, which is an episode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum EnvironmentStateType {
@@ -460,7 +463,8 @@ pub enum EnvironmentStateType {
     Running = 1,
     /// The task ended the episode. The next step ignores its actions and begins the next episode.
     Terminated = 2,
-    /// The step limit or a reset of the world ended the episode. The next step begins the next one.
+    /// The step limit or a reset of the world ended the episode. The next step ignores its actions and begins the next
+    /// episode.
     Interrupted = 3,
 }
 impl EnvironmentStateType {
@@ -568,9 +572,9 @@ pub mod environment_client {
             self.inner = self.inner.max_encoding_message_size(limit);
             self
         }
-        /// Every request gets exactly one response, in order: the variant of the same name, or `error`, after which nothing has
-        /// changed and the stream goes on. Requests may be sent without waiting for earlier responses. The stream itself ends
-        /// with a status only in the cases in which a session of perturb.v1 does.
+        /// Every request gets exactly one response, in order: the variant of the same name, or `error`. After an `error`
+        /// nothing has changed, and the stream continues. Requests may be sent without waiting for earlier responses. The
+        /// stream ends with a status in the same cases as a session of perturb.v1.
         pub async fn process(
             &mut self,
             request: impl tonic::IntoStreamingRequest<
@@ -618,9 +622,9 @@ pub mod environment_server {
             >
             + std::marker::Send
             + 'static;
-        /// Every request gets exactly one response, in order: the variant of the same name, or `error`, after which nothing has
-        /// changed and the stream goes on. Requests may be sent without waiting for earlier responses. The stream itself ends
-        /// with a status only in the cases in which a session of perturb.v1 does.
+        /// Every request gets exactly one response, in order: the variant of the same name, or `error`. After an `error`
+        /// nothing has changed, and the stream continues. Requests may be sent without waiting for earlier responses. The
+        /// stream ends with a status in the same cases as a session of perturb.v1.
         async fn process(
             &self,
             request: tonic::Request<tonic::Streaming<super::EnvironmentRequest>>,

@@ -5,7 +5,7 @@ pub struct Status {
     /// A gRPC status code, e.g. 3 INVALID_ARGUMENT.
     #[prost(int32, tag = "1")]
     pub code: i32,
-    /// A sentence: the received value, the expected value and a remedy.
+    /// A message for users: the received value, the expected value, and what to do.
     #[prost(string, tag = "2")]
     pub message: ::prost::alloc::string::String,
     /// Never set by this server.
