@@ -8,9 +8,9 @@ use perturb_text::Table;
 
 /// Explanation, for users, of the intervals in a comparison.
 pub const INTERVALS_NOTE: &str = "\
-Intervals have 95 %. Those over seeds are t intervals, which cover the mean in 95 % also with three seeds if the means of\n\
-seeds are normally distributed; fewer than three seeds have none. Those over episodes speak of these policies in other\n\
-episodes. p is of t tests over seeds, corrected after Holm.";
+All intervals are 95 % intervals. Intervals over seeds are t intervals: they cover the mean in 95 % of cases, even with\n\
+three seeds, if the means of seeds are normally distributed. Fewer than three seeds have no interval. Intervals over\n\
+episodes describe these policies in other episodes. p is the p-value of t tests over seeds, with Holm's correction.";
 
 /// The comparison of several conditions in one environment.
 #[derive(Clone, Debug, PartialEq)]
@@ -39,6 +39,7 @@ fn comparison_in(environment: &str, assessed: &[ExternalEvaluation]) -> Option<E
     if agents.len() < 2 {
         return None;
     }
+    // Names a condition after its agent, and after its training distribution if an agent has several.
     let condition = |&(agent, trained_on)| {
         let own = policies.iter().filter(|(name, policy)| (*name, policy.trained_on()) == (agent, trained_on));
         let keyed = own.enumerate().map(|(index, (_, policy))| ((index + 1).to_string(), &policy.records));
@@ -46,6 +47,7 @@ fn comparison_in(environment: &str, assessed: &[ExternalEvaluation]) -> Option<E
         ComparedCondition { name, policies: keyed.collect() }
     };
     let conditions: Vec<ComparedCondition<'_>> = kinds.iter().map(condition).collect();
+    // Compares only tests that all policies have.
     let names = |records: &Records| records.about.tests.iter().map(|test| test.set.name.clone()).collect::<Vec<_>>();
     let mut common = names(&policies[0].1.records);
     common.retain(|name| policies.iter().all(|(_, policy)| names(&policy.records).contains(name)));

@@ -16,11 +16,11 @@ pub(super) fn sentences(results: &Results<'_>, selections: &[MethodResults<'_>])
     let compared = if results.plan.cells.is_empty() {
         ""
     } else {
-        " In the experiment's environments success is judged by its rule. No configuration was selected, and no run is \
-         paired with the experiment's: seeds of trainings and tests are others."
+        " In the experiment's environments, success is judged by the experiment's rule. No configuration was selected. No \
+         run is paired with a run of the experiment, because the seeds of trainings and tests differ."
     };
     let mut lines = vec![format!(
-        "{count} trained elsewhere, by settings that are not known here, and only tested; rows say so.{compared}"
+        "{count} trained elsewhere, with unknown settings, and only tested here; their rows say so.{compared}"
     )];
     let mut known: BTreeMap<&str, (u32, &str)> = BTreeMap::new();
     for result in results.done() {

@@ -75,7 +75,7 @@ impl<'a> Report<'a> {
         let papers = if of_rows(&|row| !row.papers.is_empty()) { ", beside the paper's means" } else { "" };
         let conditional = match self.plan.selection {
             Selection::Paper if !intervals.is_empty() && self.plan.selects() => {
-                " The intervals are those of the configurations that were selected, whatever else might have been."
+                " The intervals apply to the selected configurations, and ignore that others might have been selected."
             }
             _ => "",
         };

@@ -12,17 +12,19 @@ use super::{MISSING, Picture, PictureDrawing, Report, ReportBundle};
 use crate::plot::{self, CurveQuantity, PlotError, draw_curves, svg};
 
 pub(super) const STYLE: &str = include_str!("style.css");
-const METRICS: &str = "Default is the success rate of policies that were trained and tested on D, Interpolation that of \
-                       policies trained and tested on R. Extrapolation is the geometric mean of three: trained on D and \
-                       tested on R, trained on D and tested on E, trained on R and tested on E.";
-const SCENARIOS: &str = "Mean ± standard deviation over runs, and in brackets how well the episodes determine the rate of \
-                         these policies. The darker, the higher the success rate.";
+const METRICS: &str = "Default is the success rate of policies that were trained and tested on D. Interpolation is the success \
+                       rate of policies that were trained and tested on R. Extrapolation is the geometric mean of three \
+                       success rates: trained on D and tested on R, trained on D and tested on E, trained on R and tested \
+                       on E.";
+const SCENARIOS: &str = "Mean ± standard deviation over runs; in brackets, the 95 % interval for the rate of these policies, \
+                         given the number of test episodes. A darker colour means a higher success rate.";
 const STATISTICS: &str = "Pairs are runs of two methods with the same seed, in each of the environments. P(X > Y) is the \
-                          probability that a run of X is better than one of Y, where equal ones count half. Corrected \
-                          p-values up to 0.05 are, all together, wrong with a probability of 5 % at most.";
-const SURFACES: &str = "How the selected policies do over parameters. Heatmaps are means over runs; colours are mean return \
-                        and success rate, the same in all pictures of an environment; what lies beyond their scale has the \
-                        colour of its end. Boxes are R's and E's, the ring is D.";
+                          probability that a run of X is better than a run of Y; equal runs count half. If all corrected \
+                          p-values up to 0.05 are taken as differences, the probability that any of them is false is at \
+                          most 5 %.";
+const SURFACES: &str = "Results of the selected policies over parameters. Heatmaps are means over runs. Colours show mean \
+                        return and success rate, with the same scales in all pictures of an environment; a value beyond a \
+                        scale has the colour of the scale's end. The boxes show R and E, and the ring shows D.";
 /// Characters that a `data:` URI must percent-encode.
 const ENCODED: &AsciiSet =
     &NON_ALPHANUMERIC.remove(b'-').remove(b'_').remove(b'.').remove(b',').remove(b'/').remove(b'=');

@@ -90,8 +90,8 @@ impl Report<'_> {
             environment: String::new(),
             file: "profiles".into(),
             name: "performance profiles".into(),
-            caption: "Performance profiles: the share of runs, over all environments, whose success rate is above that at the \
-                      axis. Bands are 95 % stratified bootstrap intervals at each point; there are none of a single run."
+            caption: "Performance profiles: the share of runs, over all environments, with a success rate above the value \
+                      on the x axis. Bands are 95 % stratified bootstrap intervals at each point; a single run has none."
                 .into(),
             drawing: PictureDrawing::Panels(Panels {
                 title: "All environments: share of runs above a success rate".into(),

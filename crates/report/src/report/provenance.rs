@@ -51,7 +51,7 @@ pub(super) fn sentences(
         let (lack, their) = if incomplete == 1 { ("lacks", "its") } else { ("lack", "their") };
         let selected = match results.plan.selection {
             Selection::Paper if results.plan.selects() => {
-                format!(", so that {their} configurations were selected among fewer than the plan has")
+                format!(", so {their} configurations were selected from incomplete results")
             }
             Selection::Paper | Selection::Clean => String::new(),
         };
@@ -69,13 +69,13 @@ pub(super) fn sentences(
     let (known, selected) = recorded.count();
     if known < selected {
         lines.push(format!(
-            "{known} of {selected} selected cells have recorded episodes, from which success over a parameter follows."
+            "{known} of {selected} selected cells have recorded episodes. Success over a parameter is computed from these."
         ));
     }
     lines.push(
-        "Numbers are success rates in percent: mean ± standard deviation over runs; one run has none. The paper's are \
-         those of its five runs; a difference is ours less the paper's. Hopper and HalfCheetah run on another physics \
-         engine than the paper's, and have none."
+        "Numbers are success rates in percent: mean ± standard deviation over runs; a single run has no standard \
+         deviation. The paper's numbers are means over its five runs. A difference is our number minus the paper's. \
+         Hopper and HalfCheetah have no differences, because they run on a different physics engine than in the paper."
             .into(),
     );
     lines

@@ -54,8 +54,8 @@ impl Report<'_> {
     /// Returns the table of interquartile means and optimality gaps with their intervals; `None` if it has no rows.
     pub(super) fn iqm_table(&self) -> Option<Table> {
         let title = "Interquartile means and optimality gaps: over all environments and the runs that all of them have, with \
-                     95 % stratified bootstrap intervals; where something was selected, also the interval with every \
-                     selection made anew in each resample. The gap is how far success rates stay below 100 % on average";
+                     95 % stratified bootstrap intervals. If configurations were selected, a second interval repeats the \
+                     selection in each resample. The gap is the mean distance of success rates from 100 %";
         let mut table = Table::builder(title, &self.averages).text("method", |row| &row.method);
         for metric in Metric::ALL {
             let column = |name: &str| Column { name: name.into(), group: Some(metric.to_string()), is_number: true };
