@@ -1,4 +1,4 @@
-// Script of the pages: receives events, replaces changed parts and draws curves. It changes nothing on the server.
+// Script of the pages. It receives events, replaces changed parts of the page, and draws curves.
 "use strict";
 
 (() => {
@@ -72,7 +72,7 @@
     sizes.observe(place);
   }
 
-  // Removes the chart, because the run was begun anew and has no data.
+  // Removes the chart of a run that was started again and has no data yet.
   function clear(figure) {
     const known = plots.get(figure), place = figure.querySelector(".plot");
     if (!known) return;
@@ -105,7 +105,7 @@
     figure.dataset.reach = curve[by][curve[by].length - 1];
   }
 
-  // Draws the curves of the cells in work, with one colour for each kind.
+  // Draws the curves of the running cells, with one colour for each kind of cell.
   function drawCells(figure, cells) {
     figure.parentElement.hidden = cells.length === 0;
     if (cells.length === 0) return clear(figure);
@@ -170,14 +170,15 @@
     new ResizeObserver(fit).observe(report.parentElement);
   }
 
-  // Returns a key that identifies an element among others of its kind: its address or its text.
+  // Returns a key that identifies an element among its siblings: its link address or its text.
   const keyOf = (node) =>
     node.nodeType !== Node.ELEMENT_NODE ? null
       : node.getAttribute("href") ?? node.getAttribute("src") ?? node.querySelector("[href], [src]")?.getAttribute("href")
         ?? node.querySelector("[src]")?.getAttribute("src") ?? null;
   const alike = (a, b) => a.nodeType === b.nodeType && a.nodeName === b.nodeName && keyOf(a) === keyOf(b);
 
-  // Changes `old` to `fresh`, but only where they differ, so that focus, clicks and playing films are not disturbed.
+  // Makes the element `old` equal to `fresh`. Changes only the parts that differ, so that focus, clicks and playing films
+  // are not disturbed.
   function become(old, fresh) {
     if (old.isEqualNode(fresh)) return;
     if (old.nodeType !== Node.ELEMENT_NODE) {

@@ -1,4 +1,4 @@
-//! The state of a saved assessment, read again when its files change.
+//! The state of a saved assessment. It is read again when its files change.
 
 use std::path::{Path, PathBuf};
 
@@ -9,16 +9,17 @@ use perturb_text::shortened;
 /// The state of an assessment at the last refresh.
 #[derive(Debug)]
 pub(crate) struct LiveAssessment {
-    /// The served folder. Links must not lead out of it.
+    /// The served folder. Symbolic links that lead out of it are not followed.
     root: PathBuf,
     path: PathBuf,
-    /// The stamps of all files in the folder.
+    /// The stamps (sizes and times) of all files in the folder.
     stamps: Vec<Option<Stamp>>,
     status: Result<AssessmentStatus, String>,
 }
 
 impl LiveAssessment {
-    /// Makes the state of the assessment in `path`, before its first refresh. Files outside of `root` are not read.
+    /// Makes the state of the assessment in `path`, which is empty before its first refresh. Files outside of `root`
+    /// are not read.
     pub(crate) fn new(root: &Path, path: &Path) -> Self {
         let status = Err("it was not read yet".into());
         Self { root: root.to_owned(), path: path.to_owned(), stamps: Vec::new(), status }
@@ -40,7 +41,7 @@ impl LiveAssessment {
         }
     }
 
-    /// Returns the status, or the reason why it is not known.
+    /// Returns the status, or the reason why it could not be read.
     pub(crate) fn status(&self) -> Result<&AssessmentStatus, &str> {
         self.status.as_ref().map_err(String::as_str)
     }

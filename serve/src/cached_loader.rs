@@ -1,4 +1,4 @@
-//! A cached value that one task at a time refreshes, for a limited share of the time.
+//! A cached value that is loaded again on demand, by one task at a time and with pauses between loads.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -10,14 +10,14 @@ use tokio::sync::{Mutex, Semaphore};
 pub(crate) const MIN_PAUSE: Duration = Duration::from_secs(1);
 /// Pause between two loads, as a multiple of the time that the last load took.
 pub(crate) const PAUSE_FACTOR: u32 = 5;
-/// Longest time that a caller waits for a load.
+/// Maximum time for which a caller waits for a load.
 const LOAD_TIMEOUT: Duration = Duration::from_secs(20);
 
-/// A value that is loaded again when it is wanted and its pause is over. Clones share the value.
+/// A cached value. [`get`](Self::get) loads it again if the pause since the last load is over. Clones share the value.
 #[derive(Debug)]
 pub(crate) struct CachedLoader<T> {
     last: Arc<Mutex<Option<LoadedValue<T>>>>,
-    /// Set while a load takes longer than callers wait.
+    /// Whether a load has already taken longer than callers wait, and still runs.
     is_overdue: Arc<AtomicBool>,
 }
 
@@ -30,10 +30,10 @@ struct LoadedValue<T> {
     duration: Duration,
 }
 
-/// Why there is no value.
+/// The reason why there is no value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum CachedLoadError {
-    /// The loading function has panicked, which is a fault of this program.
+    /// The loading function has panicked, which is a bug in this program.
     Panicked,
     /// The load takes too long, for example because a file system does not answer.
     TimedOut,
@@ -62,9 +62,10 @@ impl<T: Clone + Send + 'static> CachedLoader<T> {
         self.last.try_lock().is_err()
     }
 
-    /// Returns the last value during its pause. After the pause it calls `load`, as soon as `permits` has a permit.
+    /// Returns the last value if the pause since its load is not over. Otherwise waits for one of `permits`, calls
+    /// `load`, and returns the new value.
     ///
-    /// A load runs to its end although nobody waits for it any more, but an overdue load returns its permit.
+    /// A load continues even if no caller waits for it any more. It returns its permit after [`LOAD_TIMEOUT`].
     pub(crate) async fn get(
         &self,
         permits: &Arc<Semaphore>,
@@ -73,6 +74,7 @@ impl<T: Clone + Send + 'static> CachedLoader<T> {
         self.get_within(LOAD_TIMEOUT, permits, load).await
     }
 
+    /// Implements [`get`](Self::get) with another timeout.
     async fn get_within(
         &self,
         timeout: Duration,
@@ -85,6 +87,7 @@ impl<T: Clone + Send + 'static> CachedLoader<T> {
         let last = Arc::clone(&self.last);
         let is_overdue = Arc::clone(&self.is_overdue);
         let permits = Arc::clone(permits);
+        // The lock makes other callers wait for a running load, whose value they then get.
         let task = tokio::spawn(async move {
             let mut last = last.lock_owned().await;
             if let Some(last) = last.as_ref().filter(|last| last.at.elapsed() < pause_after(last.duration)) {

@@ -1,4 +1,4 @@
-//! Accepts connections: a limited number at a time, and none that stands still.
+//! Accepts connections. It limits their number, and closes connections whose clients send or read nothing.
 
 use std::collections::VecDeque;
 use std::convert::Infallible;
@@ -21,16 +21,16 @@ use tokio::net::TcpListener;
 use tokio::sync::{Notify, Semaphore};
 use tower_service::Service;
 
-/// Limits of all connections together, and of each one.
+/// The limit of the number of connections, and the time limits of each connection.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ConnectionLimits {
-    /// Number of open connections. A browser opens about six. A further client takes the place of the connection that
-    /// has waited longest for a request; if all are being answered, it waits.
+    /// Maximum number of open connections. A browser opens about six. When the maximum is reached, a new connection
+    /// replaces the oldest one that has no request in progress. If all have one, the new connection waits.
     max_connections: usize,
-    /// Time in which a client must send the head of a request. It counts from the connection's start, or from the end
-    /// of the previous response.
+    /// Maximum time for a client to send the head of a request. It counts from the start of the connection, or from the
+    /// end of the last response.
     head_timeout: Duration,
-    /// Time after which the kernel closes a connection whose client takes none of the bytes that wait for it.
+    /// Time after which the kernel closes a connection whose client acknowledges no sent data.
     write_timeout: Duration,
 }
 
@@ -40,19 +40,19 @@ impl Default for ConnectionLimits {
     }
 }
 
-/// The address of a client, as an extension of its requests.
+/// The address of a client. It is attached to the client's requests as an extension.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ClientAddress(pub(crate) IpAddr);
 
-/// A connection that may be closed for the sake of another while it waits for a request.
+/// An open connection. It may be closed in favour of a new connection while it has no request in progress.
 #[derive(Debug, Default)]
 struct OpenConnection {
-    /// Number of requests that are being answered.
+    /// Number of requests in progress.
     requests: AtomicUsize,
     closing: Notify,
 }
 
-/// The open connections, the oldest first.
+/// The open connections, oldest first.
 #[derive(Debug, Default)]
 struct OpenConnections(Mutex<VecDeque<Arc<OpenConnection>>>);
 
@@ -67,7 +67,8 @@ impl OpenConnections {
         self.lock().retain(|other| !Arc::ptr_eq(other, connection));
     }
 
-    /// Closes the oldest connection that waits for a request, if there is one: clients that send none shut out nobody.
+    /// Closes the oldest connection without a request in progress, if there is one. Clients that send no requests
+    /// therefore cannot block other clients.
     fn close_waiting(&self) {
         let mut all = self.lock();
         let waiting = all.iter().position(|connection| connection.requests.load(Ordering::Relaxed) == 0);
@@ -81,7 +82,7 @@ impl OpenConnections {
     }
 }
 
-/// A request that is being answered, until its response is whole or lost.
+/// Counts a request as in progress, until its response was sent or dropped.
 struct RequestGuard(Arc<OpenConnection>);
 
 impl Drop for RequestGuard {
@@ -90,7 +91,7 @@ impl Drop for RequestGuard {
     }
 }
 
-/// Answers requests with `router` on every connection of `listener`. Never returns.
+/// Accepts the connections of `listener`, and answers their requests with `router`. Never returns.
 pub(crate) async fn serve(mut listener: TcpListener, router: Router, limits: ConnectionLimits) -> Infallible {
     let permits = Arc::new(Semaphore::new(limits.max_connections));
     let all = Arc::new(OpenConnections::default());
@@ -123,7 +124,7 @@ pub(crate) async fn serve(mut listener: TcpListener, router: Router, limits: Con
         tokio::spawn(async move {
             let _permit = permit;
             tokio::select! {
-                // A client that goes away or exceeds a time limit is no error of this server.
+                // Errors of a client that disconnects or exceeds a time limit are ignored.
                 _ = connection => {}
                 () = open.closing.notified() => {}
             }
@@ -132,7 +133,7 @@ pub(crate) async fn serve(mut listener: TcpListener, router: Router, limits: Con
     }
 }
 
-/// A response body that keeps its request's guard until it was sent or dropped.
+/// A response body that holds the guard of its request until it was sent or dropped.
 struct GuardedBody {
     body: Body,
     _guard: RequestGuard,

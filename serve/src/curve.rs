@@ -1,37 +1,38 @@
-//! The learning curve of a training, from `monitor.csv` while it grows. It has at most 160 points.
+//! The learning curve of a training. It is read from `monitor.csv` while that file grows, and has at most 160 points.
 
 use perturb_text::shortened;
 use serde::Serialize;
 
 use crate::tail::{MAX_READ_BYTES, Tail, TailUpdate};
 
-/// Maximum number of groups in memory. Beyond it, pairs of groups are merged.
+/// Maximum number of groups of episodes in memory. When it is exceeded, pairs of groups are merged.
 const MAX_GROUPS: usize = 512;
 /// Maximum number of points of a curve.
 const MAX_POINTS: usize = 160;
-/// Minimum number of episodes of a point.
+/// Minimum number of episodes that a point is a mean of.
 const MIN_EPISODES_PER_POINT: usize = 10;
 /// Minimum time over which a speed is measured, in seconds.
 const MIN_SPEED_SECONDS: f64 = 1.0;
-/// Maximum number of different speeds of a curve.
+/// Maximum number of different speeds in a curve.
 const MAX_SPEEDS: f64 = 40.0;
-/// Share of the time since the last speed. Episodes that follow within it were written in the same block.
+/// Groups whose ends are closer together than this time count as written at once. The time is given as a share of the
+/// time since the last measured speed.
 const SAME_BLOCK_SHARE: f64 = 0.02;
 
-/// Sums over the episodes of a growing log.
+/// The episodes of a growing log, summed up in groups.
 #[derive(Debug)]
 pub(crate) struct EpisodeLog {
     tail: Tail,
-    /// Positions of the columns return, length, seconds and success; `None` before the header was read.
+    /// Positions of the columns with return, length, time and success; `None` before the header was read.
     columns: Option<[usize; 4]>,
     groups: Vec<EpisodeGroup>,
-    /// Number of episodes in each group but the last one.
+    /// Number of episodes in each group. The last group may have fewer.
     group_size: usize,
     /// Number of lines that were read.
     lines: usize,
-    /// Fault of the first line that is not understood.
+    /// The error of the first line that could not be parsed.
     line_fault: Option<String>,
-    /// Reason why the file cannot be read now.
+    /// The reason why the file could not be read at the last attempt.
     read_error: Option<String>,
 }
 
@@ -46,23 +47,23 @@ struct EpisodeGroup {
     end: f64,
 }
 
-/// A curve as it is drawn. Each list has one number for each point, which is a mean over some episodes.
+/// The points of a learning curve. Each list has one number per point. A point stands for consecutive episodes.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub(crate) struct LearningCurve {
-    /// Number of episodes at the middle of the point.
+    /// Number of episodes up to the middle of the point.
     pub(crate) episodes: Vec<f64>,
-    /// Number of steps of all environments at the middle of the point.
+    /// Number of steps of all environments up to the middle of the point.
     pub(crate) steps: Vec<f64>,
-    /// Undiscounted return.
+    /// Mean undiscounted return; `None` if it is not finite.
     #[serde(rename = "return")]
     pub(crate) episode_return: Vec<Option<f64>>,
     /// Success rate, in percent.
     pub(crate) success: Vec<f64>,
-    /// Episode length, in steps.
+    /// Mean length of episodes, in steps.
     pub(crate) length: Vec<f64>,
-    /// Steps per second.
+    /// Steps per second; `None` if it is not known yet.
     pub(crate) speed: Vec<Option<f64>>,
-    /// Number of episodes of each point but the last one.
+    /// Number of episodes of each point. The last point may have more or fewer.
     #[serde(rename = "each")]
     pub(crate) episodes_per_point: usize,
 }
@@ -81,7 +82,7 @@ impl EpisodeLog {
         }
     }
 
-    /// Reads the new episodes. Returns whether anything has changed.
+    /// Reads the episodes that were added to the file. Returns whether anything has changed.
     pub(crate) fn read_new(&mut self) -> bool {
         let new = match self.tail.read_new() {
             Ok(TailUpdate::Unchanged) => return self.read_error.take().is_some(),
@@ -115,13 +116,13 @@ impl EpisodeLog {
         true
     }
 
-    /// Returns the number of episodes.
+    /// Returns the number of episodes that were read.
     pub(crate) fn episode_count(&self) -> usize {
         self.groups.iter().map(|group| group.episodes).sum()
     }
 
-    /// Returns the mean length in steps and the speed in steps per second of the last tenth of the time. Returns `None`
-    /// before there are episodes.
+    /// Returns the mean length of episodes in steps and the speed in steps per second, over the last tenth of the
+    /// training time. Returns `None` if they are not known yet.
     pub(crate) fn recent(&self) -> Option<(f64, f64)> {
         let end = self.groups.last()?.end;
         let is_old = |group: &EpisodeGroup| end - group.end >= MIN_SPEED_SECONDS.max(end / 10.0);
@@ -133,7 +134,7 @@ impl EpisodeLog {
         (length > 0.0 && speed > 0.0 && speed.is_finite()).then_some((length, speed))
     }
 
-    /// Returns the log's fault, if it has one.
+    /// Returns an error message if the file could not be read, or a line could not be parsed.
     pub(crate) fn fault(&self) -> Option<&str> {
         self.read_error.as_deref().or(self.line_fault.as_deref())
     }
@@ -176,13 +177,13 @@ impl EpisodeLog {
         }
     }
 
-    /// Returns the curve so far.
+    /// Returns the curve of the episodes that were read.
     pub(crate) fn curve(&self) -> LearningCurve {
         let points = (self.episode_count() / MIN_EPISODES_PER_POINT).clamp(1, MAX_POINTS);
         let groups_per_point = self.groups.len().div_ceil(points).max(1);
         let mut parts: Vec<EpisodeGroup> = self.groups.chunks(groups_per_point).map(EpisodeGroup::sum).collect();
         let episodes_per_point = groups_per_point * self.group_size;
-        // A mean over a few episodes at the end would mislead.
+        // If the last point has few episodes, it is merged with the point before it, because its mean is unreliable.
         if let [.., before, last] = &mut parts[..]
             && last.episodes < episodes_per_point / 2
         {
@@ -207,10 +208,10 @@ impl EpisodeLog {
     }
 }
 
-/// Returns the steps per second of each part.
+/// Returns the speed of each part of the curve, in steps per second.
 ///
-/// A training writes its episodes in blocks, with the time of writing. So consecutive parts share a speed until enough
-/// time has passed.
+/// A training writes many episodes at once, and all of them get the time of writing. A speed is therefore measured over
+/// consecutive parts until enough time has passed, and these parts share it.
 fn speeds(parts: &[EpisodeGroup]) -> Vec<Option<f64>> {
     let end = parts.last().map_or(0.0, |last| last.end);
     let mut speeds = Vec::new();
@@ -226,7 +227,8 @@ fn speeds(parts: &[EpisodeGroup]) -> Vec<Option<f64>> {
             steps = 0.0;
         }
     }
-    // The last parts have the speed before them. If the whole curve is short, all parts have its mean speed.
+    // The remaining parts at the end get the last measured speed. If none was measured, they get the curve's mean
+    // speed.
     let last = speeds.last().copied().unwrap_or_else(|| Some(steps / end).filter(|speed| speed.is_finite()));
     speeds.resize(parts.len(), last);
     speeds

@@ -1,4 +1,4 @@
-//! Errors of the server and of its pages.
+//! Errors of the web server and of its pages.
 
 use std::io::ErrorKind;
 use std::net::SocketAddr;
@@ -8,7 +8,7 @@ use perturb_files::FileError;
 
 use crate::cached_loader::CachedLoadError;
 
-/// The server cannot start.
+/// The reason why the web server cannot start.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the messages explain the fields")]
@@ -36,12 +36,12 @@ fn explained(error: &std::io::Error) -> String {
     }
 }
 
-/// Why a page has nothing to show.
+/// The reason why a page cannot be shown.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum ViewError {
-    /// There is no run in the folder that the address names.
+    /// The address does not name the folder of a run.
     RunNotFound,
-    /// The served folder cannot be listed, for this reason.
+    /// The served folder cannot be listed. The text has the reason.
     Unlisted(String),
     /// The run's files could not be read.
     Load(CachedLoadError),

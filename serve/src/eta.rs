@@ -1,27 +1,29 @@
-//! The remaining time of an experiment, from its progress while its page was open.
+//! Estimates the remaining time of an experiment from its progress while its page is open.
 //!
-//! It does not matter who makes the progress: processes, Slurm jobs or several machines.
+//! The estimate uses only the progress in the experiment's files, so it works for local processes, Slurm jobs and
+//! several machines.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 /// Time between two samples of the progress.
 const SAMPLE_INTERVAL: Duration = Duration::from_secs(10);
-/// Number of samples that are kept.
+/// Maximum number of stored samples.
 const MAX_SAMPLES: usize = 90;
-/// Time between the first sample and the first estimate.
+/// Minimum time between the first sample and an estimate.
 const MIN_TIME: Duration = Duration::from_secs(10);
-/// Share of the whole experiment that must be done between the first sample and an estimate.
+/// Minimum share of the whole experiment that must be done between the first sample and an estimate.
 const MIN_SHARE: f64 = 0.002;
 
-/// Samples of the progress: the done share of each cell, 0 to 1, with the time of the sample.
+/// Samples of the progress. A sample has its time and the finished share of each cell, 0 to 1.
 #[derive(Debug, Default)]
 pub(crate) struct Eta(VecDeque<(Instant, Vec<f32>)>);
 
 impl Eta {
     /// Adds a sample if the last one is old enough.
     pub(crate) fn sample(&mut self, now: Instant, shares: &[f32]) {
-        // Cells were begun anew or the plan has changed, so that earlier samples do not apply.
+        // If a share has decreased or the number of cells differs, cells were started again or the plan has changed.
+        // Earlier samples are then useless.
         let differs =
             |then: &[f32]| then.len() != shares.len() || then.iter().zip(shares).any(|(then, now)| now < then);
         if self.0.back().is_some_and(|(_, then)| differs(then)) {
@@ -33,13 +35,14 @@ impl Eta {
         }
     }
 
-    /// Drops all samples, because nobody works on the experiment.
+    /// Drops all samples. Call it while the experiment is not running.
     pub(crate) fn reset(&mut self) {
         self.0.clear();
     }
 
-    /// Returns the remaining seconds at the speed since the first sample. `weights` are the cells' durations relative
-    /// to each other. Returns `None` before there is enough progress.
+    /// Returns the remaining time in seconds, at the speed since the first sample. `shares` has the finished share of
+    /// each cell, and `weights` the durations of the cells relative to each other. Returns `None` before there is
+    /// enough progress.
     pub(crate) fn remaining_seconds(&self, now: Instant, shares: &[f32], weights: &[f64]) -> Option<f64> {
         let (start, then) = self.0.front()?;
         let time = now.duration_since(*start);

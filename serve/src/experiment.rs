@@ -1,4 +1,4 @@
-//! The state of an experiment, read again when its files change.
+//! The state of an experiment. It is read again when its files change.
 
 use std::collections::{HashMap, HashSet};
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -16,44 +16,46 @@ use crate::curve::LearningCurve;
 use crate::eta::Eta;
 use crate::training::{LOCK_INTERVAL, LiveTraining};
 
-/// Maximum number of cells in work whose curves are read.
+/// Maximum number of running cells whose curves are read.
 pub(crate) const MAX_CURVES: usize = 48;
-/// Approximate duration of a test episode, as a share of a training episode's.
+/// Approximate duration of a test episode, as a share of the duration of a training episode.
 const TEST_SHARE: f64 = 0.25;
-/// Longest time between the end of a cell and the start of the next one, during which the experiment is still in work.
+/// Time for which the experiment still counts as running after its last running cell was seen. It covers the time
+/// between the end of a cell and the start of the next one.
 const BETWEEN_CELLS: Duration = Duration::from_secs(15);
-/// Pause before a plan that was not understood is read again, as a multiple of the time that reading took.
+/// Pause before a damaged experiment is read again, as a multiple of the time that the last reading took.
 const REREAD_FACTOR: u32 = 20;
 
 /// The state of an experiment at the last refresh.
 #[derive(Debug)]
 pub(crate) struct LiveExperiment {
-    /// The served folder. Links must not lead out of it.
+    /// The served folder. Symbolic links that lead out of it are not followed.
     root: PathBuf,
     path: PathBuf,
-    /// Time of the last reading, and how long it took.
+    /// Time of the last reading; `None` before the first.
     read: Option<Instant>,
+    /// Duration of the last reading.
     read_duration: Duration,
-    /// Stamps of `cells/` and of the plan.
+    /// Stamps (sizes and times) of the folder `cells/` and of the plan.
     stamps: [Option<Stamp>; 2],
     status: Result<ExperimentStatus, String>,
-    /// Time at which a cell was last seen in work.
+    /// Time at which a running cell was last seen.
     worked: Option<Instant>,
-    /// Trainings of the first cells in work, by the cells' ids.
+    /// Trainings of the first [`MAX_CURVES`] running cells, by the cells' ids.
     trainings: HashMap<String, LiveTraining>,
-    /// Progress of all cells in work, by their ids.
+    /// Progress of all running cells, by their ids.
     progress: HashMap<String, CellProgress>,
     eta: Eta,
-    /// Number of settled cells for which `weights` were computed.
+    /// Number of settled cells (finished or failed) when `weights` was computed.
     weighted: usize,
     /// Duration of each cell relative to the others.
     weights: Vec<f64>,
     report_files: ReportFiles,
-    /// Ids of cells whose trainings have a page.
+    /// Ids of cells whose trainings have a page, i.e. whose trainings have begun.
     with_page: HashSet<String>,
 }
 
-/// The progress of a cell, from the last line of its `progress.csv`.
+/// The progress of a running cell, from the last line of its `progress.csv`.
 #[derive(Clone, Copy, Debug, Default)]
 struct CellProgress {
     stamp: Option<Stamp>,
@@ -65,28 +67,29 @@ struct CellProgress {
 struct ReportFiles {
     /// Time at which the files were listed.
     at: Option<Instant>,
-    /// Number of settled cells, and the time of their last change in seconds since 1970.
+    /// Number of settled cells (finished or failed), and the time of their last change in seconds since 1970.
     settled: (usize, i64),
     /// A hash of the files' names and stamps.
     fingerprint: u64,
-    /// Name of a file that leads out of the served folder and must not be read.
+    /// Name of a symbolic link that leads out of the served folder and must not be followed.
     outside: Option<String>,
 }
 
-/// The curve of a cell in work.
+/// The learning curve of a running cell.
 #[derive(Debug, Serialize)]
 pub(crate) struct CellCurve {
     pub(crate) id: String,
-    /// Environment, method, and version or set of the training.
+    /// A text with the environment, the method, and the version or set of the training.
     pub(crate) kind: String,
-    /// Number of episodes at the middle of each point.
+    /// Number of episodes up to the middle of each point.
     pub(crate) episodes: Vec<f64>,
     /// Success rate of each point, in percent.
     pub(crate) success: Vec<f64>,
 }
 
 impl LiveExperiment {
-    /// Makes the state of the experiment in `path`, before its first refresh. Files outside of `root` are not read.
+    /// Makes the state of the experiment in `path`, which is empty before its first refresh. Files outside of `root`
+    /// are not read.
     pub(crate) fn new(root: &Path, path: &Path) -> Self {
         Self {
             root: root.to_owned(),
@@ -108,7 +111,8 @@ impl LiveExperiment {
 
     /// Reads the status again if its files have changed, or if enough time has passed.
     pub(crate) fn refresh(&mut self) {
-        // A new cell changes the stamp of `cells/`. Changes inside of a cell's folder do not, hence the time.
+        // A new cell changes the stamp of `cells/`. A change inside a cell's folder does not, so the status is also
+        // read again after some time.
         let stamps = ["cells", "plan.toml"].map(|name| Stamp::read(&self.path.join(name)));
         let is_idle = self.state() != "in work";
         let reread_pause = LOCK_INTERVAL.max(self.read_duration * REREAD_FACTOR);
@@ -134,7 +138,7 @@ impl LiveExperiment {
         self.read_duration = start.elapsed();
     }
 
-    /// Reads the progress of the cells in work.
+    /// Reads the progress of the running cells.
     fn read_progress(&mut self) {
         let Ok(status) = &self.status else { return self.progress.clear() };
         let mut before = std::mem::take(&mut self.progress);
@@ -150,17 +154,19 @@ impl LiveExperiment {
         }
     }
 
-    /// Refreshes the status and everything else that the page shows.
+    /// Refreshes the status, the curves, and everything else that the experiment's own page shows.
     pub(crate) fn refresh_details(&mut self) {
         self.refresh();
         let Ok(status) = &self.status else { return self.trainings.clear() };
         let is_inside = |id: &str| !leads_out(&self.root, &self.path, Path::new("cells").join(id).join("training"));
+        // The curves of running cells.
         let first: Vec<&str> = working(status).filter(|id| is_inside(id)).take(MAX_CURVES).collect();
         self.trainings.retain(|id, _| first.contains(&id.as_str()));
         for id in first {
             let training = || LiveTraining::new(&self.root, &status.folder.cell(id).training());
             self.trainings.entry(id.to_owned()).or_insert_with(training).refresh_details();
         }
+        // The estimate of the remaining time.
         let settled = status.count(CellStatus::is_settled);
         if self.weighted != settled || self.weights.len() != status.cells.len() {
             self.weighted = settled;
@@ -172,6 +178,7 @@ impl LiveExperiment {
         } else {
             self.eta.sample(Instant::now(), &shares);
         }
+        // The files of the report, and the cells whose trainings have a page.
         let settled = (settled, status.changed());
         let files = &self.report_files;
         let is_due = files.settled != settled || files.at.is_none_or(|at| at.elapsed() >= LOCK_INTERVAL);
@@ -190,12 +197,13 @@ impl LiveExperiment {
         }
     }
 
-    /// Returns the status, or the reason why it is not known.
+    /// Returns the status, or the reason why it could not be read.
     pub(crate) fn status(&self) -> Result<&ExperimentStatus, &str> {
         self.status.as_ref().map_err(String::as_str)
     }
 
-    /// Returns [`ExperimentStatus::state`], but between two cells the experiment is still in work.
+    /// Returns the state as a text, such as "in work" for a running experiment. In contrast to
+    /// [`ExperimentStatus::state`], an experiment still counts as running for a short time between two cells.
     pub(crate) fn state(&self) -> &'static str {
         let Ok(status) = &self.status else { return "not understood" };
         let has_open_cells = status.cells.iter().any(|cell| !cell.is_settled());
@@ -222,14 +230,14 @@ impl LiveExperiment {
         self.report_files.fingerprint
     }
 
-    /// Returns the folder for the report, or the reason why none can be built.
+    /// Returns the folder from which the report is built, or the reason why no report can be built.
     pub(crate) fn report_folder(&self) -> Result<PathBuf, String> {
         let outside = self.report_files.outside.clone();
         self.status().map_err(|reason| format!("this experiment is not understood: {reason}"))?;
         outside.map_or_else(|| Ok(self.path.clone()), |name| Err(format!("{name} is {LEADS_OUT}")))
     }
 
-    /// Returns the training of a cell in work, unless it is beyond [`MAX_CURVES`].
+    /// Returns the training of a running cell. Returns `None` if the cell is not among the first [`MAX_CURVES`].
     pub(crate) fn training(&self, id: &str) -> Option<&LiveTraining> {
         self.trainings.get(id)
     }
@@ -239,13 +247,13 @@ impl LiveExperiment {
         self.with_page.contains(id)
     }
 
-    /// Returns the remaining seconds, if they are known.
+    /// Returns the remaining time in seconds, or `None` if it is not known yet.
     pub(crate) fn remaining_seconds(&self) -> Option<f64> {
         let status = self.status.as_ref().ok()?;
         self.eta.remaining_seconds(Instant::now(), &self.shares(status), &self.weights)
     }
 
-    /// Returns the curves of cells in work, in the order of the plan.
+    /// Returns the learning curves of running cells, in the order of the plan.
     pub(crate) fn curves(&self) -> Vec<CellCurve> {
         let Ok(status) = &self.status else { return Vec::new() };
         let curve = |cell: &Cell| {
@@ -256,7 +264,7 @@ impl LiveExperiment {
         status.plan.cells.iter().filter_map(curve).collect()
     }
 
-    /// Returns the done share of each cell, 0 to 1.
+    /// Returns the finished share of each cell, 0 to 1.
     fn shares(&self, status: &ExperimentStatus) -> Vec<f32> {
         let share = |(cell, known): (&Cell, &CellStatus)| match known {
             CellStatus::Done(_) | CellStatus::Failed(_) => 1.0,
@@ -271,24 +279,24 @@ impl LiveExperiment {
     }
 }
 
-/// Returns the ids of the cells in work, in the order of the plan.
+/// Returns the ids of the running cells, in the order of the plan.
 fn working(status: &ExperimentStatus) -> impl Iterator<Item = &str> {
     let all = status.plan.cells.iter().zip(&status.cells);
     all.filter(|(_, known)| **known == CellStatus::InWork).map(|(cell, _)| cell.id.as_str())
 }
 
-/// Returns the duration of a cell's tests, in training episodes.
+/// Returns the duration of a cell's tests, as the number of training episodes that take the same time.
 fn test_cost(cell: &Cell) -> f64 {
     TEST_SHARE * tested_episodes(cell)
 }
 
-/// Returns the duration of each cell relative to the others: the measured seconds of its kind, or an estimate by the
-/// number of its episodes.
+/// Returns the duration of each cell relative to the others. It is the measured duration of cells of the same kind, or
+/// an estimate from the number of the cell's episodes.
 fn weights(status: &ExperimentStatus) -> Vec<f64> {
     let taken = status.durations();
     let cells = &status.plan.cells;
     let episodes = |cell: &Cell| generated_episodes(&cell.config, cell.config.common.episodes) + test_cost(cell);
-    // Seconds per episode of the kinds that were measured.
+    // Seconds per episode, of each cell whose kind was measured.
     let measured: Vec<f64> =
         cells.iter().filter_map(|cell| taken.seconds(cell).map(|seconds| seconds / episodes(cell))).collect();
     let mean = if measured.is_empty() { 1.0 } else { perturb_records::statistics::mean(measured.iter().copied()) };
@@ -296,7 +304,8 @@ fn weights(status: &ExperimentStatus) -> Vec<f64> {
 }
 
 impl ReportFiles {
-    /// Lists the plan and its tables, the heatmaps, and of each settled cell the files that a report reads.
+    /// Finds the files that a report reads: the plan, the tables beside it, the heatmaps, and the files of finished and
+    /// failed cells.
     fn list(status: &ExperimentStatus, settled: (usize, i64), root: &Path) -> Self {
         let mut hasher = DefaultHasher::new();
         let mut outside = None;

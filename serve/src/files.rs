@@ -1,6 +1,7 @@
-//! Sends a file of a run, or a part of it.
+//! Sends a file of a run, or a part of the file.
 //!
-//! tower-http's file server would follow links, and compares times of whole seconds in place of entity tags.
+//! The file server of tower-http is not used. It follows symbolic links, and it detects changes of a file only by its
+//! time in whole seconds.
 
 use std::fs::{File, Metadata};
 use std::io::SeekFrom;
@@ -17,18 +18,19 @@ use tokio_util::io::ReaderStream;
 
 use crate::paths::{RelativePath, Root, media_type};
 
-/// Bytes that a request asks for.
+/// The bytes of a file that a request asks for.
 #[derive(Debug, PartialEq)]
 enum RequestedRange {
     /// The whole file.
-    ReportBundle,
+    WholeFile,
     /// The bytes at these positions.
     Part(RangeInclusive<u64>),
-    /// Bytes after the end of the file.
+    /// Bytes beyond the end of the file.
     NotSatisfiable,
 }
 
-/// Sends the file that `relative` names. Returns `None` if there is none or such files are not sent.
+/// Returns the response with the file at `relative`. Returns `None` if there is no such file, or if files of this kind
+/// are not sent.
 pub(crate) async fn send(root: Root, relative: RelativePath, headers: &HeaderMap) -> Option<Response> {
     let opened = tokio::task::spawn_blocking(move || {
         let path = root.resolve(&relative)?;
@@ -36,6 +38,7 @@ pub(crate) async fn send(root: Root, relative: RelativePath, headers: &HeaderMap
         open(&path).ok().map(|opened| (kind, opened))
     });
     let (kind, (file, metadata)) = opened.await.ok()??;
+    // If the client already has this version of the file, it is not sent again.
     let length = metadata.len();
     let mut file = tokio::fs::File::from_std(file);
     let tag = format!("\"{}\"", Stamp::from_metadata(&metadata).tag());
@@ -44,11 +47,11 @@ pub(crate) async fn send(root: Root, relative: RelativePath, headers: &HeaderMap
     if header_text(header::IF_NONE_MATCH).is_some_and(has_tag) {
         return Some((StatusCode::NOT_MODIFIED, [(header::ETAG, tag)]).into_response());
     }
-    // The client has parts of an earlier file if the tag differs. It gets the whole new file.
+    // If the tag differs, the client has parts of an earlier version of the file, so it gets the whole new file.
     let range = header_text(header::RANGE).filter(|_| header_text(header::IF_RANGE).is_none_or(|known| known == tag));
-    let requested = range.map_or(RequestedRange::ReportBundle, |range| parse_range(range, length));
+    let requested = range.map_or(RequestedRange::WholeFile, |range| parse_range(range, length));
     let (status, from, count) = match &requested {
-        RequestedRange::ReportBundle => (StatusCode::OK, 0, length),
+        RequestedRange::WholeFile => (StatusCode::OK, 0, length),
         RequestedRange::Part(range) => (StatusCode::PARTIAL_CONTENT, *range.start(), range.end() - range.start() + 1),
         RequestedRange::NotSatisfiable => {
             let range = [(header::CONTENT_RANGE, format!("bytes */{length}"))];
@@ -70,8 +73,8 @@ pub(crate) async fn send(root: Root, relative: RelativePath, headers: &HeaderMap
     Some(response)
 }
 
-/// Opens the plain file at `path`, whose links are resolved already. Fails if a part of the path has become a link
-/// since.
+/// Opens the plain file at `path`, which must not contain symbolic links. Fails if a part of the path was replaced by a
+/// symbolic link.
 fn open(path: &Path) -> std::io::Result<(File, Metadata)> {
     let opened = open_plain(path)?;
     match std::fs::read_link(format!("/proc/self/fd/{}", opened.0.as_raw_fd()))? == path {
@@ -80,17 +83,18 @@ fn open(path: &Path) -> std::io::Result<(File, Metadata)> {
     }
 }
 
-/// Parses a `Range` header with one range. The whole file is sent for several ranges and for invalid headers.
+/// Parses a `Range` header for a file of `length` bytes. Returns the whole file if the header is invalid or has several
+/// ranges.
 fn parse_range(header: &str, length: u64) -> RequestedRange {
     let Some((from, to)) = header.strip_prefix("bytes=").and_then(|range| range.split_once('-')) else {
-        return RequestedRange::ReportBundle;
+        return RequestedRange::WholeFile;
     };
     let last = length.saturating_sub(1);
     let (from, to) = match (from.parse::<u64>(), to.parse::<u64>()) {
         (Ok(from), Ok(to)) if from <= to => (from, to.min(last)),
         (Ok(from), Err(_)) if to.is_empty() => (from, last),
         (Err(_), Ok(count)) if from.is_empty() => (length.saturating_sub(count), last),
-        _ => return RequestedRange::ReportBundle,
+        _ => return RequestedRange::WholeFile,
     };
     if from > to || length == 0 { RequestedRange::NotSatisfiable } else { RequestedRange::Part(from..=to) }
 }
@@ -108,9 +112,9 @@ mod tests {
     #[case("bytes=-4", RequestedRange::Part(6..=9))]
     #[case("bytes=-99", RequestedRange::Part(0..=9))]
     #[case("bytes=10-", RequestedRange::NotSatisfiable)]
-    #[case("bytes=3-2", RequestedRange::ReportBundle)]
-    #[case("bytes=0-1,4-5", RequestedRange::ReportBundle)]
-    #[case("lines=1-2", RequestedRange::ReportBundle)]
+    #[case("bytes=3-2", RequestedRange::WholeFile)]
+    #[case("bytes=0-1,4-5", RequestedRange::WholeFile)]
+    #[case("lines=1-2", RequestedRange::WholeFile)]
     fn ranges_of_ten_bytes(#[case] header: &str, #[case] expected: RequestedRange) {
         assert_eq!(parse_range(header, 10), expected);
     }

@@ -27,23 +27,24 @@ use crate::stream_places::StreamPlaces;
 use crate::{files, pages};
 use pages::{MessagePage, error_page};
 
-/// Time between comments on a silent event stream. They show whether the client is still there.
+/// Time between two comments on an event stream without events. Sending them shows whether the client is still
+/// connected.
 const KEEP_ALIVE_INTERVAL: Duration = Duration::from_secs(15);
-/// Content security policy of pages. They use files of this program and pictures of the folder only.
+/// Content security policy of pages. It permits only scripts, styles and pictures from this server.
 const PAGE_POLICY: &str =
     "default-src 'self'; object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'";
-/// Content security policy of reports and files. Reports and pictures may have styles inside, but no scripts.
+/// Content security policy of reports and files. It permits inline styles and embedded pictures, but no scripts.
 const STATIC_POLICY: &str = "default-src 'none'; style-src 'unsafe-inline'; img-src 'self' data:; base-uri 'none'; \
                      form-action 'none'; frame-ancestors 'self'";
 
-/// State that all requests share.
+/// The state that all requests share.
 #[derive(Debug)]
 pub(crate) struct AppState {
     root: Root,
     stream_places: StreamPlaces,
     /// Whether the server listens on the loopback address.
     is_loopback: bool,
-    /// Further names by which it is asked, of a proxy for instance.
+    /// Host names that requests may state in addition to localhost.
     hosts: Vec<String>,
     reports: Arc<ReportCache>,
     pub(crate) publisher: Arc<Publisher>,
@@ -77,8 +78,8 @@ pub(crate) fn router(state: Arc<AppState>) -> Router {
         .with_state(state)
 }
 
-/// Refuses methods that change something and requests that another site caused. Adds the security headers to each
-/// response.
+/// Refuses methods other than GET and HEAD, unknown host names, and requests that a page of another site caused. Makes
+/// the links of message pages relative, and adds the security headers to each response.
 async fn guard(State(state): State<Arc<AppState>>, request: Request, next: Next) -> Response {
     let way_up = WayUp::from_path(request.uri().path());
     let mut response = if !matches!(*request.method(), Method::GET | Method::HEAD) {
@@ -112,8 +113,8 @@ async fn guard(State(state): State<Arc<AppState>>, request: Request, next: Next)
     response
 }
 
-/// Tells whether a page of another site embeds a picture, frame or script from here. That page would see nothing, but
-/// could have files read all the time. Links are followed from any site.
+/// Tells whether a page of another site embeds a picture, frame or script from this server. Such a page could not read
+/// the response, but could make the server read files all the time. Links from other sites are permitted.
 fn is_embedded_by_another_site(headers: &HeaderMap) -> bool {
     let header_text = |name: &str| headers.get(name).and_then(|value| value.to_str().ok());
     let is_link =
@@ -121,8 +122,9 @@ fn is_embedded_by_another_site(headers: &HeaderMap) -> bool {
     matches!(header_text("sec-fetch-site"), Some("cross-site" | "same-site")) && !is_link
 }
 
-/// Tells whether the request names this machine as localhost, by a loopback address or as one of `hosts`. Another site
-/// could let its own name lead here, and its pages would then have the same origin.
+/// Tells whether a request states `localhost`, a loopback address, or one of `hosts` as its host. All other names are
+/// refused, because another site could make its own host name resolve to this server (DNS rebinding). Pages of that
+/// site would then have the same origin as this server's pages.
 fn is_known_host(headers: &HeaderMap, uri: &Uri, hosts: &[String]) -> bool {
     let host =
         headers.get(header::HOST).and_then(|host| host.to_str().ok()).or(uri.authority().map(|host| host.as_str()));
@@ -148,7 +150,7 @@ async fn index(State(state): State<Arc<AppState>>) -> Response {
 async fn run(State(state): State<Arc<AppState>>, uri: Uri) -> Response {
     let Some(relative) = relative_path(&uri, "/run/") else { return error_page(&ViewError::RunNotFound) };
     if let Some(name) = relative.path().file_name().filter(|_| uri.path().ends_with('/')) {
-        // Relative links need one spelling of each address.
+        // Each page has only one address, without a slash at its end, because relative links depend on the slashes.
         return Redirect::permanent(&format!("../{}", RelativePath::default().join(name).encode())).into_response();
     }
     match state.publisher.view(&Topic::Run(relative.clone())).await {
@@ -172,19 +174,19 @@ async fn run_events(
     }
 }
 
-/// Streams the events of a page.
+/// Returns a stream of server-sent events with the changes of a page.
 fn events(state: &AppState, topic: Topic, ClientAddress(peer): ClientAddress) -> Response {
     let Some(place) = state.stream_places.take(peer) else {
         let message = "Too many pages are open already; close some.";
         let mut response = pages::message_page(StatusCode::SERVICE_UNAVAILABLE, message);
-        // Clients that ask again and again shall not keep connections from others.
+        // Closing the connection prevents clients that retry from occupying connections.
         response.headers_mut().insert(header::CONNECTION, HeaderValue::from_static("close"));
         return response;
     };
     let events = WatchStream::new(state.publisher.subscribe(topic));
     let events = events.filter(|event: &EventData| future::ready(!event.is_empty()));
     let events = events.map(move |event| {
-        let _place = &place; // until the stream ends
+        let _place = &place; // keeps the place until the stream ends
         Ok::<_, Infallible>(Event::default().data(event))
     });
     Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE_INTERVAL)).into_response()
@@ -192,7 +194,7 @@ fn events(state: &AppState, topic: Topic, ClientAddress(peer): ClientAddress) ->
 
 async fn report(State(state): State<Arc<AppState>>, uri: Uri) -> Response {
     let Some(relative) = relative_path(&uri, "/report/") else { return error_page(&ViewError::RunNotFound) };
-    // The report is built from the files that the page has shown.
+    // The report is built from the same files as the experiment's page.
     let source = match state.publisher.view(&Topic::Run(relative)).await {
         Ok(view) => view.update.report_source.clone(),
         Err(error) => return error_page(&error),
@@ -227,7 +229,7 @@ async fn asset(uri: Uri) -> Response {
     }
 }
 
-/// Returns the path after `prefix` in the address.
+/// Returns the path of a run or file, which follows `prefix` in the address.
 fn relative_path(uri: &Uri, prefix: &str) -> Option<RelativePath> {
     RelativePath::decode(uri.path().strip_prefix(prefix)?)
 }

@@ -14,25 +14,26 @@ use crate::training::LiveTraining;
 pub(crate) const MAX_FOLDERS: usize = 10_000;
 /// Maximum number of listed runs.
 pub(crate) const MAX_ROWS: usize = 500;
-/// Maximum number of pictures from folders that are no runs.
+/// Maximum number of shown pictures from folders that are not runs.
 const MAX_PICTURES: usize = 24;
 
-/// All runs.
+/// The list of all runs below the served folder.
 #[derive(Debug)]
 pub(crate) struct Index {
-    /// Runs in work first, then those that changed last; at most [`MAX_ROWS`].
+    /// At most [`MAX_ROWS`] runs. Running ones come first, and the others follow by the time of their last change,
+    /// latest first.
     pub(crate) runs: Vec<Row>,
-    /// Number of runs that are not listed.
+    /// Number of runs that are left out because of the limit.
     pub(crate) more_runs: usize,
-    /// Links to folders out of the served folder, which are not followed.
+    /// Symbolic links to folders outside of the served folder. They are not followed.
     pub(crate) links_out: Vec<RelativePath>,
     /// Whether there are more folders than were searched.
     pub(crate) has_more_folders: bool,
-    /// Pictures from folders that are no runs.
+    /// Pictures from folders that are not runs.
     pub(crate) pictures: Pictures,
 }
 
-/// A run.
+/// A run in the list.
 #[derive(Debug)]
 pub(crate) struct Row {
     pub(crate) relative: RelativePath,
@@ -40,7 +41,7 @@ pub(crate) struct Row {
     pub(crate) summary: RunSummary,
     /// Time of the last change, in seconds since 1970.
     pub(crate) changed: i64,
-    /// Remaining time in seconds, if it is known.
+    /// Remaining time in seconds; `None` if it is not known.
     pub(crate) remaining_seconds: Option<f64>,
 }
 
@@ -51,7 +52,7 @@ impl Index {
 
     fn scan_within(root: &Root, known: &Runs, max_folders: usize, max_rows: usize) -> Result<Self, FileError> {
         let found = places(root.path(), max_folders, Some(root.path()))?;
-        // Hidden folders are not served.
+        // `relative` returns `None` for hidden folders, which are not served.
         let rows =
             found.runs.iter().filter_map(|place| Some(Row::new(root.relative(&place.path)?, place, root, known)));
         let mut runs: Vec<Row> = rows.collect();
@@ -79,7 +80,7 @@ impl Row {
                 |training| {
                     training.refresh();
                     if training.status().is_ok_and(|status| status.state == "in work") {
-                        // The remaining time follows from the log of episodes.
+                        // The remaining time is estimated from the log of episodes, which is read here.
                         training.refresh_details();
                     }
                     (training.summary(), training.changed(), training.remaining_seconds())

@@ -1,4 +1,4 @@
-//! A cache whose entries are dropped when nobody has used them for ten minutes.
+//! A cache that drops entries that were not used for ten minutes.
 
 use std::collections::HashMap;
 use std::hash::Hash;
@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 /// Time after which an unused entry is dropped.
 const IDLE_TIMEOUT: Duration = Duration::from_secs(600);
 
-/// Values by their keys, each with the time of its last use.
+/// A cache of values by key. It stores the time of each value's last use.
 #[derive(Debug)]
 pub(crate) struct KeyedCache<K, V>(Mutex<HashMap<K, (V, Instant)>>);
 
@@ -19,7 +19,7 @@ impl<K, V> Default for KeyedCache<K, V> {
 }
 
 impl<K: Eq + Hash, V: Clone> KeyedCache<K, V> {
-    /// Returns the value of `key`, which `new` makes if there is none.
+    /// Returns the value of `key`. If there is none, inserts the result of `new`.
     pub(crate) fn get_or_insert_with(&self, key: K, new: impl FnOnce() -> V) -> V {
         let mut entries = self.entries();
         let (value, used) = entries.entry(key).or_insert_with(|| (new(), Instant::now()));
@@ -32,7 +32,7 @@ impl<K: Eq + Hash, V: Clone> KeyedCache<K, V> {
         self.entries().remove(key);
     }
 
-    /// Drops the values that were not used lately and that `is_busy` does not keep.
+    /// Drops the values that were not used for [`IDLE_TIMEOUT`], except those for which `is_busy` returns true.
     pub(crate) fn remove_idle(&self, is_busy: impl Fn(&V) -> bool) {
         self.remove_unused_for(IDLE_TIMEOUT, is_busy);
     }

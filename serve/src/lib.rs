@@ -1,13 +1,13 @@
 //! `perturb serve`: a read-only web page that shows trainings and experiments while they run.
 //!
-//! - [`Server`] listens. `connections` limits connections and `stream_places` event streams, `http` routes requests and
-//!   keeps other sites out, `links` makes links relative.
+//! - [`Server`] listens. `connections` limits the number of connections, and `stream_places` that of event streams.
+//!   `http` routes requests and refuses requests from other sites, and `links` makes links relative.
 //! - `paths` and `files` send files of the served folder.
 //! - `publisher` reads the files of open pages and sends changes as server-sent events. `cached_loader` limits how
-//!   often files are read, `runs` keeps the state of each run between two readings.
-//! - `training`, `experiment`, `index` and `pictures` read runs. `tail` and `curve` follow a growing log, `eta`
-//!   estimates the remaining time, `report` builds reports, `server_status` polls a server of environments.
-//! - `pages` makes HTML of all this.
+//!   often files are read, and `runs` keeps the state of each run between two readings.
+//! - `training`, `experiment`, `assessment`, `index` and `pictures` read runs. `tail` and `curve` follow a growing log,
+//!   `eta` estimates the remaining time, `report` builds reports, and `server_status` polls a perturb-server.
+//! - `pages` makes HTML from the runs' states.
 #![forbid(unsafe_code)]
 
 mod assessment;
@@ -45,20 +45,21 @@ pub use error::ServeError;
 use http::AppState;
 use paths::Root;
 
-/// Options of the server.
+/// Options of the web server.
 #[derive(Clone, Debug)]
 pub struct ServeOptions {
     /// The folder with the runs.
     pub folder: PathBuf,
-    /// Address to listen at; port 0 takes a free port.
+    /// Address to listen at. Port 0 takes a free port.
     pub address: SocketAddr,
-    /// Further host names by which a server on the loopback address is asked, of a proxy for instance.
+    /// Host names that requests may state in addition to localhost, e.g. the name of a reverse proxy. They matter only
+    /// if the server listens on the loopback address.
     pub hosts: Vec<String>,
-    /// A server of environments whose status is shown.
+    /// A perturb-server whose status the page shows.
     pub server: Option<perturb_protocol::Address>,
 }
 
-/// A web server that listens.
+/// A web server that listens at its address.
 #[derive(Debug)]
 pub struct Server {
     listener: TcpListener,
@@ -67,7 +68,7 @@ pub struct Server {
 }
 
 impl Server {
-    /// Opens the folder and listens.
+    /// Opens the folder, and begins to listen at the address.
     ///
     /// # Errors
     /// [`ServeError`] if the folder cannot be read or the address cannot be used.

@@ -1,29 +1,29 @@
-//! Links between pages, relative to the page that has them, so that they hold behind a proxy with any path.
+//! Makes links between pages relative, so that they work behind a reverse proxy that serves the page below any path.
 //!
-//! Pages are written with links from the root, `href="/run/a"`. Texts from files cannot look like one, because quotes in
-//! them are escaped.
+//! Pages are written with absolute links such as `href="/run/a"`, which are then replaced. Texts from files cannot
+//! contain such a link, because their quotes are escaped.
 
 use crate::paths::RelativePath;
 
-/// The beginnings of attributes with links.
+/// The attributes that contain links, up to the opening quote.
 const ATTRIBUTES: [&str; 3] = ["href=\"", "src=\"", "data-events=\""];
 
-/// The way from a page to the root, `./` or `../../` for instance.
+/// The relative path from a page to the root of the site, such as `./` or `../../`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct WayUp(String);
 
 impl WayUp {
-    /// Returns the way from the list of all runs.
+    /// Returns the path from the list of all runs.
     pub(crate) fn from_index() -> Self {
         Self::from_path("/")
     }
 
-    /// Returns the way from the page of a run. The address of that page does not end with a slash.
+    /// Returns the path from the page of a run. The address of that page does not end with a slash.
     pub(crate) fn from_run(relative: &RelativePath) -> Self {
         Self("../".repeat(relative.path().iter().count().max(1)))
     }
 
-    /// Returns the way from the page at a path.
+    /// Returns the path from the page whose address has this absolute path.
     pub(crate) fn from_path(path: &str) -> Self {
         match path.matches('/').count() {
             0 | 1 => Self("./".into()),
@@ -31,7 +31,7 @@ impl WayUp {
         }
     }
 
-    /// Makes the links of a page, or of a part of one, relative.
+    /// Makes the absolute links in the HTML of a page, or of a part of a page, relative.
     pub(crate) fn relative_links(&self, html: &str) -> String {
         ATTRIBUTES.iter().fold(html.to_owned(), |html, attribute| {
             html.replace(&format!("{attribute}/"), &format!("{attribute}{}", self.0))

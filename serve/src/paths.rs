@@ -1,4 +1,4 @@
-//! Paths below the served folder, as addresses name them, and the kinds of files that are sent.
+//! Paths below the served folder in addresses of pages, and the kinds of files that are sent.
 
 use std::ffi::OsStr;
 use std::os::unix::ffi::{OsStrExt, OsStringExt};
@@ -9,7 +9,7 @@ use perturb_files::require_folder;
 
 use crate::error::ServeError;
 
-/// Bytes that are escaped in addresses: all but letters, digits and `-_.~`.
+/// Bytes that are percent-encoded in addresses: all except letters, digits and `-_.~`.
 const ESCAPED: &AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'_').remove(b'.').remove(b'~');
 
 /// The served folder.
@@ -21,7 +21,8 @@ pub(crate) struct Root {
     given: PathBuf,
 }
 
-/// A path below the served folder, without `..` and without hidden names. It is empty for the folder itself.
+/// A path relative to the served folder, without `..` and without hidden names. It is empty for the served folder
+/// itself.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
 pub(crate) struct RelativePath(PathBuf);
 
@@ -48,14 +49,14 @@ impl Root {
         &self.given
     }
 
-    /// Returns the absolute path of `relative` without symbolic links. Returns `None` if nothing is there, or if it is
-    /// not below the folder.
+    /// Returns the absolute path of `relative`, with symbolic links resolved. Returns `None` if it does not exist, if
+    /// it is outside of the served folder, or if it is hidden.
     pub(crate) fn resolve(&self, relative: &RelativePath) -> Option<PathBuf> {
         let real = self.path.join(&relative.0).canonicalize().ok()?;
         self.relative(&real).map(|_| real)
     }
 
-    /// Returns the path of `path` below the folder. Returns `None` if it is elsewhere or hidden.
+    /// Returns the absolute path `path` relative to the served folder. Returns `None` if it is outside or hidden.
     pub(crate) fn relative(&self, path: &Path) -> Option<RelativePath> {
         let names = path.strip_prefix(&self.path).ok()?;
         names.iter().all(is_visible_name).then(|| RelativePath(names.to_owned()))
@@ -63,8 +64,7 @@ impl Root {
 }
 
 impl RelativePath {
-    /// Decodes the path in an address, whose bytes may be written as `%41`. Returns `None` for invalid and hidden
-    /// paths.
+    /// Decodes the percent-encoded path in an address. Returns `None` for invalid and hidden paths.
     pub(crate) fn decode(text: &str) -> Option<Self> {
         let text = text.strip_suffix('/').unwrap_or(text);
         let mut path = PathBuf::new();
@@ -75,13 +75,13 @@ impl RelativePath {
         Some(Self(path))
     }
 
-    /// Encodes the path for an address.
+    /// Returns the percent-encoded path for an address.
     pub(crate) fn encode(&self) -> String {
         let names = self.0.iter().map(|name| percent_encode(name.as_bytes(), ESCAPED).to_string());
         names.collect::<Vec<_>>().join("/")
     }
 
-    /// Returns the path with another name at its end.
+    /// Returns the path with a name appended.
     pub(crate) fn join(&self, name: impl AsRef<Path>) -> Self {
         Self(self.0.join(name))
     }
@@ -97,7 +97,7 @@ fn is_visible_name(name: &OsStr) -> bool {
     !bytes.is_empty() && bytes[0] != b'.' && !bytes.contains(&b'/') && !bytes.contains(&0)
 }
 
-/// Text files of runs that are sent, with their media types.
+/// Names of text files that are sent, with their media types.
 const TEXT_FILES: [(&str, &str); 7] = [
     ("config.toml", "text/plain; charset=utf-8"),
     ("plan.toml", "text/plain; charset=utf-8"),
@@ -107,7 +107,7 @@ const TEXT_FILES: [(&str, &str); 7] = [
     ("timing.json", "application/json"),
     ("report.md", "text/plain; charset=utf-8"),
 ];
-/// Extensions of tables, pictures and films that are sent, with their media types.
+/// File name extensions of tables, pictures and films that are sent, with their media types.
 const MEDIA_EXTENSIONS: [(&str, &str); 6] = [
     ("csv", "text/csv; charset=utf-8"),
     ("svg", "image/svg+xml"),
@@ -117,7 +117,7 @@ const MEDIA_EXTENSIONS: [(&str, &str); 6] = [
     ("webm", "video/webm"),
 ];
 
-/// Returns the media type of the file at `path`. Returns `None` if such files are not sent.
+/// Returns the media type of the file at `path`. Returns `None` if files with such a name are not sent.
 pub(crate) fn media_type(path: &Path) -> Option<&'static str> {
     let name = path.file_name()?.to_str()?;
     let extension = path.extension().and_then(OsStr::to_str).unwrap_or_default();

@@ -1,4 +1,4 @@
-//! Pictures and films in the folders of runs.
+//! Finds pictures and films in the folders of runs.
 
 use std::path::Path;
 
@@ -6,9 +6,9 @@ use perturb_files::{self as files, Stamp};
 
 use crate::paths::RelativePath;
 
-/// Maximum number of pictures that are shown of a run.
+/// Maximum number of pictures of a run that its page shows.
 const MAX_PICTURES: usize = 60;
-/// Folders of a run without pictures, or whose pictures are shown elsewhere.
+/// Subfolders of a run that are not searched. They have no pictures, or their pictures are shown elsewhere.
 const SKIPPED_FOLDERS: [&str; 5] = ["cells", "checkpoint", "marks", "report", "slurm"];
 /// File name extensions of pictures and films.
 const EXTENSIONS: [&str; 5] = ["svg", "png", "gif", "mp4", "webm"];
@@ -19,15 +19,16 @@ pub(crate) struct RunPicture {
     pub(crate) relative: RelativePath,
     pub(crate) name: String,
     pub(crate) is_film: bool,
-    /// Changes with the file, so that browsers load a changed picture again.
+    /// Size and time of the file. It becomes part of the picture's address, so that browsers load a changed picture
+    /// again.
     pub(crate) stamp: Stamp,
 }
 
-/// Pictures and films.
+/// The pictures and films that a page shows.
 #[derive(Debug, Default)]
 pub(crate) struct Pictures {
     pub(crate) shown: Vec<RunPicture>,
-    /// Number of files beyond the limit.
+    /// Number of further pictures, which are not shown because of the limit.
     pub(crate) more: usize,
 }
 
@@ -38,8 +39,8 @@ impl Pictures {
     }
 }
 
-/// Finds the pictures in one folder, in the order of their names. At most `max_shown` files are opened, the others
-/// counted. A picture that is there in two formats is shown once.
+/// Finds the pictures in one folder, in the order of their names. At most `max_shown` files are examined, and the
+/// others are only counted. A picture that exists in two formats is listed once.
 pub(crate) fn scan_folder(relative: &RelativePath, path: &Path, max_shown: usize) -> Pictures {
     let mut found = Pictures::default();
     let listed = files::list(path).unwrap_or_default(); // sorted
@@ -66,7 +67,7 @@ pub(crate) fn scan_folder(relative: &RelativePath, path: &Path, max_shown: usize
     found
 }
 
-/// Finds the pictures of a run: in its folder, and in the folders directly below it.
+/// Finds the pictures of a run, in its folder and in the folders directly below it.
 pub(crate) fn scan_run(relative: &RelativePath, path: &Path) -> Pictures {
     let mut found = scan_folder(relative, path, MAX_PICTURES);
     for folder in files::list(path).unwrap_or_default() {

@@ -1,7 +1,7 @@
-//! Publishes pages to their subscribers.
+//! Loads pages, and publishes their changes to subscribers.
 //!
-//! One task reads the files of the pages that somebody has open. Each subscriber gets the latest event only: a slow one
-//! misses the events in between.
+//! A subscriber is a browser that has a page open. One task reads the files of all open pages again and again. A
+//! subscriber always gets the latest event, so a slow subscriber misses events in between.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -24,14 +24,14 @@ use crate::runs::Runs;
 use crate::server_status::{self, ServerMonitor};
 use crate::training::LiveTraining;
 
-/// Maximum number of pages whose files are read at the same time. More would take processors from trainings.
+/// Maximum number of pages whose files are read at the same time. It leaves processor time to trainings.
 const MAX_CONCURRENT_LOADS: usize = 4;
-/// Time after which a round of loads stops waiting. Later results are published when they arrive.
+/// Maximum time for which one round of loads waits. Results that arrive later are published when they arrive.
 const BROADCAST_TIMEOUT: Duration = Duration::from_secs(2);
-/// Time that a new subscriber waits, so that others who arrive with it share one load.
+/// Time between a new subscription and its load, so that subscriptions that arrive together share one load.
 const DEBOUNCE: Duration = Duration::from_millis(50);
 
-/// A page that can be subscribed to.
+/// A page, as the subject of requests and subscriptions.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub(crate) enum Topic {
     /// The list of all runs.
@@ -40,14 +40,14 @@ pub(crate) enum Topic {
     Run(RelativePath),
 }
 
-/// The data of an event, as it is sent. Empty before the first load.
+/// The data of an event as it is sent to browsers. It is empty before the first load of a page.
 pub(crate) type EventData = Arc<str>;
 
 /// A loaded page.
 #[derive(Debug)]
 pub(crate) struct View {
     pub(crate) update: Update,
-    /// `update` as an event.
+    /// `update` as the data of an event.
     event: EventData,
 }
 
@@ -61,7 +61,7 @@ pub(crate) struct Publisher {
     loaders: KeyedCache<Topic, ViewLoader>,
     load_permits: Arc<Semaphore>,
     topics: Mutex<HashMap<Topic, watch::Sender<EventData>>>,
-    /// Notified of each new subscriber.
+    /// Is notified when there is a new subscriber.
     subscribed: Notify,
     reports: Arc<ReportCache>,
     server: Option<Arc<ServerMonitor>>,
@@ -81,7 +81,7 @@ impl Publisher {
         }
     }
 
-    /// Returns the page of `topic` as it is now, or was at the last load.
+    /// Returns the page of `topic`. Loads it again if the pause since the last load is over.
     pub(crate) async fn view(self: &Arc<Self>, topic: &Topic) -> Result<Arc<View>, ViewError> {
         let loader = self.loader(topic);
         let this = Arc::clone(self);
@@ -89,7 +89,7 @@ impl Publisher {
         let view = loader.get(&self.load_permits, move || this.load(&loaded_topic)).await;
         let view = view.unwrap_or_else(|error| Err(ViewError::Load(error)));
         if matches!(view, Err(ViewError::RunNotFound)) {
-            // Clients can make up any number of names.
+            // Pages that do not exist are not cached, because clients can request any number of them.
             self.loaders.remove(topic);
         }
         view
@@ -99,7 +99,7 @@ impl Publisher {
         self.loaders.get_or_insert_with(topic.clone(), ViewLoader::default)
     }
 
-    /// Reads the files of `topic`. Blocks.
+    /// Reads the files of `topic` and makes its page. Blocks the thread.
     fn load(&self, topic: &Topic) -> Result<Arc<View>, ViewError> {
         self.runs.remove_idle();
         self.loaders.remove_idle(ViewLoader::is_loading);
@@ -112,6 +112,7 @@ impl Publisher {
         Ok(Arc::new(View { update, event }))
     }
 
+    /// Refreshes the state of the list or run that `topic` names, and returns the content of its page.
     fn update(&self, topic: &Topic) -> Result<Update, ViewError> {
         let root = &self.root;
         let relative = match topic {
@@ -152,7 +153,7 @@ impl Publisher {
         })
     }
 
-    /// Adds a subscriber of `topic`. The first value may be empty.
+    /// Adds a subscriber of `topic`. The receiver's first value is empty if the page was not loaded yet.
     pub(crate) fn subscribe(&self, topic: Topic) -> watch::Receiver<EventData> {
         let mut topics = self.topics();
         let receiver = topics.entry(topic).or_insert_with(|| watch::channel(EventData::from("")).0).subscribe();
@@ -161,7 +162,7 @@ impl Publisher {
         receiver
     }
 
-    /// Publishes changes. Never returns.
+    /// Loads the subscribed pages again and again, and publishes their changes. Never returns.
     pub(crate) async fn run(self: Arc<Self>) {
         let mut polled: Option<Instant> = None;
         loop {
@@ -179,7 +180,7 @@ impl Publisher {
             let start = Instant::now();
             self.publish(topics).await;
             let next_round = tokio::time::Instant::now() + pause_after(start.elapsed());
-            // New subscribers get their first event during the pause. The others are not loaded sooner for that.
+            // During the pause, only pages of new subscribers without an event are loaded.
             while tokio::time::timeout_at(next_round, self.subscribed.notified()).await.is_ok() {
                 tokio::time::sleep(DEBOUNCE).await;
                 self.publish(self.subscribed_topics(|event| event.is_empty())).await;
@@ -187,16 +188,17 @@ impl Publisher {
         }
     }
 
-    /// Returns the topics with subscribers whose last event satisfies `wanted`. Drops those without subscribers.
+    /// Drops topics without subscribers. Returns the remaining topics whose last event satisfies `wanted`.
     fn subscribed_topics(&self, wanted: impl Fn(&EventData) -> bool) -> Vec<Topic> {
         let mut topics = self.topics();
         topics.retain(|_, sender| sender.receiver_count() > 0);
         topics.iter().filter(|(_, sender)| wanted(&sender.borrow())).map(|(topic, _)| topic.clone()).collect()
     }
 
-    /// Loads these topics and sends their events.
+    /// Loads the pages of `topics`, and sends events to their subscribers.
     async fn publish(self: &Arc<Self>, topics: Vec<Topic>) {
-        // A load that does not end delays no other topic. Topics without an event yet get one, be it an error.
+        // A page that is still being loaded is skipped, so that it does not delay others. A page without an event is
+        // never skipped, so that its subscribers get at least an error.
         let is_due = |topic: &Topic| {
             let has_event = self.topics().get(topic).is_some_and(|sender| !sender.borrow().is_empty());
             !(has_event && self.loader(topic).is_loading())
@@ -209,10 +211,11 @@ impl Publisher {
                 tokio::spawn(async move { this.publish_topic(&topic).await })
             })
             .collect();
-        // `publish_topic` sends an error if its load panics, and goes on after the timeout.
+        // `publish_topic` sends an error if its load panics, and continues after the timeout.
         let _ = tokio::time::timeout(BROADCAST_TIMEOUT, futures_util::future::join_all(loads)).await;
     }
 
+    /// Loads the page of `topic`, and sends it to the subscribers if it differs from their last event.
     async fn publish_topic(self: &Arc<Self>, topic: &Topic) {
         let event = match self.view(topic).await {
             Ok(view) => Arc::clone(&view.event),

@@ -1,4 +1,5 @@
-//! A cache of the experiments' reports. It builds one report at a time, and so seldom that trainings do not notice.
+//! A cache of the experiments' reports. It builds one report at a time, with pauses that leave the processor to
+//! trainings.
 
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -9,44 +10,45 @@ use perturb_experiment::Folder;
 use perturb_report::{ReportBundle, ReportError, ReportInputs};
 use tokio::sync::Semaphore;
 
-/// Number of reports that are kept.
+/// Maximum number of cached reports.
 const MAX_REPORTS: usize = 16;
-/// Number of requests that may wait for reports at the same time. Browsers repeat refused requests.
+/// Maximum number of requests that wait for reports at the same time. Further requests are refused, and browsers repeat
+/// them.
 const MAX_WAITING: usize = 32;
-/// Pause between two builds of any reports, as a multiple of the last build's time.
+/// Pause between two builds of any reports, as a multiple of the last build's duration.
 const BUILD_PAUSE_FACTOR: u32 = 2;
 /// Minimum time between two builds of the same report.
 const MIN_REBUILD_INTERVAL: Duration = Duration::from_secs(5);
-/// Time between two builds of the same report, as a multiple of the last build's time.
+/// Time between two builds of the same report, as a multiple of the last build's duration.
 const REBUILD_INTERVAL_FACTOR: u32 = 10;
-/// Longest time that a request waits for a report.
+/// Maximum time for which a request waits for a report.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(60);
-/// Time after which a build no longer delays other reports. It may hang, for example in a file system that does not
+/// Time after which other reports no longer wait for a build. The build may hang, e.g. in a file system that does not
 /// answer.
 const BUILD_TIMEOUT: Duration = Duration::from_secs(120);
 /// Message for requests that have waited too long.
 const STILL_BUILDING: &str = "it is still being built; load this page again in a minute";
 
-/// Builds the report of an experiment's folder as HTML, or returns the reason why there is none.
+/// A function that builds the report of an experiment's folder as HTML. Its error is a text with the reason.
 type BuildReport = fn(&Path) -> Result<Arc<str>, String>;
 
-/// Reports by their experiments' folders.
+/// A cache of reports, by the folders of their experiments.
 #[derive(Debug)]
 pub(crate) struct ReportCache {
     reports: Mutex<HashMap<PathBuf, CachedReport>>,
-    /// Earliest start of the next build. Whoever holds the lock may build.
+    /// Earliest start of the next build. A task must hold this lock while it builds.
     next_build: tokio::sync::Mutex<Instant>,
     waiting: Arc<Semaphore>,
-    /// Folders whose builds exceed the build timeout.
+    /// Folders of running builds that have exceeded the build timeout.
     overdue: Mutex<HashSet<PathBuf>>,
     build: BuildReport,
     build_timeout: Duration,
 }
 
-/// A report, or the reason why there is none.
+/// The result of a build: a report, or the reason why it could not be built.
 #[derive(Clone, Debug)]
 struct CachedReport {
-    /// Fingerprint of the files from which it was built.
+    /// Fingerprint of the files from which the report was built.
     fingerprint: u64,
     page: Result<Arc<str>, String>,
     /// Time at which the build ended.
@@ -55,8 +57,8 @@ struct CachedReport {
 }
 
 impl CachedReport {
-    /// Tells whether the report is up to date, or too recent to be built again. A failed build is repeated although the
-    /// files have not changed, because its cause may be gone.
+    /// Tells whether the report is up to date, or too recent to be built again. A failed build is never up to date,
+    /// because a second attempt may succeed with the same files.
     fn is_usable(&self, fingerprint: u64) -> bool {
         let interval = MIN_REBUILD_INTERVAL.max(self.build_time * REBUILD_INTERVAL_FACTOR);
         self.page.is_ok() && self.fingerprint == fingerprint || self.at.elapsed() < interval
@@ -81,8 +83,8 @@ impl ReportCache {
         }
     }
 
-    /// Returns the fingerprint of the report that would be sent now. It is `fingerprint`, which the files have, or an
-    /// earlier one.
+    /// Returns the fingerprint of the report that a request would get now. `fingerprint` is that of the present files.
+    /// The result is an earlier fingerprint if the cached report is too recent to be built again.
     pub(crate) fn fingerprint(&self, folder: &Path, fingerprint: u64) -> u64 {
         let reports = self.reports();
         reports
@@ -91,17 +93,21 @@ impl ReportCache {
             .map_or(fingerprint, |report| report.fingerprint)
     }
 
-    /// Returns the report of the experiment in `folder`, whose files have this `fingerprint`, or the reason why there
-    /// is none.
+    /// Returns the report of the experiment in `folder` as HTML. Builds it if there is no usable one in the cache.
+    /// `fingerprint` is that of the present files.
+    ///
+    /// # Errors
+    /// A text with the reason why there is no report.
     pub(crate) async fn page(self: &Arc<Self>, folder: &Path, fingerprint: u64) -> Result<Arc<str>, String> {
         let this = Arc::clone(self);
         let folder = folder.to_owned();
         let Ok(permit) = Arc::clone(&self.waiting).try_acquire_owned() else {
             return Err("too many requests wait for reports already".into());
         };
-        // The build runs to its end although nobody waits for it any more.
+        // The build is a separate task, so that it continues even if the request is given up.
         let task = tokio::spawn(async move {
             let _permit = permit;
+            // Only the task with this lock may build. Meanwhile another task may have built the report.
             let mut next_build = this.next_build.lock().await;
             if this.overdue().contains(&folder) {
                 return Err(STILL_BUILDING.into());
@@ -138,7 +144,7 @@ impl ReportCache {
         }
     }
 
-    /// Adds a report. Drops the oldest one if there are too many.
+    /// Adds a report to the cache. If there are more than [`MAX_REPORTS`], drops the oldest report.
     fn insert(&self, folder: PathBuf, report: CachedReport) {
         let mut reports = self.reports();
         let oldest = reports.iter().min_by_key(|(_, report)| report.at).map(|(folder, _)| folder.clone());

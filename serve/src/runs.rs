@@ -1,4 +1,4 @@
-//! The runs that pages were opened of, kept between requests.
+//! The states of runs, which are kept in memory between requests.
 
 use std::path::Path;
 use std::sync::{Arc, Mutex};
@@ -8,7 +8,7 @@ use crate::experiment::LiveExperiment;
 use crate::keyed_cache::KeyedCache;
 use crate::training::LiveTraining;
 
-/// All runs that were shown lately.
+/// The states of all runs that pages have shown in the last ten minutes.
 #[derive(Debug, Default)]
 pub(crate) struct Runs {
     pub(crate) trainings: RunCache<LiveTraining>,
@@ -16,12 +16,12 @@ pub(crate) struct Runs {
     pub(crate) assessments: RunCache<LiveAssessment>,
 }
 
-/// Runs of one kind by their folders. Each has a lock of its own, so that a slow run delays no other one.
+/// The states of runs of one kind, by folder. Each state has its own lock, so that a slow run does not delay others.
 #[derive(Debug)]
 pub(crate) struct RunCache<T>(KeyedCache<Box<Path>, Arc<Mutex<T>>>);
 
 impl Runs {
-    /// Drops the runs that were not used lately.
+    /// Drops the states that were not used in the last ten minutes.
     pub(crate) fn remove_idle(&self) {
         self.trainings.0.remove_idle(|_| false);
         self.experiments.0.remove_idle(|_| false);
@@ -36,11 +36,13 @@ impl<T> Default for RunCache<T> {
 }
 
 impl<T> RunCache<T> {
-    /// Returns the result of `with` for the run in `folder`. `new` makes the run if it is not in the cache.
+    /// Calls `with` for the state of the run in `folder`, and returns its result. Calls `new` first if the state is not
+    /// in the cache.
     pub(crate) fn with<R>(&self, folder: &Path, new: impl Fn() -> T, with: impl FnOnce(&mut T) -> R) -> R {
         let run = self.0.get_or_insert_with(folder.into(), || Arc::new(Mutex::new(new())));
         let mut guard = run.lock().unwrap_or_else(|poisoned| {
-            // The thread that held the lock has panicked, so the run may be inconsistent: begin with a new one.
+            // The thread that held the lock has panicked, so the state may be inconsistent. It is replaced by a new
+            // one.
             let mut guard = poisoned.into_inner();
             *guard = new();
             run.clear_poison();

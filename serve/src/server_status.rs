@@ -1,4 +1,4 @@
-//! The status of a server of environments, as it answers itself.
+//! Polls a perturb-server for its status.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -8,32 +8,32 @@ use perturb_protocol::{Address, Connection, Timeouts};
 
 /// Time between two requests to the server.
 pub(crate) const POLL_INTERVAL: Duration = Duration::from_secs(2);
-/// Number of response times of which the median and the maximum are shown.
+/// Number of latest response times whose median and maximum are shown.
 const MAX_RESPONSE_TIMES: usize = 30;
-/// Time after which a server counts as not answering.
+/// Maximum time to wait for the server's answer.
 const RESPONSE_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Polls a server and keeps its last answer.
+/// Polls a perturb-server, and stores its last answer.
 #[derive(Debug)]
 pub(crate) struct ServerMonitor {
     address: Address,
     last: Mutex<Option<Result<ServerStatus, String>>>,
-    /// Durations of the last responses, the latest first.
+    /// The latest response times, most recent first.
     response_times: Mutex<VecDeque<Duration>>,
 }
 
-/// The status of a perturb-server, as of its last answer.
+/// The status of a perturb-server at its last answer.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct ServerStatus {
     /// Version of the server's program.
     pub(crate) version: String,
-    /// Number of environments in its catalogue.
+    /// Number of environments in the server's catalogue.
     pub(crate) environments: usize,
     /// Maximum number of environments in a session.
     pub(crate) max_batch_size: u32,
-    /// Median of the last response times.
+    /// Median of the latest response times.
     pub(crate) median_response: Duration,
-    /// Maximum of the last response times.
+    /// Maximum of the latest response times.
     pub(crate) max_response: Duration,
 }
 
@@ -46,12 +46,12 @@ impl ServerMonitor {
         &self.address
     }
 
-    /// Returns the last answer, or the reason why there is none. Returns `None` before the first poll.
+    /// Returns the status from the last poll, or the reason why that poll failed. Returns `None` before the first poll.
     pub(crate) fn last(&self) -> Option<Result<ServerStatus, String>> {
         self.last.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Asks the server once.
+    /// Requests the status from the server once, and stores the result.
     pub(crate) async fn poll(self: Arc<Self>) {
         self.poll_within(RESPONSE_TIMEOUT).await;
     }

@@ -1,19 +1,19 @@
-//! Places for event streams, which stay open: a limited number, and of each client fewer.
+//! Limits the number of open event streams, in total and for each client.
 
 use std::collections::HashMap;
 use std::net::IpAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Maximum number of event streams.
+/// Maximum total number of event streams.
 pub(crate) const MAX_STREAMS: usize = 64;
-/// Maximum number of event streams of one client address. A browser opens one for each page that it shows.
+/// Maximum number of event streams for one client address. A browser opens a stream for each page that it shows.
 const MAX_STREAMS_PER_PEER: usize = 32;
 
-/// Counts event streams by client address.
+/// A limiter that counts the open event streams by client address.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct StreamPlaces(Arc<Mutex<HashMap<IpAddr, usize>>>);
 
-/// The place of an event stream, until it is dropped.
+/// A permit for one event stream. Dropping it releases the permit.
 #[derive(Debug)]
 pub(crate) struct StreamPlace {
     places: StreamPlaces,
@@ -21,7 +21,7 @@ pub(crate) struct StreamPlace {
 }
 
 impl StreamPlaces {
-    /// Takes a place for a stream to `peer`. Returns `None` if there is none.
+    /// Returns a permit for a stream to the client `peer`, or `None` if a limit is reached.
     pub(crate) fn take(&self, peer: IpAddr) -> Option<StreamPlace> {
         let mut taken = self.lock();
         let total: usize = taken.values().sum();

@@ -1,14 +1,14 @@
-//! Reads the new lines of a growing file, each line once.
+//! Reads the lines that are appended to a growing file, each line once.
 
 use std::io::{ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use perturb_files::{Stamp, open_plain};
 
-/// Number of bytes that one call reads at most; the next call reads on. Longer lines are not read.
+/// Maximum number of bytes that one call reads. The next call continues from there. Lines that are longer are not read.
 pub(crate) const MAX_READ_BYTES: u64 = 64 << 20;
-/// Number of bytes before the read position that are compared with the file, to notice that it was truncated and has
-/// grown again.
+/// Number of bytes before the read position that are compared with the file again. A difference shows that the file was
+/// truncated and has grown again.
 const CONTEXT_BYTES: usize = 64;
 
 /// The read position in a growing file.
@@ -16,24 +16,24 @@ const CONTEXT_BYTES: usize = 64;
 pub(crate) struct Tail {
     path: PathBuf,
     stamp: Option<Stamp>,
-    /// Position at which the next line begins.
+    /// Position in the file at which the next line begins, in bytes.
     offset: u64,
     /// The bytes before `offset`, at most [`CONTEXT_BYTES`].
     context: Vec<u8>,
-    /// Inode of a file whose next line exceeds the limit. Nothing more is read of it.
+    /// Inode of the file if its next line is too long. Nothing more is read from it.
     oversized_inode: Option<u64>,
 }
 
-/// Result of reading on.
+/// The result of reading new lines.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum TailUpdate {
     /// There are no new lines.
     Unchanged,
-    /// The new lines.
+    /// Lines were appended; these are their bytes.
     Appended(Vec<u8>),
     /// The file was replaced, truncated or deleted. These are its lines from the beginning.
     Restarted(Vec<u8>),
-    /// The next line exceeds [`MAX_READ_BYTES`].
+    /// The next line is longer than [`MAX_READ_BYTES`].
     LineTooLong,
 }
 
@@ -60,6 +60,7 @@ impl Tail {
         }
         let was_read = self.stamp.is_some();
         let mut bytes = Vec::new();
+        // Read from the context on. If the context differs, the file has been replaced, and is read from its beginning.
         file.seek(SeekFrom::Start(self.offset - self.context.len() as u64))?;
         file.by_ref().take(MAX_READ_BYTES).read_to_end(&mut bytes)?;
         let restarted = !bytes.starts_with(&self.context);
@@ -69,7 +70,7 @@ impl Tail {
             file.seek(SeekFrom::Start(0))?;
             file.by_ref().take(MAX_READ_BYTES).read_to_end(&mut bytes)?;
         }
-        // There may be more to read although the file stays the same.
+        // If the maximum was read, the next call must read on even if the file has not changed.
         let is_full = bytes.len() as u64 == MAX_READ_BYTES;
         let is_oversized = is_full && !bytes[self.context.len()..].contains(&b'\n');
         self.oversized_inode = is_oversized.then_some(now.inode());

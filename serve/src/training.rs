@@ -1,4 +1,4 @@
-//! The state of a training, read again when its files change.
+//! The state of a training. It is read again when its files change.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -10,30 +10,31 @@ use perturb_text::shortened;
 
 use crate::curve::{EpisodeLog, LearningCurve};
 
-/// Time between two looks at the lock of a run whose files stay the same.
+/// Time between two checks whether a process still holds the lock of a run. Files need not change for such a check.
 pub(crate) const LOCK_INTERVAL: Duration = Duration::from_secs(5);
-/// Files from which the status is read.
+/// Files from which a training's status is read.
 const STATUS_FILES: [&str; 3] = ["config.toml", "checkpoint/checkpoint.json", "progress.csv"];
-/// All files that are read.
+/// All files of a training that are read.
 const READ_FILES: [&str; 5] =
     ["config.toml", "checkpoint/checkpoint.json", "checkpoint.json", "progress.csv", "monitor.csv"];
 
 /// The state of a training at the last refresh.
 #[derive(Debug)]
 pub(crate) struct LiveTraining {
-    /// The served folder. Links must not lead out of it.
+    /// The served folder. Symbolic links that lead out of it are not followed.
     root: PathBuf,
     path: PathBuf,
     stamps: [Option<Stamp>; STATUS_FILES.len()],
-    /// Time of the last look at the lock.
+    /// Time of the last check of the lock.
     checked: Option<Instant>,
     status: Result<TrainingStatus, String>,
-    /// The episodes; `None` until somebody wants to see the curve.
+    /// The log of episodes; `None` until the learning curve is requested.
     episodes: Option<EpisodeLog>,
 }
 
 impl LiveTraining {
-    /// Makes the state of the training in `path`, before its first refresh. Files outside of `root` are not read.
+    /// Makes the state of the training in `path`, which is empty before its first refresh. Files outside of `root` are
+    /// not read.
     pub(crate) fn new(root: &Path, path: &Path) -> Self {
         let root = root.to_owned();
         let path = path.to_owned();
@@ -41,7 +42,7 @@ impl LiveTraining {
         Self { root, path, stamps: Default::default(), checked: None, status, episodes: None }
     }
 
-    /// Reads the status again if its files have changed.
+    /// Reads the status again if its files have changed, or if a process has taken or released the training's lock.
     pub(crate) fn refresh(&mut self) {
         if let Some(name) = READ_FILES.into_iter().find(|name| leads_out(&self.root, &self.path, name)) {
             *self = Self { status: Err(format!("{name} is {LEADS_OUT}")), ..Self::new(&self.root, &self.path) };
@@ -67,7 +68,7 @@ impl LiveTraining {
         }
     }
 
-    /// Returns the status, or the reason why it is not known.
+    /// Returns the status, or the reason why it could not be read.
     pub(crate) fn status(&self) -> Result<&TrainingStatus, &str> {
         self.status.as_ref().map_err(String::as_str)
     }
@@ -90,14 +91,15 @@ impl LiveTraining {
         self.episodes.as_ref().map(EpisodeLog::curve).unwrap_or_default()
     }
 
-    /// Returns the faults of its files other than the configuration.
+    /// Returns the error messages about the log of episodes and the checkpoint.
     pub(crate) fn faults(&self) -> Vec<String> {
         let log = self.episodes.as_ref().and_then(EpisodeLog::fault).map(|fault| format!("monitor.csv: {fault}"));
         let checkpoint = self.status.as_ref().ok().and_then(|status| status.damaged.clone());
         log.into_iter().chain(checkpoint).collect()
     }
 
-    /// Returns the remaining seconds at the speed of the last episodes.
+    /// Returns the remaining time in seconds, at the speed of the last episodes. Returns `None` if the training is not
+    /// running or the speed is not known.
     pub(crate) fn remaining_seconds(&self) -> Option<f64> {
         let status = self.status.as_ref().ok().filter(|status| status.state == "in work")?;
         let (count, (length, speed)) =
@@ -106,7 +108,8 @@ impl LiveTraining {
         (count < all).then(|| (all - count) * length / speed).filter(|seconds| seconds.is_finite())
     }
 
-    /// Returns the seconds of acting, waiting for servers, updating, and everything else.
+    /// Returns the time in seconds that was spent choosing actions, waiting for servers, updating the policy, and on
+    /// everything else.
     pub(crate) fn time_shares(&self) -> Option<[f64; 4]> {
         let progress = self.status.as_ref().ok()?.progress.as_ref()?;
         let [acting, waiting, updating, all] =
@@ -122,19 +125,19 @@ impl LiveTraining {
         self.status.as_ref().ok()?.progress.as_ref()
     }
 
-    /// Returns the names of the text files that are there and may be sent.
+    /// Returns the names of the training's text files that exist and may be sent.
     pub(crate) fn files(&self) -> impl Iterator<Item = &'static str> {
         let may_be_sent = |name: &&str| self.path.join(name).is_file() && !leads_out(&self.root, &self.path, name);
         ["config.toml", "monitor.csv", "progress.csv"].into_iter().filter(may_be_sent)
     }
 
-    /// Returns the recorded result of a cell's training, or the reason why the cell failed or its record is damaged.
-    /// Returns `None` before there is one, and for trainings that belong to no cell.
+    /// Returns the result of the experiment's cell to which the training belongs, or the reason why the cell failed or
+    /// its files are damaged. Returns `None` if there is no result yet, or if the training does not belong to a cell.
     pub(crate) fn result(&self) -> Option<Result<Box<CellResult>, String>> {
         let cell = self.path.parent().filter(|_| self.path.ends_with("training"))?;
         let experiment = cell.parent().filter(|cells| cells.ends_with("cells"))?.parent()?;
         if !experiment.starts_with(&self.root) {
-            // The cell is served without its experiment.
+            // The experiment's folder is outside of the served folder.
             return None;
         }
         if let Some(name) = ["result.json", "failure.json"].into_iter().find(|name| leads_out(&self.root, cell, name)) {

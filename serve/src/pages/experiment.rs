@@ -14,7 +14,7 @@ use crate::experiment::{LiveExperiment, MAX_CURVES as MAX_LISTED};
 use crate::paths::{RelativePath, Root};
 use crate::pictures::scan_run;
 
-/// Maximum number of cells of which a map is drawn.
+/// Maximum number of cells in the map of all cells. For more cells no map is drawn.
 const MAX_MAPPED: usize = 1000;
 
 pub(crate) fn update(
@@ -113,8 +113,10 @@ fn head(status: &ExperimentStatus, experiment: &LiveExperiment) -> Markup {
     }
 }
 
-/// Shows the success of the finished cells, and the number of cells, by kinds of cells.
+/// Returns a table with a row for each kind of cell, i.e. each environment, method and training set. A row has the
+/// number of finished cells, and their mean success in each test.
 fn kinds(status: &ExperimentStatus) -> Markup {
+    // Each kind of cell with its number of finished cells and its number of cells, in the order of the plan.
     let rates = status.rates();
     let mut kinds: Vec<(String, usize, usize)> = Vec::new();
     for (cell, known) in status.plan.cells.iter().zip(&status.cells) {
@@ -207,12 +209,13 @@ fn one(cell: &Cell, experiment: &LiveExperiment, relative: &RelativePath) -> Mar
     }
 }
 
-/// Says that the report is older than the results. Reports are built seldom, so that trainings do not notice.
+/// Returns a note if the report is older than the results. Reports are built rarely, to leave the processor to
+/// trainings.
 fn lag(lags: bool) -> Markup {
     html! { @if lags { p.note { "Some results are newer than this report. It will be built again soon and shown without a reload." } } }
 }
 
-/// Shows every cell as a square.
+/// Returns the map of all cells, which shows each cell as a square in the colour of its state.
 fn map(status: &ExperimentStatus, experiment: &LiveExperiment, relative: &RelativePath) -> Markup {
     if status.cells.len() > MAX_MAPPED {
         return html! { p { (grouped(status.cells.len())) " cells are too many to draw one by one." } };
@@ -266,7 +269,7 @@ fn failures(status: &ExperimentStatus, experiment: &LiveExperiment, relative: &R
     }
 }
 
-/// Links to a cell's training, if it has begun.
+/// Returns `words`, as a link to the page of the cell's training if the training has begun.
 fn cell_link(experiment: &LiveExperiment, relative: &RelativePath, cell: &Cell, words: &Markup) -> Markup {
     let address = || run_link(&relative.join("cells").join(&cell.id).join("training"));
     html! { @if experiment.has_page(&cell.id) { a href=(address()) { (words) } } @else { (words) } }

@@ -12,10 +12,11 @@ use crate::index::{Index, MAX_FOLDERS, Row};
 use crate::paths::Root;
 use crate::server_status::ServerStatus;
 
-/// Maximum number of links out of the folder that are named.
+/// Maximum number of symbolic links out of the served folder that the page names.
 const MAX_SHOWN_LINKS: usize = 20;
 
-/// A polled server with its last answer, if there is one yet.
+/// The address of a polled perturb-server, and its last status or the reason why it has none; `None` before the first
+/// poll.
 type PolledServer<'a> = (&'a Address, Option<Result<ServerStatus, String>>);
 
 pub(crate) fn update(root: &Root, index: &Index, server: Option<&PolledServer<'_>>) -> Update {
@@ -114,7 +115,7 @@ fn milliseconds(time: Duration) -> String {
     format!("{:.1} ms", 1e3 * time.as_secs_f64())
 }
 
-/// Shows the status of the server of environments.
+/// Returns the section with the status of the perturb-server.
 fn server_section((address, last): &PolledServer<'_>) -> Markup {
     let text = |text: String| html! { (text) };
     html! {

@@ -1,7 +1,7 @@
-//! The pages as HTML. Texts from files and addresses are escaped.
+//! Makes the pages as HTML. Texts from files and addresses are escaped.
 //!
-//! A page consists of named parts. When something changes, an event has all parts as they would be in a new page, and
-//! the script replaces them. Curves are sent as numbers.
+//! A page consists of named parts. When something changes, an event with all parts of the page is sent, and the page's
+//! script replaces the parts that differ. Curves are sent as numbers.
 
 pub(crate) mod assessment;
 pub(crate) mod experiment;
@@ -25,22 +25,22 @@ use crate::error::ViewError;
 use crate::links::WayUp;
 use crate::paths::{RelativePath, Root};
 
-/// The content of a page.
+/// The changing content of a page.
 #[derive(Debug, Default)]
 pub(crate) struct Update {
-    /// Title of the window.
+    /// Title of the browser window.
     pub(crate) title: String,
     /// Kind of the run; `None` for the list of all runs.
     pub(crate) kind: Option<RunKind>,
     /// The parts of the page, by their names.
     pub(crate) parts: Vec<(&'static str, Markup)>,
-    /// Numbers of the charts.
+    /// The numbers that the page's charts show.
     pub(crate) charts: Value,
-    /// Fingerprint of the report that would be sent now.
+    /// Fingerprint of the report that a request would get now.
     pub(crate) report: u64,
     /// Files of an experiment's report; `None` for other pages.
     pub(crate) report_source: Option<ReportSource>,
-    /// Links to the folders above.
+    /// Links to the runs whose folders contain this one.
     breadcrumbs: Markup,
 }
 
@@ -61,11 +61,11 @@ impl Update {
         self
     }
 
-    /// Returns the page as JSON for the script.
+    /// Returns the content as JSON for the page's script.
     pub(crate) fn to_json(&self) -> String {
         let parts: Map<String, Value> =
             self.parts.iter().map(|(name, part)| ((*name).to_owned(), Value::from(part.0.clone()))).collect();
-        // JavaScript's numbers have 53 bits.
+        // The fingerprint is sent as text, because numbers in JavaScript have only 53 bits.
         let report = format!("{:016x}", self.report);
         json!({ "title": self.title, "parts": parts, "charts": self.charts, "report": report }).to_string()
     }
@@ -116,7 +116,7 @@ pub(crate) fn run_page(root: &Root, relative: &RelativePath, update: &Update) ->
     }
 }
 
-/// Returns a whole page, which gets its changes from the address `events`.
+/// Returns a whole HTML page. Its script gets changes from the address `events`.
 fn document(title: &str, events: &str, breadcrumbs: &Markup, main: &Markup) -> String {
     html! {
         (DOCTYPE)
@@ -145,7 +145,7 @@ fn document(title: &str, events: &str, breadcrumbs: &Markup, main: &Markup) -> S
     .into_string()
 }
 
-/// Returns links to the served folder, to the runs above `relative`, and to itself.
+/// Returns links to the served folder, to the runs whose folders contain `relative`, and the name of `relative` itself.
 fn breadcrumbs(root: &Root, relative: &RelativePath) -> Markup {
     let mut way = RelativePath::default();
     let mut links = Vec::new();
@@ -178,13 +178,13 @@ fn run_link(relative: &RelativePath) -> String {
     format!("/run/{}", relative.encode())
 }
 
-/// Returns the shown name of `relative`. An empty path stands for the served folder.
+/// Returns the name of `relative` for display. An empty path means the served folder.
 fn shown_name(root: &Root, relative: &RelativePath) -> String {
     let path: &Path = if relative.path().as_os_str().is_empty() { root.given() } else { relative.path() };
     path.display().to_string()
 }
 
-/// Returns a state such as "in work" with its colour.
+/// Returns the element of a state, such as "in work", in the colour of the state.
 fn badge(state: &str) -> Markup {
     html! { span class={ "state " (state.replace(' ', "-")) } { (state) } }
 }
@@ -200,12 +200,12 @@ fn time(seconds: i64) -> Markup {
     html! { time datetime=(time.format("%Y-%m-%dT%H:%M:%SZ")) { (time.format("%Y-%m-%d %H:%M UTC")) } }
 }
 
-/// Returns a list of names with their values.
+/// Returns a list of names and their values.
 fn facts<'a>(facts: impl IntoIterator<Item = (&'a str, Markup)>) -> Markup {
     html! { dl.facts { @for (name, value) in facts { div { dt { (name) } dd { (value) } } } } }
 }
 
-/// Returns a list of faults; empty if there are none.
+/// Returns a list of error messages. It is empty if there are none.
 fn faults(sentences: &[String]) -> Markup {
     html! {
         @if !sentences.is_empty() {
@@ -224,11 +224,11 @@ fn chart(name: &str, title: &str) -> Markup {
     }
 }
 
-/// The text of a page with a message, whose links are not relative yet.
+/// The HTML of a page with a message. It is attached to a response as an extension until its links are made relative.
 #[derive(Clone, Debug)]
 pub(crate) struct MessagePage(pub(crate) String);
 
-/// Returns a page with a message in place of content. Its text is the extension [`MessagePage`] until links are relative.
+/// Returns a response with a page that only has a message. Its HTML is in the extension [`MessagePage`].
 pub(crate) fn message_page(status: StatusCode, message: &str) -> Response {
     let page = html! {
         (DOCTYPE)
@@ -246,7 +246,7 @@ pub(crate) fn message_page(status: StatusCode, message: &str) -> Response {
     (status, Extension(MessagePage(page.into_string()))).into_response()
 }
 
-/// Time after which browsers ask again for a report that could not be built, in seconds.
+/// Time after which browsers request a report again that could not be built, in seconds.
 const REPORT_RETRY_SECONDS: u32 = 15;
 
 /// Returns the page that is shown in place of a report.
@@ -257,7 +257,7 @@ pub(crate) fn no_report(reason: &str) -> String {
             head {
                 meta charset="utf-8";
                 meta name="color-scheme" content="light dark";
-                meta http-equiv="refresh" content=(REPORT_RETRY_SECONDS); // the cause may be gone by then
+                meta http-equiv="refresh" content=(REPORT_RETRY_SECONDS); // the next attempt may succeed
                 title { "perturb: no report" }
             }
             body { p { "There is no report now: " (shortened(reason)) } }
@@ -266,7 +266,7 @@ pub(crate) fn no_report(reason: &str) -> String {
     .into_string()
 }
 
-/// Returns a file of this program by its name, with its media type.
+/// Returns the media type and the content of a script, style or icon of the pages, by its name.
 pub(crate) fn asset(name: &str) -> Option<(&'static str, &'static str)> {
     const SCRIPT: &str = "text/javascript; charset=utf-8";
     const STYLE: &str = "text/css; charset=utf-8";

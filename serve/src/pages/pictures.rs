@@ -1,11 +1,11 @@
-//! Pictures and films on pages.
+//! The section of a page with pictures and films.
 
 use maud::{Markup, html};
 use perturb_text::grouped;
 
 use crate::pictures::{Pictures, RunPicture};
 
-/// Shows pictures under a heading; empty if there are none.
+/// Returns the section with pictures under a heading. It is empty if there are none.
 pub(crate) fn section(pictures: &Pictures) -> Markup {
     html! {
         @if !pictures.shown.is_empty() {

@@ -15,7 +15,7 @@ use crate::paths::{RelativePath, Root};
 use crate::pictures::scan_run;
 use crate::training::LiveTraining;
 
-/// Names of the time shares, each with the class of its colour.
+/// The activities in a training's time shares. Each has its name on the page, and the suffix of its CSS class.
 const TIME_SHARES: [(&str, &str); 4] =
     [("choosing actions", "a"), ("waiting for servers", "b"), ("updating the policy", "c"), ("anything else", "d")];
 
@@ -102,7 +102,7 @@ fn head(status: &TrainingStatus, training: &LiveTraining) -> Markup {
     }
 }
 
-/// Shows figures of the last 100 episodes and of the last update.
+/// Returns a list of means over the last 100 episodes, and of numbers from the last update.
 fn figures(training: &LiveTraining, curve: &LearningCurve) -> Markup {
     let Some(progress) = training.progress() else { return Markup::default() };
     let text = |text: String| html! { (text) };
@@ -125,7 +125,7 @@ fn figures(training: &LiveTraining, curve: &LearningCurve) -> Markup {
     facts(known.into_iter().flatten())
 }
 
-/// Explains the points of the curve.
+/// Returns a note that explains the points of the learning curve.
 fn note(training: &LiveTraining, curve: &LearningCurve) -> Markup {
     let count = curve.episodes.len();
     html! {
@@ -139,7 +139,7 @@ fn note(training: &LiveTraining, curve: &LearningCurve) -> Markup {
     }
 }
 
-/// Shows the shares of the time as a bar with numbers.
+/// Returns a bar with the training's time shares, and their percentages.
 fn shares(training: &LiveTraining) -> Markup {
     let Some(shares) = training.time_shares() else { return Markup::default() };
     let all: f64 = shares.iter().sum::<f64>().max(1e-9);
@@ -168,7 +168,7 @@ fn shares(training: &LiveTraining) -> Markup {
     }
 }
 
-/// Shows the results of a cell's tests.
+/// Returns a table with the results of a cell's tests.
 fn tests(result: &CellResult) -> Markup {
     let row = |name: &str, TestResult { episodes, success_percent, success_percent_95: [low, high], mean_return, mean_length }: &TestResult| {
         html! {

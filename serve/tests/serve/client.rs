@@ -19,13 +19,13 @@ const PLAN: &str =
     "environments = ['CartPole']\nversions = ['D', 'R']\ntest_versions = ['D', 'R', 'E']\ntest_episodes = 10
     settings = { episodes = 100 }\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\n";
 
-/// A served folder of runs.
+/// A folder of runs, and a server that shows it.
 pub struct Place {
     pub folder: TempDir,
     pub address: SocketAddr,
 }
 
-/// A response; `head` is in lower case.
+/// An HTTP response. `head` is in lower case.
 pub struct Answer {
     pub status: u16,
     pub head: String,
@@ -57,7 +57,7 @@ impl Place {
         self.ask("GET", path, "localhost")
     }
 
-    /// Repeats a request until the response satisfies `wanted`. Pages may be a second old.
+    /// Repeats a request until the response satisfies `wanted`, because pages may be a second old.
     #[track_caller]
     pub fn until(&self, path: &str, wanted: impl Fn(&Answer) -> bool) -> Answer {
         let start = Instant::now();
@@ -115,7 +115,7 @@ impl Events {
         }
     }
 
-    /// Returns the response's status.
+    /// Returns the status code of the response.
     pub fn status(&mut self) -> String {
         let mut line = String::new();
         self.0.read_line(&mut line).unwrap();
@@ -166,7 +166,7 @@ pub fn write_training(path: &Path, episodes: usize) {
     write(&path.join("progress.csv"), progress);
 }
 
-/// Returns lines of monitor.csv.
+/// Returns the lines of monitor.csv for the episodes `from` to `to`.
 pub fn lines(from: usize, to: usize) -> String {
     (from..to).map(|i| format!("{i},4,{}.0,{},1\n", i + 1, i % 2)).collect()
 }

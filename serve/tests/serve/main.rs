@@ -1,4 +1,4 @@
-//! The pages over HTTP, without a browser.
+//! Tests of the pages over HTTP, without a browser.
 #![allow(clippy::unwrap_used)]
 
 mod client;

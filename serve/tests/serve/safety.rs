@@ -1,4 +1,4 @@
-//! Requests that are refused.
+//! Requests that the web server must refuse.
 
 use std::os::unix::fs::symlink;
 
