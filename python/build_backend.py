@@ -1,7 +1,8 @@
-"""Build backend for pip: writes the server's catalogue, then calls maturin.
+"""Build backend for pip. It writes the server's catalogue to a file, and then calls maturin.
 
-The catalogue is src/perturb/catalogue.json: the environments and limits that the program perturb-server prints. It is
-not in git. The program is PERTURB_SERVER, else the one that cargo built in the clone, else the one on PATH.
+The file is src/perturb/catalogue.json, which is not in git. It has the environments and limits that the program
+perturb-server prints. The program is the one that the environment variable PERTURB_SERVER names, or else the one that
+cargo built in the clone, or else the first on PATH.
 """
 
 import json
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import maturin
-from maturin import (  # noqa: F401  (a build's other steps are maturin's)
+from maturin import (  # noqa: F401  (maturin does the other steps of a build)
     get_requires_for_build_editable,
     get_requires_for_build_wheel,
     prepare_metadata_for_build_editable,
@@ -28,7 +29,7 @@ REMEDY = f"build it with `make build` in the clone, or set PERTURB_SERVER to a {
 def build_wheel(
     directory: str, config_settings: dict[str, Any] | None = None, metadata_directory: str | None = None
 ) -> str:
-    """Make a wheel of the package and the native module; `make wheel` adds the server."""
+    """Make a wheel with the package and the native module. `make wheel` adds the programs."""
     write_catalogue()
     return str(maturin.build_wheel(directory, config_settings, metadata_directory))
 
@@ -42,20 +43,20 @@ def build_editable(
 
 
 def build_sdist(directory: str, config_settings: dict[str, Any] | None = None) -> str:  # noqa: ARG001
-    """Refuse, because the native module is made of crates beside this folder."""
+    """Raise an error, because the native module needs crates outside of this folder."""
     raise RuntimeError(
         "there is no source distribution: build a wheel in a clone, `make wheel` or `pip install ./python`"
     )
 
 
 def write_catalogue() -> None:
-    """Ask the server for its environments."""
+    """Write the catalogue of perturb-server to src/perturb/catalogue.json."""
     catalogue = ask_catalogue(find_server(ROOT.parent), version(ROOT))
     (ROOT / "src/perturb/catalogue.json").write_text(catalogue, encoding="utf-8")
 
 
 def version(project: Path) -> str:
-    """Return the package's version from pyproject.toml. Python 3.10 cannot read TOML yet."""
+    """Return the package's version from pyproject.toml, without a TOML parser, which Python 3.10 does not have."""
     found = re.search(r'^version = "(.+)"$', (project / "pyproject.toml").read_text("utf-8"), re.MULTILINE)
     if found is None:
         raise RuntimeError(f"{project}/pyproject.toml has no version")
@@ -63,7 +64,7 @@ def version(project: Path) -> str:
 
 
 def find_server(clone: Path) -> str:
-    """Find the program."""
+    """Return the path of the program perturb-server."""
     target = Path(os.environ.get("CARGO_TARGET_DIR") or clone / "target")
     named, built = os.environ.get("PERTURB_SERVER"), target / "release" / PROGRAM
     found = shutil.which(named) if named else shutil.which(built) or shutil.which(PROGRAM)
@@ -74,7 +75,7 @@ def find_server(clone: Path) -> str:
 
 
 def ask_catalogue(server: str, version: str) -> str:
-    """Ask the program for its environments and limits, as JSON."""
+    """Return the JSON text with environments and limits that perturb-server prints, and check its version."""
     asked = subprocess.run([server, "--catalogue"], capture_output=True, text=True, check=False)
     if asked.returncode != 0:
         raise RuntimeError(f"{server} --catalogue ended with status {asked.returncode}: {asked.stderr}; {REMEDY}")

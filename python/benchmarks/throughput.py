@@ -26,32 +26,35 @@ try:
 except ImportError:
     envpool = None
 
-# A contender's step, which gives back how many episodes ended.
+# A function that steps all environments of a contender with given actions. Returns the number of ended episodes.
 Step = Callable[[Any], int]
 
 
 @dataclass(frozen=True)
 class Contender:
-    """How a contender steps, how it ends, and the type of its actions."""
+    """An implementation that is measured: its environments, already reset once."""
 
     step: Step
     close: Callable[[], None]
+    # The NumPy type of its actions.
     kind: Any
 
 
 @dataclass(frozen=True)
 class Case:
-    """A case: the environment, Gymnasium's and EnvPool's names for it, the batch size, and target ratios."""
+    """An environment and a batch size that are measured, with target ratios."""
 
     name: str
+    # The environment's id in Gymnasium.
     gymnasium: str
+    # The environment's id in EnvPool.
     envpool: str
     num_envs: int
-    # What the private server should reach of EnvPool.
+    # Target for the rate of the private server divided by the rate of EnvPool.
     private: float
-    # What the embedded server should reach of Gymnasium.
+    # Target for the rate of the embedded server divided by the rate of Gymnasium.
     embedded: float | None = None
-    # Whether random actions end episodes within a round.
+    # Whether random actions are expected to end episodes within a round.
     ends: bool = True
 
 
@@ -70,7 +73,7 @@ CASES = [
 
 
 def batch(envs: Any, kind: Any) -> Contender:
-    """A batch, at its first observations."""
+    """Return a contender that steps a batch of environments. They have been reset already."""
 
     def step(actions: Any) -> int:
         _, _, terminated, truncated, _ = envs.step(actions)
@@ -80,7 +83,7 @@ def batch(envs: Any, kind: Any) -> Contender:
 
 
 def single(env: Any, kind: Any) -> Contender:
-    """One environment by itself, at its first observation."""
+    """Return a contender that steps a single environment. It has been reset already."""
 
     def step(actions: Any) -> int:
         _, _, terminated, truncated, _ = env.step(actions[0])
@@ -93,7 +96,7 @@ def single(env: Any, kind: Any) -> Contender:
 
 
 def made(name: str, case: Case, **settings: Any) -> Contender:
-    """What Gymnasium makes of a name."""
+    """Return a contender that steps environments which Gymnasium makes from an id."""
     kind = np.int64 if CATALOGUE[case.name].discrete else np.float32
     if case.num_envs == 1:
         env = gymnasium.make(name, **settings)
@@ -105,7 +108,7 @@ def made(name: str, case: Case, **settings: Any) -> Contender:
 
 
 def in_halves(case: Case, server: str | None, kind: Any) -> Contender:
-    """Two batches of half the size that take turns."""
+    """Return a contender with two batches of half the size, which step alternately with `send` and `recv`."""
     halves = [perturb.PerturbVectorEnv(case.name, case.num_envs // 2, server=server) for _ in range(2)]
     for i, half in enumerate(halves):
         half.reset(seed=1 + i * case.num_envs // 2)
@@ -146,7 +149,7 @@ def contenders(case: Case, server: str | None) -> dict[str, Contender]:
 
 
 def rate(contender: Contender, actions: Any, seconds: float) -> tuple[float, int]:
-    """Return the steps of single environments a second, and the number of ended episodes."""
+    """Return the steps per second, summed over environments, and the number of ended episodes."""
     steps = ended = 0
     rows = list(actions.astype(contender.kind))
     start = time.perf_counter()
@@ -158,7 +161,7 @@ def rate(contender: Contender, actions: Any, seconds: float) -> tuple[float, int
 
 
 def measure(case: Case, server: str | None, rounds: int, seconds: float) -> dict[str, float]:
-    """Return the median rate of each contender, in steps of single environments a second."""
+    """Return the median rate of each contender, in steps per second, summed over environments."""
     description, rng = CATALOGUE[case.name], np.random.default_rng(1)
     drawn: Any
     if isinstance(description.actions, int):
@@ -179,25 +182,25 @@ def measure(case: Case, server: str | None, rounds: int, seconds: float) -> dict
     for contender in found.values():
         contender.close()
     for name, ended in endings.items():
-        # Gymnasium's batch may be too slow to end an episode: its Acrobot has 500 steps.
+        # Gymnasium's batch may be too slow to end an episode. Episodes of Acrobot, for example, have 500 steps.
         assert ended > 0 or not case.ends or name == "Gymnasium", f"{name} ended no episode of {case.name}"
     return {name: statistics.median(results) for name, results in rates.items()}
 
 
 def compared(medians: dict[str, float], own: str, other: str, target: float | None) -> str:
-    """A ratio beside its target."""
+    """Return a text with the ratio of two rates and its target."""
     if target is None or other not in medians:
         return f"{'':15}"
     return f"{medians[own] / medians[other]:9.2f} ({target:g})"
 
 
 def main() -> None:
-    """Measure, and print a table."""
+    """Measure all contenders, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", help="environments; at first all")
+    parser.add_argument("names", nargs="*", help="environments to measure; by default all")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=0.5)
-    parser.add_argument("--server", help="unix:/path or host:port; at first a server of its own")
+    parser.add_argument("--server", help="unix:/path or host:port; by default a private server")
     arguments = parser.parse_args()
 
     print("EnvPool is not installed: pip install envpool" if envpool is None else f"EnvPool {envpool.__version__}")

@@ -16,28 +16,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 sys.path.append(str(Path(__file__).parents[2] / "proto/perturb"))
-pb = grpc.protos("v1/perturb.proto")  # compiles it
+pb = grpc.protos("v1/perturb.proto")  # compiles the file
 
 N, T, HIDDEN = 8, 200, 64
-# Networks for the actions and for the values: [out, in] and [out] of each layer, from the input to the output.
+# A network: the weights [out, in] and biases [out] of each layer, from the input to the output.
 Layers = list[tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 
 def network(rng: np.random.Generator, sizes: list[int]) -> Layers:
-    """Draw the layers of a network."""
+    """Return a network's layers with random weights."""
     pairs = zip(sizes[1:], sizes, strict=False)
     return [((rng.normal(size=(o, i)) / i**0.5).astype("<f4"), np.zeros(o, "<f4")) for o, i in pairs]
 
 
 def forward(layers: Layers, rows: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Compute a network: tanh after every layer but the last."""
+    """Return the output of a network, with tanh after every layer except the last."""
     for weight, bias in layers[:-1]:
         rows = np.tanh(rows @ weight.T + bias)
     return rows @ layers[-1][0].T + layers[-1][1]
 
 
 def main() -> None:
-    """Play, and compute again."""
+    """Play in the server, and compare the policy's outputs with this program's own computation."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--server", default="127.0.0.1:7447", help="unix:/path or host:port")
     options = [("grpc.default_authority", "localhost"), ("grpc.max_receive_message_length", -1)]

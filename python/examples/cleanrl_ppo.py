@@ -21,7 +21,7 @@ LEARNING_RATE, MAX_GRAD_NORM = 1e-3, 0.5
 
 
 class Agent(nn.Module):  # type: ignore[misc]
-    """Two networks of 64 × 64: the policy's logits, and the value."""
+    """A policy network and a value network, each with two hidden layers of 64 units."""
 
     def __init__(self, observations: int, actions: int) -> None:
         super().__init__()
@@ -35,7 +35,7 @@ class Agent(nn.Module):  # type: ignore[misc]
 
 
 def main() -> None:
-    """Train, and print the returns as they come."""
+    """Train, and print the returns of finished episodes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--version", choices=["D", "R", "E"], default="D")
     parser.add_argument("--steps", type=int, default=100_000)
@@ -52,7 +52,7 @@ def main() -> None:
             version=arguments.version,
             server=arguments.server,
             autoreset_mode="SameStep",
-            copy=True,  # PyTorch warns of arrays that cannot be written to
+            copy=True,  # PyTorch warns about read-only arrays
         )
     )
     assert isinstance(envs.single_action_space, gymnasium.spaces.Discrete)

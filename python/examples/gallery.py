@@ -1,4 +1,4 @@
-"""Draws every environment, each as it is by default and with extreme physics, into one PNG file each. Needs Pillow.
+"""Draws every environment with default and with extreme physics, into one PNG file per environment. Needs Pillow.
 
 Run: python gallery.py [--out pictures] [--server unix:/path]
 """
@@ -17,7 +17,7 @@ VERSIONS: tuple[perturb.Version, ...] = ("D", "E")
 
 
 def picture(name: str, version: perturb.Version, server: str | None) -> np.ndarray:
-    """The environment after some random actions, which are the same in every version."""
+    """Return a picture of the environment after some random actions, which are the same in every version."""
     env = perturb.PerturbEnv(name, version=version, server=server, render_mode="rgb_array")
     env.action_space.seed(1)
     env.reset(seed=1)
@@ -31,7 +31,7 @@ def picture(name: str, version: perturb.Version, server: str | None) -> np.ndarr
 
 
 def main() -> None:
-    """Write one file of each environment: D on the left, E on the right."""
+    """Write a file for each environment, with version D on the left and E on the right."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("pictures"), help="the folder for the files")
     parser.add_argument("--server", help="unix:/path or host:port; at first a server of its own")

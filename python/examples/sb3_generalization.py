@@ -14,7 +14,7 @@ EPISODES = 100
 
 
 def success_rate(model: PPO, environment: str, version: perturb.Version) -> float:
-    """Successful episodes, in percent."""
+    """Return the share of successful episodes in percent."""
     env = perturb.PerturbEnv(environment, version=version)
     successes = 0
     for episode in range(EPISODES):
@@ -30,13 +30,13 @@ def success_rate(model: PPO, environment: str, version: perturb.Version) -> floa
 
 
 def main() -> None:
-    """Train and test."""
+    """Train a policy, and test it on all versions."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--environment", default="CartPole")
     parser.add_argument("--train", choices=["D", "R", "E"], default="D")
     parser.add_argument("--steps", type=int, default=50_000)
     arguments = parser.parse_args()
-    torch.set_num_threads(1)  # with networks this small a second thread costs more than it computes
+    torch.set_num_threads(1)  # for networks this small, a second thread costs more time than it saves
 
     env = perturb.PerturbEnv(arguments.environment, version=arguments.train)
     model = PPO("MlpPolicy", env, seed=1, device="cpu").learn(arguments.steps)

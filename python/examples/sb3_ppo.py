@@ -27,13 +27,13 @@ class StopAtGoal(BaseCallback):  # type: ignore[misc]
 
 
 def main() -> None:
-    """Train and test."""
+    """Train a policy, and test it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--version", choices=["D", "R", "E"], default="D")
     parser.add_argument("--server", help="unix:/path or host:port; at first a server of its own")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)  # with networks this small a second thread costs more than it computes
+    torch.set_num_threads(1)  # for networks this small, a second thread costs more time than it saves
 
     env = Monitor(gymnasium.make("perturb/CartPole-v1", version=arguments.version, server=arguments.server))
     model = PPO("MlpPolicy", env, seed=arguments.seed, device="cpu")

@@ -13,7 +13,7 @@ import perturb  # noqa: F401  (registers the environments)
 
 
 def main() -> None:
-    """Print how long each pole stays up."""
+    """Print the number of steps for which each pole stays up."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--server", help="unix:/path or host:port; at first a server of its own")
     lengths = np.array([0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0, 5.0])
@@ -38,7 +38,7 @@ def main() -> None:
         steps += up
         ended = terminated | truncated
         up &= ~ended
-        if ended.any():  # the others go on, these begin again and are no longer counted
+        if ended.any():  # environments whose episode ended are reset, and their later steps are not counted
             observations, _ = envs.reset(options={"reset_mask": ended})
     envs.close()
     for length, count in zip(lengths, steps, strict=True):

@@ -1,4 +1,4 @@
-"""A server for the tests."""
+"""Fixtures of all tests: servers, programs, and the protocol's messages."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ ROOT = Path(__file__).parents[2]
 
 
 def messages() -> Any:
-    """Compile the protocol's messages for gRPC's own Python, so that tests have another's view of the protocol."""
-    folder = str(ROOT / "proto/perturb")  # above it they would be a part of the package perturb
+    """Compile the protocol's messages with gRPC's own tools, so that tests do not depend on perturb's own code."""
+    folder = str(ROOT / "proto/perturb")  # with the folder above it, the modules would clash with the package perturb
     if folder not in sys.path:
         sys.path.append(folder)
     return grpc.protos("v1/perturb.proto")
 
 
 def identifier(name: str) -> str:
-    """Give the id by which Gymnasium makes an environment."""
+    """Return the environment's id in Gymnasium."""
     return f"perturb/{name}-v{CATALOGUE[name].revision}"
 
 
 class Server:
-    """A perturb-server as people run it, on a Unix socket or a free TCP port."""
+    """A running perturb-server process that listens on a Unix socket or a free TCP port."""
 
     def __init__(self, *flags: str, listen: str | None = None) -> None:
         self._directory = tempfile.TemporaryDirectory(prefix="perturb-test-")
@@ -53,13 +53,13 @@ class Server:
 
 @pytest.fixture(scope="session", autouse=True)
 def _program() -> None:
-    """Let the tests find the server that cargo built, unless another is named."""
+    """Use the perturb-server that cargo built, unless PERTURB_SERVER names another one."""
     os.environ.setdefault(local_server.VARIABLE, str(ROOT / "target/release/perturb-server"))
 
 
 @pytest.fixture(scope="session")
 def server(request: pytest.FixtureRequest, _program: None) -> Iterator[str]:
-    """Give the address of a server that all tests share, or name the embedded server."""
+    """Return the address of a server that all tests share, or `embedded`."""
     if getattr(request, "param", None) == "embedded":
         yield "embedded"
         return
@@ -68,12 +68,12 @@ def server(request: pytest.FixtureRequest, _program: None) -> Iterator[str]:
     running.end()
 
 
-# Tests of what a session does, which must not depend on the way to its server.
+# Test modules that run twice: with a server on a socket, and with the embedded server.
 BOTH_WAYS = {"bad_input", "changes", "disturbances", "faults", "halves", "infos", "observing", "options", "render"}
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run tests of sessions with a server on a socket and with the embedded one."""
+    """Run the tests of the modules in BOTH_WAYS with a server on a socket and with the embedded server."""
     of_a_session = metafunc.module.__name__.rpartition("test_")[2] in BOTH_WAYS
     if "server" in metafunc.fixturenames and of_a_session and not metafunc.definition.get_closest_marker("socket"):
         metafunc.parametrize("server", ["socket", "embedded"], indirect=True, scope="session")
@@ -81,7 +81,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture
 def start_server(_program: None) -> Iterator[Callable[..., Server]]:
-    """Start servers of the test's own."""
+    """Return a function that starts a server for the test alone."""
     running: list[Server] = []
 
     def start(*flags: str, listen: str | None = None) -> Server:

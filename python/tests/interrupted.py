@@ -26,27 +26,27 @@ import perturb
 
 from .processes import SECONDS, freeze, wait_until
 
-# Always the same actions, so that observations follow from how many steps there were.
+# The actions are always the same, so that observations depend only on the number of steps.
 ACTIONS = np.zeros(4, dtype=np.int64)
-# After so many steps the environments begin anew.
+# Number of steps after which the environments are reset.
 STEPS = 500
 
 
 class Stepping:
-    """Environments that are stepped, and what has to come of it."""
+    """Environments that are stepped, and the observations that they must return."""
 
     def __init__(self, address: str) -> None:
         self.envs = perturb.PerturbVectorEnv(
             "CartPole", len(ACTIONS), server=address, autoreset_mode="SameStep", timeout=float("inf")
         )
-        # What is observed after 0, 1, 2, … steps; the last few only where an interrupt came in the way of a reset.
+        # The observations after 0, 1, 2, … steps. More than STEPS steps happen only if an interrupt prevents a reset.
         self.truth = [self.envs.reset(seed=1)[0].tobytes()]
         self.truth += [self._step() for _ in range(STEPS + 5)]
         self.place = 0
         self._begin()
 
     def go(self) -> None:
-        """Step without end."""
+        """Step until an interrupt comes."""
         while True:
             if self.place >= STEPS:
                 self._begin()
@@ -55,7 +55,7 @@ class Stepping:
             assert observed == self.truth[self.place]
 
     def goes_on(self) -> bool:
-        """Step once after an interrupt. Whether the environments were still there; if not, they begin anew."""
+        """Step once after an interrupt. Return whether the session still exists. If not, reset the environments."""
         try:
             observed = self._step()
         except perturb.OutOfOrderError as gone:
@@ -64,7 +64,7 @@ class Stepping:
             self._begin()
             return False
         place = self.truth.index(observed)
-        # The interrupt may have come between a reply and its count, or before a reset was sent.
+        # The interrupt may have come after a reply was received and before it was counted, or before a reset was sent.
         assert place - self.place in (1, 2) or (self.place == 0 and place > STEPS), (self.place, place)
         self.place = place
         return True
@@ -78,14 +78,14 @@ class Stepping:
 
 
 def interrupt(way: str, envs: perturb.PerturbVectorEnv, server: int, chance: random.Random, sent: list[float]) -> None:
-    """Send Ctrl-C to this process."""
+    """Send SIGINT, as Ctrl-C does, to this process. `way` selects the moment."""
     time.sleep(chance.uniform(0, 0.005))
     if way != "anywhere":
         freeze(server)
         wait_until(lambda: envs._client.session.waits)
     sent.append(time.monotonic())
     os.kill(os.getpid(), signal.SIGINT)
-    if way == "as the reply comes":  # before or after the wait looks for signals, which is every 20 ms
+    if way == "as the reply comes":  # at random times, because the waiting thread checks for signals every 20 ms
         time.sleep(chance.uniform(0, 0.03))
         os.kill(server, signal.SIGCONT)
 
@@ -95,7 +95,7 @@ def descriptors() -> int:
 
 
 def main(address: str, server: int, times: int) -> None:
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # who runs the tests in the background may have it ignored
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started the tests with SIGINT ignored
     stepping = Stepping(address)
     chance, sent, went_on, slowest = random.Random(times), list[float](), 0, 0.0
     before = descriptors()

@@ -1,4 +1,4 @@
-"""Other processes: programs in Python that run beside the tests, and servers that are stopped."""
+"""Helpers for other processes: Python programs that the tests start, and servers that they stop."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-# What "within seconds" means here: the rest is for a machine that is busy. Less than a reply may take unless told
-# otherwise, a minute.
+# Upper bound for events that should happen within seconds, s. It is long because the machine may be busy, and shorter
+# than the default timeout of replies, 60 s.
 SECONDS = 30.0
 
 
@@ -34,7 +34,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 def runs(pid: int) -> bool:
-    """Whether there is such a process that has not ended."""
+    """Whether the process with this id is running."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     except FileNotFoundError:
@@ -42,8 +42,8 @@ def runs(pid: int) -> bool:
 
 
 def python(*arguments: str) -> subprocess.Popen[str]:
-    """Run another Python, which finds these tests, in a group of its own, for it may fork."""
-    # Python 3.12 and later warn of every fork beside threads.
+    """Start another Python process that can import these tests. It has its own process group, because it may fork."""
+    # Python 3.12 and later warn of every fork of a process with threads.
     return subprocess.Popen(
         [sys.executable, "-W", "ignore::DeprecationWarning", *arguments],
         cwd=Path(__file__).parents[1],
@@ -55,7 +55,7 @@ def python(*arguments: str) -> subprocess.Popen[str]:
 
 
 def output_of(*arguments: str, seconds: float = 60) -> tuple[str, str]:
-    """Return the output and the errors of another Python, if it ends in time."""
+    """Run another Python process. Return its standard output and standard error. Fail if it does not end in time."""
     process = python(*arguments)
     try:
         return process.communicate(timeout=seconds)
@@ -66,7 +66,7 @@ def output_of(*arguments: str, seconds: float = 60) -> tuple[str, str]:
 
 
 def freeze(pid: int) -> None:
-    """Stop the process and wait until every thread stands. SIGCONT continues it."""
+    """Stop the process with SIGSTOP, and wait until all its threads are stopped. SIGCONT continues it."""
     os.kill(pid, signal.SIGSTOP)
     threads = [thread / "stat" for thread in Path(f"/proc/{pid}/task").iterdir()]
     wait_until(lambda: all(thread.read_text().rpartition(")")[2].split()[0] == "T" for thread in threads))

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(autouse=True)
 def _takes_longer() -> None:
-    """Lift the limit of other tests."""
+    """Remove the time limit that other tests have."""
     faulthandler.cancel_dump_traceback_later()
 
 
@@ -37,7 +37,7 @@ def run(*command: str) -> str:
     return ended.stdout
 
 
-@pytest.mark.filterwarnings("ignore:We recommend")  # Pendulum's torque of ±2
+@pytest.mark.filterwarnings("ignore:We recommend")  # a warning about Pendulum's action range of ±2
 @pytest.mark.parametrize("version", ["D", "R", "E"])
 @pytest.mark.parametrize("name", list(CATALOGUE))
 def test_stable_baselines3s_checker_accepts_all_environments(name: str, version: str, server: str) -> None:
@@ -49,16 +49,16 @@ def test_stable_baselines3s_checker_accepts_all_environments(name: str, version:
 
 
 def test_stable_baselines3s_ppo_learns_cart_pole(server: str) -> None:
-    """With its default settings, to a mean return of 195 within 60 000 steps."""
+    """With default settings, PPO reaches a mean return of 195 within 60 000 steps."""
     output = run("sb3_ppo.py", "--server", server)
     match = re.search(r"(\d+) steps, mean return of the last 100 episodes ([\d.]+)\n.*test episodes ([\d.]+)", output)
     assert match is not None, output
-    assert int(match[1]) <= 60_000 + 2048, output  # a last rollout is finished
+    assert int(match[1]) <= 60_000 + 2048, output  # the last rollout, of 2048 steps, is finished
     assert max(float(match[2]), float(match[3])) >= 195, output
 
 
 def test_ppo_in_one_file_learns_cart_pole(server: str) -> None:
-    """Twice as many steps as it took when it was written."""
+    """The limit is twice the number of steps that the training took when this test was written."""
     returns = [float(value) for value in re.findall(r"episodes +([\d.]+)", run("cleanrl_ppo.py", "--server", server))]
     assert returns[-1] >= 195, returns
     assert returns[0] < 100, returns
@@ -89,7 +89,7 @@ def test_report_has_agent_and_checkpoint_gives_same_bytes(server: str, tmp_path:
 
 
 def test_a_study_of_two_conditions_takes_twenty_lines(tmp_path: Path) -> None:
-    """Its numbers are those of a script with pandas over the episodes that it writes."""
+    """The printed numbers equal those that pandas computes from the recorded episodes."""
     import pandas as pd
 
     lines = [line for line in (EXAMPLES / "sb3_study.py").read_text().splitlines() if line]
@@ -102,7 +102,7 @@ def test_a_study_of_two_conditions_takes_twenty_lines(tmp_path: Path) -> None:
     for tested_on in ("D", "R", "E"):
         seeds = {name: by_seed[name, tested_on] for name in ("no DR", "DR")}
         for condition, means in seeds.items():
-            half = 4.302653 * means.sem()  # the quantile of 2 degrees of freedom
+            half = 4.302653 * means.sem()  # 97.5 % quantile of Student's t with 2 degrees of freedom
             interval = f"[{means.mean() - half:.1f}, {means.mean() + half:.1f}]"
             assert rows[condition, tested_on][:3] == ["3", f"{means.mean():.1f}", interval], output
         pairs = (seeds["DR"] - seeds["no DR"]).tolist()

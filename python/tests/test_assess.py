@@ -1,4 +1,4 @@
-"""Policies of all kinds in the tests of `perturb evaluate`, and their figures."""
+"""`evaluate` tests policies of all kinds in the episodes of `perturb evaluate`, and computes their statistics."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from perturb import _native
 from .conftest import ROOT
 from .test_policy import CART_POLE, PENDULUM, POLICIES
 
-# Overrides where the program perturb is looked for.
+# Environment variable with the path of the program perturb.
 VARIABLE = "PERTURB_PROGRAM"
 
 
 def evaluated(checkpoint: Path, records: Path, server: str, *arguments: str) -> None:
-    """Run `perturb evaluate`; without the program the test is skipped."""
+    """Run `perturb evaluate`. Skip the test if the program is missing."""
     run("evaluate", "--checkpoint", str(checkpoint), "--records", str(records), "--server", server, *arguments)
 
 
@@ -62,7 +62,7 @@ def test_saved_assessments_are_listed(server: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("cell", ["CartPole-ppo-ff-D-9bd6546b-s7", "Pendulum-ppo-ff-R-9bd6546b-s8"])
 def test_shipped_policies_have_their_shipped_records(cell: str, server: str) -> None:
-    """The 3000 test episodes that the experiment recorded, judged by its rule, have the table's checksums."""
+    """The 3000 test episodes of a shipped policy have the checksums in the results table."""
     pytest.importorskip("pandas")
     policy = perturb.load_policy(POLICIES / f"{cell}.safetensors")
     assessment = perturb.evaluate(policy, policy.environment, success="code", server=server)
@@ -72,7 +72,7 @@ def test_shipped_policies_have_their_shipped_records(cell: str, server: str) -> 
 
 
 def checksums(columns: dict[str, Any]) -> dict[str, str]:
-    """Checksums of each test's episodes, as docs/results-table.md describes them."""
+    """Return the checksum of each test's episodes, computed as docs/results-table.md describes."""
     hashes: dict[str, Any] = {}
     parameters = [name for name in columns if name.startswith(("requested_", "applied_"))]
     for row in range(len(columns["seed"])):
@@ -145,9 +145,9 @@ def test_so_they_do_on_sets_of_ones_own_and_with_another_rule(tmp_path: Path, se
 
 
 def upright(observations: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """Push where the pole falls to: a good policy on D, and a worse one on E."""
+    """Push in the direction in which the pole falls. This policy is good on D, and worse on E."""
     pushed: np.ndarray[Any, Any] = (observations[:, 2] + observations[:, 3] > 0).astype(np.int64)
-    observations[:] = np.nan  # they are its own
+    observations[:] = np.nan  # the function may change its observations
     return pushed
 
 
@@ -172,7 +172,7 @@ def test_function_plays_same_episodes_as_checkpoint(server: str) -> None:
 
 
 def test_a_function_with_memory_is_told_where_episodes_begin(server: str) -> None:
-    """It counts the steps of each episode: as the records do."""
+    """The function counts the steps of each episode, and its counts equal the recorded lengths."""
     lengths: list[int] = []
 
     def counts(observations: Any, memory: Any, starts: Any) -> tuple[Any, Any]:
@@ -225,7 +225,7 @@ def test_policies_of_each_version_give_the_nine_scenarios(server: str) -> None:
     extrapolation = (rate["DR"] * rate["DE"] * rate["RE"]) ** (1 / 3)
     metrics = assessment.metrics
     assert (metrics["Default"], metrics["Interpolation"]) == (rate["DD"], rate["RR"])
-    assert metrics["Extrapolation"] == pytest.approx(extrapolation, rel=1e-12)  # a root by exp and log
+    assert metrics["Extrapolation"] == pytest.approx(extrapolation, rel=1e-12)  # the root is computed with exp and log
     assert set(assessment.columns()["trained_on"]) == {"D", "R", "E"}
     text = str(assessment)
     assert "paper: ppo ff" in text
@@ -253,7 +253,7 @@ def test_figures_follow_from_the_episodes(server: str) -> None:
     z, share = 1.959963984540054, successes / n
     middle = (share + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z / (1 + z**2 / n) * np.sqrt(share * (1 - share) / n + z**2 / (4 * n**2))
-    # In both orders of the same operations.
+    # The tolerance allows for another order of the same operations.
     assert result.success_interval == pytest.approx((100 * (middle - half), 100 * (middle + half)), rel=1e-9)
     returns = np.sort(columns["return"])
     assert result.cvar_return == pytest.approx(returns[:100].mean(), rel=1e-12)
@@ -268,7 +268,7 @@ def test_figures_follow_from_the_episodes(server: str) -> None:
     for part in parts:
         last = part.high == max(it.high for it in parts)
         within = (lengths >= part.low) & ((lengths <= part.high) if last else (lengths < part.high))
-        if part.high not in {it.low for it in parts}:  # the end of an interval belongs to it
+        if part.high not in {it.low for it in parts}:  # without an adjacent bin, the upper edge belongs to this bin
             within |= lengths == part.high
         assert part.episodes == within.sum()
         assert part.successes == columns["success"][within].sum()

@@ -156,7 +156,7 @@ def test_wrong_settings_of_a_batch_are_refused(settings: dict[str, Any], says: s
         (-1, None, "seed=-1"),
         (2**64, None, "2\\^64"),
         (1.5, None, "1.5"),
-        (2**64 - 2, None, "2\\^64"),  # the third environment's does not fit
+        (2**64 - 2, None, "2\\^64"),  # the seed of the third environment would be 2^64
         ([1, 2], None, "2 numbers"),
         (np.array([1, 2]), None, "2 numbers"),
         (np.array([1.0, 2.0, 3.0]), None, "1.0"),

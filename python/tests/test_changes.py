@@ -1,4 +1,4 @@
-"""Changes of the physics while a training runs, and assignments that would change nothing."""
+"""The physics can change while a training runs, and assignments without an effect are refused."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_parameters_act_at_the_next_episode_of_each_slot(mode: AutoresetMode, se
         np.testing.assert_array_equal(terminated[untouched], expected_terminated[untouched])
         ended = terminated | truncated
         if mode is AutoresetMode.SAME_STEP and ended.any():
-            for slot in np.flatnonzero(ended & untouched).tolist():  # what ended had the parameters of before
+            for slot in np.flatnonzero(ended & untouched).tolist():  # the episode that ended had the earlier parameters
                 assert infos["final_info"]["parameters"]["length"][slot] != 0.7
         begun = ended if mode is AutoresetMode.SAME_STEP else before
         for slot in np.flatnonzero(begun).tolist():
@@ -141,7 +141,7 @@ def test_attributes_that_exist_can_be_assigned(server: str) -> None:
 
 
 def test_values_are_written_alike_everywhere(server: str) -> None:
-    """A number, an interval and a union, as Python has them and as text."""
+    """A number, an interval and several intervals can be written as Python values and as text."""
     pairs: list[tuple[Any, str]] = [
         (0.7, "0.7"),
         ((0.5, 0.6), "0.5..0.6"),

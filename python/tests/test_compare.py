@@ -1,4 +1,4 @@
-"""Comparisons of conditions have the numbers that a script with pandas computes from the recorded episodes."""
+"""The numbers of comparisons equal those that pandas computes from the recorded episodes."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from .test_policy import CART_POLE, POLICIES
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-# Quantiles of Student's t, 97.5 %: of 2 and of 59 degrees of freedom (tables, to 6 digits).
+# The 97.5 % quantiles of Student's t with 2 and with 59 degrees of freedom (from tables, to 6 digits).
 T_2, T_59 = 4.302653, 2.000995
 
 
 def noisy(share: float, seed: int) -> Callable[[Any], Any]:
-    """Make a policy that pushes to where the pole falls, but in some steps at random."""
+    """Make a policy that pushes in the direction in which the pole falls, and in a share of the steps at random."""
 
     def act(observations: Any) -> Any:
         generator = np.random.default_rng([seed, int(abs(observations[:, 2].sum()) * 1e6)])
@@ -37,7 +37,7 @@ def noisy(share: float, seed: int) -> Callable[[Any], Any]:
 
 @pytest.fixture(scope="module")
 def comparison(server: str) -> perturb.Comparison:
-    """Give two conditions with three seeds each."""
+    """Return a comparison of two conditions with three seeds each."""
     conditions = {"plain": [noisy(0.55, s) for s in (1, 2, 3)], "careful": [noisy(0.3, s) for s in (4, 5, 6)]}
     return perturb.compare(conditions, "CartPole", versions=("R", "E"), episodes=60, seed=4, server=server)
 
@@ -72,7 +72,7 @@ def test_numbers_are_those_of_a_pandas_script(comparison: perturb.Comparison) ->
         half = T_2 * pairs.std(ddof=1) / math.sqrt(3)
         assert difference.seeds_interval == pytest.approx((pairs.mean() - half, pairs.mean() + half), rel=1e-5)
         t = pairs.mean() / (pairs.std(ddof=1) / math.sqrt(3))
-        assert difference.p == pytest.approx(1 - abs(t) / math.sqrt(2 + t * t), rel=1e-9)  # with 2 degrees of freedom
+        assert difference.p == pytest.approx(1 - abs(t) / math.sqrt(2 + t * t), rel=1e-9)  # for 2 degrees of freedom
         wide = frame.groupby([*address, "condition"])["percent"].mean().unstack()
         by_episode = wide["careful"] - wide["plain"]
         half = T_59 * by_episode.sem()
@@ -136,7 +136,7 @@ def test_saved_assessments_are_compared_as_they_are(
     assert (again.means, again.differences) == (comparison.means, comparison.differences)
     only = perturb.compare(saved, versions=("E",), score="return", baseline="plain")
     assert [it.tested_on for it in only.means] == ["E", "E"]
-    # A new policy plays the episodes of the saved ones.
+    # A policy without an assessment is tested in the episodes of the saved assessments.
     mixed = perturb.compare({"plain": saved["plain"][0], "upright": upright}, server=server)
     assert mixed.differences[0].same_episodes
     assert mixed.mean("plain", "E").by_seed == comparison.mean("plain", "E").by_seed[:1]

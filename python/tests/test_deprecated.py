@@ -1,4 +1,4 @@
-"""Names of version 0.1 are still found, with a warning."""
+"""The names of version 0.1 still work, and cause a warning."""
 
 from __future__ import annotations
 

@@ -35,12 +35,12 @@ def test_delays_agree_with_gymnasiums_wrapper(server: str) -> None:
     rows = [first] + [wrapped.step(np.array([np.sin(step)], dtype=np.float32))[0] for step in range(30)]
     wrapped.close()
     own = observations(30, server=server, parameters={"sensor_delay": 4})
-    # Before, Gymnasium's observations are 0.
+    # In the first four steps, Gymnasium's wrapper returns zeros.
     np.testing.assert_array_equal(np.stack(rows)[4:], own[4:])
 
 
 class RecordedSticky(StickyAction[np.ndarray, np.ndarray]):
-    """Gymnasium's wrapper, with decisions of an episode's stream (docs/disturbances.md) instead of its draws."""
+    """Gymnasium's wrapper with the random numbers of perturb's `action_hold` (docs/disturbances.md)."""
 
     def __init__(self, environment: gym.Env[np.ndarray, np.ndarray], probability: float, seed: int) -> None:
         super().__init__(environment, probability)
@@ -48,24 +48,24 @@ class RecordedSticky(StickyAction[np.ndarray, np.ndarray]):
 
     @property  # type: ignore[misc]
     def np_random(self) -> "RecordedDecisions":  # type: ignore[override]
-        """The recorded decisions."""
+        """The generator, which returns recorded random numbers."""
         return self._recorded
 
 
 class RecordedDecisions:
-    """The numbers of the stream of `action_hold` in episode 0 of environment 0, one for each step from 1 on."""
+    """A generator that returns the random numbers of `action_hold` in episode 0 of environment 0, from step 1 on."""
 
     def __init__(self, seed: int) -> None:
         self._key, self._step = np.array([seed, 0], dtype=np.uint64), 0
 
     def uniform(self) -> float:
-        """Return the number of the next step."""
+        """Return the random number of the next step."""
         self._step += 1
         counter = np.array([0, 0, 2, self._step], dtype=np.uint64)
         return float(np.random.Generator(np.random.Philox(key=self._key, counter=counter)).random())
 
     def integers(self, low: int, _high: int) -> int:
-        """Return the least number of repetitions."""
+        """Return the minimum number of repetitions."""
         return low
 
 
@@ -95,7 +95,7 @@ def test_noise_is_that_of_numpys_streams(server: str) -> None:
         counter = np.array([0, 0, 4, step], dtype=np.uint64)
         normal = np.random.Generator(np.random.Philox(key=key, counter=counter)).standard_normal(3)
         expected = np.clip(row + 0.01 * np.array([1, 1, 8]) * normal, *ends)
-        np.testing.assert_allclose(seen, expected, rtol=0, atol=1e-6)  # float32 of numbers up to 8
+        np.testing.assert_allclose(seen, expected, rtol=0, atol=1e-6)  # float32 rounding of numbers up to 8
 
 
 def test_physics_change_within_an_episode(server: str) -> None:

@@ -1,4 +1,4 @@
-"""The embedded server: what a private server does, in this process."""
+"""The embedded server behaves like a private server."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ STEPS = 60
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two outcomes are equal to the last bit, with equal types."""
+    """Whether two outcomes have the same types and the same bits."""
     return all(data_equivalence(one, other, exact=True) for one, other in zip(a, b, strict=True))
 
 
@@ -78,7 +78,7 @@ def test_robots_are_a_private_servers_to_the_last_bit(name: str) -> None:
 
 
 def physics_threads() -> int:
-    """The threads of embedded servers."""
+    """Return the number of threads of embedded servers in this process."""
     names = (task / "comm" for task in Path("/proc/self/task").iterdir())
     return sum(name.read_text().startswith("physics-") for name in names)
 
@@ -96,7 +96,7 @@ def test_threads_end_with_last_environment() -> None:
     assert (EmbeddedServer, None) not in local_server._shared
 
 
-# A step of so many takes long enough to be interrupted.
+# Number of environments whose step takes long enough to be interrupted.
 MANY = 4096
 
 
@@ -117,7 +117,7 @@ def test_interrupt_ends_a_session_and_a_reset_begins_anew() -> None:
 
 
 def test_wait_ends_when_another_thread_closes_the_environment() -> None:
-    """Other threads run during a step."""
+    """The step releases Python's lock, so another thread can close the environment."""
     envs, actions = many()
     envs.reset(seed=2)
     caught: list[BaseException] = []
@@ -148,7 +148,7 @@ def test_reply_that_takes_too_long_ends_a_session() -> None:
 
 
 class BrokenNative:
-    """The native half of a session that is lost during `render`, while another thread starts an embedded server."""
+    """A fake native session that fails during `render`, while another thread starts an embedded server."""
 
     ended = False
 
@@ -168,7 +168,7 @@ class BrokenNative:
         raise _native.Failure("ended", 0, "as the test wants")
 
     def poll_io(self) -> None:
-        """Nothing to answer."""
+        """Do nothing, because there are no pings to answer."""
 
 
 def test_a_lost_session_waits_for_no_server_that_starts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -265,10 +265,10 @@ def test_embedded_needs_no_program(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_small_step_does_not_wait_for_a_worker() -> None:
-    """Its thread alone computes: others have no time of the processor."""
+    """The calling thread does all the work, so the other threads use no processor time."""
     with perturb.PerturbEnv("CartPole", server="embedded") as env:
         env.reset(seed=1)
-        time.sleep(0.2)  # workers fall asleep
+        time.sleep(0.2)  # afterwards the worker threads are blocked
         before = time.process_time() - time.thread_time()
         for step in range(2000):
             _, _, terminated, truncated, _ = env.step(step % 2)

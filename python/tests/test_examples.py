@@ -1,4 +1,4 @@
-"""The examples that need nothing but the package."""
+"""The examples run, and print the expected results."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_server_plays_the_policy_that_numpy_computes(server: str) -> None:
     output = run("act.py", "--server", server)
     assert output.startswith("200 steps of 8 environments, finished: True\n")
     assert int(re.findall(r"(\d+) episodes ended", output)[0]) >= 8
-    # float32 rounding of sums of 64 numbers, and the server's own tanh
+    # The tolerance allows for float32 rounding of sums of 64 numbers, and for the server's different tanh.
     assert float(re.findall(r"at most (\S+)", output)[0]) < 1e-5
 
 

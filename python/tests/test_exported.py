@@ -1,4 +1,4 @@
-"""Exported networks act as the policies do. They need torch, or onnx: `make python-acceptance` installs both."""
+"""Exported networks choose the same actions as the policies. `make python-acceptance` installs torch and onnx."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def observations(policy: perturb.Policy) -> NDArray[np.float32]:
 
 
 def sampled(policy: perturb.Policy, rows: NDArray[np.float32]) -> NDArray[Any]:
-    """Act once at each observation, always with the same random number."""
+    """Sample an action for each observation, each time with the same random number."""
     return np.concatenate([policy.actor(seed=1)(row[None]) for row in rows])
 
 
 def same_actions(outputs: NDArray[Any], actions: NDArray[Any]) -> None:
-    """Check that the actions follow from logits, or from means, by one random number for all."""
+    """Check that one random number explains all actions, given their logits or means."""
     if actions.dtype == np.float32:
         noise = actions - outputs
         assert np.ptp(noise, axis=0).max() < 2e-6, "float32 products in another order"
@@ -39,7 +39,8 @@ def same_actions(outputs: NDArray[Any], actions: NDArray[Any]) -> None:
     logits = outputs.astype(np.float64)
     probabilities = np.exp(logits - logits.max(axis=1, keepdims=True))
     first = (probabilities / probabilities.sum(axis=1, keepdims=True)).cumsum(axis=1)
-    # A choice is the first whose cumulative probability is above the random number: it lies between these bounds.
+    # The chosen action is the first whose cumulative probability is above the random number. So the random number lies
+    # between these bounds.
     rows = np.arange(len(actions))
     above = first[rows, actions].min()
     below = np.where(actions > 0, first[rows, np.maximum(actions - 1, 0)], 0).max()
@@ -74,7 +75,7 @@ def test_onnx_acts_as_the_policy(path: Path, tmp_path: Path) -> None:
 
 
 def recurrent(environment: str, folder: Path, server: str) -> perturb.Policy:
-    """Train a recurrent policy for a moment, so that its weights are not the initial ones."""
+    """Train a recurrent policy for a few episodes, so that its weights differ from the initial ones."""
     settings = ["--architecture", "rc", "--episodes", "40", "--set", "learning_rate=1e-2"]
     run("train", "--env", environment, *settings, "--server", server, "--out", str(folder))
     return perturb.load_policy(folder)
@@ -82,7 +83,7 @@ def recurrent(environment: str, folder: Path, server: str) -> perturb.Policy:
 
 @pytest.mark.parametrize("environment", ["CartPole", "Pendulum"])
 def test_recurrent_exports_remember_as_the_policy(environment: str, tmp_path: Path, server: str) -> None:
-    """A thousand steps in ten episodes. Another actor with the same seed gives the random numbers of each step."""
+    """The export is compared in a thousand steps. Another actor with the same seed has the same random numbers."""
     torch = pytest.importorskip("torch")
     pytest.importorskip("onnx")
     policy = recurrent(environment, tmp_path / "run", server)
@@ -120,7 +121,7 @@ def test_recurrent_exports_remember_as_the_policy(environment: str, tmp_path: Pa
         return
     first = 1 / (1 + np.exp(network[:, 1].astype(np.float64) - network[:, 0]))
     first_second = 1 / (1 + np.exp(second[:, 1].astype(np.float64) - second[:, 0]))
-    # In each step one number decides both choices: the first choice exactly where its probability is above.
+    # In each step both actors compare the same random number with their probability of the first action.
     higher = first > first_second
     contradictions = np.where(higher, (acted == 1) & (acted_second == 0), (acted == 0) & (acted_second == 1))
     assert not contradictions[np.abs(first - first_second) > 1e-6].any()

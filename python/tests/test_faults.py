@@ -1,4 +1,4 @@
-"""Clients and servers that die, hang or fork: errors within seconds, and nothing is left behind."""
+"""If a client or server dies, hangs or forks, errors come within seconds, and nothing is left behind."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def test_parameters_of_a_snapshot_are_not_forgotten_silently(start_server: Calla
 
 @pytest.mark.parametrize("how", ["refused", "lost"])
 def test_a_restore_that_is_refused_changes_nothing(how: str, start_server: Callable[..., Any]) -> None:
-    """If the server is lost in the middle, nobody knows."""
+    """If the server is lost during a restore, the client does not know the parameters any more."""
     with tempfile.TemporaryDirectory() as directory:
         listen = f"unix:{directory}/server.sock"
         running = start_server(listen=listen)
@@ -179,9 +179,9 @@ def test_a_server_that_hangs_is_given_up(start_server: Callable[..., Any]) -> No
 def test_a_server_that_answers_no_pings_is_given_up(
     start_server: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With other limits, since the real ones are half a minute; the limit of replies, a minute, has no part in it."""
+    """The real limits add up to half a minute, so the test sets shorter ones. They are below the timeout of replies."""
     monkeypatch.setattr(session, "KEEPALIVE_INTERVAL", 1.0)
-    monkeypatch.setattr(session, "KEEPALIVE_LIMIT", 5.0)  # which holds during the reset, too
+    monkeypatch.setattr(session, "KEEPALIVE_LIMIT", 5.0)  # long enough for the reset, in which it applies, too
     running = start_server(listen="tcp://127.0.0.1:0")
     env = perturb.PerturbEnv("CartPole", server=running.address)
     env.reset(seed=1)
@@ -221,7 +221,7 @@ def test_idle_session_answers_keepalive_pings(start_server: Callable[..., Any]) 
 TENDING = """
 import perturb
 from perturb import session
-session.TEND_INTERVAL = 1e-6
+session.POLL_INTERVAL = 1e-6
 for seed in range(40):
     envs = [perturb.PerturbEnv("CartPole", server={address!r}) for _ in range(20)]
     for env in envs:
@@ -307,7 +307,7 @@ def test_proxy_variables_do_not_reach_loopback_and_sockets(
     start_server: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("http_proxy", "HTTP_PROXY", "https_proxy", "grpc_proxy", "all_proxy"):
-        monkeypatch.setenv(name, "http://127.0.0.1:9")  # nobody listens there
+        monkeypatch.setenv(name, "http://127.0.0.1:9")  # no program listens at this port
     for name in ("no_proxy", "NO_PROXY", "no_grpc_proxy"):
         monkeypatch.delenv(name, raising=False)
     for listen in (None, "tcp://127.0.0.1:0"):
@@ -316,7 +316,7 @@ def test_proxy_variables_do_not_reach_loopback_and_sockets(
         env.close()
 
 
-# The private server.
+# Tests of private servers.
 
 
 def private() -> local_server.LocalServer | None:
@@ -384,7 +384,7 @@ def test_collection_while_private_server_is_acquired() -> None:
 
 
 def test_process_closes_sessions_before_its_server() -> None:
-    """Otherwise the server would wait for them for its second of grace."""
+    """Otherwise the server would wait a second for open sessions."""
     ending = """
 from pathlib import Path
 import perturb
@@ -417,7 +417,7 @@ def test_a_private_server_that_is_killed_is_told_and_replaced() -> None:
     assert private() is not shared
     with within(SECONDS), pytest.raises(perturb.ServerConnectionError, match="ended with status -9"):
         other.step(0)
-    env.step(0)  # the other's share was of the server that is gone
+    env.step(0)  # closing `other`, whose server is gone, does not affect this server
     env.close()
     assert private() is None
 
@@ -438,7 +438,7 @@ sys.stdin.readline() if {wait} else None
 @pytest.mark.parametrize("fork", [False, True])
 @pytest.mark.parametrize("ending", ["exit", signal.SIGTERM, signal.SIGKILL])
 def test_private_server_ends_with_its_process(ending: Any, fork: bool) -> None:
-    """Also if a process that was forked from it lives on."""
+    """The server ends even if a process that was forked from its owner still runs."""
     client = subprocess.Popen(
         [sys.executable, "-c", OWNING.format(wait=ending != "exit", fork=fork)],
         stdin=subprocess.PIPE,
@@ -494,17 +494,17 @@ def test_a_program_that_is_no_server_is_said(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_settings_of_other_servers_do_not_reach_the_private_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PERTURB_SERVER_WORKERS", "0")  # with which no server starts
-    envs = perturb.PerturbVectorEnv("CartPole", 20_000)  # more than the default, too
+    monkeypatch.setenv("PERTURB_SERVER_WORKERS", "0")  # a server with this setting does not start
+    envs = perturb.PerturbVectorEnv("CartPole", 20_000)  # more environments than the default limit of a server
     envs.reset()
     envs.close()
 
 
-# Forks.
+# Tests of forks.
 
 
 def in_fork(function: Callable[[], Any]) -> Any:
-    """Call the function in a forked process and give back what it returns, or the text of its error."""
+    """Call the function in a forked process. Return its result, or the text of its error."""
     receiver, sender = multiprocessing.Pipe(duplex=False)
 
     def child() -> None:
@@ -567,7 +567,7 @@ def test_a_forked_process_goes_on_beside_its_parent(server: str) -> None:
 
 @pytest.mark.parametrize("own", [False, True])
 def test_gymnasiums_asynchronous_batches_work(own: bool, server: str) -> None:
-    """They make an environment in the parent for its spaces, and fork."""
+    """An AsyncVectorEnv makes an environment in the parent process to read its spaces, and then forks."""
     settings: dict[str, Any] = {} if own else {"server": server}
     parent = perturb.PerturbEnv("Pendulum", **settings)
     parent.reset()

@@ -1,4 +1,4 @@
-"""The classic tasks give through this package what Gymnasium 1.4 computed: tests/server/data/classic_control.jsonl."""
+"""The classic tasks agree with trajectories of Gymnasium 1.4, in tests/server/data/classic_control.jsonl."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from .conftest import ROOT, identifier
 
 CASES = [json.loads(line) for line in (ROOT / "tests/server/data/classic_control.jsonl").read_text().splitlines()]
 
-# Rounding to float32, half an ulp by each side, relative, or absolute below 1. Pendulum's torque is rounded too, by
-# 2^-24 of at most 2 N m; light rods of E turn this into 3 / (m l²) · 0.05 s ≤ 1.2 times as much speed.
+# Tolerances of one step, relative, or absolute below 1. Each side rounds to float32, by half an ulp. Pendulum's torque,
+# at most 2 N m, is also rounded, by 2^-24 of itself. With E's light rods, the error of the speed is this error times
+# 3 / (m l²) · 0.05 s ≤ 1.2.
 SINGLE_STEP = {"CartPole": 1.2e-7, "MountainCar": 1.2e-7, "Acrobot": 1.2e-7, "Pendulum": 4e-7}
 
 
@@ -25,9 +26,9 @@ def deviation(got: Any, expected: Any) -> float:
 
 @pytest.mark.parametrize("case", CASES, ids=[f"{i}-{case['env']}-{case['version']}" for i, case in enumerate(CASES)])
 def test_every_step_of_a_golden_trajectory_agrees(case: dict[str, Any], server: str) -> None:
-    """Each environment of a batch begins at one of the trajectory's states, and takes one step."""
+    """Each environment of a batch starts at one state of the trajectory, and takes one step."""
     states = [case["state0"], *case["states"]]
-    # Beyond an ending there are states that a reset does not accept.
+    # Resets do not accept states after the end of an episode.
     n = next((t + 1 for t, ended in enumerate(case["terminated"]) if ended), len(case["actions"]))
     envs = gymnasium.make_vec(identifier(case["env"]), num_envs=n, autoreset_mode="Disabled", server=server)
     options = {"parameters": case["params"], "state": states[:n]}
@@ -50,8 +51,8 @@ def test_every_step_of_a_golden_trajectory_agrees(case: dict[str, Any], server: 
 
 @pytest.mark.parametrize("case", CASES, ids=[f"{i}-{case['env']}-{case['version']}" for i, case in enumerate(CASES)])
 def test_trajectories_from_the_initial_state_agree(case: dict[str, Any], server: str) -> None:
-    """Nothing is rounded on the way but Pendulum's torque: float64 errors of 1e-9 over 50 steps vanish in float32."""
-    tolerance = {"Pendulum": 1e-4}.get(case["env"], 1.3e-7)  # its rounded torques pile up, and it is unstable upright
+    """States are float64 on both sides, so errors of 1e-9 over 50 steps vanish in the rounding to float32."""
+    tolerance = {"Pendulum": 1e-4}.get(case["env"], 1.3e-7)  # Pendulum's torques are rounded to float32 in each step
     env = gymnasium.make(identifier(case["env"]), parameters=case["params"], server=server)
     discrete = isinstance(env.action_space, gymnasium.spaces.Discrete)
     env.reset(options={"state": case["state0"]})

@@ -1,4 +1,4 @@
-"""Servers that require tokens or certificates: a client without them learns what is missing, others play as usual."""
+"""Servers can require tokens or certificates. A client without them gets an error that names what is missing."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-# Flags of a server, or variables of a client, and the files that they name.
+# The flags of a server, or the environment variables of a client, with the names of their files.
 Files: TypeAlias = "dict[str, str]"
 
-# What a server may ask for …
+# Flags of servers that require credentials.
 TLS: Files = {"--tls-cert": "server.pem", "--tls-key": "server.key"}
 MUTUAL_TLS: Files = TLS | {"--tls-client-ca": "clients.pem"}
 TOKENS: Files = {"--tokens": "tokens.toml"}
-# … and what lets in.
+# Environment variables of clients with these credentials.
 TRUST: Files = {"PERTURB_CA": "servers.pem"}
 IDENTITY: Files = TRUST | {"PERTURB_CERT": "client.pem", "PERTURB_KEY": "client.key"}
 TOKEN: Files = {"PERTURB_TOKEN_FILE": "token"}
@@ -44,16 +44,16 @@ name = "train"
 draws = ["D", "R"]
 """
 EXPIRED = datetime.datetime(2021, 1, 1, tzinfo=datetime.timezone.utc)
-# Within E's lengths, and beyond R's.
+# A length that E can draw, and R cannot.
 EXTREME = {"parameters": {"length": 1.0}}
 NOT_ALLOWED = r'a token of the role "train" may not draw from .* of CartPole: .*; ask for what it may draw from, or who'
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where certificates and tokens are, good and bad."""
+    """Make a folder with valid and invalid certificates and tokens."""
     folder = tmp_path_factory.mktemp("guarded")
-    # The strangers' authority has the name of the clients', and another key.
+    # The authority `strangers` has the same name as `clients`, and another key.
     servers, clients, strangers = (
         trustme.CA(organization_name="perturb", organization_unit_name=unit)
         for unit in ("servers", "clients", "clients")
@@ -84,13 +84,13 @@ def flags(asks: Files, folder: Path) -> list[str]:
 
 @pytest.fixture
 def start(folder: Path, start_server: Callable[..., Server]) -> Callable[[Files], str]:
-    """Start servers that require tokens or certificates; gives their addresses."""
+    """Return a function that starts a server with the given flags, and returns its address."""
     return lambda asks: start_server(*flags(asks, folder), listen="tcp://127.0.0.1:0").address
 
 
 @pytest.fixture(scope="module")
 def guarded(folder: Path, _program: None) -> Iterator[str]:
-    """Give the address of a server that requires a token and a client's certificate."""
+    """Return the address of a server that requires a token and a client certificate."""
     running = Server(*flags(MUTUAL_TLS | TOKENS, folder), listen="tcp://127.0.0.1:0")
     yield running.address
     running.end()
@@ -98,7 +98,7 @@ def guarded(folder: Path, _program: None) -> Iterator[str]:
 
 @pytest.fixture(autouse=True)
 def have(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Files], None]:
-    """Give this process these files and no others; at first none."""
+    """Return a function that sets exactly these environment variables of credentials. At first none is set."""
 
     def have(files: Files) -> None:
         for variable in (*ALL, "PERTURB_INSECURE"):
@@ -111,7 +111,7 @@ def have(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Files], Non
 
 
 def played(server: str) -> list[bytes]:
-    """What is observed in a hundred steps of a batch and of one environment, across the ends of episodes."""
+    """Return the bytes of all observations in a hundred steps of a batch and of a single environment."""
     envs = perturb.PerturbVectorEnv("CartPole", 3, version="R", server=server)
     observed = [envs.reset(seed=1)[0].tobytes()]
     observed += [envs.step(np.full(3, step // 5 % 2))[0].tobytes() for step in range(100)]
@@ -233,7 +233,7 @@ def test_plain_client_and_tls_server_are_told_apart(
 
 
 def test_a_token_does_not_go_unencrypted_to_another_machine(have: Callable[[Files], None]) -> None:
-    """Which is refused before anything is sent: the address is one that stands for no machine."""
+    """The client refuses before it connects. The address does not belong to a machine."""
     have(TOKEN)
     with pytest.raises(
         perturb.ServerConnectionError,

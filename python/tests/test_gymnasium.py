@@ -1,4 +1,4 @@
-"""Rules of Gymnasium for environments, and habits of its users."""
+"""The environments follow Gymnasium's rules, and work in the ways in which its users use environments."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def equal(a: object, b: object) -> bool:
 
 
 def with_hashes_as_rows(infos: dict[str, Any]) -> dict[str, Any]:
-    """Return infos of Gymnasium's vector with the tuples of `model_hash` as a batch has them: uint8, a row each."""
+    """Convert `model_hash` in infos of Gymnasium's vector environment, tuples, to rows of uint8 as in a batch."""
     rows = dict(infos)
     for key, value in infos.items():
         if isinstance(value, dict):
@@ -34,7 +34,7 @@ def with_hashes_as_rows(infos: dict[str, Any]) -> dict[str, Any]:
     return rows
 
 
-@pytest.mark.filterwarnings("ignore")  # CartPole's unbounded observations, Pendulum's torque of ±2
+@pytest.mark.filterwarnings("ignore")  # warnings about CartPole's unbounded observations and Pendulum's action range
 @pytest.mark.parametrize("version", ["D", "R", "E", "R+E"])
 @pytest.mark.parametrize("name", NAMES)
 def test_gymnasiums_checker_accepts_all_environments(name: str, version: str, server: str) -> None:
@@ -57,7 +57,7 @@ def test_the_papers_ids_are_the_versions(name: str, server: str) -> None:
 
 
 def run(envs: gymnasium.vector.VectorEnv[Any, Any, Any], steps: int) -> list[Any]:
-    """Reset, act, and reset ended environments if their mode does not."""
+    """Reset and step the environments. In the mode Disabled, also reset environments whose episode has ended."""
     envs.action_space.seed(1)
     results: list[Any] = [envs.reset(seed=100)]
     for _ in range(steps):
@@ -72,7 +72,7 @@ def run(envs: gymnasium.vector.VectorEnv[Any, Any, Any], steps: int) -> list[Any
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("name", ["CartPole", "Hopper"])
 def test_batch_equals_gymnasiums_vector_of_singles(name: str, mode: AutoresetMode, receipts: bool, server: str) -> None:
-    """Observations, rewards, flags and infos, with their structure, types and masks."""
+    """The observations, rewards, flags and infos are equal, with their structure, types and masks."""
     n, steps = 5, 150
     settings: dict[str, Any] = {"version": "E", "server": server, "receipts": receipts, "reward_terms": True}
     settings["episodes_per_trial"] = 2
@@ -111,7 +111,7 @@ def test_final_observations_and_infos_follow_gymnasium(server: str) -> None:
     assert equal(infos["_final_obs"], terminated)
     assert equal(infos["_final_info"], terminated)
     assert abs(infos["final_obs"][i][2]) > np.deg2rad(12)
-    assert abs(observations[i][2]) <= 0.05  # the next episode's
+    assert abs(observations[i][2]) <= 0.05  # an observation of the next episode
     assert equal(infos["final_info"]["is_success"], np.zeros(3, dtype=np.bool_))
     assert infos["parameters"]["force"][i] == 10.0
     assert "is_success" not in infos
@@ -150,7 +150,7 @@ def test_gymnasiums_wrappers_work_on_batches(mode: AutoresetMode, server: str) -
         if mode is AutoresetMode.DISABLED and ended.any():
             wrapped.reset(options={"reset_mask": ended})
     assert len(lengths) >= 16
-    assert all(8 <= length <= 11 for length in lengths)  # pushed to one side only
+    assert all(8 <= length <= 11 for length in lengths)  # the episodes are short, because all pushes go to one side
     wrapped.close()
 
 
@@ -165,7 +165,7 @@ def test_two_environments_of_one_seed_match(server: str) -> None:
 
 
 def test_random_numbers_are_those_of_the_documents(server: str) -> None:
-    """docs/random-streams.md: seed 7, environment 3, trial 2 of CartPole E."""
+    """The example in docs/random-streams.md has seed 7, environment 3 and trial 2 of CartPole E."""
     env = gymnasium.make("perturb/CartPole-v1", version="E", environment_index=3, server=server)
     env.reset(seed=7)
     env.reset()

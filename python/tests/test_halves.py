@@ -50,7 +50,7 @@ def test_sent_step_is_computed_before_anyone_waits(start_server: Callable[..., A
         batch.reset(seed=1)
 
     def seconds(think: float) -> list[float]:
-        """How long it took to receive steps that were sent so long before."""
+        """Return the times that `recv` takes, each `think` seconds after `send`."""
         taken = []
         for _ in range(5):
             for batch in envs:
@@ -106,7 +106,7 @@ def test_halves_out_of_order_are_refused_and_change_nothing(server: str) -> None
 
 
 def test_replies_that_fill_the_line_do_not_block_requests(start_server: Callable[..., Any]) -> None:
-    """64 requests of 320 kB and replies of 1.8 MB are more than a connection holds."""
+    """64 requests of 320 kB and 64 replies of 1.8 MB are more than the buffers of a connection hold."""
     n = 80_000
     running = start_server("--max-envs", str(n))
     envs = perturb.PerturbVectorEnv("CartPole", n, server=running.address, receipts=False, timeout=10)
@@ -146,7 +146,7 @@ def test_batches_in_threads_do_not_wait_for_each_other(server: str) -> None:
         envs = make(server)
         results.append([envs.step(actions)[0].tobytes() for actions in ACTIONS])
 
-    threads = [threading.Thread(target=run) for _ in range(24)]  # more than runtimes of their own
+    threads = [threading.Thread(target=run) for _ in range(24)]  # more sessions than the maximum number of runtimes
     for thread in threads:
         thread.start()
     for thread in threads:

@@ -1,4 +1,4 @@
-"""Infos of a batch are plain dictionaries, and stay so when libraries read or rebuild them."""
+"""The infos of a batch are plain dictionaries, which other libraries can read and convert."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_readers_in_c_see_all_of_infos(server: str) -> None:
 
 
 def test_infos_have_numbers_alone(server: str) -> None:
-    """Libraries that convert arrays, as NumpyToTorch of Gymnasium, can convert neither text nor objects."""
+    """Wrappers that convert arrays, such as Gymnasium's NumpyToTorch, cannot convert text or objects."""
     expected = bytes.fromhex(perturb.environments()["Hopper"].model_hash)
     assert len(expected) == 32
     single = perturb.PerturbEnv("Hopper", server=server)
@@ -80,7 +80,7 @@ def test_infos_have_numbers_alone(server: str) -> None:
 
 
 def test_achieved_is_there_at_each_end(server: str) -> None:
-    """NaN where nothing was achieved, as in MountainCar without the goal; Monitor wants a key always or never."""
+    """`achieved` is NaN without a value, because Monitor of stable-baselines3 needs a key always or never."""
     env = gymnasium.make(identifier("MountainCar"), server=server)
     env.reset(seed=1)
     info: dict[str, Any] = {}

@@ -20,13 +20,13 @@ from .processes import SECONDS, freeze, output_of, wait_until, within
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-# `make interrupts-test` sets a thousand.
+# Number of interrupts. `make interrupts-test` sets it to 1000.
 TIMES = int(os.environ.get("PERTURB_TEST_INTERRUPTS", "50"))
 
 
 @contextlib.contextmanager
 def interrupting(envs: perturb.PerturbVectorEnv) -> Iterator[None]:
-    """Interrupt the step inside once it waits, by a signal that means nothing to pytest."""
+    """Interrupt the step in the `with` block while it waits, with a signal that pytest does not handle."""
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
@@ -51,7 +51,7 @@ def test_an_interrupt_leaves_no_reply_behind(start_server: Callable[..., Any]) -
     envs = perturb.PerturbVectorEnv("Hopper", 4, server=running.address)
     expected = envs.reset(seed=2)[0].tobytes()
     actions = np.zeros((4, 3), dtype=np.float32)
-    freeze(running.process.pid)  # so that the step still waits when the interrupt comes
+    freeze(running.process.pid)  # the step must still be waiting when the interrupt comes
     with interrupting(envs):
         envs.step(actions)
     with pytest.raises(perturb.OutOfOrderError, match="interrupted"):
@@ -64,7 +64,7 @@ def test_an_interrupt_leaves_no_reply_behind(start_server: Callable[..., Any]) -
 def test_second_interrupt_costs_no_more_than_first(
     start_server: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It may come before it is noted that the session is gone; a reset must open another one all the same."""
+    """If the second interrupt prevents the session from being marked as lost, a reset still opens a new session."""
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
@@ -86,13 +86,13 @@ def test_second_interrupt_costs_no_more_than_first(
 
 INTERRUPTED = """
 import os, signal, threading, time, numpy as np, perturb
-signal.signal(signal.SIGINT, signal.default_int_handler)  # who runs the tests in the background may have it ignored
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started the tests with SIGINT ignored
 envs = perturb.PerturbVectorEnv("CartPole", 4, server={address!r}, timeout=float("inf"))
 envs.reset(seed=1)
 os.kill({server}, signal.SIGSTOP)
 tasks = "/proc/{server}/task"
 while any(open(f"{{tasks}}/{{task}}/stat").read().rsplit(")", 1)[1].split()[0] != "T" for task in os.listdir(tasks)):
-    time.sleep(0.01)  # until then it may still answer
+    time.sleep(0.01)  # until all its threads are stopped, the server may still answer
 
 def interrupt():
     while not envs._client.session.waits:
@@ -118,7 +118,7 @@ def test_ctrl_c_interrupts_a_step_at_once_and_the_process_ends(start_server: Cal
 
 
 def test_many_interrupts_never_hang_or_mix_replies(start_server: Callable[..., Any]) -> None:
-    running = start_server("--max-sessions", "8")  # sessions that were left behind would fill it
+    running = start_server("--max-sessions", "8")  # sessions that are not closed would exceed this limit
     arguments = (running.address, str(running.process.pid), str(TIMES))
     out, errors = output_of("-m", "tests.interrupted", *arguments, seconds=SECONDS + TIMES)
     assert errors == "", errors

@@ -1,4 +1,4 @@
-"""Observations that have the episode's parameters at their end."""
+"""With observe="parameters", observations end with the episode's parameters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ENTRIES = json.loads(resources.files("perturb").joinpath("catalogue.json").read_
 
 
 def seen(entry: dict[str, Any], applied: dict[str, Any]) -> list[np.float32]:
-    """What is observed of the physics that a receipt was read back from."""
+    """Return the parameters in observations that correspond to the applied values of a receipt."""
     scaled = []
     for parameter, rule in zip(entry["parameters"], entry["parameter_observations"], strict=True):
         low, high = rule["at_minus_one"], rule["at_plus_one"]
@@ -25,7 +25,7 @@ def seen(entry: dict[str, Any], applied: dict[str, Any]) -> list[np.float32]:
     return scaled
 
 
-@pytest.mark.filterwarnings("ignore")  # as without parameters
+@pytest.mark.filterwarnings("ignore")  # warnings about spaces, as for observations without parameters
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry["name"])
 def test_observed_parameters_are_in_observation_and_space(entry: dict[str, Any], server: str) -> None:
     settings: dict[str, Any] = {"version": "E", "server": server}

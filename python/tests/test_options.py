@@ -1,4 +1,4 @@
-"""Parameters, states, masks, receipts, snapshots, ownership of arrays."""
+"""Options of environments and resets: parameters, states, masks, receipts, snapshots; and ownership of arrays."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_a_mask_resets_some(server: str) -> None:
     assert after[1].tolist() == [0.5, 0, 0, 0]
     assert infos["_parameters"].tolist() == mask.tolist()
     assert infos["parameters"]["force"].tolist() == [0, 7, 0]
-    # It has the seed 51 and is environment 1.
+    # The environment that was reset has seed 51 and index 1.
     same = make(version="R", parameters={"force": 7}, environment_index=1, server=server)
     assert same.reset(seed=51)[1]["parameters"]["mass"] == infos["parameters"]["mass"][1]
 
@@ -174,7 +174,7 @@ def test_receipts_and_terms_come_on_request(server: str) -> None:
     _, reward, _, _, info = env.step(np.full(3, 0.5, dtype=np.float32))
     assert list(info) == ["reward_terms"]
     assert list(info["reward_terms"]) == ["alive", "progress", "electricity", "stall_torque", "joint_limits"]
-    assert reward == pytest.approx(sum(info["reward_terms"].values()), abs=1e-6)  # float32, a few units
+    assert reward == pytest.approx(sum(info["reward_terms"].values()), abs=1e-6)  # float32 rounding of small numbers
     env = make(server=server)
     env.reset(seed=1)
     assert env.step(0)[4] == {}

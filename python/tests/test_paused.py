@@ -33,7 +33,7 @@ for line in sys.stdin:
 
 
 def paused(address: str, seconds: float) -> list[str]:
-    """Stop a client for some seconds, and return what it says afterwards."""
+    """Stop a client process for some seconds, and return the lines that it prints afterwards."""
     child = subprocess.Popen(
         [sys.executable, "-c", CHILD, address], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )

@@ -1,4 +1,4 @@
-"""Policies and assessments are sent to other processes."""
+"""Policies and assessments can be pickled, and so sent to other processes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def tables(assessment: perturb.Assessment) -> tuple[Any, ...]:
 def test_a_pickled_policy_is_the_same(again: Any, tmp_path: Path) -> None:
     file = Path(shutil.copy(CART_POLE, tmp_path))
     policy = perturb.load_policy(file)
-    file.unlink()  # as on another machine
+    file.unlink()  # on another machine the file does not exist
     other = again(policy)
     assert (other.id, repr(other)) == (policy.id, repr(policy))
     assert act(other) == act(policy)

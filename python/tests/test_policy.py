@@ -1,4 +1,4 @@
-"""Checkpoints in Python act as in the program that trained them. The checkpoints are those of a shipped experiment."""
+"""Loaded policies choose the same actions as in the learner. The checkpoints are from a shipped experiment."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_policy_says_what_it_is(tmp_path: Path) -> None:
 def test_an_actor_samples_what_its_seed_indices_and_trials_say(path: Path, shape: tuple[int, ...], kind: type) -> None:
     policy = perturb.load_policy(path)
     rng = np.random.default_rng(1)
-    # Where the policy is not sure what to do.
+    # Observations for which no action has a probability near 1.
     rows = [rng.normal(0, 0.02, (3, policy.observation_size)).astype(np.float32) for _ in range(20)]
     starts = [np.array([step == 5, False, step == 9]) for step in range(20)]
 

@@ -1,4 +1,4 @@
-"""Servers that break the protocol, or are of another version: the client accepts none of their replies."""
+"""The client refuses replies of servers that violate the protocol or have another version."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Answer = pb.SessionResponse
 
 
 class FakeServer:
-    """Answers requests by `answers`, from a session's first on."""
+    """A fake server that answers the requests of a session with the functions or messages in `answers`."""
 
     def __init__(self, method: str = "Session") -> None:
         self._directory = tempfile.TemporaryDirectory(prefix="perturb-test-")
@@ -88,7 +88,7 @@ def fake() -> Iterator[FakeServer]:
 
 
 def test_a_server_that_keeps_to_the_protocol_is_understood(fake: FakeServer) -> None:
-    """So that the tests below fail for their own reason."""
+    """The fake server works without a violation, so the tests below fail only because of their violation."""
     fake.answers = [Answer(opened=opened()), Answer(stepped=stepped())]
     env = perturb.PerturbEnv("CartPole", server=fake.address)
     env.reset()
@@ -195,7 +195,7 @@ def test_a_second_reply_to_one_request_is_refused(fake: FakeServer) -> None:
     env = perturb.PerturbEnv("CartPole", server=fake.address)
     env.reset()
     assert env.step(0)[1] == 0
-    time.sleep(0.5)  # the session is looked after meanwhile, and so the reply arrives
+    time.sleep(0.5)  # the keepalive thread polls the sessioner meanwhile, and so the reply arrives
     with pytest.raises(perturb.ProtocolError, match="a second reply to an earlier request"):
         env.step(0)
     with pytest.raises(perturb.OutOfOrderError, match="gone"):

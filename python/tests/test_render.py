@@ -40,7 +40,7 @@ def test_gymnasiums_checker_accepts_all_pictures(name: str, server: str) -> None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(env.unwrapped)
-    # Of other things it warns, such as CartPole's unbounded observations.
+    # Other warnings are ignored, such as that about CartPole's unbounded observations.
     assert not [warning for warning in caught if "render" in str(warning.message).lower()]
     env.close()
 
@@ -110,7 +110,7 @@ def test_the_size_is_the_one_that_was_asked_for(server: str) -> None:
 
 
 def test_as_many_frames_are_shown_as_are_simulated(server: str) -> None:
-    """docs/environments.md has the lengths of the steps."""
+    """The number of frames per second follows from the lengths of steps in docs/environments.md."""
     frames = {"CartPole": 50, "MountainCar": 1, "Acrobot": 5, "Pendulum": 20, "HalfCheetah": 60.6, "Hopper": 60.6}
     for name, expected in frames.items():
         metadata = gymnasium.make(identifier(name), server=server, **SMALL).metadata

@@ -1,4 +1,4 @@
-"""Assessments in reports, replayed, and drawn."""
+"""Assessments can be shown in reports, replayed and plotted."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ EXPERIMENT = ROOT / "results/results.parquet/beyond/confirm-2"
 
 @pytest.fixture(scope="module")
 def assessment(server: str) -> perturb.Assessment:
-    """Give an agent's tests that sometimes succeed."""
+    """Return an assessment with successes and failures."""
     return perturb.evaluate({"D": upright, "R": upright}, "CartPole", episodes=100, server=server, name="pushes")
 
 
 def rows(page: str, part: str) -> list[str]:
-    """Rows of tables that have something in them."""
+    """Return the rows of a page's tables that are not empty."""
     return [row for row in re.findall(r"<tr[^>]*>.*?</tr>", page, re.DOTALL) if part in row]
 
 
@@ -148,7 +148,7 @@ def test_bootstrap_intervals_match_spread_of_episodes(assessment: perturb.Assess
         returns = columns["return"][(columns["trained_on"] == scenario[0]) & (columns["set"] == "E")]
         low, high = result.return_interval
         assert low < result.mean_return < high
-        # The mean of 100 episodes is nearly normal; 1000 resamples find its quantiles to some 5 %.
+        # The mean of 100 episodes is nearly normal. 1000 resamples estimate its quantiles with an error of about 5 %.
         assert high - low == pytest.approx(2 * 1.96 * returns.std() / 10, rel=0.2)
         low, high = result.cvar_interval
         assert low <= result.cvar_return <= high

@@ -1,4 +1,4 @@
-"""The published table of results, in pandas."""
+"""`read_results` reads the published results table as a pandas DataFrame."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def trained(server: str, steps: int, version: perturb.Version = "D", **settings:
 
 
 def test_ppo_trains_without_wrapper_or_warning(server: str) -> None:
-    """Its default settings but for the rollout learn CartPole; returns come from the environments themselves."""
+    """PPO with default settings, except for the rollout's length, learns CartPole without a Monitor wrapper."""
     model = trained(server, 40_000)
     returns = [episode["r"] for episode in model.ep_info_buffer]
     assert len(returns) == 100

@@ -1,4 +1,4 @@
-"""Environments of a task's folder."""
+"""Environments can be made from task folders."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ ARM = ROOT / "examples/tasks/reaching_arm"
 
 @pytest.fixture
 def arm(tmp_path: Path) -> Path:
-    """A copy of the arm's folder, which the test may change."""
+    """Return a copy of the folder of the task `arm`, which the test may change."""
     return Path(shutil.copytree(ARM, tmp_path / "arm"))
 
 
 def steps(env: Any, count: int = 5) -> list[bytes]:
-    """Play with a fixed action, and return the bytes of the observations."""
+    """Step with a fixed action, and return the bytes of the observations."""
     observation, _ = env.reset(seed=3)
     told = [observation.tobytes()]
     action = np.full(env.action_space.shape, 0.5, np.float32)
@@ -163,7 +163,7 @@ def test_a_running_servers_tasks_need_no_folder(start_server: Callable[..., Serv
 
 
 def test_the_tutorials_arm_is_the_example_with_its_policies() -> None:
-    """So that the tables of both are of the same files."""
+    """The tutorial's tables are valid for the example, because their files are equal."""
     example = ROOT / "examples/tasks/my_arm"
     tutorial = (ROOT / "docs/tutorials/your-robot.md").read_text()
     for name in ("arm.xml", "task.toml"):

@@ -1,4 +1,4 @@
-"""Folders of Gymnasium's tasks."""
+"""Task folders can be written for tasks of Gymnasium and dm_control."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def test_a_folder_has_the_task_the_model_and_the_licence(name: str, tmp_path: Pa
 def test_a_folder_of_dm_control_has_model_and_includes(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The package dm_control is no dependency, so its files are stand-ins."""
+    """The package dm_control is not a dependency of the tests, so dummy files replace its files."""
     package = tmp_path / "dm_control"
     (package / "suite/common").mkdir(parents=True)
     model = name.split("-")[0] + ".xml"

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(autouse=True)
 def _trains(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the tests find the program that cargo built, unless another is named."""
+    """Use the program perturb that cargo built, unless PERTURB_PROGRAM names another one."""
     if training.VARIABLE not in os.environ:
         built = ROOT / "target/release/perturb"
         if shutil.which(built):

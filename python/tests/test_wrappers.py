@@ -1,4 +1,4 @@
-"""Gymnasium's vector wrappers around a batch as it comes: equal values in all modes."""
+"""Gymnasium's vector wrappers give equal values around a batch of perturb and around Gymnasium's own batch."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_wrappers_give_equal_values(name: str, mode: AutoresetMode, server: str)
         pytest.skip("Gymnasium's wrapper is not for this mode")
     observations, got = plain.reset(seed=5)[0], wrapped.reset(seed=5)[0]
     kept = []
-    for step in range(410):  # two ends, each after 200 steps
+    for step in range(410):  # two episodes of 200 steps, and the start of a third
         np.testing.assert_allclose(got, change(observations), rtol=1e-6, atol=1e-6)
         if step < 5:
             kept.append((got, np.array(got)))

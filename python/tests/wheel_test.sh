@@ -1,6 +1,6 @@
 #!/bin/sh
-# wheel_test.sh WHEEL DEPENDENCIES: installs the wheel, with the wheels in the directory DEPENDENCIES and nothing else, in a new
-# environment, and runs what it brings: the programs, the README's loop, robots. BARE=1: where there is no compiler.
+# wheel_test.sh WHEEL DEPENDENCIES: installs the wheel in a new environment, with dependencies only from the folder
+# DEPENDENCIES, and runs its programs, the loop in the README, and robots. With BARE=1 it checks that there is no compiler.
 set -eu
 wheel=$1 dependencies=$2
 here=$(cd "$(dirname "$0")" && pwd)
@@ -8,7 +8,7 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 for tool in cc gcc clang cargo rustc; do
     if [ -n "${BARE:-}" ] && command -v "$tool" >/dev/null; then
-        echo "$tool is here; the wheel is to be tested where there is nothing of the kind" >&2
+        echo "$tool is installed; with BARE=1 the wheel is tested without a compiler" >&2
         exit 1
     fi
 done
@@ -21,7 +21,7 @@ case $wheel in
 esac
 unset PERTURB_SERVER
 
-seconds() { # command …: runs it quietly, and prints how long it took
+seconds() { # runs a command without its output, and prints how long it took in seconds
     start=$(date +%s.%N)
     "$@" >"$work/output" 2>&1 || { cat "$work/output" >&2; exit 1; }
     echo "$(date +%s.%N) $start" | awk '{ printf "%.1f s\n", $1 - $2 }'
@@ -35,7 +35,7 @@ took=$(seconds "$work/venv/bin/pip" install -q --disable-pip-version-check --no-
 echo "install: $took"
 "$work/venv/bin/pip" check
 files=$(echo "$work"/venv/lib/python3*/site-packages/perturb*)
-# shellcheck disable=SC2086  # they are several, without spaces
+# shellcheck disable=SC2086  # the variable has several names without spaces
 echo "wheel: $(du -k "$wheel" | cut -f1) kB; installed: $(du -kc $files | tail -1 | cut -f1) kB"
 
 took=$(seconds "$work/venv/bin/perturb-server" --help)

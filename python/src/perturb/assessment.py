@@ -160,6 +160,7 @@ class Assessment:
             UnknownNameError: if the scenario was not tested.
         """
         result, records = self._find(scenario)
+        # The rows of this test, and the context (a number from 0) of each of its episodes.
         every = records.columns()
         tested = np.array(every["set"]) == result.tested_on
         columns = {name: np.asarray(values)[tested] for name, values in every.items()}

@@ -169,7 +169,7 @@ class Client:
             if self._task is not None:
                 self.description.require_same_model(served)
             begun = OpenedSession(opened, opened.observations, opened.events)
-            if any(self._own):
+            if any(self._own):  # environments with parameters of their own get them by resets
                 begun = self._give_own(session, opened, seed)
         except BaseException:
             session.close()

@@ -227,6 +227,7 @@ class Comparison:
             UnknownNameError: if there is no such test.
             InvalidArgumentError: if a parameter is unknown, or if none varies in the test.
         """
+        # Choose the test and the parameters that are not given.
         first = self._assessments()[0]
         tests = list(dict.fromkeys(it.tested_on for it in self.means))
         if tested_on is None:
@@ -242,7 +243,7 @@ class Comparison:
         title = (
             title or f"{self.environment}, a success is {self.success or 'what the server says'}: tested on {tested_on}"
         )
-        if y is None:
+        if y is None:  # one varying parameter: a curve for each condition
             lines = {
                 name: plots.pooled([one.success_by_parameter(tested_on, x) for one in policies.values()])
                 for name, policies in self.evaluations.items()

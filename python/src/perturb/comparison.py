@@ -142,6 +142,7 @@ def _compared(
         (name, [(key, one._assessed[0].records) for key, one in policies.items()])
         for name, policies in evaluations.items()
     ]
+    # The native module computes all numbers, and returns them as JSON.
     found: Mapping[str, Any] = json.loads(native(_native.compare, plain, list(tests), score, baseline))
     means = tuple(
         ConditionMean(
@@ -182,7 +183,7 @@ def _interval(ends: Sequence[float] | None) -> tuple[float, float] | None:
 
 
 def _conditions(conditions: Any) -> dict[str, dict[str, Any]]:
-    """Return the policies of each condition by their keys, with assessments and checkpoints read."""
+    """Return the policies of each condition, by condition and key. Paths are replaced by the loaded policies."""
     if not isinstance(conditions, Mapping) or not conditions:
         raise InvalidArgumentError(
             f"conditions is {conditions!r}; expected a dict of policies by names, such as "

@@ -1,4 +1,4 @@
-"""The contents of folders as values, so that policies and assessments can be pickled."""
+"""Reads and writes all files of a folder, so that policies and assessments can be pickled."""
 
 from __future__ import annotations
 

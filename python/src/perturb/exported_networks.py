@@ -149,6 +149,7 @@ def to_torch(network: Network) -> Any:
             if starts is not None:
                 kept = 1 - torch.as_tensor(starts, device=x.device).to(x.dtype)[:, None]
                 h, c = h * kept, c * kept
+            # The LSTM's gates: input, forget, cell and output.
             i, f, g, o = (self.lstm_input(x) + self.lstm_memory(h)).chunk(4, dim=1)
             c = torch.sigmoid(f) * c + torch.sigmoid(i) * torch.tanh(g)
             h = torch.sigmoid(o) * torch.tanh(c)
@@ -179,6 +180,7 @@ def to_onnx(network: Network, path: str) -> None:
         inputs = [x, constant(f"{name}.weight", weight), constant(f"{name}.bias", bias)]
         return node("Gemm", inputs, f"{name}.output", transB=1)
 
+    # Normalise observations in float64, as the learner does, and apply the hidden layers.
     x = node("Cast", ["observations"], "observations.double", to=TensorProto.DOUBLE)
     x = node("Sub", [x, constant("mean", network.mean)], "centred")
     x = node("Div", [x, constant("deviation", network.deviation)], "scaled")
@@ -191,6 +193,7 @@ def to_onnx(network: Network, path: str) -> None:
     inputs = [helper.make_tensor_value_info("observations", float32, ["N", len(network.mean)])]
     outputs = [helper.make_tensor_value_info("outputs", float32, ["N", len(network.head[1])])]
     if network.lstm is not None:
+        # The LSTM with its state as further inputs and outputs of the model.
         size = network.lstm[1].shape[1]
         inputs += [helper.make_tensor_value_info(name, float32, ["N", size]) for name in ("h", "c")]
         outputs += [helper.make_tensor_value_info(name, float32, ["N", size]) for name in ("next_h", "next_c")]

@@ -25,7 +25,7 @@ class PolicyMetadata:
     seed: int
     # The requested number of episodes of each test.
     episodes: int
-    # What the policy observes: `state` or `parameters`.
+    # The contents of the policy's observations: `state` or `parameters`.
     observe: str
     # Whether the policy took the mode of its action distribution instead of sampling. None if unknown.
     deterministic: bool | None

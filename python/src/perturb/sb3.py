@@ -185,7 +185,7 @@ class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-
         Raises:
             AttributeError: for any other method or number of arguments.
         """
-        slots = list(self._get_indices(indices))
+        slots = list(self._get_indices(indices))  # in the caller's order, which may repeat a slot
         if method_name not in _METHODS or method_kwargs or len(method_args) != _METHODS[method_name]:
             raise AttributeError(
                 f"{method_name!r} cannot be called like this; there are snapshot(), restore(snapshot), render(), "

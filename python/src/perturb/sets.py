@@ -135,6 +135,7 @@ def sampled(
         context = {}
         for parameter in parameters.values():
             intervals = parameter.random if version == "R" else parameter.extreme
+            # A uniform position on the intervals laid end to end.
             place = generator.random() * sum(high - low for low, high in intervals)
             for low, high in intervals:
                 if place <= high - low:
@@ -174,6 +175,7 @@ def heatmap(
         InvalidArgumentError: if the environment is unknown, if the number of points is out of range, if a parameter is
             given twice, or if x or y is left out and the environment has no default axes.
     """
+    # The range of each axis is from the lowest to the highest value that R or E draws.
     known = _environment(environment, task)
     usual = known.heatmap_axes or (None, None)
     axes = (usual[0] if x is None else x, usual[1] if y is None else y)

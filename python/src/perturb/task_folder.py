@@ -120,6 +120,7 @@ def describe(
     try:
         return catalogue.find(environment)
     except InvalidArgumentError:
+        # The name may be that of a task that the running server serves.
         if server is None or server == EMBEDDED or not isinstance(environment, str):
             raise
         served = _served(server, timeout)

@@ -93,7 +93,7 @@ def _differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[st
     same: dict[str, Any] = {}
     for name, values in before.items():
         a, b = np.asarray(values), np.asarray(after[name])
-        same[name] = (a == b) | ((a != a) & (b != b)) if a.dtype.kind == "f" else a == b
+        same[name] = (a == b) | ((a != a) & (b != b)) if a.dtype.kind == "f" else a == b  # NaN equals NaN
     wrong = np.flatnonzero(~np.logical_and.reduce(list(same.values())))
     sentences = []
     for row in wrong.tolist():
@@ -119,6 +119,7 @@ def play(
     Raises:
         PolicyError: if the policy does not fit the environment, or if its name is not the expected one.
     """
+    # Describe the environment, with the disturbances if a set names one, and prepare the policy for it.
     environment, observe = settings.environment, settings.observe
     names = [name for _, _, drawn, contexts in settings.sets for named in (drawn, *(contexts or ())) for name in named]
     address = None if settings.server is None else parse_address(settings.server)
@@ -235,6 +236,7 @@ def _test(
         with players.seeded(seed) if tested.loaded is None else contextlib.nullcontext():
             player = tested.player(num_envs, seed)
             native(player.begin, observations)
+            # Step all environments until the test has enough finished episodes.
             done, wanted = 0, 1
             while done < wanted:
                 stepped = client.session.step(native(player.act), encode)

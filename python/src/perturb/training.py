@@ -94,6 +94,7 @@ def train(
             f"server={server!r} is for environments and tests in this process, and another program trains: leave "
             "server= out, which starts a private server"
         )
+    # Each argument becomes an option of `perturb train`.
     program = _find_program()
     command = [program, "--quiet", "train", "--env", str(environment), "--version", requests.version(version)]
     command += ["--algorithm", str(algorithm), "--seed", str(requests.seed(seed))]

@@ -186,6 +186,7 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
             self._resetting[:] = False
         else:
             self._resetting &= ~mask
+        # If a session was just opened and the reset asks for nothing else, its first episodes are the result.
         waiting = any(slot in self._next_parameters for slot in selected)
         if opened is not None and first is None and not (parameters or states or waiting):
             return opened.observations, opened.events.batch(None, False)
@@ -200,6 +201,7 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         states: bytes,
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begin the next episodes of the selected environments. Equal resets share one request."""
+        # Positions in `selected`, grouped by whether there is a seed and by the parameters that change.
         alike: dict[Any, list[int]] = {}
         for place, slot in enumerate(selected):
             own = self._next_parameters.get(slot)
