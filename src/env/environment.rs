@@ -57,7 +57,7 @@ pub struct EnvironmentSpec {
     pub push: Option<PushSpec>,
     /// The success rule of the paper's text.
     pub success: Success,
-    /// The success rule of the paper's published code; `None` if it is the same as [`Self::success`].
+    /// The success rule of the paper's published code; `None` if it is the same as `success`.
     pub code_success: Option<Success>,
     /// The two parameters that heat maps show along x and y by default.
     pub heatmap_axes: Option<[&'static str; 2]>,

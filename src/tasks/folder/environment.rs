@@ -20,7 +20,8 @@ use std::sync::Arc;
 
 /// Maximal absolute position or velocity in a saved state. MuJoCo reports divergence above this value.
 const MAX_STATE: f64 = 1e10;
-/// The reason why an `expect` holds. If it does not, the worker's panic ends its batch, but not the server.
+/// The message of an `expect`, which states why it cannot fail. If it fails anyway, the worker's panic ends its batch,
+/// but not the server.
 const NO_MEMORY: &str = "there is memory for the one simulation of this thread";
 
 /// The time at which the poses that a step's readings use are computed.

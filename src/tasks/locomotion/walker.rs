@@ -267,7 +267,8 @@ impl Walker {
     }
 }
 
-/// The reason why an `expect` holds. If it does not, the worker's panic ends its batch, but not the server.
+/// The message of an `expect`, which states why it cannot fail. If it fails anyway, the worker's panic ends its batch,
+/// but not the server.
 const NO_MEMORY: &str = "there is memory for the one simulation of this thread";
 
 impl Environment for Walker {
