@@ -37,7 +37,7 @@ use crate::{
     proto::{self, dm_env_rpc::v1::environment_server::EnvironmentServer, perturb_server::PerturbServer},
     render::Renderer,
 };
-use std::{future::Future, io, sync::Arc, time::Duration};
+use std::{future::Future, io, pin::Pin, sync::Arc, time::Duration};
 use tokio::{
     task::JoinSet,
     time::{Instant, timeout},
@@ -89,6 +89,10 @@ pub enum Error {
     Reflection(#[from] tonic_reflection::server::Error),
 }
 
+/// A boxed future. The code of the server's future is compiled in this library once, not in each program that calls
+/// [`run`].
+type BoxFuture<'a, T> = Pin<Box<dyn Future<Output = T> + 'a>>;
+
 /// Serves the environments of `catalogue` on `listeners`, and the metrics page on the listener `metrics` if there is
 /// one. Returns after a shutdown, which begins when `shutdown` resolves: new sessions are refused, running sessions may
 /// continue for the grace period, then all connections are closed.
@@ -98,13 +102,36 @@ pub enum Error {
 ///
 /// # Errors
 /// [`Error`], if the server cannot start or a listener fails.
-pub async fn run(
+pub fn run<'a>(
+    listeners: Vec<Listener>,
+    metrics: Option<Listener>,
+    config: &'a Config,
+    guards: &'a Security,
+    catalogue: Catalogue,
+    shutdown: impl Future<Output = ()> + 'a,
+) -> impl Future<Output = Result<(), Error>> + 'a {
+    run_boxed(listeners, metrics, config, guards, catalogue, Box::pin(shutdown))
+}
+
+/// [`run`] without type parameters.
+fn run_boxed<'a>(
+    listeners: Vec<Listener>,
+    metrics: Option<Listener>,
+    config: &'a Config,
+    guards: &'a Security,
+    catalogue: Catalogue,
+    shutdown: BoxFuture<'a, ()>,
+) -> BoxFuture<'a, Result<(), Error>> {
+    Box::pin(serve(listeners, metrics, config, guards, catalogue, shutdown))
+}
+
+async fn serve(
     listeners: Vec<Listener>,
     metrics: Option<Listener>,
     config: &Config,
     guards: &Security,
     catalogue: Catalogue,
-    shutdown: impl Future<Output = ()>,
+    shutdown: BoxFuture<'_, ()>,
 ) -> Result<(), Error> {
     let listing = listing(&catalogue, config)?;
     let (mut controller, drain) = Controller::new();
