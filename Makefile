@@ -181,7 +181,7 @@ slurm-test: build-all ## do a plan on a real Slurm of two nodes, started for it,
 	PERTURB_SLURM_REQUIRED=1 cargo test $(ALL) --test cli slurm::
 
 load-test: build-all ## a server full of Hoppers for five minutes: 1024 sessions of 16, and one more that is refused
-	PERTURB_TEST_FULL_SERVER_SECONDS=$(LOAD_SECONDS) cargo test $(ALL) --test server -- --nocapture every_place_can_be_taken
+	PERTURB_TEST_FULL_SERVER_SECONDS=$(LOAD_SECONDS) cargo test $(ALL) --test server -- --nocapture hoppers_can_fill_all_places
 
 # The tests of what threads share, once more with two transport threads in servers that do not say how many they have.
 threads-test: build-all opengl ## sessions, leases, limits, tokens and shutdowns with two transport threads; minutes

@@ -135,7 +135,7 @@ async fn connections_beyond_the_soft_descriptor_limit_are_served() {
     }
 }
 
-/// For so many seconds the test below steps, where the variable says so.
+/// The environment variable with the number of seconds for which the test below steps. `make load-test` sets it.
 #[cfg(feature = "mujoco")]
 const SECONDS: &str = "PERTURB_TEST_FULL_SERVER_SECONDS";
 
