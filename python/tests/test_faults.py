@@ -580,3 +580,29 @@ def test_gymnasiums_asynchronous_batches_work(own: bool, server: str) -> None:
     envs.close()
     parent.step(np.zeros(1, dtype=np.float32))
     parent.close()
+
+
+@pytest.mark.parametrize("n_started", [0, 1])
+def test_a_process_without_further_threads_is_told_so(monkeypatch: pytest.MonkeyPatch, n_started: int) -> None:
+    """The limit is reached by the thread that reads the server's output, or by the one that answers keepalive pings."""
+    start = threading.Thread.start
+    monkeypatch.setattr(session, "_keepalive", session._KeepaliveThread())
+    started: list[threading.Thread] = []
+
+    def limited(thread: threading.Thread) -> None:
+        if len(started) == n_started:
+            raise RuntimeError("can't start new thread")
+        started.append(thread)
+        start(thread)
+
+    monkeypatch.setattr(local_server, "_shared", {})
+    monkeypatch.setattr(threading.Thread, "start", limited)
+    running = sum(server.exit_status() is None for server in local_server._running)
+    env = perturb.PerturbEnv("CartPole")
+    with pytest.raises(perturb.PerturbError, match=r"starts no further thread or process .*; raise the limit"):
+        env.reset()
+    assert sum(server.exit_status() is None for server in local_server._running) == running
+    monkeypatch.setattr(threading.Thread, "start", start)
+    env.reset(seed=1)
+    env.close()
+    session._keepalive.end()

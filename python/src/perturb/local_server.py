@@ -25,6 +25,7 @@ from typing import IO, Any, Protocol, TypeVar
 from .address import Address, parse_address
 from .catalogue import MAX_SOCKET_PATH_BYTES
 from .errors import PerturbError, ServerStartError
+from .threads import start_thread
 
 PROGRAM = "perturb-server"
 # Environment variable with the path of the program.
@@ -130,7 +131,11 @@ class LocalServer:
     def _wait_until_ready(self, program: Path) -> None:
         lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         # This thread reads all of the server's output, so that the server never blocks on a full pipe.
-        threading.Thread(target=_read, args=(self.process.stdout, lines), daemon=True).start()
+        try:
+            start_thread("perturb-server-output", _read, self.process.stdout, lines)
+        except PerturbError as error:
+            self.end()
+            raise ServerStartError(f"the private server {program} did not start: {error}") from error
         limit = START_LIMIT if self.task is None else START_LIMIT + TASK_LIMIT
         deadline = time.monotonic() + limit
         while True:

@@ -32,6 +32,7 @@ from .errors import (
     refusal,
 )
 from .local_server import LocalServer
+from .threads import start_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -107,7 +108,11 @@ class Session:
         # Python may delete a session at any time, also while a lock is held, so the finalizer only notes the resources.
         self._forget = weakref.finalize(self, _unclosed.append, self._resources)
         self._forget.atexit = False  # _at_exit closes the remaining sessions
-        _keepalive.add(self)
+        try:
+            _keepalive.add(self)
+        except PerturbError:
+            self.close()
+            raise
 
     @property
     def waits(self) -> bool:
@@ -391,8 +396,7 @@ class _KeepaliveThread:
             self._sessions.add(session)
             if self._thread is None:
                 self._last_run = _now()
-                self._thread = threading.Thread(target=self._run, name="perturb-keeper", daemon=True)
-                self._thread.start()
+                self._thread = start_thread("perturb-keepalive", self._run)
 
     def end(self) -> None:
         """End the thread. It must not run in the native module while Python exits."""
