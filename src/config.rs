@@ -517,6 +517,7 @@ impl Config {
         builder.add_source(config::Config::try_from(arguments)?).build()?.try_deserialize::<Self>()?.validated()
     }
 
+    /// Checks the ranges of all values, and that other machines cannot use an unprotected server.
     fn validated(self) -> Result<Self, Error> {
         let refuse = |key, got: &dyn ToString, expected| Err(Error::Value { key, got: got.to_string(), expected });
         if self.listen.is_empty() {
@@ -560,8 +561,8 @@ impl Config {
             }
             _ => {}
         }
-        let asks = self.tokens.is_some() || self.tls_client_ca.is_some();
-        let lacks = match (self.tls_cert.is_some(), asks) {
+        let authenticates = self.tokens.is_some() || self.tls_client_ca.is_some();
+        let lacks = match (self.tls_cert.is_some(), authenticates) {
             _ if self.insecure => None,
             (true, true) => None,
             (true, false) => Some("this server would not ask who they are"),

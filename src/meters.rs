@@ -76,7 +76,7 @@ impl Meter {
     }
 }
 
-/// Counts the steps of one batch, and adds them to the counters of all environments with the same name.
+/// The step counter of one batch. It also adds to the counters of all environments with the same name.
 pub struct Tally {
     /// The counters of all environments with the same name.
     pub meter: Arc<Meter>,

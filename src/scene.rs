@@ -79,7 +79,7 @@ pub enum Shape {
         points: Vec<Point>,
         /// The width of the dashes, m.
         width: f64,
-        /// The colour.
+        /// The colour of the dashes.
         colour: Colour,
     },
     /// The graph of a function, as a line.
@@ -88,14 +88,14 @@ pub enum Shape {
         graph: Graph,
         /// The width, m.
         width: f64,
-        /// The colour.
+        /// The colour of the line.
         colour: Colour,
     },
     /// The area below the graph of a function.
     Ground {
         /// The function, whose graph is the upper edge of the area.
         graph: Graph,
-        /// The colour.
+        /// The colour of the area.
         colour: Colour,
     },
 }

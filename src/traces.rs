@@ -21,7 +21,7 @@ pub const ENDPOINT: &str = "OTEL_EXPORTER_OTLP_ENDPOINT";
 const SERVICE: &str = "perturb-server";
 const SERVICE_VARIABLE: &str = "OTEL_SERVICE_NAME";
 
-/// Sends spans to the collector. When it is dropped, it sends all spans that are left.
+/// The sender of spans to the collector. When it is dropped, it sends all spans that are left.
 pub struct Traces {
     provider: SdkTracerProvider,
     _end: oneshot::Sender<()>,

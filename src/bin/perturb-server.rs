@@ -34,7 +34,7 @@ const CONTRACT: &str = include_str!("../../proto/perturb/v1/perturb.proto");
 fn main() -> ExitCode {
     let _ = perturb_system::ignore_sigxfsz(); // if this fails, the only loss is that a file-size limit ends the program
     let arguments = Arguments::parse();
-    if let Some(page) = about(&arguments) {
+    if let Some(page) = requested_text(&arguments) {
         // Ignored: the reader may close the pipe early.
         let _ = io::stdout().write_all(&page);
         return ExitCode::SUCCESS;
@@ -47,7 +47,7 @@ fn main() -> ExitCode {
                 ExitCode::SUCCESS
             }
             Err(error) => {
-                complain(format_args!("--new-token {name:?}: {error}"));
+                print_error(format_args!("--new-token {name:?}: {error}"));
                 ExitCode::from(2)
             }
         };
@@ -59,7 +59,7 @@ fn main() -> ExitCode {
     let config = match Config::load(&arguments) {
         Ok(config) => config,
         Err(error) => {
-            complain(error);
+            print_error(error);
             return ExitCode::from(2);
         }
     };
@@ -75,7 +75,7 @@ fn main() -> ExitCode {
     let _traces = match perturb::traces::init(config.filter()) {
         Ok(traces) => traces,
         Err(error) => {
-            complain(format_args!("traces cannot be sent: {error}; correct the variables OTEL_…"));
+            print_error(format_args!("traces cannot be sent: {error}; correct the variables OTEL_…"));
             return ExitCode::from(2);
         }
     };
@@ -95,24 +95,24 @@ fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(Failure::Setting(error)) => {
-            complain(error);
+            print_error(error);
             ExitCode::from(2)
         }
         Err(Failure::Other(error)) => {
-            complain(error);
+            print_error(error);
             ExitCode::FAILURE
         }
     }
 }
 
 /// Prints an error on standard error, and ignores failures to print it.
-fn complain(words: impl std::fmt::Display) {
+fn print_error(words: impl std::fmt::Display) {
     let _ = writeln!(io::stderr(), "perturb-server: {words}");
 }
 
 /// Returns the text that the command line requests instead of a server, if any: shell completions, the protocol, the
 /// schema of tasks, or the manual page.
-fn about(arguments: &Arguments) -> Option<Vec<u8>> {
+fn requested_text(arguments: &Arguments) -> Option<Vec<u8>> {
     let (mut command, mut page) = (Arguments::command(), Vec::new());
     if let Some(shell) = arguments.completions {
         clap_complete::generate(shell, &mut command, "perturb-server", &mut page);
@@ -258,12 +258,12 @@ fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
     // The runtime of the first transport thread. Each transport thread has a runtime of its own, because passing a
     // request between threads doubles latency.
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    let guards = Security::load(config, &environments.catalogue).map_err(Failure::setting)?;
+    let security = Security::load(config, &environments.catalogue).map_err(Failure::setting)?;
     let result = runtime.block_on(async {
         // Signal handlers are set before the addresses are printed, because the reader of the addresses may send a
         // signal at once.
         let shutdown = shutdown(config.exit_with_stdin)?;
-        tokio::spawn(reload_on_hangup(signal(SignalKind::hangup())?, guards.reloader()));
+        tokio::spawn(reload_on_hangup(signal(SignalKind::hangup())?, security.reloader()));
         let mut listeners = Vec::new();
         let metrics = match &config.metrics {
             Some(address) => {
@@ -275,7 +275,7 @@ fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
         for address in &config.listen {
             let listener = Listener::bind(address, config.socket_mode).await.map_err(Failure::setting)?;
             // Ignored: the program that started the server may have closed the pipe.
-            let _ = writeln!(io::stdout(), "listening on {}", told(&listener.address()?, config));
+            let _ = writeln!(io::stdout(), "listening on {}", client_address(&listener.address()?, config));
             listeners.push(listener);
         }
         if let Some(listener) = &metrics {
@@ -286,7 +286,7 @@ fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
         }
         #[cfg(feature = "mujoco")]
         tokio::spawn(watch_folders(environments.folders.clone()));
-        server::run(listeners, metrics, config, &guards, environments.catalogue.clone(), shutdown).await?;
+        server::run(listeners, metrics, config, &security, environments.catalogue.clone(), shutdown).await?;
         Ok(())
     });
     // Does not wait for connections that are still open.
@@ -295,7 +295,7 @@ fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
 }
 
 /// Returns an address in the syntax that clients use.
-fn told(address: &ListenAddress, config: &Config) -> String {
+fn client_address(address: &ListenAddress, config: &Config) -> String {
     match address {
         ListenAddress::Tcp(tcp) if config.tls_cert.is_some() => format!("https://{tcp}"),
         // Absolute, because a client may have another working directory.

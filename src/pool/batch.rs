@@ -37,7 +37,8 @@ const SHARD_COST_US: RangeInclusive<f64> = 20.0..=200.0;
 const SHARDS_PER_WORKER: f64 = 32.0;
 /// The minimum cost of a worker's part of a batch, µs. Cheaper batches are not split among all workers.
 const MIN_WORKER_SHARE_US: f64 = 10.0;
-/// Batches of at most this many environments are freed on the transport thread, since this takes only a moment.
+/// The maximum number of environments for which a batch is freed on the transport thread, since this takes only a
+/// moment.
 const INLINE_DROP_MAX_ENVS: usize = 64;
 
 /// The reset of one environment. It begins a new episode. If there is a new seed or new distributions, it also begins a
@@ -67,7 +68,7 @@ pub struct Batch {
     /// The number of requests that were passed to the workers so far.
     n_requests: u64,
     /// Whether a request was passed to the workers and its end has not been awaited yet.
-    under_way: bool,
+    is_running: bool,
     /// If the next request is a pipelined step that has already started: its start time.
     pipelined_since: Option<Instant>,
     /// The policy of the last `act`. Any other request that changes the environments drops it.
@@ -106,7 +107,7 @@ impl Batch {
             n_workers: pool.workers(),
             buffer: BytesMut::new(),
             n_requests: 0,
-            under_way: false,
+            is_running: false,
             pipelined_since: None,
             runner: None,
             drop_hook: None,
@@ -160,7 +161,7 @@ impl Batch {
         };
         let number = self.next_request();
         let ended = self.workers.wait(&self.job, number).await;
-        self.under_way = false;
+        self.is_running = false;
         // If a pipelined step followed this one, the worker has already gathered the result of this step.
         let (pipelined_since, end) = {
             let mut pipelined = lock(&self.job.pipelined);
@@ -196,25 +197,26 @@ impl Batch {
         follows.then_some(StepQueue { job, spec, size })
     }
 
-    /// Lets a policy play several steps. If `turn` has no new policy, the previous policy continues; if it has no new
-    /// task, the previous task continues. The caller must have checked that there is a policy, that a new task does not
-    /// replace an unfinished one, that the mode is [`Autoreset::SameStep`], and that policy and weights fit the batch.
+    /// Lets a policy play several steps. If `request` has no new policy, the previous policy continues; if it has no
+    /// new task, the previous task continues. The caller must have checked that there is a policy, that a new task does
+    /// not replace an unfinished one, that the mode is [`Autoreset::SameStep`], and that policy and weights fit the
+    /// batch.
     ///
     /// # Errors
     /// [`Error::Policy`] if numbers are not finite, [`Error::Defect`] if a worker panicked. After an error, the next
     /// call needs a new policy.
-    pub async fn act(&mut self, turn: RolloutRequest) -> Result<Rollout, Error> {
+    pub async fn act(&mut self, request: RolloutRequest) -> Result<Rollout, Error> {
         self.ready().await?;
-        let task = Box::new(RolloutTask::new(turn, self.runner.take()));
+        let task = Box::new(RolloutTask::new(request, self.runner.take()));
         let number = self.next_request();
         let task = self.workers.run_rollout(&self.job, task, number).await;
-        self.under_way = false;
-        let (runner, played) = task?.finish()?;
+        self.is_running = false;
+        let (runner, rollout) = task?.finish()?;
         self.runner = runner;
-        Ok(played)
+        Ok(rollout)
     }
 
-    /// The policy that the next rollout continues, if there is one.
+    /// The policy that the next rollout continues, or `None` if the next rollout must bring a new policy.
     pub fn policy_runner(&self) -> Option<&PolicyRunner> {
         self.runner.as_deref()
     }
@@ -231,11 +233,11 @@ impl Batch {
         slots.iter().for_each(|&slot| is_released[slot] = true);
         let mut all = self.job.shards.iter().flat_map(|shard| lock(shard).take_slots()).collect::<Vec<Episodes>>();
         let mut slot = 0..;
-        let gone: Vec<Episodes> =
+        let released: Vec<Episodes> =
             all.extract_if(.., |_| slot.next().is_some_and(|slot: usize| is_released[slot])).collect();
-        let mut gone = Some(gone);
+        let mut released = Some(released);
         self.workers.reaper.drop_later(Box::new(move || {
-            drop(gone.take());
+            drop(released.take());
             true
         }));
         self.size = all.len();
@@ -344,18 +346,18 @@ impl Batch {
     /// step.
     pub async fn finish_abandoned(&mut self) {
         // Errors are ignored here: the next request reports them.
-        if self.under_way {
+        if self.is_running {
             self.job.is_halted.store(true, Ordering::Relaxed);
             lock(&self.job.pipelined).stop();
             let _ = self.workers.wait(&self.job, self.n_requests).await;
             self.job.take_rollout();
-            self.under_way = false;
+            self.is_running = false;
             self.pipelined_since = lock(&self.job.pipelined).take_result().map(|(_, begun)| begun);
         }
         if self.pipelined_since.take().is_some() {
             let number = self.next_request();
             let _ = self.workers.wait(&self.job, number).await;
-            self.under_way = false;
+            self.is_running = false;
         }
     }
 
@@ -390,13 +392,13 @@ impl Batch {
     async fn run(&mut self) -> Result<(), Error> {
         let number = self.next_request();
         let result = self.workers.run(&self.job, number).await;
-        self.under_way = false;
+        self.is_running = false;
         result
     }
 
     /// Counts a request that is passed to the workers now. Returns its number.
     fn next_request(&mut self) -> u64 {
-        self.under_way = true;
+        self.is_running = true;
         self.n_requests += 1;
         self.n_requests
     }

@@ -7,7 +7,7 @@ use std::sync::{
 };
 use tokio::sync::Notify;
 
-/// Counts the environments in use, and limits their number.
+/// A counter of the environments in use, with a limit.
 pub(super) struct Capacity {
     used: AtomicUsize,
     limit: usize,

@@ -14,15 +14,15 @@ use std::{
 };
 use tokio::sync::Notify;
 
-/// Batches whose step costs less than this, in µs, are stepped on the session's thread, since passing them to a worker
+/// The maximum cost of a batch's step, µs, for which it runs on the session's thread, since passing it to a worker
 /// costs more.
 pub(super) const INLINE_MAX_US: f64 = 20.0;
 /// The limit that applies instead of [`INLINE_MAX_US`], in µs, to a session that also made the previous step on the
 /// server. Then no other session is waiting, and up to this cost a second worker saves less than passing the batch to
 /// it costs.
 pub(super) const INLINE_MAX_US_UNCONTENDED: f64 = 80.0;
-/// Batches whose step costs at most this, in µs, are also reset on the session's thread. A reset costs as much as a few
-/// steps.
+/// The maximum cost of a batch's step, µs, for which the batch is also reset on the session's thread. A reset costs as
+/// much as a few steps.
 pub(super) const INLINE_RESET_MAX_US: f64 = 4.0;
 /// The maximum cost of a job, in µs, for which the session polls for the end before it sleeps.
 const POLL_MAX_US: f64 = 50.0;

@@ -17,8 +17,8 @@ use std::{
 /// The niceness of the thread. Its priority is low because no request waits for it.
 const REAPER_NICENESS: i32 = 3;
 
-/// Frees a closed session's batch, if it is no longer in use. Returns whether it did. The reaper's thread calls this,
-/// because freeing thousands of environments would block the transport thread for too long.
+/// A function that frees a closed session's batch, if no worker uses it any more, and returns whether it did. The
+/// reaper's thread calls it, because freeing thousands of environments would block the transport thread for too long.
 pub(super) type DeferredDrop = Box<dyn FnMut() -> bool + Send>;
 /// The interval at which freeing a batch that was still in use is retried.
 const REAP_INTERVAL: Duration = Duration::from_millis(1);

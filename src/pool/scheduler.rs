@@ -154,8 +154,8 @@ struct JobQueue {
 impl StepScheduler {
     /// Runs a step of all shards on the calling thread, if the job is cheap. Returns whether it did.
     pub(super) fn step_inline(&self, job: &Job) -> bool {
-        let tiny = if self.mark_last_stepped(job) { INLINE_MAX_US_UNCONTENDED } else { INLINE_MAX_US };
-        run_inline(job, tiny)
+        let max_us = if self.mark_last_stepped(job) { INLINE_MAX_US_UNCONTENDED } else { INLINE_MAX_US };
+        run_inline(job, max_us)
     }
 
     /// Runs the resets of all shards on the calling thread, if the job is cheap. Returns whether it did.
@@ -284,15 +284,15 @@ impl StepScheduler {
             let shards = job.shards.len();
             // Waiting jobs come first. If none waits and the job has a single shard, this worker runs it directly.
             // Through the queue, an idle worker might take the job, which is in this worker's cache.
-            let is_own = shards == 1 && self.waiting.load(Ordering::Acquire) == 0;
-            if !is_own {
+            let runs_here = shards == 1 && self.waiting.load(Ordering::Acquire) == 0;
+            if !runs_here {
                 self.push(job, shards, shards - 1);
             }
             if matches!(next, Continuation::Request) {
                 self.mark_last_stepped(job);
                 job.notify_done();
             }
-            if !is_own {
+            if !runs_here {
                 return;
             }
             job.run(0);

@@ -5,7 +5,7 @@ use crate::env::EnvironmentSpec;
 use bytes::Bytes;
 use std::sync::Arc;
 
-/// Queues a step of a batch behind its running step.
+/// A handle with which a session queues a step of a batch behind the running step.
 pub struct StepQueue {
     pub(super) job: Arc<Job>,
     /// The description of the batch's environment.

@@ -36,7 +36,7 @@ pub struct StepResult {
     pub receipt_values: Bytes,
 }
 
-/// Gathers the outputs of shards. The arrays are split off from `buffer`, whose memory is reused.
+/// The shards whose outputs are gathered. The arrays are split off from `buffer`, whose memory is reused.
 pub(super) struct ShardOutputs<'a> {
     pub(super) shards: &'a [Mutex<Shard>],
     pub(super) buffer: &'a mut BytesMut,

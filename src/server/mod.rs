@@ -8,9 +8,10 @@
 //! - [`session`]: runs sessions of either protocol; leases, by which a session survives the loss of its connection.
 //! - [`transport`]: reads messages from the network and sends replies, within a memory budget.
 //! - [`audit`]: checks from which distributions a token may draw, and records all draws in the ledger.
-//! - [`auth`]: tokens, their quotas and roles.
-//! - [`net`]: connections, their limits and encryption.
-//! - [`shutdown`]: the phases of a shutdown; [`error`]: the classes of errors, with their gRPC codes; [`limits`], [`id`].
+//! - [`auth`]: tokens, with their quotas, rate limits and roles.
+//! - [`net`]: connections, with their limits and their encryption.
+//! - [`shutdown`]: the phases of a shutdown; [`error`]: the classes of errors, with their gRPC codes; [`limits`]: size
+//!   limits of requests; [`id`]: random names.
 
 pub mod api;
 pub mod audit;

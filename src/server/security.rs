@@ -34,18 +34,18 @@ impl Security {
     /// # Errors
     /// If a file cannot be read or is invalid. The message names the file and what was expected.
     pub fn load(config: &Config, catalogue: &Catalogue) -> io::Result<Self> {
-        let mut guards = Self::default();
+        let mut security = Self::default();
         if let Some(path) = &config.tokens {
-            guards.tokens = Some(guards.load_tokens(path.clone(), catalogue)?);
+            security.tokens = Some(security.load_tokens(path.clone(), catalogue)?);
         }
         if let Some(files) = config.tls() {
-            guards.tls = Some(guards.load_tls(files)?);
+            security.tls = Some(security.load_tls(files)?);
         }
         if let Some(path) = &config.ledger {
             let wrong = |error| io::Error::other(format!("the ledger {}: {error}; correct --ledger", path.display()));
-            guards.ledger = Some(Ledger::open(path).map_err(wrong)?);
+            security.ledger = Some(Ledger::open(path).map_err(wrong)?);
         }
-        Ok(guards)
+        Ok(security)
     }
 
     /// Returns a handle that has the token and TLS files read again immediately.

@@ -23,7 +23,7 @@ pub struct Drain {
     sessions: watch::Sender<()>,
 }
 
-/// Sets the phase of the shutdown, and waits for sessions to end.
+/// The controller of the shutdown: it sets the phase, and waits for sessions to end.
 pub struct Controller {
     /// The sender of the phase to the handles of each transport thread.
     phases: Vec<watch::Sender<ShutdownPhase>>,

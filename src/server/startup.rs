@@ -129,61 +129,63 @@ async fn serve(
     listeners: Vec<Listener>,
     metrics: Option<Listener>,
     config: &Config,
-    guards: &Security,
+    security: &Security,
     catalogue: Catalogue,
     shutdown: BoxFuture<'_, ()>,
 ) -> Result<(), Error> {
     let listing = listing(&catalogue, config)?;
     let (mut controller, drain) = Controller::new();
-    let state = ServerParts::new(config, catalogue, drain.clone())?;
+    let parts = ServerParts::new(config, catalogue, drain.clone())?;
     let renderer = Renderer::new();
     let pictures = renderer.times();
-    let worlds = state.worlds(guards);
-    let service = state.service(listing, renderer, guards);
+    let worlds = parts.worlds(security);
+    let service = parts.service(listing, renderer, security);
     let requests = [("perturb.v1", service.counts()), ("dm_env_rpc.v1", worlds.counts())];
     let balance = Balance::new(config.transport_threads, Instant::now());
-    let sources = Arc::new(state.sources(requests, guards, pictures, balance.loads()));
+    let sources = Arc::new(parts.sources(requests, security, pictures, balance.loads()));
     let (health, health_service) = tonic_health::server::health_reporter();
     set_health(&health, ServingStatus::Serving).await;
 
-    let handshakes = Handshakes { limit: state.handshake, tls: guards.tls.clone() };
-    let is_watched = metrics.is_some();
-    let _scraped = metrics.map(|listener| answer_scrapers(listener, &sources)); // ends with this function
+    let handshakes = Handshakes { limit: parts.handshake, tls: security.tls.clone() };
+    let has_metrics = metrics.is_some();
+    let _metrics_server = metrics.map(|listener| answer_scrapers(listener, &sources)); // stops when this function returns
+    // One gRPC server for each transport thread. The first runs on this thread.
     let mut servers = JoinSet::new();
     let (threads, accepted) = TransportThreads::new(balance);
-    for (place, accepted) in accepted.into_iter().enumerate() {
+    for (index, accepted) in accepted.into_iter().enumerate() {
         let view = controller.view();
         let (service, worlds) = (service.with_drain(view.clone()), worlds.with_drain(view.clone()));
-        let router = router(config, &state, guards.tokens.clone(), service, worlds, health_service.clone())?;
+        let router = router(config, &parts, security.tokens.clone(), service, worlds, health_service.clone())?;
         let connections = handshake::connections(accepted, handshakes.clone());
-        let watching = is_watched.then(|| Arc::clone(&sources));
+        let lag_sources = has_metrics.then(|| Arc::clone(&sources));
         let served = async move {
             tokio::select! {
                 served = router.serve_with_incoming_shutdown(connections, closed(view)) => served.map_err(Error::from),
-                () = watch_lag(watching, place) => Ok(()),
+                () = watch_lag(lag_sources, index) => Ok(()),
             }
         };
-        if place == 0 {
+        if index == 0 {
             servers.spawn(served);
         } else {
-            let thread = transport_threads::spawn(format!("transport-{place}"), served)?;
+            let thread = transport_threads::spawn(format!("transport-{index}"), served)?;
             servers.spawn(async { thread.await? });
         }
     }
+    // Accepted connections are passed to the transport threads.
     for listener in listeners {
-        servers.spawn(accept(listener, state.connections.clone(), threads.clone(), drain.clone()));
+        servers.spawn(accept(listener, parts.connections.clone(), threads.clone(), drain.clone()));
     }
     tokio::select! {
         () = shutdown => {}
-        () = capacity_health::report_capacity(&health, &state.limiter, &state.pool) => {}
+        () = capacity_health::report_capacity(&health, &parts.limiter, &parts.pool) => {}
         // Before the shutdown, a server task ends only if it fails.
         Some(ended) = servers.join_next() => return ended.map_err(io::Error::other)?,
     }
     shut_down(config, &controller, &health, &sources.requests, servers).await;
-    if let Some(ledger) = &guards.ledger {
+    if let Some(ledger) = &security.ledger {
         // The ledger records the last draws of a session when its environments are freed, so the ledger is closed after
         // that.
-        if timeout(CONNECTION_CLOSE_TIMEOUT, state.pool.freed()).await.is_err() {
+        if timeout(CONNECTION_CLOSE_TIMEOUT, parts.pool.freed()).await.is_err() {
             tracing::warn!("the ledger ends before all environments are freed");
         }
         ledger.close().await;
@@ -228,10 +230,10 @@ struct ServerParts {
     limiter: PeerLimiter,
     connections: PeerLimiter,
     handshake: Duration,
-    transit: StreamLimits,
+    stream_limits: StreamLimits,
     sessions: Sessions,
     leases: Leases<proto::SessionResponse>,
-    leased: lease::LeaseCounters,
+    lease_counters: lease::LeaseCounters,
     errors: ErrorCounters,
     access: AccessLog,
 }
@@ -245,26 +247,27 @@ impl ServerParts {
         let seconds = |count: u64| (count > 0).then(|| Duration::from_secs(count));
         let handshake = Duration::from_secs(config.handshake_seconds);
         let limits = SessionLimits { bytes: config.max_message_bytes, handshake, idle: seconds(config.idle_seconds) };
-        let of_a_peer = if config.max_peer_sessions > 0 { config.max_peer_sessions } else { usize::MAX };
-        let connections = PeerLimiter::new(usize::MAX, of_a_peer.saturating_add(MAX_OTHER_STREAMS));
-        let (errors, access, leased) =
+        let max_per_peer = if config.max_peer_sessions > 0 { config.max_peer_sessions } else { usize::MAX };
+        let connections = PeerLimiter::new(usize::MAX, max_per_peer.saturating_add(MAX_OTHER_STREAMS));
+        let (errors, access, lease_counters) =
             (ErrorCounters::default(), AccessLog::default(), lease::LeaseCounters::default());
-        let limiter = PeerLimiter::new(config.max_sessions, of_a_peer);
-        let sessions = Sessions::new(limiter.clone(), limits, drain, errors.clone(), access.clone(), leased.clone());
+        let limiter = PeerLimiter::new(config.max_sessions, max_per_peer);
+        let sessions =
+            Sessions::new(limiter.clone(), limits, drain, errors.clone(), access.clone(), lease_counters.clone());
         Ok(Self {
             pool,
             catalogue: Arc::new(catalogue),
             limiter,
             connections,
             handshake,
-            transit: StreamLimits {
+            stream_limits: StreamLimits {
                 budget: Budget::new(config.max_memory),
                 limit: seconds(config.stall_seconds),
                 handshake,
             },
             sessions,
-            leases: Leases::new(Duration::from_secs(config.lease_seconds), leased.clone()),
-            leased,
+            leases: Leases::new(Duration::from_secs(config.lease_seconds), lease_counters.clone()),
+            lease_counters,
             errors,
             access,
         })
@@ -275,30 +278,30 @@ impl ServerParts {
         &self,
         listing: proto::ListEnvironmentsResponse,
         renderer: Renderer,
-        guards: &Security,
+        security: &Security,
     ) -> PerturbService {
         let shared = ServerContext {
             pool: Arc::clone(&self.pool),
             catalogue: Arc::clone(&self.catalogue),
             listing,
             renderer,
-            ledger: guards.ledger.clone(),
+            ledger: security.ledger.clone(),
             leases: self.leases.clone(),
         };
         PerturbService::new(shared, self.sessions.clone())
     }
 
     /// The service of `dm_env_rpc.v1`.
-    fn worlds(&self, guards: &Security) -> dm_env_rpc::service::DmEnvRpcService {
+    fn worlds(&self, security: &Security) -> dm_env_rpc::service::DmEnvRpcService {
         let (pool, catalogue) = (Arc::clone(&self.pool), Arc::clone(&self.catalogue));
-        dm_env_rpc::service::DmEnvRpcService::new(pool, catalogue, self.sessions.clone(), guards.ledger.clone())
+        dm_env_rpc::service::DmEnvRpcService::new(pool, catalogue, self.sessions.clone(), security.ledger.clone())
     }
 
     /// The counters that the metrics read.
     fn sources(
         &self,
         requests: [RequestCounts; 2],
-        guards: &Security,
+        security: &Security,
         pictures: Arc<Histogram>,
         loads: Vec<Arc<ThreadLoad>>,
     ) -> MetricsSources {
@@ -306,14 +309,14 @@ impl ServerParts {
         MetricsSources {
             pool: Arc::clone(&self.pool),
             sessions: self.limiter.clone(),
-            leases: self.leased.clone(),
+            leases: self.lease_counters.clone(),
             connections: self.connections.clone(),
-            budget: self.transit.budget.clone(),
+            budget: self.stream_limits.budget.clone(),
             requests,
             errors: self.errors.clone(),
             access: self.access.clone(),
-            tokens: guards.tokens.clone(),
-            ledger: guards.ledger.clone(),
+            tokens: security.tokens.clone(),
+            ledger: security.ledger.clone(),
             pictures,
             threads: loads.into_iter().map(TransportMeter::new).collect(),
         }
@@ -323,13 +326,13 @@ impl ServerParts {
 /// Builds the router of all gRPC services: authentication, raw request bodies, compression, size limits.
 fn router<H: Health>(
     config: &Config,
-    state: &ServerParts,
+    parts: &ServerParts,
     tokens: Option<Tokens>,
     service: PerturbService,
     worlds: dm_env_rpc::service::DmEnvRpcService,
     health: HealthServer<H>,
 ) -> Result<Router, Error> {
-    let auth = AuthLayer::new(tokens, state.errors.clone());
+    let auth = AuthLayer::new(tokens, parts.errors.clone());
     let perturb = PerturbServer::new(service)
         .max_decoding_message_size(MAX_UNARY_BYTES) // for unary requests; sessions have limits of their own
         .max_encoding_message_size(usize::MAX)
@@ -337,11 +340,11 @@ fn router<H: Health>(
         .accept_compressed(CompressionEncoding::Deflate);
     let perturb = ServiceBuilder::new()
         .layer(auth.clone())
-        .layer(RawBodyLayer::new(ENDPOINT, state.transit.clone()))
+        .layer(RawBodyLayer::new(ENDPOINT, parts.stream_limits.clone()))
         .service(perturb);
     let worlds = ServiceBuilder::new()
         .layer(auth.clone())
-        .layer(RawBodyLayer::new(dm_env_rpc::service::ENDPOINT, state.transit.clone()))
+        .layer(RawBodyLayer::new(dm_env_rpc::service::ENDPOINT, parts.stream_limits.clone()))
         .service(
             EnvironmentServer::new(worlds)
                 .max_encoding_message_size(usize::MAX)
@@ -379,10 +382,10 @@ fn answer_scrapers(listener: Listener, sources: &Arc<MetricsSources>) -> JoinSet
     tasks
 }
 
-/// Measures how late transport thread number `place` wakes up, if the metrics are served. Never resolves.
-async fn watch_lag(sources: Option<Arc<MetricsSources>>, place: usize) {
+/// Measures how late transport thread number `index` wakes up, if the metrics are served. Never resolves.
+async fn watch_lag(sources: Option<Arc<MetricsSources>>, index: usize) {
     match sources {
-        Some(sources) => sources.threads[place].watch_lag().await,
+        Some(sources) => sources.threads[index].watch_lag().await,
         None => std::future::pending().await,
     }
 }

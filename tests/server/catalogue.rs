@@ -1,4 +1,4 @@
-//! What holds for every environment of the catalogue, whichever it is.
+//! Properties that every environment of the catalogue must have.
 
 use crate::common::{self, action_bytes, episodes, observe, play, settings, start_line, step};
 use perturb::{
@@ -17,7 +17,7 @@ fn unique<'a>(names: impl Iterator<Item = &'a str>) -> bool {
     names.into_iter().all(|name| !name.is_empty() && seen.insert(name))
 }
 
-/// A state that every environment can start from: near the origin, within the channels' ranges.
+/// Returns a legal initial state of the environment: near the origin, within the ranges of the channels.
 fn some_state(spec: &EnvironmentSpec, seed: u64) -> Vec<f64> {
     let mut stream = Stream::new(seed, 0, Purpose::InitialState, 0);
     spec.state.iter().map(|c| stream.uniform(c.low.max(-0.05), c.high.min(0.05))).collect()
@@ -126,7 +126,8 @@ fn success_is_what_was_achieved_compared_with_the_threshold() {
     }
 }
 
-/// The rounding of a few operations of double precision; an edit that did not take effect differs by percents.
+/// The tolerance for the rounding of a few operations in double precision. An edit without effect would differ by
+/// percents.
 const ROUNDING: f64 = 1e-9;
 
 #[test]
@@ -188,7 +189,7 @@ fn reward_is_the_sum_of_its_terms() {
         for t in 0..1500 {
             let (outcome, terms) = step(&mut e, &action_bytes(spec, 1, t));
             assert_eq!(terms.len(), spec.reward_terms.len());
-            // The same numbers added in the same order: no tolerance.
+            // Exact: the same numbers are added in the same order.
             assert_eq!(outcome.reward, terms.iter().sum::<f64>(), "{}", spec.name);
             total += outcome.reward;
             if e.ended() {
@@ -282,7 +283,7 @@ fn an_exact_state_gives_the_same_bytes_whatever_ran_before() {
         let mut fresh = episodes(spec, Version::R, 4, 0, 10);
         let mut used = episodes(spec, Version::R, 4, 0, 10);
         play(&mut used, 1, 0, 10);
-        // The same counts for both: a trial's second episode.
+        // Both are in the second episode of a trial, so their counts are equal.
         used.begin_trial(Some(4), None, None);
         fresh.begin(Some(&state));
         used.begin(Some(&state));
@@ -338,7 +339,7 @@ fn parameters_stay_within_a_trial_and_are_drawn_anew_after_it() {
     }
 }
 
-/// At most `steps` steps of the running episode.
+/// Plays the running episode, at most `steps` steps.
 fn play_to_its_end(e: &mut Episodes, steps: u64) {
     for t in 0..steps {
         if !e.ended() {
@@ -400,7 +401,7 @@ fn derived_quantities_follow_every_edit() {
     let mut e = episodes(common::catalogue().find("CartPole").unwrap(), Version::E, 13, 0, 1);
     for _ in 0..50 {
         let [_, length, mass] = e.receipt().requested[..] else { panic!("three parameters") };
-        // 1 kg is the cart's mass.
+        // The cart's mass is 1 kg.
         assert_eq!(e.receipt().applied[3..], [mass + 1.0, mass * length]);
         e.begin(None);
     }
@@ -418,7 +419,7 @@ fn every_parameter_changes_the_receipt_and_the_physics() {
             let settings = env::Settings { distributions, ..settings(spec, Version::D, 1, 0, 1) };
             let mut e = Episodes::new((spec.make)().unwrap(), settings);
             let applied = e.receipt().applied;
-            // Steps until every parameter had its effect, contacts with the floor included.
+            // Enough steps for every parameter to have an effect, also by contacts with the floor.
             let observations: Vec<_> = (0..40)
                 .map(|t| {
                     if !e.ended() {

@@ -1,4 +1,5 @@
-//! What every server of the protocol must do, seen from outside: at PERTURB_ADDRESS, or at a server started here.
+//! What every server of the protocol must do, tested through the protocol only. The server is the one at
+//! PERTURB_ADDRESS, or one that the test starts.
 
 use crate::common::server::{self, Actor, Server, Session, action, doubles, floats, open, parameters, stepped};
 use bytes::Bytes;
@@ -47,7 +48,7 @@ fn contains(set: &Distribution, x: f64) -> bool {
     set.intervals.iter().any(|i| i.low <= x && x <= i.high)
 }
 
-/// A legal exact state, other for every `k`.
+/// Returns a legal exact state, different for every `k`.
 fn state(environment: &Environment, k: usize) -> Vec<f64> {
     let entry = |(i, c): (usize, &perturb::proto::Channel)| (0.003 * (1 + i + k) as f64).clamp(c.low, c.high);
     environment.state.iter().enumerate().map(entry).collect()
@@ -57,13 +58,13 @@ fn requested(starts: &[EpisodeStart]) -> Vec<Vec<f64>> {
     starts.iter().map(|start| start.receipt.as_ref().unwrap().requested.clone()).collect()
 }
 
-/// (environment, trial, episode, episode in trial)
+/// Returns the indices (environment, trial, episode, episode in trial).
 fn numbers(episode: &Option<perturb::proto::Episode>) -> (u32, u64, u64, u32) {
     let episode = episode.as_ref().unwrap();
     (episode.environment_index, episode.trial_index, episode.episode_index, episode.episode_in_trial)
 }
 
-/// Row `i` of an array of rows of `width` bytes.
+/// Returns row `i` of an array whose rows have `width` bytes.
 fn row(bytes: &Bytes, i: usize, width: usize) -> Bytes {
     bytes.slice(i * width..(i + 1) * width)
 }
@@ -201,7 +202,7 @@ async fn step_replies_have_the_promised_shapes_and_reward_sums() {
             let terms = floats(&full.reward_terms);
             assert_eq!(terms.len(), N * e.reward_terms.len());
             for (terms, reward) in terms.chunks(e.reward_terms.len()).zip(floats(&full.rewards)) {
-                // Each term and the sum were rounded to f32 on their own.
+                // The terms and the sum were rounded to f32 separately.
                 let (sum, size) = (terms.iter().sum::<f32>(), terms.iter().map(|t| t.abs()).sum::<f32>());
                 assert!((sum - reward).abs() <= 1e-6 * (1.0 + size), "{}: {terms:?} is not {reward}", e.name);
             }
@@ -211,7 +212,7 @@ async fn step_replies_have_the_promised_shapes_and_reward_sums() {
                 assert_eq!(full.truncated[slot] == 1, end.length == e.step_limit, "{}: {end:?}", e.name);
                 assert!(end.length <= e.step_limit && !end.diverged);
             }
-            // The same without what was not asked for.
+            // Removes the fields that were not requested.
             let strip = |end: &EpisodeEnd| EpisodeEnd { receipt: None, ..end.clone() };
             let ended = full.ended.iter().map(strip).collect();
             let expected = Stepped { ended, started: vec![], reward_terms: Bytes::new(), ..full.clone() };
@@ -221,7 +222,7 @@ async fn step_replies_have_the_promised_shapes_and_reward_sums() {
     }
 }
 
-/// What a client sees of one episode.
+/// Everything that a client receives of one episode.
 #[derive(Debug, PartialEq, Default, Clone)]
 struct Seen {
     first: Bytes,
@@ -229,7 +230,8 @@ struct Seen {
     end: Option<EpisodeEnd>,
 }
 
-/// Plays until every environment has ended `episodes` episodes; an action depends on environment, episode and step.
+/// Plays until every environment has finished `episodes` episodes. Actions depend on environment, episode and step
+/// only.
 async fn episodes(target: &Target, e: &Environment, autoreset: AutoresetMode, episodes: usize) -> Vec<Vec<Seen>> {
     const N: usize = 3;
     let o = 4 * e.observation.len();
@@ -392,7 +394,7 @@ async fn versions_draw_from_their_sets_and_receipts_say_so() {
                 assert_eq!(receipt.model_hash, e.model_hash);
                 for (p, requested) in e.parameters.iter().zip(&receipt.requested) {
                     let applied = receipt.applied[e.applied.iter().position(|q| q.name == p.applied).unwrap()];
-                    // Rounding, where the physics keeps a mass in place of a density.
+                    // Tolerance for rounding where the physics stores a mass instead of a density.
                     assert!((applied - requested).abs() <= 1e-9 * requested.abs(), "{}: {}", e.name, p.name);
                 }
             }
@@ -489,7 +491,7 @@ async fn an_exact_state_replaces_the_drawn_one_for_one_episode() {
         let mask = Bytes::from_static(&[0, 1]);
         let one = session.ask(Reset { mask, states: doubles(&state(e, 3)), ..Reset::default() }).await;
         assert_ne!(one.observations, row(&done.observations, 1, o), "{}: another state, another look", e.name);
-        // The next episode is drawn as if nothing had happened.
+        // The next episode is drawn as if there had been no exact state.
         for _ in 0..2 {
             twin.ask(Reset::default()).await;
         }
@@ -522,7 +524,8 @@ async fn a_restored_environment_goes_on_as_it_did() {
         assert_eq!(other.restore(&[], snapshots.clone()).await, before);
         assert!(other.play(actor, 38, steps).await == after, "{}: in a session opened otherwise", e.name);
 
-        // Slot 0's environment into slot 2: it keeps its index, the others their course.
+        // Restores the environment of slot 0 into slot 2. It keeps its index, and the other environments are
+        // unaffected.
         let (mut moved, opened) = target.open(open(&e.name, N as u32, 4)).await;
         let o = 4 * e.observation.len();
         let restored = moved.restore(&[0, 0, 1], vec![snapshots[0].clone()]).await;
@@ -583,7 +586,7 @@ async fn a_refused_request_changes_nothing() {
             Request::Reset(Reset { seeds: vec![1; N], parameters: half, ..Reset::default() }),
             Request::Reset(Reset { seeds: vec![1; N], states: doubles(&states), ..Reset::default() }),
             Request::Snapshot(Snapshot { mask: Bytes::from_static(&[1]) }),
-            // The first two could be restored: none may be.
+            // The first two snapshots are valid, but none may be restored.
             Request::Restore(Restore { mask: Bytes::new(), snapshots }),
         ];
         assert!(elsewhere == twin.play(actor, 20, 30).await);

@@ -9,7 +9,7 @@ use std::io::Write;
 const STEPS: u64 = 2_000;
 const BATCH: u32 = 8;
 
-/// Everything that the server answers to the same requests: open, steps, snapshot, reset.
+/// Returns all responses to the same requests: open, steps, snapshot, reset.
 async fn transcript(address: &str, open: Open, actor: Actor<'_>, steps: u64) -> Vec<SessionResponse> {
     let (mut session, opened) = Session::open(address, open).await;
     let mut all = vec![SessionResponse { response: Some(Response::Opened(opened)) }];
@@ -49,7 +49,7 @@ async fn bytes_depend_neither_on_threads_nor_on_the_transport() {
             assert!(ended >= BATCH as usize, "{name}: only {ended} episodes ended: too little was compared");
             hashes.push((place, hash(&responses)));
         }
-        // Past the test harness, which shows nothing of tests that pass.
+        // Written to standard error directly, because the test harness hides the output of tests that pass.
         writeln!(std::io::stderr(), "{name}, {STEPS} steps of {BATCH}: SHA-256 {}", hashes[0].1).unwrap();
         assert!(hashes.iter().all(|(_, hash)| *hash == hashes[0].1), "{name}: {hashes:#?}");
     }
@@ -57,7 +57,7 @@ async fn bytes_depend_neither_on_threads_nor_on_the_transport() {
 
 #[tokio::test]
 async fn bytes_do_not_depend_on_how_many_shards_a_batch_has() {
-    // Large enough to be cut, and cut differently: by one worker, and by three.
+    // Large enough to be cut into shards, and differently by one and by three workers.
     const BATCH: u32 = 1200;
     let (one, three) = (Server::with_folders(&["--workers", "1"]), Server::with_folders(&["--workers", "3"]));
     for environment in &catalogue(one.tcp()).await {
@@ -102,7 +102,8 @@ async fn a_batch_split_over_two_servers_equals_the_whole() {
     }
 }
 
-/// Two parts of a batch as the whole would report them; the second begins at this slot.
+/// Joins the results of two parts of a batch to the result of the whole batch. `second` is the first slot of the second
+/// part.
 fn joined(a: &Stepped, b: &Stepped, second: u32) -> Stepped {
     let both = |field: fn(&Stepped) -> &bytes::Bytes| [&field(a)[..], &field(b)[..]].concat().into();
     let ended = b.ended.iter().cloned().map(|e| EpisodeEnd { slot: e.slot + second, ..e });

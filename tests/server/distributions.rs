@@ -11,7 +11,7 @@ use perturb::{
 use proptest::prelude::*;
 use rstest::rstest;
 
-/// Environment, parameter, unit, D, R, E: docs/environments.md and the paper's table of parameter ranges.
+/// The table of docs/environments.md and of the paper: environment, parameter, unit, D, R, E.
 #[rustfmt::skip]
 #[allow(clippy::type_complexity)]
 const DOCUMENT: &[(&str, &str, &str, f64, (f64, f64), [(f64, f64); 2])] = &[
@@ -33,12 +33,13 @@ const DOCUMENT: &[(&str, &str, &str, f64, (f64, f64), [(f64, f64); 2])] = &[
     ("Hopper", "friction", "1", 0.8, (0.5, 1.1), [(0.2, 0.5), (1.1, 1.4)]),
 ];
 
-/// Trials drawn for each test of a distribution.
+/// The number of trials that are drawn for each test of a distribution.
 const DRAWS: u32 = 4000;
-/// Standard deviations beyond which a count is wrong: happens by chance once in 1.7 million comparisons, and the seed
-/// is fixed.
+/// The number of standard deviations beyond which a count fails. By chance this happens once in 1.7 million
+/// comparisons, and the seed is fixed.
 const SIGMAS: f64 = 5.0;
-/// Bound of √n times the Kolmogorov-Smirnov distance: exceeded by chance with probability 2 exp(-2 · 2.7²) = 9e-7.
+/// The bound of √n times the Kolmogorov-Smirnov distance. By chance it is exceeded with probability 2 exp(-2 · 2.7²) =
+/// 9e-7.
 const KOLMOGOROV_SMIRNOV: f64 = 2.7;
 
 fn all_parameters() -> Vec<(&'static str, &'static Parameter)> {
@@ -46,7 +47,7 @@ fn all_parameters() -> Vec<(&'static str, &'static Parameter)> {
     catalogue.specs().flat_map(|spec| spec.parameters.iter().map(|parameter| (spec.name, parameter))).collect()
 }
 
-/// The parameters of `DRAWS` trials, `[DRAWS, P]`, as the receipts of the episodes give them.
+/// Returns the parameters of `DRAWS` trials, `[DRAWS, P]`, from the receipts of the episodes.
 fn drawn(spec: &'static EnvironmentSpec, version: Version) -> Vec<Vec<f64>> {
     let mut episodes = common::episodes(spec, version, 2026, 3, 1);
     let draw = |_| {
@@ -60,7 +61,8 @@ fn column(rows: &[Vec<f64>], parameter: usize) -> Vec<f64> {
     rows.iter().map(|row| row[parameter]).collect()
 }
 
-/// √n times the greatest distance between the values' empirical distribution and the uniform one on `interval`.
+/// Returns √n times the largest distance between the empirical distribution of the values and the uniform one on
+/// `interval`.
 fn distance_from_uniform(mut values: Vec<f64>, interval: Interval) -> f64 {
     values.sort_by(f64::total_cmp);
     let n = values.len() as f64;
@@ -91,7 +93,7 @@ fn defaults_lie_in_r_and_r_lies_between_the_halves_of_e() {
         assert!(p.bounds.low <= p.extreme[0].low && p.extreme[1].high <= p.bounds.high, "{place}");
         assert_eq!((p.extreme[0].high, p.extreme[1].low), (p.random.low, p.random.high), "{place}");
         assert!(p.extreme[0].low < p.extreme[0].high && p.extreme[1].low < p.extreme[1].high, "{place}");
-        // `distribution` says that these unions are valid.
+        // `distribution` panics if a union is invalid.
         for version in [Version::D, Version::R, Version::E] {
             p.distribution(version);
         }
@@ -157,7 +159,7 @@ fn parameters_are_drawn_independently() {
         };
         for i in 0..spec.parameters.len() {
             for j in 0..i {
-                // The mean of the product has standard deviation 1 / (12 √n) if the two are independent.
+                // If the two are independent, the mean of the product has standard deviation 1 / (12 √n).
                 let mean = scaled(i).zip(scaled(j)).map(|(a, b)| a * b).sum::<f64>() / f64::from(DRAWS);
                 let sigmas = mean * 12.0 * f64::from(DRAWS).sqrt();
                 assert!(sigmas.abs() < SIGMAS, "{}: parameters {i} and {j}: {sigmas} σ", spec.name);
@@ -294,7 +296,7 @@ fn overrides_that_are_wrong_change_nothing() {
             let beyond = [Interval::new(low.next_down(), high), Interval::new(low, high.next_up())];
             for interval in beyond {
                 let mut distributions = base.clone();
-                // A right one stands before the wrong one.
+                // A valid distribution comes before the invalid one.
                 let right = (spec.parameters[0].name, Distribution::fixed(spec.parameters[0].default));
                 let wrong = (parameter.name, Distribution::union(&[interval]).unwrap());
                 let refused = resolve(spec, &mut distributions, [right, wrong]).unwrap_err();
@@ -316,7 +318,7 @@ fn overrides_that_are_wrong_change_nothing() {
     }
 }
 
-/// One to five ascending intervals, some touching, of very different lengths.
+/// Generates one to five ascending intervals, some touching, of very different lengths.
 fn unions() -> impl Strategy<Value = Vec<Interval>> {
     let part = (prop_oneof![Just(0.0), 1e-9..1e-3, 0.0..1e5], prop_oneof![1e-12..1e-6, 0.001..1.0, 1.0..1e5]);
     (-1e5..1e5, prop::collection::vec(part, 1..6)).prop_map(|(mut at, parts)| {
@@ -330,7 +332,7 @@ fn unions() -> impl Strategy<Value = Vec<Interval>> {
     })
 }
 
-/// Fractions with the extremes: the streams give multiples of 2⁻⁵³ below 1.
+/// Generates fractions, including the smallest and the largest: the streams give multiples of 2⁻⁵³ below 1.
 fn fractions() -> impl Strategy<Value = f64> {
     prop_oneof![8 => 0.0..1.0, 1 => Just(0.0), 1 => Just(1.0_f64.next_down())]
 }

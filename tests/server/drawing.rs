@@ -1,4 +1,4 @@
-//! The renderer in process: its queue, what is given up, what is absurd, what fails.
+//! The renderer without a server: its queue, abandoned requests, absurd scenes, failures.
 
 use futures_util::future::join_all;
 use perturb::{
@@ -6,11 +6,11 @@ use perturb::{
     scene::{Drawing, Graph, Scene, Shape, colour},
 };
 
-/// More requests than wait for the thread.
+/// A number of requests larger than the renderer's queue.
 const MANY: usize = 200;
 const SIZE: Size = Size { width: 24, height: 16 };
 
-/// A disc at this place.
+/// Returns a drawing of a disc at `x`.
 fn disc(x: f64) -> Scene {
     let mut drawing = Drawing::new([-3.0, -1.0], [3.0, 1.0]);
     drawing.disc([x, 0.0], 0.5, colour::BLUE);
@@ -107,10 +107,10 @@ fn a_failed_drawing_fails_alone() {
         run(renderer.draw(Scene::Model(PosedModel { look, edited: None, qpos: qpos.to_vec() }), SIZE))
     };
     let expected = draw(look, &qpos).unwrap();
-    // A defect: positions of another robot.
+    // Positions of another robot, which only a defect could cause.
     assert_eq!(draw(look, &qpos[1..]), Err(Error::Defect));
     assert_eq!(draw(look, &qpos), Ok(expected.clone()));
-    // A model that cannot be compiled makes the thread start afresh, which leaves no trace either.
+    // After a model that cannot be compiled, the thread starts again from scratch, which must not be visible either.
     for (mjcf, words) in [("<mujoco/>", "no end"), ("<mujoco></mujoco>", "torso")] {
         let bad: &'static Look = Box::leak(Box::new(Look { mjcf, ..*look }));
         let Err(Error::Failed { environment: "Hopper", reason }) = draw(bad, &qpos) else { panic!("it was drawn") };

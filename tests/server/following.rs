@@ -1,4 +1,4 @@
-//! A step that is asked for before the one under way has ended follows that at once, and changes no byte.
+//! A pipelined step starts as soon as the running step ends, and changes no byte.
 
 use crate::{
     common::{
@@ -21,7 +21,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Too many for a session to step them itself.
+/// A batch size for which steps do not run on the session's own thread.
 const N: usize = 2000;
 
 fn acrobots(autoreset: Autoreset) -> BatchSettings {
@@ -42,7 +42,8 @@ async fn poll_once<F: Future>(mut future: Pin<&mut F>) -> Poll<F::Output> {
     poll_fn(|context| Poll::Ready(future.as_mut().poll(context))).await
 }
 
-/// Has a step begin and this one follow it; what came of the first, and whether it was under way before.
+/// Starts a step and queues a second one behind it. Returns the result of the first, and whether it was still running
+/// when the second was queued.
 async fn followed(batch: &mut Batch, first: &[u8], second: Bytes) -> (Result<StepResult, Error>, bool) {
     let queue = batch.step_queue().unwrap();
     let mut stepping = pin!(batch.step(first));
@@ -55,7 +56,7 @@ async fn followed(batch: &mut Batch, first: &[u8], second: Bytes) -> (Result<Ste
     }
 }
 
-/// Waits for what the workers do in their own time.
+/// Waits until a condition holds that the workers make true.
 async fn wait_until(condition: impl Fn() -> bool) {
     let deadline = Instant::now() + Duration::from_secs(30);
     while !condition() {
@@ -78,7 +79,7 @@ async fn pipelined_step_runs_early_and_gives_the_same_bytes() {
         let (stepped, was_under_way) = self::followed(&mut batch, &first, second.clone()).await;
         let stepped = stepped.unwrap();
         if was_under_way {
-            // Unless it had ended before the other was offered.
+            // Not if the first step had ended before the second was queued.
             let start = Instant::now();
             while batch.steps() < before + 2 * N as u64 && start.elapsed() < Duration::from_millis(200) {
                 tokio::time::sleep(Duration::from_millis(1)).await;
@@ -112,7 +113,7 @@ async fn a_batch_with_a_step_that_follows_settles_and_can_be_dropped() {
         let next = actions(spec, 100 + t);
         assert!(batch.step(&next).await.unwrap() == twin.step(&next).await.unwrap(), "step {t}");
     }
-    // Whoever does not ask for the step that followed finds it done.
+    // If the session does not request the queued step, it is finished before the next request.
     let before = batch.steps();
     followed(&mut batch, &first, first.clone()).await.0.unwrap();
     let saved = batch.snapshot((0..N).collect()).await.unwrap();
@@ -137,7 +138,7 @@ async fn failing_pipelined_step_loses_its_batch_and_no_worker() {
     for t in 0..10 {
         let (mut balls, ..) = Batch::open(&pool, settings(&ball::SPEC, Autoreset::SameStep)).await.unwrap();
         let (good, fatal) = (forces(0.5), forces(ball::FATAL));
-        let _ = followed(&mut balls, &good, fatal.clone()).await; // the failure may come first
+        let _ = followed(&mut balls, &good, fatal.clone()).await; // the first step may already fail
         assert_eq!(balls.step(&fatal).await, Err(Error::Defect));
         assert_eq!(balls.step(&good).await, Err(Error::Defect));
         assert_eq!(balls.snapshot(vec![0]).await, Err(Error::Defect));
@@ -157,7 +158,8 @@ async fn no_step_is_pipelined_that_needs_the_last_result() {
     assert!(batch.step_queue().is_none());
 }
 
-/// The responses to all of these requests, each sent after the response to the one before, or all at once.
+/// Returns the responses to these requests. They are sent one at a time, after the response to the previous one, or all
+/// at once.
 async fn responses(server: &Server, open: Open, requests: &[Request], at_once: bool) -> Vec<SessionResponse> {
     let (mut session, _) = Session::open(server.unix(), open).await;
     let mut responses = Vec::new();

@@ -1,4 +1,4 @@
-//! Groups of slots with settings of their own, and environments that are released.
+//! Groups of slots with settings of their own, and the release of environments.
 
 use crate::common::server::{Actor, Server, Session, floats, open, parameters, refusal, until};
 use bytes::Bytes;
@@ -8,7 +8,7 @@ use prost::Message;
 use rstest::rstest;
 use tonic::Code;
 
-/// Groups that differ in everything.
+/// Returns groups that differ in all settings.
 fn groups() -> Vec<SlotGroup> {
     let group = |size, version: Version, seed, first_environment_index, episodes_per_trial| SlotGroup {
         size,
@@ -31,7 +31,7 @@ fn with(groups: Vec<SlotGroup>) -> Open {
     Open { environment, autoreset_mode, receipts: true, reward_terms: true, groups, ..Open::default() }
 }
 
-/// The part of a batch's reply that is about these slots, numbered from 0.
+/// Returns the part of a batch's reply for `size` slots from `first` on, renumbered from 0.
 fn part(stepped: &Stepped, first: u32, size: u32) -> Stepped {
     let n = stepped.rewards.len() as u32 / 4;
     let rows = |bytes: &Bytes| {
@@ -107,7 +107,7 @@ async fn parameters_of_r_and_e_replace_those_of_both() {
     for started in [at_open.started, at_reset.started] {
         let requested: Vec<Vec<f64>> = started.into_iter().map(|start| start.receipt.unwrap().requested).collect();
         assert!(requested.iter().all(|values| values[1] == 0.3));
-        // R's force is within 5 … 15, E's is not.
+        // Version R's force is within 5 … 15, version E's is not.
         let of_r = requested.iter().filter(|values| (5.0..15.0).contains(&values[0])).count();
         assert!((15..45).contains(&of_r), "{of_r} of 60");
         let mass_of_r = |values: &&Vec<f64>| (0.05..0.5).contains(&values[2]) == (5.0..15.0).contains(&values[0]);
@@ -160,7 +160,7 @@ async fn release_leaves_the_other_environments_as_they_are(#[values("1", "3")] w
     let (mut twin, _) = Session::open(server.unix(), asked).await;
     let actor = Actor::new(opened.environment.as_ref().unwrap(), N);
     let mut stays: Vec<usize> = (0..N).collect();
-    // The actions and replies of those that stay, of what all got.
+    // Extracts the bytes of the environments that stay from the bytes of all environments.
     let of = |stays: &[usize], bytes: &Bytes| -> Bytes {
         let each = bytes.len() / N;
         stays.iter().flat_map(|slot| bytes[slot * each..][..each].to_vec()).collect()

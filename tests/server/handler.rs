@@ -1,4 +1,4 @@
-//! The embedded server: the handler of a session without gRPC, a request in, a reply out.
+//! The embedded server: the session handler without gRPC, called with requests.
 
 use crate::{
     acting::game::PLAIN,
@@ -28,13 +28,13 @@ async fn embedded_server_gives_the_responses_of_a_server() {
     let mut session = Session::connect(server.unix()).await;
     let mut own = EmbeddedServer::start(tasks::catalogue()).unwrap().session();
     let requests: [Request; 8] = [
-        step(vec![0; 4]), // before open, which is refused
+        step(vec![0; 4]), // refused, because it comes before open
         open("CartPole", 8, 7).into(),
         step(vec![0; 32]),
         Render { slot: 3, width: 32, height: 32 }.into(),
         Snapshot { mask: vec![1, 0, 0, 0, 0, 0, 0, 1].into() }.into(),
         Reset { seeds: vec![5; 8], ..Reset::default() }.into(),
-        Reset { seeds: vec![5; 2000], ..Reset::default() }.into(), // more than are counted
+        Reset { seeds: vec![5; 2000], ..Reset::default() }.into(), // more entries than are allowed
         step(vec![0; 3]),                                          // of a wrong length
     ];
     for request in requests {

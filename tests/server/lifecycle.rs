@@ -1,4 +1,4 @@
-//! How the server begins and ends: configuration, addresses, health, reflection, signals, draining.
+//! Start and end of the server: configuration, addresses, health, reflection, signals, draining.
 
 use crate::common::server::{self, Actor, Server, Session, client, command, environment, open, until, within};
 use insta::assert_snapshot;
@@ -27,7 +27,7 @@ async fn health(address: &str, service: &str) -> Result<ServingStatus, Status> {
     Ok(reply.into_inner().status())
 }
 
-/// Runs a server that is expected to end by itself.
+/// Runs a server that must end by itself.
 pub fn finished(command: &mut std::process::Command) -> Output {
     let mut child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let start = Instant::now();
@@ -41,7 +41,7 @@ pub fn finished(command: &mut std::process::Command) -> Output {
     child.wait_with_output().unwrap()
 }
 
-/// Runs a server that is expected to refuse; what it said.
+/// Runs a server that must refuse its settings. Returns its message.
 fn refused(mut command: std::process::Command) -> String {
     let Output { status, stdout, stderr } = finished(&mut command);
     let stderr = String::from_utf8(stderr).unwrap();
@@ -57,7 +57,7 @@ fn file(directory: &Path, text: &str) -> std::path::PathBuf {
     path
 }
 
-/// The most environments that one session may open.
+/// Returns the maximum number of environments of a session.
 async fn max_envs(server: &Server) -> u32 {
     let mut client = server::client(server.tcp()).await;
     let reply = within(client.list_environments(perturb::proto::ListEnvironmentsRequest {})).await.unwrap();
@@ -108,7 +108,7 @@ async fn signal_lets_running_sessions_go_on_and_refuses_new_ones(#[values("TERM"
 async fn grace_period_ends_sessions_with_unavailable() {
     let mut server = Server::start(&["--grace-seconds", "1"]);
     let (mut silent, _) = Session::open(server.tcp(), open("CartPole", 4, 1)).await;
-    // This one always has requests on their way.
+    // This session always has requests in flight.
     let (mut busy, opened) = Session::open(server.unix(), open("Acrobot", 200, 1)).await;
     let sender = busy.sender();
     busy.close();
@@ -137,7 +137,7 @@ async fn grace_period_ends_sessions_with_unavailable() {
 
 #[tokio::test]
 async fn server_without_sessions_ends_at_once() {
-    // Connections without a session do not keep it.
+    // Connections without sessions do not delay the end.
     let mut server = Server::start(&["--grace-seconds", "100000"]);
     let _idle = server::client(server.tcp()).await;
     let mut half = TcpStream::connect(server.port()).unwrap();
@@ -278,7 +278,7 @@ async fn a_stale_socket_is_replaced_a_live_one_and_a_file_are_not() {
     let message = String::from_utf8(second.stderr).unwrap();
     assert!(message.contains("cannot listen at") && message.contains("another program does"), "{message}");
     assert_eq!(health(&address, SERVICE).await.unwrap(), ServingStatus::Serving, "the first is still there");
-    drop(server); // killed: its socket stays
+    drop(server); // kills it, so that the socket's file stays
     assert!(UnixStream::connect(&socket).is_err() && socket.exists());
     let server = Server::spawn(listen(), tempfile::tempdir().unwrap(), 1);
     assert_eq!(health(&address, SERVICE).await.unwrap(), ServingStatus::Serving);
@@ -330,7 +330,7 @@ async fn the_transport_comes_before_physics() {
     let server = Server::start(&["--workers", "2"]);
     let niceness = |task: &Path| {
         let stat = std::fs::read_to_string(task.join("stat")).unwrap();
-        // After the name in brackets: the state and fifteen numbers stand before it.
+        // The part after the name in parentheses: the field follows the state and fifteen numbers.
         let rest = stat.rsplit_once(") ").unwrap().1.to_owned();
         rest.split(' ').nth(16).unwrap().parse::<i32>().unwrap()
     };
@@ -407,7 +407,7 @@ fn a_bad_file_is_refused_before_any_port_is_bound() {
     ];
     let said = wrong.map(|text| {
         let mut command = command();
-        // Messages name the file as seen from here.
+        // The server runs in the folder of the file, because messages name the file relative to it.
         command.arg("--config").arg(file(directory.path(), text)).current_dir(directory.path());
         format!("{text}\n{}\n", refused(command))
     });
@@ -445,7 +445,7 @@ async fn a_flag_beats_a_variable_and_a_variable_beats_the_file(
     let [in_file, variable, flag] = given;
     let directory = tempfile::tempdir().unwrap();
     let mut command = command();
-    // The address comes from the file or from a variable, too.
+    // The address may also come from the file or from a variable.
     if let Some(n) = in_file {
         let text = format!("max_envs = {n}\nlisten = [\"tcp://127.0.0.1:0\", \"tcp://[::1]:0\"]\n");
         command.env("PERTURB_SERVER_CONFIG", file(directory.path(), &text));
@@ -479,7 +479,7 @@ async fn health_knows_the_service_and_no_other() {
     }
 }
 
-/// Asks a version of reflection for its services and for the file of one of its symbols.
+/// Requests the services, and the file of one symbol, from a version of the reflection service.
 macro_rules! reflect {
     ($version:ident, $address:expr) => {{
         use tonic_reflection::pb::$version::{
@@ -561,7 +561,7 @@ async fn requests_are_counted_by_kind_and_told_at_the_end() {
 #[tokio::test]
 async fn a_session_that_ended_in_order_has_freed_its_places(#[case] envs: u32) {
     const OPENS: u64 = 1_000;
-    // Full with one session: each open needs all places of the one before.
+    // One session fills the server, so each `open` needs all the room of the previous session.
     let server = Server::start(&["--max-envs", &envs.to_string(), "--max-sessions", "1"]);
     let mut connection = client(server.tcp()).await;
     for seed in 0..OPENS {

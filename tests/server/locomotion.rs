@@ -15,7 +15,7 @@ fn stream(index: u64) -> Stream {
     Stream::new(7, 0, Purpose::InitialState, index)
 }
 
-/// A copy of the model that runs.
+/// Returns a copy of the simulated model.
 fn model(walker: &Walker) -> Model {
     walker.inspect(|simulation| simulation.model().try_clone()).unwrap().unwrap()
 }
@@ -27,7 +27,7 @@ fn n_actions(walker: &Walker) -> usize {
     }
 }
 
-/// The eight corners of the E sets: (power, density, friction).
+/// Returns the eight corners of version E's outer bounds: (power, density, friction).
 fn corners(walker: &Walker) -> Vec<[f64; 3]> {
     let ends = |i: usize| {
         let [low, high] = walker.spec().parameters[i].extreme;
@@ -66,7 +66,7 @@ impl Actions {
     }
 }
 
-/// Everything that a step shows, as bits.
+/// All outputs of a step, as bits.
 #[derive(Debug, PartialEq, Clone)]
 struct Seen {
     observation: Vec<u32>,
@@ -108,7 +108,7 @@ fn rollout(walker: &mut Walker, actions: &mut Stream, n_steps: usize) -> Vec<See
 
 #[test]
 fn masses_are_those_of_the_geoms() {
-    // The document gives four digits.
+    // The documentation gives four digits.
     let close = |a: f64, b: f64| assert!((a - b).abs() < 5e-4 * b, "{a} is not {b}");
     let torso_mass = |walker: &Walker| {
         let mut applied = [0.0; 4];
@@ -133,7 +133,7 @@ fn an_edit_equals_compiling_the_edited_text() {
     for make in ROBOTS {
         let mut walker = make();
         for corner @ [power, density, friction] in corners(&walker) {
-            // An edit before, to see that nothing accumulates.
+            // An earlier edit, to check that edits do not accumulate.
             walker.set_parameters(&[1.0, 1234.0, 0.3]);
             walker.set_parameters(&corner);
             let mut xml = walker.mjcf().replacen(r#"friction="0.8 "#, &format!(r#"friction="{friction} "#), 1);
@@ -150,8 +150,9 @@ fn an_edit_equals_compiling_the_edited_text() {
             for (a, b) in edited.iter().zip(&compiled) {
                 assert_eq!((a.name, a.values.len()), (b.name, b.values.len()));
                 for (x, y) in a.values.iter().zip(&b.values) {
-                    // Scaling a mass and integrating it from a density round differently, and the derived arrays
-                    // amplify that: 4e-13 is the bound of the definition. Below 1e-6 the numbers are rounding errors.
+                    // The model scales masses, while the reference integrates them from a density. The rounding errors
+                    // differ, and derived arrays amplify them: 4e-13 is the documented bound. Numbers below 1e-6 are
+                    // rounding errors themselves.
                     let error = (x - y).abs() / x.abs().max(y.abs()).max(1e-6);
                     assert!(error <= 4e-13, "{} at {corner:?}: {x} and {y}", a.name);
                 }
@@ -163,8 +164,8 @@ fn an_edit_equals_compiling_the_edited_text() {
     }
 }
 
-/// The friction that a sliding robot really feels: lost forward momentum over the floor's push. Holds in any pose as
-/// long as every contact slides.
+/// Measures the friction of a sliding robot: its lost forward momentum, divided by the floor's push. This is valid in
+/// any pose in which all contacts slide.
 fn felt_friction(walker: &mut Walker, friction: f64) -> f64 {
     let [power, density, _] = defaults(walker);
     walker.set_parameters(&[power, density, friction]);
@@ -199,7 +200,7 @@ fn friction_decides_how_fast_a_sliding_robot_slows_down() {
         let mut walker = make();
         for friction in [0.2, 0.8, 1.4] {
             let felt = felt_friction(&mut walker, friction);
-            // MuJoCo's friction is soft: it gives way a little.
+            // Tolerance for MuJoCo's soft friction, which gives way a little.
             assert!((felt - friction).abs() < 0.1 * friction, "{} {friction}: {felt}", walker.spec().name);
         }
     }
@@ -223,7 +224,7 @@ fn density_and_power_change_what_happens() {
     }
 }
 
-/// Poses and contacts of a saved state, computed anew.
+/// Recomputes the poses and contacts of a saved state.
 fn recomputed(walker: &Walker, save: &[f64]) -> Simulation {
     let mut simulation = Simulation::new(model(walker)).unwrap();
     let (n_q, n_v) = (simulation.model().n_q(), simulation.model().n_v());
@@ -233,13 +234,13 @@ fn recomputed(walker: &Walker, save: &[f64]) -> Simulation {
     simulation
 }
 
-/// The place of the robot's parts, in the mean.
+/// Returns the mean x coordinate of the robot's bodies, m.
 fn place(simulation: &Simulation) -> f64 {
     let n_body = simulation.model().n_body();
     (1..n_body).map(|body| simulation.xipos(body)[0]).sum::<f64>() / (n_body - 1) as f64
 }
 
-/// Which of these geoms touch anything, as 0 and 1.
+/// Returns for each geom 1 if it touches anything, otherwise 0.
 fn touching(simulation: &Simulation, geoms: &[&str]) -> Vec<f32> {
     let touches = |name: &&str| {
         let geom = simulation.model().id(Kind::Geom, name).unwrap();
@@ -248,14 +249,14 @@ fn touching(simulation: &Simulation, geoms: &[&str]) -> Vec<f32> {
     geoms.iter().map(|name| f32::from(u8::from(touches(name)))).collect()
 }
 
-/// What the task's definition makes of the states before and after a step.
+/// Observation and reward terms according to the task's definition, from the states before and after a step.
 #[derive(Debug)]
 struct Defined {
-    /// Without the contact flags, not clamped.
+    /// The observation without the contact flags, before clamping.
     observation: Vec<f64>,
     height: f64,
     pitch: f64,
-    /// All but the first, which depends on the flags.
+    /// The reward terms except for the first, which depends on the contact flags.
     terms: [f64; 4],
 }
 
@@ -293,7 +294,7 @@ fn observation_and_reward_follow_from_the_state(
     #[case] safe: fn(f64, &[f32]) -> bool,
 ) {
     let mut walker = make();
-    // Aslant, so that also the cheetah falls.
+    // Starts tilted, so that the cheetah falls, too.
     let mut start = vec![0.0; walker.spec().state.len()];
     (start[1], start[2]) = (0.3, 0.9);
     walker.reset_to(&start);
@@ -303,20 +304,20 @@ fn observation_and_reward_follow_from_the_state(
     let (mut draws, mut action, mut terms) = (stream(1), vec![0.0; n_actions(&walker)], [0.0; 5]);
     let (mut touched, mut fell) = (false, false);
     for _ in 0..300 {
-        // Beyond the motors' range, which costs as received.
+        // Actions exceed the motors' range. The control cost counts them unclamped.
         action.fill_with(|| draws.uniform(-2.0, 2.0) as f32);
         let transition = walker.step(Action::Continuous(&action), &mut terms);
         let after = recomputed(&walker, &saved(&walker));
         let (seen, defined) = (observation(&walker), Defined::of(&before, &after, initial_height, &action));
         for (x, y) in seen.iter().zip(&defined.observation) {
-            assert!((f64::from(*x) - y.clamp(-5.0, 5.0)).abs() < 1e-6, "{seen:?} {defined:?}"); // f32
+            assert!((f64::from(*x) - y.clamp(-5.0, 5.0)).abs() < 1e-6, "{seen:?} {defined:?}"); // the tolerance of rounding to f32
         }
         assert_eq!(seen[8 + 2 * action.len()..], previous_flags, "flags are one step late");
         let alive = safe(defined.height, &previous_flags) && defined.pitch.abs() < 1.0;
         assert_eq!(transition.terminated, !alive);
         assert_eq!(terms[0], if alive { 1.0 } else { -1.0 });
         for (x, y) in terms[1..].iter().zip(defined.terms) {
-            assert!((x - y).abs() < 1e-9 * y.abs().max(1.0), "{terms:?} {defined:?}"); // order of sums
+            assert!((x - y).abs() < 1e-9 * y.abs().max(1.0), "{terms:?} {defined:?}"); // the order of the sum may differ
         }
         previous_flags = touching(&after, flags);
         touched |= previous_flags.contains(&1.0);
@@ -326,7 +327,7 @@ fn observation_and_reward_follow_from_the_state(
     assert!(touched && fell, "{touched} {fell}");
 }
 
-/// A state in the air at `place`, leaning forward by `pitch` and moving on at `speed`.
+/// Returns a state in the air at x = `place`, leaning forward by `pitch` and moving at `speed`.
 fn thrown(walker: &Walker, place: f64, pitch: f64, speed: f64) -> Vec<f64> {
     let n = walker.spec().state.len();
     let mut state = vec![0.0; n];
@@ -353,7 +354,8 @@ fn robot_succeeds_that_was_20_m_ahead_in_any_step() {
     }
 }
 
-/// The reference asks after the reset, and so never about the step that ends an episode.
+/// The reference implementation judges after the reset, so it never judges the step that ends an episode. This
+/// environment does.
 #[test]
 fn robot_succeeds_that_falls_in_the_step_to_20_m() {
     for make in ROBOTS {
@@ -389,7 +391,7 @@ fn endure(make: Make, corner: [f64; 3], actions: Actions, n_steps: usize) {
     }
 }
 
-/// Twenty episodes in each corner.
+/// Plays twenty episodes in each corner.
 #[rstest]
 fn nothing_diverges_in_the_corners_of_the_extreme_sets(
     #[values(ROBOTS[0], ROBOTS[1])] make: Make,
@@ -410,7 +412,7 @@ fn a_snapshot_replays_to_the_same_bytes() {
             rollout(&mut walker, &mut actions, steps);
             let (state, seen) = (saved(&walker), observation(&walker));
             let expected = rollout(&mut walker, &mut actions.clone(), 200);
-            // Into a used walker and into a new one.
+            // Loads the state into a used walker and into a new one.
             for mut other in [walker, make()] {
                 other.load(&state).unwrap();
                 assert_eq!(observation(&other), seen);
@@ -455,9 +457,9 @@ fn a_reset_after_use_equals_a_fresh_one() {
             used.set_parameters(&parameters);
             assert_eq!(restart(&mut used), fresh);
         }
-        // Without new parameters, as within a trial.
+        // The same without new parameters, as within a trial.
         assert_eq!(restart(&mut used), fresh);
-        // After divergence.
+        // The same after a divergence.
         let n = used.spec().state.len();
         used.reset_to(&vec![1e20; n]);
         assert_eq!(restart(&mut used), fresh);
@@ -498,18 +500,18 @@ fn divergence_ends_the_episode_with_finite_numbers() {
             walker.load(&state).unwrap();
             assert_eq!(saved(walker), state);
         };
-        // During a step: a control beyond what MuJoCo accepts, 1e10.
+        // Divergence during a step: a control above MuJoCo's limit of 1e10.
         walker.set_parameters(&[1e11, 1000.0, 0.8]);
         walker.reset(&mut stream(0));
         let before = observation(&walker);
         check(&mut walker, &before);
         check(&mut walker, &before);
-        // At the reset.
+        // Divergence at the reset.
         let n = walker.spec().state.len();
         walker.reset_to(&vec![1e20; n]);
         let zeros = vec![0.0; walker.spec().observation.len()];
         check(&mut walker, &zeros);
-        // And it is over with the next reset.
+        // The next reset ends the divergence.
         walker.set_parameters(&[1.0, 1000.0, 0.8]);
         walker.reset(&mut stream(0));
         assert!(!walker.step(Action::Continuous(&action), &mut [0.0; 5]).diverged);

@@ -1,4 +1,4 @@
-//! The server's tests, one program, so that it is linked once.
+//! The tests of the server, in one program so that it is linked only once.
 #![allow(clippy::unwrap_used)]
 
 mod common;

@@ -1,4 +1,4 @@
-//! Sessions whose observations have the parameters at their end.
+//! Sessions whose observations contain the parameters at their end.
 
 use crate::common::server::{Actor, Server, Session, catalogue, floats, open, parameters};
 use bytes::Bytes;
@@ -8,14 +8,14 @@ use perturb::proto::{
 };
 use rstest::rstest;
 
-/// Beyond an episode of every task.
+/// A number of steps longer than an episode of any environment.
 const STEPS: u64 = 1010;
 
 fn observing(open: Open) -> Open {
     Open { observe_parameters: true, ..open }
 }
 
-/// What is observed of the physics that a receipt was read back from, by the catalogue's words.
+/// Returns the observed parameters for a receipt's applied values, computed as the catalogue describes.
 fn entries(environment: &Environment, receipt: &Receipt) -> Vec<f32> {
     let seen = environment.parameters.iter().zip(&environment.parameter_observations);
     let entry = seen.map(|(parameter, seen)| {
@@ -26,7 +26,7 @@ fn entries(environment: &Environment, receipt: &Receipt) -> Vec<f32> {
     entry.collect()
 }
 
-/// Rows of observations, cut after the environment's own entries.
+/// Splits each row of observations into the environment's own entries and the parameters.
 fn rows(environment: &Environment, observations: &Bytes) -> Vec<(Vec<f32>, Vec<f32>)> {
     let (own, seen) = (environment.observation.len(), environment.parameter_observations.len());
     let cut = |row: &[f32]| (row[..own].to_vec(), row[own..].to_vec());
@@ -37,7 +37,7 @@ fn own_rows(environment: &Environment, observations: &Bytes) -> Vec<Vec<f32>> {
     floats(observations).chunks_exact(environment.observation.len()).map(<[f32]>::to_vec).collect()
 }
 
-/// The parameters that episodes in progress are observed with, by slot.
+/// The parameters that the observations of running episodes must contain, by slot.
 struct Expected<'a> {
     environment: &'a Environment,
     running: Vec<Vec<f32>>,
@@ -50,7 +50,8 @@ impl Expected<'_> {
         }
     }
 
-    /// Compares a step with that of a session without parameters; what else they tell is the same.
+    /// Checks the parameters in a step result, and that everything else equals the result of a session without
+    /// parameters.
     fn check(&mut self, plain: &Stepped, seen: &Stepped) {
         let environment = self.environment;
         self.begin(&seen.started);
@@ -140,7 +141,7 @@ async fn the_catalogue_says_how_each_parameter_is_observed() {
     }
 }
 
-/// At their bounds: what is observed reaches as far as the catalogue says, and is not clipped.
+/// Tests parameters at their bounds: observed values reach as far as the catalogue says, and are not clipped.
 #[rstest]
 #[case::least(|seen: &perturb::proto::Parameter| seen.low, |entry: &perturb::proto::Channel| entry.low)]
 #[case::greatest(|seen: &perturb::proto::Parameter| seen.high, |entry: &perturb::proto::Channel| entry.high)]
@@ -183,7 +184,7 @@ async fn a_reset_and_a_restore_bring_other_parameters(#[case] name: &str) {
     let row = rows(&environment, &reset.observations).remove(0);
     assert_eq!(row.1, entries(&environment, reset.started[0].receipt.as_ref().unwrap()));
     assert_eq!(row.1[0], 1.0);
-    // Back into another slot, and into sessions of either kind.
+    // Restores into another slot, and into sessions with and without observed parameters.
     let restore = |mask: &'static [u8]| Restore { mask: Bytes::from_static(mask), snapshots: saved.clone() };
     let restored = session.ask(restore(&[1, 0])).await.observations;
     assert_eq!(rows(&environment, &restored), [before[1].clone()]);
@@ -193,7 +194,7 @@ async fn a_reset_and_a_restore_bring_other_parameters(#[case] name: &str) {
     assert_eq!(own_rows(&environment, &plain.ask(restore(&[])).await.observations), [before[1].0.clone()]);
     let snapshots = plain.ask(Snapshot::default()).await.snapshots;
     assert_eq!(snapshots, saved, "a snapshot does not know who observes");
-    // What follows it has the same parameters, until the trial's end.
+    // Later episodes have the same parameters until the trial ends.
     let actions = Actor::new(&environment, 1).actions(0);
     let stepped = rows(&environment, &other.step(actions).await.observations);
     assert_eq!(stepped[0].1, before[1].1);

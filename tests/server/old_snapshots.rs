@@ -1,6 +1,5 @@
-//! Snapshots that earlier servers took can be restored, unless their environment has another revision now. Each is of
-//! seed
-//! 77 and index 0 in version R, after 20 steps, as the server of commit 886bf00 saved it.
+//! Snapshots of earlier servers can be restored, unless their environment has a new revision. Each was saved by the
+//! server of commit 886bf00, with seed 77 and index 0 in version R, after 20 steps.
 
 #[cfg(feature = "mujoco")]
 use crate::common::server::{Actor, environment};
@@ -12,7 +11,8 @@ use perturb::proto::{SessionResponse, session_response::Response};
 
 const SEED: u64 = 77;
 
-/// The first episode's end without what it achieved: an old snapshot of a robot does not say how far it had come.
+/// Removes from the first episode's end what the episode achieved, because an old snapshot of a robot does not contain
+/// the distance so far.
 #[cfg(feature = "mujoco")]
 fn forget(mut responses: Vec<SessionResponse>) -> Vec<SessionResponse> {
     let steps = responses.iter_mut().filter_map(|response| match &mut response.response {

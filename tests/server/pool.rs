@@ -1,4 +1,4 @@
-//! The pool: batches give the bytes of their environments, whoever steps them, and give back what they took.
+//! The pool: a batch gives the bytes of its environments, no matter which thread steps them, and frees what it used.
 
 use crate::common::{self, action_bytes, floats, observe, step};
 use bytes::Bytes;
@@ -31,7 +31,7 @@ fn batch_settings(spec: &'static EnvironmentSpec, size: usize, autoreset: Autore
     }
 }
 
-/// Random actions for slots whose environments have the indices from `first` on.
+/// Returns random actions for environments with indices from `first` on.
 fn actions(spec: &EnvironmentSpec, first: u32, size: usize, t: u64) -> Vec<u8> {
     (0..size as u64).flat_map(|slot| action_bytes(spec, u64::from(first) + slot, t)).collect()
 }
@@ -44,7 +44,7 @@ fn entry(slot: usize) -> ResetEntry {
     ResetEntry { slot, seed: None, distributions: None, state: None }
 }
 
-/// Starts of single environments as a batch reports them.
+/// Returns the starts of single environments as a batch reports them.
 fn starts(models: &[Episodes]) -> Vec<(u32, EpisodeStart)> {
     models.iter().enumerate().map(|(slot, e)| (slot as u32, e.started(true))).collect()
 }
@@ -55,7 +55,7 @@ fn observations(models: &[Episodes]) -> Vec<u8> {
     out
 }
 
-/// What a batch should do, written down with one environment after another.
+/// A reference for a batch: single environments, stepped one after the other.
 struct Model {
     models: Vec<Episodes>,
     autoreset: Autoreset,
@@ -157,7 +157,8 @@ async fn batch_gives_the_bytes_of_its_environments() {
     }
 }
 
-/// A CartPole batch of one, pushed to one side until it falls; the step at which it does and what it gave.
+/// Opens a CartPole batch of one and pushes it to one side until it falls. Returns the batch, and the result of the
+/// last step.
 async fn fall(pool: &Pool, mode: Autoreset) -> (Batch, StepResult) {
     let spec = common::catalogue().find("CartPole").unwrap();
     let (mut batch, _, _) = Batch::open(pool, batch_settings(spec, 1, mode)).await.unwrap();
@@ -190,13 +191,13 @@ async fn next_step_mode_resets_with_reward_0_and_no_flags() {
     assert!(!beyond_the_limit(&next.observations) && next.ended.is_empty() && next.final_observations.is_empty());
     assert_eq!(next.started[0].1.id.episode_index, 1);
 
-    // The ignored action left no trace: the same with the other one.
+    // The ignored action has no effect: another action gives the same.
     drop(batch);
     let (mut other, _) = fall(pool_with_room(&pool).await, Autoreset::NextStep).await;
     assert_eq!(other.step(&[1, 0, 0, 0]).await.unwrap(), next);
 }
 
-/// The pool once nothing is in use.
+/// Waits until no environment of the pool is in use.
 async fn pool_with_room(pool: &Pool) -> &Pool {
     wait_until(|| pool.environments() == 0).await;
     pool
@@ -236,7 +237,7 @@ async fn disabled_mode_refuses_steps_of_ended_environments() {
 async fn a_refused_step_names_the_slots_that_ended() {
     let spec = common::catalogue().find("CartPole").unwrap();
     let pool = Pool::new(4, 2000).unwrap();
-    // So many that there are several shards.
+    // Large enough for several shards.
     let size = 2000;
     let (mut batch, _, _) = Batch::open(&pool, batch_settings(spec, size, Autoreset::Disabled)).await.unwrap();
     let fallen = |angle| move |slot| ResetEntry { state: Some(vec![0.0, 0.0, angle, 0.0]), ..entry(slot) };
@@ -271,7 +272,7 @@ async fn what_was_not_asked_for_is_not_sent() {
     assert!(ended > 4);
 }
 
-/// Everything that can be seen of one environment in one step.
+/// All outputs of one environment in one step.
 #[derive(Debug, PartialEq)]
 struct Seen {
     observation: Vec<u8>,
@@ -282,7 +283,7 @@ struct Seen {
     start: Option<EpisodeStart>,
 }
 
-/// Cuts a batch's outcome into those of its environments.
+/// Splits a batch's result into those of its environments.
 fn cut(spec: &EnvironmentSpec, size: usize, stepped: &StepResult) -> Vec<Seen> {
     let row = |bytes: &Bytes, i: usize, n: usize| bytes[4 * n * i..][..4 * n].to_vec();
     let o = spec.observation.len();
@@ -303,7 +304,7 @@ fn cut(spec: &EnvironmentSpec, size: usize, stepped: &StepResult) -> Vec<Seen> {
 #[tokio::test]
 async fn bytes_do_not_depend_on_the_number_of_workers() {
     for spec in common::catalogue().specs() {
-        // Several shards, also for the cheapest environment.
+        // Large enough for several shards, even for the cheapest environment.
         let size = (100.0 / spec.step_cost).ceil() as usize;
         let mut runs: Vec<Vec<StepResult>> = Vec::new();
         for workers in [1, 2, 4] {
@@ -354,7 +355,7 @@ async fn bytes_do_not_depend_on_how_a_batch_is_split() {
     }
 }
 
-/// A waker that writes down when it is rung.
+/// A waker that records the order in which wakers are called.
 struct Bell {
     id: usize,
     rung: Arc<Mutex<Vec<usize>>>,
@@ -371,7 +372,7 @@ async fn small_batches_finish_before_a_large_one_that_came_first() {
     const ATTEMPTS: usize = 50;
     let spec = common::catalogue().find("Acrobot").unwrap();
     let size = 40_000; // over 200 shards
-    // Still too long for their sessions to wait awake, which would ring the bells before the end.
+    // Still too expensive to be polled for, which would call the wakers before the end.
     let small = 1000;
     let pool = Pool::new(1, size + 10 * small).unwrap();
     let mut batches = Vec::new();
@@ -379,8 +380,8 @@ async fn small_batches_finish_before_a_large_one_that_came_first() {
         batches.push(Batch::open(&pool, batch_settings(spec, size, Autoreset::SameStep)).await.unwrap().0);
     }
     let actions = vec![0; 4 * size];
-    // The workers ring the bells: the order does not depend on when this thread is awake. Only if it slept from the
-    // large batch's request until the small ones' does an attempt say nothing.
+    // The workers call the wakers, so the order does not depend on when this thread runs. An attempt is inconclusive
+    // only if this thread slept between the requests of the large batch and of the small ones.
     for _ in 0..ATTEMPTS {
         let rung = Arc::new(Mutex::new(Vec::new()));
         let mut steps: Vec<_> = Vec::new();
@@ -405,12 +406,12 @@ async fn small_batches_finish_before_a_large_one_that_came_first() {
     panic!("the large batch never let the small ones pass");
 }
 
-/// Polls the future once, which lets a request begin without waiting for its end.
+/// Polls the future once, which starts a request without waiting for its end.
 async fn poll_once<F: Future>(mut future: Pin<&mut F>) -> Poll<F::Output> {
     poll_fn(|context| Poll::Ready(future.as_mut().poll(context))).await
 }
 
-/// Waits for what the workers do in their own time.
+/// Waits until a condition holds that the workers make true.
 async fn wait_until(condition: impl Fn() -> bool) {
     let deadline = Instant::now() + Duration::from_secs(30);
     while !condition() {
@@ -430,7 +431,7 @@ async fn a_step_that_is_soon_done_waits_for_no_worker() {
         let (mut batch, ..) = open(name, size).await.unwrap();
         let (long, actions) = (vec![0; 4 * 40_000], vec![0; 4 * size]);
         let mut long = Box::pin(busy.step(&long));
-        let _ = poll_once(long.as_mut()).await; // the only worker has something to do for long
+        let _ = poll_once(long.as_mut()).await; // occupies the only worker for a long time
         let mut step = Box::pin(batch.step(&actions));
         assert_eq!(poll_once(step.as_mut()).await.is_ready(), is_tiny, "{size} of {name}");
     }
@@ -471,7 +472,7 @@ async fn workers_that_fell_asleep_are_woken_for_every_job() {
         Batch::open(&pool, batch_settings(common::catalogue().find(name).unwrap(), size, Autoreset::SameStep))
     };
     let work = async {
-        // Too long to be done without workers.
+        // Too expensive to run on the session's thread.
         let (mut small, ..) = open("Acrobot", 50).await.unwrap();
         let (mut other, ..) = open("Acrobot", 50).await.unwrap();
         let (mut large, ..) = open("Acrobot", 900).await.unwrap(); // several shards
@@ -511,7 +512,7 @@ async fn a_batch_dropped_in_mid_step_gives_its_environments_back() {
     let size = 20_000;
     let pool = Pool::new(2, size).unwrap();
     let mut in_mid_step = 0;
-    // Not every attempt: this thread may sleep for as long as the step takes.
+    // Not every attempt succeeds, because this thread may sleep for as long as the step takes.
     for _ in 0..50 {
         let (mut batch, ..) = Batch::open(&pool, batch_settings(spec, size, Autoreset::SameStep)).await.unwrap();
         let actions = vec![0; 4 * size];
@@ -523,7 +524,7 @@ async fn a_batch_dropped_in_mid_step_gives_its_environments_back() {
         }
     }
     assert!(in_mid_step > 0);
-    // Also when it is dropped while it opens.
+    // Also if the batch is dropped while it is being opened.
     {
         let open = pin!(Batch::open(&pool, batch_settings(spec, size, Autoreset::SameStep)));
         let _ = poll_once(open).await;
@@ -586,7 +587,7 @@ async fn reset_touches_only_the_selected_slots() {
         }
         let (first, started) = batch.reset(vec![entry(1), entry(3)]).await.unwrap();
         assert_eq!(first.len(), 2 * 4 * spec.observation.len());
-        // Trials have two episodes: the parameters stay for the second and change for the third.
+        // A trial has two episodes: the parameters stay for the second episode and change for the third.
         assert_eq!(ids(&started), [(1, 0, 1, 1), (3, 0, 1, 1)]);
         let opened = |slot: u32| {
             let settings = Settings {

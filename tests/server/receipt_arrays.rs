@@ -5,7 +5,7 @@ use bytes::Bytes;
 use perturb::proto::{AutoresetMode, EpisodeEnd, Open, Stepped, Version};
 use rstest::rstest;
 
-/// What arrays are to have of a step whose receipts came as messages.
+/// Returns the arrays that correspond to a step result with receipts as messages.
 fn arrays(told: &Stepped) -> (Bytes, Bytes) {
     let ended = told.ended.iter().map(|end| (end.slot, end.episode.unwrap(), end.receipt.as_ref().unwrap()));
     let started =

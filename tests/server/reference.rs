@@ -1,4 +1,4 @@
-//! The classic tasks compute what Gymnasium computes: trajectories that Gymnasium 1.4 ran in f64 under edited
+//! The classic control tasks agree with Gymnasium: recorded trajectories of Gymnasium 1.4 in f64 under edited
 //! parameters.
 
 use perturb::{
@@ -9,13 +9,14 @@ use serde_json::Value;
 
 const GOLDEN: &str = include_str!("data/classic_control.jsonl");
 
-/// A single step is a few dozen operations, each rounding by 1.1e-16 and amplified by at most a few hundred (by the
-/// short light poles of E): 1e-12 leaves room for another order of the same operations, and for no error of the model.
+/// The tolerance of a single step: a few dozen operations, each with a rounding error of 1.1e-16, amplified by at most
+/// a few hundred (by the short light poles of E). It allows another order of the same operations, but no error of the
+/// model.
 const SINGLE_STEP: f64 = 1e-12;
-/// Errors of single steps grow along a trajectory; over 50 steps less than a thousandfold.
+/// The tolerance of a trajectory: over 50 steps, errors of single steps grow less than a thousandfold.
 const TRAJECTORY: f64 = 1e-9;
 const TRAJECTORY_STEPS: usize = 50;
-/// Rounding to f32: half an ulp by each side, relative, or absolute below 1.
+/// The tolerance of rounding to f32: half an ulp on each side, relative, or absolute below 1.
 const OBSERVATION: f64 = 1.2e-7;
 
 /// One recorded trajectory.
@@ -24,7 +25,7 @@ struct Case {
     environment: String,
     parameters: Vec<f64>,
     actions: Vec<f64>,
-    /// One more than there are actions: the first is the initial state.
+    /// The initial state, and the state after each action.
     states: Vec<Vec<f64>>,
     observations: Vec<Vec<f64>>,
     rewards: Vec<f64>,
@@ -56,7 +57,8 @@ fn cases() -> Vec<Case> {
     GOLDEN.lines().enumerate().map(case).collect()
 }
 
-/// An environment that takes recorded actions. Pendulum's torques were f64, which the wire's f32 cannot carry.
+/// Replays recorded actions in an environment. Pendulum's recorded torques are f64, which the protocol's f32 cannot
+/// carry.
 enum Replay {
     Discrete(Box<dyn Environment>),
     Pendulum(Pendulum),
@@ -101,12 +103,12 @@ impl Replay {
     }
 }
 
-/// Relative deviation, absolute below 1.
+/// Returns the relative deviation, or the absolute one for numbers below 1.
 fn deviation(got: f64, expected: f64) -> f64 {
     (got - expected).abs() / expected.abs().max(1.0)
 }
 
-/// Keeps the largest deviation, and fails where one is not below the tolerance. NaN is not.
+/// Updates the largest deviation. Fails if a deviation is not below the tolerance, or is NaN.
 fn compare(largest: &mut f64, tolerance: f64, got: &[f64], expected: &[f64], place: &str) {
     assert_eq!(got.len(), expected.len(), "{place}");
     for (&got, &expected) in got.iter().zip(expected) {

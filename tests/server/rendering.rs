@@ -1,4 +1,4 @@
-//! Pictures, asked of a real server. Tests need OpenGL in software: Debian's libegl1 and libgl1-mesa-dri.
+//! Pictures from a real server. These tests need OpenGL in software: Debian's libegl1 and libgl1-mesa-dri.
 
 use crate::common::server::{self, Actor, Server, Session, catalogue, doubles, open, parameters, refusal};
 use bytes::Bytes;
@@ -26,7 +26,7 @@ fn start() -> Server {
     Server::start(&["--workers", "2"])
 }
 
-/// Version D, nothing resets by itself.
+/// Returns an `open` in version D without autoreset.
 fn plain(environment: &str, n: u32) -> Open {
     let (version, mode) = (Version::Default.into(), AutoresetMode::Disabled.into());
     Open { version, autoreset_mode: mode, ..open(environment, n, 3) }
@@ -36,21 +36,22 @@ async fn session(server: &Server, environment: &str, n: u32) -> Session {
     Session::open(server.unix(), plain(environment, n)).await.0
 }
 
-/// A picture of one environment at an exact state.
+/// Returns a picture of one environment in an exact state.
 async fn at(server: &Server, environment: &str, state: &[f64], size: (u32, u32)) -> Bytes {
     let mut session = session(server, environment, 1).await;
     session.ask(Reset { states: doubles(state), ..Reset::default() }).await;
     session.render(0, size).await
 }
 
-/// A robot's state: at this place, all else at its initial pose and at rest.
+/// Returns a robot's state at this x, at rest in its initial pose.
 fn robot_state(name: &str, x: f64) -> Vec<f64> {
     let mut state = vec![0.0; tasks::catalogue().find(name).unwrap().state.len()];
     state[0] = x;
     state
 }
 
-/// Where in the picture the colour is, right and up from its lower left corner, in 0 … 1, and in how many pixels.
+/// Finds the pixels for which `is` is true. Returns their centre, right and up from the lower left corner, 0 … 1, and
+/// their number.
 fn centre(pixels: &[u8], (width, height): (u32, u32), is: impl Fn([u8; 3]) -> bool) -> (f64, f64, usize) {
     let (mut x, mut y, mut n) = (0.0, 0.0, 0);
     for (i, &pixel) in pixels.as_chunks::<3>().0.iter().enumerate() {
@@ -75,7 +76,8 @@ fn vermillion([r, g, b]: [u8; 3]) -> bool {
     (r, g, b) == (213, 94, 0)
 }
 
-/// The robots alone have strong colours; floor and sky are pale, and the line at the goal is green.
+/// Whether a colour is strong. Only robots have strong colours: floor and sky are pale, and the line at the goal is
+/// green.
 fn strong([r, g, b]: [u8; 3]) -> bool {
     r.abs_diff(b) > 110 && g < r.max(b)
 }
@@ -107,7 +109,8 @@ async fn pictures_differ_exactly_as_states_do() {
         let (mut one, mut two) = (session(&server, name, 3).await, session(&other, name, 1).await);
         let pictures = [one.render(0, SMALL).await, one.render(1, SMALL).await, one.render(2, SMALL).await];
         assert!(pictures[0] != pictures[1] && pictures[1] != pictures[2], "{name}: other states, the same picture");
-        // Nothing may depend on the pictures before: not on the first one, nor on another camera's or a larger one.
+        // A picture must not depend on earlier pictures: not on the first, nor on one by another camera, nor on a
+        // larger one.
         assert_eq!(one.render(0, SMALL).await, pictures[0], "{name}: the first picture");
         let large = one.render(1, (500, 400)).await;
         assert_eq!(one.render(1, SMALL).await, pictures[1], "{name}: after a larger one");
@@ -157,14 +160,14 @@ async fn up_is_up_and_right_is_right() {
     assert!(left_x < 0.3 && right_x > 0.7, "{left_x} {right_x}");
     assert!(right_y > centre(&valley, SMALL, blue).1 + 0.2);
 
-    // Hanging, upright, and both links to the right: the angle is from hanging, anticlockwise.
+    // Hanging, upright, and both links to the right. The angle is measured from hanging, anticlockwise.
     for (angle, x, y) in [(0.0, 0.0, -1.0), (PI, 0.0, 1.0), (FRAC_PI_2, 1.0, 0.0)] {
         let pixels = at(&server, "Acrobot", &[angle, 0.0, 0.0, 0.0], SMALL).await;
         let (tip_x, tip_y, _) = centre(&pixels, SMALL, orange);
         let (is_x, is_y) = (tip_x - 0.5, tip_y - 0.5);
         assert!((is_x - 0.227 * x).abs() < 0.02 && (is_y - 0.227 * y).abs() < 0.02, "{angle}: {is_x} {is_y}");
     }
-    // The angle is from upright, anticlockwise.
+    // The angle is measured from upright, anticlockwise.
     for (angle, x, y) in [(0.0, 0.0, 1.0), (PI, 0.0, -1.0), (FRAC_PI_2, -1.0, 0.0)] {
         let pixels = at(&server, "Pendulum", &[angle, 0.0], SMALL).await;
         let (rod_x, rod_y, _) = centre(&pixels, SMALL, vermillion);
@@ -201,7 +204,7 @@ async fn lengths_can_be_seen() {
         }
         assert!(counts[1] > 1.6 * counts[0], "{name}: {counts:?}");
     }
-    // Absurd ones, too: all of the pole, a hundred times as long, is in view.
+    // Absurd lengths also work: a pole a hundred times as long is completely visible.
     let open = Open { parameters: parameters(&[("length", &[(100.0, 100.0)])]), ..plain("CartPole", 1) };
     let (mut session, _) = Session::open(server.unix(), open).await;
     let (_, y, _) = centre(&session.render(0, SMALL).await, SMALL, |[r, g, b]| r > g && g > b && b < 200);
@@ -230,7 +233,7 @@ async fn the_camera_follows_a_robot_wherever_it_runs() {
             let again = at(&server, name, &robot_state(name, 0.0), SMALL).await;
             assert!(again == start, "{name}: the place of the last picture shows in this one");
         }
-        // A hundred steps forward, with a run-up and whatever becomes of it.
+        // A hundred steps forward with a run-up.
         let (mut session, opened) =
             Session::open(server.unix(), Open { autoreset_mode: AutoresetMode::NextStep.into(), ..plain(name, 1) })
                 .await;
@@ -285,14 +288,14 @@ async fn sessions_draw_side_by_side() {
     }
 }
 
-/// Who waits is seen from the order of replies. If the server's thread or its only worker drew, at most one step would
-/// be taken for each picture. The pictures are received by another thread, as large as they are.
+/// The order of replies shows who waits. If the server's transport thread or its only worker drew the pictures, at most
+/// one step would be taken for each picture. Another thread receives the large pictures.
 #[tokio::test]
 async fn nobody_waits_for_anothers_pictures() {
     const PICTURES: usize = 6;
     let server = Server::start(&["--workers", "1"]);
     let cart_pole = server::environment(server.unix(), "CartPole").await;
-    // A robot takes long to draw; without MuJoCo a large picture must do.
+    // A robot takes long to draw. Without MuJoCo, a large picture is used instead.
     let (name, side) = robots().next().map_or(("CartPole", 2048), |robot| (robot, 1024));
     let mut stepping = Session::open(server.unix(), open("CartPole", 1, 1)).await.0;
     let address = server.unix().to_owned();
@@ -301,7 +304,7 @@ async fn nobody_waits_for_anothers_pictures() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(async {
             let mut drawing = Session::open(&address, plain(name, 1)).await.0;
-            drawing.render(0, (side, side)).await; // what the first one takes longer does not count
+            drawing.render(0, (side, side)).await; // excludes the setup time of the first picture
             ready.send(()).unwrap();
             for _ in 0..PICTURES {
                 drawing.send(Render { slot: 0, width: side, height: side }).await;
@@ -352,7 +355,7 @@ async fn bad_requests_are_refused_and_change_nothing() {
     assert_eq!(session.render(2, SMALL).await, before);
 }
 
-/// A server on a machine without OpenGL, whose lack the system's own switches bring about.
+/// Starts a server without OpenGL, which `switch` disables by settings of the operating system.
 fn server_without_gl(switch: impl FnOnce(&mut Command, &std::path::Path)) -> Server {
     let directory = tempfile::tempdir().unwrap();
     let mut command = server::command();
@@ -363,7 +366,7 @@ fn server_without_gl(switch: impl FnOnce(&mut Command, &std::path::Path)) -> Ser
 
 #[tokio::test]
 async fn without_opengl_the_server_runs_and_says_what_is_missing() {
-    // No driver; and a library that cannot be loaded.
+    // First without a driver, then with a library that cannot be loaded.
     let no_driver = server_without_gl(|command, _| {
         command.env("__EGL_VENDOR_LIBRARY_FILENAMES", "/nowhere.json");
     });

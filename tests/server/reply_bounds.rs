@@ -1,4 +1,4 @@
-//! Clients learn how long replies can be, before one is too long for their libraries.
+//! Clients learn the maximum length of replies before a reply is too long for their library.
 
 use crate::common::server::{Actor, Server, Session, catalogue, client, open, parameters};
 use bytes::Bytes;
@@ -10,7 +10,7 @@ use prost::Message;
 use rstest::rstest;
 use tonic::Code;
 
-/// Checks that `length` is at most `bound`, and that the bound is not a multiple of it.
+/// Asserts that `length` is at most `bound`, and that the bound is not many times larger.
 fn is_tight(what: &str, length: usize, bound: u64) {
     let length = length as u64;
     assert!(length <= bound, "{what}: {length} bytes are more than {bound}");
@@ -30,7 +30,7 @@ async fn the_longest_step_is_within_the_bound_and_near(
 ) {
     const N: u32 = 300;
     let server = Server::start(&[]);
-    // Nothing but a step limit ends these episodes, so all end in the same step.
+    // Only the step limit ends these episodes, so all end in the same step.
     let asked = Open {
         receipts,
         receipt_arrays,

@@ -1,4 +1,5 @@
-//! What follows a restored snapshot is what followed the snapshot, wherever it is restored; what is none does no harm.
+//! A restored environment continues exactly as after the snapshot, wherever it is restored. Invalid snapshots do no
+//! harm.
 
 use crate::common::{self, action_bytes, episodes, observe, play, start_line, step};
 use bytes::Bytes;
@@ -10,7 +11,7 @@ use proptest::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::{path::Path, process::Command};
 
-/// The layout of src/env/snapshot.rs, to make snapshots that no server would.
+/// The layout of snapshots, as in src/env/snapshot.rs, to make snapshots that no server would make.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Saved {
     format: u32,
@@ -48,7 +49,7 @@ fn encode(saved: &Saved) -> Vec<u8> {
     sealed(postcard::to_stdvec(saved).unwrap())
 }
 
-/// Bytes of the checksum at a snapshot's end.
+/// The length of the checksum at the end of a snapshot, bytes.
 const CHECKSUM: usize = 4;
 
 fn sealed(content: Vec<u8>) -> Vec<u8> {
@@ -56,7 +57,8 @@ fn sealed(content: Vec<u8>) -> Vec<u8> {
     [content, sum.to_vec()].concat()
 }
 
-/// An environment in the middle of its first trial's second episode, at most 4 steps in: some fall soon.
+/// Returns an environment in its first trial's second episode, after at most 4 steps, because some environments end
+/// soon.
 fn used(spec: &EnvironmentSpec) -> Episodes {
     let mut e = episodes(spec, Version::E, 31, 5, 3);
     step(&mut e, &action_bytes(spec, 1, 0));
@@ -72,7 +74,7 @@ fn used(spec: &EnvironmentSpec) -> Episodes {
     e
 }
 
-/// An environment with another past.
+/// Returns an environment with another history.
 fn other(spec: &EnvironmentSpec) -> Episodes {
     let mut e = episodes(spec, Version::R, 99, 1000, 1);
     play(&mut e, 2, 0, 77);
@@ -115,7 +117,7 @@ fn a_snapshot_in_mid_episode_continues_with_the_same_bytes() {
         let steps = u64::from(spec.step_limit) + 100;
         let expected = play(&mut e, 3, 0, steps);
         assert!(expected.iter().any(|line| line.starts_with("start")), "{}: later episodes are compared", spec.name);
-        // Into itself, one with another past, and a fresh one.
+        // Restores into the same environment, into one with another history, and into a new one.
         for mut target in [e, other(spec), episodes(spec, Version::D, 0, 0, 1)] {
             target.restore(&snapshot).unwrap();
             assert_eq!(target.snapshot(), snapshot, "{}", spec.name);
@@ -167,7 +169,7 @@ fn restored_ended_environment_stays_ended() {
             assert_eq!(target.finished(true), e.finished(true));
             e.begin(None);
             target.begin(None);
-            // After the second episode this is a new trial, with parameters drawn from the restored distributions.
+            // After the second episode comes a new trial, with parameters drawn from the restored distributions.
             assert_eq!(e.id().trial_index, episode_in_trial);
             assert_eq!(start_line(&target), start_line(&e));
             assert_eq!(play(&mut target, 4, 0, 300), play(&mut e, 4, 0, 300), "{}", spec.name);
@@ -211,7 +213,7 @@ const CHILD: &str = "PERTURB_TEST_SNAPSHOTS";
 #[test]
 fn a_snapshot_continues_in_another_process() {
     if let Some(directory) = std::env::var_os(CHILD) {
-        // This is the other process.
+        // This code runs in the other process.
         for spec in common::catalogue().specs() {
             let path = Path::new(&directory).join(spec.name);
             let mut e = episodes(spec, Version::D, 0, 0, 1);
@@ -294,7 +296,7 @@ fn contradictory_snapshots_are_refused() {
         ("a goal reached in the future", |s, _| s.progress.reached_at = s.progress.length + 1),
         ("more trials than episodes", |s, _| s.progress.trial = s.progress.episode + 1),
         ("counts at their end", |s, _| (s.progress.trial, s.progress.episode) = (u64::MAX, u64::MAX)),
-        // One fewer is what robots had before they kept their greatest distance.
+        // One number fewer is the old format, before robots stored their largest distance.
         ("two numbers too few in the state", |s, _| s.state.truncate(s.state.len() - 2)),
         ("a number too many in the state", |s, _| s.state.push(0.0)),
         ("a state that is no number", |s, _| s.state[0] = f64::NAN),
@@ -354,7 +356,7 @@ fn a_snapshot_with_something_behind_it_is_refused() {
     }
 }
 
-/// Restores what may be no snapshot: refused without a change, or taken without harm.
+/// Restores bytes that may be no valid snapshot. They are either refused without a change, or accepted without harm.
 fn try_restore(spec: &EnvironmentSpec, bytes: &[u8]) -> Result<(), TestCaseError> {
     let mut e = other(spec);
     let before = e.snapshot();
@@ -394,7 +396,7 @@ proptest! {
                 let index = index.index(snapshot.len());
                 snapshot[index] ^= 1 << bit;
             }
-            try_restore(spec, &sealed(snapshot))?; // somebody meant it
+            try_restore(spec, &sealed(snapshot))?; // with a valid checksum
         }
     }
 }
@@ -432,7 +434,7 @@ async fn run(batch: &mut Batch, steps: std::ops::Range<u64>) -> Vec<StepResult> 
 async fn a_batch_restored_into_another_goes_on_with_the_same_bytes() {
     for spec in common::catalogue().specs() {
         for mode in [Autoreset::NextStep, Autoreset::SameStep] {
-            // So many that there are several shards, cut differently by one and by four workers.
+            // Large enough for several shards, cut differently for one and for four workers.
             let size = (if spec.step_cost < 1.0 { 60.0 } else { 200.0 } / spec.step_cost).ceil() as usize;
             let (one, four) = (Pool::new(1, size).unwrap(), Pool::new(4, size).unwrap());
             let (mut batch, ..) = Batch::open(&one, batch_settings(spec, 1, size, mode)).await.unwrap();
@@ -464,7 +466,7 @@ async fn a_snapshot_goes_on_in_another_slot() {
         let observed = batch.restore(vec![(4, snapshot.clone()), (5, snapshot)]).await.unwrap();
         let width = 4 * spec.observation.len();
         assert_eq!(observed[..width], observed[width..]);
-        // The three slots get the same actions and give the same bytes, episodes and their names included.
+        // The three slots get the same actions, and give the same bytes, including episodes and their indices.
         for t in 0..u64::from(spec.step_limit + 5) {
             let action = action_bytes(spec, 1, t);
             let stepped = batch.step(&action.repeat(6)).await.unwrap();
@@ -490,7 +492,7 @@ async fn a_refused_restore_of_several_changes_nothing_in_any_shard() {
         run(&mut batch, 0..9).await;
         let before = batch.snapshot(all()).await.unwrap();
         assert!(before.iter().zip(&early).all(|(a, b)| a != b));
-        // One wrong one: first, in the middle, last. The others could be restored.
+        // One invalid snapshot, at the start, in the middle or at the end. The others are valid.
         for wrong in [0, size / 2, size - 1] {
             let mut entries: Vec<(usize, Bytes)> = early.iter().cloned().enumerate().collect();
             entries[wrong].1 = Bytes::from_static(b"garbage");
@@ -498,7 +500,7 @@ async fn a_refused_restore_of_several_changes_nothing_in_any_shard() {
             assert!(matches!(refused, Err(pool::Error::Environment(Error::Snapshot { .. }))), "{refused:?}");
             assert!(batch.snapshot(all()).await.unwrap() == before, "{}: slot {wrong} is wrong", spec.name);
         }
-        // And the batch goes on as if nothing had been asked.
+        // The batch continues as if nothing had been requested.
         let after = run(&mut batch, 9..30).await;
         batch.restore(before.into_iter().enumerate().collect()).await.unwrap();
         assert!(run(&mut batch, 9..30).await == after, "{}", spec.name);
@@ -529,7 +531,7 @@ async fn after_a_refused_restore_observations_are_those_of_before() {
         let early = batch.snapshot(vec![0]).await.unwrap().remove(0);
         let last = run(&mut batch, 0..4).await.pop().unwrap();
         batch.restore(vec![(0, early), (1, Bytes::new())]).await.unwrap_err();
-        // A step reports all observations; a reset of another slot shows that the first kept its own.
+        // A step reports all observations. A reset of another slot shows that the first slot kept its own.
         batch.reset(vec![ResetEntry { slot: 2, seed: None, distributions: None, state: None }]).await.unwrap();
         let now = batch.snapshot(vec![0]).await.unwrap().remove(0);
         let observed = batch.restore(vec![(0, now)]).await.unwrap();

@@ -1,4 +1,4 @@
-//! Robots take turns in one simulation of their thread. Nobody can tell.
+//! Robots share one simulation for each thread, which must not be visible.
 
 use perturb::{
     env::{Action, ActionSpace, Environment, Purpose, Stream},
@@ -18,11 +18,11 @@ fn n_actions(walker: &Walker) -> usize {
     }
 }
 
-/// A robot whose life follows from a number.
+/// A robot with a random history, which is a function of a number.
 struct Life {
     walker: Walker,
     stream: Stream,
-    /// All that was seen of it, as bits.
+    /// All outputs of the robot so far, as bits.
     seen: Vec<u64>,
     diverged: usize,
 }
@@ -39,7 +39,7 @@ impl Life {
         state
     }
 
-    /// Seldom something else, else a few steps.
+    /// Takes a few steps, sometimes after a reset, a change of parameters or a restore.
     fn go_on(&mut self) {
         match self.stream.uniform(0.0, 20.0) as u32 {
             0 => {
@@ -54,7 +54,7 @@ impl Life {
                 assert_eq!(self.saved(), state);
             }
             3 => {
-                // Diverges at once, or in the steps to come.
+                // The state diverges at once or in the next steps.
                 let size = [1e20, 1e7][(self.stream.next_u64() % 2) as usize];
                 let state: Vec<f64> =
                     self.walker.spec().state.iter().map(|_| self.stream.uniform(-size, size)).collect();
@@ -90,7 +90,7 @@ fn robots_that_take_turns_live_as_each_does_alone(
     const LIVES: u64 = 7;
     const TURNS: usize = 400;
     let alone = |number| {
-        // On a thread of its own, so with a simulation of its own.
+        // Runs on a thread of its own, and so with a simulation of its own.
         let live = move || {
             let mut life = Life::new(make, number);
             (0..TURNS).for_each(|_| life.go_on());
@@ -102,7 +102,7 @@ fn robots_that_take_turns_live_as_each_does_alone(
     let mut order = Stream::new(2, 0, Purpose::InitialState, threads as u64);
     let mut turns = [0; LIVES as usize];
     while turns.iter().any(|&turns| turns < TURNS) {
-        // Each thread gets some of those whose turn it is, and no life always the same thread.
+        // Each thread gets some of the robots that continue now, and a robot changes between threads.
         let mut hands: Vec<Vec<&mut Life>> = (0..threads).map(|_| Vec::new()).collect();
         for (life, turns) in lives.iter_mut().zip(&mut turns) {
             if *turns < TURNS && order.unit() < 0.6 {
@@ -164,7 +164,8 @@ fn physics_is_mujocos_with_a_model_and_data_of_ones_own(#[values(ROBOTS[0], ROBO
     }
 }
 
-/// Set in the process that measures: one of its own, so that no other test's memory counts.
+/// The environment variable that marks the process that measures memory. It is a separate process, so that no other
+/// test's memory counts.
 const MEASURING: &str = "PERTURB_TEST_MEMORY";
 
 fn resident_kb() -> f64 {
@@ -189,7 +190,7 @@ fn a_hopper_takes_at_most_4_kb() {
     }
     const N: u32 = 20_000;
     let hopper = |index| {
-        // Its parameters are its own, and it has fallen.
+        // The robot has parameters of its own, and it has fallen.
         let mut episodes = common::episodes(&hopper::SPEC, Version::R, 1, index, 1);
         (0..20).for_each(|_| {
             episodes.step(Action::Continuous(&[1.0; 3]), &mut [0.0; 5]);

@@ -1,4 +1,4 @@
-//! The random streams are NumPy's Philox, number for number, so that another language can repeat them.
+//! The random streams equal NumPy's Philox, number for number, so other languages can reproduce them.
 
 use crate::common;
 use perturb::{
@@ -9,7 +9,7 @@ use rstest::rstest;
 use serde_json::Value;
 use std::f64::consts::PI;
 
-/// Written by data/make_streams.py.
+/// The numbers of NumPy, written by data/make_streams.py.
 const FIXTURE: &str = include_str!("data/streams.jsonl");
 
 fn hex(value: &Value) -> u64 {
@@ -71,7 +71,7 @@ fn parameters_are_the_trials_numbers_in_the_catalogues_order() {
                     .collect();
                 let requested = e.receipt().requested;
                 for (requested, expected) in requested.iter().zip(&expected) {
-                    // `at` multiplies and adds in the same order, except for the version's rounding of its length.
+                    // `at` multiplies and adds in the same order, except that the version's length was rounded.
                     assert!((requested - expected).abs() <= 1e-15 * expected.abs(), "{}", spec.name);
                 }
                 e.begin(None);
@@ -98,7 +98,7 @@ fn initial_states_are_the_episodes_numbers_in_the_states_order(
     let draw = |&(low, high): &(f64, f64)| if low == high { low } else { low + (high - low) * stream.unit() };
     assert_eq!(state, ranges.iter().map(draw).collect::<Vec<_>>());
 
-    // And the episodes use this stream.
+    // Episodes use this stream.
     let mut episodes = common::episodes(tasks::catalogue().find(name).unwrap(), Version::D, 12, 34, 1);
     (0..episode).for_each(|_| episodes.begin(None));
     let mut observation = vec![0.0; environment.spec().observation.len()];

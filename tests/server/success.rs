@@ -1,4 +1,4 @@
-//! Endings and success, at the boundaries of their rules.
+//! Ends of episodes and success, at the boundaries of their rules.
 
 use crate::common::{episodes, observe, settings, step};
 use perturb::{
@@ -41,7 +41,8 @@ static REACHED_WITHIN_5: EnvironmentSpec = scripted_spec(Achievement::FirstGoal,
 static HELD_FOR_LAST_3: EnvironmentSpec = scripted_spec(Achievement::LastGoals, Comparison::AtLeast, 3.0);
 static HELD_FOR_ANY_3: EnvironmentSpec = scripted_spec(Achievement::LongestGoals, Comparison::AtLeast, 3.0);
 
-/// One character a step: `.` nothing, `g` the goal holds, `T` terminated, `G` both, `D` diverged.
+/// An environment that follows a script of one character a step: `.` nothing, `g` the goal holds, `T` terminated, `G`
+/// both, `D` diverged.
 struct Scripted {
     spec: &'static EnvironmentSpec,
     script: &'static [u8],
@@ -87,7 +88,7 @@ impl Environment for Scripted {
     }
 }
 
-/// Plays the script, which must end the episode with its last mark; returns the last outcome and the ended episode.
+/// Plays a script, whose last character must end the episode. Returns the last outcome, and the ended episode.
 fn run(spec: &'static EnvironmentSpec, script: &'static str) -> (Outcome, EpisodeEnd) {
     let scripted = Scripted { spec, script: script.as_bytes(), time: 0 };
     let mut e = Episodes::new(Box::new(scripted), settings(spec, Version::D, 0, 0, 1));
@@ -205,7 +206,8 @@ fn counts_start_anew_with_every_episode() {
 
 // The real environments, driven to both sides of their rules.
 
-/// The discrete environment from this state, acting by `policy` (of the time and the observation) until the end.
+/// Plays an environment with discrete actions from this state to the end of the episode. `policy` chooses actions from
+/// time and observation.
 fn drive(name: &str, state: &[f64], policy: impl Fn(u32, &[f32]) -> i32) -> (Outcome, EpisodeEnd) {
     let mut e = episodes(tasks::catalogue().find(name).unwrap(), Version::D, 0, 0, 1);
     e.begin(Some(state));
@@ -230,7 +232,7 @@ fn the_papers_code_has_thresholds_of_its_own(#[case] name: &str, #[case] descrip
     assert_eq!((code.achievement, code.comparison), (spec.success.achievement, spec.success.comparison));
 }
 
-/// Whether an episode is a success by the rule of the paper's code.
+/// Returns whether an episode is a success by the rule of the paper's code.
 fn by_code(name: &str, end: &EpisodeEnd) -> bool {
     let code = tasks::catalogue().find(name).unwrap().code_success.expect("a rule of its own");
     end.code_achieved.is_some_and(|achieved| match code.comparison {
@@ -257,7 +259,7 @@ fn cart_pole_succeeds_from_195_steps() {
     assert!([194, 195, 200].iter().all(|length| lengths.contains(length)), "both sides were seen: {lengths:?}");
 }
 
-/// Waits at the valley's bottom, then swings up with the velocity.
+/// Plays MountainCar: waits at the bottom of the valley, then builds up energy by pushing in the direction of motion.
 fn mountain_car(wait: u32, position: f64) -> (Outcome, EpisodeEnd) {
     drive("MountainCar", &[position, 0.0], |t, o| if t < wait { 1 } else { if o[1] < 0.0 { 0 } else { 2 } })
 }
@@ -294,7 +296,7 @@ fn acrobot_succeeds_up_to_80_steps() {
     let mut lengths = Vec::new();
     for wait in 0..60 {
         for angle in [-0.1, -0.05, -0.01, 0.005, 0.02, 0.03, 0.07, 0.1] {
-            // Torque with the sense of the first link's swing puts energy in.
+            // A torque in the direction of the first link's velocity adds energy.
             let pump = |t, o: &[f32]| if t < wait { 1 } else { if o[4] > 0.0 { 0 } else { 2 } };
             let (outcome, end) = drive("Acrobot", &[angle, 0.0, 0.0, 0.0], pump);
             assert_eq!(end.success, outcome.terminated && end.length <= 80, "{} steps", end.length);
@@ -309,10 +311,11 @@ fn acrobot_succeeds_up_to_80_steps() {
     assert!(seen, "both sides were seen: {lengths:?}");
 }
 
-/// An episode of a pendulum that is led to an angle in each step, with whether it was near upright after each.
+/// Plays an episode of a pendulum that is held at an angle in each step. Returns it, and whether the pendulum was near
+/// upright after each step.
 fn pendulum(angle: impl Fn(u32) -> f32) -> (Vec<bool>, EpisodeEnd) {
     let spec = tasks::catalogue().find("Pendulum").unwrap();
-    // A rod so light that the torque can hold it anywhere.
+    // The rod is light enough for the torque to hold it at any angle.
     let light = [("length", 1.0), ("mass", 0.1)].map(|(name, value)| (name, perturb::env::Distribution::fixed(value)));
     let mut settings = settings(spec, Version::D, 0, 0, 1);
     perturb::env::resolve(spec, &mut settings.distributions, light).unwrap();
@@ -321,7 +324,7 @@ fn pendulum(angle: impl Fn(u32) -> f32) -> (Vec<bool>, EpisodeEnd) {
     let mut near = Vec::new();
     for t in 0..spec.step_limit {
         let [cos, sin, velocity] = observe(&e)[..] else { panic!("three numbers") };
-        // Gravity's acceleration is 15 sin θ, the torque's 30 u.
+        // The acceleration is 15 sin θ by gravity and 30 u by the torque.
         let torque = -0.5 * sin + 2.0 * (angle(t) - sin.atan2(cos)) - 0.4 * velocity;
         step(&mut e, &torque.to_le_bytes());
         near.push(observe(&e)[0] > 0.5); // within π/3
@@ -348,7 +351,7 @@ fn pendulum_succeeds_after_100_steps_near_upright() {
     let mut entries = Vec::new();
     for left in 80..110 {
         let (near, end) = pendulum(|t| if (20..20 + left).contains(&t) { 0.0 } else { 1.3 });
-        let held = near.iter().filter(|near| **near).count(); // once
+        let held = near.iter().filter(|near| **near).count(); // they are consecutive steps
         assert_eq!((end.achieved, end.code_achieved), (Some(0.0), Some(held as f64)));
         assert_eq!((end.success, code.holds(end.code_achieved)), (false, held >= 100), "held for {held} steps");
         entries.push(held);
@@ -358,9 +361,9 @@ fn pendulum_succeeds_after_100_steps_near_upright() {
 
 // The predicates themselves, on both sides of their thresholds.
 
-/// Steps from states drawn between `low` and `high` and compares what the environment says of the new state with what
-/// `expected` does: (terminated, goal). Some new states lie within 1e-3 of the threshold, on either side: `margin` is
-/// positive where the goal holds.
+/// Takes a step from random states between `low` and `high`, and compares the new state's (terminated, goal) with
+/// `expected`. Some new states lie within 1e-3 of the threshold on either side. `margin` is positive where the goal
+/// holds.
 fn check_goal(
     name: &str,
     low: &[f64],
@@ -431,7 +434,7 @@ fn acrobot_ends_when_its_tip_is_a_link_above_the_joint() {
 
 #[test]
 fn pendulum_is_near_upright_within_a_third_of_pi_and_never_ends() {
-    // By the cosine, which knows nothing of wrapping.
+    // Uses the cosine, so that the angle need not be wrapped.
     let near = |s: &[f64]| s[0].cos() - 0.5;
     check_goal("Pendulum", &[-20.0, -8.0], &[20.0, 8.0], |s| (false, near(s) > 0.0), near);
 }

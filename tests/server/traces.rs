@@ -1,11 +1,11 @@
-//! Spans go to a collector, in builds with the feature `otel`.
+//! Spans are sent to a collector, in builds with the feature `otel`.
 
 use crate::common::server::{DEADLINE, Server, Session, command, open, step, within};
 use bytes::Bytes;
 use std::time::Duration;
 use tokio::{net::TcpListener, sync::mpsc};
 
-/// A collector that tells what it was sent, and with which path.
+/// Starts a collector. Returns its address, and a receiver of the requests that it gets, each with its path.
 async fn collector() -> (String, mpsc::UnboundedReceiver<(String, Vec<u8>)>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = format!("http://{}", listener.local_addr().unwrap());

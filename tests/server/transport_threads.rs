@@ -1,4 +1,4 @@
-//! Several transport threads: connections are spread over them, and what the server promises holds across them.
+//! Several transport threads: connections are spread over them, and the server's guarantees hold across them.
 
 use crate::{
     common::server::{Actor, Server, Session, client, environment, open},
@@ -11,12 +11,12 @@ use tonic::Code;
 const TOKEN: &str = "correct-horse-battery";
 const TWO: [&str; 2] = ["--transport-threads", "2"];
 
-/// The series of the connections that a thread has.
+/// Returns the metric series of a thread's number of connections.
 fn connections(thread: usize) -> String {
     format!("perturb_transport_connections{{thread=\"{thread}\"}}")
 }
 
-/// Sessions on connections of their own, by both transports in turn.
+/// Opens sessions, each on a new connection, alternately over TCP and the Unix socket.
 async fn sessions(server: &Server, count: usize) -> Vec<Session> {
     let mut sessions = Vec::new();
     for place in 0..count {

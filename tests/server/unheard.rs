@@ -1,9 +1,9 @@
-//! Servers whose log cannot be written: its disk is full, or whoever read it is gone.
+//! Servers whose log cannot be written, because its disk is full or its reader has ended.
 
 use crate::common::server::{Server, Session, command, open};
 use std::process::Command;
 
-/// The server with these flags, whose standard error takes nothing.
+/// Returns the command of a server with these flags whose standard error cannot be written.
 fn unheard(flags: &[&str]) -> Command {
     let mut shell = Command::new("sh");
     shell.args(["-c", "exec \"$@\" 2>/dev/full", "sh"]).arg(command().get_program()).args(flags);
@@ -16,7 +16,7 @@ async fn a_server_that_cannot_log_serves_and_ends_in_order() {
     let mut server = Server::spawn(unheard(&flags), tempfile::tempdir().unwrap(), 1);
     let (mut lasting, _) = Session::open(server.tcp(), open("CartPole", 1, 1)).await;
     for seed in 0..3 {
-        // Its end has a line in the log.
+        // The end of this session is logged.
         let (mut session, _) = Session::open(server.tcp(), open("CartPole", 1, seed)).await;
         session.close();
         assert_eq!(session.end().await.code(), tonic::Code::Ok);
@@ -26,7 +26,8 @@ async fn a_server_that_cannot_log_serves_and_ends_in_order() {
     assert_eq!(server.ended().await.code(), Some(0));
 }
 
-/// Whoever started it was killed, and somebody else's session goes on: it warns of that before it ends.
+/// The program that started the server was killed while another client's session runs. The server logs a warning before
+/// it ends.
 #[tokio::test]
 async fn private_server_that_cannot_warn_removes_its_folder() {
     let directory = tempfile::tempdir().unwrap();

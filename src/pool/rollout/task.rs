@@ -127,7 +127,7 @@ impl RolloutTask {
     /// false at the end of the rollout. If `halted`, the rollout ends now.
     pub(in crate::pool) fn after_step(&mut self, shards: &[Mutex<Shard>], halted: bool) -> bool {
         match self.advance(shards) {
-            Ok(goes_on) => goes_on && !halted,
+            Ok(continues) => continues && !halted,
             Err(error) => {
                 self.error = Some(error);
                 false

@@ -20,7 +20,7 @@ use std::sync::{
     atomic::{AtomicU32, Ordering},
 };
 
-/// Checks and records the draws of one session, or of one dm_env_rpc world.
+/// The auditor of one session's, or one dm_env_rpc world's, draws of parameters: it checks them and records them.
 #[derive(Clone)]
 pub struct DrawAuditor {
     bearer: Option<Bearer>,
@@ -70,7 +70,7 @@ impl DrawAuditor {
     /// # Errors
     /// [`Error::NotAllowed`] if the role forbids a draw, [`Error::NoLedger`] if the ledger cannot be written.
     pub async fn open(&self, settings: &BatchSettings) -> Result<PendingDraws, Error> {
-        if self.is_free() {
+        if self.is_exempt() {
             return Ok(PendingDraws::default());
         }
         let begins = settings.groups.iter().map(|group| {
@@ -86,7 +86,7 @@ impl DrawAuditor {
 
     /// Checks and records the draws of environments that are about to be reset.
     pub async fn reset(&self, batch: &Batch, entries: &[ResetEntry]) -> Result<PendingDraws, Error> {
-        if self.is_free() {
+        if self.is_exempt() {
             return Ok(PendingDraws::default());
         }
         let (mut previous, mut starts) = (Vec::new(), Vec::new());
@@ -112,7 +112,7 @@ impl DrawAuditor {
 
     /// Checks and records the draws of environments that are about to be restored.
     pub async fn restore(&self, batch: &Batch, entries: &[(usize, Bytes)]) -> Result<PendingDraws, Error> {
-        if self.is_free() || entries.is_empty() {
+        if self.is_exempt() || entries.is_empty() {
             return Ok(PendingDraws::default());
         }
         let spec = batch.settings().spec;
@@ -135,19 +135,19 @@ impl DrawAuditor {
         self.begin(spec, begins, previous).await
     }
 
-    /// Records that the draws of `begun` did not happen, because the environments could not be created.
-    pub fn open_failed(&self, spec: &EnvironmentSpec, begun: PendingDraws) {
-        self.note(spec, Vec::new(), Vec::new(), begun.withdraw());
+    /// Records that the draws of `pending` did not happen, because the environments could not be created.
+    pub fn open_failed(&self, spec: &EnvironmentSpec, pending: PendingDraws) {
+        self.note(spec, Vec::new(), Vec::new(), pending.withdraw());
     }
 
-    /// Records that the draws of `begun` did not happen, because the environments in `slots` could not be restored.
+    /// Records that the draws of `pending` did not happen, because the environments in `slots` could not be restored.
     /// They continue as before.
-    pub fn restore_failed(&self, batch: &Batch, slots: &[usize], begun: PendingDraws) {
+    pub fn restore_failed(&self, batch: &Batch, slots: &[usize], pending: PendingDraws) {
         let spec = batch.settings().spec;
         let previous: Vec<_> = slots.iter().map(|slot| (batch.draw(*slot), batch.distributions(*slot))).collect();
         let begins = previous.iter().map(|(draw, distributions)| (NextDraw { draw: *draw, distributions }, 1));
         let (regions, begins) = group_begins(spec, begins);
-        self.note(spec, regions, begins, begun.withdraw());
+        self.note(spec, regions, begins, pending.withdraw());
     }
 
     /// Records that the environments in `slots`, which the session is about to release, end their draws.
@@ -162,8 +162,8 @@ impl DrawAuditor {
     pub fn record_drop(&self, batch: &mut Batch) {
         if self.ledger.is_some() {
             let (own, spec) = (self.clone(), batch.settings().spec);
-            let tell = move |previous: Vec<Draw>| own.note(spec, Vec::new(), Vec::new(), group_ends(previous));
-            batch.when_freed(Box::new(tell));
+            let record = move |previous: Vec<Draw>| own.note(spec, Vec::new(), Vec::new(), group_ends(previous));
+            batch.when_freed(Box::new(record));
         }
     }
 
@@ -197,7 +197,7 @@ impl DrawAuditor {
     }
 
     /// Whether draws need neither a check nor a record.
-    fn is_free(&self) -> bool {
+    fn is_exempt(&self) -> bool {
         self.ledger.is_none() && self.bearer.as_ref().is_none_or(|bearer| bearer.role().is_none())
     }
 
@@ -217,10 +217,10 @@ impl DrawAuditor {
         }
         let Some(ledger) = &self.ledger else { return Ok(PendingDraws::default()) };
         let (regions, begins) = group_begins(spec, begins);
-        let begun = PendingDraws(begins.clone());
+        let pending = PendingDraws(begins.clone());
         let bytes = ledger.write(self.event(spec, regions, begins, group_ends(ends))).await?;
         self.charge_line(bytes);
-        Ok(begun)
+        Ok(pending)
     }
 
     fn note(&self, spec: &EnvironmentSpec, regions: Vec<Region>, begins: Vec<DrawStart>, ends: Vec<DrawEnd>) {

@@ -221,11 +221,12 @@ impl LedgerWriter {
         found
     }
 
+    /// Compares the open file with the file at the path, and its length with the bytes that were written.
     fn file_is_intact(&self) -> Result<(), String> {
         let own = self.file.metadata().map_err(|error| error.to_string())?;
         match self.path.metadata() {
             Err(error) => return Err(format!("the file is gone ({error}); move it back, or restart the server")),
-            Ok(there) if (there.dev(), there.ino()) != (own.dev(), own.ino()) => {
+            Ok(at_path) if (at_path.dev(), at_path.ino()) != (own.dev(), own.ino()) => {
                 return Err("another file has taken its place; move it back, or restart the server".into());
             }
             Ok(_) => {}

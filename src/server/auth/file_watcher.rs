@@ -14,7 +14,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(500);
 /// The maximum length of a watched file, bytes.
 const MAX_FILE_BYTES: u64 = 1 << 20;
 
-/// Watches files on a thread of its own. The thread ends when this and all its [reloaders](Reloader) have been dropped.
+/// The watcher of some files. Its thread ends when this and all its [reloaders](Reloader) have been dropped.
 pub struct FileWatcher(Sender<()>);
 
 /// A handle that makes file watchers reload their files immediately.
@@ -24,14 +24,14 @@ pub struct Reloader(Vec<Sender<()>>);
 impl Reloader {
     /// Makes a reloader for these watchers.
     pub fn new(watchers: &[FileWatcher]) -> Self {
-        Self(watchers.iter().map(|FileWatcher(look)| look.clone()).collect())
+        Self(watchers.iter().map(|FileWatcher(reload_sender)| reload_sender.clone()).collect())
     }
 
     /// Makes the watchers reload their files immediately, even if they have not changed. Returns `false` if there is no
     /// watcher.
     pub fn reload(&self) -> bool {
-        for look in &self.0 {
-            let _ = look.send(()); // fails if the watcher's thread has ended
+        for reload_sender in &self.0 {
+            let _ = reload_sender.send(()); // fails if the watcher's thread has ended
         }
         !self.0.is_empty()
     }
@@ -64,28 +64,30 @@ impl FileWatcher {
         before: Vec<Vec<u8>>,
         mut reload: impl FnMut(&[Vec<u8>]) -> Result<(), String> + Send + 'static,
     ) -> io::Result<Self> {
-        let (look, asked) = channel::<()>();
+        let (reload_sender, reload_requests) = channel::<()>();
         let watch = move || {
-            let mut taken: Contents = Ok(before);
-            let mut last = taken.clone();
+            let mut loaded: Contents = Ok(before);
+            let mut last = loaded.clone();
             loop {
-                let is_asked = match asked.recv_timeout(POLL_INTERVAL) {
+                let is_requested = match reload_requests.recv_timeout(POLL_INTERVAL) {
                     Ok(()) => true,
                     Err(RecvTimeoutError::Timeout) => false,
                     Err(RecvTimeoutError::Disconnected) => return,
                 };
                 let now = read(&paths);
-                if is_asked || (now != taken && now == last) {
+                if is_requested || (now != loaded && now == last) {
                     match now.as_ref().map_err(Clone::clone).and_then(|contents| reload(contents)) {
                         Ok(()) => tracing::info!("read {what} again"),
-                        Err(reason) => tracing::error!("{what} changed, and those of before stay in force: {reason}"),
+                        Err(reason) => {
+                            tracing::error!("{what} changed, and those of before stay in force: {reason}")
+                        }
                     }
-                    taken.clone_from(&now);
+                    loaded.clone_from(&now);
                 }
                 last = now;
             }
         };
         std::thread::Builder::new().name("files".into()).spawn(watch).map_err(|error| explain_no_thread(&error))?;
-        Ok(Self(look))
+        Ok(Self(reload_sender))
     }
 }

@@ -88,6 +88,7 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
         let what = if about_keys { words.lines().next().unwrap_or_default() } else { "this cannot be read" };
         TokenFileError { line: line(error.span().map_or(0, |span| span.start)), what: what.into() }
     })?;
+    // Parameter sets, which roles refer to.
     let mut known_sets: BTreeMap<String, DrawSet> =
         Version::KNOWN.iter().map(|version| (version.to_string(), DrawSet::Version(*version))).collect();
     for set in sets {
@@ -102,6 +103,7 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
             });
         }
     }
+    // Roles, which tokens refer to.
     let mut known_roles: BTreeMap<String, Arc<Role>> = BTreeMap::new();
     for role in roles {
         let line = line(role.span().start);
@@ -124,6 +126,7 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
             return Err(TokenFileError { line, what: format!("there are two roles called {name:?}") });
         }
     }
+    // Tokens.
     let (mut names, mut digests) = (BTreeSet::new(), BTreeSet::new());
     let mut listed = Vec::with_capacity(entries.len());
     for entry in entries {

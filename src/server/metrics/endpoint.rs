@@ -37,12 +37,14 @@ pub async fn serve(listener: Listener, sources: Arc<MetricsSources>) {
     loop {
         let sources = Arc::clone(&sources);
         let accepted = match &listener {
-            Listener::Tcp(listener) => {
-                listener.accept().await.map(|(stream, _)| tokio::spawn(converse(stream, sources)).abort_handle())
-            }
-            Listener::Unix(listener, _) => {
-                listener.accept().await.map(|(stream, _)| tokio::spawn(converse(stream, sources)).abort_handle())
-            }
+            Listener::Tcp(listener) => listener
+                .accept()
+                .await
+                .map(|(stream, _)| tokio::spawn(serve_connection(stream, sources)).abort_handle()),
+            Listener::Unix(listener, _) => listener
+                .accept()
+                .await
+                .map(|(stream, _)| tokio::spawn(serve_connection(stream, sources)).abort_handle()),
         };
         match accepted {
             Ok(connection) => {
@@ -65,7 +67,7 @@ async fn pause(error: &io::Error) {
 }
 
 /// Answers the only request of a connection.
-async fn converse(stream: impl AsyncRead + AsyncWrite + Unpin, sources: Arc<MetricsSources>) {
+async fn serve_connection(stream: impl AsyncRead + AsyncWrite + Unpin, sources: Arc<MetricsSources>) {
     let answer = service_fn(|request| {
         let response = answer(&request, &sources);
         async move { Ok::<_, Infallible>(response) }

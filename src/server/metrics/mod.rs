@@ -32,19 +32,19 @@ pub type RequestCounts = (&'static str, Arc<RequestCounters>);
 pub struct MetricsSources {
     /// The pool, with the counters of environments.
     pub pool: Arc<Pool>,
-    /// The limiter of sessions, for their number and limit.
+    /// The limiter of sessions; the page shows their number and their limit.
     pub sessions: PeerLimiter,
     /// The counters of leases.
     pub leases: LeaseCounters,
-    /// The limiter of connections, for their number.
+    /// The limiter of connections; the page shows their number.
     pub connections: PeerLimiter,
-    /// The memory budget, for the bytes in flight and their limit.
+    /// The memory budget; the page shows the bytes in flight and their limit.
     pub budget: Budget,
     /// The counters of requests, for each protocol.
     pub requests: [RequestCounts; 2],
     /// The counters of errors, by class.
     pub errors: ErrorCounters,
-    /// The access log, for the counts of ended sessions.
+    /// The access log; the page shows its counts of ended sessions.
     pub access: AccessLog,
     /// The tokens, if the server requires tokens.
     pub tokens: Option<Tokens>,
@@ -58,7 +58,7 @@ pub struct MetricsSources {
 
 /// The measurements of a transport thread.
 pub struct TransportMeter {
-    /// The load of the thread, for its number of connections.
+    /// The load of the thread; the page shows its number of connections.
     pub load: Arc<ThreadLoad>,
     /// The delays with which the thread woke up.
     pub lag: Histogram,

@@ -90,7 +90,7 @@ impl MetricsCollector {
             })
         });
         page.counters("perturb_requests", "Requests of sessions that were answered", each)?;
-        let named: Vec<_> = errors.counts().map(|(kind, n)| (written(kind.code()), kind.reason(), n)).collect();
+        let named: Vec<_> = errors.counts().map(|(kind, n)| (code_name(kind.code()), kind.reason(), n)).collect();
         let each = named.iter().map(|(code, reason, n)| ([("code", code.as_str()), ("reason", reason)], *n as f64));
         page.counters("perturb_refusals", "Requests, calls and sessions that were refused or ended, by reason", each)?;
         let endings = access.endings();
@@ -150,7 +150,11 @@ fn resources(page: &mut Page<'_>) -> EncodeResult {
         ("process_start_time_seconds", "When the process started, since 1970", resources.start_seconds),
         ("process_threads", "Threads", resources.threads as f64),
         ("process_open_fds", "File descriptors in use", resources.descriptors as f64),
-        ("process_max_fds", "The most file descriptors", resources.max_descriptors.map_or(f64::INFINITY, |n| n as f64)),
+        (
+            "process_max_fds",
+            "Maximum number of file descriptors",
+            resources.max_descriptors.map_or(f64::INFINITY, |n| n as f64),
+        ),
     ] {
         page.gauges(name, help, [(NO_LABELS, value)])?;
     }
@@ -158,7 +162,7 @@ fn resources(page: &mut Page<'_>) -> EncodeResult {
 }
 
 /// Returns the name of a gRPC code as in gRPC's documentation, e.g. `RESOURCE_EXHAUSTED`.
-fn written(code: Code) -> String {
+fn code_name(code: Code) -> String {
     let mut text = String::new();
     for letter in format!("{code:?}").chars() {
         if letter.is_uppercase() && !text.is_empty() {
@@ -225,7 +229,7 @@ mod tests {
 
     #[test]
     fn codes_are_written_as_in_grpcs_documents() {
-        assert_eq!(written(Code::ResourceExhausted), "RESOURCE_EXHAUSTED");
-        assert_eq!(written(Code::Ok), "OK");
+        assert_eq!(code_name(Code::ResourceExhausted), "RESOURCE_EXHAUSTED");
+        assert_eq!(code_name(Code::Ok), "OK");
     }
 }

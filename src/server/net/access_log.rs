@@ -53,7 +53,7 @@ pub struct SessionRecord<'a> {
     pub ending: &'static str,
 }
 
-/// Writes the access log, and counts ended sessions by protocol and ending.
+/// The access log, and the counts of ended sessions by protocol and ending.
 #[derive(Clone, Default)]
 pub struct AccessLog(Arc<Mutex<LogState>>);
 
@@ -105,13 +105,13 @@ impl AccessLog {
         let mut state = self.lock();
         *state.endings.entry((protocol, ending)).or_default() += 1;
         let now = Instant::now();
-        let (since, wanted) = state.window.get_or_insert((now, 0));
+        let (since, n_ended) = state.window.get_or_insert((now, 0));
         // A window that exceeds the maximum is ended by the task below, which logs how many sessions were omitted.
-        if *wanted <= MAX_LINES_PER_WINDOW && since.elapsed() >= WINDOW {
-            (*since, *wanted) = (now, 0);
+        if *n_ended <= MAX_LINES_PER_WINDOW && since.elapsed() >= WINDOW {
+            (*since, *n_ended) = (now, 0);
         }
-        *wanted += 1;
-        if *wanted == MAX_LINES_PER_WINDOW + 1
+        *n_ended += 1;
+        if *n_ended == MAX_LINES_PER_WINDOW + 1
             && let Ok(runtime) = Handle::try_current()
         {
             let (access, end) = (self.clone(), *since + WINDOW);
@@ -120,12 +120,12 @@ impl AccessLog {
                 access.log_left_out();
             });
         }
-        *wanted <= MAX_LINES_PER_WINDOW
+        *n_ended <= MAX_LINES_PER_WINDOW
     }
 
     fn log_left_out(&self) {
         let window = self.lock().window.take();
-        let left_out = window.map_or(0, |(_, wanted)| wanted.saturating_sub(MAX_LINES_PER_WINDOW));
+        let left_out = window.map_or(0, |(_, n_ended)| n_ended.saturating_sub(MAX_LINES_PER_WINDOW));
         tracing::info!(target: "perturb::access", left_out, "more sessions ended than there are lines for");
     }
 

@@ -1,4 +1,4 @@
-//! Listens at addresses: TCP ports and Unix sockets.
+//! Listeners at TCP ports and Unix sockets.
 
 use super::{handshake::AcceptedSocket, peer_limiter::Peer};
 use crate::config::{ListenAddress, SocketMode};
@@ -42,7 +42,7 @@ fn explain(address: &ListenAddress, flag: &str, error: &io::Error) -> String {
     }
 }
 
-/// Removes a Unix socket's file when dropped, unless another server has replaced the file.
+/// The file of a Unix socket. It is removed when this is dropped, unless another server has replaced it.
 pub struct SocketFile {
     path: PathBuf,
     /// Device and inode number of the file.

@@ -39,7 +39,7 @@ impl ThreadLoad {
     }
 }
 
-/// Counts a connection as its thread's until it is dropped, and counts the connection's work.
+/// A connection's part in the load of its thread. The thread has one connection less when this is dropped.
 pub struct ConnectionLoad(Arc<ThreadLoad>);
 
 impl ConnectionLoad {
@@ -61,7 +61,7 @@ impl Drop for ConnectionLoad {
     }
 }
 
-/// Chooses the thread for each new connection according to the threads' recent work.
+/// The balancer of connections: it chooses the thread for each new connection according to the threads' recent work.
 pub struct Balance {
     threads: Vec<RecentWork>,
     /// The time of the last choice.

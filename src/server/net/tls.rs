@@ -22,7 +22,7 @@ use tokio_rustls::{
 };
 
 /// Builds the TLS settings from the contents of the files, which are in the order of [`TlsFiles::paths`].
-fn configured(files: &TlsFiles, contents: &[Vec<u8>]) -> Result<ServerConfig, String> {
+fn build_config(files: &TlsFiles, contents: &[Vec<u8>]) -> Result<ServerConfig, String> {
     let [cert, key, rest @ ..] = contents else { return Err("a certificate and a key are expected".into()) };
     let chain = certificates(&files.cert, cert)?;
     let key = PrivateKeyDer::from_pem_slice(key).map_err(|error| {
@@ -75,7 +75,7 @@ impl Tls {
     /// # Errors
     /// If a file is invalid: a text that names the file and the fault.
     pub fn new(files: TlsFiles, contents: &[Vec<u8>]) -> Result<Self, String> {
-        let config = Arc::new(configured(&files, contents)?);
+        let config = Arc::new(build_config(&files, contents)?);
         Ok(Self { files: Arc::new(files), config: Arc::new(RwLock::new(config)) })
     }
 
@@ -84,7 +84,7 @@ impl Tls {
     /// # Errors
     /// If a file is invalid: a text that names the file and the fault. The settings are unchanged then.
     pub fn reload(&self, contents: &[Vec<u8>]) -> Result<(), String> {
-        let config = Arc::new(configured(&self.files, contents)?);
+        let config = Arc::new(build_config(&self.files, contents)?);
         *self.config.write().unwrap_or_else(PoisonError::into_inner) = config;
         Ok(())
     }

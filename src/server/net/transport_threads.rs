@@ -25,7 +25,7 @@ use tokio::{
 /// The pause after the operating system could not accept a connection.
 const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(200);
 
-/// Passes accepted connections to the transport threads.
+/// A handle to the transport threads, with which accepted connections are passed to them.
 #[derive(Clone)]
 pub struct TransportThreads {
     threads: Arc<[mpsc::UnboundedSender<Accepted>]>,

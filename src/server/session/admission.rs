@@ -16,7 +16,7 @@ use crate::server::{
 };
 use std::time::Duration;
 
-/// Admits sessions to the server, within the limits of the server, each peer and each token.
+/// The admission of sessions, within the limits of the server, each peer and each token.
 #[derive(Clone)]
 pub struct Sessions {
     limiter: PeerLimiter,

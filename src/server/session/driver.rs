@@ -67,7 +67,7 @@ impl Sessions {
         let stream = stream::poll_fn(move |context| {
             received.poll_recv(context).map(|response| {
                 Some(response?.map(|OutgoingResponse { response, memory }| {
-                    memory.into_iter().for_each(|share| outbox.push(share));
+                    memory.into_iter().for_each(|reservation| outbox.push(reservation));
                     response
                 }))
             })
@@ -121,11 +121,11 @@ impl<H: SessionHandler> SessionDriver<H> {
         let mut attachment = Attachment::Attached(responses);
         loop {
             attachment = match attachment {
-                Attachment::Attached(responses) => match self.attached(&responses).await {
+                Attachment::Attached(responses) => match self.run_attached(&responses).await {
                     Attachment::Ended => return self.close(responses).await,
                     next => next,
                 },
-                Attachment::Detached(resuming) => self.detached(resuming).await,
+                Attachment::Detached(resuming) => self.run_detached(resuming).await,
                 Attachment::Resumed(runtime, responses) => return self.spawn(&runtime, responses),
                 Attachment::Ended => return,
             };
@@ -141,22 +141,22 @@ impl<H: SessionHandler> SessionDriver<H> {
     }
 
     /// Answers the requests of the current stream until the stream is lost or replaced, or the session ends.
-    async fn attached(&mut self, responses: &ResponseSender<H::Response>) -> Attachment<H::Response> {
+    async fn run_attached(&mut self, responses: &ResponseSender<H::Response>) -> Attachment<H::Response> {
         let mut closed = pin!(responses.closed());
         loop {
             while self.lease.as_ref().is_some_and(|lease| lease.sent < lease.stored.last()) {
-                let slot = match self.slot(responses).await {
-                    Ok(slot) => slot,
+                let permit = match self.reserve_send(responses).await {
+                    Ok(permit) => permit,
                     Err(attachment) => return attachment,
                 };
                 if let Some(response) = self.lease.as_mut().and_then(ActiveLease::next) {
-                    slot.send(Ok(response));
+                    permit.send(Ok(response));
                 }
             }
             let Self { exchange, lease } = self;
             let message = tokio::select! {
                 biased; // if the client closed the stream and then its connection, the log says "closed", not "gone"
-                ask = resume_request(lease) => match self.accept_resume(ask) {
+                resume = resume_request(lease) => match self.accept_resume(resume) {
                     Some(resuming) => return self.supersede(responses, resuming),
                     None => continue,
                 },
@@ -166,7 +166,7 @@ impl<H: SessionHandler> SessionDriver<H> {
                         exchange.ending = CLOSED;
                         return Attachment::Ended;
                     }
-                    Err(stop) => return self.stopped(responses, stop),
+                    Err(stop) => return self.on_stop(responses, stop),
                 },
                 () = &mut closed => return self.detach(None),
             };
@@ -187,7 +187,7 @@ impl<H: SessionHandler> SessionDriver<H> {
             lease.stored.on_request();
             match self.exchange.answer(message).await {
                 Ok(answer) => self.store_reply(answer),
-                Err(stop) => return Err(self.stopped(responses, stop)),
+                Err(stop) => return Err(self.on_stop(responses, stop)),
             }
             return Ok(());
         }
@@ -201,7 +201,7 @@ impl<H: SessionHandler> SessionDriver<H> {
                 let reply = self.exchange.finish(answer);
                 self.deliver(reply, responses).await
             }
-            Err(stop) => Err(self.stopped(responses, stop)),
+            Err(stop) => Err(self.on_stop(responses, stop)),
         }
     }
 
@@ -221,18 +221,18 @@ impl<H: SessionHandler> SessionDriver<H> {
                 self.lease = Some(ActiveLease { stored: ReplayBuffer::new(grant.max_unanswered), grant, sent: 0 });
                 None
             }
-            Some(StreamHandover::Resume(ticket)) => Some(ticket),
+            Some(StreamHandover::Resume(accepted)) => Some(accepted),
             None => None,
         };
         match responses.try_send(Ok(OutgoingResponse { response, memory })) {
             Ok(()) => {}
             Err(TrySendError::Closed(_)) => return Err(self.detach(None)),
-            Err(TrySendError::Full(response)) => self.slot(responses).await?.send(response),
+            Err(TrySendError::Full(response)) => self.reserve_send(responses).await?.send(response),
         }
-        let Some(ticket) = resumed else { return Ok(()) };
+        let Some(accepted) = resumed else { return Ok(()) };
         self.exchange.ending = MOVED;
         // If the resumed session has ended meanwhile, the send fails, and the stream ends at once.
-        let _ = ticket.stream.send(ResumingStream {
+        let _ = accepted.stream.send(ResumingStream {
             requests: self.exchange.requests.detach(),
             responses: responses.clone(),
             drain: self.exchange.sessions.drain.clone(),
@@ -242,7 +242,7 @@ impl<H: SessionHandler> SessionDriver<H> {
     }
 
     /// Waits until the stream can take another response.
-    async fn slot<'r>(
+    async fn reserve_send<'r>(
         &mut self,
         responses: &'r ResponseSender<H::Response>,
     ) -> Result<mpsc::Permit<'r, Result<OutgoingResponse<H::Response>, Status>>, Attachment<H::Response>> {
@@ -253,22 +253,22 @@ impl<H: SessionHandler> SessionDriver<H> {
                 biased;
                 () = exchange.sessions.drain.closed() => refused(Error::Draining),
                 error = revoked(bearer.as_ref()) => refused(error),
-                ask = resume_request(lease) => match self.accept_resume(ask) {
+                resume = resume_request(lease) => match self.accept_resume(resume) {
                     Some(resuming) => return Err(self.supersede(responses, resuming)),
                     None => continue,
                 },
-                slot = responses.reserve() => return slot.map_err(|_| self.detach(None)),
+                permit = responses.reserve() => return permit.map_err(|_| self.detach(None)),
             };
-            return Err(self.stopped(responses, stop));
+            return Err(self.on_stop(responses, stop));
         }
     }
 
     /// Waits until another stream resumes the session or its lease expires.
-    async fn detached(&mut self, mut resuming: Option<Resuming<H::Response>>) -> Attachment<H::Response> {
+    async fn run_detached(&mut self, mut resuming: Option<Resuming<H::Response>>) -> Attachment<H::Response> {
         let Self { exchange, lease } = self;
         let Some(lease) = lease else { return Attachment::Ended };
         let _counted = lease.grant.counters().detach();
-        let over = Instant::now() + lease.grant.time();
+        let expiry = Instant::now() + lease.grant.time();
         let bearer = exchange.requests.bearer.clone();
         loop {
             let error = tokio::select! {
@@ -289,11 +289,11 @@ impl<H: SessionHandler> SessionDriver<H> {
                         Err(_) => continue, // the accepted stream was lost before it arrived
                     }
                 }
-                Some(ask) = lease.grant.resume_requests.recv() => {
-                    resuming = lease.accept_resume(ask).or(resuming);
+                Some(resume) = lease.grant.resume_requests.recv() => {
+                    resuming = lease.accept_resume(resume).or(resuming);
                     continue;
                 }
-                () = sleep_until(over) => None,
+                () = sleep_until(expiry) => None,
             };
             match error {
                 Some(error) => exchange.end_by(&error),
@@ -303,8 +303,8 @@ impl<H: SessionHandler> SessionDriver<H> {
         }
     }
 
-    fn accept_resume(&mut self, ask: ResumeRequest<H::Response>) -> Option<Resuming<H::Response>> {
-        self.lease.as_mut().and_then(|lease| lease.accept_resume(ask))
+    fn accept_resume(&mut self, resume: ResumeRequest<H::Response>) -> Option<Resuming<H::Response>> {
+        self.lease.as_mut().and_then(|lease| lease.accept_resume(resume))
     }
 
     /// Ends the current stream, because another stream resumes the session.
@@ -326,7 +326,7 @@ impl<H: SessionHandler> SessionDriver<H> {
     }
 
     /// Handles a stream that cannot continue. A session with a lease ends only if the server itself stops it.
-    fn stopped(
+    fn on_stop(
         &mut self,
         responses: &ResponseSender<H::Response>,
         stop: StreamStop<H::Error>,
@@ -351,16 +351,17 @@ impl<H: SessionHandler> SessionDriver<H> {
     fn store_reply(&mut self, answer: Result<Reply<H::Response>, H::Error>) {
         let Self { exchange, lease: Some(lease) } = self else { return };
         let stored = &mut lease.stored;
-        let wants_room =
+        let needs_memory =
             |kind| matches!(kind, ErrorKind::MemoryFull | ErrorKind::TokenQuota | ErrorKind::MoreThanTokenQuota);
-        if answer.as_ref().is_err_and(|error| wants_room(error.kind())) {
+        if answer.as_ref().is_err_and(|error| needs_memory(error.kind())) {
             stored.clear(); // the client has received them, and they take memory that the request needs
         }
         let Reply { response, memory: outgoing, .. } = exchange.finish(answer);
         let (budget, bytes) = (exchange.requests.budget().clone(), response.encoded_len() + REPLY_OVERHEAD_BYTES);
-        let held: usize = stored.replies().map(|reply| reply.memory.as_ref().map_or(0, MemoryReservation::bytes)).sum();
+        let stored_bytes: usize =
+            stored.replies().map(|reply| reply.memory.as_ref().map_or(0, MemoryReservation::bytes)).sum();
         let mut memory = budget.reserve(bytes);
-        if memory.is_err() || held + bytes > MAX_STORED_BYTES {
+        if memory.is_err() || stored_bytes + bytes > MAX_STORED_BYTES {
             stored.clear();
             memory = memory.or_else(|_| budget.reserve(bytes));
         }
@@ -405,9 +406,9 @@ fn end_stream<R: Send + 'static>(responses: &ResponseSender<R>, status: Status) 
 /// Waits for a stream's request to resume the session. Without a lease it never resolves.
 async fn resume_request<R>(lease: &mut Option<ActiveLease<R>>) -> ResumeRequest<R> {
     if let Some(lease) = lease
-        && let Some(ask) = lease.grant.resume_requests.recv().await
+        && let Some(resume) = lease.grant.resume_requests.recv().await
     {
-        return ask;
+        return resume;
     }
     std::future::pending().await
 }

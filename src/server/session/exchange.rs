@@ -36,7 +36,7 @@ pub(super) struct Exchange<H: SessionHandler> {
     /// A request that was read while the previous request was being answered.
     ahead: Option<Result<Option<Message>, StreamStop>>,
     /// Whether the current request was read ahead. If so, its step may already have started.
-    came_ahead: bool,
+    was_read_ahead: bool,
     /// Whether a request may be read before the previous request is answered.
     pub(super) reads_ahead: bool,
     handler: H,
@@ -55,7 +55,7 @@ pub(super) struct Exchange<H: SessionHandler> {
     price: u64,
     /// The final statistics of the session; `None` until it is closed.
     final_stats: Option<SessionStats>,
-    awake: AdaptiveSpin,
+    spin: AdaptiveSpin,
     /// The reason for the session's end that the access log will state, unless it changes before the end.
     pub(super) ending: &'static str,
     /// The number of times that the session was resumed.
@@ -75,7 +75,7 @@ impl<H: SessionHandler> Exchange<H> {
         Self {
             requests,
             ahead: None,
-            came_ahead: false,
+            was_read_ahead: false,
             reads_ahead: true,
             handler,
             counts,
@@ -86,7 +86,7 @@ impl<H: SessionHandler> Exchange<H> {
             charged: 0,
             price: 0,
             final_stats: None,
-            awake: AdaptiveSpin::default(),
+            spin: AdaptiveSpin::default(),
             ending: GONE,
             resumed: 0,
             admission,
@@ -100,30 +100,30 @@ impl<H: SessionHandler> Exchange<H> {
         let limits = self.request_limits();
         let bearer = self.requests.bearer.clone();
         self.was_open = self.handler.is_open();
-        let Self { requests, ahead, came_ahead, awake, .. } = self;
-        *came_ahead = ahead.is_some();
+        let Self { requests, ahead, was_read_ahead, spin, .. } = self;
+        *was_read_ahead = ahead.is_some();
         let next = async {
             match ahead.take() {
                 Some(request) => request,
-                None => awake.until(requests.next(limits)).await,
+                None => spin.until(requests.next(limits)).await,
             }
         };
         let limit = if self.was_open { idle } else { Some(idle.map_or(handshake, |idle| idle.min(handshake))) };
-        let passed = if self.was_open { Duration::ZERO } else { self.known_open.elapsed() };
-        let late = || {
+        let elapsed = if self.was_open { Duration::ZERO } else { self.known_open.elapsed() };
+        let timed_out = || {
             let seconds = limit.map_or(0, |limit| limit.as_secs());
             Err(refused(Error::Idle { seconds }))
         };
         // The timeout applies even if a request has already arrived.
-        if limit.is_some_and(|limit| passed > limit) {
-            return late();
+        if limit.is_some_and(|limit| elapsed > limit) {
+            return timed_out();
         }
         tokio::select! {
             biased; // the shutdown comes first, so a client that never pauses cannot delay it
             () = self.sessions.drain.closed() => Err(refused(Error::Draining)),
             error = revoked(bearer.as_ref()) => Err(refused(error)),
             request = next => request.map_err(|stop| stop.map(|error| Error::from(error).into())),
-            () = sleep(limit.map(|limit| limit.saturating_sub(passed))) => late(),
+            () = sleep(limit.map(|limit| limit.saturating_sub(elapsed))) => timed_out(),
         }
     }
 
@@ -146,21 +146,22 @@ impl<H: SessionHandler> Exchange<H> {
             return Err(refused(Error::Draining));
         }
         // Holds the request's memory reservation until the request is answered.
-        let (request, _share) = match message {
-            Message::Whole(bytes, share) => (bytes, share),
-            Message::Refused(error) => return Ok(self.undecoded(error)),
+        let (request, _reservation) = match message {
+            Message::Whole(bytes, reservation) => (bytes, reservation),
+            Message::Refused(error) => return Ok(self.refuse_undecoded(error)),
         };
         // A client that exceeds its token's rate waits before its request is decoded. Requests are read ahead only for
         // tokens without a rate, so such a request need not wait.
         let bearer = self.requests.bearer.clone();
         let was_open = self.handler.is_open();
-        if let Err(error) = self.pace(bearer.as_ref().filter(|_| was_open && !self.came_ahead)).await? {
-            return Ok(self.undecoded(error));
+        if let Err(error) = self.pace(bearer.as_ref().filter(|_| was_open && !self.was_read_ahead)).await? {
+            return Ok(self.refuse_undecoded(error));
         }
         let request = match self.sessions.decoder.decode(request, H::FIELDS, self.request_limits()).await? {
             Ok(request) => request,
-            Err(error) => return Ok(self.undecoded(error)),
+            Err(error) => return Ok(self.refuse_undecoded(error)),
         };
+        // A stream that was admitted only for resuming must resume a session with its first request.
         let resumes = H::RESUMES.is_some_and(|resumes| resumes(&request));
         if let Admission::ResumeOnly(_, refusal) = &self.admission
             && !resumes
@@ -173,10 +174,11 @@ impl<H: SessionHandler> Exchange<H> {
                 && !resumes
                 && let Err(error) = self.pace(Some(bearer)).await?
             {
-                return Ok(self.undecoded(error));
+                return Ok(self.refuse_undecoded(error));
             }
             self.price += self.handler.price(&request);
         }
+        // The request is answered. Meanwhile the next request may be read and offered to the pool.
         let offer = if self.reads_ahead { self.handler.pipeline(&request) } else { None };
         let limits = self.request_limits();
         let Self { handler, counts, requests, ahead, .. } = self;
@@ -250,7 +252,7 @@ impl<H: SessionHandler> Exchange<H> {
     }
 
     /// Counts and charges a request that is refused before it is decoded. Returns its error.
-    fn undecoded<R>(&mut self, error: impl Into<Error>) -> Result<R, H::Error> {
+    fn refuse_undecoded<R>(&mut self, error: impl Into<Error>) -> Result<R, H::Error> {
         self.price += UNDECODED_PRICE;
         let error = H::Error::from(error.into());
         self.counts.count_undecoded(&error);

@@ -38,7 +38,7 @@ impl<R> Reply<R> {
     }
 }
 
-/// Answers the requests of one session, in one protocol. Dropping it frees the session's resources.
+/// The handler of one session's requests, in one protocol. Dropping it frees the session's resources.
 pub trait SessionHandler: Send + 'static {
     /// The type of the client's messages.
     type Request: prost::Message + Default + 'static;
@@ -52,7 +52,7 @@ pub trait SessionHandler: Send + 'static {
     const PROTOCOL: &'static str;
     /// The kinds of requests in logs and metrics. The last one is for requests that cannot be decoded.
     const KINDS: &'static [&'static str];
-    /// Tells whether a request resumes another session. `None` in a protocol without leases.
+    /// The function that tells whether a request resumes another session. `None` in a protocol without leases.
     const RESUMES: Option<fn(&Self::Request) -> bool>;
 
     /// The kind of a request, one of [`KINDS`](Self::KINDS).

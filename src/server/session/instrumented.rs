@@ -20,7 +20,7 @@ pub struct RequestCount {
     pub refused: AtomicU64,
 }
 
-/// Counts the requests of a protocol by kind.
+/// The counters of a protocol's requests, by kind.
 pub struct RequestCounters(Vec<(&'static str, RequestCount)>);
 
 impl RequestCounters {

@@ -48,7 +48,7 @@ pub enum Error {
         /// The number of the session's last reply.
         last: u64,
     },
-    /// Some replies after `got` are no longer stored.
+    /// Some replies after number `got`, which the client needs, are no longer stored.
     #[error(
         "last_reply is {got}, but replies up to {first} are kept no more: open.lease said that so many requests would not \
          wait, or there was no memory for them; open another session"
@@ -84,7 +84,7 @@ pub struct OutgoingResponse<R> {
     pub memory: Option<MemoryReservation>,
 }
 
-/// Sends responses, or the status that ends the stream, to a client's stream.
+/// A sender of responses to a client's stream, or of the status that ends it.
 pub type ResponseSender<R> = mpsc::Sender<Result<OutgoingResponse<R>, Status>>;
 
 /// All leases of a server's sessions in one protocol. `R` is the protocol's response.
@@ -109,7 +109,7 @@ struct LeaseEntry<R> {
     resume_requests: mpsc::Sender<ResumeRequest<R>>,
 }
 
-/// Counts leases, sessions without a stream, and resumed sessions.
+/// The counters of leases, of sessions without a stream, and of resumed sessions.
 #[derive(Clone, Default)]
 pub struct LeaseCounters(Arc<LeaseCounts>);
 
@@ -153,7 +153,7 @@ impl LeaseCounters {
     }
 }
 
-/// Keeps one counter of [`LeaseCounters`] raised by one until it is dropped.
+/// A guard that keeps one of the [`LeaseCounters`] raised by one until it is dropped.
 pub struct CountGuard {
     counters: LeaseCounters,
     counter: fn(&LeaseCounts) -> &AtomicUsize,

@@ -48,7 +48,7 @@ impl Budget {
         MemoryReservation {
             state: Arc::clone(&self.state),
             bytes: 0,
-            held: self.bearer.as_ref().map(Token::reserve_bytes),
+            quota: self.bearer.as_ref().map(Token::reserve_bytes),
         }
     }
 
@@ -57,9 +57,9 @@ impl Budget {
     /// # Errors
     /// [`Error::MemoryFull`] if the budget has no room, [`Error::Auth`] if the token's quota has none.
     pub fn reserve(&self, bytes: usize) -> Result<MemoryReservation, Error> {
-        let mut share = self.empty();
-        share.grow(bytes)?;
-        Ok(share)
+        let mut reservation = self.empty();
+        reservation.grow(bytes)?;
+        Ok(reservation)
     }
 }
 
@@ -68,7 +68,7 @@ pub struct MemoryReservation {
     state: Arc<BudgetCounter>,
     bytes: usize,
     /// The part of the token's quota for these bytes, if there is a token.
-    held: Option<QuotaGuard>,
+    quota: Option<QuotaGuard>,
 }
 
 impl MemoryReservation {
@@ -86,7 +86,7 @@ impl MemoryReservation {
         if bytes == 0 {
             return Ok(());
         }
-        self.held.as_mut().map(|held| held.grow(bytes)).transpose()?;
+        self.quota.as_mut().map(|quota| quota.grow(bytes)).transpose()?;
         let BudgetCounter { used, limit } = &*self.state;
         let fits = |used: usize| used.checked_add(bytes).filter(|sum| sum <= limit);
         match used.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits) {
@@ -95,8 +95,8 @@ impl MemoryReservation {
                 Ok(())
             }
             Err(used) => {
-                if let Some(held) = &mut self.held {
-                    held.release(bytes);
+                if let Some(quota) = &mut self.quota {
+                    quota.release(bytes);
                 }
                 Err(Error::MemoryFull { wanted: bytes, used, limit: *limit })
             }
@@ -106,8 +106,8 @@ impl MemoryReservation {
     /// Changes the reservation to `bytes`, even if that exceeds the budget. Call it when a reply's final length is
     /// known.
     pub fn resize(&mut self, bytes: usize) {
-        if let Some(held) = &mut self.held {
-            held.set(bytes);
+        if let Some(quota) = &mut self.quota {
+            quota.set(bytes);
         }
         let used = &self.state.used;
         used.fetch_add(bytes, Ordering::Relaxed);
@@ -127,8 +127,8 @@ pub struct PendingReservations(Arc<Mutex<Vec<MemoryReservation>>>);
 
 impl PendingReservations {
     /// Queues the reservation of a reply.
-    pub fn push(&self, share: MemoryReservation) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(share);
+    pub fn push(&self, reservation: MemoryReservation) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(reservation);
     }
 
     /// Attaches all queued reservations, and the value that `hold` returns, to the bytes of a reply. They are released

@@ -54,7 +54,7 @@ impl fmt::Display for Compression {
     }
 }
 
-/// Decompresses a message in small parts, so that the caller can let other tasks run in between.
+/// A decompressor of one message, in small parts so that the caller can let other tasks run in between.
 pub(super) enum Decompressor<'a> {
     Gzip(GzDecoder<PartialInput<'a>>),
     Deflate(ZlibDecoder<PartialInput<'a>>),

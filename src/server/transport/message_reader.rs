@@ -43,7 +43,7 @@ pub struct StreamLimits {
     pub handshake: Duration,
 }
 
-/// Reads the gRPC messages of a stream from the body of its HTTP request.
+/// A reader of a stream's gRPC messages, from the body of its HTTP request.
 pub struct MessageReader {
     body: Body,
     /// The compression of those messages whose header says that they are compressed.
@@ -52,10 +52,10 @@ pub struct MessageReader {
     buffer: BytesMut,
     message: Option<PartialMessage>,
     /// The deadline for the end of the partly read message.
-    due: Option<Instant>,
+    deadline: Option<Instant>,
     /// The memory reservation of the partly read message.
-    share: MemoryReservation,
-    transit: StreamLimits,
+    reservation: MemoryReservation,
+    stream_limits: StreamLimits,
     /// The connection of the stream, if it is known.
     pub connection: Option<Connection>,
     /// The token of the call; `None` if the server requires none.
@@ -115,7 +115,7 @@ impl MessageReader {
     pub(super) fn new(
         body: Body,
         compression: Option<Compression>,
-        transit: StreamLimits,
+        stream_limits: StreamLimits,
         connection: Option<Connection>,
         bearer: Option<Bearer>,
         outbox: PendingReservations,
@@ -125,9 +125,9 @@ impl MessageReader {
             compression,
             buffer: BytesMut::new(),
             message: None,
-            due: None,
-            share: transit.budget.empty(),
-            transit,
+            deadline: None,
+            reservation: stream_limits.budget.empty(),
+            stream_limits,
             connection,
             bearer,
             outbox,
@@ -136,14 +136,14 @@ impl MessageReader {
 
     /// The memory budget of the stream.
     pub fn budget(&self) -> &Budget {
-        &self.transit.budget
+        &self.stream_limits.budget
     }
 
     /// Moves the reader out and leaves a reader without messages in its place.
     pub fn detach(&mut self) -> Self {
         let (connection, bearer) = (self.connection.clone(), self.bearer.clone());
         let outbox = PendingReservations::default();
-        let left = Self::new(Body::empty(), None, self.transit.clone(), connection, bearer, outbox);
+        let left = Self::new(Body::empty(), None, self.stream_limits.clone(), connection, bearer, outbox);
         std::mem::replace(self, left)
     }
 
@@ -183,13 +183,15 @@ impl MessageReader {
     /// Returns the next HTTP/2 frame. Within a message, enforces the maximum pause and the message's deadline.
     async fn frame(&mut self) -> Result<Option<Result<http_body::Frame<Bytes>, Status>>, StreamStop> {
         let next = self.body.frame();
-        match self.transit.limit.filter(|_| self.message.is_some()) {
+        match self.stream_limits.limit.filter(|_| self.message.is_some()) {
             None => Ok(next.await),
             Some(limit) => {
-                let soon = Instant::now() + limit;
+                let pause_end = Instant::now() + limit;
                 let unfinished =
                     |_| StreamStop::Refused(Error::Unfinished { seconds: limit.as_secs(), rate: MIN_BYTES_PER_SECOND });
-                timeout_at(self.due.map_or(soon, |due| due.min(soon)), next).await.map_err(unfinished)
+                timeout_at(self.deadline.map_or(pause_end, |deadline| deadline.min(pause_end)), next)
+                    .await
+                    .map_err(unfinished)
             }
         }
     }
@@ -209,8 +211,8 @@ impl MessageReader {
         if length > limits.bytes {
             return Err(StreamStop::Refused(Error::TooLarge { got: length, limit: limits.bytes }));
         }
-        let longest = |limit| limit + Duration::from_secs((length / MIN_BYTES_PER_SECOND) as u64);
-        self.due = self.transit.limit.map(|limit| Instant::now() + longest(limit));
+        let max_duration = |limit| limit + Duration::from_secs((length / MIN_BYTES_PER_SECOND) as u64);
+        self.deadline = self.stream_limits.limit.map(|limit| Instant::now() + max_duration(limit));
         Ok(compression
             .map_or(PartialMessage::Wanted(length), |compression| PartialMessage::Compressed(length, compression)))
     }
@@ -230,12 +232,12 @@ impl MessageReader {
                     whole.freeze()
                 };
                 self.message = None;
-                Some(Message::Whole(bytes, std::mem::replace(&mut self.share, self.transit.budget.empty())))
+                Some(Message::Whole(bytes, std::mem::replace(&mut self.reservation, self.stream_limits.budget.empty())))
             }
             Some(PartialMessage::Refused(left, refusal)) => {
-                let come = (*left).min(self.buffer.len());
-                self.buffer.advance(come);
-                *left -= come;
+                let arrived = (*left).min(self.buffer.len());
+                self.buffer.advance(arrived);
+                *left -= arrived;
                 let refused = (*left == 0).then(|| Message::Refused(refusal.clone()))?;
                 self.message = None;
                 Some(refused)
@@ -250,7 +252,7 @@ impl MessageReader {
         let Some(PartialMessage::Compressed(length, compression)) = self.message else { return Ok(None) };
         let Some(compressed) = self.buffer.get(..length) else { return Ok(None) };
         let mut decompressor = compression.decompressor(compressed);
-        let mut share = self.transit.budget.empty();
+        let mut reservation = self.stream_limits.budget.empty();
         let mut bytes = Vec::new();
         let message = loop {
             let more = decompressor.append_part(&mut bytes);
@@ -259,11 +261,11 @@ impl MessageReader {
                 return Err(StreamStop::Refused(Error::DecompressedTooLarge { limit: limits.bytes }));
             }
             let budgeted = bytes.len().saturating_sub(unbudgeted(limits));
-            if let Err(refusal) = share.grow(budgeted - share.bytes()) {
+            if let Err(refusal) = reservation.grow(budgeted - reservation.bytes()) {
                 break Message::Refused(refusal);
             }
             if !more {
-                break Message::Whole(bytes.into(), share);
+                break Message::Whole(bytes.into(), reservation);
             }
             yield_now().await;
         };
@@ -273,7 +275,7 @@ impl MessageReader {
         } else {
             self.buffer = BytesMut::from(&self.buffer[length..]); // frees the memory of the message
         }
-        self.share = self.transit.budget.empty();
+        self.reservation = self.stream_limits.budget.empty();
         self.message = None;
         Ok(Some(message))
     }
@@ -281,13 +283,13 @@ impl MessageReader {
     /// Stores bytes that have arrived, and reserves memory for them.
     fn push_data(&mut self, data: &[u8], limits: RequestLimits) {
         if let Some(PartialMessage::Wanted(length) | PartialMessage::Compressed(length, _)) = self.message {
-            let beyond = |bytes: usize| bytes.min(length).saturating_sub(unbudgeted(limits));
-            let (before, after) = (beyond(self.buffer.len()), beyond(self.buffer.len() + data.len()));
-            if let Err(refusal) = self.share.grow(after - before) {
-                self.share = self.transit.budget.empty();
+            let budgeted_bytes = |bytes: usize| bytes.min(length).saturating_sub(unbudgeted(limits));
+            let (before, after) = (budgeted_bytes(self.buffer.len()), budgeted_bytes(self.buffer.len() + data.len()));
+            if let Err(refusal) = self.reservation.grow(after - before) {
+                self.reservation = self.stream_limits.budget.empty();
                 // Frees the bytes of the message that have already arrived, together with their reservation.
-                let come = std::mem::take(&mut self.buffer).len();
-                self.message = Some(PartialMessage::Refused(length - come, refusal));
+                let arrived = std::mem::take(&mut self.buffer).len();
+                self.message = Some(PartialMessage::Refused(length - arrived, refusal));
             }
             if self.buffer.capacity() - self.buffer.len() < data.len() {
                 // The buffer at most doubles, because a client may announce a longer message than it sends.

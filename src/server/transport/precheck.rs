@@ -13,7 +13,8 @@ use std::sync::Arc;
 use tokio::sync::Semaphore;
 use tonic::Status;
 
-/// Requests with at most this many fields are decoded on the transport thread, since a hand-over would take longer.
+/// The maximum number of fields for which a request is decoded on the transport thread, since a hand-over would take
+/// longer.
 const INLINE_DECODE_MAX_FIELDS: usize = 1000;
 /// The maximum number of requests that are decoded at the same time outside the transport threads.
 const MAX_CONCURRENT_DECODES: usize = 2;
@@ -31,8 +32,8 @@ const MAX_COUNTED_FIELDS: usize = 8;
 pub struct Field {
     number: u64,
     name: &'static str,
-    most: Cardinality,
-    inside: FieldKind,
+    max_entries: Cardinality,
+    kind: FieldKind,
 }
 
 /// The type of a field's entries.
@@ -66,11 +67,11 @@ impl Cardinality {
 }
 
 /// Makes a [`Field`] with its field number, its name in errors, its maximum number of entries, and their type.
-pub const fn field(number: u64, name: &'static str, most: Cardinality, inside: FieldKind) -> Field {
-    Field { number, name, most, inside }
+pub const fn field(number: u64, name: &'static str, max_entries: Cardinality, kind: FieldKind) -> Field {
+    Field { number, name, max_entries, kind }
 }
 
-/// Decodes requests, large requests outside the transport threads.
+/// A decoder of requests. It decodes large requests outside the transport threads.
 #[derive(Clone)]
 pub struct Decoder(Arc<Semaphore>);
 
@@ -159,19 +160,19 @@ fn count(mut message: &[u8], fields: &[Field], limits: RequestLimits, work: &mut
         let Some((field, counted)) = fields.iter().zip(&mut counts).find(|(field, _)| field.number == tag >> 3) else {
             continue;
         };
-        *counted += match field.inside {
+        *counted += match field.kind {
             Numbers if tag & 7 == 2 => {
                 *work = work.checked_sub(part.len() / PACKED_BYTES_PER_FIELD).ok_or(PrecheckError::Work)?;
                 part.iter().filter(|byte| **byte < 0x80).count() // counts the last byte of each number
             }
             _ => 1,
         };
-        let most = field.most.entries(limits);
-        if *counted > most {
-            let got = format!("there more than {most} times");
+        let max_entries = field.max_entries.entries(limits);
+        if *counted > max_entries {
+            let got = format!("there more than {max_entries} times");
             return Err(PrecheckError::Refused(InvalidValue::new(field.name, got, "no more than can be needed")));
         }
-        if let Fields(fields) = field.inside
+        if let Fields(fields) = field.kind
             && !count(part, fields, limits, work)?
         {
             return Ok(false);

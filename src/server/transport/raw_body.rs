@@ -28,20 +28,20 @@ use tower::Layer;
 pub struct RawBodyService<S> {
     service: S,
     path: &'static str,
-    transit: StreamLimits,
+    stream_limits: StreamLimits,
 }
 
 /// The tower layer that wraps a service in [`RawBodyService`].
 #[derive(Clone)]
 pub struct RawBodyLayer {
     path: &'static str,
-    transit: StreamLimits,
+    stream_limits: StreamLimits,
 }
 
 impl RawBodyLayer {
-    /// Makes a layer for the method with this path. Its streams get the limits `transit`.
-    pub fn new(path: &'static str, transit: StreamLimits) -> Self {
-        Self { path, transit }
+    /// Makes a layer for the method with this path. Its streams get the limits `stream_limits`.
+    pub fn new(path: &'static str, stream_limits: StreamLimits) -> Self {
+        Self { path, stream_limits }
     }
 }
 
@@ -49,14 +49,14 @@ impl<S> Layer<S> for RawBodyLayer {
     type Service = RawBodyService<S>;
 
     fn layer(&self, service: S) -> Self::Service {
-        RawBodyService::new(service, self.path, self.transit.clone())
+        RawBodyService::new(service, self.path, self.stream_limits.clone())
     }
 }
 
 impl<S> RawBodyService<S> {
-    /// Wraps `service`. Streams of the method with this path get the limits `transit`.
-    pub fn new(service: S, path: &'static str, transit: StreamLimits) -> Self {
-        Self { service, path, transit }
+    /// Wraps `service`. Streams of the method with this path get the limits `stream_limits`.
+    pub fn new(service: S, path: &'static str, stream_limits: StreamLimits) -> Self {
+        Self { service, path, stream_limits }
     }
 }
 
@@ -82,13 +82,16 @@ where
         let connection = request.extensions().get::<Connection>().cloned();
         let is_stream = request.uri().path() == self.path;
         // Unary calls have one small reply, which needs no timeout.
-        let timeouts = is_stream.then_some(ReadTimeouts { first: self.transit.handshake, rest: self.transit.limit });
+        let timeouts =
+            is_stream.then_some(ReadTimeouts { first: self.stream_limits.handshake, rest: self.stream_limits.limit });
         if is_stream {
             let bearer = request.extensions_mut().remove::<Bearer>();
-            let transit = StreamLimits { budget: self.transit.budget.for_token(bearer.clone()), ..self.transit };
+            let stream_limits =
+                StreamLimits { budget: self.stream_limits.budget.for_token(bearer.clone()), ..self.stream_limits };
             let body = std::mem::take(request.body_mut());
             let compression = Compression::from_headers(request.headers());
-            let reader = MessageReader::new(body, compression, transit, connection.clone(), bearer, outbox.clone());
+            let reader =
+                MessageReader::new(body, compression, stream_limits, connection.clone(), bearer, outbox.clone());
             request.extensions_mut().insert(RawBody(Arc::new(Mutex::new(Some(reader)))));
         }
         let response = self.service.call(request);
@@ -98,7 +101,7 @@ where
     }
 }
 
-/// Carries the reader of the raw body as a request extension. Extensions must be `Clone`, hence the shared cell.
+/// A request extension that carries the reader of the raw body. Extensions must be `Clone`, hence the shared cell.
 #[derive(Clone)]
 struct RawBody(Arc<Mutex<Option<MessageReader>>>);
 
@@ -107,7 +110,7 @@ struct RawBody(Arc<Mutex<Option<MessageReader>>>);
 /// # Errors
 /// If the body was not withheld, which is a defect.
 pub fn messages<T>(request: &mut tonic::Request<T>) -> Result<MessageReader, Status> {
-    let kept = request.extensions_mut().remove::<RawBody>();
-    let reader = kept.and_then(|kept| kept.0.lock().unwrap_or_else(PoisonError::into_inner).take());
+    let raw_body = request.extensions_mut().remove::<RawBody>();
+    let reader = raw_body.and_then(|raw_body| raw_body.0.lock().unwrap_or_else(PoisonError::into_inner).take());
     reader.ok_or_else(|| Status::internal("the request's body is not there: a defect of the server"))
 }

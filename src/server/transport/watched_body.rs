@@ -49,22 +49,22 @@ struct ProgressState {
     unread_since: Instant,
     /// The time since which a reply waits for the client's flow-control window. Meanwhile the session reads no
     /// requests, so its own timeouts cannot end it.
-    held_since: Option<Instant>,
+    blocked_since: Option<Instant>,
     /// Whether the client has read no reply yet.
     is_first: bool,
 }
 
 impl ProgressState {
     fn new() -> Self {
-        Self { unread: 0, unread_since: Instant::now(), held_since: None, is_first: true }
+        Self { unread: 0, unread_since: Instant::now(), blocked_since: None, is_first: true }
     }
 
     /// Returns the timeout that the client has exceeded, if any.
     fn exceeded(&self, timeouts: ReadTimeouts) -> Option<Duration> {
-        let held_since = self.held_since.map_or(Duration::ZERO, |unread_since| unread_since.elapsed());
+        let blocked = self.blocked_since.map_or(Duration::ZERO, |since| since.elapsed());
         let unread = if self.unread == 0 { Duration::ZERO } else { self.unread_since.elapsed() };
-        let first = Some(timeouts.first).filter(|&limit| self.is_first && held_since > limit);
-        first.or(timeouts.rest.filter(|&limit| held_since.max(unread) > limit))
+        let first = Some(timeouts.first).filter(|&limit| self.is_first && blocked > limit);
+        first.or(timeouts.rest.filter(|&limit| blocked.max(unread) > limit))
     }
 }
 
@@ -86,14 +86,14 @@ impl ReadProgress {
     /// Records that the transport asks for more data, so the previous reply no longer waits for the client's window.
     fn on_poll(&self) {
         let mut state = self.state();
-        if state.held_since.take().is_some() {
+        if state.blocked_since.take().is_some() {
             state.is_first = false;
         }
     }
 
     /// Records that the transport has received data, which may wait for the client's window.
     fn on_frame(&self) {
-        self.state().held_since = Some(Instant::now());
+        self.state().blocked_since = Some(Instant::now());
     }
 }
 
@@ -103,7 +103,7 @@ impl Drop for ReadProgress {
     }
 }
 
-/// Counts a reply as unread until it is dropped.
+/// A guard that counts a reply as unread until it is dropped.
 struct UnreadGuard(Arc<ReadProgress>);
 
 impl UnreadGuard {
@@ -140,8 +140,8 @@ impl WatchedBody {
 /// Closes the connection when its client has exceeded a read timeout.
 async fn watch(progress: Weak<ReadProgress>, connection: Connection, timeouts: ReadTimeouts) {
     let mut limit = Some(timeouts.rest.map_or(timeouts.first, |rest| rest.min(timeouts.first)));
-    while let Some(looked_after) = limit {
-        sleep(looked_after / CHECKS_PER_TIMEOUT).await;
+    while let Some(timeout) = limit {
+        sleep(timeout / CHECKS_PER_TIMEOUT).await;
         let Some(progress) = progress.upgrade() else { return };
         let state = progress.state();
         if let Some(exceeded) = state.exceeded(timeouts) {

@@ -1,4 +1,4 @@
-//! A policy in environments, played by the server and by a client that acts by itself.
+//! A policy that plays environments, once on the server and once in a client that chooses the actions itself.
 
 use crate::common::server::{Server, Session, doubles, floats, mixed};
 use bytes::Bytes;
@@ -12,28 +12,28 @@ use perturb_policy::{
     random::{Purpose, stream},
 };
 
-/// Of the policy's randomness.
+/// The seed of the policy's random streams.
 pub const SEED: u64 = 77;
 
-/// What is played, and how.
+/// An environment and a policy, with everything that can be varied about the policy.
 #[derive(Clone, Copy)]
 pub struct Game {
     pub environment: &'static str,
-    /// N.
+    /// N, the number of environments.
     pub n: usize,
     pub per_trial: u32,
-    /// The LSTM's width, or 0.
+    /// The width of the LSTM; 0 for a feed-forward policy.
     pub lstm: u32,
-    /// Whether inputs hold the last action's outcome.
+    /// Whether the policy's inputs contain the previous action, reward and end of episode.
     pub outcomes: bool,
     /// Whether observations and rewards are normalised.
     pub normalised: bool,
     pub testing: bool,
-    /// Whether parameters are observed.
+    /// Whether observations contain the parameters.
     pub sees: bool,
 }
 
-/// A training with everything on: CartPole, recurrent, RL².
+/// A training with all features: recurrent policy, RL², normalisation; in CartPole.
 pub const FULL: Game = Game {
     environment: "CartPole",
     n: 5,
@@ -48,7 +48,7 @@ pub const FULL: Game = Game {
 /// A small feed-forward policy without normalisation in CartPole.
 pub const PLAIN: Game = Game { per_trial: 1, lstm: 0, outcomes: false, normalised: false, ..FULL };
 
-/// The statistics that a game begins with.
+/// The number of samples in the normalisers' initial statistics.
 const SEEN: u64 = 100;
 const GAMMA: f64 = 0.99;
 
@@ -81,13 +81,13 @@ impl Game {
         }
     }
 
-    /// Weights that depend on their place and `version` alone.
+    /// Returns weights that are a function of their index and `version` only.
     pub fn weights(self, environment: &Environment, version: u64) -> Vec<f32> {
         let weight = |i| (mixed(mixed(i) ^ version) >> 40) as f32 / (1 << 24) as f32 * 1.6 - 0.8;
         (0..self.spec(environment).n_weights() as u64).map(weight).collect()
     }
 
-    /// In half of the games.
+    /// Whether the normaliser's return continues over the ends of episodes: true for feed-forward policies.
     fn return_runs_on(self) -> bool {
         self.lstm == 0
     }
@@ -107,7 +107,7 @@ impl Game {
         }
     }
 
-    /// The policy as a client hands it over.
+    /// Returns the policy as a client sends it.
     pub fn policy(self, environment: &Environment) -> Policy {
         let of = |size: usize| Moments {
             count: SEEN,
@@ -139,7 +139,7 @@ impl Game {
         }
     }
 
-    /// A request of a new policy.
+    /// Returns a request to play `task` with a new policy.
     pub fn act(self, environment: &Environment, task: act::Task) -> Act {
         Act {
             policy: Some(self.policy(environment)),
@@ -149,7 +149,7 @@ impl Game {
         }
     }
 
-    /// A session of the game's environments.
+    /// Opens a session with the game's environments.
     pub async fn session(self, server: &Server) -> (Session, Environment) {
         let (session, opened) = Session::open(server.unix(), self.open()).await;
         (session, opened.environment.unwrap())
@@ -163,12 +163,12 @@ pub fn kind(environment: &Environment) -> ActionKind {
     }
 }
 
-/// Little-endian bytes of f32.
+/// Encodes f32 values as little-endian bytes.
 pub fn wire(numbers: &[f32]) -> Bytes {
     numbers.iter().flat_map(|x| x.to_le_bytes()).collect()
 }
 
-/// A client that acts by itself, over ordinary steps.
+/// A client that chooses the actions itself and sends ordinary steps.
 pub struct Client {
     game: Game,
     session: Session,
@@ -192,7 +192,7 @@ impl Client {
         Self { game, session, environment, player }
     }
 
-    /// Plays a task with these weights, and writes down what the server should say of it.
+    /// Plays a task with the weights of `version`. Returns the reply that the server should give to the same task.
     pub async fn play(&mut self, version: u64, task: CollectUntil) -> Acted {
         let Self { game, session, environment, player } = self;
         player.load(&game.weights(environment, version)).unwrap();
@@ -238,7 +238,7 @@ fn ended(end: &perturb::proto::EpisodeEnd) -> SlotEnd {
     SlotEnd { slot: end.slot as usize, trial_index: episode.trial_index, episode_in_trial: episode.episode_in_trial }
 }
 
-/// An [`Acted`] that grows.
+/// The arrays of an [`Acted`], collected step by step.
 #[derive(Default)]
 struct Rollout {
     steps: u32,
@@ -289,7 +289,7 @@ impl Rollout {
     }
 }
 
-/// Has the server play a whole task, in as many replies as it takes; what they say together, and their number.
+/// Has the server play a task to its end. Returns the joined replies, and their number.
 pub async fn play(session: &mut Session, act: Act) -> (Acted, usize) {
     let (most_steps, only_ended) = (act.most_steps, act.only_ended);
     let mut all = session.ask(act).await;

@@ -1,4 +1,4 @@
-//! A policy played by the server: the bytes of a client that acts by itself.
+//! Policies that the server plays give the same bytes as a client that chooses the actions itself.
 
 pub mod game;
 mod refusals;
@@ -13,10 +13,10 @@ use perturb::proto::{
 use perturb_policy::CollectUntil;
 use rstest::rstest;
 
-/// Beyond an episode of every task.
+/// A number of steps longer than an episode of any environment here.
 const STEPS: u32 = 520;
 
-/// Compares array by array, so that a failure says which.
+/// Compares two replies array by array, so a failure names the array.
 fn assert_same(got: &Acted, expected: &Acted) {
     assert_eq!((got.steps, got.finished), (expected.steps, expected.finished));
     assert_eq!(got.starts, expected.starts);
@@ -68,7 +68,7 @@ async fn same_bytes(game: Game) {
     let server = Server::with_folders(&["--workers", "2"]);
     let mut client = Client::begin(game, &server).await;
     let (mut session, environment) = game.session(&server).await;
-    // Some steps, other weights and more steps than an episode has, complete episodes, and steps after them.
+    // Tasks: some steps; more steps than an episode has, with new weights; complete episodes; steps after them.
     let asked = [Asked::Steps(7), Asked::Steps(STEPS), Asked::Episodes(8), Asked::Steps(5)];
     let mut ends = 0;
     for (version, task) in (0..).zip(asked) {

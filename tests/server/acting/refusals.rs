@@ -1,4 +1,4 @@
-//! What an act, or a saved player, is refused for. A refusal changes nothing.
+//! Refused requests `act` and `save_player`. A refusal changes nothing.
 
 use super::game::{FULL, Game, PLAIN, play, wire};
 use crate::common::server::{Server, Session, doubles};
@@ -10,7 +10,7 @@ use perturb::proto::{
 use rstest::rstest;
 use tonic::Code;
 
-/// The policy of a request that has one.
+/// Returns the policy of a request, which must have one.
 fn policy(act: &mut Act) -> &mut Policy {
     act.policy.as_mut().unwrap()
 }
@@ -33,7 +33,7 @@ fn rewards(act: &mut Act) -> &mut RewardMoments {
     policy(act).rewards.as_mut().unwrap()
 }
 
-/// The same bytes with another f32 in place of the first.
+/// Returns `bytes` with the first f32 replaced.
 fn with_first(bytes: &Bytes, first: f32) -> Bytes {
     [&first.to_le_bytes()[..], &bytes[4..]].concat().into()
 }
@@ -91,7 +91,7 @@ async fn a_bad_value_is_refused(#[case] spoil: fn(&mut Act), #[case] words: &str
     assert_eq!(play(&mut session, on.clone()).await, play(&mut twin, on).await, "it changed something");
 }
 
-/// What comes before an act that is refused.
+/// The state of the session before the refused `act`.
 #[derive(Clone, Copy)]
 enum Before {
     Nothing,

@@ -1,4 +1,4 @@
-//! A policy that plays for long holds up nobody, and ends when nobody waits for it.
+//! A long rollout does not delay other sessions, and it ends when its session ends.
 
 use super::game::{PLAIN, SEED};
 use crate::common::{
@@ -38,7 +38,7 @@ async fn mountain_cars(pool: &Pool, size: usize) -> Batch {
     Batch::open(pool, settings).await.unwrap().0
 }
 
-/// Steps without number, of which only the ends of episodes are recorded: seconds, until these are a reply's size.
+/// Returns a request for a rollout that takes seconds: it records only the ends of episodes, so its reply stays small.
 fn endless(size: usize) -> RolloutRequest {
     let spec = PolicySpec::feed_forward(2, ActionKind::Discrete { n: 3 });
     let policy = Policy {

@@ -1,4 +1,4 @@
-//! A client that sends what it likes: any bytes as a stream's messages, and reads replies only when asked to.
+//! A client that can send any bytes as messages of a stream, and reads replies only when told to.
 
 use crate::common::server::within;
 use bytes::Bytes;
@@ -12,13 +12,13 @@ use tokio::{net::TcpStream, task::JoinHandle};
 pub const SESSION: &str = "/perturb.v1.Perturb/Session";
 pub const LIST: &str = "/perturb.v1.Perturb/ListEnvironments";
 
-/// A connection, which is closed when this is dropped.
+/// An HTTP/2 connection. Dropping it closes the connection.
 pub struct Connection {
     requests: SendRequest<Bytes>,
     task: JoinHandle<()>,
 }
 
-/// A call under way.
+/// A running gRPC call.
 pub struct Call {
     sending: SendStream<Bytes>,
     head: Option<ResponseFuture>,
@@ -26,7 +26,8 @@ pub struct Call {
 }
 
 impl Connection {
-    /// To a host and port. The server may send so many bytes to each stream, and to all together, before they are read.
+    /// Connects to `port`, "host:port". `window` is the flow-control window in bytes of each stream and of the
+    /// connection.
     pub async fn new(port: &str, window: u32) -> Self {
         let tcp = TcpStream::connect(port).await.unwrap();
         let mut builder = h2::client::Builder::new();
@@ -36,12 +37,12 @@ impl Connection {
         Self { requests, task }
     }
 
-    /// Begins a call. None if the server takes no more calls, or is gone.
+    /// Starts a call. Returns `None` if the server accepts no more calls or has closed the connection.
     pub async fn call(&mut self, path: &str) -> Option<Call> {
         self.call_compressed(path, "identity").await
     }
 
-    /// The same, whose header names this compression of its messages.
+    /// Starts a call whose header announces this compression of its messages.
     pub async fn call_compressed(&mut self, path: &str, encoding: &str) -> Option<Call> {
         let request = Request::builder()
             .method(Method::POST)
@@ -57,7 +58,7 @@ impl Connection {
         Some(Call { sending, head: Some(head), receiving: None })
     }
 
-    /// Whether the server has closed it.
+    /// Whether the server has closed the connection.
     pub fn is_closed(&self) -> bool {
         self.task.is_finished()
     }
@@ -70,7 +71,7 @@ impl Drop for Connection {
 }
 
 impl Call {
-    /// Sends these bytes as they are; whether the server took them all.
+    /// Sends raw bytes. Returns whether the server accepted all of them.
     pub async fn send(&mut self, mut bytes: Bytes) -> bool {
         while !bytes.is_empty() {
             self.sending.reserve_capacity(bytes.len());
@@ -87,17 +88,17 @@ impl Call {
         true
     }
 
-    /// Sends a whole message; whether the server took it.
+    /// Sends a message. Returns whether the server accepted all of it.
     pub async fn send_message(&mut self, message: &[u8]) -> bool {
         self.send(framed(message.len(), message)).await
     }
 
-    /// Sends no more.
+    /// Closes the sending half of the call.
     pub fn close(&mut self) {
         let _ = self.sending.send_data(Bytes::new(), true);
     }
 
-    /// The next bytes of the reply, none at its end.
+    /// Returns the next bytes of the reply, or `None` at its end.
     pub async fn receive(&mut self) -> Option<Bytes> {
         if let Some(head) = self.head.take() {
             self.receiving = Some(within(head).await.ok()?.into_body());
@@ -108,7 +109,7 @@ impl Call {
         Some(bytes)
     }
 
-    /// The gRPC status with which the call ends, and its message; none if the connection ended it.
+    /// Returns the gRPC status and the message with which the call ends, or `None` if the connection ended first.
     pub async fn status(&mut self) -> Option<(i32, String)> {
         if let Some(head) = self.head.take() {
             let response = within(head).await.ok()?;
@@ -122,12 +123,12 @@ impl Call {
     }
 }
 
-/// The first bytes of a message of that length.
+/// Returns the header of a message of `length` bytes, followed by `bytes`.
 pub fn framed(length: usize, bytes: &[u8]) -> Bytes {
     [&[0], &(length as u32).to_be_bytes()[..], bytes].concat().into()
 }
 
-/// A message whose header says that it is compressed.
+/// Returns a message whose header says that it is compressed.
 pub fn framed_compressed(bytes: &[u8]) -> Bytes {
     [&[1], &(bytes.len() as u32).to_be_bytes()[..], bytes].concat().into()
 }

@@ -1,9 +1,9 @@
-//! What is left to do when a large session ends.
+//! The end of a large session does not block the transport thread.
 
 use crate::common::server::{Server, Session, open, until};
 use std::time::Duration;
 
-/// The processor time that a server's transport thread, its first, has had.
+/// Returns the CPU time of the server's first transport thread.
 fn transport_time(server: &Server) -> Duration {
     let id = server.child.id();
     let schedule = std::fs::read_to_string(format!("/proc/{id}/task/{id}/schedstat")).unwrap();
@@ -28,6 +28,7 @@ async fn transport_does_not_free_thousands_of_hoppers() {
     .await;
     let took = transport_time(&server) - before;
     println!("the transport took {took:?} of a processor");
-    // It was 155 ms for the Hoppers alone; now it is what connections and the opening of CartPoles take.
+    // When the transport thread freed the environments itself, the Hoppers alone took 155 ms. What is left is the time
+    // for connections and for opening the CartPoles.
     assert!(took < Duration::from_millis(100), "{took:?}");
 }

@@ -1,4 +1,4 @@
-//! Clients that compress their requests, as some gRPC stacks do without being asked.
+//! Clients that compress their requests. Some gRPC libraries do so by default.
 
 use super::{
     Neighbour,
@@ -13,7 +13,7 @@ use std::io::Write;
 use tonic::{Code, codec::CompressionEncoding};
 
 const WINDOW: u32 = 1 << 20;
-/// Enough environments that requests have some kB.
+/// A batch size for which requests are some kB long.
 const BATCH: u32 = 256;
 
 fn gzip(bytes: &[u8]) -> Vec<u8> {
@@ -22,7 +22,7 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
     encoder.finish().unwrap()
 }
 
-/// Opens a session and steps it, and returns its replies.
+/// Opens a session and steps it. Returns its replies.
 async fn replies(mut session: Session) -> Vec<SessionResponse> {
     let requests = [Request::from(open("CartPole", BATCH, 7))].into_iter();
     let mut replies = Vec::new();

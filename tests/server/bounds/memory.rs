@@ -1,4 +1,4 @@
-//! How much memory clients may take, and for how long.
+//! How much memory clients can occupy, and for how long.
 
 use super::{
     Neighbour,
@@ -13,7 +13,7 @@ use prost::Message;
 use std::time::{Duration, Instant};
 use tonic::Code;
 
-/// What a server takes beside what it counts: its allocator's, HTTP/2's, and what tests cannot see.
+/// Memory that the budget does not count, bytes: that of the allocator and of HTTP/2, and some tolerance.
 const REST: usize = 150 << 20;
 
 fn message(request: impl Into<Request>) -> Vec<u8> {
@@ -33,7 +33,7 @@ async fn unfinished_messages_take_no_more_than_the_budget() {
     let half = Bytes::from(vec![0; LENGTH - 1]);
     let mut connections = Vec::new();
     let mut calls = Vec::new();
-    // 600 MB.
+    // In total 600 MB.
     for _ in 0..20 {
         let mut connection = Connection::new(server.port(), 1 << 20).await;
         let mut call = connection.call(SESSION).await.unwrap();
@@ -48,7 +48,7 @@ async fn unfinished_messages_take_no_more_than_the_budget() {
     println!("the server took {} MB more", grown >> 20);
     assert!(grown < 100_000_000 + REST, "the server took {grown} bytes more");
     neighbour.was_not_held_up();
-    // The last is refused in its place, and its session goes on.
+    // The last client's large request is refused in order, and its session continues.
     let mut last = calls.pop().unwrap();
     assert!(last.send(Bytes::from_static(&[0])).await);
     let reply = last.receive().await.unwrap();
@@ -56,7 +56,7 @@ async fn unfinished_messages_take_no_more_than_the_budget() {
     assert!(refusal.contains("of the server's 100000000"), "{refusal}");
     assert!(last.send_message(&message(perturb::proto::Step { actions: vec![0; 4].into() })).await);
     assert!(last.receive().await.is_some());
-    // What the others held is free when they are gone.
+    // The memory of the other clients is free after they have disconnected.
     drop((last, calls, connections));
     let (mut session, _) = Session::open(server.tcp(), same_step("CartPole", 1)).await;
     until("there is room for a large request", async || {
@@ -71,7 +71,7 @@ async fn pictures_that_nobody_reads_take_no_more_than_the_budget() {
     let neighbour = Neighbour::start(server.unix());
     let before = server.memory();
     let (mut connections, mut calls) = (Vec::new(), Vec::new());
-    // 1.2 GB.
+    // In total 1.2 GB.
     for _ in 0..100 {
         let mut connection = Connection::new(server.port(), 1 << 16).await;
         let mut call = connection.call(SESSION).await.unwrap();
@@ -81,7 +81,7 @@ async fn pictures_that_nobody_reads_take_no_more_than_the_budget() {
         connections.push(connection);
         calls.push(call);
     }
-    // Another asks until it is refused: there is no room for more.
+    // Another client requests pictures until one is refused, which shows that the budget is used up.
     let (mut other, _) = Session::open(server.tcp(), open("MountainCar", 1, 1)).await;
     let start = Instant::now();
     loop {
@@ -93,13 +93,13 @@ async fn pictures_that_nobody_reads_take_no_more_than_the_budget() {
             _ => assert!(start.elapsed() < Duration::from_secs(60), "it is never refused"),
         }
     }
-    // Time to draw those that wait for their turn.
+    // Leaves time to draw the pictures that are still queued.
     tokio::time::sleep(Duration::from_secs(2)).await;
     let grown = server.peak_memory() - before;
     println!("the server took {} MB more", grown >> 20);
     assert!(grown < 100_000_000 + REST, "the server took {grown} bytes more");
     neighbour.was_not_held_up();
-    // Those who leave make room.
+    // Clients that disconnect free their memory.
     drop((calls, connections));
     until("there is room for a picture", async || {
         matches!(other.answer(Render { slot: 0, width: 2048, height: 2048 }).await, Response::Render(_))
@@ -129,7 +129,7 @@ async fn a_snapshot_of_empty_lists_takes_no_memory() {
     let (mut session, _) = Session::open(server.tcp(), same_step("CartPole", 1)).await;
     let good = session.snapshot(&[]).await.remove(0);
     let before = server.memory();
-    // As many parameters as there are bytes, each with an empty list of intervals.
+    // As many parameters as fit into the bytes, each with an empty list of intervals.
     let name = good.windows(8).position(|window| window == b"CartPole").unwrap();
     for at in name + 8..good.len().min(name + 100) {
         let mut bad = good[..at].to_vec();
@@ -161,7 +161,7 @@ async fn client_that_neither_reads_nor_ends_a_message_is_gone() {
     let (code, message) = half.status().await.unwrap();
     assert_eq!(code, Code::DeadlineExceeded as i32, "{message}");
     until("the connection is closed", async || unread.is_closed()).await;
-    // Both environments are free. One that waits without a word, and has read everything, stays.
+    // Both environments are free again. A session that is idle and has read all its replies is kept.
     let mut session = Session::connect(server.tcp()).await;
     until("there is room", async || matches!(session.answer(open("MountainCar", 2, 1)).await, Response::Opened(_)))
         .await;
@@ -178,7 +178,7 @@ async fn a_message_that_drips_for_ever_is_ended() {
     assert!(call.receive().await.is_some());
     assert!(call.send(framed(1000, &[])).await);
     let start = Instant::now();
-    // Each byte comes in time, and all of them would take minutes.
+    // Each byte arrives within the maximum pause, but the whole message would take minutes.
     while call.send(Bytes::from_static(&[0])).await {
         assert!(start.elapsed() < Duration::from_secs(60), "it is waited for");
         tokio::time::sleep(Duration::from_millis(400)).await;
@@ -201,7 +201,7 @@ async fn a_call_that_never_ends_its_request_is_ended() {
     assert!((9..30).contains(&seconds), "after {seconds} s, expected 10");
 }
 
-/// Thousands come and go within the time that a client may leave its replies unread.
+/// Thousands of clients connect and disconnect within the time for which a client may leave its replies unread.
 #[tokio::test]
 async fn nothing_is_left_of_a_connection_that_has_ended() {
     const MOST: usize = 4 << 20;
@@ -217,7 +217,8 @@ async fn nothing_is_left_of_a_connection_that_has_ended() {
     come_and_go(500).await;
     let before = server.memory();
     come_and_go(5_000).await;
-    // The last ones may still be ending. A quarter of the time that a client has to read is longer than this.
+    // The last connections may still be ending. This timeout is shorter than the interval at which unread replies are
+    // checked.
     tokio::time::timeout(
         Duration::from_secs(20),
         until("memory is given back", async || server.memory() < before + MOST),
@@ -242,8 +243,8 @@ async fn repeated_opens_take_little_more_memory_than_one() {
         }
         drop(session);
     }
-    // Without a thread that frees them all it was 1.5: each worker's heap grew by what the others had. With one, 1.0 to
-    // 1.1 in twenty runs, with 2 workers and with 16.
+    // The factor was 1.5 when the workers freed environments, because each worker's heap kept what the others had used.
+    // With one thread that frees all of them, it was 1.0 to 1.1 in twenty runs, with 2 and with 16 workers.
     until("memory is given back", async || server.memory() as f64 <= 1.3 * once as f64).await;
     let (now, peak) = (server.memory(), server.peak_memory());
     println!("once {} MB, ten times {} MB, at most {} MB", once >> 20, now >> 20, peak >> 20);

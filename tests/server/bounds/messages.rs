@@ -1,4 +1,4 @@
-//! How large requests may be, when, and of how many parts.
+//! Limits of the size of requests and of their number of entries, before and after `open`.
 
 use super::{
     Neighbour,
@@ -12,7 +12,7 @@ use tonic::Code;
 
 const WINDOW: u32 = 1 << 20;
 
-/// A request whose field `number` has these bytes.
+/// Encodes a request whose field `number` contains `bytes`.
 fn request(number: u8, bytes: &[u8]) -> Vec<u8> {
     let mut message = vec![number << 3 | 2];
     prost::encode_length_delimiter(bytes.len(), &mut message).unwrap();
@@ -20,7 +20,7 @@ fn request(number: u8, bytes: &[u8]) -> Vec<u8> {
     message
 }
 
-/// So many empty entries of a repeated field.
+/// Encodes `count` empty entries of the repeated field `number`.
 fn empty_entries(number: u8, count: usize) -> Vec<u8> {
     [number << 3 | 2, 0].repeat(count)
 }
@@ -42,7 +42,7 @@ async fn request_over_1_mib_before_open_is_refused_unread() {
         assert_eq!(code, Code::OutOfRange as i32, "{message}");
         assert!(message.contains("1048576"), "the limit is told: {message}");
     }
-    // A request of as many bytes is read.
+    // A request of exactly the maximum length is read.
     let (mut session, _) = (Session::connect(server.tcp()).await, ());
     let padding = "x".repeat((1 << 20) - 40);
     let (code, _) = session.refused(Open { environment: padding, ..open("CartPole", 1, 1) }).await;
@@ -71,7 +71,7 @@ async fn counts_are_bounded_while_a_large_request_is_decoded() {
     let neighbour = Neighbour::start(server.unix());
     let before = server.memory();
     let many = 15 << 20;
-    // Snapshots, seeds, distributions, and widths of a policy; and parts of the last open that none of it has room for.
+    // Too many snapshots, seeds, distributions, or widths of a policy; and too many entries within an `open`.
     for request in [
         request(5, &empty_entries(2, many)),
         request(3, &[0x10, 1].repeat(many)),

@@ -1,4 +1,5 @@
-//! What one client may take of the server: each attack is tried beside a neighbour, who must not notice.
+//! Limits of what one client can take from the server. Each attack runs while another session steps, which must not be
+//! delayed.
 
 pub mod client;
 #[cfg(feature = "mujoco")]
@@ -20,15 +21,17 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// The longest step of a neighbour, whose machine may be busy with much else. What it comes to is printed.
+/// The maximum time of a neighbour's step, on a machine that may be busy. The measured time is printed.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Where nothing else runs, the most that 99 of 100 of its steps take, ms: `make bounds-test`. …
+/// The environment variable with the maximum of the 99th percentile of a neighbour's step times, ms. `make bounds-test`
+/// sets it, on an idle machine.
 const P99_MS: &str = "PERTURB_TEST_NEIGHBOUR_P99_MS";
-/// … It looks at so many steps at least, of which none takes longer than this.
+/// The minimum number of measured steps.
 const FEWEST: usize = 100;
+/// The maximum time of a neighbour's step on an idle machine.
 const LONGEST: Duration = Duration::from_secs(1);
 
-/// A session that steps all the time, on a thread of its own, and measures how long each step takes.
+/// A session that steps continuously on a thread of its own, and measures the time of each step.
 struct Neighbour {
     stop: Arc<AtomicBool>,
     thread: JoinHandle<Vec<Duration>>,
@@ -57,7 +60,7 @@ impl Neighbour {
         Self { stop, thread }
     }
 
-    /// Ends it; no step took long.
+    /// Ends the session, and asserts that no step took too long.
     fn was_not_held_up(self) {
         self.stop.store(true, Ordering::Relaxed);
         let mut times = self.thread.join().expect("the neighbour's session failed");

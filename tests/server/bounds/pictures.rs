@@ -1,4 +1,4 @@
-//! What pictures may take of others' time.
+//! Drawing pictures does not delay other sessions.
 
 use crate::common::server::{Server, Session, open};
 use perturb::proto::Render;
@@ -20,7 +20,7 @@ async fn a_small_picture_does_not_wait_for_all_the_large_ones() {
     for session in &sessions {
         session.send(Render { slot: 0, width: 2048, height: 2048 }).await;
     }
-    // Asked for before this thread is busy with reading the large ones.
+    // Requested before this thread is busy with reading the large pictures.
     small.send(Render { slot: 0, width: 64, height: 64 }).await;
     let mut reading = tokio::task::JoinSet::new();
     for mut session in sessions {

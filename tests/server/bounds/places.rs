@@ -1,4 +1,4 @@
-//! Who may have how many places, and how long a place is kept for somebody who does not come.
+//! Limits of the number of sessions and connections, and timeouts of clients that occupy one without using it.
 
 use super::client::{Connection, SESSION};
 use crate::common::server::{Server, Session, client, command, open, until, within};
@@ -18,11 +18,11 @@ async fn half_a_preface_is_closed_in_time() {
         half.write_all(part).unwrap();
         half.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
         let closed = tokio::task::spawn_blocking(move || half.read_to_end(&mut Vec::new())).await.unwrap();
-        // An end, or a reset: no time-out.
+        // The connection was closed or reset; the read did not time out.
         let waited = closed.as_ref().is_err_and(|error| error.kind() == std::io::ErrorKind::WouldBlock);
         assert!(!waited, "{closed:?}");
     }
-    // A connection without calls has begun, and stays.
+    // A connection that has finished its handshake is kept even without calls.
     let mut idle = client(server.tcp()).await;
     tokio::time::sleep(Duration::from_secs(7)).await;
     let mut session = Session::start(&mut idle).await.unwrap();
@@ -46,7 +46,7 @@ async fn sessions_that_are_never_opened_give_their_places_back() {
     opened.step(vec![0; 4].into()).await;
 }
 
-/// Each stream's first reply waits for a window that its client never opens, so that nothing else of it is looked at.
+/// Each stream's first reply waits for a flow-control window that the client never opens.
 #[tokio::test]
 async fn session_with_unread_first_reply_gives_its_place_back() {
     let server = Server::start(&["--handshake-seconds", "3", "--max-sessions", "20"]);
@@ -81,7 +81,7 @@ async fn who_is_refused_again_and_again_has_not_opened_a_session() {
     assert!(start.elapsed() >= Duration::from_secs(3));
 }
 
-/// Its next request is always there already.
+/// The client always sends its next request before the previous one is refused.
 #[tokio::test]
 async fn refusals_without_a_pause_do_not_extend_the_handshake() {
     let server = Server::start(&["--handshake-seconds", "2"]);
@@ -108,9 +108,9 @@ async fn a_peer_has_no_more_sessions_and_connections_than_its_quota() {
     let status = Session::start(&mut one).await.err().expect("a third session is refused");
     assert_eq!(status.code(), Code::ResourceExhausted, "{status:?}");
     assert!(status.message().contains("all of the 2 sessions"), "{status:?}");
-    // By another way it is another peer.
+    // A client on the Unix socket is another peer.
     let (mut other, _) = Session::open(server.unix(), open("CartPole", 1, 1)).await;
-    // Connections are closed beyond some more than its sessions.
+    // A peer may have some more connections than sessions; further connections are closed.
     let mut connections: Vec<TcpStream> = (0..40).map(|_| TcpStream::connect(server.port()).unwrap()).collect();
     let mut last = connections.pop().unwrap();
     last.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
@@ -163,7 +163,7 @@ async fn hoppers_can_fill_all_places_and_one_more_is_refused() {
     let seconds = std::env::var(SECONDS).map_or(0, |seconds| seconds.parse().unwrap());
     let (start, mut rounds, mut times) = (Instant::now(), 0, Vec::new());
     while rounds < 3 || start.elapsed() < Duration::from_secs(seconds) {
-        // All at once: what one waits is what the server takes for all.
+        // All sessions step at once, so a session's waiting time is the time that the server takes for all of them.
         let sent = Instant::now();
         for session in &sessions {
             session.send(step(vec![0; 4 * 3 * 16])).await;

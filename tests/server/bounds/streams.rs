@@ -1,4 +1,4 @@
-//! How many streams a connection may have at a time.
+//! The limit of concurrent streams of a connection.
 
 use crate::common::server::{Server, Session, channel, open, until, within};
 use std::time::Duration;
@@ -8,31 +8,31 @@ use tokio::{
 };
 use tonic_health::pb::{HealthCheckRequest, health_client::HealthClient};
 
-/// As many as the server takes sessions, and sixteen for other calls. What watches health is none of the sessions.
+/// The expected limit: the maximum number of sessions, plus sixteen other calls, such as watches of the health.
 const STREAMS: u32 = 4 + 16;
 const FLAGS: [&str; 2] = ["--max-sessions", "4"];
 
-/// Kinds of HTTP/2's frames.
+/// Types of HTTP/2 frames.
 const DATA: u8 = 0;
 const HEADERS: u8 = 1;
 const RST_STREAM: u8 = 3;
 const SETTINGS: u8 = 4;
-/// Their flags.
+/// Flags of HTTP/2 frames.
 const END_STREAM: u8 = 1;
 const END_HEADERS: u8 = 4;
-/// The setting that says how many streams there may be.
+/// The HTTP/2 setting with the maximum number of concurrent streams.
 const MAX_CONCURRENT_STREAMS: u16 = 3;
-/// Why a stream is reset.
+/// The HTTP/2 error code with which a server refuses a stream.
 const REFUSED_STREAM: u32 = 7;
 const CANCEL: u32 = 8;
 
-/// A client that heeds no limit: every library waits until there is a place.
+/// A client that ignores the limit. No gRPC library does so: they all wait until a stream ends.
 struct Greedy {
     tcp: TcpStream,
     next: u32,
 }
 
-/// What comes.
+/// A frame that was received.
 struct Frame {
     kind: u8,
     stream: u32,
@@ -62,7 +62,7 @@ impl Greedy {
         Frame { kind: head[3], stream: number(&head[5..]), payload }
     }
 
-    /// The streams that the server says there may be, which comes first.
+    /// Reads the server's first frame, its settings. Returns its maximum number of streams.
     async fn announced(&mut self) -> Option<u32> {
         let frame = self.receive().await;
         assert_eq!(frame.kind, SETTINGS);
@@ -71,7 +71,8 @@ impl Greedy {
         named.find_map(|(name, number)| (name == MAX_CONCURRENT_STREAMS).then_some(number))
     }
 
-    /// Begins to watch the server's health, which does not end: the stream, or why it was reset.
+    /// Starts an endless call that watches the server's health. Returns the stream's number, or the error code with
+    /// which it was reset.
     async fn watch(&mut self) -> Result<u32, u32> {
         let (stream, mut head) = (self.next, Vec::new());
         self.next += 2;
@@ -83,7 +84,7 @@ impl Greedy {
             ("content-type", "application/grpc"),
             ("te", "trailers"),
         ] {
-            // Both as they are, each behind its length.
+            // Name and value are written uncompressed, each after its length.
             head.push(0);
             for text in [name, value] {
                 head.push(text.len() as u8);

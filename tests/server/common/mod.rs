@@ -1,4 +1,4 @@
-//! What several test files need: environments at their first episode, actions, and transcripts to compare.
+//! Helpers for several test files: environments at their first episode, actions, and transcripts to compare.
 
 pub mod proxy;
 pub mod server;
@@ -7,7 +7,7 @@ use perturb::env::{
     Action, ActionSpace, Catalogue, EnvironmentSpec, Episodes, Outcome, Purpose, Settings, Stream, Version,
 };
 
-/// A folder like the reaching arm's, with a length as its last parameter, and the folders of examples/tasks.
+/// Returns the folders of examples/tasks, and a variant of the reaching arm whose last parameter is a length.
 #[cfg(feature = "mujoco")]
 pub fn folders() -> Vec<std::path::PathBuf> {
     static WITH_LENGTH: std::sync::OnceLock<std::path::PathBuf> = std::sync::OnceLock::new();
@@ -25,7 +25,7 @@ pub fn folders() -> Vec<std::path::PathBuf> {
     [with_length.clone(), examples.join("quadruped"), examples.join("reaching_arm")].into()
 }
 
-/// A length of the reaching arm.
+/// A parameter of the reaching arm: the length of its upper link.
 #[cfg(feature = "mujoco")]
 pub const UPPER_LENGTH: &str = r#"
 [[parameter]]
@@ -38,7 +38,7 @@ random = [0.3, 0.4]
 extreme = [[0.25, 0.3], [0.4, 0.45]]
 "#;
 
-/// The built-in environments, and those of the folders in examples/tasks.
+/// Returns the built-in environments, and the environments of the folders in examples/tasks.
 pub fn catalogue() -> Catalogue {
     #[cfg(feature = "mujoco")]
     {
@@ -49,14 +49,14 @@ pub fn catalogue() -> Catalogue {
     perturb::tasks::catalogue()
 }
 
-/// The environments of the folders in examples/tasks.
+/// Returns the environments of the folders in examples/tasks.
 #[cfg(feature = "mujoco")]
 pub fn folder_specs() -> Vec<&'static EnvironmentSpec> {
     let built_in = perturb::tasks::catalogue();
     catalogue().specs().filter(|spec| built_in.names().all(|name| name != spec.name)).collect()
 }
 
-/// Settings of an environment of this version.
+/// Returns settings of an environment in this version.
 pub fn settings(spec: &EnvironmentSpec, version: Version, seed: u64, index: u32, per_trial: u32) -> Settings {
     Settings {
         seed,
@@ -66,13 +66,13 @@ pub fn settings(spec: &EnvironmentSpec, version: Version, seed: u64, index: u32,
     }
 }
 
-/// The environment at the start of its first episode.
+/// Returns an environment at the start of its first episode.
 pub fn episodes(spec: &EnvironmentSpec, version: Version, seed: u64, index: u32, per_trial: u32) -> Episodes {
     Episodes::new((spec.make)().unwrap(), settings(spec, version, seed, index, per_trial))
 }
 
-/// The wire's bytes of the action that actor number `actor` takes at time `t`: random, but a function of these alone.
-/// A vector's entries leave the channels' ranges now and then, as they may.
+/// Returns the encoded action of actor number `actor` at time `t`: random, but a function of these two numbers only.
+/// Continuous actions sometimes exceed their ranges, which is allowed.
 pub fn action_bytes(spec: &EnvironmentSpec, actor: u64, t: u64) -> Vec<u8> {
     let mut stream = Stream::new(0xAC7, actor, Purpose::InitialState, t);
     match spec.action {
@@ -83,12 +83,12 @@ pub fn action_bytes(spec: &EnvironmentSpec, actor: u64, t: u64) -> Vec<u8> {
     }
 }
 
-/// The f32 of little-endian bytes.
+/// Decodes little-endian f32 values.
 pub fn floats(bytes: &[u8]) -> Vec<f32> {
     bytes.as_chunks::<4>().0.iter().map(|word| f32::from_le_bytes(*word)).collect()
 }
 
-/// Steps with an action given as the wire's bytes; returns also the reward's terms.
+/// Takes a step with an encoded action. Also returns the terms of the reward.
 pub fn step(episodes: &mut Episodes, action: &[u8]) -> (Outcome, Vec<f64>) {
     let mut terms = vec![f64::NAN; episodes.spec().reward_terms.len()];
     let outcome = match episodes.spec().action {
@@ -100,21 +100,21 @@ pub fn step(episodes: &mut Episodes, action: &[u8]) -> (Outcome, Vec<f64>) {
     (outcome, terms)
 }
 
-/// The current observation.
+/// Returns the current observation.
 pub fn observe(episodes: &Episodes) -> Vec<f32> {
     let mut out = vec![f32::NAN; episodes.spec().observation.len()];
     episodes.observe(&mut out);
     out
 }
 
-/// What an episode starts with: its name, its physics, its first observation. Numbers are printed with all digits, so
-/// that equal lines are equal bytes.
+/// Describes the start of an episode in one line: its indices, its physics, its first observation. Numbers are printed
+/// with all digits, so equal lines mean equal bytes.
 pub fn start_line(episodes: &Episodes) -> String {
     format!("start {:?} {:?}", episodes.started(true), observe(episodes))
 }
 
-/// Takes the actor's steps from time `from` on, `steps` of them, beginning a new episode where one has ended, and
-/// returns a line for everything that can be seen.
+/// Takes `steps` steps of the actor from time `from` on, and begins a new episode after each end. Returns lines with
+/// all outputs.
 pub fn play(episodes: &mut Episodes, actor: u64, from: u64, steps: u64) -> Vec<String> {
     let mut lines = Vec::new();
     for t in from..from + steps {

@@ -1,4 +1,4 @@
-//! A line that breaks: a proxy in front of a server, whose connections are cut or fall silent.
+//! A proxy in front of a server, which can cut connections or hold back their bytes.
 
 use std::{
     io::{Read, Write},
@@ -10,7 +10,7 @@ use std::{
     thread,
 };
 
-/// Listens on a port of this machine until the process ends.
+/// The proxy. It listens until the process ends.
 pub struct Proxy {
     port: u16,
     state: Arc<State>,
@@ -23,18 +23,18 @@ struct State {
     cut: AtomicUsize,
 }
 
-/// Both ends of one, and whether its bytes are held back.
+/// A connection through the proxy: its two sockets, and whether its bytes are held back.
 #[derive(Clone)]
 struct Connection {
     ends: [Arc<TcpStream>; 2],
     is_silent: Arc<AtomicBool>,
-    /// So many more bytes go through, both ways together.
+    /// The number of bytes, in both directions together, after which the connection is cut.
     left: Arc<AtomicUsize>,
 }
 
 impl Proxy {
-    /// In front of the server at `address`, host and port. Connection number n, counted from 0, is cut when `most(n)`
-    /// bytes went through.
+    /// Starts a proxy in front of the server at `address`, "host:port". Connection number n, from 0, is cut after
+    /// `most(n)` bytes.
     pub fn start(address: &str, most: impl Fn(usize) -> usize + Send + 'static) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let (port, state) = (listener.local_addr().unwrap().port(), Arc::<State>::default());
@@ -59,23 +59,23 @@ impl Proxy {
         Self { port, state }
     }
 
-    /// Where it listens, host and port.
+    /// The address of the proxy, "host:port".
     pub fn address(&self) -> String {
         format!("127.0.0.1:{}", self.port)
     }
 
-    /// Cuts all connections.
+    /// Closes all connections.
     pub fn cut(&self) {
         self.state.connections.lock().unwrap().drain(..).for_each(|connection| connection.cut());
     }
 
-    /// Lets nothing more through on the connections that there are, and closes none: a cable that was pulled.
+    /// Holds back all bytes of the existing connections without closing them, like an unplugged cable.
     pub fn silence(&self) {
         let connections = self.state.connections.lock().unwrap();
         connections.iter().for_each(|connection| connection.is_silent.store(true, Ordering::Relaxed));
     }
 
-    /// How many connections were cut because of their bytes.
+    /// The number of connections that were cut because of their number of bytes.
     pub fn cuts(&self) -> usize {
         self.state.cut.load(Ordering::Relaxed)
     }
@@ -83,7 +83,7 @@ impl Proxy {
 
 impl Connection {
     fn cut(&self) {
-        self.ends.iter().for_each(|end| _ = end.shutdown(Shutdown::Both)); // it may be already
+        self.ends.iter().for_each(|end| _ = end.shutdown(Shutdown::Both)); // fails if it is already closed
     }
 
     fn pass(&self, way: usize, state: &State) {

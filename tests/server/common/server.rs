@@ -21,23 +21,23 @@ use tonic::{
     transport::{Channel, Endpoint},
 };
 
-/// Nothing here takes nearly as long; only a hang does.
+/// A timeout far longer than anything in the tests takes, so that only a hang exceeds it.
 pub const DEADLINE: Duration = Duration::from_secs(120);
-/// Steps sent ahead of their replies by [`Session::play`].
+/// The number of steps that [`Session::play`] sends before it reads a reply.
 const AHEAD: u64 = 32;
 
 /// A running server. It is killed when this is dropped.
 pub struct Server {
     pub child: Child,
-    /// Where it listens, in the order of its lines.
+    /// The addresses at which it listens, in the order in which it printed them.
     pub addresses: Vec<String>,
     pub directory: TempDir,
-    /// Kept open, or dropped to close the server's standard input.
+    /// The server's standard input, which closes when this is dropped.
     pub stdin: Option<ChildStdin>,
 }
 
 impl Server {
-    /// A server on a free TCP port and a Unix socket, with these flags.
+    /// Starts a server with these flags, on a free TCP port and a Unix socket.
     pub fn start(flags: &[&str]) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let socket = format!("unix:{}", directory.path().join("socket").display());
@@ -46,7 +46,7 @@ impl Server {
         Self::spawn(command, directory, 2)
     }
 
-    /// The same with the tasks of examples/tasks, where there is MuJoCo.
+    /// Like [`Server::start`], with the tasks of examples/tasks if there is MuJoCo.
     pub fn with_folders(flags: &[&str]) -> Self {
         #[cfg(feature = "mujoco")]
         {
@@ -58,7 +58,7 @@ impl Server {
         Self::start(flags)
     }
 
-    /// Runs a command that listens at so many addresses.
+    /// Runs a command that starts a server. Waits until it has printed `addresses` addresses.
     pub fn spawn(mut command: Command, directory: TempDir, addresses: usize) -> Self {
         let log = std::fs::File::create(directory.path().join("log")).unwrap();
         let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(log).spawn().unwrap();
@@ -72,37 +72,37 @@ impl Server {
         server
     }
 
-    /// The TCP address.
+    /// The address of the TCP port.
     pub fn tcp(&self) -> &str {
         self.addresses.iter().find(|a| a.starts_with("http://")).unwrap()
     }
 
-    /// The TCP address as host and port.
+    /// The TCP port as "host:port".
     pub fn port(&self) -> &str {
         self.tcp().strip_prefix("http://").unwrap()
     }
 
-    /// The Unix socket's address.
+    /// The address of the Unix socket.
     pub fn unix(&self) -> &str {
         self.addresses.iter().find(|a| a.starts_with("unix:")).unwrap()
     }
 
-    /// The Unix socket's path.
+    /// The path of the Unix socket.
     pub fn socket(&self) -> PathBuf {
         self.unix().strip_prefix("unix:").unwrap().into()
     }
 
-    /// What it logged so far.
+    /// Returns the log so far.
     pub fn log(&self) -> String {
         String::from_utf8_lossy(&std::fs::read(self.directory.path().join("log")).unwrap()).into_owned()
     }
 
-    /// Sends it a signal.
+    /// Sends the server a signal.
     pub fn signal(&self, signal: &str) {
         self::signal(self.child.id(), signal);
     }
 
-    /// Waits for its end.
+    /// Waits until the server's process ends.
     pub async fn ended(&mut self) -> ExitStatus {
         let start = Instant::now();
         loop {
@@ -114,19 +114,19 @@ impl Server {
         }
     }
 
-    /// When it was started, s since 1970, as its log's file tells.
+    /// Returns the server's start time, s since 1970, from the creation time of its log file.
     pub fn started_seconds(&self) -> f64 {
         let log = std::fs::metadata(self.directory.path().join("log")).unwrap();
         let created = log.created().or_else(|_| log.modified()).unwrap();
         created.duration_since(std::time::UNIX_EPOCH).unwrap().as_secs_f64()
     }
 
-    /// Its resident memory, in bytes.
+    /// Returns the server's resident memory, bytes.
     pub fn memory(&self) -> usize {
         self.memory_line("VmRSS:")
     }
 
-    /// The most that it ever had, in bytes.
+    /// Returns the server's peak resident memory, bytes.
     pub fn peak_memory(&self) -> usize {
         self.memory_line("VmHWM:")
     }
@@ -148,10 +148,11 @@ impl Drop for Server {
     }
 }
 
-/// How many transport threads the servers of all tests have that do not say so themselves: `make threads-test`.
+/// The environment variable with the default number of transport threads of servers in tests. `make threads-test` sets
+/// it.
 const TRANSPORT_THREADS: &str = "PERTURB_TEST_TRANSPORT_THREADS";
 
-/// The server program, not started yet.
+/// Returns the command of the server program.
 pub fn command() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_perturb-server"));
     for (name, _) in std::env::vars_os().filter(|(name, _)| name.to_string_lossy().starts_with("PERTURB_SERVER_")) {
@@ -169,7 +170,7 @@ pub fn signal(process: u32, signal: &str) {
     assert!(sent.success(), "kill -{signal} {process}: {sent}");
 }
 
-/// The lines that a process prints, as they come.
+/// Returns a receiver of the lines that a process prints.
 pub fn lines(output: impl std::io::Read + Send + 'static) -> mpsc::Receiver<String> {
     let (sender, lines) = mpsc::channel();
     std::thread::spawn(move || {
@@ -182,12 +183,12 @@ pub fn lines(output: impl std::io::Read + Send + 'static) -> mpsc::Receiver<Stri
     lines
 }
 
-/// The future's output, or a panic if it hangs.
+/// Returns the future's output. Panics if the future hangs.
 pub async fn within<T>(future: impl Future<Output = T>) -> T {
     tokio::time::timeout(DEADLINE, future).await.expect("no answer before the deadline")
 }
 
-/// Asks again and again until the answer is yes.
+/// Repeats `ask` until it returns true. Panics, naming `what`, if that takes too long.
 pub async fn until(what: &str, mut ask: impl AsyncFnMut() -> bool) {
     let start = Instant::now();
     while !within(ask()).await {
@@ -196,46 +197,46 @@ pub async fn until(what: &str, mut ask: impl AsyncFnMut() -> bool) {
     }
 }
 
-/// A connection of its own.
+/// Opens a new connection.
 pub async fn channel(address: &str) -> Channel {
     let endpoint = Endpoint::from_shared(address.to_owned()).unwrap().tcp_nodelay(true);
     within(endpoint.connect()).await.unwrap_or_else(|error| panic!("no connection to {address}: {error:?}"))
 }
 
-/// A client on a connection of its own.
+/// Returns a client on a new connection.
 pub async fn client(address: &str) -> PerturbClient<Channel> {
     PerturbClient::new(channel(address).await).max_decoding_message_size(usize::MAX)
 }
 
-/// Every environment of the server.
+/// Returns the catalogue of the server.
 pub async fn catalogue(address: &str) -> Vec<Environment> {
     let reply = within(client(address).await.list_environments(proto::ListEnvironmentsRequest {})).await.unwrap();
     reply.into_inner().environments
 }
 
-/// One environment of the server.
+/// Returns one entry of the server's catalogue.
 pub async fn environment(address: &str, name: &str) -> Environment {
     catalogue(address).await.into_iter().find(|e| e.name == name).unwrap()
 }
 
-/// A session.
+/// A client's session.
 pub struct Session {
     requests: Option<tokio::sync::mpsc::Sender<SessionRequest>>,
     responses: Streaming<SessionResponse>,
 }
 
 impl Session {
-    /// A session on a connection of its own, not open yet.
+    /// Starts a session on a new connection, without opening it.
     pub async fn connect(address: &str) -> Self {
         Self::start(&mut client(address).await).await.unwrap()
     }
 
-    /// A session on this connection, not open yet.
+    /// Starts a session on an existing connection, without opening it.
     pub async fn start(client: &mut PerturbClient<Channel>) -> Result<Self, Status> {
         Self::show(client, None).await
     }
 
-    /// The same, which shows a token.
+    /// Like [`Session::start`], with a token.
     pub async fn show(client: &mut PerturbClient<Channel>, token: Option<&str>) -> Result<Self, Status> {
         let (requests, receiver) = tokio::sync::mpsc::channel(1024);
         let mut call = tonic::Request::new(ReceiverStream::new(receiver));
@@ -246,35 +247,36 @@ impl Session {
         Ok(Self { requests: Some(requests), responses })
     }
 
-    /// An open session on a connection of its own.
+    /// Opens a session on a new connection.
     pub async fn open(address: &str, open: Open) -> (Self, proto::Opened) {
         let mut session = Self::connect(address).await;
         let opened = session.ask(open).await;
         (session, opened)
     }
 
-    /// Sends a request; its response is still to be received. If the session is over, receiving tells why.
+    /// Sends a request without waiting for its response. If the session has ended, [`Session::receive`] returns the
+    /// reason.
     pub async fn send(&self, request: impl Into<Request>) {
         let requests = self.requests.as_ref().expect("closed already");
         let _ = within(requests.send(SessionRequest { request: Some(request.into()) })).await;
     }
 
-    /// Where requests go, for senders of their own.
+    /// Returns a sender of requests, for use by other tasks.
     pub fn sender(&self) -> tokio::sync::mpsc::Sender<SessionRequest> {
         self.requests.clone().unwrap()
     }
 
-    /// Sends no more.
+    /// Closes the sending half of the stream.
     pub fn close(&mut self) {
         self.requests = None;
     }
 
-    /// The next response, none at the stream's end.
+    /// Returns the next response, or `None` at the end of the stream.
     pub async fn receive(&mut self) -> Result<Option<SessionResponse>, Status> {
         within(self.responses.message()).await
     }
 
-    /// The status with which the stream ends, after whatever responses are still to come.
+    /// Reads all remaining responses. Returns the status with which the stream ends.
     pub async fn end(&mut self) -> Status {
         loop {
             match self.receive().await {
@@ -285,20 +287,20 @@ impl Session {
         }
     }
 
-    /// The response to a request, whatever it is.
+    /// Sends a request and returns its response, which may be an error.
     pub async fn answer(&mut self, request: impl Into<Request>) -> Response {
         self.send(request).await;
         let response = self.receive().await.unwrap().expect("the stream ended");
         response.response.expect("a response is never empty")
     }
 
-    /// The reply to a request that is not refused.
+    /// Sends a request and returns its reply. Panics if it is refused.
     pub async fn ask<A: TypedRequest>(&mut self, request: A) -> A::Reply {
         let response = self.answer(request).await;
         A::reply(response).unwrap_or_else(|other| panic!("{} was answered by {other:?}", A::NAME))
     }
 
-    /// Why a request is refused.
+    /// Sends a request that must be refused. Returns the code and the message.
     pub async fn refused(&mut self, request: impl Into<Request>) -> (Code, String) {
         match self.answer(request).await {
             Response::Error(error) => (Code::from_i32(error.code), error.message),
@@ -306,27 +308,27 @@ impl Session {
         }
     }
 
-    /// A step of these actions.
+    /// Takes a step with these actions.
     pub async fn step(&mut self, actions: Bytes) -> Stepped {
         self.ask(Step { actions }).await
     }
 
-    /// Snapshots of the environments that the mask selects.
+    /// Takes snapshots of the environments that the mask selects.
     pub async fn snapshot(&mut self, mask: &[u8]) -> Vec<Bytes> {
         self.ask(Snapshot { mask: Bytes::copy_from_slice(mask) }).await.snapshots
     }
 
-    /// A restore of the environments that the mask selects; their observations.
+    /// Restores the environments that the mask selects. Returns their observations.
     pub async fn restore(&mut self, mask: &[u8], snapshots: Vec<Bytes>) -> Bytes {
         self.ask(Restore { mask: Bytes::copy_from_slice(mask), snapshots }).await.observations
     }
 
-    /// A picture's pixels, `[height, width, 3]`.
+    /// Requests a picture. Returns its pixels, `[height, width, 3]`.
     pub async fn render(&mut self, slot: u32, (width, height): (u32, u32)) -> Bytes {
         self.ask(Render { slot, width, height }).await.pixels
     }
 
-    /// Steps with the random actions of times `from` … `to`-1, pipelined; the responses.
+    /// Takes pipelined steps with the random actions of times `from` … `to`-1. Returns the responses.
     pub async fn play(&mut self, actor: Actor<'_>, from: u64, to: u64) -> Vec<SessionResponse> {
         let mut responses = Vec::new();
         let mut sent = from;
@@ -341,8 +343,8 @@ impl Session {
     }
 }
 
-/// Random actions for a batch of `n` environments, the first of which has index `first`. An environment's action is a
-/// function of its index and the time alone. A vector's entries leave the channels' ranges now and then, as they may.
+/// Random actions for a batch of `n` environments, of which the first has index `first`. An environment's action is a
+/// function of its index and the time only. Continuous actions sometimes exceed their ranges, which is allowed.
 #[derive(Clone, Copy)]
 pub struct Actor<'a> {
     pub environment: &'a Environment,
@@ -351,18 +353,18 @@ pub struct Actor<'a> {
 }
 
 impl<'a> Actor<'a> {
-    /// For a batch whose first index is 0.
+    /// Makes the actor of a batch whose first environment index is 0.
     pub fn new(environment: &'a Environment, n: usize) -> Self {
         Self { environment, first: 0, n }
     }
 
-    /// The batch's actions at a time.
+    /// Returns the batch's encoded actions at time `t`.
     pub fn actions(self, t: u64) -> Bytes {
         (self.first..).take(self.n).flat_map(|index| action(self.environment, index, t)).collect()
     }
 }
 
-/// The wire's bytes of one environment's action.
+/// Returns the encoded action of one environment.
 pub fn action(environment: &Environment, index: u64, t: u64) -> Vec<u8> {
     let unit = |entry: u64| mixed(mixed(mixed(index) ^ t) ^ entry) as f64 / u64::MAX as f64 * (1.0 - 1e-9);
     match environment.action.as_ref().unwrap().kind.as_ref().unwrap() {
@@ -374,7 +376,7 @@ pub fn action(environment: &Environment, index: u64, t: u64) -> Vec<u8> {
     }
 }
 
-/// SplitMix64's finaliser: a well mixed function of its argument.
+/// The finaliser of SplitMix64, a hash function.
 pub fn mixed(x: u64) -> u64 {
     let x = x.wrapping_add(0x9E37_79B9_7F4A_7C15);
     let x = (x ^ (x >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -382,7 +384,7 @@ pub fn mixed(x: u64) -> u64 {
     x ^ (x >> 31)
 }
 
-/// An `open` with everything on: version R, receipts and reward terms, next-step autoreset.
+/// Returns an `open` with all features: version R, receipts and reward terms, next-step autoreset.
 pub fn open(environment: &str, batch_size: u32, seed: u64) -> Open {
     Open {
         environment: environment.into(),
@@ -396,18 +398,18 @@ pub fn open(environment: &str, batch_size: u32, seed: u64) -> Open {
     }
 }
 
-/// A step of these actions.
+/// Returns a request for a step with these actions.
 pub fn step(actions: impl Into<Bytes>) -> Request {
     Request::Step(Step { actions: actions.into() })
 }
 
-/// A refusal as a line of a snapshot.
+/// Formats a refusal as a line of a snapshot file.
 pub fn refusal((code, message): (Code, String)) -> String {
-    // A server without MuJoCo has two environments less.
+    // A server without MuJoCo has two fewer environments.
     format!("{code:?}: {}\n", message.replace(", HalfCheetah, Hopper", ""))
 }
 
-/// The step among these responses.
+/// Returns the result of a step in a response. Panics if the response is another.
 pub fn stepped(response: &SessionResponse) -> &Stepped {
     match &response.response {
         Some(Response::Stepped(stepped)) => stepped,
@@ -415,22 +417,22 @@ pub fn stepped(response: &SessionResponse) -> &Stepped {
     }
 }
 
-/// The f32 of little-endian bytes.
+/// Decodes little-endian f32 values.
 pub fn floats(bytes: &[u8]) -> Vec<f32> {
     bytes.as_chunks::<4>().0.iter().map(|word| f32::from_le_bytes(*word)).collect()
 }
 
-/// Little-endian bytes of f64.
+/// Encodes f64 values as little-endian bytes.
 pub fn doubles(numbers: &[f64]) -> Bytes {
     numbers.iter().flat_map(|x| x.to_le_bytes()).collect()
 }
 
-/// A distribution over these intervals.
+/// Returns a distribution over these intervals.
 pub fn union(intervals: &[(f64, f64)]) -> proto::Distribution {
     proto::Distribution { intervals: intervals.iter().map(|&(low, high)| proto::Interval { low, high }).collect() }
 }
 
-/// Distributions by name.
+/// Returns distributions by the names of their parameters.
 pub fn parameters(each: &[(&str, &[(f64, f64)])]) -> std::collections::HashMap<String, proto::Distribution> {
     each.iter().map(|(name, intervals)| ((*name).into(), union(intervals))).collect()
 }

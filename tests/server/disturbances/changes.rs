@@ -1,4 +1,4 @@
-//! Physics that change within an episode: when they change, to what, and what goes over.
+//! Changes of the physics within an episode: their time, the new parameters, and the state that is carried over.
 
 use super::{disturbed, settings};
 use crate::common::{self, action_bytes, observe, play, start_line, step};
@@ -9,7 +9,7 @@ use perturb::env::{
 
 const ADDRESS: (u64, u32) = (5, 9);
 
-/// A value for each parameter after a change, which is none that version D has.
+/// Returns a value for each parameter after a change, different from the value in version D.
 fn changed(spec: &'static EnvironmentSpec) -> Vec<(&'static str, f64)> {
     let value = |disturbance: &Parameter| {
         let [_, above] = disturbance.extreme;
@@ -24,13 +24,13 @@ fn catalogue() -> impl Iterator<Item = &'static EnvironmentSpec> {
     specs.into_iter()
 }
 
-/// An environment of version D whose physics change as `when` says.
+/// Returns an environment of version D whose physics change as `when` says.
 fn changing(spec: &'static EnvironmentSpec, when: &[(&'static str, f64)]) -> Episodes {
     disturbed(spec, Version::D, &[when, &changed(spec)].concat(), ADDRESS)
 }
 
-/// The same episode by hand: an environment that is given other parameters, and its own state, wherever `is_changed` is
-/// another than in the step before.
+/// Plays the same episode without the disturbance: whenever `is_changed` changes, its environment gets the other
+/// parameters and its own state again.
 struct ByHand {
     environment: Box<dyn Environment>,
     sets: [Vec<f64>; 2],
@@ -50,7 +50,7 @@ impl ByHand {
         }
     }
 
-    /// The reward's terms of a step and the observation after it.
+    /// Takes a step. Returns the terms of the reward, and the observation after it.
     fn step(&mut self, action: Action<'_>, is_changed: bool) -> (Vec<f64>, Vec<f32>, bool) {
         if is_changed != self.is_changed {
             self.is_changed = is_changed;

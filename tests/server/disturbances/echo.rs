@@ -1,4 +1,4 @@
-//! An environment that observes the actions that act on it.
+//! An environment whose observation contains the actions that reached it.
 
 use perturb::{
     env::{
@@ -8,7 +8,7 @@ use perturb::{
     scene::Scene,
 };
 
-/// Two motors; their last actions, the number of steps, and a constant are observed.
+/// The description: two motors; observations are their last actions, the number of steps, and a constant.
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "Echo",
     revision: 0,
@@ -41,13 +41,14 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     heatmap_axes: None,
 };
 
-/// The constant that is observed.
+/// The constant in the observation.
 pub const CONSTANT: f32 = 7.0;
 
 struct Echo {
-    /// The motors, the number of steps, the constant, and the push of the last step.
+    /// The last actions of both motors, the number of steps, the constant, and the two components of the last step's
+    /// push.
     state: [f64; 6],
-    /// Whether the next step is pushed.
+    /// Whether the next step has a push.
     is_pushed: bool,
 }
 

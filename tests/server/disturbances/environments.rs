@@ -1,4 +1,4 @@
-//! What holds for the disturbances of every environment of the catalogue.
+//! Properties of disturbances in every environment of the catalogue.
 
 use super::{all, disturbed, settings};
 use crate::common::{self, action_bytes, episodes, observe, play, start_line, step};
@@ -85,7 +85,7 @@ fn disturbances_leave_the_other_draws_alone() {
                 let own = disturbance::disturbances(spec).len();
                 let tail = |values: &[f64]| values[values.len() - own..].to_vec();
                 for (requested, applied) in tail(&receipt.requested).into_iter().zip(tail(&receipt.applied)) {
-                    // Masses after a change are read back from the physics to rounding.
+                    // After a change, masses are read back from the physics, exactly except for rounding.
                     assert!((requested - applied).abs() <= 1e-9 * requested, "{}: {requested} {applied}", spec.name);
                 }
                 plain.begin(None);
@@ -221,7 +221,7 @@ fn names_that_are_neither_are_refused_with_those_that_are() {
 #[test]
 fn disturbed_episodes_follow_from_their_addresses() {
     for spec in common::catalogue().specs() {
-        // The third episode, after two others and at once.
+        // The third episode, once after two others and once directly.
         let mut after_others: Episodes = disturbed(spec, Version::D, &all(spec), (8, 2));
         play(&mut after_others, 1, 0, 3);
         after_others.begin(None);

@@ -1,17 +1,17 @@
-//! The law of each disturbance, exactly, by an environment that observes what acts on it.
+//! The exact law of each disturbance, tested with an environment that observes the actions that reach it.
 
 use super::{disturbed, echo};
 use crate::common::observe;
 use perturb::env::{Action, Draw, Episodes, Purpose, Stream, Version};
 
-/// Draws for the distribution of a law.
+/// The number of draws for the test of a distribution.
 const DRAWS: u32 = 100_000;
-/// What the largest difference of two distribution functions, times √n, is below in 999 of 1000 samples (Kolmogorov). The
-/// samples here are always the same.
+/// The bound of √n times the largest difference of two distribution functions. 999 of 1000 samples are below it
+/// (Kolmogorov). The samples here are always the same.
 const MAX_KOLMOGOROV: f64 = 1.95;
-/// Standard deviations within which a count of successes is in more than 9999 of 10 000 samples.
+/// The number of standard deviations within which a count of successes lies in more than 9999 of 10 000 samples.
 const MAX_DEVIATIONS: f64 = 4.0;
-/// The neutral action: 0, or the end of the range that is nearest to 0.
+/// The neutral action of each motor: 0, or the end of its range that is nearest to 0.
 const NEUTRAL: [f32; 2] = [0.0, 0.5];
 const ADDRESS: (u64, u32) = (5, 9);
 
@@ -19,12 +19,12 @@ fn echo(values: &[(&str, f64)]) -> Episodes {
     disturbed(&echo::SPEC, Version::D, values, ADDRESS)
 }
 
-/// The action of step `t`: every one is another.
+/// Returns the action of step `t`, different for every step.
 fn action(t: u32) -> [f32; 2] {
     [t as f32 + 1.0, -(t as f32) - 2.0]
 }
 
-/// Takes `steps` steps and returns what acted in each.
+/// Takes `steps` steps. Returns the action that reached the environment in each.
 fn acted(episodes: &mut Episodes, steps: u32, action: impl Fn(u32) -> [f32; 2]) -> Vec<[f32; 2]> {
     let mut terms = [0.0];
     let step = |t| {
@@ -35,29 +35,29 @@ fn acted(episodes: &mut Episodes, steps: u32, action: impl Fn(u32) -> [f32; 2]) 
     (0..steps).map(step).collect()
 }
 
-/// The stream of a step of the first episode.
+/// Returns the random stream of a step of the first episode.
 fn stream(purpose: Purpose, step: u32) -> Stream {
     let draw = Draw { seed: ADDRESS.0, environment_index: ADDRESS.1, episode_index: 0 };
     Stream::at_step(&draw, purpose, step)
 }
 
-/// The first normal numbers of the stream of a step of the first episode.
+/// Returns the first normal numbers of the stream of a step of the first episode.
 fn normals<const N: usize>(purpose: Purpose, step: u32) -> [f64; N] {
     let mut stream = stream(purpose, step);
     std::array::from_fn(|_| stream.normal())
 }
 
-/// Checks that a sample is of the normal distribution with this mean and standard deviation.
+/// Asserts that a sample is from the normal distribution with this mean and standard deviation.
 fn assert_normal(sample: Vec<f64>, mean: f64, deviation: f64) {
     assert_distributed(sample, |x| 0.5 * libm::erfc(-(x - mean) / (deviation * std::f64::consts::SQRT_2)));
 }
 
-/// Checks that a sample is of the uniform distribution on [0, 1].
+/// Asserts that a sample is from the uniform distribution on [0, 1].
 fn assert_uniform(sample: Vec<f64>) {
     assert_distributed(sample, |x| x.clamp(0.0, 1.0));
 }
 
-/// Checks that a sample is of the distribution with this function.
+/// Asserts that a sample is from the distribution with this distribution function.
 fn assert_distributed(mut sample: Vec<f64>, expected: impl Fn(f64) -> f64) {
     sample.sort_by(f64::total_cmp);
     let n = sample.len() as f64;
@@ -69,15 +69,15 @@ fn assert_distributed(mut sample: Vec<f64>, expected: impl Fn(f64) -> f64) {
     assert!(largest * n.sqrt() < MAX_KOLMOGOROV, "{}", largest * n.sqrt());
 }
 
-/// Checks that `count` of `n` events are as many as events of this probability are.
+/// Asserts that the count `count` among `n` events is plausible for this probability.
 fn assert_frequency(count: usize, n: usize, probability: f64) {
     let (expected, deviation) = (n as f64 * probability, (n as f64 * probability * (1.0 - probability)).sqrt());
     let deviations = (count as f64 - expected) / deviation;
     assert!(deviations.abs() < MAX_DEVIATIONS, "{count} of {n}, {deviations} deviations from {expected}");
 }
 
-/// `numpy.random.Generator(Philox(key=[5, 9], counter=[0, 3, 4, 7])).standard_normal(10**6)` by NumPy 2.4: the first four
-/// numbers, the last one, and the sum.
+/// The result of `numpy.random.Generator(Philox(key=[5, 9], counter=[0, 3, 4, 7])).standard_normal(10**6)` in NumPy
+/// 2.4: the first four numbers, the last number, and the sum.
 const NUMPY: ([f64; 4], f64, f64) = (
     [1.3611326763840133, -1.7000479093337983, 0.7246232653554274, -1.43594102052377],
     0.24873658710877308,
@@ -90,12 +90,13 @@ fn normal_numbers_are_those_of_numpy() {
     let mut stream = Stream::at_step(&draw, Purpose::SensorNoise, 7);
     let numbers: Vec<f64> = (0..1_000_000).map(|_| stream.normal()).collect();
     let (first, last, sum) = NUMPY;
-    // Each number is rounded by some 1e-13 of itself. A single other decision would shift all that follow.
+    // Each number may differ by a relative 1e-13 from rounding. A single different decision would shift all later
+    // numbers.
     let is_near = |a: f64, b: f64| (a - b).abs() < 1e-11;
     assert!(numbers.iter().zip(first).all(|(&a, b)| is_near(a, b)), "{:?}", &numbers[..4]);
     assert!(is_near(numbers[numbers.len() - 1], last), "{}", numbers[numbers.len() - 1]);
     assert!((numbers.iter().sum::<f64>() - sum).abs() < 1e-6);
-    // 3.65 is the edge of the tail, which is drawn in another way.
+    // Beyond 3.65, in the tail, another method is used.
     assert!((200..400).contains(&numbers.iter().filter(|number| number.abs() > 3.65).count()));
     assert_normal(numbers, 0.0, 1.0);
 }
@@ -159,7 +160,7 @@ fn actions_pass_delay_hold_noise_and_scale_in_order() {
     }
 }
 
-/// Takes steps, whose number is observed, and returns what is seen at first and after each.
+/// Takes steps. Returns the first observation and the observation after each step; each contains the number of steps.
 fn seen(episodes: &mut Episodes, steps: u32) -> Vec<Vec<f32>> {
     let first = observe(episodes);
     let mut terms = [0.0];
@@ -202,7 +203,7 @@ fn lost_observations_read_zero() {
     const PROBABILITY: f64 = 0.2;
     let seen = seen(&mut echo(&[("sensor_dropout", PROBABILITY)]), DRAWS);
     let mut lost = [0; 3];
-    // Before the first step all of it is 0.
+    // Before the first step, the observed actions are 0.
     for (t, seen) in (1..=DRAWS).zip(&seen[1..]) {
         let mut stream = stream(Purpose::SensorDropout, t);
         for (entry, lost) in seen.iter().zip(&mut lost) {
@@ -244,7 +245,7 @@ fn whole_numbers_are_drawn_as_likely() {
     counts.iter().for_each(|&count| assert_frequency(count, EPISODES, 0.2));
 }
 
-/// Takes steps and returns the push of each, along x and z.
+/// Takes steps. Returns the push of each step, along x and z.
 fn pushed(episodes: &mut Episodes, steps: u32) -> Vec<[f64; 2]> {
     seen(episodes, steps)[1..].iter().map(|seen| [seen[4].into(), seen[5].into()]).collect()
 }
@@ -268,7 +269,7 @@ fn pushes_come_at_random_in_random_directions() {
     }
     assert_frequency(angles.len(), DRAWS as usize, 1.0 / INTERVAL);
     assert_uniform(angles);
-    // A push changes whether the next step has one no more than any other step's.
+    // After a push, the next step is as likely to have a push as any other step.
     let both = pushed.windows(2).filter(|pair| pair.iter().all(|push| *push != [0.0; 2])).count();
     assert_frequency(both, pushed.len() - 1, 1.0 / (INTERVAL * INTERVAL));
 }
@@ -292,7 +293,7 @@ fn directions_are_uniform_on_a_line_a_circle_and_a_sphere() {
     let turn = |x: f64, y: f64| y.atan2(x) / std::f64::consts::TAU + 0.5;
     assert!(directions(2).all(|direction| direction[2] == 0.0));
     assert_uniform(directions(2).map(|[x, y, _]| turn(x, y)).collect());
-    // On a sphere each coordinate is uniform (Archimedes).
+    // For points on a sphere, each coordinate is uniform (Archimedes).
     assert_uniform(directions(3).map(|[x, y, _]| turn(x, y)).collect());
     for axis in 0..3 {
         assert_uniform(directions(3).map(|direction| (direction[axis] + 1.0) / 2.0).collect());

@@ -1,4 +1,4 @@
-//! Disturbances: their laws, what they leave alone, and sessions with them.
+//! Disturbances: their laws, what they do not change, and sessions with them.
 
 mod changes;
 mod echo;
@@ -10,7 +10,7 @@ mod sessions;
 
 use perturb::env::{Distribution, EnvironmentSpec, Episodes, Parameter, Settings, Version, disturbance, resolve};
 
-/// Settings of a disturbed environment with these values beside those of the version.
+/// Returns settings of a disturbed environment: a version, and these values of parameters.
 fn settings(
     spec: &'static EnvironmentSpec,
     version: Version,
@@ -23,7 +23,7 @@ fn settings(
     Settings { seed, environment_index, distributions, episodes_per_trial: 1 }
 }
 
-/// A disturbed environment with these values beside those of the version, at the start of its first episode.
+/// Returns a disturbed environment, with a version and these values of parameters, at the start of its first episode.
 fn disturbed(
     spec: &'static EnvironmentSpec,
     version: Version,
@@ -33,7 +33,7 @@ fn disturbed(
     Episodes::new((disturbance::disturbed(spec).make)().unwrap(), settings(spec, version, values, address))
 }
 
-/// A value that disturbs, of each disturbance that the environment can have.
+/// Returns a value with an effect for each disturbance that the environment supports.
 fn all(spec: &'static EnvironmentSpec) -> Vec<(&'static str, f64)> {
     let value = |parameter: &Parameter| match parameter.name {
         "action_delay" => 3.0,

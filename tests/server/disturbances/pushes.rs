@@ -1,4 +1,4 @@
-//! A push gives the physics its impulse, in one step, and nothing else.
+//! A push changes the momentum by its impulse in one step, and changes nothing else.
 
 use crate::{
     common,
@@ -14,7 +14,7 @@ fn make(spec: &'static EnvironmentSpec) -> Box<dyn Environment> {
     (spec.make)().unwrap()
 }
 
-/// The neutral action's step, with a push or without one. Returns the state that is saved.
+/// Takes a step with the neutral action, with or without a push. Returns the saved state.
 fn step(environment: &mut dyn Environment, impulse: Option<f64>) -> Vec<f64> {
     let spec = environment.spec();
     if let Some(impulse) = impulse {
@@ -32,7 +32,7 @@ fn step(environment: &mut dyn Environment, impulse: Option<f64>) -> Vec<f64> {
     state
 }
 
-/// The difference that a push makes to the state after one step from `state`.
+/// Returns the change of the state by a push in one step from `state`.
 fn difference(name: &str, state: &[f64], impulse: f64) -> Vec<f64> {
     let after = |impulse| {
         let mut environment = make(common::catalogue().find(name).unwrap());
@@ -42,7 +42,7 @@ fn difference(name: &str, state: &[f64], impulse: f64) -> Vec<f64> {
     after(Some(impulse)).iter().zip(after(None)).map(|(pushed, other)| pushed - other).collect()
 }
 
-/// Differences of numbers near 1 are rounded by some 1e-16.
+/// The tolerance for differences of numbers near 1, which have rounding errors of some 1e-16.
 const ROUNDING: f64 = 1e-12;
 
 #[test]
@@ -60,7 +60,7 @@ fn a_push_gives_the_cart_its_momentum() {
 fn a_push_gives_the_car_and_the_pendulum_their_momenta() {
     let [_, v] = difference("MountainCar", &[-0.5, 0.0], 0.01)[..] else { unreachable!() };
     assert!((v - 0.01).abs() < ROUNDING, "{v}");
-    // A rod of 1 kg and 1 m about its end.
+    // The moment of inertia is that of a rod of 1 kg and 1 m about its end.
     let [_, omega] = difference("Pendulum", &[0.3, 0.2], 0.4)[..] else { unreachable!() };
     assert!((omega / 3.0 - 0.4).abs() < ROUNDING, "{omega}");
 }
@@ -69,15 +69,15 @@ fn a_push_gives_the_car_and_the_pendulum_their_momenta() {
 fn a_push_turns_the_first_link_of_the_acrobot() {
     let impulse = 0.01;
     let difference = difference("Acrobot", &[0.0; 4], impulse);
-    // At rest and hanging the momenta are those of the mass matrix, [d1, d2; d2, d3].
+    // At rest and hanging down, the momenta follow from the mass matrix [d1, d2; d2, d3].
     let (d1, d2, d3) = (1.0 * 0.25 + (1.0 + 0.25 + 1.0) + 2.0, 0.25 + 0.5 + 1.0, 0.25 + 1.0);
     let (first, second) = (difference[2], difference[3]);
     let momenta = [d1 * first + d2 * second, d2 * first + d3 * second];
-    // Gravity takes a part back while the links turn, for 0.2 s.
+    // Gravity removes a part of the momentum while the links turn, for 0.2 s.
     assert!((momenta[0] - impulse).abs() < 0.1 * impulse && momenta[1].abs() < 0.1 * impulse, "{momenta:?}");
 }
 
-/// The x of the centre of mass of all bodies in m, and their mass in kg.
+/// Returns the x coordinate of the centre of mass of all bodies, m, and their mass, kg.
 fn centre_of_mass(walker: &Walker) -> (f64, f64) {
     let mut saved = Vec::new();
     walker.save(&mut saved);
@@ -104,11 +104,12 @@ fn a_push_gives_the_hopper_its_momentum() {
     let expected: Vec<_> = (0..4).map(|_| step(&mut alone, None)).collect();
     step(&mut pushed, Some(IMPULSE));
     let (before, mass) = centre_of_mass(&pushed);
-    // The same thread's simulation steps another hopper: it must not feel the force.
+    // The simulation of this thread then steps another hopper, which must not feel the force.
     assert_eq!((0..4).map(|_| step(&mut after, None)).collect::<Vec<_>>(), expected);
     step(&mut pushed, None);
     let momentum = mass * ((centre_of_mass(&pushed).0 - before) / hopper::SPEC.control_timestep - 1.0);
-    // It moved by 1 m/s before. Its dampers act between its bodies. MuJoCo integrates joints, not momenta: to 1 %.
+    // The robot moved at 1 m/s before. Its dampers act only between its bodies. The tolerance is 1 %, because MuJoCo
+    // integrates joints and not momenta.
     assert!((momentum - IMPULSE).abs() < 0.01 * IMPULSE, "{momentum}");
 }
 
@@ -132,7 +133,8 @@ fn a_push_gives_the_body_of_a_folder_its_momentum() {
     let expected = step(alone.as_mut(), None);
     let state = step(pushed.as_mut(), Some(IMPULSE));
     assert_eq!(step(after.as_mut(), None), expected, "the same thread's simulation steps another cart");
-    // Diverged or not, time, two positions, two velocities. The pole's centre of mass is 0.4 m above the hinge.
+    // The saved state is: diverged or not, time, two positions, two velocities. The pole's centre of mass is 0.4 m
+    // above the hinge.
     let (angle, cart_velocity, angular_velocity) = (state[3], state[4], state[5]);
     let momentum = 2.0 * cart_velocity + 0.5 * (cart_velocity + 0.4 * angle.cos() * angular_velocity);
     assert!((momentum - IMPULSE).abs() < 0.01 * IMPULSE, "{momentum}");

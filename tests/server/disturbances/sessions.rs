@@ -1,4 +1,4 @@
-//! Sessions with disturbances: what they open, and that their bytes depend on nothing but their addresses.
+//! Sessions with disturbances: their `open`, and that their bytes depend on nothing but seed and indices.
 
 use crate::{
     common::server::{Actor, Server, Session, catalogue, environment, open, parameters, refusal, stepped},
@@ -7,7 +7,7 @@ use crate::{
 use bytes::Bytes;
 use perturb::proto::{Environment, Open, Reset, Restore, SlotGroup, Version};
 
-/// Disturbances that every environment has, drawn anew in each episode.
+/// Adds disturbances that every environment supports, drawn anew in each episode.
 fn disturbed(open: Open) -> Open {
     let values = parameters(&[
         ("action_delay", &[(0.0, 3.0)]),
@@ -22,7 +22,7 @@ fn disturbed(open: Open) -> Open {
     Open { parameters: values, ..open }
 }
 
-/// The answers to an open, to steps, to a snapshot and to its restore in another session.
+/// Returns the responses to an open, to steps, to a snapshot, and to its restore in another session.
 async fn transcript(address: &str, open: Open, actor: Actor<'_>, steps: u64) -> Vec<String> {
     let (mut session, opened) = Session::open(address, open.clone()).await;
     let mut all = vec![format!("{opened:?}")];

@@ -1,4 +1,4 @@
-//! A client of dm_env_rpc, made of the generated code.
+//! A client of dm_env_rpc, built on the generated code.
 
 use crate::common::server::{self, within};
 use perturb::proto::dm_env_rpc::v1::{
@@ -16,30 +16,30 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Status, Streaming, transport::Channel};
 
 pub const ACTION: u64 = 1;
-/// observation, reward, truncated, success, diverged
+/// The uids of all observations: observation, reward, truncated, success, diverged.
 pub const ALL: [u64; 5] = [1, 2, 3, 4, 5];
 pub const PROPERTIES: &str = "type.googleapis.com/dm_env_rpc.v1.extensions.properties.PropertyRequest";
 
 pub type Settings = BTreeMap<String, Tensor>;
 
-/// A stream.
+/// A client's stream.
 pub struct Agent {
     requests: Option<tokio::sync::mpsc::Sender<EnvironmentRequest>>,
     responses: Streaming<EnvironmentResponse>,
 }
 
 impl Agent {
-    /// A stream on a connection of its own.
+    /// Starts a stream on a new connection.
     pub async fn connect(address: &str) -> Self {
         Self::start(&mut EnvironmentClient::new(server::channel(address).await)).await.unwrap()
     }
 
-    /// A stream on this connection.
+    /// Starts a stream on an existing connection.
     pub async fn start(client: &mut EnvironmentClient<Channel>) -> Result<Self, Status> {
         Self::show(client, None).await
     }
 
-    /// The same, which shows a token.
+    /// Like [`Agent::start`], with a token.
     pub async fn show(client: &mut EnvironmentClient<Channel>, token: Option<&str>) -> Result<Self, Status> {
         let (requests, receiver) = tokio::sync::mpsc::channel(1024);
         let mut call = tonic::Request::new(ReceiverStream::new(receiver));
@@ -50,7 +50,7 @@ impl Agent {
         Ok(Self { requests: Some(requests), responses })
     }
 
-    /// An agent in a new world.
+    /// Starts a stream, makes a world and joins it.
     pub async fn in_world(address: &str, settings: Settings) -> (Self, String) {
         let mut agent = Self::connect(address).await;
         let world = agent.create(settings).await;
@@ -59,7 +59,7 @@ impl Agent {
     }
 
     pub async fn send(&self, payload: Option<Request>) {
-        // If the stream is over, receiving tells why.
+        // Ignored: if the stream has ended, receiving returns the reason.
         let _ = within(self.requests.as_ref().unwrap().send(EnvironmentRequest { payload })).await;
     }
 
@@ -71,7 +71,7 @@ impl Agent {
         within(self.responses.message()).await
     }
 
-    /// The status with which the stream ends.
+    /// Waits for the end of the stream, and returns its status.
     pub async fn end(&mut self) -> Status {
         loop {
             match self.receive().await {
@@ -87,7 +87,7 @@ impl Agent {
         self.receive().await.unwrap().expect("the stream ended").payload.expect("a response is never empty")
     }
 
-    /// A request that is refused.
+    /// Sends a request that must be refused. Returns the code and the message.
     pub async fn refused(&mut self, request: Request) -> (Code, String) {
         match self.ask(request).await {
             Response::Error(status) => (Code::from_i32(status.code), status.message),
@@ -109,7 +109,7 @@ impl Agent {
         }
     }
 
-    /// A step that asks for everything.
+    /// Takes a step and requests all observations.
     pub async fn step(&mut self, action: Tensor) -> Seen {
         match self.ask(step(action)).await {
             Response::Step(response) => Seen::of(response),
@@ -171,7 +171,7 @@ impl Agent {
     }
 }
 
-/// What a step showed.
+/// The observations of a step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Seen {
     pub state: rpc::EnvironmentStateType,
@@ -248,7 +248,7 @@ pub fn list(key: &str) -> property_request::Payload {
     property_request::Payload::ListProperty(properties::ListPropertyRequest { key: key.into() })
 }
 
-/// Settings by name, `env_id` among them.
+/// Returns the settings of a world: its environment `env_id`, and others by name.
 pub fn settings<const N: usize>(env_id: &str, others: [(&str, Tensor); N]) -> Settings {
     let all = [("env_id", text(env_id))].into_iter().chain(others);
     all.map(|(name, tensor)| (name.into(), tensor)).collect()
@@ -274,12 +274,12 @@ pub fn double(x: f64) -> Tensor {
     scalar(tensor::Payload::Doubles(tensor::DoubleArray { array: vec![x] }))
 }
 
-/// A choice.
+/// Returns a discrete action.
 pub fn choice(n: i32) -> Tensor {
     scalar(tensor::Payload::Int32s(tensor::Int32Array { array: vec![n] }))
 }
 
-/// A vector.
+/// Returns a continuous action.
 pub fn vector(array: &[f32]) -> Tensor {
     floats(array, &[array.len() as i32])
 }

@@ -1,4 +1,4 @@
-//! The server's other protocol.
+//! Tests of dm_env_rpc, the server's second protocol.
 
 pub mod client;
 mod ownership;

@@ -1,4 +1,4 @@
-//! Whose worlds of dm_env_rpc are: names, and who may reset and destroy.
+//! Ownership of worlds in dm_env_rpc: their names, and who may reset and destroy them.
 
 use super::client::{Agent, Settings, boolean, choice, create, destroy, double, join, reset_world, settings, text};
 use crate::common::server::{Server, channel, refusal};
@@ -36,7 +36,7 @@ async fn a_name_cannot_be_guessed_unless_it_was_asked_for() {
     }
     assert_snapshot!(refusals);
     other.create(settings("CartPole", [])).await;
-    other.create(settings("CartPole", [])).await; // nothing was left behind by what was refused
+    other.create(settings("CartPole", [])).await; // refused requests have left nothing behind
     agent.destroy("pole_2.a-B").await;
     assert_eq!(other.create(named("pole_2.a-B")).await, "pole_2.a-B", "a name is free again with its world");
 }
@@ -60,7 +60,7 @@ async fn world_is_changed_only_by_its_maker_and_its_agent() {
     for request in [reset_world(&world, heavy()), destroy(&world)] {
         assert_eq!(agent.refused(request).await.0, Code::PermissionDenied, "it has left it");
     }
-    // Whoever is told the name may join, and be its agent.
+    // Everybody who knows the name may join the world and be its agent.
     stranger.join(&world).await;
     drop(maker);
     stranger.step(choice(0)).await;

@@ -1,4 +1,5 @@
-//! The server of dm_env_rpc, seen from outside: the package's own compliance cases, and what they do not ask.
+//! The server of dm_env_rpc, tested through the protocol: the compliance tests of the Python package, and further
+//! cases.
 
 use super::client::{
     self, ACTION, ALL, Agent, PROPERTIES, Seen, choice, create, destroy, double, floats, int64, join, leave, property,
@@ -19,10 +20,11 @@ use rstest::rstest;
 use std::{collections::BTreeMap, path::Path, process::Command};
 use tonic::Code;
 
-/// A Python with the package of tests/server/dm_env_rpc/requirements.txt.
+/// The environment variable with a Python that has the packages of tests/server/dm_env_rpc/requirements.txt.
 const PYTHON: &str = "PERTURB_TEST_DM_ENV_RPC_PYTHON";
 
-/// Runs a program of tests/server/dm_env_rpc with that Python, if there is one. Returns what it printed.
+/// Runs a program of tests/server/dm_env_rpc with that Python. Returns its output, or `None` if there is no such
+/// Python.
 fn python(program: &str, arguments: &[&str]) -> Option<String> {
     let Ok(python) = std::env::var(PYTHON) else {
         eprintln!(
@@ -69,7 +71,7 @@ fn the_definitions_are_the_packages() {
     }
 }
 
-/// The action of a time, within its bounds, for both protocols.
+/// Returns the action at time `t`, within its bounds, encoded for both protocols.
 fn actions(e: &Environment, t: u64) -> (Vec<u8>, Tensor) {
     let bytes = action(e, 0, t);
     match e.action.as_ref().unwrap().kind.as_ref().unwrap() {
@@ -177,12 +179,12 @@ async fn observations_are_within_their_specs() {
     }
 }
 
-/// A step that asks for the observation alone.
+/// Returns a step request for the observation only.
 fn observe(actions: BTreeMap<u64, Tensor>) -> Request {
     Request::Step(rpc::StepRequest { actions, requested_observations: vec![ALL[0]] })
 }
 
-/// Actions that Pendulum refuses.
+/// Returns actions that Pendulum refuses.
 fn wrong_vectors() -> Vec<BTreeMap<u64, Tensor>> {
     let doubles = tensor::Payload::Doubles(tensor::DoubleArray { array: vec![0.5] });
     let alone = [
@@ -206,7 +208,7 @@ fn wrong_vectors() -> Vec<BTreeMap<u64, Tensor>> {
     alone.map(|action| BTreeMap::from([(ACTION, action)])).into_iter().chain([BTreeMap::new(), one_too_many]).collect()
 }
 
-/// Actions that CartPole refuses.
+/// Returns actions that CartPole refuses.
 fn wrong_choices() -> Vec<BTreeMap<u64, Tensor>> {
     let alone = [choice(2), choice(-1), int64(1), Tensor { shape: vec![1], ..choice(1) }, vector(&[1.0])];
     alone.map(|action| BTreeMap::from([(ACTION, action)])).into_iter().chain([BTreeMap::new()]).collect()
@@ -227,7 +229,7 @@ async fn wrong_actions_are_refused_by_name_and_change_nothing(
     assert_eq!(agent.step(actions(&e, 0).1).await, twin.step(actions(&e, 0).1).await);
     let mut refusals = String::new();
     for (t, wrong) in (1..).zip(wrong) {
-        // The last step may have ended the episode, when actions are not looked at.
+        // Resets the world, because actions are ignored if the last step ended the episode.
         agent.reset(client::Settings::new()).await;
         twin.reset(client::Settings::new()).await;
         let good = actions(&e, t).1;
@@ -248,7 +250,7 @@ async fn an_unknown_observation_is_refused_before_anything_is_done() {
     let unknown = Request::Step(rpc::StepRequest { actions, requested_observations: vec![1, 6, 2] });
     let mut refusals = String::new();
     for t in 0..3 {
-        // Before the first episode, in it, and before the second.
+        // Checked before the first episode, during it, and before the second.
         if t == 2 {
             agent.reset(client::Settings::new()).await;
             twin.reset(client::Settings::new()).await;
@@ -278,7 +280,7 @@ async fn one_element_stands_for_all_and_one_dimension_may_be_inferred() {
         }
         assert!(seen[0] == seen[1] && seen[0] == seen[2], "{}: {seen:?}", e.name);
         if n > 1 {
-            // As many as there are elements: one, which is not n.
+            // A dimension of -1 is inferred as the number of elements: 1, which is not n.
             let (mut agent, _) = Agent::in_world(server.tcp(), settings(&e.name, [])).await;
             agent.step(vector(&[])).await;
             let (code, message) = agent.refused(step(floats(&[0.25], &[-1]))).await;
@@ -287,7 +289,7 @@ async fn one_element_stands_for_all_and_one_dimension_may_be_inferred() {
     }
 }
 
-/// Settings of create_world that are refused.
+/// Returns settings of `create_world` that are refused.
 fn wrong_settings() -> Vec<client::Settings> {
     let cart = |name, tensor| settings("CartPole", [(name, tensor)]);
     let two = tensor::Payload::Strings(tensor::StringArray { array: vec!["CartPole".into(), "Pendulum".into()] });
@@ -418,7 +420,7 @@ async fn an_observation_that_is_asked_for_many_times_is_made_once() {
     let response = agent.ask(step(1_000)).await;
     let Response::Step(stepped) = response else { panic!("{response:?}") };
     assert!(stepped.observations.keys().eq([&ALL[0]]));
-    // Beyond any need it is refused, and the world goes on.
+    // A request above the limit is refused, and the world continues.
     let (code, message) = agent.refused(step(500_000)).await;
     assert!(code == Code::InvalidArgument && message.contains("step.requested_observations"), "{message}");
     let Response::Step(_) = agent.ask(step(1)).await else { panic!("the stream ended") };

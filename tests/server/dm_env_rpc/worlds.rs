@@ -1,5 +1,5 @@
-//! Worlds of dm_env_rpc: how long they live, what resets and properties do to them, limits, shutdown, and their
-//! neighbours.
+//! Worlds of dm_env_rpc: their lifetime, effects of resets and properties, limits, shutdown, and effects on other
+//! sessions.
 
 use super::client::{
     Agent, Seen, Settings, boolean, choice, create, destroy, double, floats, int64, join, list, property, read,
@@ -22,7 +22,7 @@ fn none() -> Settings {
     Settings::new()
 }
 
-/// An agent's steps with the same action.
+/// Takes steps with the same action.
 async fn play(agent: &mut Agent, action: i32, steps: usize) -> Vec<Seen> {
     let mut seen = Vec::new();
     for _ in 0..steps {
@@ -31,13 +31,13 @@ async fn play(agent: &mut Agent, action: i32, steps: usize) -> Vec<Seen> {
     seen
 }
 
-/// What a new world with these settings plays.
+/// Returns the steps of a new world with these settings.
 async fn reference(address: &str, settings: Settings, action: i32, steps: usize) -> Vec<Seen> {
     let (mut agent, _) = Agent::in_world(address, settings).await;
     play(&mut agent, action, steps).await
 }
 
-/// Waits until the stream can make a world, and makes it.
+/// Waits until the stream can make a world, and makes it. Returns its name.
 async fn created(agent: &mut Agent, settings: Settings) -> String {
     let mut world = String::new();
     until("there is room for a world", async || match agent.ask(create(settings.clone())).await {
@@ -52,7 +52,7 @@ async fn created(agent: &mut Agent, settings: Settings) -> String {
     world
 }
 
-/// Waits until the stream can join a world that somebody leaves.
+/// Waits until the stream can join a world that another agent is leaving.
 async fn joined(agent: &mut Agent, world: &str) {
     until("the world has no agent", async || match agent.ask(join(world)).await {
         Response::JoinWorld(_) => true,
@@ -125,7 +125,7 @@ async fn a_dropped_stream_frees_its_worlds_and_one_that_closes_too() {
         match round {
             0 | 1 => agent.close(),
             2 | 3 => {
-                // In mid-step, and in the middle of making a world.
+                // The stream ends during a step, and while it makes a world.
                 agent.leave().await;
                 agent.destroy(&world).await;
                 for _ in 0..100 {
@@ -145,7 +145,7 @@ async fn a_dropped_stream_frees_its_worlds_and_one_that_closes_too() {
 async fn world_continues_after_its_agent_vanishes_mid_step() {
     let server = Server::start(&["--workers", "1"]);
     let catalogue = server::catalogue(server.tcp()).await;
-    // Of those here the one with the longest step.
+    // The available environment with the most expensive step.
     let (name, action) = match catalogue.iter().any(|e| e.name == "HalfCheetah") {
         true => ("HalfCheetah", vector(&[0.5; 6])),
         false => ("Acrobot", choice(2)),
@@ -180,7 +180,7 @@ async fn reset_begins_the_next_episode_and_skips_none() {
     let server = Server::start(&[]);
     let cart = || settings("CartPole", [("version", text("R")), ("seed", int64(4))]);
     let (mut agent, world) = Agent::in_world(server.tcp(), cart()).await;
-    // Episode 0 is the world's first, however often it is reset or left before.
+    // The first episode is episode 0, no matter how often the world was reset or left before.
     let episode_0 = reference(server.tcp(), cart(), 1, 5).await;
     agent.reset(none()).await;
     agent.reset_world(&world, none()).await;
@@ -193,13 +193,13 @@ async fn reset_begins_the_next_episode_and_skips_none() {
     let episode_1 = play(&mut agent, 1, 5).await;
     assert_ne!(episode_0, episode_1);
     assert_eq!(agent.read("episode_index").await, uint64(1));
-    // A seed is used once, for the next episode; then the counts go on.
+    // A new seed applies to the next episode. After that, the counts continue.
     agent.reset(Settings::from([("seed".into(), int64(4))])).await;
     agent.reset(none()).await;
     assert_eq!(play(&mut agent, 1, 5).await, episode_0);
     agent.reset_world(&world, none()).await;
     assert_eq!(play(&mut agent, 1, 5).await, episode_1);
-    // Leaving breaks the episode off.
+    // Leaving interrupts the episode.
     agent.leave().await;
     agent.join(&world).await;
     assert_eq!(agent.step(choice(1)).await.reward, 0.0);
@@ -219,7 +219,7 @@ async fn a_reset_may_change_seed_version_and_parameters() {
     assert_eq!(seen, reference(server.tcp(), same, 0, 5).await, "the fixed force went with the version D");
     assert_eq!(agent.read("version").await, text("E"));
     assert_eq!(agent.read("parameters.mass").await, double(0.3));
-    // The rest stays in force, for other agents too; from outside as well.
+    // Other settings stay in force, also for other agents, and also if another stream has set them.
     agent.leave().await;
     let mut other = Agent::connect(server.tcp()).await;
     other.reset_world(&world, Settings::from([("length".into(), double(0.2))])).await;
@@ -246,14 +246,14 @@ async fn a_reset_of_the_world_interrupts_its_agent_once() {
     assert_eq!(last, Seen { state: State::Interrupted, ..undisturbed[3].clone() }, "the step itself is carried out");
     assert!(!last.truncated, "the step limit has no part in it");
     assert_eq!(play(&mut agent, 1, 4).await, reference(server.tcp(), seeded(2), 1, 4).await, "with the new seed");
-    // An agent whose episode is over need not be interrupted, nor one that resets first.
+    // An agent is not interrupted if its episode has ended, or if it resets first.
     agent.reset(none()).await;
     other.reset_world(&world, none()).await;
     assert!(play(&mut agent, 1, 4).await.iter().all(|seen| seen.state == State::Running));
     other.reset_world(&world, none()).await;
     agent.reset(none()).await;
     assert!(play(&mut agent, 1, 4).await.iter().all(|seen| seen.state == State::Running));
-    // A task that ends in that step has ended.
+    // If the task ends the episode in the interrupted step, the episode counts as terminated.
     let mut length = 0;
     let until_end = reference(server.tcp(), seeded(3), 1, 50).await;
     while until_end[length].state == State::Running {
@@ -266,7 +266,7 @@ async fn a_reset_of_the_world_interrupts_its_agent_once() {
     assert_eq!(until_end[length].state, State::Terminated);
 }
 
-/// Every property of the agent's world, those in folders too.
+/// Returns all properties of the agent's world, including those in folders.
 async fn properties(agent: &mut Agent) -> Vec<PropertySpec> {
     let mut listed = agent.list("").await;
     assert!(listed.len() > 10);
@@ -318,7 +318,8 @@ async fn properties_are_listed_read_and_written_as_their_specs_say() {
             let (code, message) = agent.refused(property(list(&spec.name))).await;
             assert!(code == Code::PermissionDenied && message.contains("cannot be listed"), "{message}");
         }
-        // What was written: the version, the seed, and every parameter fixed at what had been drawn.
+        // The properties are written: the version, the seed, and every parameter, fixed at the value that had been
+        // drawn.
         let before: Vec<_> = values(&mut agent, e).await;
         agent.step(choice(0)).await;
         assert_eq!(values(&mut agent, e).await, before, "{}", e.name);
@@ -358,7 +359,7 @@ async fn wrong_properties_are_refused_by_name() {
     assert_snapshot!(refusals);
 }
 
-/// The values of all parameters.
+/// Returns the values of all parameters.
 async fn values(agent: &mut Agent, e: &perturb::proto::Environment) -> Vec<rpc::Tensor> {
     let mut values = Vec::new();
     for p in &e.parameters {

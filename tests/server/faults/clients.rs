@@ -1,4 +1,4 @@
-//! Bad clients and bad luck.
+//! Faulty clients: invalid bytes, sudden ends, unread replies.
 
 use super::Bystander;
 use crate::common::server::{self, Actor, Server, Session, environment, open, step, until, within};
@@ -35,7 +35,7 @@ async fn garbage_bytes_on_the_port_harm_nobody() {
         [PREFACE, &noise].concat(),
         [PREFACE, &settings, &noise].concat(),
         [PREFACE, &[0xFF; 9]].concat(),
-        [PREFACE, &settings, &[0, 0, 5, 1, 4, 0, 0, 0, 1], b"\xFF\xFF\xFF\xFF\xFF"].concat(), // headers that are none
+        [PREFACE, &settings, &[0, 0, 5, 1, 4, 0, 0, 0, 1], b"\xFF\xFF\xFF\xFF\xFF"].concat(), // invalid headers
     ];
     let mut open_connections: Vec<Box<dyn Read>> = Vec::new();
     for piece in &pieces {
@@ -44,11 +44,11 @@ async fn garbage_bytes_on_the_port_harm_nobody() {
             Box::new(UnixStream::connect(server.socket()).unwrap()),
         ];
         for connection in &mut connections {
-            // The server may hang up before it has read everything.
+            // Ignored: the server may close the connection before it has read everything.
             let _ = connection.write_all(piece);
             let _ = connection.flush();
         }
-        // Some hang up, some stay.
+        // Some clients disconnect, some stay.
         drop(connections.swap_remove(0));
         open_connections.push(Box::new(connections.remove(0)));
         tcp.goes_on().await;
@@ -61,7 +61,7 @@ async fn garbage_bytes_on_the_port_harm_nobody() {
 trait ReadWrite: Read + Write {}
 impl<T: Read + Write> ReadWrite for T {}
 
-/// Not a test of its own: the client that other tests start as a process, to kill it.
+/// The client that other tests start as a process, to kill it. It is not a test of its own.
 #[test]
 #[ignore = "a process for other tests"]
 fn client_that_steps_for_ever() {
@@ -79,11 +79,11 @@ fn client_that_steps_for_ever() {
     });
 }
 
-/// That client as a process, which is killed when this is dropped.
+/// The client as a process, which is killed when this is dropped.
 struct ClientProcess(Child);
 
 impl ClientProcess {
-    /// Starts it and waits until it steps.
+    /// Starts the process, and waits until it steps.
     async fn start(address: &str) -> Self {
         let mut command = Command::new(std::env::current_exe().unwrap());
         command
@@ -92,7 +92,7 @@ impl ClientProcess {
         let mut client = Self(command.stdout(Stdio::piped()).spawn().unwrap());
         let lines = server::lines(client.0.stdout.take().unwrap());
         until("the client steps", async || lines.try_iter().any(|line| line == "stepping")).await;
-        // Read on: a closed pipe would end it.
+        // Continues reading, because a closed pipe would end the process.
         std::thread::spawn(move || lines.iter().count());
         client
     }
@@ -105,7 +105,7 @@ impl Drop for ClientProcess {
     }
 }
 
-/// Waits until so many environments can be opened at once.
+/// Waits until a session with `n` environments can be opened.
 pub(super) async fn room_for(address: &str, n: u32) {
     until("the environments are free again", async || {
         let mut session = Session::connect(address).await;
@@ -148,7 +148,7 @@ async fn two_hundred_sessions_opened_and_dropped_leave_nothing_behind() {
     const EACH: u32 = 5;
     let server = Server::start(&["--max-envs", "1003", "--max-sessions", "250"]);
     let bystander = Bystander::start(server.tcp()).await;
-    // All at a time, over one connection and over many, dropped in mid-step.
+    // Concurrent sessions, over one connection and over many, dropped during a step.
     let mut client = server::client(server.unix()).await;
     for own_connection in [false, true] {
         let mut sessions = Vec::new();
@@ -157,7 +157,7 @@ async fn two_hundred_sessions_opened_and_dropped_leave_nothing_behind() {
                 true => Session::connect(server.tcp()).await,
                 false => Session::start(&mut client).await.unwrap(),
             };
-            // At first the session that looked for room may still hold it.
+            // At first, the session that waited for room may still hold it.
             until("there is room", async || {
                 matches!(session.answer(open("CartPole", EACH, seed)).await, Response::Opened(_))
             })
@@ -170,7 +170,7 @@ async fn two_hundred_sessions_opened_and_dropped_leave_nothing_behind() {
         drop((sessions, one_more));
         room_for(server.tcp(), 200 * EACH).await;
     }
-    // One after the other, dropped without waiting for any reply.
+    // Successive sessions, dropped without waiting for a reply.
     for seed in 0..200 {
         let session = Session::connect(server.tcp()).await;
         session.send(open("CartPole", 1000, seed)).await;
@@ -206,7 +206,7 @@ async fn client_that_never_reads_costs_bounded_memory() {
     let sending = tokio::spawn({
         let (sent, stop, environment) = (Arc::clone(&sent), Arc::clone(&stop), environment.clone());
         async move {
-            // Up to 800 MB of requests, and 5 GB of replies.
+            // In total up to 800 MB of requests and 5 GB of replies.
             for t in 0..100_000 {
                 let request = Some(step(Actor::new(&environment, N).actions(t)));
                 if stop.load(Ordering::Relaxed) || sender.send(SessionRequest { request }).await.is_err() {
@@ -228,7 +228,7 @@ async fn client_that_never_reads_costs_bounded_memory() {
     let grown = server.memory().saturating_sub(before);
     assert!(grown < 64 << 20, "the server grew by {grown} bytes");
     bystander.goes_on().await;
-    // It reads at last: every reply is there, in order.
+    // Finally the client reads, and every reply arrives, in order.
     stop.store(true, Ordering::Relaxed);
     session.close();
     let mut replies = Vec::new();

@@ -1,4 +1,4 @@
-//! Many clients over lines with faults, beside one whose line has none.
+//! Many clients over faulty connections, and one client over a connection without faults.
 
 use super::{Bystander, clients::room_for};
 use crate::common::server::{self, Server, within};
@@ -13,16 +13,16 @@ use std::{
 const CLIENTS: usize = 60;
 const ENVS: usize = 5;
 const STEPS: usize = 40;
-/// Beyond it there is no fault: so many bytes a client's steps come to, with what goes before them.
+/// The number of bytes within which a fault happens: about the length of a client's whole session.
 const MOST: u64 = 20_000;
-/// Short, so that halves are given up soon.
+/// Short timeouts, so that half-open connections are given up soon.
 const PATIENCE: Timeouts = Timeouts {
     reply: Duration::from_secs(3),
     keepalive_interval: Duration::from_secs(1),
     keepalive_limit: Duration::from_secs(2),
 };
 
-/// What a client sees until it has done its steps, or something is wrong.
+/// Plays a client's session. Stores its step results in `seen`, until the last step or an error.
 async fn play(address: &str, seen: &mut Vec<Stepped>) -> Result<(), ClientError> {
     let address: Address = address.parse().unwrap();
     let connection = Connection::open_with(&address, PATIENCE).await?;
@@ -64,7 +64,7 @@ async fn faults_of_lines_end_sessions_and_change_none() {
     let (mut happened, mut noticed) = (0, 0);
     for (course, faults, seen, error) in courses.lock().unwrap().iter() {
         let kind = course.from_server.or(course.from_client).map(|fault| fault.kind);
-        // A changed byte that nothing protects may be believed.
+        // Nothing protects bytes against changes, so a flipped bit may change a result.
         assert!(kind == Some(FaultKind::BitFlip) || truth.starts_with(seen), "{course:?} changed what was seen");
         assert!(*faults > 0 || error.is_none(), "{course:?}: nothing happened, but {error:?}");
         (happened, noticed) = (happened + faults, noticed + usize::from(error.is_some()));

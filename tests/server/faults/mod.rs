@@ -1,5 +1,5 @@
-//! Bad input, bad clients and bad luck, each tried against a running server beside another session, which must not
-//! notice: its bytes equal those of an undisturbed run.
+//! Invalid requests, faulty clients and faulty connections. Each is tried while another session steps; its bytes must
+//! equal those of an undisturbed run.
 
 mod clients;
 mod lines;
@@ -17,7 +17,7 @@ use std::{
 };
 use tokio::task::JoinHandle;
 
-/// A session that steps all the time, beside whatever a test does.
+/// A session that steps continuously while a test runs.
 struct Bystander {
     address: String,
     environment: Environment,
@@ -51,7 +51,7 @@ impl Bystander {
         bystander
     }
 
-    /// Waits until it has taken more steps.
+    /// Waits until the session has taken more steps.
     async fn goes_on(&self) {
         let before = self.steps.load(Ordering::Relaxed);
         until("the other session goes on", async || {
@@ -61,7 +61,7 @@ impl Bystander {
         .await;
     }
 
-    /// Ends it and compares with an undisturbed run of as many steps.
+    /// Ends the session, and compares its bytes with an undisturbed run of the same number of steps.
     async fn ends_unharmed(self) {
         self.goes_on().await;
         self.stop.store(true, Ordering::Relaxed);

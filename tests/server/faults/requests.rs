@@ -1,4 +1,4 @@
-//! Bad input.
+//! Invalid requests.
 
 use super::Bystander;
 use crate::common::server::{
@@ -21,7 +21,7 @@ fn i32s(numbers: &[i32]) -> Vec<u8> {
     numbers.iter().flat_map(|x| x.to_le_bytes()).collect()
 }
 
-/// What each of these requests is refused with, a line for each.
+/// Sends requests that must be refused. Returns a line with the refusal of each.
 async fn refusals(session: &mut Session, requests: impl IntoIterator<Item = Request>) -> String {
     let mut lines = String::new();
     for request in requests {
@@ -30,7 +30,7 @@ async fn refusals(session: &mut Session, requests: impl IntoIterator<Item = Requ
     lines
 }
 
-/// The same of an open session, whose bytes stay those of a twin to which nothing was done.
+/// Does the same in an open session, whose bytes must then equal those of an undisturbed session.
 async fn harmless_refusals(address: &str, e: &Environment, n: u32, requests: Vec<Request>) -> String {
     let (mut session, _) = Session::open(address, open(&e.name, n, 1)).await;
     let (mut twin, _) = Session::open(address, open(&e.name, n, 1)).await;
@@ -98,7 +98,7 @@ async fn wrong_requests_before_open_are_refused_and_open_still_works() {
     ];
     let mut session = Session::connect(server.unix()).await;
     assert_snapshot!(refusals(&mut session, wrong).await);
-    // Whatever was refused has left nothing behind: the rest of the room is there, to the last place.
+    // Refused requests have left nothing behind: all remaining environments can be opened.
     let opened = session.ask(Open { batch_size: 997, first_environment_index: u32::MAX - 996, ..base() }).await;
     assert_eq!(opened.started[996].episode.as_ref().unwrap().environment_index, u32::MAX);
     assert_snapshot!(refusals(&mut session, [Request::Open(base())]).await, @"FailedPrecondition: open came on a session that is open already; use reset, or start another session");
@@ -221,7 +221,7 @@ async fn a_snapshot_with_any_byte_changed_is_refused_or_harmless() {
                 match session.answer(request).await {
                     Response::Error(error) => assert_eq!(error.code, Code::InvalidArgument as i32, "{error:?}"),
                     Response::Restore(_) => {
-                        // What it was restored to can be run, reset and saved.
+                        // The restored environment can be stepped, reset and saved.
                         session.play(actor, 0, 5).await;
                         session.ask(Reset::default()).await;
                         let saved = session.snapshot(&[]).await;
@@ -237,14 +237,14 @@ async fn a_snapshot_with_any_byte_changed_is_refused_or_harmless() {
     assert!(!server.log().contains("panicked"), "{}", server.log());
 }
 
-/// A request that this protocol does not know.
+/// A request of a kind that this protocol does not have.
 #[derive(Clone, PartialEq, prost::Message)]
 struct Unknown {
     #[prost(uint64, tag = "99")]
     something: u64,
 }
 
-/// A request whose `open` is a number.
+/// A malformed request, whose `open` is a number.
 #[derive(Clone, PartialEq, prost::Message)]
 struct Malformed {
     #[prost(uint64, tag = "1")]

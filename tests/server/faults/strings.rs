@@ -1,4 +1,4 @@
-//! Clients' texts in refusals and in the log, which terminals show.
+//! Texts of clients in error messages and in the log: they are shortened and contain no control characters.
 
 use crate::{
     common::server::{Server, Session, open, parameters, within},
@@ -9,13 +9,13 @@ use perturb::proto::{Open, Reset, Restore, session_request::Request};
 use std::{io::Write, net::TcpStream};
 use tonic::Code;
 
-/// The longest that a refusal is, whatever came: a sentence or two with names of ours, and a hundred characters that
-/// came.
+/// The maximum length of an error message: a sentence or two, and a hundred characters of the client's text.
 const LONGEST: usize = 1000;
-/// A line of the log has the refusal, and where it was.
+/// The maximum length of a line of the log, which contains the error message and its context.
 const LONGEST_LINE: usize = 2 * LONGEST;
 
-/// Colours, a terminal's title, the line's beginning, a bell, another direction, and 20 kB.
+/// Returns a text that sets colours and a terminal's title, returns to the line's start, rings the bell, changes the
+/// writing direction, and has 20 kB.
 fn evil() -> String {
     format!("evil\x1b[31m\x1b]0;title\x07\r\n\u{202e}\0{}", "e".repeat(20_000))
 }
@@ -66,7 +66,7 @@ async fn clients_texts_are_shortened_and_escaped() {
     ] {
         is_harmless(&agent.refused(request).await.1);
     }
-    // A header has no control characters, but may be long, and not of UTF-8.
+    // A header cannot have control characters, but it may be long and not UTF-8.
     let mut client = crate::common::server::client(server.tcp()).await;
     let stranger = within(Session::show(&mut client, Some(&"e".repeat(8_000)))).await;
     let status = stranger.err().unwrap();
@@ -85,8 +85,7 @@ async fn clients_texts_are_shortened_and_escaped() {
 async fn what_goes_wrong_in_a_library_on_clients_demand_is_not_logged() {
     const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0";
     let server = Server::start(&[]);
-    // Headers that are none, a frame of a stream that is none, a window that overflows, resets without end, another
-    // end.
+    // Invalid headers, a frame for an unknown stream, an overflowing window, endless resets, an invalid end.
     let resets: Vec<u8> = (0..3_000_u32).flat_map(|n| reset(2 * n + 1)).collect();
     for frames in [
         &b"\0\0\x05\x01\x04\0\0\0\x01\xFF\xFF\xFF\xFF\xFF"[..],
@@ -97,7 +96,7 @@ async fn what_goes_wrong_in_a_library_on_clients_demand_is_not_logged() {
         b"GET / HTTP/1.1\r\n\r\n",
     ] {
         let mut connection = TcpStream::connect(server.port()).unwrap();
-        // It may end it before it has all.
+        // Ignored: the server may close the connection before it has read everything.
         let _ = connection.write_all(&[PREFACE, frames].concat());
         let _ = std::io::Read::read_to_end(&mut connection.try_clone().unwrap(), &mut Vec::new());
     }
@@ -109,7 +108,7 @@ async fn what_goes_wrong_in_a_library_on_clients_demand_is_not_logged() {
     }
 }
 
-/// A stream that is begun with a header of `:method GET` and reset.
+/// Returns the frames that start a stream, with a header `:method GET`, and reset it.
 fn reset(stream: u32) -> Vec<u8> {
     let id = stream.to_be_bytes();
     [&b"\0\0\x01\x01\x05"[..], &id, b"\x82", b"\0\0\x04\x03\0", &id, b"\0\0\0\x08"].concat()

@@ -1,4 +1,4 @@
-//! Every field of `edit` does to the compiled model what the same edit of the text does, when it is compiled again.
+//! Each field of `edit` changes the compiled model in the same way as compiling an edited text.
 
 use super::{folder, load};
 use perturb::env::{Action, Environment, Purpose, Stream};
@@ -6,8 +6,8 @@ use rstest::rstest;
 
 const STEPS: usize = 100;
 
-/// A model with every element that can be edited: sliding and rolling contacts, a declared pair, a servo of each kind,
-/// a tendon, limits, air, and statistics of its own.
+/// A model with all elements that can be edited: sliding and rolling contacts, a declared pair, a servo of each kind, a
+/// tendon, limits, air, and statistics of its own.
 const MODEL: &str = r#"<mujoco>
   <compiler angle="radian"/>
   <option timestep="0.004" gravity="0.3 0 -9.81" wind="1 0 0" density="20" viscosity="0.01"/>
@@ -71,8 +71,8 @@ fn environment(name: &str, edit: &str, bounds: (f64, f64, f64), model: &str) -> 
     (spec.make)().unwrap()
 }
 
-/// Positions, velocities and all else of the state after each of some steps of random actions, from a state in which
-/// the box slides, the ball rolls and spins, and the puck slides.
+/// Returns the complete state after each of some steps with random actions. In the initial state the box slides, the
+/// ball rolls and spins, and the puck slides.
 fn trajectory(environment: &mut dyn Environment) -> Vec<Vec<f64>> {
     let spec = environment.spec();
     let mut state = vec![0.0; spec.state.len()];
@@ -105,15 +105,16 @@ fn trajectory(environment: &mut dyn Environment) -> Vec<Vec<f64>> {
     states
 }
 
-/// The largest difference, with numbers of at least 1 compared relatively.
+/// Returns the largest difference: relative for numbers above 1, otherwise absolute.
 fn difference(a: &[Vec<f64>], b: &[Vec<f64>]) -> f64 {
     let each = a.iter().flatten().zip(b.iter().flatten());
     each.map(|(a, b)| (a - b).abs() / a.abs().max(1.0)).fold(0.0, f64::max)
 }
 
-/// Bit-equal: the edit writes the number that the compiler writes, and MuJoCo computes the rest in the same way.
+/// No tolerance: the edit writes the same number as the compiler, and MuJoCo computes the rest in the same way.
 const EXACT: f64 = 0.0;
-/// The compiler computes a mass and an inertia from a density or from a scaled geom; ours are scaled by one factor.
+/// The tolerance where the compiler computes mass and inertia from a density or a scaled geom, and the edit scales both
+/// by a factor.
 const ROUNDED: f64 = 1e-9;
 
 #[rstest]
@@ -176,7 +177,7 @@ fn an_edit_is_a_recompiled_text(
     let found = difference(&edited_states, &expected);
     assert!(found <= tolerance, "after {STEPS} steps they differ by {found:e}");
 
-    // Nothing accumulates: the pristine model comes back, whatever was set before.
+    // Edits do not accumulate: after any edits, the original model comes back.
     edited.set_parameters(&[bounds.1]);
     assert_eq!(trajectory(edited.as_mut()), pristine);
 }
@@ -220,7 +221,7 @@ fn additions_start_from_the_pristine_model() {
 
 #[test]
 fn a_statistic_of_the_model_survives_an_edit_of_masses() {
-    // The solver scales by the mean inertia, which mj_setConst computes anew.
+    // The solver scales by the mean inertia, which `mj_setConst` recomputes.
     let with_mean = MODEL.replace("<statistic ", "<statistic meaninertia=\"0.02\" ");
     let edit = "{ body = \"upper\", field = \"mass\", by = \"set\" }";
     let mut edited = environment("OwnMean", edit, (0.5, 1.1, 3.0), &with_mean);

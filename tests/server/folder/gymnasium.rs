@@ -1,5 +1,5 @@
-//! Gymnasium's eleven MuJoCo tasks: the files that the Python package has, with the models of the package gymnasium,
-//! give Gymnasium's observations, rewards and ends.
+//! Gymnasium's eleven MuJoCo tasks: the task files of the Python package, with the models of the package gymnasium,
+//! give Gymnasium's observations, rewards and ends of episodes.
 
 use super::folder;
 use crate::common::server::{self, Server, Session, doubles, floats, open};
@@ -10,14 +10,15 @@ use std::{
     process::Command,
 };
 
-/// The folder of the package gymnasium's MJCF files. `make test` installs the package and sets this.
+/// The environment variable with the folder of the package gymnasium's MJCF files. `make test` installs the package and
+/// sets it.
 const ASSETS: &str = "PERTURB_TEST_GYMNASIUM_ASSETS";
-/// What golden.py wrote.
+/// The recorded episodes, written by golden.py.
 const GOLDEN: &[u8] = include_bytes!("../data/gymnasium_mujoco.bin");
-/// Relative difference of rewards: they are sent as f32, and NumPy adds in another order.
+/// The relative tolerance of rewards: they are sent as f32, and NumPy adds in another order.
 const REWARD_TOLERANCE: f64 = 1e-6;
 
-/// Names of tasks in the golden data, and of their files.
+/// The names of tasks in the recorded data, and the names of their files.
 const TASKS: [(&str, &str); 11] = [
     ("hopper", "hopper_v5"),
     ("half_cheetah", "half_cheetah_v5"),
@@ -32,7 +33,7 @@ const TASKS: [(&str, &str); 11] = [
     ("inverted_double_pendulum", "inverted_double_pendulum_v5"),
 ];
 
-/// The package's models; `None` where it need not be there. In CI it must be.
+/// Returns the folder of the package's models, or `None` if the package is not installed. In CI it must be installed.
 pub fn assets() -> Option<PathBuf> {
     match std::env::var_os(ASSETS) {
         Some(folder) => Some(folder.into()),
@@ -46,7 +47,7 @@ pub fn assets() -> Option<PathBuf> {
     }
 }
 
-/// A folder of each task, in a temporary folder.
+/// Makes a temporary folder for each task.
 pub fn folders(assets: &Path) -> Vec<(&'static str, tempfile::TempDir)> {
     let files = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/src/perturb/task_files");
     let folder = |(name, file): (&'static str, &str)| {
@@ -59,21 +60,21 @@ pub fn folders(assets: &Path) -> Vec<(&'static str, tempfile::TempDir)> {
     TASKS.into_iter().map(folder).collect()
 }
 
-/// An episode of the golden data.
+/// A recorded episode.
 pub struct Golden {
     pub task: String,
     pub seed: u16,
-    /// Positions, then velocities.
+    /// The initial state: positions, then velocities.
     pub state: Vec<f64>,
-    /// `[T]` lists of A.
+    /// The actions, `[T, A]`.
     pub actions: Vec<Vec<f32>>,
-    /// `[T + 1]` lists of O.
+    /// The observations, `[T + 1, O]`.
     pub observations: Vec<Vec<f32>>,
     pub rewards: Vec<f64>,
     pub terminated: Vec<bool>,
 }
 
-/// Reads what golden.py wrote.
+/// Reads the recorded episodes.
 pub fn golden() -> Vec<Golden> {
     let mut rest = GOLDEN;
     let mut episodes = Vec::new();
@@ -137,7 +138,7 @@ async fn eleven_tasks_are_those_of_gymnasium() {
     }
 }
 
-/// Numbers as bits: 0 and -0 differ, and NaN is itself.
+/// Returns the bits of numbers, so that 0 and -0 differ, and NaN equals itself.
 fn bits(numbers: &[f32]) -> Vec<u32> {
     numbers.iter().map(|x| x.to_bits()).collect()
 }
@@ -155,8 +156,8 @@ fn check_describes_all_eleven_without_a_warning() {
     }
 }
 
-/// Scales the masses of a text: densities and masses of geoms. Geoms that have neither, also by a default, have MuJoCo's
-/// density of 1000.
+/// Scales all masses of an MJCF text: densities and masses of geoms. Geoms with neither, not even by a default, have
+/// MuJoCo's density of 1000.
 fn with_scaled_masses(mjcf: &str, factor: f64) -> String {
     let given = ["density", "mass"];
     let names_mass = |tag: &str| given.iter().any(|name| tag.contains(&format!(" {name}=\"")));
@@ -180,7 +181,7 @@ fn with_scaled_masses(mjcf: &str, factor: f64) -> String {
     mjcf.split('<').map(scaled).collect::<Vec<_>>().join("<")
 }
 
-/// A text with the numbers of an attribute multiplied in each element of a kind; `None` if that changes nothing.
+/// Multiplies the numbers of an attribute in all elements of a kind. Returns `None` if that changes nothing.
 fn scaled(mjcf: &str, element: &str, key: &str, factor: f64) -> Option<String> {
     let mark = format!(" {key}=");
     let part = |part: &str| {
@@ -195,8 +196,8 @@ fn scaled(mjcf: &str, element: &str, key: &str, factor: f64) -> Option<String> {
     (text != mjcf).then_some(text)
 }
 
-/// Edits of Gymnasium's models: what an edit makes of the text. Frictions differ too much from text to text; edits.rs has a
-/// model for them.
+/// Returns the MJCF text that corresponds to an edit of the compiled model. Frictions are left out, because texts write
+/// them too differently; edits.rs has a model for them.
 fn recompiled(mjcf: &str, edit: &str) -> Option<String> {
     let option = |attribute: &str| {
         let (before, after) = mjcf.split_once("<option ")?;
@@ -223,7 +224,7 @@ fn edits_of_gymnasiums_models_are_recompiled_texts() {
         let task = fs::read_to_string(edited_folder.path().join("task.toml")).unwrap();
         let (model, _) = task.split_once("model = \"").unwrap().1.split_once('"').unwrap();
         let mjcf = fs::read_to_string(edited_folder.path().join(model)).unwrap();
-        // Which would scale the text's masses back.
+        // This attribute would undo the scaling of masses.
         let mjcf = mjcf.replace(" settotalmass=\"14\"", "");
         let task = task.split("[[parameter]]").next().unwrap().lines().filter(|line| !line.starts_with("heatmap"));
         let task: String = task.flat_map(|line| [line, "\n"]).collect();
@@ -238,7 +239,7 @@ fn edits_of_gymnasiums_models_are_recompiled_texts() {
             ("mass", "body = \"*\", field = \"mass\", by = \"scale\"", 0.8),
         ] {
             let Some(text) = recompiled(&mjcf, edit) else { continue };
-            // A mass of 0 is none.
+            // A mass of 0 is invalid.
             let low = if edit == "mass" { 0.1 } else { 0.0 };
             let parameter = format!(
                 "[[parameter]]\nname = \"edited\"\ndescription = \"x\"\nedit = [{{ {toml} }}]\nbounds = [{low:?}, 5000.0]\n\
@@ -266,8 +267,8 @@ fn edits_of_gymnasiums_models_are_recompiled_texts() {
             let difference = |(a, b): (&f64, &f64)| (a - b).abs() / a.abs().max(1.0);
             let differences = edited.iter().zip(&fresh).map(difference);
             let largest = differences.fold(0.0, f64::max);
-            // The compiler multiplies volumes by scaled densities, an edit the rounded masses; contacts let the last digit
-            // grow.
+            // The compiler multiplies volumes by scaled densities, and the edit scales rounded masses. Contacts amplify
+            // the difference.
             let tolerance = if edit == "mass" { 1e-6 } else { 0.0 };
             assert!(largest <= tolerance, "{name}: {edit}: {largest:e} after at least 100 timesteps");
             compared += 1;

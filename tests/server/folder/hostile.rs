@@ -1,4 +1,4 @@
-//! Models that MuJoCo aborts on, or that take all memory: the server refuses to start, and says why.
+//! Models on which MuJoCo aborts, or which need all memory: the server refuses to start, and says why.
 
 use super::{CART, TASK, folder};
 use crate::common::server;

@@ -1,4 +1,5 @@
-//! Lengths and sizes: an edited model is, to the bit, the one that MuJoCo compiles from the text with other numbers.
+//! Lengths and sizes: an edited model equals, to the bit, the model that MuJoCo compiles from a text with other
+//! numbers.
 
 use super::{CART, TASK, folder, gymnasium, load};
 use crate::common::UPPER_LENGTH;
@@ -8,7 +9,7 @@ use std::{fs, path::Path};
 
 const STEPS: usize = 100;
 
-/// A parameter of these edits.
+/// Returns the TOML text of a parameter with these edits.
 fn parameter(name: &str, edit: &str, (low, default, high): (f64, f64, f64)) -> String {
     format!(
         "\n[[parameter]]\nname = \"{name}\"\ndescription = \"a length\"\nedit = [{edit}]\ndefault = {default:?}\nbounds = \
@@ -16,14 +17,14 @@ fn parameter(name: &str, edit: &str, (low, default, high): (f64, f64, f64)) -> S
     )
 }
 
-/// The parameters of an environment with these values of some, and the defaults of all others.
+/// Returns the values of all parameters: those in `given`, and otherwise the defaults.
 fn values(spec: &EnvironmentSpec, given: &[(&str, f64)]) -> Vec<f64> {
     let value = |name: &str| given.iter().find(|(known, _)| *known == name).map(|(_, value)| *value);
     spec.parameters.iter().map(|parameter| value(parameter.name).unwrap_or(parameter.default)).collect()
 }
 
-/// Steps an environment with random actions, and the model of `mjcf` with the same ones from the same state: all numbers
-/// of the state must be the same after each step.
+/// Steps the environment and the model of `mjcf` from the same state with the same random actions. Asserts that all
+/// numbers of the state are equal after each step.
 fn assert_is(environment: &mut dyn Environment, mjcf: &str, about: &str) {
     let spec = environment.spec();
     let mut bare = Simulation::new(Model::from_xml(mjcf).unwrap()).unwrap();
@@ -55,7 +56,7 @@ fn assert_is(environment: &mut dyn Environment, mjcf: &str, about: &str) {
     }
 }
 
-/// A text with some numbers replaced, each as often as it is there, which must be as often as said.
+/// Replaces numbers in a text. Asserts that each occurs the given number of times.
 fn replaced(text: &str, changes: &[(&str, String, usize)]) -> String {
     changes.iter().fold(text.to_owned(), |text, (old, new, times)| {
         assert_eq!(text.matches(old).count(), *times, "{old}");
@@ -63,7 +64,7 @@ fn replaced(text: &str, changes: &[(&str, String, usize)]) -> String {
     })
 }
 
-/// Loads a task with more parameters.
+/// Loads a task with additional parameters.
 fn with_parameters(task: &str, model: (&str, &str), name: &str, parameters: &[String]) -> Box<dyn Environment> {
     let own = task.split("name = \"").nth(1).and_then(|rest| rest.split('"').next()).unwrap();
     let task = task.replacen(&format!("name = \"{own}\""), &format!("name = \"{name}\""), 1) + &parameters.concat();
@@ -103,7 +104,7 @@ fn lengths_of_walker2d_are_those_of_an_edited_text() {
         (1.1, 1.1, 0.08, 0.1),
     ] {
         environment.set_parameters(&values(spec, &[("thigh", thigh), ("leg", leg), ("foot", foot), ("lift", lift)]));
-        // A leg's frame is in the middle of the leg, and its anchor 0.25 m above.
+        // The leg's frame is in the middle of the leg, and its anchor is 0.25 m above.
         let knee = if (thigh, leg) == (1.0, 1.0) {
             -0.700_000_000_000_000_1
         } else {
@@ -166,7 +167,7 @@ fn lengths_of_ant_are_those_of_an_edited_text() {
 fn lengths_of_the_arm_are_those_of_an_edited_text() {
     let files = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/tasks/reaching_arm");
     let [task, mjcf] = ["task.toml", "arm.xml"].map(|file| fs::read_to_string(files.join(file)).unwrap());
-    // The task's other parameters set the mass of the lower arm.
+    // Removes the task's other parameters, which set the mass of the lower arm.
     let task = task.split("[[parameter]]").next().unwrap();
     let lower = parameter("lower", "{ body = \"lower\", field = \"size\", by = \"scale\" }", (0.5, 1.0, 2.0));
     let mut environment = with_parameters(task, ("arm.xml", &mjcf), "ScaledArm", &[UPPER_LENGTH.to_owned(), lower]);
@@ -195,7 +196,7 @@ fn lengths_of_the_arm_are_those_of_an_edited_text() {
     }
 }
 
-/// A cart with lengths and a mass, by name.
+/// Loads a cart task with lengths and a mass as parameters, under this name.
 fn cart(name: &str) -> Box<dyn Environment> {
     let parameters = [
         parameter("length", "{ body = \"pole\", field = \"length\", by = \"set\" }", (0.000_1, 0.8, 2.0)),
@@ -257,7 +258,7 @@ fn environments_of_other_lengths_take_turns_unseen() {
     for (environment, length) in together.iter_mut().zip(lengths) {
         environment.set_parameters(&[1.2, length, 0.04, 0.0]);
     }
-    // Twice: the models that stand in the cache are those that were compiled.
+    // Done twice: models from the cache must equal freshly compiled ones.
     for _ in 0..2 {
         let found: Vec<Vec<u64>> = together.iter_mut().map(|environment| trajectory(environment.as_mut())).collect();
         assert_eq!(found, alone);
@@ -268,7 +269,7 @@ fn environments_of_other_lengths_take_turns_unseen() {
 fn an_impossible_model_is_divergence_and_told_by_the_receipt() {
     let mut environment = cart("ImpossibleCart");
     environment.set_parameters(&[1.0, 0.7, 0.04, 0.0]);
-    // Each of both is possible alone. Together the pole has less than MuJoCo's least inertia.
+    // Each value alone is possible. Together they give the pole less than MuJoCo's minimum inertia.
     environment.set_parameters(&[1.0, 0.000_1, 0.000_1, 0.0]);
     environment.reset(&mut Stream::new(4, 0, Purpose::InitialState, 0));
     assert!(environment.scene().is_none());

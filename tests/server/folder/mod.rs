@@ -13,7 +13,7 @@ use perturb::{env::EnvironmentSpec, tasks::folder};
 use std::{fs, path::Path};
 use tempfile::TempDir;
 
-/// Writes a folder of these files: names and texts.
+/// Writes a folder with these files, given by name and text.
 pub fn folder(files: &[(&str, &str)]) -> TempDir {
     let directory = tempfile::tempdir().unwrap();
     for (name, text) in files {
@@ -24,12 +24,12 @@ pub fn folder(files: &[(&str, &str)]) -> TempDir {
     directory
 }
 
-/// Loads a folder that must be accepted.
+/// Loads a folder, which must be valid.
 pub fn load(path: &Path) -> &'static EnvironmentSpec {
     folder::load(path).unwrap_or_else(|error| panic!("{}: {error}", path.display())).spec()
 }
 
-/// A pendulum on a rail, with all that a small task has.
+/// A pendulum on a rail, with everything that a small task has.
 pub const CART: &str = r#"<mujoco>
   <option timestep="0.01"/>
   <size njmax="50" nconmax="20" nstack="20000"/>
@@ -49,7 +49,7 @@ pub const CART: &str = r#"<mujoco>
 </mujoco>
 "#;
 
-/// A task with [`CART`].
+/// The task file for the model [`CART`].
 pub const TASK: &str = r#"format = 1
 name = "CartAndPole"
 description = "Balance a pole on a cart."

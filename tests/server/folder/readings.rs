@@ -1,9 +1,9 @@
-//! Readings, rewards and successes are what the simulation says.
+//! Readings, rewards and success rules agree with the simulation.
 
 use super::{CART, TASK, folder, load};
 use perturb::env::{Action, Environment, EnvironmentSpec, Episodes, Settings, Version};
 
-/// The cart's task with another observation, reward or success.
+/// Loads the cart task with some lines replaced, e.g. another observation, reward or success rule.
 fn with(name: &str, replaced: &[(&str, &str)]) -> &'static EnvironmentSpec {
     let mut task = TASK.replace("CartAndPole", name);
     for (key, line) in replaced {
@@ -174,7 +174,7 @@ fn huge_actions_make_finite_rewards() {
     assert_eq!(terms, [1.0, -1e30]);
 }
 
-/// What episodes of 5 steps of a constant action achieve, and whether they succeed.
+/// Plays an episode of 5 steps with a constant action. Returns what it achieved, and whether it was a success.
 fn achieved(name: &str, success: &str) -> (Option<f64>, bool) {
     let spec = with(name, &[("success", success), ("step_limit", "step_limit = 5")]);
     let distributions = spec.distributions(Version::D);

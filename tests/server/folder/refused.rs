@@ -1,10 +1,10 @@
-//! Folders that are refused: the sentence, the place and the exit status of each.
+//! Invalid folders: the message, the place and the exit status for each.
 
 use super::{CART, TASK, folder};
 use crate::common::server;
 use std::{fs, os::unix::fs::symlink, path::Path};
 
-/// A change of a right folder that makes it wrong.
+/// A change that makes a valid folder invalid.
 type Spoil = fn(&Path);
 
 fn replace(path: &Path, file: &str, old: &str, new: &str) {
@@ -14,7 +14,7 @@ fn replace(path: &Path, file: &str, old: &str, new: &str) {
     fs::write(path, text.replacen(old, new, 1)).unwrap();
 }
 
-/// The name of each wrong folder, and what makes it wrong.
+/// The name of each invalid folder, and the change that makes it invalid.
 #[rustfmt::skip]
 const WRONG: &[(&str, Spoil)] = &[
     ("no file", |f| fs::remove_file(f.join("task.toml")).unwrap()),
@@ -134,7 +134,7 @@ fn the_schema_has_the_keys_of_the_parser() {
     let parsed: serde_json::Value = serde_json::from_str(schema).unwrap();
     let output = server::command().arg("--task-schema").output().unwrap();
     assert_eq!(String::from_utf8(output.stdout).unwrap(), schema);
-    // A key that the parser does not know is refused with a list of those that it knows.
+    // An unknown key is refused with a list of the known keys.
     let told = |old: &str, new: &str| {
         let task = TASK.replacen(old, new, 1);
         let folder = folder(&[("task.toml", &task), ("cart.xml", CART)]);

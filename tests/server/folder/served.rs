@@ -1,4 +1,4 @@
-//! A server with folders: all that a server does for its own environments.
+//! A server with task folders supports everything that it supports for built-in environments.
 
 use super::{CART, TASK, folder};
 use crate::{

@@ -1,4 +1,4 @@
-//! Environments of folders share simulations, and whatever ran before cannot be seen.
+//! Environments of task folders share simulations, but are independent of what ran before.
 
 use super::{CART, TASK, folder, load};
 use crate::common::{self, action_bytes, observe, play, start_line, step};
@@ -96,7 +96,7 @@ fn states_of_wrong_lengths_and_numbers_are_refused() {
     }
 }
 
-/// A cart that leaves the numbers that MuJoCo takes, after some steps.
+/// Loads a cart whose state exceeds MuJoCo's range after some steps.
 fn diverging() -> &'static EnvironmentSpec {
     let model = CART.replace("gear=\"20\"", "gear=\"1e12\"").replace("limited=\"true\" range=\"-2 2\"", "");
     let task = TASK.replace("CartAndPole", "DivergingCart").replace(", above = -0.5, below = 0.5", ", above = -1e30");
@@ -155,7 +155,7 @@ fn an_environment_takes_less_than_eight_kilobytes() {
         );
         let mut state = Vec::new();
         environment.save(&mut state);
-        // All that it keeps: what is saved, and its part of the edited model.
+        // Everything that an environment keeps: its saved state, and its part of the edited model.
         assert!(8 * state.len() < 4096, "{}: {} numbers", spec.name, state.len());
     }
 }

@@ -1,4 +1,4 @@
-//! What is drawn is written down.
+//! The ledger records every draw.
 
 use super::{
     connect, logged,
@@ -55,7 +55,7 @@ async fn ledger_has_draws_before_they_happen_and_their_ends() {
     let region = first[0].regions[0].to_string();
     assert_eq!(region, "force [5, 15], length [0.25, 0.75], mass [0.05, 0.5]");
 
-    // Every push to the left fails within ten steps or so.
+    // Pushing to the left ends every episode within ten steps or so.
     steps(&mut session, 4, 60).await;
     within(session.ask(Reset { mask: vec![0, 0, 0, 1].into(), seeds: vec![9], ..Reset::default() })).await.unwrap();
     within(session.ask(Reset::default())).await.unwrap();
@@ -105,7 +105,7 @@ async fn refusals_are_written_down_and_a_server_that_ends_says_so() {
     assert_eq!(kinds, ["began", "ann", "begins", "ends", "ended"]);
     assert!(guarded.server.log().contains("head="), "{}", guarded.server.log());
 
-    // Another goes on with it, one that was changed it does not touch.
+    // Another server continues the ledger, but refuses a changed one.
     let flags = ["--ledger", path.to_str().unwrap()];
     let server = Server::start(&flags);
     assert_eq!(self::entries(&path).len(), 6);
@@ -124,7 +124,7 @@ async fn refusals_are_written_down_and_a_server_that_ends_says_so() {
 async fn nothing_is_drawn_that_cannot_be_written_down() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("ledger");
-    // Files of this server may have so many blocks, which is what a full disk comes to.
+    // Limits the size of the server's files in blocks, which has the same effect as a full disk.
     let limited = |blocks: u32, path: &Path| {
         let mut server = command();
         server.arg("--ledger").arg(path).args(["--listen", "tcp://127.0.0.1:0"]);
@@ -194,7 +194,7 @@ async fn ledger_withdraws_draws_that_did_not_happen() {
     until("it is taken back", async || draws(&path).len() == 3).await;
     assert_eq!(draws(&path)[2].ends, [DrawEnd { seed: 9, index: 0, count: 1, episode: None }]);
 
-    // A snapshot of an episode that has ended, which same-step mode does not take.
+    // A snapshot of an ended episode, which same-step mode refuses.
     drop(session);
     until("there is room", async || draws(&path).len() == 4).await;
     let disabled = Open { autoreset_mode: AutoresetMode::Disabled.into(), ..open("CartPole", 1, 5) };
@@ -249,7 +249,7 @@ async fn a_ledger_that_was_tampered_with_is_noticed(#[case] tampering: Tampering
     let refusal = within(Stream::open(&connection, open("CartPole", 1, 2))).await.unwrap_err().to_string();
     assert!(refusal.contains("writes down what is drawn, and cannot") && refusal.contains(part), "{refusal}");
     super::steps(&mut session, 1).await.expect("what is drawn already goes on");
-    // Put back as it was, it is gone on with.
+    // After the file is restored, the server continues to write it.
     match tampering {
         Tampering::Deleted | Tampering::Replaced => std::fs::rename(&aside, &path).unwrap(),
         Tampering::Truncated | Tampering::Lengthened => std::fs::write(&path, &whole).unwrap(),

@@ -1,4 +1,4 @@
-//! Servers that ask who comes: tokens, TLS, and what is refused without.
+//! Servers with tokens, TLS, roles and a ledger.
 
 mod encryption;
 mod ledger;
@@ -14,7 +14,7 @@ use perturb_protocol::{Address, ClientError, Connection, Stream, Timeouts, crede
 use std::{ffi::OsString, path::Path, time::Instant};
 use tonic::Code;
 
-/// A connection of a client whose environment has these variables.
+/// Connects a client that has these environment variables.
 async fn connect(address: &str, variables: &[(&str, &Path)]) -> Result<Connection, ClientError> {
     let address: Address = address.parse().unwrap();
     let variable = |name: &str| {
@@ -27,18 +27,18 @@ async fn connect(address: &str, variables: &[(&str, &Path)]) -> Result<Connectio
     }
 }
 
-/// A session of some environments.
+/// Opens a session with `envs` environments.
 async fn begin(connection: &Connection, envs: u32) -> Result<Stream, ClientError> {
     within(Stream::open(connection, open("CartPole", envs, 1))).await.map(|(stream, _)| stream)
 }
 
-/// A step of `envs` environments.
+/// Takes steps with `envs` environments.
 async fn steps(stream: &mut Stream, envs: usize) -> Result<(), ClientError> {
     let step = perturb::proto::Step { actions: vec![0; 4 * envs].into() };
     within(stream.ask(step)).await.map(drop)
 }
 
-/// The sentence of what is no safe connection, which nobody waits for.
+/// Returns the message of an error for an unsafe connection, which clients do not retry.
 #[track_caller]
 fn unsafe_words<T>(result: Result<T, ClientError>) -> String {
     let error = result.err().expect("it is refused");
@@ -47,7 +47,7 @@ fn unsafe_words<T>(result: Result<T, ClientError>) -> String {
     error.to_string()
 }
 
-/// The sentence of a refusal for want of a good token, which nobody waits for.
+/// Returns the message of an error for a missing or wrong token, which clients do not retry.
 #[track_caller]
 fn unauthenticated<T>(result: Result<T, ClientError>) -> String {
     let error = result.err().expect("it is refused");
@@ -56,7 +56,7 @@ fn unauthenticated<T>(result: Result<T, ClientError>) -> String {
     error.to_string()
 }
 
-/// Waits until the server has logged something.
+/// Waits until the server's log contains `part`.
 async fn logged(server: &Server, part: &str) {
     let start = Instant::now();
     while !server.log().contains(part) {

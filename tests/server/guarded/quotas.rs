@@ -1,4 +1,4 @@
-//! How much a token may have in flight, and how fast its environments may step.
+//! Quotas and rate limits of tokens.
 
 use super::{
     logged,
@@ -18,14 +18,14 @@ use rstest::rstest;
 use std::time::{Duration, Instant};
 use tonic::Code;
 
-/// A session of who has the token, on a connection of its own.
+/// Opens a session with this token on a new connection.
 async fn session(guarded: &Guarded, token: &str, open: Open) -> Session {
     let mut session = Session::show(&mut client(guarded.server.tcp()).await, Some(token)).await.unwrap();
     session.ask(open).await;
     session
 }
 
-/// So many steps of `envs` environments, and how long they took.
+/// Takes `count` steps with `envs` environments. Returns the observations and the time.
 async fn timed(session: &mut Session, envs: usize, count: usize) -> (Vec<Bytes>, Duration) {
     let start = Instant::now();
     let mut seen = Vec::new();
@@ -44,16 +44,17 @@ async fn sessions_of_a_token_share_its_rate() {
     let (mut one, mut other) = (session(&guarded, ANN, open(1)).await, session(&guarded, ANN, open(2)).await);
     let mut bob = session(&guarded, BOB, open(1)).await;
     let ((slow, took), (_, its)) = tokio::join!(timed(&mut one, ENVS, 10), timed(&mut other, ENVS, 10));
-    // 400 steps, but that nobody waits for the last of each, and none were allowed for the time before.
+    // In total 400 steps at 200 a second. Nobody waits for the last step of a session, and an idle token may make up
+    // for one second.
     let least = Duration::from_secs_f64((400.0 - 2.0 * ENVS as f64) / 200.0 - 1.0);
     assert!(took.max(its) > least, "{took:?}, {its:?}");
     let (fast, took) = timed(&mut bob, ENVS, 10).await;
     println!("another's ten steps took {took:?}");
     assert!(fast == slow, "a rate changes no number");
-    // Some seconds ahead of it, whatever time passes until the next request.
+    // So many steps exceed the rate by some seconds, no matter how long the next request takes.
     let (_, took) = timed(&mut one, ENVS, 20).await;
     assert!(took > Duration::from_secs_f64(0.8), "{took:?}");
-    // By the machine's own socket no token is asked for, and nobody is slow.
+    // Over the Unix socket no token is required, and no rate applies.
     let (mut neighbour, _) = Session::open(guarded.server.unix(), open(1)).await;
     assert!(timed(&mut neighbour, ENVS, 10).await.0 == slow);
 }
@@ -124,7 +125,7 @@ async fn a_token_has_so_many_bytes_in_flight_and_no_more() {
     let (code, words) = ann.refused(picture()).await;
     assert_eq!(code, Code::ResourceExhausted, "{words}");
     assert!(words.contains("\"ann\" may have 4000000 bytes in flight here"), "{words}");
-    // More than it may ever have need not be tried again.
+    // A request above the whole quota gets another code, because a retry cannot help.
     let (code, words) = other.refused(Render { slot: 0, width: 2048, height: 2048 }).await;
     assert_eq!(code, Code::InvalidArgument, "{words}");
     let (code, words) = ann.refused(Act { weights: vec![0; 5_000_000].into(), ..Act::default() }).await;
@@ -136,7 +137,7 @@ async fn a_token_has_so_many_bytes_in_flight_and_no_more() {
     bob.ask(picture()).await;
     drop(other);
     until("the bytes are free again", async || matches!(ann.answer(picture()).await, Response::Render(_))).await;
-    // Each is free once it is written.
+    // The memory of each picture is free once the picture is written.
     for _ in 0..5 {
         ann.ask(picture()).await;
     }
@@ -156,7 +157,7 @@ async fn session_is_resumed_although_its_token_is_ahead_of_its_rate() {
     assert_eq!(session.refused(step()).await.0, Code::ResourceExhausted, "40 s are too long to wait");
 }
 
-/// The time that `count` requests of a token with 1 000 steps a second take, after the first ones.
+/// Returns the time that `count` requests take, after the first ones, for a token with 1 000 steps a second.
 async fn paced(session: &mut Session, count: usize, request: impl Fn() -> Request) -> Duration {
     let start = Instant::now();
     for _ in 0..count {
@@ -187,7 +188,8 @@ async fn requests_cost_as_much_of_the_rate_as_steps(#[case] kind: &str, #[case] 
         _ => Request::Render(Render { slot: 0, width: 200, height: 200 }),
     })
     .await;
-    // Each costs 20 steps at least, or 39 for a picture; one second can be made up for, and nobody waits for the last.
+    // Each request costs at least 20 steps, or 39 for a picture. The token may make up for one second, and nobody waits
+    // for the last request.
     assert!(took.as_secs_f64() >= 0.9, "{kind}: {took:?}");
 }
 
@@ -197,7 +199,7 @@ async fn opens_and_catalogues_cost_as_much_of_the_rate_as_steps() {
     let mut connection = client(guarded.server.tcp()).await;
     let start = Instant::now();
     for _ in 0..60 {
-        // 16 for the session, 4 for its environments, and the ledger's line.
+        // The price is 16 for the session and 4 for its environments, plus the ledger's line.
         let mut session = Session::show(&mut connection, Some(ANN)).await.unwrap();
         session.ask(open("CartPole", 4, 1)).await;
         session.close();
@@ -227,7 +229,7 @@ async fn a_rate_bounds_how_fast_the_ledger_grows() {
     }
     let seconds = start.elapsed().as_secs_f64();
     let bytes = std::fs::metadata(guarded.directory.path().join("ledger")).unwrap().len() as f64;
-    // docs/access.md says 16 bytes a step; one second can be made up for, and the last request is not waited for.
+    // docs/access.md says 16 bytes a step. The token may make up for one second, and the last request does not wait.
     let most = 16.0 * RATE as f64 * (seconds + 1.0) + 10_000.0;
     println!("{bytes} bytes in {seconds} s, at most {most}");
     assert!(bytes < most, "{bytes} bytes in {seconds} s");

@@ -1,4 +1,4 @@
-//! What tokens with a role may draw from.
+//! Roles limit what a token's sessions may draw.
 
 use super::{
     connect,
@@ -37,7 +37,7 @@ fn values(parameters: &[(&str, f64, f64)]) -> HashMap<String, Distribution> {
     parameters.iter().map(|&(name, low, high)| (name.to_owned(), interval(low, high))).collect()
 }
 
-/// The sentence of a refusal for what may not be drawn from.
+/// Returns the message of an error for a draw that the role forbids.
 #[track_caller]
 fn denied<T>(result: Result<T, ClientError>) -> String {
     match result.err().expect("it is refused") {
@@ -95,12 +95,13 @@ async fn no_other_way_leads_around_a_role() {
     };
     denied(within(Stream::open(&ann, groups)).await);
 
-    // What another token saved.
+    // A snapshot that another token has saved.
     let bob = guarded.connect(BOB).await;
     let (mut other, _) = within(Stream::open(&bob, of(Version::Extreme, &[]))).await.unwrap();
     let foreign = within(other.ask(Snapshot::default())).await.unwrap().snapshots;
     denied(within(session.ask(Restore { snapshots: foreign, ..Restore::default() })).await);
-    // Values that are in no distribution: the server draws none, but a snapshot may hold them until the trial ends.
+    // Values outside the snapshot's distributions. The server would draw no such values, but they would stay in force
+    // until the trial ends.
     let (mut fixed, _) = within(Stream::open(&bob, of(Version::Random, &[("length", 0.35, 0.35)]))).await.unwrap();
     let own = within(fixed.ask(Snapshot::default())).await.unwrap().snapshots;
     let forged = own.iter().map(|snapshot| with_length(snapshot, 1.5)).collect();
@@ -112,11 +113,11 @@ async fn no_other_way_leads_around_a_role() {
     within(Stream::open(&neighbour, of(Version::Extreme, &[]))).await.expect("a Unix socket has its own guard");
 }
 
-/// A snapshot of length 0.35 whose value in force is another, with the right checksum.
+/// Returns the snapshot of a pole of length 0.35 with another length in force, and a correct checksum.
 fn with_length(snapshot: &[u8], length: f64) -> bytes::Bytes {
     let mut forged = snapshot[..snapshot.len() - 4].to_vec();
     let old = 0.35f64.to_le_bytes();
-    // Twice in its distribution, before the value.
+    // The number occurs twice in the distribution and then as the value.
     let places: Vec<usize> = (0..forged.len() - 8).filter(|&place| forged[place..place + 8] == old).collect();
     assert_eq!(places.len(), 3);
     forged[places[2]..places[2] + 8].copy_from_slice(&length.to_le_bytes());

@@ -1,4 +1,4 @@
-//! What is refused before any port is bound, and what is not.
+//! Insecure settings, which are refused before a port is bound, and secure ones.
 
 use super::connect;
 use crate::common::server::{Server, command};
@@ -10,7 +10,7 @@ use std::{
     time::Instant,
 };
 
-/// Runs a server that is expected to refuse; what it said.
+/// Runs a server that must refuse its settings. Returns its message.
 fn refused(mut command: Command) -> String {
     let output = command.stdin(Stdio::null()).output().unwrap();
     let words = String::from_utf8(output.stderr).unwrap();
@@ -114,7 +114,7 @@ fn a_socket_has_its_mode(#[case] flags: &[&str], #[case] mode: u32) {
 fn health_is_asked_through_tls(#[case] is_own: bool) {
     let directory = tempfile::tempdir().unwrap();
     let authority = Authority::new("authority");
-    // No name of the loopback interface is in it.
+    // The certificate has no name of the loopback interface.
     let pair = authority.issue(directory.path(), "server", &["example.org"], 2040);
     let other = authority.issue(directory.path(), "other", &["example.org"], 2040);
     let [cert, key] = [&pair.cert, &pair.key].map(|path| path.to_str().unwrap());

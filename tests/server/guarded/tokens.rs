@@ -1,4 +1,4 @@
-//! Tokens.
+//! Tokens: authentication, quotas of sessions, reloading, revocation.
 
 use super::{begin, connect, logged, steps, unauthenticated};
 use crate::{
@@ -142,7 +142,7 @@ async fn a_token_has_its_quotas() {
     let six = begin(&ann, 6).await.unwrap();
     let words = refused(begin(&guarded.connect(ANN).await, 3).await.map(drop));
     assert!(words.contains("\"ann\" may have 8 environments"), "{words}");
-    // The refused session leaves its place as soon as its connection's thread has heard that its client is gone.
+    // The refused session frees its place as soon as its connection's thread learns that the client has disconnected.
     let mut two = None;
     crate::common::server::until("its place can be had", async || {
         two = begin(&ann, 2).await.ok();

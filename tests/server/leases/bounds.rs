@@ -1,4 +1,4 @@
-//! What leases may take, and who may have them.
+//! Limits of leases: number, memory, tokens.
 
 use super::{begin, leased, not_resumed, replies, resume};
 use crate::{
@@ -25,7 +25,7 @@ async fn a_full_server_takes_up_its_sessions_and_nothing_else() {
     let mut guess = Session::connect(server.tcp()).await;
     guess.send(Resume { lease: vec![0; 16].into(), last_reply: 0 }).await;
     assert_eq!(guess.end().await.code(), Code::NotFound, "a wrong guess has no second one");
-    // There is room for one such stream for each lease, until it has said what it wants.
+    // For each lease there is room for one more stream, until it sends its first request.
     let _waits = Session::connect(server.tcp()).await;
     let refused = Session::start(&mut client(server.tcp()).await).await.err().expect("no more room");
     assert_eq!(refused.code(), Code::ResourceExhausted);
@@ -51,7 +51,7 @@ async fn session_is_resumed_only_with_its_own_token() {
     another.send(leased(1)).await;
     assert_eq!(another.end().await.code(), Code::ResourceExhausted, "it still has its one session");
     Session::show(&mut connection, Some(ANN)).await.unwrap().ask(ask()).await;
-    // Without a stream, too, it ends with its token.
+    // A session without a stream also ends when its token is revoked.
     std::fs::write(&file, entry("bob", BOB)).unwrap();
     until("it has ended", async || server.log().contains(r#"ending="revoked_token""#)).await;
     watched.until(r#"perturb_refusals_total{code="UNAUTHENTICATED",reason="revoked_token"}"#, 1.0).await;
@@ -66,7 +66,7 @@ async fn stored_replies_are_budgeted_and_dropped_for_room() {
     let empty = watched.page().number("perturb_in_flight_bytes");
     let picture = || Render { slot: 0, width: 512, height: 512 };
     session.ask(picture()).await;
-    // The picture as it is kept, beside a reply's own bytes; what was sent of it is gone.
+    // The stored picture and the overhead of a reply. The memory for sending it is already free.
     let kept = empty + PICTURE as f64;
     until("one is kept", async || (kept..kept + 2e3).contains(&watched.page().number("perturb_in_flight_bytes"))).await;
     for _ in 1..20 {

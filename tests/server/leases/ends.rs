@@ -1,4 +1,4 @@
-//! How a session with a lease ends.
+//! The ends of sessions with leases.
 
 use super::{begin, leased, not_resumed, resume, undisturbed};
 use crate::{
@@ -12,7 +12,7 @@ use perturb::proto::session_response::Response;
 use std::time::{Duration, Instant};
 use tonic::Code;
 
-/// Whether so many environments can be opened.
+/// Returns whether a session with `envs` environments can be opened.
 async fn has_room(server: &Server, envs: u32) -> bool {
     matches!(Session::connect(server.unix()).await.answer(open("CartPole", envs, 1)).await, Response::Opened(_))
 }

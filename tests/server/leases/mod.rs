@@ -1,4 +1,4 @@
-//! Leases: sessions that outlive their connections.
+//! Leases, with which sessions outlive their connections.
 
 mod bounds;
 mod ends;
@@ -13,12 +13,12 @@ use tonic::Code;
 
 const ENVS: u32 = 4;
 
-/// An `open` that asks for a lease, with so many requests that wait.
+/// Returns an `open` that requests a lease with `lease` unanswered requests.
 fn leased(lease: u32) -> Open {
     Open { lease, ..open("CartPole", ENVS, 7) }
 }
 
-/// An open session with a lease on a connection of its own, and what it is named by.
+/// Opens a session with a lease on a new connection. Returns it with the name of the lease.
 async fn begin(address: &str, lease: u32) -> (Session, Opened, Environment) {
     let environment = environment(address, "CartPole").await;
     let (session, opened) = Session::open(address, leased(lease)).await;
@@ -26,19 +26,19 @@ async fn begin(address: &str, lease: u32) -> (Session, Opened, Environment) {
     (session, opened, environment)
 }
 
-/// Takes a session up on a connection of its own.
+/// Resumes a session on a new connection.
 async fn resume(address: &str, lease: &Bytes, last_reply: u64) -> (Session, Resumed) {
     let mut session = Session::connect(address).await;
     let resumed = session.ask(Resume { lease: lease.clone(), last_reply }).await;
     (session, resumed)
 }
 
-/// Why it is not taken up.
+/// Tries to resume a session, which must fail. Returns the code and the message.
 async fn not_resumed(address: &str, lease: &Bytes, last_reply: u64) -> (Code, String) {
     Session::connect(address).await.refused(Resume { lease: lease.clone(), last_reply }).await
 }
 
-/// What an undisturbed session replies to the first steps.
+/// Returns the replies of an undisturbed session to the first steps.
 async fn undisturbed(address: &str, steps: u64) -> Vec<SessionResponse> {
     let environment = environment(address, "CartPole").await;
     let (mut session, _) = Session::open(address, open("CartPole", ENVS, 7)).await;
@@ -46,7 +46,7 @@ async fn undisturbed(address: &str, steps: u64) -> Vec<SessionResponse> {
     session.play(actor, 0, steps).await
 }
 
-/// The next replies.
+/// Receives the next `count` replies.
 async fn replies(session: &mut Session, count: u64) -> Vec<SessionResponse> {
     let mut replies = Vec::new();
     for _ in 0..count {
@@ -55,7 +55,7 @@ async fn replies(session: &mut Session, count: u64) -> Vec<SessionResponse> {
     replies
 }
 
-/// The reply in a response.
+/// Returns the reply in a response.
 #[track_caller]
 fn reply<A: TypedRequest>(response: Response) -> A::Reply {
     A::reply(response).unwrap_or_else(|other| panic!("answered by {other:?}"))

@@ -1,4 +1,4 @@
-//! The client that is in this repository, over lines that break.
+//! The Rust client of this repository, over connections that break.
 
 use super::{leased, undisturbed};
 use crate::common::{
@@ -12,14 +12,14 @@ use std::time::{Duration, Instant};
 
 const STEPS: u64 = 400;
 
-/// A connection through a proxy that lets so many bytes of each connection through.
+/// Connects through a proxy that cuts connection number n after `most(n)` bytes.
 async fn connect(server: &Server, most: impl Fn(usize) -> usize + Send + 'static) -> (Proxy, Connection) {
     let proxy = Proxy::start(server.port(), most);
     let connection = within(Connection::open(&format!("http://{}", proxy.address()).parse().unwrap())).await.unwrap();
     (proxy, connection)
 }
 
-/// Takes steps, so many of them ahead of their replies.
+/// Takes steps, some of them ahead of the replies.
 async fn play(
     stream: &mut Stream,
     actor: Actor<'_>,
@@ -47,7 +47,7 @@ async fn session_over_a_breaking_line_has_the_same_bytes(#[case] ahead: u32) {
     let expected = undisturbed(server.tcp(), STEPS).await;
     let described = environment(server.tcp(), "CartPole").await;
     for seed in 0..4 {
-        // The first has to open the session; some of the others do not even take it up.
+        // The first connection must last until the session is open. Some of the others break before they resume it.
         let most = move |number| if number == 0 { 20_000 } else { mixed(mixed(seed) ^ number as u64) as usize % 6_000 };
         let (proxy, connection) = connect(&server, most).await;
         let (mut stream, _) = within(Stream::open(&connection, leased(ahead))).await.unwrap();

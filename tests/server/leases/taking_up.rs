@@ -1,4 +1,4 @@
-//! A session is taken up where it was.
+//! Resumed sessions continue where they were.
 
 use super::{begin, leased, not_resumed, replies, reply, resume, undisturbed};
 use crate::{
@@ -38,7 +38,7 @@ async fn lost_reply_is_sent_again_without_another_step() {
     let actor = Actor::new(&environment, 4);
     session.play(actor, 0, 10).await;
     for last in [9, 10, 9] {
-        // As if the tenth had been lost.
+        // Resumes as if the tenth reply had been lost.
         let resumed;
         (session, resumed) = resume(server.tcp(), &opened.lease, last).await;
         assert_eq!(resumed.last_reply, 10);
@@ -64,7 +64,7 @@ async fn replies_are_stored_for_all_unanswered_requests() {
     assert!(code == Code::FailedPrecondition && words.contains("replies up to 6 are kept no more"), "{code} {words}");
     let (code, words) = not_resumed(server.tcp(), &opened.lease, 11).await;
     assert!(code == Code::OutOfRange && words.contains("last_reply is 11, but 10 is the last"), "{code} {words}");
-    // Neither did the session any harm, which goes on in its stream.
+    // Neither attempt affected the session, which continues on its stream.
     assert!(session.play(actor, 9, 12).await == expected[9..]);
 }
 
@@ -106,7 +106,7 @@ async fn what_was_under_way_when_the_connection_broke_is_done() {
     let expected = twin.ask(act()).await;
     let (session, opened) = Session::open(server.tcp(), Open { lease: 1, ..game.open() }).await;
     session.send(act()).await;
-    // A round trip of the same connection's thread later it is at work, or the request is still to be read.
+    // After this time, the request is being answered, or it has not been read yet.
     tokio::time::sleep(std::time::Duration::from_millis(20)).await;
     drop(session);
     let (mut session, resumed) = resume(server.tcp(), &opened.lease, 0).await;

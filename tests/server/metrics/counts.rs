@@ -1,4 +1,4 @@
-//! Counts are right after requests that are known.
+//! Counters have the right values after known requests.
 
 use super::Watched;
 use crate::{
@@ -98,7 +98,7 @@ async fn the_other_protocol_is_counted_too() {
     }
     agent.refused(worlds::join(&world)).await;
     let page = watched.page();
-    // The first step begins the episode.
+    // In next-step mode, the first step after an end begins the episode.
     for (series, number) in [
         (r#"perturb_steps_total{environment="CartPole"}"#, 3.0),
         (r#"perturb_requests_total{protocol="dm_env_rpc.v1",kind="step",outcome="done"}"#, 4.0),
@@ -115,7 +115,7 @@ async fn the_other_protocol_is_counted_too() {
 
 #[tokio::test]
 async fn what_may_happen_is_told_before_it_does() {
-    // A rate is of two numbers: without the 0 before, nobody sees the first event of its kind.
+    // `rate` compares two samples. Without a first sample of 0, the first event of its kind would be invisible.
     const ALREADY_OPEN: &str = r#"perturb_refusals_total{code="FAILED_PRECONDITION",reason="already_open"}"#;
     let watched = Watched::start(&[]);
     let page = watched.page();

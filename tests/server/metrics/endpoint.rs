@@ -1,4 +1,4 @@
-//! Where metrics are told, and where not.
+//! Addresses of the metrics page, and requests to it.
 
 use super::{Watched, page};
 use crate::{
@@ -12,7 +12,7 @@ use std::{
     time::Instant,
 };
 
-/// Runs a server that is expected to refuse; what it said.
+/// Runs a server that must refuse its settings. Returns its message.
 fn refused(mut command: Command) -> String {
     let output = finished(&mut command);
     let words = String::from_utf8(output.stderr).unwrap();
@@ -73,7 +73,7 @@ fn with_insecure_everybody_may_read_them() {
 fn two_servers_at_one_address_are_refused_with_a_sentence(#[case] address: &str) {
     let directory = tempfile::tempdir().unwrap();
     let path = format!("unix:{}", directory.path().join("metrics").display());
-    // Whoever has it: the sentence is the same.
+    // The port is in use. The message is the same for any program that uses it.
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = match address {
         "unix:" => path,
@@ -115,7 +115,7 @@ fn half_requests_keep_nobody_from_the_page() {
     let half: Vec<_> = (0..145)
         .map(|_| {
             let mut stream = page::unix(&watched.socket);
-            let _ = stream.write_all(b"GET /metrics HTTP/1.1\r\nHost: "); // an older one may be closed already
+            let _ = stream.write_all(b"GET /metrics HTTP/1.1\r\nHost: "); // fails if the connection is already closed
             stream
         })
         .collect();
@@ -148,7 +148,7 @@ fn a_server_that_ends_removes_its_socket() {
 #[test]
 fn no_metrics_are_told_unless_asked_for() {
     let server = Server::start(&[]);
-    // The port of sessions speaks HTTP/2 alone.
+    // The port for sessions accepts only HTTP/2.
     let stream = TcpStream::connect(server.port()).unwrap();
     stream.set_read_timeout(Some(DEADLINE)).unwrap();
     let mut text = Vec::new();

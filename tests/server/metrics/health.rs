@@ -1,4 +1,4 @@
-//! Health tells load balancers whether there is room.
+//! The health service tells load balancers whether the server has room.
 
 use crate::common::server::{Server, Session, channel, open, until, within};
 use perturb::server::net::capacity_health::NEW_SESSIONS;

@@ -1,18 +1,18 @@
-//! How late the transport's thread is, as the page tells.
+//! The metric of the transport thread's wake-up delay.
 
 use super::{Watched, page::Page};
 use crate::common::server::until;
 use std::time::{Duration, Instant};
 
 const LAG: &str = "perturb_transport_lag_seconds";
-/// Between two looks at it.
+/// The interval at which the server measures the delay.
 const TICK: Duration = Duration::from_millis(100);
-/// How long the server is kept from its work. …
+/// The time for which the server is stopped.
 const KEPT: Duration = Duration::from_millis(1200);
-/// … The look that falls into it is late by more than this bound of the histogram, s.
+/// A bound of the histogram, s, that the measurement during the stop exceeds.
 const BOUND: &str = "0.524288";
 
-/// Stops every thread of the server for a while.
+/// Stops all threads of the server for a while.
 async fn keep_from_work(watched: &Watched) {
     watched.server.signal("STOP");
     let tasks = format!("/proc/{}/task", watched.server.child.id());
@@ -40,7 +40,7 @@ async fn lag_of_a_busy_transport_is_measured() {
     let page = watched.page();
     let (looks, sum, earlier) = (page.number(&count), page.number(&sum), before.number(&sum));
     assert!(sum - earlier > BOUND.parse::<f64>().unwrap(), "{sum} s after {earlier} s");
-    // Each look begins when the one before is over: ticks and lags are times in a row.
+    // Measurements are made one after the other, so intervals and delays add up to at most the elapsed time.
     let most = start.elapsed().as_secs_f64() - TICK.as_secs_f64() * looks;
     assert!(sum < most, "{looks} looks were late by {sum} s in all, in {:?}", start.elapsed());
 }

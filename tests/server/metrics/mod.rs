@@ -1,4 +1,4 @@
-//! What the server says of itself: metrics, health when it is full, the access log.
+//! Monitoring of the server: metrics, health when it is full, the access log.
 
 mod counts;
 mod endpoint;
@@ -12,7 +12,7 @@ pub use page::Page;
 use std::path::PathBuf;
 use tempfile::TempDir;
 
-/// A server that tells metrics at a socket.
+/// A server with a metrics page on a Unix socket.
 pub struct Watched {
     pub server: Server,
     socket: PathBuf,
@@ -31,7 +31,7 @@ impl Watched {
         Page::scrape(&self.socket)
     }
 
-    /// Waits until a series has this number.
+    /// Waits until a series of the metrics has this value.
     pub async fn until(&self, series: &str, number: f64) {
         let what = format!("{series} is {number}");
         until(&what, async || self.page().number(series) == number).await;

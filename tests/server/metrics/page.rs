@@ -1,4 +1,4 @@
-//! A page of metrics, read by the rules of OpenMetrics' text format.
+//! Reads a metrics page and checks it against the OpenMetrics text format.
 
 use std::{
     collections::BTreeMap,
@@ -11,19 +11,19 @@ use std::{
 
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// The numbers of a page by their names with labels, as they stand there.
+/// A metrics page, and its values by name with labels, as written on the page.
 #[derive(Debug)]
 pub struct Page {
     pub text: String,
     numbers: BTreeMap<String, f64>,
 }
 
-/// What comes back for a request line: the head and the body.
+/// Sends a request line. Returns the head and the body of the response.
 pub fn asked(stream: impl Read + Write, line: &str) -> (String, String) {
     asked_for(stream, line, "")
 }
 
-/// The same with further header lines.
+/// Sends a request line and header lines. Returns the head and the body of the response.
 pub fn asked_for(mut stream: impl Read + Write, line: &str, headers: &str) -> (String, String) {
     write!(stream, "{line} HTTP/1.1\r\nHost: localhost\r\n{headers}\r\n").unwrap();
     let mut text = String::new();
@@ -32,14 +32,14 @@ pub fn asked_for(mut stream: impl Read + Write, line: &str, headers: &str) -> (S
     (head.into(), body.into())
 }
 
-/// A connection to a socket of metrics.
+/// Connects to a metrics page on a Unix socket.
 pub fn unix(socket: &Path) -> UnixStream {
     let stream = UnixStream::connect(socket).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
     stream
 }
 
-/// The same to a port.
+/// Connects to a metrics page on a TCP port.
 pub fn tcp(port: &str) -> TcpStream {
     let stream = TcpStream::connect(port).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
@@ -47,7 +47,7 @@ pub fn tcp(port: &str) -> TcpStream {
 }
 
 impl Page {
-    /// What is told at this socket now, all of whose lines must be what they should.
+    /// Reads the page on this Unix socket, and checks all its lines.
     pub fn scrape(socket: &Path) -> Self {
         let (head, text) = asked(unix(socket), "GET /metrics");
         assert!(
@@ -94,10 +94,10 @@ impl Page {
         page
     }
 
-    /// Counts grow with their bounds, up to all.
+    /// Checks that the counts of each histogram grow with their bounds, up to the total count.
     fn check_histograms(&self) {
         let mut last: Option<(&str, f64)> = None;
-        // In the page's order, which is that of bounds.
+        // The lines are in order of bounds.
         for line in self.text.lines().filter(|line| line.contains("_bucket{")) {
             let (series, number) = line.rsplit_once(' ').unwrap();
             let number: f64 = number.parse().unwrap();
@@ -112,18 +112,18 @@ impl Page {
         }
     }
 
-    /// The number of this name with labels; 0 where it is not told.
+    /// Returns the value of a series, or 0 if the page does not contain it.
     pub fn number(&self, series: &str) -> f64 {
         self.numbers.get(series).copied().unwrap_or_default()
     }
 
-    /// Whether it is told.
+    /// Returns whether the page contains a series.
     pub fn tells(&self, series: &str) -> bool {
         self.numbers.contains_key(series)
     }
 }
 
-/// `{name="value",…}`, or nothing.
+/// Checks that labels have the form `{name="value",…}` or are empty.
 fn check_labels(labels: &str) {
     let Some(inside) = labels.strip_prefix('{') else { return assert_eq!(labels, "") };
     let mut rest = inside.strip_suffix('}').expect(labels);

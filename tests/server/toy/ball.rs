@@ -1,4 +1,4 @@
-//! A ball on a line that is pushed through something viscous.
+//! A ball on a line, pushed through a viscous medium.
 
 use perturb::{
     env::{
@@ -39,14 +39,14 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
 
 const STATE: &[Channel] = &[Channel::new("x", "m", -100.0, 100.0), Channel::new("velocity", "m/s", -100.0, 100.0)];
 const DT: f64 = 0.1;
-/// What has a ball's step panic.
+/// An action with which the step of a ball panics.
 pub const FATAL: f32 = 1e9;
 
 struct Ball {
     mass: f64,
     drag: f64,
     state: [f64; 2],
-    /// The greatest x of the episode.
+    /// The largest x of the episode so far.
     distance: f64,
 }
 
@@ -110,7 +110,7 @@ impl Environment for Ball {
     }
 }
 
-/// Balls that the thread has freed that frees what sessions leave behind.
+/// The number of balls that were freed by the pool's reaper thread.
 pub static FREED: AtomicUsize = AtomicUsize::new(0);
 
 impl Drop for Ball {

@@ -1,4 +1,4 @@
-//! A server with one more environment, which has everything of it in this folder.
+//! A server with an additional environment, which is completely defined in this folder.
 
 pub mod ball;
 
@@ -18,7 +18,7 @@ use std::{
 };
 use tokio::sync::oneshot;
 
-/// A server in a thread of this process, with the catalogue that no program has.
+/// A server in a thread of this process, with a catalogue of its own.
 struct InThread {
     address: String,
     shutdown: Option<oneshot::Sender<()>>,
@@ -98,7 +98,7 @@ async fn another_environment_is_what_its_equations_say() {
     let (mut session, _) = Session::open(&server.address, exact).await;
     session.ask(Reset { states: doubles(&[0.0, 0.0]), ..Reset::default() }).await;
     let step = session.step(1.0f32.to_le_bytes().to_vec().into()).await;
-    // Mass 1, drag 0.5: 0.1 s of 1 N.
+    // Mass 1 kg, drag 0.5, a force of 1 N for 0.1 s.
     assert_eq!(floats(&step.observations), [0.01, 0.1]);
     let refused = Open { parameters: parameters(&[("drag", &[(-1.0, -1.0)])]), ..open("Ball", 1, 1) };
     let mut session = Session::connect(&server.address).await;

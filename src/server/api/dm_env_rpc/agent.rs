@@ -57,11 +57,11 @@ impl Agent {
         if self.sessions.phase() != ShutdownPhase::Running {
             return Err(session::Error::Draining.into());
         }
-        let (settings, version, own) = settings::create(self.worlds.catalogue(), &request.settings)?;
-        self.worlds.is_free(&self.caller, &own)?;
-        let held = self.caller.envs(1)?;
+        let (settings, version, ownership) = settings::create(self.worlds.catalogue(), &request.settings)?;
+        self.worlds.is_free(&self.caller, &ownership)?;
+        let env_quota = self.caller.envs(1)?;
         let runner = Runner::open(self.worlds.pool(), settings, version, self.worlds.draws(&self.caller)).await?;
-        Ok(rpc::CreateWorldResponse { world_name: self.worlds.add(&self.caller, runner, own, held)? })
+        Ok(rpc::CreateWorldResponse { world_name: self.worlds.add(&self.caller, runner, ownership, env_quota)? })
     }
 
     async fn join_world(&mut self, request: rpc::JoinWorldRequest) -> Result<rpc::JoinWorldResponse, Error> {

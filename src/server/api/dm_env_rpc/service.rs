@@ -55,8 +55,8 @@ impl Environment for DmEnvRpcService {
         &self,
         mut request: Request<Streaming<EnvironmentRequest>>,
     ) -> Result<Response<Self::ProcessStream>, Status> {
-        let frames = raw_body::messages(&mut request)?;
-        let agent = Agent::new(Arc::clone(&self.worlds), frames.bearer.clone(), self.sessions.clone());
-        Ok(Response::new(self.sessions.begin(frames, agent, &self.counts)?))
+        let reader = raw_body::messages(&mut request)?;
+        let agent = Agent::new(Arc::clone(&self.worlds), reader.bearer.clone(), self.sessions.clone());
+        Ok(Response::new(self.sessions.begin(reader, agent, &self.counts)?))
     }
 }

@@ -17,7 +17,7 @@ pub(super) struct World {
     name: String,
     spec: &'static EnvironmentSpec,
     draws: DrawAuditor,
-    wanted: Mutex<PendingChanges>,
+    pending: Mutex<PendingChanges>,
 }
 
 /// The settings with which the next episode will begin.
@@ -41,14 +41,14 @@ pub(super) struct JoinedWorld {
 impl World {
     /// Makes a world with this name for a new environment.
     pub(super) fn new(name: String, runner: &Runner) -> Self {
-        let wanted = PendingChanges {
+        let pending = PendingChanges {
             version: runner.version(),
             distributions: runner.episodes().distributions.clone(),
             new_distributions: false,
             seed: None,
             interruption: false,
         };
-        Self { name, spec: runner.spec(), draws: runner.draws().clone(), wanted: Mutex::new(wanted) }
+        Self { name, spec: runner.spec(), draws: runner.draws().clone(), pending: Mutex::new(pending) }
     }
 
     /// The world's name, unique among the worlds of one token.
@@ -66,40 +66,40 @@ impl World {
     /// # Errors
     /// If a parameter is out of its bounds, or the token's role does not allow the draw. The change is not stored then.
     pub(super) fn change(&self, change: WorldChange) -> Result<(), Error> {
-        let mut wanted = self.lock();
-        let version = change.version.unwrap_or(wanted.version);
+        let mut pending = self.lock();
+        let version = change.version.unwrap_or(pending.version);
         if change.version.is_some() || !change.parameters.is_empty() {
             let mut distributions = match change.version {
                 Some(version) => self.spec.distributions(version),
-                None => wanted.distributions.clone(),
+                None => pending.distributions.clone(),
             };
             resolve(self.spec, &mut distributions, change.parameters)?;
             self.draws.check(self.spec, &distributions)?;
-            (wanted.distributions, wanted.new_distributions) = (distributions, true);
+            (pending.distributions, pending.new_distributions) = (distributions, true);
         }
-        wanted.version = version;
-        wanted.seed = change.seed.or(wanted.seed);
+        pending.version = version;
+        pending.seed = change.seed.or(pending.seed);
         Ok(())
     }
 
     /// Takes the stored changes, for an episode that is about to begin.
     pub(super) fn take_changes(&self) -> Changes {
-        let mut wanted = self.lock();
-        wanted.interruption = false;
-        let new = std::mem::take(&mut wanted.new_distributions);
+        let mut pending = self.lock();
+        pending.interruption = false;
+        let new = std::mem::take(&mut pending.new_distributions);
         Changes {
-            version: wanted.version,
-            seed: wanted.seed.take(),
-            distributions: new.then(|| wanted.distributions.clone().into()),
+            version: pending.version,
+            seed: pending.seed.take(),
+            distributions: new.then(|| pending.distributions.clone().into()),
         }
     }
 
     /// Stores changes again, because the episode for which they were taken could not begin. Later changes take
     /// precedence.
     pub(super) fn keep(&self, changes: Changes) {
-        let mut wanted = self.lock();
-        wanted.seed = wanted.seed.or(changes.seed);
-        wanted.new_distributions |= changes.distributions.is_some();
+        let mut pending = self.lock();
+        pending.seed = pending.seed.or(changes.seed);
+        pending.new_distributions |= changes.distributions.is_some();
     }
 
     /// Requests that the running episode ends with its next step.
@@ -113,6 +113,6 @@ impl World {
     }
 
     fn lock(&self) -> MutexGuard<'_, PendingChanges> {
-        self.wanted.lock().unwrap_or_else(PoisonError::into_inner)
+        self.pending.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

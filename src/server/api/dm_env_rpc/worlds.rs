@@ -104,15 +104,15 @@ impl Worlds {
     ///
     /// # Errors
     /// [`Error::Taken`], if a world of the same token has the name.
-    pub(super) fn is_free(&self, maker: &Caller, own: &Ownership) -> Result<(), Error> {
-        match own.name.as_ref().filter(|name| self.lock().worlds.contains_key(&maker.key(name))) {
+    pub(super) fn is_free(&self, maker: &Caller, ownership: &Ownership) -> Result<(), Error> {
+        match ownership.name.as_ref().filter(|name| self.lock().worlds.contains_key(&maker.key(name))) {
             Some(name) => Err(Error::Taken { world: name.clone() }),
             None => Ok(()),
         }
     }
 
-    /// Adds a new world with its runner. It keeps `held`, its environment's part of the token's quota. Returns its
-    /// name.
+    /// Adds a new world with its runner. The world keeps `held`, its environment's part of the token's quota. Returns
+    /// the world's name.
     ///
     /// # Errors
     /// [`Error::Taken`] if another world has the requested name, [`Error::NoRandomness`] if no random name can be made.
@@ -120,10 +120,10 @@ impl Worlds {
         &self,
         maker: &Caller,
         runner: Runner,
-        own: Ownership,
+        ownership: Ownership,
         held: Option<QuotaGuard>,
     ) -> Result<String, Error> {
-        let name = match own.name {
+        let name = match ownership.name {
             Some(name) => name,
             None => random_name(runner.spec().name)?,
         };
@@ -136,7 +136,7 @@ impl Worlds {
             world,
             maker: Some(maker.stream),
             agent: None,
-            shared: own.shared,
+            shared: ownership.shared,
             runner: Some(runner),
             _held: held,
         };

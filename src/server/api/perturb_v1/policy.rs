@@ -56,6 +56,7 @@ pub fn rollout_request(batch: &Batch, rate: Option<u32>, request: proto::Act) ->
     let sizes = Sizes { envs: n_envs, observation, parameters, action };
     let proto::Act { policy: given, weights: given_weights, task: given_task, most_steps, only_ended } = request;
     let task = task(given_task)?;
+    // The policy: a new one with its weights, or the current one, maybe with new weights.
     let (policy, given_weights) = match (given, batch.policy_runner()) {
         (Some(_), _) if given_weights.is_empty() => {
             return Err(order("with a new policy but without its weights", "send both together"));
@@ -66,10 +67,11 @@ pub fn rollout_request(batch: &Batch, rate: Option<u32>, request: proto::Act) ->
             return Err(order("without a policy while none plays", advice));
         }
         (None, Some(runner)) => {
-            let own = (!given_weights.is_empty()).then(|| weights(&given_weights, runner.spec()));
-            (None, own.transpose()?)
+            let new_weights = (!given_weights.is_empty()).then(|| weights(&given_weights, runner.spec()));
+            (None, new_weights.transpose()?)
         }
     };
+    // The task: a new one, unless the current policy has an unfinished one.
     let unfinished = policy.is_none() && batch.policy_runner().is_some_and(|runner| !runner.task().is_done());
     match (&task, unfinished) {
         (None, false) => return Err(order("without a task and none is unfinished", "name steps or episodes")),
@@ -83,13 +85,15 @@ pub fn rollout_request(batch: &Batch, rate: Option<u32>, request: proto::Act) ->
         let advice = "finish it by requests without weights, or send another policy";
         return Err(order("with weights while a task is unfinished", advice));
     }
+    // The maximum number of steps, by computing time and by the token's rate.
     let spec = policy.as_ref().map(|policy| &policy.spec).or_else(|| batch.policy_runner().map(PolicyRunner::spec));
-    let computed = spec.map_or(0.0, |spec| spec.n_weights() as f64 / WEIGHTS_PER_US);
-    if computed * n_envs as f64 > MAX_REPLY_COST_US {
+    let policy_cost_us = spec.map_or(0.0, |spec| spec.n_weights() as f64 / WEIGHTS_PER_US);
+    if policy_cost_us * n_envs as f64 > MAX_REPLY_COST_US {
         let got = format!("with {} weights in {n_envs} environments", spec.map_or(0, PolicySpec::n_weights));
         return Err(Error::value("act.policy", got, "fewer, so that a step takes less than about a second"));
     }
-    let affordable = (MAX_REPLY_COST_US / ((settings.spec.step_cost + computed) * n_envs as f64)).max(1.0) as usize;
+    let affordable =
+        (MAX_REPLY_COST_US / ((settings.spec.step_cost + policy_cost_us) * n_envs as f64)).max(1.0) as usize;
     // Limits a reply to the steps that the rate allows in a second, so the client does not wait long for its next
     // reply.
     let allowed = rate.map_or(usize::MAX, |rate| (rate as usize / n_envs.max(1)).max(1));

@@ -26,15 +26,15 @@ pub const ENDPOINT: &str = "/perturb.v1.Perturb/Session";
 /// The service of `perturb.v1`: the catalogue, and sessions.
 #[derive(Clone)]
 pub struct PerturbService {
-    shared: Arc<ServerContext>,
+    context: Arc<ServerContext>,
     sessions: Sessions,
     counts: Arc<RequestCounters>,
 }
 
 impl PerturbService {
     /// Makes a service whose sessions use the parts `shared`, within the limits of `sessions`.
-    pub fn new(shared: ServerContext, sessions: Sessions) -> Self {
-        Self { shared: Arc::new(shared), sessions, counts: RequestCounters::new::<Session>() }
+    pub fn new(context: ServerContext, sessions: Sessions) -> Self {
+        Self { context: Arc::new(context), sessions, counts: RequestCounters::new::<Session>() }
     }
 
     /// Returns a handle to the same service that observes the shutdown through `drain`.
@@ -60,15 +60,15 @@ impl Perturb for PerturbService {
             bearer.acquire_within(MAX_LISTING_WAIT).await.map_err(|error| status(&error))?;
             bearer.charge(0, LISTING_PRICE);
         }
-        Ok(Response::new(self.shared.listing.clone()))
+        Ok(Response::new(self.context.listing.clone()))
     }
 
     async fn session(
         &self,
         mut request: Request<Streaming<proto::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let frames = raw_body::messages(&mut request)?;
-        let session = Session::new(Arc::clone(&self.shared), frames.bearer.clone(), frames.budget().clone());
-        Ok(Response::new(self.sessions.begin(frames, session, &self.counts)?))
+        let reader = raw_body::messages(&mut request)?;
+        let session = Session::new(Arc::clone(&self.context), reader.bearer.clone(), reader.budget().clone());
+        Ok(Response::new(self.sessions.begin(reader, session, &self.counts)?))
     }
 }

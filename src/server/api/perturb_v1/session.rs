@@ -77,6 +77,7 @@ impl Session {
                 format!("requests that wait at a time, 0 … {MAX_STORED_REPLIES}"),
             ));
         }
+        // Check the settings, and describe the environment as this session sees it.
         let max_envs = self.context.listing.max_batch_size as usize;
         let settings = convert::open(&self.context.catalogue, max_envs, request)?;
         let (observes_parameters, receipt_arrays) = (settings.observe_parameters, settings.receipt_arrays);
@@ -86,24 +87,27 @@ impl Session {
             let opened = if is_disturbed { entry.disturbed() } else { entry.clone() };
             opened.observed(observes_parameters)
         });
+        // Reserve memory and quota, record the draws, create the environments.
         let envs = settings.size();
         // A batch larger than the pool gets no reservation: the pool then refuses it with a better message.
         let step_memory =
             (envs <= max_envs).then(|| self.budget.reserve(sizes::session(&settings, envs))).transpose()?;
         let env_quota = self.bearer.as_ref().map(|bearer| bearer.envs(envs)).transpose()?;
-        let (begun, spec) = (self.draws.open(&settings).await?, settings.spec);
+        let (pending, spec) = (self.draws.open(&settings).await?, settings.spec);
         let opened = Batch::open(&self.context.pool, settings).await;
-        let (mut batch, observations, started) = opened.inspect_err(|_| self.draws.open_failed(spec, begun))?;
+        let (mut batch, observations, started) = opened.inspect_err(|_| self.draws.open_failed(spec, pending))?;
         self.draws.record_drop(&mut batch);
         if let Some(bearer) = &self.bearer {
             bearer.charge(0, envs as u64);
         }
+        // Grant a lease, if the client requests one.
         let grant = match unanswered {
             0 => None,
             unanswered => self.context.leases.grant(self.bearer.clone(), unanswered as usize)?,
         };
         let lease = grant.as_ref().map_or_else(Bytes::new, |grant| Bytes::copy_from_slice(&grant.name));
         let lease_seconds = grant.as_ref().map_or(0, |grant| grant.time().as_secs() as u32);
+        // Build the reply.
         let started = convert::started(started);
         let acts = true;
         let max_step_reply_bytes = environment
@@ -147,22 +151,22 @@ impl Session {
     async fn snapshot(&mut self, request: proto::Snapshot) -> Result<SessionReply, Error> {
         let batch = self.opened("snapshot")?;
         let slots = convert::mask("snapshot.mask", batch.size(), &request.mask)?;
-        let mut share = self.budget.reserve(sizes::snapshots(slots.len()))?;
+        let mut reservation = self.budget.reserve(sizes::snapshots(slots.len()))?;
         let batch = self.opened("snapshot")?;
         let snapshots = batch.snapshot(slots).await?;
-        share.resize(sizes::snapshot_bytes(&snapshots));
-        Ok(Reply { memory: Some(share), ..reply(Response::Snapshot(proto::Snapshotted { snapshots })) })
+        reservation.resize(sizes::snapshot_bytes(&snapshots));
+        Ok(Reply { memory: Some(reservation), ..reply(Response::Snapshot(proto::Snapshotted { snapshots })) })
     }
 
     async fn restore(&mut self, request: proto::Restore) -> Result<SessionReply, Error> {
         let batch = self.batch.as_mut().ok_or(Error::NotOpen { request: "restore" })?;
         let entries = convert::restore(batch.size(), request)?;
-        let begun = self.draws.restore(batch, &entries).await?;
+        let pending = self.draws.restore(batch, &entries).await?;
         let slots: Vec<usize> = entries.iter().map(|(slot, _)| *slot).collect();
         let observations = match batch.restore(entries).await {
             Ok(observations) => observations,
             Err(error) => {
-                self.draws.restore_failed(batch, &slots, begun);
+                self.draws.restore_failed(batch, &slots, pending);
                 return Err(error.into());
             }
         };
@@ -174,10 +178,10 @@ impl Session {
         let batch = self.opened("render")?;
         let (slot, size) = convert::render(batch.size(), request)?;
         let scene = batch.scene(slot)?.ok_or(Error::NothingToDraw { slot })?;
-        let share = self.budget.reserve(sizes::picture(size))?;
+        let reservation = self.budget.reserve(sizes::picture(size))?;
         let pixels = self.context.renderer.draw(scene, size).await?;
         let rendered = proto::Rendered { pixels, width: size.width.into(), height: size.height.into() };
-        Ok(Reply { memory: Some(share), ..reply(Response::Render(rendered)) })
+        Ok(Reply { memory: Some(reservation), ..reply(Response::Render(rendered)) })
     }
 
     async fn release(&mut self, request: proto::Release) -> Result<SessionReply, Error> {
@@ -196,10 +200,10 @@ impl Session {
         let policy = sizes::policy(&request, batch.size());
         let policy = (policy > 0).then(|| self.budget.reserve(policy)).transpose()?;
         let rollout = policy::rollout_request(batch, self.bearer.as_ref().and_then(|bearer| bearer.rate()), request)?;
-        let share = self.budget.reserve(sizes::max_rollout_bytes(&rollout, batch))?;
+        let reservation = self.budget.reserve(sizes::max_rollout_bytes(&rollout, batch))?;
         self.policy_memory = policy.or(self.policy_memory.take());
         let acted = policy::rollout_response(batch.act(rollout).await?);
-        Ok(Reply { memory: Some(share), ..reply(Response::Act(acted)) })
+        Ok(Reply { memory: Some(reservation), ..reply(Response::Act(acted)) })
     }
 
     fn save_player(&mut self) -> Result<SessionReply, Error> {
