@@ -106,25 +106,26 @@ pub fn run<'a>(
     listeners: Vec<Listener>,
     metrics: Option<Listener>,
     config: &'a Config,
-    guards: &'a Security,
+    security: &'a Security,
     catalogue: Catalogue,
     shutdown: impl Future<Output = ()> + 'a,
 ) -> impl Future<Output = Result<(), Error>> + 'a {
-    run_boxed(listeners, metrics, config, guards, catalogue, Box::pin(shutdown))
+    run_boxed(listeners, metrics, config, security, catalogue, Box::pin(shutdown))
 }
 
-/// [`run`] without type parameters.
+/// Does the work of [`run`], without type parameters.
 fn run_boxed<'a>(
     listeners: Vec<Listener>,
     metrics: Option<Listener>,
     config: &'a Config,
-    guards: &'a Security,
+    security: &'a Security,
     catalogue: Catalogue,
     shutdown: BoxFuture<'a, ()>,
 ) -> BoxFuture<'a, Result<(), Error>> {
-    Box::pin(serve(listeners, metrics, config, guards, catalogue, shutdown))
+    Box::pin(serve(listeners, metrics, config, security, catalogue, shutdown))
 }
 
+/// Starts all parts of the server, serves until the shutdown, and shuts down in order.
 async fn serve(
     listeners: Vec<Listener>,
     metrics: Option<Listener>,
