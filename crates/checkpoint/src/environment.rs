@@ -32,8 +32,9 @@ pub struct EnvironmentSummary {
 /// The name of the property `model_hash` in error messages.
 const MODEL: &str = "model";
 
-/// Returns a remedy for a difference in the property `what`, as the beginning of the last part of an error message. It
-/// is empty unless the model differs, because then the files of a task's folder may have changed.
+/// Returns advice for the user if the property `what` of a served environment differs. The advice stands before the
+/// other advice in an error message. It is empty unless `what` is the model: a different model may mean that the files
+/// in a task's folder have changed.
 pub fn task_remedy(what: &str) -> &'static str {
     if what == MODEL { "if the task is a folder, serve its original files; otherwise " } else { "" }
 }

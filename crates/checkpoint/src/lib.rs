@@ -372,6 +372,7 @@ impl CheckpointDocument {
             let (directory, document) = Self::read(path)?;
             let named = document.weights.file.clone();
             match take(&directory, document) {
+                // A file that is missing twice was deleted, not replaced.
                 Err(CheckpointError::File(error)) if error.source.kind() == ErrorKind::NotFound && named != last => {
                     last = named;
                 }

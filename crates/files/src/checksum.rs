@@ -10,9 +10,9 @@ use serde_json::Value;
 
 /// The key of the checksum in a JSON document.
 const ENTRY: &str = "crc32c";
-/// The text before the checksum in other files.
+/// The text before the checksum in a file that is not JSON.
 const MARK: &[u8] = b"perturb.crc32c=";
-/// The number of hexadecimal digits of the checksum in other files.
+/// The number of hexadecimal digits of the checksum in a file that is not JSON.
 const DIGITS: usize = 8;
 /// The error message for a wrong checksum.
 pub const CHECKSUM_MISMATCH: &str = "the checksum does not match, because the file was changed or damaged";

@@ -29,8 +29,9 @@ struct Raised {
 
 impl StopFlag {
     /// Returns a flag that the signals INT, TERM, HUP, USR1, USR2 and XCPU raise. A second INT or TERM ends the program
-    /// immediately. The other signals may arrive repeatedly, from terminals, batch systems and the kernel. Those of
-    /// them that the program was started to ignore, such as HUP under `nohup`, are still ignored.
+    /// immediately. The other signals may arrive repeatedly, from terminals, batch systems and the kernel. If the
+    /// program was started with one of these other signals ignored, as `nohup` does with HUP, it still ignores this
+    /// signal.
     ///
     /// # Errors
     /// An error of the operating system.

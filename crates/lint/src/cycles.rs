@@ -120,8 +120,8 @@ impl SiblingGraph {
         cycles
     }
 
-    /// Returns a shortest cycle among `modules`. Of several, it is the one whose start comes first in alphabetical
-    /// order.
+    /// Returns a shortest cycle among `modules`. If several cycles are equally short, returns the one whose first
+    /// module comes first in alphabetical order.
     fn shortest_cycle(&self, modules: &[String]) -> Vec<Edge> {
         modules.iter().filter_map(|start| self.shortest_path_back(start)).min_by_key(Vec::len).unwrap_or_default()
     }

@@ -120,7 +120,7 @@ impl LimitTable {
     ///
     /// # Errors
     ///
-    /// An error message with the number of the line that is not `key = number`, or whose section is not a check's.
+    /// An error message with the number of the line that is not `key = number`, or whose section belongs to no check.
     pub fn parse(text: &str) -> Result<Self, String> {
         let mut limits = Self::default();
         for entry in entries(text)? {

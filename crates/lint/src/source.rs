@@ -1,4 +1,4 @@
-//! The source files that are checked: all that git tracks, or would track because it does not ignore them.
+//! The source files that are checked: all files that git tracks, and new files that git does not ignore.
 
 use std::collections::BTreeMap;
 use std::path::Path;

@@ -18,12 +18,13 @@ enum Status {
 
 /// A physics simulation: a model, which may be edited, and its current state with all quantities computed from it.
 ///
-/// A new simulation is in the model's initial state, as after [`reset`](Self::reset). These two and
-/// [`set_state`](Self::set_state) do not compute the quantities that follow from the state, such as poses and contacts.
-/// Call [`step1`](Self::step1), [`motion`](Self::motion) or [`forward`](Self::forward) before reading them.
+/// A new simulation is in the model's initial state, as after [`reset`](Self::reset). [`new`](Self::new),
+/// [`reset`](Self::reset) and [`set_state`](Self::set_state) do not compute the quantities that follow from the state,
+/// such as poses and contacts. Call [`step1`](Self::step1), [`motion`](Self::motion) or [`forward`](Self::forward)
+/// before reading such quantities.
 ///
 /// One simulation can serve several environments in turn, each with its own [`state`](Self::state) and
-/// [`constants`](Self::constants). Results depend only on these two, not on earlier computations.
+/// [`constants`](Self::constants). Results depend only on state and constants, not on earlier computations.
 #[derive(Debug)]
 pub struct Simulation {
     model: Model,
@@ -200,7 +201,7 @@ impl Simulation {
     }
 
     /// Applies the controls, and advances positions, velocities and time by one timestep. Call [`step1`](Self::step1)
-    /// first. The quantities that it computed, such as poses and contacts, are not updated to the new state.
+    /// first. Quantities that `step1` computed, such as poses and contacts, are not updated to the new state.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
@@ -298,7 +299,7 @@ impl Simulation {
     }
 
     fn run(&mut self, call: unsafe extern "C" fn(*const sys::mjModel, *mut sys::mjData) -> c_int) -> Result<(), Error> {
-        // SAFETY: `call` is a function of shim.c, which requires a model and its data, as `run_with` passes.
+        // SAFETY: `call` is a function of shim.c. It requires a model and its data, and `run_with` passes both.
         self.run_with(|model, data| unsafe { call(model, data) })
     }
 

@@ -6,7 +6,7 @@ use std::fmt;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The loaded MuJoCo library has another version than the headers with which this crate was compiled.
+    /// The loaded MuJoCo library and the headers with which this crate was compiled have different versions.
     #[error("the MuJoCo library is version {library}, the headers {header}; install libmujoco-dev and build again")]
     Version {
         /// The headers' version, e.g. 222 for 2.2.2.

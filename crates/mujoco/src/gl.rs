@@ -66,11 +66,11 @@ fn displays(egl: &Egl) -> Vec<egl::Display> {
     let mut displays = Vec::new();
     // `Egl::get_platform_display` would panic if EGL knows a platform but has no display for it.
     if let Some(function) = egl.get_proc_address("eglGetPlatformDisplayEXT") {
-        // SAFETY: the extension's function of the EGL registry's type.
+        // SAFETY: this is the extension's function, and the type is the one in the EGL registry.
         let get_platform_display = unsafe { mem::transmute::<extern "system" fn(), GetPlatformDisplay>(function) };
         let (mut devices, mut n) = ([ptr::null_mut(); MAX_DEVICES], 0);
         if let Some(function) = egl.get_proc_address("eglQueryDevicesEXT") {
-            // SAFETY: the extension's function of the EGL registry's type.
+            // SAFETY: this is the extension's function, and the type is the one in the EGL registry.
             let query_devices = unsafe { mem::transmute::<extern "system" fn(), QueryDevices>(function) };
             // SAFETY: the array has space for the number of devices that is passed.
             unsafe { query_devices(MAX_DEVICES as c_int, devices.as_mut_ptr(), &raw mut n) };

@@ -111,8 +111,8 @@ impl Model {
         Self::from_files(xml, &[])
     }
 
-    /// Compiles MJCF text that uses other files, such as meshes. `files` has the name, in lower case and without a
-    /// folder, and the content of each. Compilations in several threads wait for each other.
+    /// Compiles MJCF text that uses other files, such as meshes. `files` are pairs of a file's name, in lower case and
+    /// without a folder, and its content. Compilations in several threads wait for each other.
     ///
     /// Pass only trusted text: MuJoCo reads a file that is not in `files` from the disk.
     ///
@@ -342,7 +342,7 @@ impl Model {
         }
     }
 
-    /// Estimates the memory of a simulation of this model in bytes, from above. It includes the model and MuJoCo's
+    /// Returns an upper bound of the memory of a simulation of this model, in bytes. It includes the model and MuJoCo's
     /// data.
     pub fn simulation_bytes(&self) -> usize {
         let m = self.raw();

@@ -60,7 +60,7 @@ fn exclusive() -> MutexGuard<'static, ()> {
 
 impl Renderer {
     /// Creates a renderer of `model` in its initial pose. `size` is the expected width and height of the pictures in
-    /// pixels; larger ones are possible, but the first one takes longer.
+    /// pixels. Larger pictures are possible, but the first larger picture takes longer.
     ///
     /// # Errors
     /// [`Error::NoOpenGl`] without a usable OpenGL, [`Error::Fatal`] if OpenGL lacks a feature that MuJoCo needs.

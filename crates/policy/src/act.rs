@@ -18,8 +18,8 @@ use crate::weights::Weights;
 /// creation it allocates no memory, except to grow the caller's output buffers.
 ///
 /// The actor of a recurrent policy has a memory for every environment. [`Actor::act`] updates this memory, and
-/// [`Actor::values`] reads it. Call [`Actor::forget`] to clear it at the end of an episode, or with RL² at the end of a
-/// trial.
+/// [`Actor::values`] reads it. Call [`Actor::forget`] to clear it at the end of an episode (with RL², at the end of a
+/// trial).
 #[derive(Clone, Debug)]
 pub struct Actor {
     spec: PolicySpec,

@@ -1,4 +1,4 @@
-//! Running normalisation of observations and rewards, as stable-baselines3's VecNormalize.
+//! Running normalisation of observations and rewards, like stable-baselines3's VecNormalize.
 //!
 //! In training, call `update` and then `normalise`. In testing, call only `normalise`, which does not change the
 //! statistics. All state is f64, can be serialised with serde, and is part of a checkpoint.
@@ -144,9 +144,9 @@ impl ObservationNormaliser {
         ObservationNormaliser { moments, left_alone: 0 }
     }
 
-    /// Adds `left_alone` elements at the end of observations, which are not normalised. Use it for observed parameters:
-    /// they are scaled already. They may also be constant throughout a training; dividing by their tiny deviation would
-    /// then magnify later differences without bound.
+    /// Makes observations longer by `left_alone` elements at the end, and leaves these elements unchanged. Use this for
+    /// observed parameters, because they are already scaled. A parameter may also be constant throughout a training.
+    /// Dividing it by its tiny standard deviation would magnify later differences without bound.
     #[must_use]
     pub fn leaving_alone(self, left_alone: usize) -> Self {
         ObservationNormaliser { left_alone, ..self }
@@ -213,9 +213,9 @@ impl ObservationNormaliser {
 /// deviation of all discounted returns R_t = γ R_{t-1} + r_t seen so far (Engstrom et al., 2020, arXiv:2005.12729). The
 /// mean is not subtracted.
 ///
-/// Normally R starts from 0 in every episode, or with RL² in every trial, as in stable-baselines3. If
-/// [`RewardNormaliser::runs_on`] is true, R is not reset at these ends, as in the reference implementation (OpenAI
-/// Baselines).
+/// Normally R starts from 0 in every episode (with RL², in every trial), as in stable-baselines3. If
+/// [`RewardNormaliser::runs_on`] is true, R continues across the ends of episodes and trials, as in the reference
+/// implementation (OpenAI Baselines).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RewardNormaliser {
@@ -297,9 +297,9 @@ impl RewardNormaliser {
         self.moments.check(1)
     }
 
-    /// Adds a step's `rewards` `[N]` to the statistics. `done` `[N]` is true at the end of an episode, or with RL² of a
-    /// trial. The discounted return then starts again from 0 in the next step, unless [`RewardNormaliser::runs_on`] is
-    /// true. Returns an error for infinite numbers and NaN, and then changes nothing.
+    /// Adds a step's `rewards` `[N]` to the statistics. `done` `[N]` is true for each environment whose episode (with
+    /// RL², whose trial) ended in this step. Its discounted return then starts again from 0 in the next step, unless
+    /// [`RewardNormaliser::runs_on`] is true. Returns an error for infinite numbers and NaN, and then changes nothing.
     pub fn update(&mut self, rewards: &[f32], done: &[bool]) -> Result<()> {
         self.update_active(rewards, done, None)
     }
@@ -328,8 +328,8 @@ impl RewardNormaliser {
         Ok(())
     }
 
-    /// Resets the discounted returns of all environments to 0, unless [`RewardNormaliser::runs_on`] is true. Call it
-    /// after the environments were reset before the ends of their episodes. Does not change the statistics.
+    /// Resets the discounted returns of all environments to 0, unless [`RewardNormaliser::runs_on`] is true. Call this
+    /// after resetting environments in the middle of an episode. Does not change the statistics.
     pub fn reset_returns(&mut self) {
         if !self.runs_on {
             self.returns.fill(0.0);

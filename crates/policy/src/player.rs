@@ -64,8 +64,8 @@ pub struct TrialStreams {
     streams: Vec<ChaCha8Rng>,
 }
 
-/// The state of a player between two steps of a training, without weights and normalisers. With these it determines all
-/// further actions.
+/// The state of a player between two steps of a training, without weights and normalisers. Together with the weights
+/// and the normalisers, it determines all further actions.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PlayerState {
     /// `[N, O]` normalised observations from which the next actions are chosen.

@@ -126,7 +126,7 @@ impl<'a> Factor<'a> {
     }
 
     /// Computes one lane (16 outputs) for `rows`: eight rows at once, and the last four to seven together. `column` is
-    /// the number of the lane. `WHOLE` says that all [`LANES`] numbers of the lane are outputs.
+    /// the index of the lane. `WHOLE` is true if all [`LANES`] numbers of the lane are outputs.
     #[inline(always)]
     fn columns<S: Simd, const WHOLE: bool>(
         self,
@@ -159,7 +159,8 @@ impl<'a> Factor<'a> {
         &self.numbers[column * self.per_column..][..(self.inputs - 1) * self.per_input + last]
     }
 
-    /// Returns one vector of weights of input `i`: number `vector` in the lane that `column` holds.
+    /// Returns one SIMD vector of weights. `column` has the weights of one lane (16 outputs) for all inputs. Those of
+    /// input `i` fill one or more SIMD vectors, and `vector` is the index of the returned one.
     #[inline(always)]
     fn vector<S: Simd, const WHOLE: bool>(self, column: &[f32], i: usize, vector: usize) -> S::f32s {
         if WHOLE {
@@ -354,8 +355,8 @@ fn outer_here<S: Simd, const ADD: bool>(
     }
 }
 
-/// Computes the rows of `sums` of `R` outputs, starting at output `first`, for one lane (16 inputs). `column` is the
-/// number of the lane. `WHOLE` says that all [`LANES`] numbers of the lane are inputs.
+/// Computes one lane (16 inputs) of `R` rows of `sums`. Each row belongs to an output; `first` is the first of them.
+/// `column` is the index of the lane. `WHOLE` is true if all [`LANES`] numbers of the lane are inputs.
 #[inline(always)]
 fn outers<S: Simd, const R: usize, const ADD: bool, const WHOLE: bool>(
     simd: S,

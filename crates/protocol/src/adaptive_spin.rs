@@ -37,8 +37,8 @@ impl AdaptiveSpin {
         self.backs_off = true;
     }
 
-    /// Waits for `event`, and returns its output. While it spins, it yields repeatedly, first to the other async tasks
-    /// of the thread, one of which may have to send the request, then to other threads.
+    /// Waits for `event`, and returns its output. While it spins, it yields repeatedly: first to the other async tasks
+    /// of the thread, because one of them may have to send the request, then to other threads.
     pub async fn until<F: Future>(&mut self, event: F) -> F::Output {
         let begun = Instant::now();
         let mut event = pin!(event);

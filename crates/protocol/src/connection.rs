@@ -192,7 +192,7 @@ impl Connection {
         self.client.clone()
     }
 
-    /// Whether the server answers a health check within `limit`, be it with an error.
+    /// Whether the server answers a health check within `limit`, even if the answer is an error.
     pub async fn is_alive(&self, limit: Duration) -> bool {
         let mut health = self.health.clone();
         match timeout(limit, health.check(HealthCheckRequest { service: SERVICE.into() })).await {

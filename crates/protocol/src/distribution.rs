@@ -205,8 +205,8 @@ impl FromStr for Distribution {
     }
 }
 
-/// Returns the number in `text` if it is written with a decimal comma, with a point instead: 7.5 for `7,5`. Returns
-/// `None` for any other text.
+/// Replaces the decimal comma of the number in `text` by a point: returns `7.5` for `7,5`. Returns `None` if `text` is
+/// not a number with a decimal comma.
 pub fn decimal_comma(text: &str) -> Option<String> {
     let (whole, fraction) = text.split_once(',')?;
     let digits = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());

@@ -31,7 +31,8 @@ pub struct EndedEpisode {
     /// The value that the environment's success rule compares with its threshold. `None` if it has no value, e.g. the
     /// time to a goal that was never reached.
     pub achieved: Option<f64>,
-    /// The value that the success rule of the paper's published code compares, which may differ from the paper's rule.
+    /// The value that the success rule in the published code of Packer et al. (2018) compares with its threshold. The
+    /// rule may differ from the one in their paper.
     pub code_achieved: Option<f64>,
     /// The requested parameters, and the values read back from the physics, in the order of the catalogue.
     pub receipt: proto::Receipt,

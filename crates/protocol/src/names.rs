@@ -135,7 +135,7 @@ mod tests {
         );
         assert_eq!(refused("Pong"), "there is no environment \"Pong\"; there are CartPole, MountainCar, HalfCheetah");
         assert!(refused("perturb/CartPole-v0").starts_with("`perturb/CartPole-v0` is another revision"));
-        // Gymnasium's own environments are others.
+        // An id without the namespace `perturb/` is that of Gymnasium's own environment.
         assert!(refused("CartPole-v1").contains("(did you mean `CartPole`?)"));
         assert!(refused("perturb/").starts_with("there is no environment \"\";"));
         assert!(refused("pértürb/CartPole").starts_with("there is no environment \"pértürb/CartPole\""));

@@ -70,11 +70,11 @@ impl TryFrom<&proto::Moments> for RunningMoments {
     }
 }
 
-/// Builds the normaliser of observations of length O, `observation_size`. If the statistics are of fewer entries, the
-/// last entries of an observation are not normalised.
+/// Builds a normaliser for observations of O = `observation_size` entries. If the message has statistics for fewer
+/// entries, the last entries of an observation are not normalised.
 ///
 /// # Errors
-/// [`DecodeError`] if the message is malformed or its statistics are of more than O entries.
+/// [`DecodeError`] if the message is malformed, or has statistics for more than O entries.
 pub fn observation_normaliser(
     moments: &proto::Moments,
     observation_size: usize,

@@ -102,8 +102,8 @@ impl Region {
     }
 
     /// Whether this region and `other` have values in common, see [`Distribution::overlaps`]. A disturbance that is
-    /// missing from one of two boxes is not compared. So a region that is held out without naming disturbances is held
-    /// out with every disturbance.
+    /// missing from one of two boxes is not compared. Therefore, a region that names no disturbances overlaps the same
+    /// region with any disturbances.
     pub fn overlaps(&self, other: &Self) -> bool {
         let others = other.physics();
         let overlap = |own, other| pairs(own, other, Distribution::overlaps, |_| None);

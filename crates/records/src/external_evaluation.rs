@@ -263,7 +263,7 @@ impl ExternalEvaluation {
     }
 
     /// Writes the evaluation to the folder `path`. The folder must be new or empty, unless it contains an evaluation
-    /// and `overwrite` is set. Of an overwritten evaluation, deletes only the files with records that are no longer
+    /// and `overwrite` is set. When an evaluation is overwritten, deletes only its records files that are no longer
     /// needed.
     ///
     /// # Errors

@@ -20,7 +20,7 @@ pub struct HeatmapOptions {
     /// The names of the parameters along x and along y.
     pub parameters: [String; 2],
     /// The version from which all other parameters are drawn. In version D (deterministic) they have their defaults. In
-    /// R (random) and E (extreme) they are drawn for each episode, or with RL² for each trial.
+    /// R (random) and E (extreme) they are drawn for each episode (with RL², for each trial).
     pub base: Version,
     /// The number of points along each axis, 1 … 100.
     pub grid: usize,
@@ -109,7 +109,7 @@ impl Heatmap {
     pub const SET: &str = "heatmap";
 
     /// Returns the axes of a heatmap's test set: x is the parameter that varies faster from context to context, y the
-    /// other varying parameter. Returns `None` if `set` is not a heatmap's.
+    /// other varying parameter. Returns `None` if `set` is not the test set of a heatmap.
     pub(crate) fn axes_of(set: &TestSet, environment: &proto::Environment) -> Option<[Axis; 2]> {
         let contexts = set.listed();
         let [first, second, ..] = contexts.as_slice() else { return None };
@@ -127,8 +127,8 @@ impl Heatmap {
         Some(if faster? == 0 { [one, other] } else { [other, one] })
     }
 
-    /// Computes the heatmap from a policy's records, with the axes that the records contain. Returns `None` if there is
-    /// no heatmap's test among them.
+    /// Computes the heatmap from a policy's records, with the axes that the records contain. Returns `None` if the
+    /// records contain no test of a heatmap.
     pub fn from_recorded_test(records: &Records) -> Option<Self> {
         let axes = records.about.tests.iter().find_map(|test| test.axes.clone())?;
         Self::from_records(records, axes)
@@ -150,13 +150,14 @@ impl Heatmap {
         HeatmapKind { parameters: self.axes.clone().map(|axis| axis.name), base: self.base }
     }
 
-    /// Returns the version of the other parameters in a recorded heatmap; `None` if there is no heatmap's test.
+    /// Returns the version of the other parameters in a recorded heatmap. Returns `None` if the records contain no test
+    /// of a heatmap.
     pub fn base_of(records: &Records) -> Option<Version> {
         records.about.tests.iter().find(|test| test.set.name == Self::SET).map(|test| test.set.version)
     }
 
     /// Computes the heatmap from a policy's records, for given `axes`. The test's contexts are the points, by y, then
-    /// x. Returns `None` if there is no heatmap's test, or if its contexts do not fit the axes.
+    /// x. Returns `None` if the records contain no test of a heatmap, or if its contexts do not fit the axes.
     pub fn from_records(records: &Records, axes: [Axis; 2]) -> Option<Self> {
         let test = records.about.tests.iter().find(|test| test.set.name == Self::SET)?;
         let contexts = test.set.listed();

@@ -226,7 +226,8 @@ impl Ledgers {
     fn end_one(&mut self, address: (SessionId, u64, u32), end: (Option<u64>, Moment)) {
         let address = self.at.entry(address).or_default();
         address.ends.push(end);
-        // If no environment was in use, those that ended last had continued to draw.
+        // If no environment was in use, this end belongs to the environments that ended last: they had continued to
+        // draw.
         let went_on = address.open.is_empty();
         if address.ends.len() < address.open.len() {
             return;

@@ -58,6 +58,8 @@ fn who(session: u64, token: &str) -> LedgerSession {
     LedgerSession { session, token: Some(token.into()), environment: "CartPole".into(), revision: 1 }
 }
 
+/// Returns the record of a session in which `count` environments, from `index` on, begin to draw from `version` at
+/// episode `episode`.
 fn begins(
     session: u64,
     token: &str,
@@ -69,6 +71,8 @@ fn begins(
     LedgerEvent::Draws(DrawRecord { who: who(session, token), regions: vec![region], begins, ends: Vec::new() })
 }
 
+/// Returns the record of a session in which `count` environments, from `index` on, stop drawing. Their last episode was
+/// `episode`.
 fn ends(session: u64, token: &str, (seed, index, count, episode): (u64, u32, u32, u64)) -> LedgerEvent {
     let ends = vec![DrawEnd { seed, index, count, episode: Some(episode) }];
     LedgerEvent::Draws(DrawRecord { who: who(session, token), regions: Vec::new(), begins: Vec::new(), ends })
@@ -79,6 +83,7 @@ fn trained() -> [LedgerEvent; 2] {
     [begins(0, "ann", R, (1, 0, 2, 0)), ends(0, "ann", (1, 0, 2, 49))]
 }
 
+/// Asserts that the audit has exactly one finding, and that its description contains `part`.
 #[track_caller]
 fn says(proof: &Proof, part: &str) {
     assert!(proof.against.len() == 1 && proof.against[0].contains(part), "{proof:?}");
@@ -100,7 +105,7 @@ fn early_draws_from_test_sets_count_against_a_policy() {
     let with = |event: LedgerEvent| proof(&[begun.clone(), event, ended.clone()]);
     says(&with(begins(1, "ann", E, (9, 0, 1, 0))), "line 3 of ");
     says(&with(begins(1, "ann", RE, (9, 0, 1, 0))), "of the test set E, had been drawn");
-    // The tests on R and E have the same seed here, and so the same episode.
+    // The tests on R and E both have seed 7, so this draw has the episodes of both.
     assert_eq!(with(begins(1, "ann", R, (7, 0, 1, 0))).against.len(), 2);
     for (seed, index, count, episode) in [(7, 1, 9, 0), (7, 0, 1, 6), (8, 0, 9, 0)] {
         assert!(with(begins(1, "ann", R, (seed, index, count, episode))).against.is_empty(), "another episode");

@@ -11,7 +11,7 @@ pub struct TestResult {
     pub success_percent: f64,
     /// The 95 % Wilson interval of the success rate, [low, high] in %.
     pub success_percent_95: [f64; 2],
-    /// Mean undiscounted return of the original, not normalised rewards.
+    /// Mean undiscounted return of the original (not normalised) rewards.
     pub mean_return: f64,
     /// Mean number of steps.
     pub mean_length: f64,

@@ -53,9 +53,9 @@ pub struct Threshold {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Rule {
-    /// The environment's own criterion, which is that of the paper's text.
+    /// The environment's own criterion: the one that Packer et al. (2018) state in their paper.
     Text,
-    /// The criterion of the paper's published code.
+    /// The criterion that the published code of Packer et al. (2018) uses.
     Code,
     /// Another threshold for one of these two criteria: the one whose quantity the threshold names.
     At(Threshold),
@@ -65,12 +65,14 @@ pub enum Rule {
 const THRESHOLD: &str = "the success threshold";
 
 impl Criterion {
-    /// Returns the criterion of the paper's text for `environment`; `None` if the server did not state it.
+    /// Returns the criterion that Packer et al. (2018) state in their paper for `environment`. `None` if the server did
+    /// not report it.
     pub fn from_environment(environment: &proto::Environment) -> Option<Self> {
         Self::read(environment.success.as_ref()?, environment.step_limit)
     }
 
-    /// Returns the criterion of the paper's published code for `environment`; `None` if the server did not state it.
+    /// Returns the criterion that the published code of Packer et al. (2018) uses for `environment`. `None` if the
+    /// server did not report it.
     pub fn from_environment_code(environment: &proto::Environment) -> Option<Self> {
         Self::read(environment.code_success.as_ref()?, environment.step_limit)
     }

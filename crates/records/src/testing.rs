@@ -51,8 +51,8 @@ fn quotas(episodes: u64, contexts: usize) -> Vec<u64> {
     (0..copies).flat_map(|i| vec![each / copies + u64::from(i < each % copies); contexts]).collect()
 }
 
-/// Collects the episodes of a running test. It counts a number of trials of each environment that is fixed in advance,
-/// and of each trial only the last episode. Taking the first episodes to end would favour short episodes.
+/// Collects the episodes of a running test. The number of trials that count is fixed in advance for each environment,
+/// because taking the first episodes to end would favour short episodes. Only the last episode of each trial counts.
 #[derive(Clone, Debug)]
 pub struct TestCollector {
     test: RecordedTest,
@@ -80,7 +80,7 @@ impl TestCollector {
         self.quotas.len()
     }
 
-    /// Takes the episodes that ended in some steps, and ignores those that do not count.
+    /// Adds episodes that have just ended. Ignores episodes that do not count.
     pub fn take(&mut self, ended: impl IntoIterator<Item = EndedEpisode>) {
         let Self { quotas, episodes_per_trial, .. } = self;
         let counts = |end: &EndedEpisode| {

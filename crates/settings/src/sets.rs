@@ -38,7 +38,7 @@ pub struct TestSet {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Contexts {
-    /// Values are drawn from these distributions for each episode, or with RL² for each trial.
+    /// Values are drawn from these distributions for each episode (with RL², for each trial).
     Drawn(Parameters),
     /// Each of these contexts is used for the same number of episodes. Contexts are the points of a grid or the rows of
     /// a file.
@@ -164,7 +164,7 @@ pub struct Assignment {
     pub values: Values,
 }
 
-/// The values of a parameter, in a distribution or as points.
+/// The values of a parameter: a distribution or a list of points.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Values {
     /// A distribution from which a value is drawn for each episode.

@@ -99,7 +99,7 @@ pub(super) fn forward(
     (outputs, values, tape)
 }
 
-/// Computes h `[L·M, H]` by the loop over time, differentiable by libtorch.
+/// Runs the LSTM over all steps and returns its outputs h `[L·M, H]`, which libtorch can differentiate.
 fn unrolled(driven: &Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tensor {
     let steps = sequences.n_steps();
     let count = sequences.count();
@@ -120,7 +120,7 @@ fn unrolled(driven: &Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tenso
     Tensor::cat(&hidden, 0)
 }
 
-/// Computes the loop over time without autograd, and stores the results for the backward pass.
+/// Runs the LSTM over all steps without autograd, and stores the results for the backward pass.
 fn run(driven: Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tape {
     let steps = sequences.n_steps();
     let count = sequences.count();
@@ -184,7 +184,7 @@ pub(super) fn backward(spec: &PolicySpec, leaves: &[Tensor], loss: &Tensor, tape
     Ok(gradients)
 }
 
-/// Computes D `[L·M, 4H]` from ∂loss/∂h `[L·M, H]` by the loop backwards in time.
+/// Computes D `[L·M, 4H]` from ∂loss/∂h `[L·M, H]`, step by step from the last to the first.
 fn deltas(recurrent: &Tensor, of_hidden: &Tensor, tape: &Tape) -> Tensor {
     let [steps, count, width] = [0, 1, 2].map(|axis: usize| tape.cells.size()[axis]);
     let of_hidden = of_hidden.view((steps, count, width));

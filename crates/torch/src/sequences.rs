@@ -75,7 +75,7 @@ impl Sequences {
         })
     }
 
-    /// Makes all steps of sequence m after its first `lengths[m]` padding.
+    /// Marks the steps of sequence m after its first `lengths[m]` steps as padding.
     ///
     /// # Errors
     /// An error if the number of lengths is not M.

@@ -67,8 +67,8 @@ pub(super) fn of_all(all: &[ConditionDifference], score: ComparedScore, compared
     }
 }
 
-/// Describes a difference for which there are too few seeds: with the differences of the single pairs, or if there are
-/// none with the interval over episodes.
+/// Describes a difference with too few seeds for an interval over seeds. Lists the difference of each pair of policies.
+/// With fewer than two pairs, gives the interval over episodes instead.
 fn few_seeds_numbers(it: &ConditionDifference, score: ComparedScore) -> String {
     let head = format!("{} − {} on {}: {}", it.x, it.y, it.tested_on, points(it.difference, score));
     let over_episodes = it.episodes_95.map(|interval| format!(" {} over episodes", ends(interval)));

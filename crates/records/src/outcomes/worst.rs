@@ -42,6 +42,7 @@ impl ContextGroup {
 ///
 /// `None` if fewer than ten regions have at least two episodes, for example because all parameters are fixed.
 pub fn worst_contexts(outcomes: &Outcomes) -> Option<f64> {
+    // Each region's counts, and the number of its episodes so far. Its episodes belong to half 0 and half 1 in turn.
     let mut parts: BTreeMap<usize, (ContextGroup, usize)> = BTreeMap::new();
     for (part, success) in outcomes.parts().into_iter().zip(&outcomes.successes) {
         let (part, seen) = parts.entry(part).or_default();
@@ -54,15 +55,17 @@ pub fn worst_contexts(outcomes: &Outcomes) -> Option<f64> {
     if parts.len() < MIN_PARTS {
         return None;
     }
+    // Ranks the regions by the half `chooses`, and measures success in the other half.
     let mut one_way = |chooses: usize| {
         parts.sort_by(|a, b| a.rate(chooses).total_cmp(&b.rate(chooses)));
         judged(&parts, chooses)
     };
+    // The mean of both assignments, in %.
     Some(50.0 * (one_way(0) + one_way(1)))
 }
 
-/// Returns the success rate, 0 … 1, of the worst tenth of `parts`. `parts` are sorted by their success in the half
-/// `chooses`; the rate is measured in the other half.
+/// Returns the success rate, 0 … 1, in the worst tenth of `parts`: regions sorted by their success rate in the half
+/// `chooses` of their episodes. The returned rate is measured in the other half.
 fn judged(parts: &[ContextGroup], chooses: usize) -> f64 {
     let judges = 1 - chooses;
     let mut wanted = SHARE * parts.iter().map(|part| part.episodes[chooses]).sum::<f64>();

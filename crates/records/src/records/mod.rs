@@ -51,14 +51,15 @@ pub struct RecordsMetadata {
     pub episodes_per_trial: u32,
     /// The success criterion; `None` if the server determined success without stating its criterion.
     pub success: Option<Criterion>,
-    /// The success criterion of the paper's text. `None` in records of older programs, which had only one criterion.
+    /// The success criterion in the paper of Packer et al. (2018). `None` in records of older programs, which had only
+    /// one criterion.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub text_success: Option<Criterion>,
-    /// The success criterion of the paper's published code. `None` if the server did not state it.
+    /// The success criterion in the published code of Packer et al. (2018). `None` if the server did not report it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub code_success: Option<Criterion>,
-    /// The name of the quantity in [`EpisodeRecord::also_achieved`]. `None` if the criteria of the text and of the code
-    /// compare the same quantity.
+    /// The name of the quantity in [`EpisodeRecord::also_achieved`]. `None` if the paper's criterion and its code's
+    /// criterion compare the same quantity.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub also: Option<String>,
     /// The tests, in the order in which they were recorded.
@@ -208,8 +209,8 @@ impl RecordsMetadata {
         if self.is_judged_by_code() { (text.1, text.0) } else { text }
     }
 
-    /// Returns whether [`EpisodeRecord::achieved`] holds the quantity of the code's criterion, where it differs from
-    /// the quantity of the text's criterion.
+    /// Returns whether [`EpisodeRecord::achieved`] holds the quantity of [`RecordsMetadata::code_success`]. Returns
+    /// false if the paper's criterion compares the same quantity.
     pub fn is_judged_by_code(&self) -> bool {
         let quantity = |criterion: &Option<Criterion>| criterion.as_ref().map(|it| it.quantity.clone());
         self.also.is_some() && quantity(&self.success) == quantity(&self.code_success)

@@ -34,7 +34,7 @@ pub struct ResultsTable {
 pub struct StudyPlan {
     /// The text of the experiment file.
     pub plan: String,
-    /// The files that the experiment file refers to, by name.
+    /// The contents of the other files that the experiment file refers to, by file name.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub beside: BTreeMap<String, String>,
 }
@@ -100,11 +100,11 @@ pub struct TableRow {
 /// The numbers of cells (trainings with their tests) that a merge added, replaced and left unchanged.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct MergeCounts {
-    /// Cells that were not in the table.
+    /// Number of cells that were not in the table before.
     pub added: usize,
-    /// Cells whose rows in the table were replaced.
+    /// Number of cells whose rows in the table were replaced.
     pub replaced: usize,
-    /// Cells whose rows were already in the table.
+    /// Number of cells whose rows were already in the table.
     pub unchanged: usize,
 }
 

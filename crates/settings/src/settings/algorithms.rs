@@ -59,8 +59,8 @@ pub struct A2cConfig {
     pub max_grad_norm: f64,
     /// Weight decay λ: each gradient step multiplies every weight by 1 - learning rate · λ. Not negative, and below 1 /
     /// `learning_rate` (default: `0`). A larger value keeps outputs closer to 0, and standard deviations of continuous
-    /// actions closer to 1. This setting is written to files only if it is not the default, so that files of older
-    /// settings do not change.
+    /// actions closer to 1. A file contains this setting only if it is not the default. Other files are therefore the
+    /// same as before this setting existed.
     #[serde(skip_serializing_if = "is_zero")]
     pub weight_decay: f64,
     /// Decay per update of RMSProp's running average of squared gradients, at least 0 and below 1 (default: `0.99`).
@@ -158,8 +158,8 @@ pub struct PpoConfig {
     pub max_grad_norm: f64,
     /// Weight decay λ: each gradient step multiplies every weight by 1 - learning rate · λ. Not negative, and below 1 /
     /// `learning_rate` (default: `0`). A larger value keeps outputs closer to 0, and standard deviations of continuous
-    /// actions closer to 1. This setting is written to files only if it is not the default, so that files of older
-    /// settings do not change.
+    /// actions closer to 1. A file contains this setting only if it is not the default. Other files are therefore the
+    /// same as before this setting existed.
     #[serde(skip_serializing_if = "is_zero")]
     pub weight_decay: f64,
     /// Adam's ε, above 0 (default: `1e-5`). This limits the step of weights with small gradients.

@@ -89,8 +89,8 @@ pub struct Common {
     /// The network architecture of the policy.
     pub architecture: Architecture,
     /// The observation of the policy in training and in tests: "state", or "parameters" for the state and the current
-    /// parameters of the environment (default: `"state"`). This setting is written to files only if it is not the
-    /// default, so that files of older settings do not change.
+    /// parameters of the environment (default: `"state"`). A file contains this setting only if it is not the default.
+    /// Other files are therefore the same as before this setting existed.
     #[serde(default, skip_serializing_if = "Observe::is_default")]
     pub observe: Observe,
     /// The number of episodes after which training ends, at least 1 (default: `15000`). The last iteration is
@@ -104,8 +104,8 @@ pub struct Common {
     /// Whether observations are normalised by their running mean and variance (default: `true`).
     pub normalize_observations: bool,
     /// Standard deviation of normally distributed noise that is added to every number of an observation in training,
-    /// after normalisation if there is any, 0 … 100 (default: `0`). Tests have no noise. This setting is written to
-    /// files only if it is not the default, so that files of older settings do not change.
+    /// after normalisation if there is any, 0 … 100 (default: `0`). Tests have no noise. A file contains this setting
+    /// only if it is not the default. Other files are therefore the same as before this setting existed.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub observation_noise: f64,
     /// Whether rewards are divided by the running standard deviation of the discounted return (default: `true`).
@@ -120,8 +120,8 @@ pub struct Common {
     /// iteration always write a checkpoint.
     pub checkpoint_interval: u64,
     /// A success rate in %, 0 … 100, at which training ends early: after the iteration in which the last 100 ended
-    /// episodes reach it (default: `0`, which is never). Longer training can impair generalisation. This setting is
-    /// written to files only if it is not the default, so that files of older settings do not change.
+    /// episodes reach it (default: `0`, which is never). Longer training can impair generalisation. A file contains
+    /// this setting only if it is not the default. Other files are therefore the same as before this setting existed.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub stop_at_success: f64,
 }
@@ -167,8 +167,8 @@ impl TrainConfig {
     }
 
     /// Returns the configuration as a flat table, which [`TrainConfig::from_table`] reads. With the default preset, the
-    /// table omits some settings that were introduced later, if they have the values that trainings had before. Results
-    /// of older versions therefore keep their configuration.
+    /// table omits the settings that earlier versions of the program did not have, if they are set to the behaviour of
+    /// those versions. The table is therefore the same as the one that an earlier version wrote.
     pub fn table(&self) -> Table {
         let mut table = self.full_table();
         if self.common.preset.is_default() {

@@ -62,8 +62,9 @@ pub(super) fn apply_paper(TrainConfig { common, settings }: &mut TrainConfig) {
 /// Factor by which the authors' value loss differs: it is half of the squared error.
 const HALF: f64 = 0.5;
 
-/// Removes settings that were introduced later, if they have the values that trainings had before. The names of an
-/// experiment's trainings are derived from the remaining settings, so older trainings keep their names.
+/// Removes the settings that earlier versions of the program did not have, if they are set to the behaviour of those
+/// versions. The names of an experiment's trainings are derived from the remaining settings, so results of earlier
+/// versions are still found by name.
 pub(super) fn leave_out_younger(table: &mut Table) {
     let is_older = |key: &str, value: &toml::Value| match key {
         "preset" => value.as_str() == Some("perturb"),

@@ -166,7 +166,8 @@ fn each_preset_has_the_documents_values() {
     }
 }
 
-/// Checks the values that were tuned on seed 1, and the settings of single algorithms, in both presets.
+/// Checks the defaults that were chosen for each algorithm and architecture in trainings with seed 1. They are the same
+/// in both presets.
 #[test]
 fn each_algorithm_has_its_recommended_rates_and_lengths() {
     let (ff, rc) = (Architecture::Ff, Architecture::Rc);
@@ -218,9 +219,9 @@ fn the_command_lines_preset_beats_the_files() {
     assert_eq!(loaded(&format!("{file}\npreset = 'perturb'"), "preset = 'paper'"), loaded(&paper, ""));
 }
 
-/// The names of an experiment's trainings depend on the settings that are written. A setting that was introduced later
-/// is omitted if it has the value that trainings had before. So names do not change, and results of earlier programs
-/// are found.
+/// Checks that the table of a configuration omits a setting that earlier versions of the program did not have, if it
+/// is set to the behaviour of those versions. The names of an experiment's trainings are derived from this table, so
+/// results of earlier versions are still found by name.
 #[test]
 fn default_preset_omits_younger_settings_with_old_values() {
     for (algorithm, architecture) in pairs() {
