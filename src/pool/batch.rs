@@ -37,7 +37,7 @@ const SHARD_COST_US: RangeInclusive<f64> = 20.0..=200.0;
 const SHARDS_PER_WORKER: f64 = 32.0;
 /// The minimum cost of a worker's part of a batch, µs. Cheaper batches are not split among all workers.
 const MIN_WORKER_SHARE_US: f64 = 10.0;
-/// The maximum number of environments for which a batch is freed on the transport thread, since this takes only a
+/// The maximum number of environments in a batch that is freed on the transport thread. Freeing so few takes only a
 /// moment.
 const INLINE_DROP_MAX_ENVS: usize = 64;
 
@@ -71,7 +71,7 @@ pub struct Batch {
     is_running: bool,
     /// If the next request is a pipelined step that has already started: its start time.
     pipelined_since: Option<Instant>,
-    /// The policy of the last `act`. Any other request that changes the environments drops it.
+    /// The policy of the last [`Batch::act`]. Any other request that changes the environments drops it.
     runner: Option<Box<PolicyRunner>>,
     /// Runs when the environments are freed.
     drop_hook: Option<DropHook>,

@@ -14,17 +14,16 @@ use std::{
 };
 use tokio::sync::Notify;
 
-/// The maximum cost of a batch's step, µs, for which it runs on the session's thread, since passing it to a worker
-/// costs more.
+/// The maximum cost of a batch's step that runs on the session's thread, µs. Passing such a step to a worker would take
+/// longer.
 pub(super) const INLINE_MAX_US: f64 = 20.0;
-/// The limit that applies instead of [`INLINE_MAX_US`], in µs, to a session that also made the previous step on the
-/// server. Then no other session is waiting, and up to this cost a second worker saves less than passing the batch to
-/// it costs.
+/// The limit that replaces [`INLINE_MAX_US`], in µs, if the session also made the previous step on the server. Then no
+/// other session is waiting. Up to this cost, a second worker would save less time than passing the batch to it takes.
 pub(super) const INLINE_MAX_US_UNCONTENDED: f64 = 80.0;
-/// The maximum cost of a batch's step, µs, for which the batch is also reset on the session's thread. A reset costs as
-/// much as a few steps.
+/// The maximum cost of a step, µs, of a batch that is also reset on the session's thread. A reset costs as much as a
+/// few steps.
 pub(super) const INLINE_RESET_MAX_US: f64 = 4.0;
-/// The maximum cost of a job, in µs, for which the session polls for the end before it sleeps.
+/// The maximum cost of a job's step, µs, at which the session polls for the end of the job before it sleeps.
 const POLL_MAX_US: f64 = 50.0;
 /// The number of polls. Together they take about twice [`POLL_MAX_US`].
 const POLLS_BEFORE_WAIT: usize = 50;
@@ -52,7 +51,7 @@ pub(super) struct Job {
     rollout: Mutex<Option<Box<RolloutTask>>>,
     /// The pipelined step that may follow the running step. Not used during a rollout.
     pub(super) pipelined: Mutex<PipelinedStep>,
-    /// Whether the next part is the start of a rollout, which is no shard.
+    /// Whether the job's next part is the start of a rollout instead of a shard.
     begins_rollout: AtomicBool,
     /// The number of requests that the workers have finished so far.
     pub(super) ended: AtomicU64,

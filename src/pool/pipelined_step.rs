@@ -1,5 +1,5 @@
-//! Pipelined steps: a step that is requested while another step is running starts as soon as that step ends, while the
-//! session is still being woken to answer the first request.
+//! Pipelined steps. A client may request a step while another step is running. The pipelined step starts as soon as the
+//! running step ends. It does not wait until the session has been woken to answer the first request.
 
 use super::{
     shard::{Shard, set_actions},
@@ -16,9 +16,9 @@ pub(super) struct PipelinedStep {
     is_under_way: bool,
     /// The actions of the pipelined step, if one is queued.
     actions: Option<Bytes>,
-    /// The result and end time of the step that the pipelined step followed, until the session takes it.
+    /// The result and end time of the step before the pipelined step. `None` after the session has taken them.
     result: Option<(StepResult, Instant)>,
-    /// The end time of the last step that was not followed by a pipelined step.
+    /// The time at which a step last ended without a pipelined step in the queue.
     ended: Option<Instant>,
     buffer: BytesMut,
     reward_terms: bool,
@@ -59,7 +59,7 @@ impl PipelinedStep {
         self.result.take()
     }
 
-    /// The end time of the last step that was not followed by a pipelined step.
+    /// The time at which a step last ended without a pipelined step in the queue.
     pub(super) fn ended_at(&self) -> Option<Instant> {
         self.ended
     }

@@ -282,8 +282,8 @@ impl StepScheduler {
             }
             job.prepare();
             let shards = job.shards.len();
-            // Waiting jobs come first. If none waits and the job has a single shard, this worker runs it directly.
-            // Through the queue, an idle worker might take the job, which is in this worker's cache.
+            // Waiting jobs come first. If none waits and the job has a single shard, this worker runs the job directly,
+            // because the job is in its cache. From the queue, an idle worker might take the job.
             let runs_here = shards == 1 && self.waiting.load(Ordering::Acquire) == 0;
             if !runs_here {
                 self.push(job, shards, shards - 1);

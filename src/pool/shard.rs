@@ -77,7 +77,8 @@ pub(super) struct Shard {
     pub(super) final_observations: Vec<f32>,
     /// The episodes that ended in the last command, `[k]`, each with its slot in the batch.
     pub(super) ended: Vec<(u32, EpisodeEnd)>,
-    /// The episodes that began in the last command, each with its slot in the batch; only with receipts as messages.
+    /// The episodes that began in the last command, each with its slot in the batch. Empty without receipts, and also
+    /// after a step if receipts are arrays.
     pub(super) started: Vec<(u32, EpisodeStart)>,
     /// The receipts of the episodes in `ended`, if receipts are arrays.
     pub(super) ended_receipts: ReceiptColumns,
@@ -344,8 +345,8 @@ pub(super) fn set_actions(shards: &[Mutex<Shard>], actions: &[u8]) {
     for shard in shards {
         let mut shard = lock(shard);
         let Shard { choices, vectors, .. } = &mut *shard;
-        // Either `choices` or `vectors` is empty. `words` must be the second argument of `zip`: as the first, `zip`
-        // would consume a word that belongs to the next shard.
+        // Either `choices` or `vectors` is empty. `words` must be the second argument of `zip`. If it were the first,
+        // `zip` would consume a word that belongs to the next shard.
         choices.iter_mut().zip(&mut words).for_each(|(to, from)| *to = u32::from_le_bytes(*from));
         vectors.iter_mut().zip(&mut words).for_each(|(to, from)| *to = f32::from_le_bytes(*from));
     }

@@ -27,10 +27,11 @@ pub struct StepResult {
     pub final_observations: Bytes,
     /// The K episodes that ended, each with its slot, in order of slots.
     pub ended: Vec<(u32, EpisodeEnd)>,
-    /// The episodes that autoreset began, each with its slot; only with receipts as messages.
+    /// The episodes that autoreset began, each with its slot. Empty unless receipts are sent as messages.
     pub started: Vec<(u32, EpisodeStart)>,
-    /// The episodes of `receipt_values`, u64 `[M, 5]`; only with receipts as arrays. Columns: slot, environment index,
-    /// trial index, episode index, number within the trial. The K ended episodes come before the episodes that began.
+    /// The episodes of `receipt_values`, u64 `[M, 5]`. Empty unless receipts are sent as arrays. Columns: slot,
+    /// environment index, trial index, episode index, number within the trial. The K ended episodes come before the
+    /// episodes that began.
     pub receipt_episodes: Bytes,
     /// The receipts of these M episodes, f64 `[M, P + Q]`: P requested values, then Q applied values.
     pub receipt_values: Bytes,

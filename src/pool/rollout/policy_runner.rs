@@ -39,9 +39,9 @@ pub struct Policy {
 #[derive(Debug, Clone)]
 #[allow(clippy::large_enum_variant)] // there is only one for each policy
 pub enum PolicyRole {
-    /// All actions are drawn from this stream, and statistics are updated.
+    /// All actions are drawn from this stream. The normalisers' statistics are updated.
     Training(ChaCha8Rng),
-    /// The actions of each trial are drawn from a stream of the trial's own, and statistics are frozen.
+    /// Each trial has its own stream, from which its actions are drawn. The normalisers' statistics are frozen.
     Testing {
         /// The seed, which together with the environment index and the trial index determines a trial's stream.
         seed: u64,
@@ -54,7 +54,7 @@ pub struct PolicyRunner {
     pub(in crate::pool) task: RemainingRollout,
     /// The seed of [`PolicyRole::Testing`]; `None` in training.
     seed: Option<u64>,
-    /// The outputs of the last step, of all shards.
+    /// The outputs of all shards in the last step.
     pub(in crate::pool) step: StepBuffers,
     spec: PolicySpec,
 }

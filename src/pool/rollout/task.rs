@@ -1,4 +1,4 @@
-//! A rollout: the steps of one reply to `act`. A policy plays them on the workers, without the session.
+//! A rollout: the steps of one reply to the request `act`. A policy plays them on the workers, without the session.
 //!
 //! The worker that runs the last shard of a step gathers the outputs, chooses the next actions and gives them to the
 //! shards. Then the job goes to the back of the queue, as after any other step. The session is woken at the end of the
@@ -32,7 +32,7 @@ pub struct RolloutRequest {
     pub policy: Option<Policy>,
     /// New weights for the previous policy, `[P]`, finite; if `None`, it keeps its weights.
     pub weights: Option<Vec<f32>>,
-    /// The task to start; if `None`, the previous task continues.
+    /// The task to start: the steps or episodes that the policy has to play. If `None`, the previous task continues.
     pub task: Option<CollectUntil>,
     /// The maximum number of steps in this rollout, at least 1.
     pub max_steps: usize,
@@ -58,15 +58,15 @@ pub struct Rollout {
     pub values: BytesMut,
     /// The rewards, normalised, f32 `[T, N]`.
     pub rewards: BytesMut,
-    /// 1 where the task ended the last episode of a trial, u8 `[T, N]`.
+    /// 1 where the environment's task ended the last episode of a trial, u8 `[T, N]`.
     pub terminated: BytesMut,
     /// 1 where the step limit ended the last episode of a trial, u8 `[T, N]`.
     pub truncated: BytesMut,
     /// The value V of the last observation where `truncated` is 1, otherwise 0, f32 `[T, N]`.
     pub truncation_values: BytesMut,
-    /// The episodes that ended and count for the task, in order of steps, then of slots.
+    /// The episodes that ended and count for the policy's task, in order of steps, then of slots.
     pub ended: Vec<EndedAt>,
-    /// Whether the task was finished in this rollout.
+    /// Whether the policy's task was finished in this rollout.
     pub finished: bool,
     /// The values V of the observations after the last step, f32 `[N]`; empty unless the task is finished.
     pub last_values: BytesMut,
@@ -86,7 +86,7 @@ pub struct EndedAt {
     pub slot: u32,
     /// The facts about the ended episode.
     pub end: EpisodeEnd,
-    /// Whether the task ended the episode.
+    /// Whether the environment's task ended the episode.
     pub terminated: bool,
     /// Whether the step limit ended the episode.
     pub truncated: bool,
@@ -123,8 +123,8 @@ impl RolloutTask {
         self.error.map_or(Ok((self.runner, self.rollout)), Err)
     }
 
-    /// Called after each command of the shards. Records its outputs and gives the shards the next command. Returns
-    /// false at the end of the rollout. If `halted`, the rollout ends now.
+    /// Call it each time the shards have carried out a command. Records the outputs of the command and gives the shards
+    /// the next one. Returns false at the end of the rollout. If `halted`, the rollout ends now.
     pub(in crate::pool) fn after_step(&mut self, shards: &[Mutex<Shard>], halted: bool) -> bool {
         match self.advance(shards) {
             Ok(continues) => continues && !halted,
