@@ -328,6 +328,7 @@ pub fn judge(tree: &SourceTree, findings: &[Finding], limits: &LimitTable, exemp
             verdict.errors.push(describe(finding, limit));
         }
     }
+    // Warns of limits above the number of findings.
     let found: BTreeMap<_, _> =
         findings.iter().map(|finding| ((finding.check.section(), finding.folder.as_str()), finding.count)).collect();
     for (section, folders) in &limits.0 {
@@ -340,6 +341,7 @@ pub fn judge(tree: &SourceTree, findings: &[Finding], limits: &LimitTable, exemp
             }
         }
     }
+    // Warns of exemptions and glossary entries for types that no longer exist or are no longer defined twice.
     let names = names::read(tree);
     let twice: BTreeSet<_> = names::defined_twice(&names.types).into_keys().collect();
     for name in exemptions.duplicates.keys().filter(|name| !twice.contains(name.as_str())) {

@@ -355,6 +355,7 @@ impl Player {
         normalisers.take_rewards(&mut previous.rewards, &previous.trial_ended, statistics, stepped)?;
         normalisers.take_observations(observations, statistics, remaining.and_then(RemainingRollout::active))?;
         inputs.remember(&previous.acts, &previous.rewards, &previous.done)?;
+        // In training, computes the values of the final observations of truncated episodes.
         if statistics == Statistics::Running && previous.gather_truncated(outcome, self.observation_size) {
             normalisers.normalise(&mut previous.finals)?;
             actor.values_in(

@@ -355,8 +355,9 @@ fn outer_here<S: Simd, const ADD: bool>(
     }
 }
 
-/// Computes one lane (16 inputs) of `R` rows of `sums`. Each row belongs to an output; `first` is the first of them.
-/// `column` is the index of the lane. `WHOLE` is true if all [`LANES`] numbers of the lane are inputs.
+/// Computes one lane (16 inputs) of `R` successive rows of `sums`. Each row belongs to an output, and `first` is the
+/// index of the first row. `column` is the index of the lane. `WHOLE` is true if all [`LANES`] numbers of the lane are
+/// inputs.
 #[inline(always)]
 fn outers<S: Simd, const R: usize, const ADD: bool, const WHOLE: bool>(
     simd: S,

@@ -285,6 +285,7 @@ impl Stream {
                 }
                 Err(status) => status,
             };
+            // Only a session with a lease whose connection failed can be resumed, and not too often without a reply.
             let error = lost(self.connection.address(), A::NAME, &status);
             let Some(lease) = self
                 .lease

@@ -102,6 +102,7 @@ impl StudyEpisodes {
         let policy =
             |(cell, records): (&String, &Records)| EpisodesEntry { cell: cell.clone(), about: records.about.clone() };
         let about = StudyMetadata { policies: self.cells.iter().map(policy).collect() };
+        // The range of rows of each cell, which becomes a row group.
         let mut groups = Vec::new();
         let mut end = 0;
         for records in self.cells.values() {
@@ -128,6 +129,7 @@ impl StudyEpisodes {
             ("achieved".into(), optional(|it| it.achieved)),
             ("also_achieved".into(), optional(|it| it.also_achieved)),
         ];
+        // A parameter's column has no value in rows of environments without this parameter.
         for name in self.parameters() {
             let value = |(_, records, it): (&String, &Records, &EpisodeRecord)| {
                 let place = records.about.parameters.iter().position(|parameter| parameter.name == name)?;

@@ -113,6 +113,7 @@ impl Heatmap {
     pub(crate) fn axes_of(set: &TestSet, environment: &proto::Environment) -> Option<[Axis; 2]> {
         let contexts = set.listed();
         let [first, second, ..] = contexts.as_slice() else { return None };
+        // Collects the parameters that vary. The faster one already differs between the first two contexts.
         let (mut varying, mut faster) = (Vec::new(), None);
         for parameter in environment.parameters.iter().filter(|_| set.name == Self::SET) {
             let value = |context: &Context| context.get(&parameter.name).copied();

@@ -223,6 +223,7 @@ impl Ledgers {
         }
     }
 
+    /// Records that an environment stopped drawing. `end` is its last episode, if it had any, and the time.
     fn end_one(&mut self, address: (SessionId, u64, u32), end: (Option<u64>, Moment)) {
         let address = self.at.entry(address).or_default();
         address.ends.push(end);

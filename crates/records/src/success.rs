@@ -57,7 +57,7 @@ pub enum Rule {
     Text,
     /// The criterion that the published code of Packer et al. (2018) uses.
     Code,
-    /// Another threshold for one of these two criteria: the one whose quantity the threshold names.
+    /// One of these two criteria with another threshold. The quantity in the threshold selects the criterion.
     At(Threshold),
 }
 

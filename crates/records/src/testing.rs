@@ -99,7 +99,7 @@ impl TestCollector {
     /// Adds the test and its episodes to `records`, which must be of a policy in `environment`.
     ///
     /// # Errors
-    /// [`NotRecorded`] if an episode's parameters were not those of the test. Nothing is then added.
+    /// [`NotRecorded`] if an episode did not have the parameters of the test. Nothing is then added.
     pub fn finish(self, environment: &proto::Environment, records: &mut Records) -> Result<(), NotRecorded> {
         let Self { mut test, mut counted, .. } = self;
         test.axes = Heatmap::axes_of(&test.set, environment);

@@ -247,6 +247,7 @@ pub fn set_of(name: &str, version: Version, assignments: Vec<Assignment>) -> Res
         let what = format!("{name}: {parameter}");
         let is_new = !drawn.contains_key(&parameter) && !contexts[0].contains_key(&parameter);
         require(is_new, &what, "given twice", "given once")?;
+        // The points of this parameter in the grid. Without a grid, the parameter is drawn.
         let points = match values {
             Values::Drawn(distribution) if !is_grid => {
                 drawn.insert(parameter, distribution);
@@ -262,6 +263,7 @@ pub fn set_of(name: &str, version: Version, assignments: Vec<Assignment>) -> Res
         let count = contexts.len().saturating_mul(points.len());
         let expected = format!("a grid of at most {MAX_CONTEXTS} points");
         require(count <= MAX_CONTEXTS, name, format!("{count} points"), expected)?;
+        // Copies all contexts so far for each point of this parameter.
         let with = |point: &f64| {
             let add = |context: &Context| {
                 let mut context = context.clone();

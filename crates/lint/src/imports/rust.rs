@@ -80,6 +80,7 @@ fn read_file(tree: &SourceTree, file: &str, children: &str, module: ModulePath, 
                 let folder = inside.iter().fold(children.to_owned(), |folder, name| join(&folder, name));
                 let mut child = absolute(&module, &inside);
                 child.push(name.clone());
+                // The possible files of the child module, each with the folder of that module's own children.
                 let candidates = match path {
                     Some(path) => {
                         let path = normalise(&join(folder_part(file), &path));

@@ -146,6 +146,7 @@ impl Scanner {
 
     /// Skips the item, statement, field or match arm after a test attribute.
     fn skip_item(&mut self) {
+        // A field is `name: type`, possibly after `pub` or `pub(…)`. It ends at a comma, unlike an item.
         let is_field = {
             let mut ahead = 0;
             if self.is_word(0, "pub") {
@@ -174,6 +175,7 @@ impl Scanner {
                         | "macro_rules"
                 )
             });
+        // The number of brackets that were opened and not yet closed.
         let mut depth = 0_usize;
         while let Some(token) = self.peek(0) {
             match token.kind {

@@ -16,7 +16,7 @@ use scores::{EpisodeScores, share_episodes};
 /// A condition to compare: a group of policies that differ only in their seed.
 #[derive(Clone, Debug)]
 pub struct ComparedCondition<'a> {
-    /// The condition's name. It is freely chosen, but differs from those of the other conditions.
+    /// The condition's name. It is freely chosen, but no two conditions may have the same name.
     pub name: String,
     /// The policies, each with a key and the recorded tests. Policies of two conditions with the same key form a pair.
     /// The key is, for example, the seed of the training.

@@ -71,6 +71,7 @@ pub(super) fn decode(file: &ParquetFile) -> Result<Vec<TableRow>, AnyError> {
     Ok(rows)
 }
 
+/// Reads the rows of a row group: reads all columns, and takes the values of each row from them.
 fn rows_of(group: &RowGroup<'_>) -> Result<Vec<TableRow>, AnyError> {
     let place = |name: &str| group.place(name).ok_or_else(|| format!("it has no column {name}"));
     let texts = |name: &str| -> Result<_, AnyError> { Ok(group.texts(place(name)?)?.into_iter()) };

@@ -70,10 +70,12 @@ mod tests {
     fn of_many_pairs_random_signs_come_to_the_same() {
         let differences: Vec<f64> = (0..17).map(|i| f64::from(i % 5) - 1.2).collect();
         let with_one_more = |sign: f64| sign_flip_p(&[&differences[..16], &[sign * differences[16]]].concat(), 1);
+        // The absolute sum of the differences if difference i has the sign in bit i of `signs`.
         let sum = |signs: u32| {
             let sign = |i: usize| if signs >> i & 1 == 1 { 1.0 } else { -1.0 };
             (0..17).map(|i| sign(i) * differences[i]).sum::<f64>().abs()
         };
+        // The exact p-value: the share of combinations whose sum is at least as large as with all signs positive.
         let seen = sum((1 << 17) - 1) - 1e-9;
         let exact = (0..1 << 17).filter(|&signs| sum(signs) >= seen).count() as f64 / f64::from(1 << 17);
         assert!((with_one_more(1.0) - exact).abs() < 0.008 && exact > 0.01 && exact < 0.9, "{exact}");

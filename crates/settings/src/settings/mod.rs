@@ -82,8 +82,8 @@ pub struct Common {
     /// The version from which the environment's parameters are drawn in training: D (deterministic), R (random), E
     /// (extreme) or R+E.
     pub version: Version,
-    /// Distributions of single parameters in training that replace those of the version, e.g. `length = "0.8..1.0"` in
-    /// the table `[parameters]` (default: nothing).
+    /// Distributions of individual parameters in training. They replace the distributions of the version. An example is
+    /// `length = "0.8..1.0"` in the table `[parameters]` (default: nothing).
     #[serde(default, skip_serializing_if = "Parameters::is_empty")]
     pub parameters: Parameters,
     /// The network architecture of the policy.
