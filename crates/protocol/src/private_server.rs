@@ -70,9 +70,9 @@ impl PrivateServer {
     /// to end.
     ///
     /// # Errors
-    /// The errors of [`PrivateServer::start`], with two more minutes to start for each folder. [`ClientError::Stopped`]
-    /// if `stopped` returned a signal. [`ClientError::Tasks`] if the server refused a folder; the server writes the
-    /// reason to standard error.
+    /// The errors of [`PrivateServer::start`]; for each folder, the server has two more minutes to start.
+    /// [`ClientError::Stopped`] if `stopped` returned a signal. [`ClientError::Tasks`] if the server refused a folder;
+    /// the server writes the reason to standard error.
     pub fn start_unless(
         workers: Option<usize>,
         tasks: &[PathBuf],
@@ -316,8 +316,8 @@ fn read_lines(output: ChildStdout) -> std::io::Result<Receiver<String>> {
     Ok(receiver)
 }
 
-/// Finds the server's program. `$PERTURB_SERVER` names it; otherwise it is looked for in the directory of the running
-/// program, in the parent of that directory (tests run in `target/release/deps`), and on the PATH.
+/// Finds the server's program: the path in `$PERTURB_SERVER`, if it is set. Otherwise, searches the directory of the
+/// running program, the parent of that directory (tests run in `target/release/deps`), and the PATH.
 fn find_program() -> Result<PathBuf, ClientError> {
     if let Some(path) = std::env::var_os(VARIABLE) {
         let path = PathBuf::from(path);

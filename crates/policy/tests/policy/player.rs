@@ -63,7 +63,8 @@ fn the_return_that_rewards_are_divided_by_runs_over(
     assert_eq!(returns, expected);
 }
 
-/// Every observation is 3. With mean 1 and standard deviation 2 the policy's input follows N(1, 0.25²).
+/// Every observation is 3. The normaliser's mean is 1 and its standard deviation 2, so the normalised observation is 1.
+/// With noise of standard deviation 0.25, the policy's input follows N(1, 0.25²).
 #[test]
 fn only_training_sees_noise() {
     let played = |noise: f64, role: Role| {

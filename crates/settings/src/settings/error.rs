@@ -20,7 +20,7 @@ pub enum ConfigError {
     UnknownKey {
         origin: String,
         key: String,
-        /// A hint: the probably intended key, or the algorithms that have this key.
+        /// A hint: the key that the user probably meant, or the algorithms that have this key.
         hint: String,
         /// The algorithm whose keys are listed.
         algorithm: &'static str,
