@@ -126,8 +126,8 @@ pub fn check_distribution(
     }
 }
 
-/// Replaces in `base` the distributions of the parameters that `overrides` names, in every box. `base` has the layout
-/// of [`Settings::distributions`](super::Settings::distributions).
+/// Replaces the distributions of the parameters that `overrides` names, in each box of the parameter space. `base` has
+/// the distributions of one or two boxes, in the layout of [`Settings::distributions`](super::Settings::distributions).
 ///
 /// # Errors
 /// [`Error::UnknownParameter`], [`Error::OutOfRange`], [`Error::NotWhole`]. `base` is then unchanged.
@@ -235,8 +235,8 @@ pub trait Environment: Send {
     /// Appends the complete dynamic state to `out`. Together with the parameters it determines all later steps.
     fn save(&self, out: &mut Vec<f64>);
 
-    /// Returns an upper bound of how many numbers more than now [`Environment::save`] would append with other
-    /// parameters.
+    /// Returns an upper bound of the number of additional entries that [`Environment::save`] would append if the
+    /// parameters changed.
     fn max_saved_growth(&self) -> usize {
         0
     }

@@ -120,8 +120,8 @@ pub struct Episodes {
     pub(super) seen: Option<Box<SeenParameters>>,
 }
 
-/// Returns how many boxes `distributions` distributions for `n` parameters make: 1 or 2. Returns `None` if the numbers
-/// do not fit. Without parameters there is one box.
+/// Returns the number of boxes, 1 or 2, that together have `distributions` distributions, `n` in each box. Returns
+/// `None` if neither number fits. Without parameters there is one box.
 pub(super) fn boxes(distributions: usize, n: usize) -> Option<usize> {
     (1..=MAX_BOXES).find(|boxes| boxes * n == distributions)
 }

@@ -7,7 +7,7 @@ use super::{
 };
 use serde::{Deserialize, Serialize};
 
-/// The version of the snapshot format. Every change of [`Saved`] or of the bytes after it raises it.
+/// The version of the snapshot format. Every change of [`Saved`], or of the bytes that follow, raises the version.
 const FORMAT: u32 = 3;
 /// The last format without a checksum. Later formats end with the little-endian CRC-32C of all bytes before it.
 const UNSEALED: u32 = 2;
@@ -27,8 +27,8 @@ const MAX_COUNTERS_GROWTH_BYTES: usize = 64;
 /// Maximal episode number in a snapshot. The limit keeps later episode numbers from overflowing.
 const MAX_EPISODE: u64 = 1 << 63;
 
-/// The content of a snapshot: everything except actions that determines the future of an environment. Random streams
-/// have no state of their own, because they follow from the seed, the environment's index and the counters.
+/// The content of a snapshot: everything that determines the future of an environment, except the actions. Random
+/// streams have no state of their own, because they follow from the seed, the environment's index and the counters.
 #[derive(Serialize, Deserialize)]
 struct Saved {
     format: u32,
@@ -133,12 +133,12 @@ pub(crate) fn distributions_bytes(distributions: &[Distribution]) -> usize {
 }
 
 /// The seed, parameter distributions and current parameters of the environment in a snapshot. They show from which
-/// regions it draws.
+/// regions the environment draws.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SavedDraw {
-    /// The numbers that determine its random numbers.
+    /// The numbers that determine the environment's random numbers.
     pub draw: Draw,
-    /// The distributions of its parameters, as in [`Settings::distributions`].
+    /// The distributions of the environment's parameters, as in [`Settings::distributions`].
     pub distributions: Vec<Distribution>,
     /// The parameters of the current trial, in the order of [`EnvironmentSpec::parameters`]. A client may have forged
     /// them.

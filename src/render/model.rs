@@ -1,8 +1,8 @@
 //! Draws pictures of MuJoCo models, by MuJoCo and OpenGL.
 //!
 //! The models that run the physics have no colours, textures and lights, which would make each simulation larger. So
-//! pictures show a second model: the same MJCF with scenery added. It gets the positions of the physics, and its
-//! lengths if parameters edit them. Other parameters (power, density, friction) are not visible.
+//! pictures show a second model: the same MJCF with scenery added. The second model gets the positions of the physics.
+//! If parameters edit lengths, it also gets these lengths. Other parameters (power, density, friction) are not visible.
 
 use super::{Error, Size};
 use crate::scene::{Look, ModelView, PosedModel, Scenery};

@@ -1,5 +1,5 @@
-//! Functions that the analytic tasks share: those whose dynamics are formulas, not a MuJoCo model. The dynamics are
-//! those of Gymnasium 1.4 in f64. Sine and cosine come from the crate libm, because the C library's results differ in
+//! Functions that the analytic tasks share. The dynamics of an analytic task are formulas, not a MuJoCo model. They are
+//! Gymnasium 1.4's formulas in f64. Sine and cosine come from the crate libm, because the C library's results differ in
 //! the last digits between processors.
 
 use crate::env::{Action, Error, Stream};

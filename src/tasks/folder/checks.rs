@@ -149,7 +149,7 @@ fn friction(
             ),
         ));
     }
-    // The comparison below skips geoms whose friction is edited, too.
+    // The comparison below skips other geoms whose friction is also edited.
     let edited: Vec<usize> = parameters
         .iter()
         .flat_map(EditedParameter::places)
@@ -169,8 +169,8 @@ fn friction(
         }
     };
     // MuJoCo uses the larger friction of two touching geoms, so an edited friction below the other geom's has no
-    // effect. The other geoms are first of all the fixed ones, on which robots walk: their maximum is the limit.
-    // Without fixed geoms, the limit is the minimum of the moving ones.
+    // effect. If other geoms are fixed, the limit is the maximum of their frictions, because robots walk on them.
+    // Otherwise the limit is the minimum of the moving geoms' frictions.
     let fixed = others.clone().filter(|contact| contact.other_is_fixed).max_by(|a, b| limit(a).total_cmp(&limit(b)));
     let moving = others.min_by(|a, b| limit(a).total_cmp(&limit(b)));
     let counts = |contact: &&Contact| contact.dimension >= needed;
@@ -206,7 +206,7 @@ fn smallest(edit: &Edit, parameter: &EditedParameter, model: &Model) -> f64 {
     numbers.fold(f64::INFINITY, f64::min)
 }
 
-/// A possible contact between an edited geom, `own`, and another geom.
+/// A possible contact of the edited geom `own` with the geom `other`.
 struct Contact {
     own: usize,
     other: usize,
@@ -222,7 +222,7 @@ pub(super) fn can_touch(model: &Model, geom: usize) -> bool {
     declared.any(|&other| other as usize == geom) || !contacts_of(model, geom).is_empty()
 }
 
-/// Returns the possible contacts of a geom, except with geoms with which the model declares it as a pair.
+/// Returns the possible contacts of a geom with other geoms. Leaves out the pairs that the model declares.
 fn contacts_of(model: &Model, geom: usize) -> Vec<Contact> {
     // The value 1 means that only declared pairs can touch.
     if model.options().collision == 1 {

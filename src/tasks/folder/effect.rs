@@ -8,7 +8,7 @@ use crate::{
 };
 use perturb_mujoco::{Error, Simulation};
 
-/// Number of timesteps in a simulation that is compared.
+/// Number of timesteps in each simulation that [`unseen`] compares.
 const N_STEPS: usize = 200;
 
 /// Returns the names of the parameters that change nothing in 200 timesteps with random controls from the initial

@@ -24,12 +24,13 @@ const MAX_STATE: f64 = 1e10;
 /// but not the server.
 const NO_MEMORY: &str = "there is memory for the one simulation of this thread";
 
-/// The time at which the poses that a step's readings use are computed.
+/// The time at which MuJoCo computes the poses that a step's readings use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Poses {
-    /// Before the last timestep of the step, as MuJoCo leaves them. With the integrator RK4, in its last stage.
+    /// Before the last timestep of the step, when MuJoCo computes the poses anyway. With the integrator RK4, in the last
+    /// stage of that timestep.
     Before,
-    /// After the step. They are computed in addition.
+    /// After the step, by an additional computation.
     After,
 }
 
@@ -115,8 +116,8 @@ pub(super) struct FolderEnvironment {
     push: Option<[f64; 3]>,
     /// Whether the physics have diverged since the last reset.
     diverged: bool,
-    /// Whether the model could not be compiled with the lengths of the last parameters. Then the previous edit stays,
-    /// and each episode ends as diverged in its first step.
+    /// Whether the model could not be compiled with the lengths that the last parameters give. Then the previous edit
+    /// stays, and each episode ends as diverged in its first step.
     is_impossible: bool,
 }
 
@@ -281,7 +282,7 @@ impl FolderEnvironment {
         Ok(Some(Transition { terminated, goal, diverged: false }))
     }
 
-    /// Writes the reward terms of a step whose physics diverged to `reward_terms`. Returns the transition that ends the
+    /// Writes to `reward_terms` the terms of a step in which the physics diverged. Returns the transition that ends the
     /// episode.
     fn fail(&mut self, reward_terms: &mut [f64]) -> Transition {
         self.diverged = true;

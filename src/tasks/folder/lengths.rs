@@ -60,7 +60,8 @@ impl Slot {
     }
 }
 
-/// A summand of a number in the text: `coefficient`, times the amount (or its square) of a slot if there is one.
+/// A summand of a number in the text. It is `coefficient` if `slot` is `None`. Otherwise it is `coefficient` times the
+/// slot's amount, or times the square of the amount if `squared`.
 #[derive(Debug, Clone, Copy)]
 struct Summand {
     coefficient: f64,
@@ -174,12 +175,12 @@ impl EditedText {
     }
 }
 
-/// The indices of the slots that scale a body.
+/// The [`Slot`]s that scale a body, by their indices.
 #[derive(Clone, Copy, Default)]
 struct Scaling {
-    /// The slot that scales positions and lengths.
+    /// The index of the [`Slot`] that scales positions and lengths.
     along: Option<usize>,
-    /// The slot that scales everything else, too, such as radii.
+    /// The index of the same [`Slot`] if it also scales everything else, such as radii.
     size: Option<usize>,
 }
 
@@ -223,7 +224,7 @@ impl<'a, 'input> Editor<'a, 'input> {
         Ok(())
     }
 
-    /// Finds the slot that scales a body. Refuses a second one.
+    /// Finds the slot that scales a body. Returns an error if a second slot scales it.
     fn scaling(&self, body: usize) -> Result<Scaling> {
         let mut scaling = Scaling::default();
         for (slot, Slot { target, .. }) in self.slots.iter().enumerate() {

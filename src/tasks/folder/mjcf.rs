@@ -271,9 +271,9 @@ struct Writer<'a> {
     folders: Folders,
     physics: Text,
     picture: Text,
-    /// The names of files in the text for the physics, by their paths in the folder.
+    /// The names that the text for the physics gives to files. The key is the file's path in the folder.
     physics_names: BTreeMap<String, String>,
-    /// The names of files in the text for pictures, by their paths in the folder.
+    /// The names that the text for pictures gives to files. The key is the file's path in the folder.
     picture_names: BTreeMap<String, String>,
 }
 

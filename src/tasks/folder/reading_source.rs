@@ -1,4 +1,4 @@
-//! Converts the TOML description of a reading to the numbers of the simulation that it means.
+//! Finds the numbers of the simulation that the TOML description of a reading selects.
 
 use super::{
     elements::{Elements, actuator_name},
@@ -52,7 +52,7 @@ const BALL: i32 = 1;
 const SLIDE: i32 = 2;
 
 impl Source<'_> {
-    /// Returns the numbers that a key such as `joint` means, with its `value`.
+    /// Returns the numbers that a key such as `joint` selects by its `value`.
     pub(super) fn numbers(&self, subject: &str, value: &Value<'_>) -> Result<Numbers> {
         match subject {
             "joint" => self.joints(value),

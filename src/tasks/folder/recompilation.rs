@@ -106,8 +106,8 @@ impl Recompilation {
         self.slots.iter().zip(amounts).all(|(slot, amount)| amount.to_bits() == slot.neutral().to_bits())
     }
 
-    /// Returns the model with the lengths of the parameters `values`, from the cache if possible. If no length differs,
-    /// returns `own`, the folder's model without edits.
+    /// Returns the model with the lengths that the parameters `values` give, from the cache if possible. If no length
+    /// differs, returns `own`, the folder's model without edits.
     ///
     /// # Errors
     /// [`Error::Compile`] if the model cannot be compiled with these lengths.
@@ -135,7 +135,7 @@ impl Recompilation {
         Ok(model)
     }
 
-    /// Returns the MJCF for pictures with the lengths of the parameters `values`; `None` if no length differs.
+    /// Returns the MJCF for pictures with the lengths that the parameters `values` give; `None` if no length differs.
     pub(super) fn picture(&self, values: &[f64]) -> Option<String> {
         let amounts = self.amounts(values);
         (!self.is_neutral(&amounts)).then(|| self.picture.write(&self.slots, &amounts))

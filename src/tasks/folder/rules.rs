@@ -88,7 +88,7 @@ impl Range {
     }
 }
 
-/// The way to combine a reading's values after each step of an episode to the value that the episode achieved.
+/// The rule by which a reading's values after each step give the value that the episode achieved.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Best {
     Greatest,

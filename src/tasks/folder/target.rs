@@ -22,9 +22,9 @@ pub(super) const OPTIONS: &[&str] = &["gravity", "wind", "density", "viscosity"]
 pub(super) const KEYS: [&str; 10] =
     ["body", "geom", "pair", "joint", "actuator", "tendon", "option", "field", "axis", "end"];
 
-/// How many numbers the gain of an actuator has; its bias has as many.
+/// The number of entries in an actuator's gain. The actuator's bias has the same number.
 const N_GAIN: usize = 10;
-/// How many numbers the gear of an actuator has.
+/// The number of entries in an actuator's gear.
 const N_GEAR: usize = 6;
 
 /// A value of the model that an edit changes. The fields of variants are indices of elements, if not described

@@ -26,7 +26,7 @@ pub(super) struct Template {
 pub(super) struct ModelEdit {
     /// The values of the parameters, in order.
     pub(super) values: Box<[f64]>,
-    /// The model with the lengths of these parameters, but without other edits.
+    /// The model, compiled with the lengths that the parameters `values` give, but without other edits.
     pub(super) compiled: Arc<Model>,
     fields: Box<[f64]>,
 }
@@ -62,7 +62,7 @@ impl Template {
         }
     }
 
-    /// Returns the model with the lengths of the parameters `values`.
+    /// Returns the model, compiled with the lengths that the parameters `values` give.
     fn compiled(&self, values: &[f64]) -> Result<Arc<Model>, Error> {
         match &self.recompilation {
             None => Ok(Arc::clone(&self.model)),
