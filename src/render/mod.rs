@@ -26,7 +26,7 @@ use turns::Turns;
 /// Scheduling priority (niceness) of the drawing thread and of the graphics driver's threads. It is lower than that of
 /// the threads for physics.
 const NICENESS: i32 = 5;
-/// Maximal time that a server that shuts down waits for the picture that is being drawn.
+/// Maximal time that a server waits at shutdown for the picture being drawn.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// The size of a picture in pixels.

@@ -27,8 +27,8 @@ const NO_MEMORY: &str = "there is memory for the one simulation of this thread";
 /// The time at which MuJoCo computes the poses that a step's readings use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Poses {
-    /// Before the last timestep of the step, when MuJoCo computes the poses anyway. With the integrator RK4, in the last
-    /// stage of that timestep.
+    /// Before the last timestep of the step, when MuJoCo computes the poses anyway. With the integrator RK4, in the
+    /// last stage of that timestep.
     Before,
     /// After the step, by an additional computation.
     After,
@@ -94,10 +94,10 @@ impl Needs {
 /// computes health, the terms of the reward, the observation and the achieved value, in this order, from the same
 /// state.
 ///
-/// The physics diverge if MuJoCo raises a warning, for instance of a bad number or of dropped contacts, or a fatal
-/// error, or if a reading is not finite. Then the episode terminates, all terms except those of the kind `healthy` are
-/// 0, and the observation of the previous step stays. If a reset sets a state that diverges at once, the observation is
-/// all zeros.
+/// The physics diverge if MuJoCo raises a warning or a fatal error, or if a reading is not finite. Examples of warnings
+/// are a bad number and dropped contacts. After a divergence the episode terminates, all terms except those of the kind
+/// `healthy` are 0, and the observation of the previous step stays. If a reset sets a state that diverges at once, the
+/// observation is all zeros.
 ///
 /// An environment has no simulation of its own. It stores its parameters and state, which are written into a shared
 /// simulation before each step, and the results of the step.

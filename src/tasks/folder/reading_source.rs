@@ -116,7 +116,8 @@ impl Source<'_> {
                 BALL => &FREE_VELOCITY[3..],
                 _ => &[""],
             };
-            // A free or ball joint has several positions and velocities, which have names. Other joints have one of each.
+            // A free or ball joint has several positions and velocities, which have names. Other joints have one of
+            // each.
             let (parts, first) = if get == "position" { (positions, position) } else { (velocities, velocity) };
             if matches!(get, "sin" | "cos" | "scaled") && parts.len() > 1 {
                 let problem =
