@@ -45,9 +45,9 @@ const MAX_OBSERVATION: usize = N_TORSO + 2 * MAX_JOINTS + MAX_JOINTS;
 ///
 /// where a is the action as received, not clipped, and q̇ the joints' speeds after the step in rad/s.
 ///
-/// The physics diverge if MuJoCo raises a warning, for instance of a bad number or of dropped contacts, or a fatal
-/// error. Then the episode terminates, the term `alive` is -1 and the others are 0, and the observation of the previous
-/// step stays. If a reset sets a state that diverges at once, the observation is all zeros.
+/// The physics diverge if MuJoCo raises a warning or a fatal error. Examples of warnings are a bad number and dropped
+/// contacts. After a divergence the episode terminates, the term `alive` is -1 and the others are 0, and the
+/// observation of the previous step stays. If a reset sets a state that diverges at once, the observation is all zeros.
 ///
 /// A walker has no simulation of its own. It stores its parameters and state, which are written into a shared
 /// simulation before each step, and the results of the step.
