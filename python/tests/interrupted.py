@@ -1,10 +1,13 @@
-"""A program whose steps Ctrl-C interrupts, again and again; test_interrupts.py runs it.
+"""A program that steps environments and interrupts itself with SIGINT many times; test_interrupts.py runs it.
 
     python -m tests.interrupted ADDRESS PID TIMES
 
-The arguments are a server's address and its process, which is stopped and continued. After each interrupt the
-environments either continue or say that they are gone and begin anew. Anything else, or a round that takes too long,
-ends the program with an error. Prints, as JSON, how often either happened, and the longest delay of an interrupt, s.
+The arguments are the address of a server, the id of the server's process, and the number of interrupts. Before two of
+three interrupts, the program stops the server with SIGSTOP, so that a step is waiting when the signal comes. Later it
+continues the server. After an interrupt, the session either still exists, or the next step raises OutOfOrderError and
+the program resets the environments. Any other outcome ends the program with an error, as does an interrupt that is not
+handled within SECONDS. The program prints as JSON how often the session still existed ("went on"), how often it was
+lost ("gone"), and the longest time from a signal to its KeyboardInterrupt, in seconds ("slowest").
 """
 
 from __future__ import annotations

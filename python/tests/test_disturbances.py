@@ -1,4 +1,4 @@
-"""Disturbances: parameters that an environment has if it is made with one of them."""
+"""Disturbances, such as delayed observations. An environment has these parameters only if its settings name one."""
 
 from typing import Any
 

@@ -31,7 +31,7 @@ def sampled(policy: perturb.Policy, rows: NDArray[np.float32]) -> NDArray[Any]:
 
 
 def same_actions(outputs: NDArray[Any], actions: NDArray[Any]) -> None:
-    """Check that one random number explains all actions, given their logits or means."""
+    """Check that the actions can be sampled from the logits or means with the same random number for all rows."""
     if actions.dtype == np.float32:
         noise = actions - outputs
         assert np.ptp(noise, axis=0).max() < 2e-6, "float32 products in another order"
@@ -83,7 +83,11 @@ def recurrent(environment: str, folder: Path, server: str) -> perturb.Policy:
 
 @pytest.mark.parametrize("environment", ["CartPole", "Pendulum"])
 def test_recurrent_exports_remember_as_the_policy(environment: str, tmp_path: Path, server: str) -> None:
-    """The export is compared in a thousand steps. Another actor with the same seed has the same random numbers."""
+    """The torch and ONNX models agree over a thousand steps.
+
+    The policy samples its actions, and the exported network returns only logits or means. Therefore two actors with the
+    same seed get different observations. The same random numbers must explain the actions of both.
+    """
     torch = pytest.importorskip("torch")
     pytest.importorskip("onnx")
     policy = recurrent(environment, tmp_path / "run", server)

@@ -179,7 +179,10 @@ def test_a_server_that_hangs_is_given_up(start_server: Callable[..., Any]) -> No
 def test_a_server_that_answers_no_pings_is_given_up(
     start_server: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The real limits add up to half a minute, so the test sets shorter ones. They are below the timeout of replies."""
+    """A client sends pings to detect a dead server before the timeout of replies.
+
+    The test shortens the keepalive interval and limit, because their defaults add up to half a minute.
+    """
     monkeypatch.setattr(session, "KEEPALIVE_INTERVAL", 1.0)
     monkeypatch.setattr(session, "KEEPALIVE_LIMIT", 5.0)  # long enough for the reset, in which it applies, too
     running = start_server(listen="tcp://127.0.0.1:0")
@@ -584,7 +587,10 @@ def test_gymnasiums_asynchronous_batches_work(own: bool, server: str) -> None:
 
 @pytest.mark.parametrize("n_started", [0, 1])
 def test_a_process_without_further_threads_is_told_so(monkeypatch: pytest.MonkeyPatch, n_started: int) -> None:
-    """The limit is reached by the thread that reads the server's output, or by the one that answers keepalive pings."""
+    """The system's limit of threads prevents the start of the first or second thread of a session.
+
+    The first thread reads the output of the private server, and the second answers keepalive pings.
+    """
     start = threading.Thread.start
     monkeypatch.setattr(session, "_keepalive", session._KeepaliveThread())
     started: list[threading.Thread] = []

@@ -1,4 +1,4 @@
-"""The environments follow Gymnasium's rules, and work in the ways in which its users use environments."""
+"""The environments follow Gymnasium's rules, and work with its checker, its wrappers and its vector environments."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ ENTRIES = json.loads(resources.files("perturb").joinpath("catalogue.json").read_
 
 
 def seen(entry: dict[str, Any], applied: dict[str, Any]) -> list[np.float32]:
-    """Return the parameters in observations that correspond to the applied values of a receipt."""
+    """Return the scaled parameters that observations must contain if a receipt has these applied values."""
     scaled = []
     for parameter, rule in zip(entry["parameters"], entry["parameter_observations"], strict=True):
         low, high = rule["at_minus_one"], rule["at_plus_one"]

@@ -1,4 +1,4 @@
-"""Pictures: what they show, what they leave alone, and who can use them."""
+"""Pictures show the state of an environment, drawing does not change it, and Gymnasium's wrappers accept pictures."""
 
 from __future__ import annotations
 

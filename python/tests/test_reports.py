@@ -27,7 +27,7 @@ def assessment(server: str) -> perturb.Assessment:
 
 
 def rows(page: str, part: str) -> list[str]:
-    """Return the rows of a page's tables that are not empty."""
+    """Return the table rows of an HTML page that contain the text `part`."""
     return [row for row in re.findall(r"<tr[^>]*>.*?</tr>", page, re.DOTALL) if part in row]
 
 

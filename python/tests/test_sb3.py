@@ -1,5 +1,6 @@
-"""stable-baselines3's side: a VecEnv that trains as it is, and models that are assessed. Gigabytes of PyTorch: skipped
-where they are not installed, as `make python-acceptance` does.
+"""Tests of `perturb.sb3` with stable-baselines3: its models train on the VecEnv without wrappers, and can be evaluated.
+
+The tests are skipped if stable-baselines3 or torch is not installed. `make python-acceptance` installs them.
 """
 
 from __future__ import annotations

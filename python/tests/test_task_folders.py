@@ -163,7 +163,7 @@ def test_a_running_servers_tasks_need_no_folder(start_server: Callable[..., Serv
 
 
 def test_the_tutorials_arm_is_the_example_with_its_policies() -> None:
-    """The tutorial's tables are valid for the example, because their files are equal."""
+    """The example's files equal those in the tutorial, so the tutorial's result tables also hold for the example."""
     example = ROOT / "examples/tasks/my_arm"
     tutorial = (ROOT / "docs/tutorials/your-robot.md").read_text()
     for name in ("arm.xml", "task.toml"):

@@ -19,7 +19,7 @@ use tonic::Status;
 
 use crate::failure::{INVALID, LOST, MISMATCH, REFUSED, RequestFailure, UNREACHABLE, failure};
 
-/// A task folder in Python's form: the path of `perturb-server`, the path of the folder, and the digest of its files.
+/// A task folder as a Python tuple: the path of `perturb-server`, the path of the folder, and the digest of its files.
 type TaskFolder = (PathBuf, PathBuf, String);
 
 /// The catalogues with the task of a folder, by the folder's path and digest. A loaded task stays in memory until the
@@ -227,7 +227,8 @@ fn reply<A: TypedRequest>(answer: Answer) -> Result<A::Reply, RequestFailure> {
     }
 }
 
-/// Returns the failure for a bug in this module, when a stream is used in a wrong order.
+/// Returns the failure for a call that is not possible in the stream's present state, such as receiving a reply while
+/// no step is running. Such a call is a bug in this module.
 fn defect() -> RequestFailure {
     RequestFailure::Ended(failure(MISMATCH, 0, "no session: a defect of the native module"))
 }

@@ -286,8 +286,8 @@ impl Events {
         set(infos, &known.achieved, self.column(py, achieved), &mask)
     }
 
-    /// Adds the parameters and receipts of the episodes in `parts`. For an environment with an episode in two parts,
-    /// the later part counts.
+    /// Adds the parameters and receipts of the episodes in the tables `parts`. If several tables have an episode of the
+    /// same environment, the last of these tables counts.
     fn receipts<const P: usize>(&self, infos: &Bound<'_, PyDict>, parts: [&EpisodeTable; P]) -> PyResult<()> {
         let rows = || parts.iter().flat_map(|part| part.rows());
         if rows().next().is_none() {

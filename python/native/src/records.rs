@@ -1,4 +1,5 @@
-//! The Python class of recorded test episodes, with their files and statistics. Experiments use the same ones.
+//! The Python class of recorded test episodes, with their files and statistics. Experiments use the same
+//! files and statistics.
 
 use std::path::PathBuf;
 

@@ -14,7 +14,7 @@ use pyo3::prelude::*;
 use crate::failure::{INVALID, failure};
 use crate::requests::IntervalsByName;
 
-/// A test set in Python's form: its name, its version, the intervals that replace the version's, and the contexts of a
+/// A test set as a Python tuple: its name, its version, the intervals that replace the version's, and the contexts of a
 /// grid or a list.
 pub type Set = (String, String, IntervalsByName, Option<Vec<BTreeMap<String, f64>>>);
 
@@ -61,7 +61,7 @@ pub fn heatmap_contexts(
     Heatmap::contexts(&axes.map(axis), points.min(MAX_POINTS), &fixed)
 }
 
-/// Converts a test set to Python's form.
+/// Converts a test set to a Python tuple.
 pub fn to_python(set: &TestSet) -> Set {
     let intervals = |values: &Distribution| values.intervals().iter().map(|it| (it.low, it.high)).collect();
     let drawn = set.drawn().iter().map(|(name, values)| (name.clone(), intervals(values))).collect();
@@ -72,7 +72,7 @@ pub fn to_python(set: &TestSet) -> Set {
     (set.name.clone(), set.version.to_string(), drawn, contexts)
 }
 
-/// Converts a test set from Python's form.
+/// Converts a Python tuple to a test set.
 pub fn from_python((name, version, drawn, contexts): Set) -> PyResult<TestSet> {
     let version = parse(&version)?;
     let contexts = match contexts {

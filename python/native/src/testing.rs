@@ -51,8 +51,8 @@ impl Tests {
         Ok(Self { sets, episodes, seed, success, policy, episodes_per_trial, begun: None, counting: None })
     }
 
-    /// Begins the test on the set number `place`, counted from 0. Returns the seed and the number N of its
-    /// environments.
+    /// Begins the test on the test set at position `place` in the list of sets. Returns the seed of the test and its
+    /// number of environments N.
     fn plan(&mut self, place: usize) -> PyResult<(u64, usize)> {
         let Some(set) = self.sets.get(place) else { return Err(failure(UNUSABLE, 0, "there is no such set")) };
         let counting = TestCollector::new(
@@ -67,8 +67,9 @@ impl Tests {
         Ok(plan)
     }
 
-    /// Checks the environment of a test's session after the session was opened. The first one must fit all sets, and
-    /// the environment that a loaded policy was trained in. Later ones must equal the first.
+    /// Checks the environment of a test's session after the session was opened. The
+    /// first environment must fit all sets, and must equal the environment that a loaded policy was trained in. The
+    /// environments of later tests must equal the first environment.
     #[pyo3(signature = (opened, policy))]
     fn opened(&mut self, opened: &Opened, policy: Option<&Policy>) -> PyResult<()> {
         let served = opened.served();

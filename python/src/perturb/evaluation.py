@@ -1,4 +1,4 @@
-"""Tests of any policy in the episodes of `perturb evaluate`, recorded in the same way."""
+"""Tests policies of any kind in the episodes that `perturb evaluate` plays, and records them in the same format."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ def evaluate(
               row. N, and the environment of each row, stay the same during a test.
             - a stable-baselines3 model, also a recurrent one of sb3_contrib, with its VecNormalize if it has one.
             - a torch module that maps observations, float32 [N, O]. It runs in evaluation mode without gradients. For
-              discrete actions it returns logits [N, n], and the action with the greatest one is taken, or integers [N].
-              For continuous actions it returns numbers [N, A].
+              n discrete actions it returns either logits [N, n], of which the greatest selects the action, or the
+              actions themselves, integers [N]. For continuous actions it returns numbers [N, A].
             - a mapping from training versions to policies, `{"D": …, "R": …, "E": …}`. Each policy is tested on each
               version. Three policies thus give the paper's nine scenarios.
         environment: the environment's name in docs/environments.md, such as `CartPole`. With `task`, the name of the
@@ -141,7 +141,7 @@ def plain_sets(
     contexts: Sequence[Mapping[str, float]] | None,
     base: str,
 ) -> list[_native.Set]:
-    """Return the test sets that the arguments of `evaluate` select, in the native module's form.
+    """Return the test sets that the arguments of `evaluate` select, as tuples for the native module.
 
     Raises:
         InvalidArgumentError: if no set is selected, or if an argument is malformed.

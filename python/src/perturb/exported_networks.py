@@ -119,7 +119,7 @@ def to_torch(network: Network) -> Any:
         return layer
 
     class PolicyNetwork(torch.nn.Module):  # type: ignore[misc]
-        """Maps observations [N, O] to logits [N, n] or means [N, A].
+        """Maps observations [N, O] to the logits of n discrete actions, [N, n], or to the means of actions, [N, A].
 
         A recurrent network also takes the memory, and returns the new memory as a second value.
         """

@@ -211,9 +211,9 @@ _shared: dict[tuple[type[OwnServer], TaskFolder | None], Any] = {}
 
 
 def acquire(kind: type[Server], task: TaskFolder | None = None) -> Server:
-    """Return this process's shared server of a class and a task folder, and start it if it does not run.
+    """Return the server of class `kind` that all sessions of this process with the same task folder share.
 
-    Each call needs a call of `release`.
+    Start the server if it does not run. For each call, `release` must be called once.
 
     Raises:
         ServerStartError: if the program was not found, or the server did not start.

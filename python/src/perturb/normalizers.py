@@ -99,7 +99,7 @@ def _require_untouched(model: Any) -> None:
 
 
 def _is_affine(original: np.ndarray[Any, Any], last: np.ndarray[Any, Any]) -> bool:
-    """Whether each column of `last` [N, O] is a linear function of that column of `original`. N is at least 3."""
+    """Whether each column of `last` [N, O] is a linear function of the same column of `original`. N is at least 3."""
     for x, y in zip(original.T, last.T, strict=True):
         spread = np.ptp(y)
         if np.ptp(x) == 0 or spread == 0:

@@ -73,8 +73,8 @@ def prepare(
     `deterministic` is True, False, or None for the default of the policy's kind.
 
     Raises:
-        PolicyError: if the object is not a policy, does not fit the environment, or does not have an option that is
-            set.
+        PolicyError: if the object is not a policy, does not fit the environment, or is of a kind without an option that
+            was given.
     """
     if isinstance(policy, Policy):
         if deterministic or normalizer not in (None, False) or name is not None:
@@ -114,7 +114,7 @@ def _is(policy: Any, module: str, name: str) -> bool:
 
 
 def _remembers(function: Callable[..., Any]) -> bool:
-    """Whether a function has memory, which it shows by requiring three arguments.
+    """Whether a function has memory. A function with memory requires three arguments.
 
     Raises:
         PolicyError: if the function requires another number of arguments than one or three.
@@ -197,8 +197,8 @@ def _stable_baselines(
 class _Module:
     """A player of a torch module.
 
-    For discrete actions the module returns logits [N, n], and the action with the greatest logit is taken. It may also
-    return the actions themselves, integers [N]. For continuous actions it returns numbers [N, A].
+    For n discrete actions the module returns logits [N, n], and the player takes the action with the greatest logit.
+    The module may also return the actions themselves, integers [N]. For continuous actions it returns numbers [N, A].
     """
 
     def __init__(self, module: Any, description: Description) -> None:

@@ -144,9 +144,9 @@ def _draw_cells(cells: Sequence[Bin2D], x: str, y: str, units: Mapping[str, str]
 
 
 def _widened(parts: set[tuple[float, float]]) -> dict[tuple[float, float], tuple[float, float]]:
-    """Return the interval in which each part of an axis is drawn.
+    """Return the interval that each bin or grid point of an axis fills in the plot, by its edges (low, high).
 
-    An interval is drawn as it is. A grid point has no width, so it is drawn up to halfway to its neighbours.
+    A bin fills its own interval. A grid point has no width, so it fills the interval up to halfway to its neighbours.
     """
     ordered = sorted(parts)
     if any(low != high for low, high in ordered):

@@ -91,8 +91,8 @@ class Policy:
     def to_torch(self) -> Any:
         """Return the policy as a torch module, with its normalisation, for deployment or further training.
 
-        The module of a feed-forward policy maps observations [N, O] to outputs: logits [N, n] for discrete actions, or
-        means [N, A] for continuous ones. The module of a recurrent policy maps (observations, memory, starts) to
+        The module of a feed-forward policy maps observations [N, O] to outputs: logits [N, n] for n discrete actions,
+        or means [N, A] for continuous ones. The module of a recurrent policy maps (observations, memory, starts) to
         (outputs, memory). Pass None as the first memory, and later the memory that the last call returned. The memory
         of a row is reset if `starts`, bool [N], is true there.
 
@@ -105,9 +105,10 @@ class Policy:
     def to_onnx(self, path: str | os.PathLike[str]) -> None:
         """Write the policy to a file as an ONNX model, with its normalisation.
 
-        The input is `observations`, float32 [N, O]. The output is `outputs`: logits [N, n] for discrete actions, or
-        means [N, A] for continuous ones. The model of a recurrent policy also has the LSTM's state as inputs `h` and
-        `c` [N, H], and the next state as outputs `next_h` and `next_c`. Pass zeros at the start of an episode.
+        The input is `observations`, float32 [N, O]. The output is `outputs`: logits [N, n] for n discrete actions, or
+        means [N, A] for continuous ones. The model of a recurrent policy also has the state of the LSTM with H units as
+        inputs `h` and `c` [N, H], and the next state as outputs `next_h` and `next_c`. Pass zeros at the start of an
+        episode.
 
         Raises:
             ImportError: if onnx is not installed.

@@ -343,7 +343,7 @@ _unclosed: collections.deque[_Resources] = collections.deque()
 
 
 def _close_unclosed(*, wait: bool = True) -> None:
-    """Close the resources of deleted sessions. If `wait` is false, stop when a server is being started."""
+    """Close the resources of deleted sessions. If `wait` is false, stop if another thread starts a server."""
     with contextlib.suppress(IndexError):  # another thread may have taken the last entry
         while True:
             resources = _unclosed.popleft()

@@ -55,7 +55,7 @@ def find_folder(task: str | os.PathLike[str] | None, server: object = None) -> T
 
 @functools.lru_cache(maxsize=64)
 def entry(task: TaskFolder) -> Mapping[str, Any]:
-    """Return the description of a task in the JSON format of catalogue.json. perturb-server loads the folder for it.
+    """Run perturb-server to load a task folder. Return the task's description in the JSON format of catalogue.json.
 
     Raises:
         InvalidArgumentError: if perturb-server refuses the folder. The error has its message.

@@ -206,7 +206,7 @@ def _test(
     episodes_per_trial: int,
     show: Callable[[int, int], None],
 ) -> None:
-    """Play and record the episodes of the test on one set, which is number `place` of the policy's sets."""
+    """Play and record the episodes of the test on one set. `place` is the set's position in the list of all sets."""
     _, version, drawn, contexts = one_set
     seed, num_envs = native(tests.plan, place)
     client = Client(

@@ -116,7 +116,14 @@ def train(
 
 
 def _run(command: list[str], folder: Path | None, episodes: int | None, progress: bool | None) -> None:
-    """Run the program until it ends, and show the number of episodes in its log."""
+    """Run `perturb train` as another process until it ends.
+
+    Meanwhile, show how many of the `episodes` are finished, from the log `progress.csv` in `folder`.
+
+    Raises:
+        InvalidArgumentError: if `perturb train` refuses an argument.
+        PerturbError: if the training fails.
+    """
     # The program may start the first perturb-server on PATH, so PATH begins with the folder of this package's server.
     environment = {**os.environ, "PATH": os.pathsep.join([str(find_server().parent), os.environ.get("PATH", "")])}
     shown = Progress(progress)

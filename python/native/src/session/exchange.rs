@@ -210,7 +210,8 @@ impl OpenSession {
     }
 }
 
-/// Ends a session when it is dropped. Once the session is open, the caller forgets the guard.
+/// A guard that ends the session when the guard is dropped. Once the session is open, the caller passes the guard to
+/// [`std::mem::forget`].
 pub(super) struct OpeningGuard<'a>(pub(super) &'a Session);
 
 impl Drop for OpeningGuard<'_> {

@@ -10,7 +10,7 @@ use pyo3::prelude::*;
 use crate::embedded::{EmbeddedStream, NativeServer};
 use crate::failure::{self, INVALID, RequestFailure, failure};
 
-/// A server in Python's form.
+/// The server that Python code passes to a session: an address as text, or the object of the embedded server.
 #[derive(FromPyObject)]
 pub enum NamedServer<'py> {
     /// The address of a server.
@@ -28,7 +28,7 @@ pub(super) enum SessionServer {
 }
 
 impl SessionServer {
-    /// Converts a server from Python's form.
+    /// Makes the server of a session from the argument that Python code passed.
     ///
     /// # Errors
     /// If the address is malformed.
