@@ -9,14 +9,14 @@ use crate::tail::{MAX_READ_BYTES, Tail, TailUpdate};
 const MAX_GROUPS: usize = 512;
 /// Maximum number of points of a curve.
 const MAX_POINTS: usize = 160;
-/// Minimum number of episodes that a point is a mean of.
+/// Minimum number of episodes that a point averages, unless the log has fewer.
 const MIN_EPISODES_PER_POINT: usize = 10;
 /// Minimum time over which a speed is measured, in seconds.
 const MIN_SPEED_SECONDS: f64 = 1.0;
 /// Maximum number of different speeds in a curve.
 const MAX_SPEEDS: f64 = 40.0;
-/// Groups whose ends are closer together than this time count as written at once. The time is given as a share of the
-/// time since the last measured speed.
+/// Maximum time between the ends of two consecutive parts of the curve that count as written to the log at once. It is
+/// given as a share of the time over which the speed is measured.
 const SAME_BLOCK_SHARE: f64 = 0.02;
 
 /// The episodes of a growing log, summed up in groups.
@@ -50,9 +50,10 @@ struct EpisodeGroup {
 /// The points of a learning curve. Each list has one number per point. A point stands for consecutive episodes.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub(crate) struct LearningCurve {
-    /// Number of episodes up to the middle of the point.
+    /// x coordinates in episodes: the number of episodes before the point, plus half of the point's episodes.
     pub(crate) episodes: Vec<f64>,
-    /// Number of steps of all environments up to the middle of the point.
+    /// x coordinates in steps: the number of steps before the point, plus half of the point's steps. Steps are those of all
+    /// environments together.
     pub(crate) steps: Vec<f64>,
     /// Mean undiscounted return; `None` if it is not finite.
     #[serde(rename = "return")]
@@ -210,8 +211,8 @@ impl EpisodeLog {
 
 /// Returns the speed of each part of the curve, in steps per second.
 ///
-/// A training writes many episodes at once, and all of them get the time of writing. A speed is therefore measured over
-/// consecutive parts until enough time has passed, and these parts share it.
+/// A training writes many episodes at once, and all of them get the time of writing. Therefore consecutive parts are
+/// combined until they cover enough time, and all of them get their mean speed.
 fn speeds(parts: &[EpisodeGroup]) -> Vec<Option<f64>> {
     let end = parts.last().map_or(0.0, |last| last.end);
     let mut speeds = Vec::new();

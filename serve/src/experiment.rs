@@ -81,15 +81,15 @@ pub(crate) struct CellCurve {
     pub(crate) id: String,
     /// A text with the environment, the method, and the version or set of the training.
     pub(crate) kind: String,
-    /// Number of episodes up to the middle of each point.
+    /// x coordinates: the number of episodes before the point, plus half of the point's episodes.
     pub(crate) episodes: Vec<f64>,
     /// Success rate of each point, in percent.
     pub(crate) success: Vec<f64>,
 }
 
 impl LiveExperiment {
-    /// Makes the state of the experiment in `path`, which is empty before its first refresh. Files outside of `root`
-    /// are not read.
+    /// Makes an empty state of the experiment in the folder `path`. [`refresh`](Self::refresh) fills it. Files outside of
+    /// `root` are not read.
     pub(crate) fn new(root: &Path, path: &Path) -> Self {
         Self {
             root: root.to_owned(),

@@ -13,17 +13,17 @@ const ATTRIBUTES: [&str; 3] = ["href=\"", "src=\"", "data-events=\""];
 pub(crate) struct WayUp(String);
 
 impl WayUp {
-    /// Returns the path from the list of all runs.
+    /// Returns the relative path to the root from the page with the list of all runs.
     pub(crate) fn from_index() -> Self {
         Self::from_path("/")
     }
 
-    /// Returns the path from the page of a run. The address of that page does not end with a slash.
+    /// Returns the relative path to the root from the page of a run. The address of that page does not end with a slash.
     pub(crate) fn from_run(relative: &RelativePath) -> Self {
         Self("../".repeat(relative.path().iter().count().max(1)))
     }
 
-    /// Returns the path from the page whose address has this absolute path.
+    /// Returns the relative path to the root from the page with the absolute path `path`.
     pub(crate) fn from_path(path: &str) -> Self {
         match path.matches('/').count() {
             0 | 1 => Self("./".into()),

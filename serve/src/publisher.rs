@@ -26,7 +26,8 @@ use crate::training::LiveTraining;
 
 /// Maximum number of pages whose files are read at the same time. It leaves processor time to trainings.
 const MAX_CONCURRENT_LOADS: usize = 4;
-/// Maximum time for which one round of loads waits. Results that arrive later are published when they arrive.
+/// Maximum time for which [`Publisher::publish`] waits until all its pages are loaded. Pages that take longer are
+/// published as soon as they are loaded.
 const BROADCAST_TIMEOUT: Duration = Duration::from_secs(2);
 /// Time between a new subscription and its load, so that subscriptions that arrive together share one load.
 const DEBOUNCE: Duration = Duration::from_millis(50);

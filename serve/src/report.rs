@@ -244,7 +244,7 @@ mod tests {
         assert_eq!(refused, ["too many requests wait for reports already"]);
     }
 
-    /// Whether builds of folders called `hangs` go on.
+    /// While this is true, builds of folders called `hangs` do not end.
     static HANGS: AtomicBool = AtomicBool::new(true);
 
     fn hanging(folder: &Path) -> Result<Arc<str>, String> {

@@ -10,7 +10,8 @@ use perturb_text::shortened;
 
 use crate::curve::{EpisodeLog, LearningCurve};
 
-/// Time between two checks whether a process still holds the lock of a run. Files need not change for such a check.
+/// Time between two checks whether a process holds the lock of a run. A process can take or release the lock without
+/// changing a file.
 pub(crate) const LOCK_INTERVAL: Duration = Duration::from_secs(5);
 /// Files from which a training's status is read.
 const STATUS_FILES: [&str; 3] = ["config.toml", "checkpoint/checkpoint.json", "progress.csv"];
@@ -33,8 +34,8 @@ pub(crate) struct LiveTraining {
 }
 
 impl LiveTraining {
-    /// Makes the state of the training in `path`, which is empty before its first refresh. Files outside of `root` are
-    /// not read.
+    /// Makes an empty state of the training in the folder `path`. [`refresh`](Self::refresh) fills it. Files outside of
+    /// `root` are not read.
     pub(crate) fn new(root: &Path, path: &Path) -> Self {
         let root = root.to_owned();
         let path = path.to_owned();

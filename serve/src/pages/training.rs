@@ -15,7 +15,8 @@ use crate::paths::{RelativePath, Root};
 use crate::pictures::scan_run;
 use crate::training::LiveTraining;
 
-/// The activities in a training's time shares. Each has its name on the page, and the suffix of its CSS class.
+/// The activities on which a training spends its time, in the order of [`LiveTraining::time_shares`]. Each has its name
+/// on the page, and the suffix of its CSS class.
 const TIME_SHARES: [(&str, &str); 4] =
     [("choosing actions", "a"), ("waiting for servers", "b"), ("updating the policy", "c"), ("anything else", "d")];
 
@@ -139,7 +140,7 @@ fn note(training: &LiveTraining, curve: &LearningCurve) -> Markup {
     }
 }
 
-/// Returns a bar with the training's time shares, and their percentages.
+/// Returns a bar that shows the share of time that the training spends on each activity, and a list of the percentages.
 fn shares(training: &LiveTraining) -> Markup {
     let Some(shares) = training.time_shares() else { return Markup::default() };
     let all: f64 = shares.iter().sum::<f64>().max(1e-9);
