@@ -58,7 +58,7 @@ def test_stable_baselines3s_ppo_learns_cart_pole(server: str) -> None:
 
 
 def test_ppo_in_one_file_learns_cart_pole(server: str) -> None:
-    """The limit is twice the number of steps that the training took when this test was written."""
+    """The example's number of steps is twice what the training needed when this test was written."""
     returns = [float(value) for value in re.findall(r"episodes +([\d.]+)", run("cleanrl_ppo.py", "--server", server))]
     assert returns[-1] >= 195, returns
     assert returns[0] < 100, returns

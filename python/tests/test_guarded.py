@@ -98,7 +98,7 @@ def guarded(folder: Path, _program: None) -> Iterator[str]:
 
 @pytest.fixture(autouse=True)
 def have(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Files], None]:
-    """Return a function that sets exactly these environment variables of credentials. At first none is set."""
+    """Unset all environment variables with credentials. Return a function that does so again, and sets the given ones."""
 
     def have(files: Files) -> None:
         for variable in (*ALL, "PERTURB_INSECURE"):

@@ -18,8 +18,8 @@ pub(crate) struct LiveAssessment {
 }
 
 impl LiveAssessment {
-    /// Makes an empty state of the assessment in the folder `path`. [`refresh`](Self::refresh) fills it. Files outside of
-    /// `root` are not read.
+    /// Makes an empty state of the assessment in the folder `path`. [`refresh`](Self::refresh) fills it. Files outside
+    /// of `root` are not read.
     pub(crate) fn new(root: &Path, path: &Path) -> Self {
         let status = Err("it was not read yet".into());
         Self { root: root.to_owned(), path: path.to_owned(), stamps: Vec::new(), status }

@@ -52,8 +52,8 @@ struct EpisodeGroup {
 pub(crate) struct LearningCurve {
     /// x coordinates in episodes: the number of episodes before the point, plus half of the point's episodes.
     pub(crate) episodes: Vec<f64>,
-    /// x coordinates in steps: the number of steps before the point, plus half of the point's steps. Steps are those of all
-    /// environments together.
+    /// x coordinates in steps: the number of steps before the point, plus half of the point's steps. Steps are those of
+    /// all environments together.
     pub(crate) steps: Vec<f64>,
     /// Mean undiscounted return; `None` if it is not finite.
     #[serde(rename = "return")]

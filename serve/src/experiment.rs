@@ -88,8 +88,8 @@ pub(crate) struct CellCurve {
 }
 
 impl LiveExperiment {
-    /// Makes an empty state of the experiment in the folder `path`. [`refresh`](Self::refresh) fills it. Files outside of
-    /// `root` are not read.
+    /// Makes an empty state of the experiment in the folder `path`. [`refresh`](Self::refresh) fills it. Files outside
+    /// of `root` are not read.
     pub(crate) fn new(root: &Path, path: &Path) -> Self {
         Self {
             root: root.to_owned(),

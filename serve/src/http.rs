@@ -27,8 +27,8 @@ use crate::stream_places::StreamPlaces;
 use crate::{files, pages};
 use pages::{MessagePage, error_page};
 
-/// Time between two comments on an event stream without events. Sending them shows whether the client is still
-/// connected.
+/// Time between two comment lines that are sent on an event stream without events. A failed send shows that the client
+/// is no longer connected.
 const KEEP_ALIVE_INTERVAL: Duration = Duration::from_secs(15);
 /// Content security policy of pages. It permits only scripts, styles and pictures from this server.
 const PAGE_POLICY: &str =

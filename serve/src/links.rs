@@ -18,7 +18,7 @@ impl WayUp {
         Self::from_path("/")
     }
 
-    /// Returns the relative path to the root from the page of a run. The address of that page does not end with a slash.
+    /// Returns the relative path to the root from the page of a run. The page's address does not end with a slash.
     pub(crate) fn from_run(relative: &RelativePath) -> Self {
         Self("../".repeat(relative.path().iter().count().max(1)))
     }

@@ -105,7 +105,7 @@ pub struct EmbeddedStream {
     /// `None` while a step is running.
     session: Option<server::EmbeddedSession>,
     running: Option<StepUnderWay>,
-    /// Queues the step after the running one in the pool. `None` after it was called.
+    /// A function that queues one step in the pool, behind the running step. `None` after the function was called.
     offer: Option<Box<dyn FnOnce(SessionRequest) + Send>>,
     /// Steps that wait until the running one has finished.
     waiting: VecDeque<SessionRequest>,

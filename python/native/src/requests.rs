@@ -1,5 +1,5 @@
-//! Conversion of Python's values to requests. The Python package has checked types and shapes. The server checks
-//! values.
+//! Conversion of Python objects to requests. The Python package has checked their types and shapes. The server checks
+//! their values.
 
 use std::collections::HashMap;
 

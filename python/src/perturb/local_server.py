@@ -28,9 +28,9 @@ from .errors import PerturbError, ServerStartError
 from .threads import start_thread
 
 PROGRAM = "perturb-server"
-# Environment variable with the path of the program.
+# Environment variable with the path of the program `perturb-server`.
 VARIABLE = "PERTURB_SERVER"
-# Path of the program inside an installed wheel. Some wheels do not contain it.
+# Path of `perturb-server` inside an installed wheel. Some wheels do not contain it.
 BUNDLED = Path(__file__).with_name("_programs") / PROGRAM
 # Maximum time for a server to start, s.
 START_LIMIT = 20.0

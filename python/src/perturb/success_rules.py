@@ -91,6 +91,6 @@ def parse(rule: SuccessRule | None) -> tuple[str | None, OwnRule | None]:
 
 
 def is_own(rule: str | None) -> bool:
-    """Whether Python applied the recorded rule `QUANTITY=NUMBER`, as opposed to the native module."""
+    """Whether Python applies the success rule `QUANTITY=NUMBER`, as opposed to the native module."""
     quantity = "" if rule is None else rule.partition("=")[0]
     return quantity in ("return", "length") or quantity.endswith("()")

@@ -24,13 +24,13 @@ from .policy import Policy, load_policy
 from .progress import Progress
 
 PROGRAM = "perturb"
-# Environment variable with the path of the program.
+# Environment variable with the path of the program `perturb`.
 VARIABLE = "PERTURB_PROGRAM"
-# Path of the program inside an installed wheel. Some wheels do not contain it.
+# Path of `perturb` inside an installed wheel. Some wheels do not contain it.
 BUNDLED = Path(__file__).with_name("_programs") / PROGRAM
 # Interval at which a training's log is read for the progress, s.
 _POLL_INTERVAL = 0.2
-# Exit status with which the program reports a wrong argument.
+# Exit status with which `perturb` reports a wrong argument.
 _USAGE = 2
 
 

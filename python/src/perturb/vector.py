@@ -154,7 +154,7 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         """Begin the next episodes.
 
         Args:
-            seed: a seed s, with which environment i begins the first episode of the seed s + i; or a list of N seeds.
+            seed: a seed s, or a list of N seeds. With s, environment i begins the first episode of the seed s + i.
                 Without a seed, or where the list has None, an environment begins the next episode of its last seed. At
                 the first reset the default seed is random.
             options: the key `reset_mask`, bool [N], selects the M environments to reset, by default all. The key

@@ -18,7 +18,7 @@ use crate::session_runtime::{SessionRuntime, WaitError};
 /// Number of forks since the module was loaded, in the chain of processes that led to this process.
 pub(super) static FORKS: AtomicU32 = AtomicU32::new(0);
 
-/// Counts a fork. Python calls it in each forked process.
+/// Counts a fork. Python calls this function in each forked process.
 #[pyfunction]
 pub fn note_fork() {
     FORKS.fetch_add(1, Ordering::Relaxed);
