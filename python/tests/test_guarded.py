@@ -98,7 +98,7 @@ def guarded(folder: Path, _program: None) -> Iterator[str]:
 
 @pytest.fixture(autouse=True)
 def have(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Files], None]:
-    """Unset all environment variables with credentials. Return a function that does so again, and sets the given ones."""
+    """Unset the variables with credentials. Return a function that unsets them again, and then sets the given ones."""
 
     def have(files: Files) -> None:
         for variable in (*ALL, "PERTURB_INSECURE"):

@@ -195,7 +195,7 @@ def test_a_second_reply_to_one_request_is_refused(fake: FakeServer) -> None:
     env = perturb.PerturbEnv("CartPole", server=fake.address)
     env.reset()
     assert env.step(0)[1] == 0
-    time.sleep(0.5)  # the keepalive thread polls the sessioner meanwhile, and so the reply arrives
+    time.sleep(0.5)  # meanwhile the keepalive thread polls the session, so the second reply arrives
     with pytest.raises(perturb.ProtocolError, match="a second reply to an earlier request"):
         env.step(0)
     with pytest.raises(perturb.OutOfOrderError, match="gone"):
