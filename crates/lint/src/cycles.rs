@@ -24,7 +24,7 @@ pub struct Cycle {
     pub path: Vec<Edge>,
 }
 
-/// An import between sibling modules, at its first location.
+/// An import of one sibling module by another. If there are several such imports, only the first is kept.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Edge {
     /// The name of the importing module.

@@ -17,8 +17,8 @@ pub trait GradientBackend {
     /// An error if an array has the wrong length, or if libtorch reports one.
     fn batch<'a>(&self, sequences: &SequenceSamples<'a>) -> Result<GradientBatch<'a>>;
 
-    /// Stores the action distributions of the policy with `weights` `[P]` in `batch`, as those of the policy that
-    /// acted. The KL divergence is measured from these distributions.
+    /// Computes the action distributions of the policy that acted, whose weights are `weights` `[P]`, and stores them
+    /// in `batch`. The KL divergence is measured from these distributions.
     ///
     /// # Errors
     /// An error if the batch does not fit this policy, or if the number of weights is wrong.

@@ -23,7 +23,7 @@ pub trait RecurrentBatch {
     /// Returns N, the number of sequences.
     fn count(&self) -> usize;
 
-    /// Stores the action distributions of the policy with `weights` `[P]`, as those of the policy that acted. The KL
+    /// Computes and stores the action distributions of the policy that acted, whose weights are `weights` `[P]`. The KL
     /// divergence is measured from these distributions.
     ///
     /// # Errors

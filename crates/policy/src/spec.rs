@@ -58,21 +58,22 @@ pub struct PolicySpec {
     /// The kind of actions.
     pub action: ActionKind,
     /// Numbers of units in the hidden layers. A feed-forward policy has these layers in its policy network and again in
-    /// its value network; the paper uses `[64, 64]`. A recurrent policy has them once, before its LSTM; the paper uses
-    /// `[256, 256]`.
+    /// its value network; Packer et al. (2018) use `[64, 64]`. A recurrent policy has them once, before its LSTM;
+    /// Packer et al. use `[256, 256]`.
     pub hidden: Vec<usize>,
-    /// H, the number of units in the LSTM of a recurrent policy; the paper uses 256. `None` for a feed-forward policy.
+    /// H, the number of units in the LSTM of a recurrent policy; Packer et al. (2018) use 256. `None` for a
+    /// feed-forward policy.
     #[serde(default)]
     pub lstm: Option<usize>,
 }
 
 impl PolicySpec {
-    /// Returns the shape of the paper's feed-forward policy for inputs of `input_size` numbers.
+    /// Returns the shape of the feed-forward policy of Packer et al. (2018), for inputs of `input_size` numbers.
     pub fn feed_forward(input_size: usize, action: ActionKind) -> Self {
         Self { observation_size: input_size, action, hidden: vec![64, 64], lstm: None }
     }
 
-    /// Returns the shape of the paper's recurrent policy for inputs of `input_size` numbers.
+    /// Returns the shape of the recurrent policy of Packer et al. (2018), for inputs of `input_size` numbers.
     pub fn recurrent(input_size: usize, action: ActionKind) -> Self {
         Self { observation_size: input_size, action, hidden: vec![256, 256], lstm: Some(256) }
     }

@@ -95,7 +95,7 @@ pub struct DrawRecord {
 /// It is serialised as an array of its fields, in order. The objects of older servers can be read, too.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub struct DrawStart {
-    /// The seed.
+    /// The seed of the environments.
     pub seed: u64,
     /// The index of the first environment.
     pub index: u32,
@@ -116,7 +116,7 @@ impl Serialize for DrawStart {
 /// Environments that stop drawing from their region. It is serialised as an array of its fields, like [`DrawStart`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub struct DrawEnd {
-    /// The seed.
+    /// The seed of the environments.
     pub seed: u64,
     /// The index of the first environment.
     pub index: u32,

@@ -1,4 +1,4 @@
-//! The versions of an environment: the paper's D, R and E, and the mixture R+E.
+//! The versions of an environment: D, R and E of Packer et al. (2018), and the mixture R+E.
 
 use std::fmt;
 use std::str::FromStr;
@@ -28,9 +28,9 @@ pub enum Version {
 pub struct UnknownVersion(String);
 
 impl Version {
-    /// The paper's versions, in the paper's order.
+    /// The versions of Packer et al. (2018), in the order of their paper.
     pub const ALL: [Version; 3] = [Version::D, Version::R, Version::E];
-    /// All versions: the paper's, and R+E.
+    /// All versions: those of [`Version::ALL`], and R+E.
     pub const KNOWN: [Version; 4] = [Version::D, Version::R, Version::E, Version::RE];
     /// The names of the versions, in the order of [`Version::KNOWN`].
     pub const NAMES: [&str; 4] = ["D", "R", "E", "R+E"];

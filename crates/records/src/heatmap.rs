@@ -1,4 +1,4 @@
-//! Heatmaps: mean return and success rate of policies over two parameters.
+//! Heatmaps: mean return and success rate of policies on a grid of values of two parameters.
 
 use serde::{Deserialize, Serialize};
 
@@ -56,7 +56,8 @@ pub struct HeatmapKind {
     pub base: Version,
 }
 
-/// The mean return and success rate of a policy over two parameters, or the means over several policies.
+/// The mean return and success rate of a policy at each point of a grid of two parameters, or the averages of several
+/// policies there.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Heatmap {
     /// The environment's name in the catalogue.

@@ -1,12 +1,13 @@
-//! Recorded episodes of tests, the statistics computed from them, and the paper's numbers for comparison.
+//! Recorded episodes of tests, the statistics computed from them, and the numbers of Packer et al. (2018), "the
+//! paper", for comparison.
 //!
 //! - [`ResultsTable`] holds every result of several studies, and [`StudyEpisodes`] the episodes of one study. Each is
 //!   one Parquet file.
 //! - [`Records`] are the recorded episodes of a policy's tests. [`testing`] chooses the episodes of a test.
-//! - [`success`] has the rules of success. [`outcomes`] computes success over parameters, and tail risk.
+//! - [`success`] has the rules of success. [`outcomes`] computes how success depends on parameters, and tail risk.
 //! - [`statistics`] has means, intervals and significance tests over runs. [`Metric`] and [`Scenario`] are the paper's.
-//! - [`Heatmap`] shows a policy's results over two parameters. [`ExternalEvaluation`] holds the tests of an agent that
-//!   was not trained by an experiment.
+//! - [`Heatmap`] shows a policy's results on a grid of two parameters. [`ExternalEvaluation`] holds the tests of an
+//!   agent that was not trained by an experiment.
 //! - [`comparison`] compares conditions over seeds and over episodes.
 //! - [`paper`] has the published numbers. [`ledger`] checks a policy against the servers' ledgers.
 #![forbid(unsafe_code)]

@@ -1,4 +1,4 @@
-//! The paper's evaluation protocol: versions, scenarios and metrics.
+//! The evaluation protocol of Packer et al. (2018), "the paper": versions, scenarios and metrics.
 
 use std::fmt;
 

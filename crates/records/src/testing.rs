@@ -28,13 +28,13 @@ pub enum NotRecorded {
     NotRequested { set: String, parameter: String, asked: String, got: f64 },
 }
 
-/// Returns the seed of a test's environments on `version`.
+/// Returns the seed of the environments of a test on `version`.
 ///
-/// The seed is a number of the random stream of `seed` for `purpose`: the first, second, third or fourth for the
-/// version D, R, E or R+E. The purpose is [`Purpose::TestEnvironments`] or [`Purpose::SelectionEnvironments`]. A test
-/// therefore never repeats episodes of the training or of the selection, whatever their seeds, and the versions are
-/// independent. A parameter set uses the seed of its base version, so two sets of the same version have the same
-/// initial states.
+/// `seed` is the seed in the test's options. `purpose` is [`Purpose::TestEnvironments`], or
+/// [`Purpose::SelectionEnvironments`] for a test whose result selects a configuration. The random stream of `seed` and
+/// `purpose` gives one seed for each of the versions D, R, E and R+E, in this order. A test therefore never repeats
+/// episodes of a training or of a test for the other purpose, whatever the seeds. Seeds for different versions are
+/// independent. Test sets with the same version get the same seed, so their environments have the same initial states.
 pub fn environment_seed(purpose: Purpose, seed: u64, version: Version) -> u64 {
     let mut rng = stream(seed, purpose);
     let drawn: [u64; Version::KNOWN.len()] = std::array::from_fn(|_| rng.next_u64());

@@ -64,8 +64,8 @@ impl TensorBatch {
         })
     }
 
-    /// Stores the action distributions of `policy` with its current weights, as those of the policy that acted. The KL
-    /// divergence is measured from these distributions.
+    /// Computes and stores the action distributions of the policy that acted: `policy`, with its current weights. The
+    /// KL divergence is measured from these distributions.
     pub(crate) fn remember_acting(&mut self, policy: &TorchPolicy) {
         self.acting = Some(policy.distributions(&self.sequences));
     }

@@ -22,8 +22,8 @@
 //! D_t = (e_t tanh g σ'(i), e_t c' σ'(f), e_t σ(i) tanh'(g), δ_t tanh c_t σ'(o)).
 //!
 //! Nothing is propagated back across the start of an episode. The gradient of W_h is then a single product Dᵀ h' over
-//! all L·M rows. libtorch computes the gradients of W_x, b and the layers below, as those of Σ D · (W_x x + b) with
-//! constant D.
+//! all L·M rows. libtorch computes the gradients of W_x, b and the layers below: they equal the gradients of
+//! Σ D · (W_x x + b) with constant D.
 
 use tch::{Kind, Tensor};
 

@@ -140,8 +140,8 @@ fn noise_continues_from_a_saved_state() {
     }
 }
 
-/// In tests, statistics are not updated and rewards are normalised. In contrast, the code of the paper's authors gives
-/// an RL² policy raw rewards in tests.
+/// While a policy is being tested, the normalisers' statistics are not updated. Rewards are still normalised with them,
+/// whereas the code of Packer et al. (2018) gives an RL² policy raw rewards when testing it.
 #[test]
 fn tests_leave_statistics_unchanged() {
     // Means of 1 and variances of 4 and 100.

@@ -82,7 +82,8 @@ pub struct ConditionDifference {
     /// Whether all policies of both conditions played the same episodes. If so, `episodes_95` is computed from the
     /// difference in each episode.
     pub same_episodes: bool,
-    /// The probability, 0 … 1, that a random policy of x has a higher mean score than a random policy of y.
+    /// The probability, 0 … 1, that a policy of x has a higher mean score than a policy of y, if both are drawn at
+    /// random from their conditions.
     pub improvement: f64,
     /// The p-value of the difference: by the t test over pairs, or by Welch's test if policies are not paired. `None`
     /// if `seeds_95` is `None`.

@@ -1,4 +1,4 @@
-//! Success rates over the range of a parameter.
+//! Success rates in bins of a parameter's values.
 
 use super::Outcomes;
 use crate::statistics::wilson;

@@ -30,8 +30,8 @@ impl Schedule {
     }
 }
 
-/// Settings of A2C. The defaults are those of OpenAI Baselines. The paper tunes `learning_rate`, `n_steps` and
-/// `ent_coef`; `perturb train` has other defaults for these three.
+/// Settings of A2C. The defaults are those of OpenAI Baselines. Packer et al. (2018) tune `learning_rate`, `n_steps`
+/// and `ent_coef`; `perturb train` has other defaults for these three.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct A2cConfig {
@@ -51,9 +51,9 @@ pub struct A2cConfig {
     /// for longer.
     pub ent_coef: f64,
     /// Weight of the value loss, which is the mean squared error; not negative (default: `0.5`; paper: `0.25`, because
-    /// the authors' code multiplies half of the squared error by 0.5). Feed-forward policy and value networks share no
-    /// weights, so this setting affects the policy only through the clipping of their common gradient. Recurrent
-    /// networks share all weights except those of the two heads.
+    /// the code of Packer et al. (2018) multiplies half of the squared error by 0.5). Feed-forward policy and value
+    /// networks share no weights, so this setting affects the policy only through the clipping of their common
+    /// gradient. Recurrent networks share all weights except those of the two heads.
     pub vf_coef: f64,
     /// Maximum global norm of the gradient, above 0 (default: `0.5`). A longer gradient is scaled down to this norm.
     pub max_grad_norm: f64,
@@ -69,8 +69,8 @@ pub struct A2cConfig {
     /// This limits the step of weights with small gradients.
     pub rms_eps: f64,
     /// Whether returns of truncated episodes are bootstrapped: whether the value of the final observation follows the
-    /// last reward (default: `true`; paper: `false`). `false` treats the step limit as an end of the task, as the paper
-    /// authors' code does.
+    /// last reward (default: `true`; paper: `false`). `false` treats the step limit as an end of the task, as in the
+    /// code of Packer et al. (2018).
     pub bootstrap_truncation: bool,
 }
 
@@ -110,7 +110,8 @@ impl A2cConfig {
     }
 }
 
-/// Settings of PPO. The defaults are those of the paper, which tunes `learning_rate` and `n_steps`.
+/// Settings of PPO. The defaults are those of Packer et al. (2018), unless a field gives another value for the paper.
+/// Packer et al. tune `learning_rate` and `n_steps`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct PpoConfig {
@@ -150,9 +151,9 @@ pub struct PpoConfig {
     /// larger value limits changes of the policy that clipping allows. Packer et al. (2018) tune it for RL².
     pub kl_coef: f64,
     /// Weight of the value loss, which is the mean squared error; not negative (default: `0.5`; paper: `0.25`, because
-    /// the authors' code multiplies half of the squared error by 0.5). Feed-forward policy and value networks share no
-    /// weights, so this setting affects the policy only through the clipping of their common gradient. Recurrent
-    /// networks share all weights except those of the two heads.
+    /// the code of Packer et al. (2018) multiplies half of the squared error by 0.5). Feed-forward policy and value
+    /// networks share no weights, so this setting affects the policy only through the clipping of their common
+    /// gradient. Recurrent networks share all weights except those of the two heads.
     pub vf_coef: f64,
     /// Maximum global norm of the gradient, above 0 (default: `0.5`). A longer gradient is scaled down to this norm.
     pub max_grad_norm: f64,
@@ -165,8 +166,8 @@ pub struct PpoConfig {
     /// Adam's ε, above 0 (default: `1e-5`). This limits the step of weights with small gradients.
     pub adam_eps: f64,
     /// Whether returns of truncated episodes are bootstrapped: whether the value of the final observation follows the
-    /// last reward (default: `true`; paper: `false`). `false` treats the step limit as an end of the task, as the paper
-    /// authors' code does.
+    /// last reward (default: `true`; paper: `false`). `false` treats the step limit as an end of the task, as in the
+    /// code of Packer et al. (2018).
     pub bootstrap_truncation: bool,
 }
 
@@ -217,7 +218,7 @@ impl PpoConfig {
     }
 }
 
-/// Settings of EPOpt. The defaults are those of the paper.
+/// Settings of EPOpt. The defaults are those of Packer et al. (2018), unless a field gives another value for the paper.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct EpoptConfig {
@@ -283,8 +284,8 @@ impl EpoptConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Rl2Config {
-    /// N, the number of episodes in a trial, 1 … 10⁶ (default: `2`; the paper also tries 1 and 5). Tests count only the
-    /// last episode of each trial.
+    /// N, the number of episodes in a trial, 1 … 10⁶ (default: `2`; Packer et al. (2018) also try 1 and 5). Tests count
+    /// only the last episode of each trial.
     pub episodes_per_trial: u32,
 }
 

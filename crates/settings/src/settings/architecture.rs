@@ -19,7 +19,7 @@ pub enum Architecture {
 impl Architecture {
     /// All architectures.
     pub const ALL: [Self; 2] = [Self::Ff, Self::Rc];
-    /// The names in settings and on the command line.
+    /// The names of the architectures in settings and on the command line.
     pub const NAMES: [&str; 2] = ["ff", "rc"];
 }
 

@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use super::{Observe, Preset};
 
-/// A method, which is a row of the paper's tables: an algorithm with its architecture and, for RL², the number of
-/// episodes in a trial.
+/// A method, which is a row of the tables of Packer et al. (2018): an algorithm with its architecture and, for RL²,
+/// the number of episodes in a trial.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Method {
     /// The name of the algorithm, e.g. "ppo".

@@ -111,7 +111,7 @@ pub struct Common {
     /// Whether rewards are divided by the running standard deviation of the discounted return (default: `true`).
     pub normalize_rewards: bool,
     /// Whether the discounted return for normalising rewards continues across the ends of episodes, as in the code of
-    /// the paper's authors, instead of starting again from 0 (default: `false`; paper: `true`).
+    /// Packer et al. (2018), instead of starting again from 0 (default: `false`; paper: `true`).
     pub reward_return_runs_on: bool,
     /// The number of iterations between two lines of progress.csv, at least 1 (default: `100` with A2C and RL²-A2C,
     /// else `1`). A line contains the figures of the last update, and means over the last 100 ended episodes.

@@ -17,7 +17,7 @@ pub enum Observe {
 }
 
 impl Observe {
-    /// The names in settings and on the command line.
+    /// The names of these choices in settings and on the command line.
     pub const NAMES: [&'static str; 2] = ["state", "parameters"];
 
     /// Returns whether this is the default.

@@ -1,4 +1,4 @@
-//! Presets of default settings: the recommended ones, or the paper's published ones.
+//! Presets of default settings: the recommended ones, or those that Packer et al. (2018) published.
 
 use std::fmt;
 
@@ -8,7 +8,7 @@ use toml::Table;
 use super::{Architecture, Base, Ranking, TrainConfig, Wrapper};
 
 /// A preset, which chooses the default settings. Each setting that differs between presets can also be given
-/// individually. docs/algorithms.md lists them, with their locations in the authors' code.
+/// individually. docs/algorithms.md lists these settings, with their locations in the code of Packer et al. (2018).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Preset {
@@ -38,7 +38,7 @@ impl fmt::Display for Preset {
     }
 }
 
-/// Replaces the defaults of an algorithm by the values of the paper's authors.
+/// Replaces the defaults of an algorithm by the values of Packer et al. (2018).
 pub(super) fn apply_paper(TrainConfig { common, settings }: &mut TrainConfig) {
     common.preset = Preset::Paper;
     common.num_envs = 1;
@@ -59,7 +59,8 @@ pub(super) fn apply_paper(TrainConfig { common, settings }: &mut TrainConfig) {
     }
 }
 
-/// Factor by which the authors' value loss differs: it is half of the squared error.
+/// Factor for the weight of the value loss. The code of Packer et al. (2018) uses half of the squared error as the
+/// value loss; ours is the whole squared error.
 const HALF: f64 = 0.5;
 
 /// Removes the settings that earlier versions of the program did not have, if they are set to the behaviour of those

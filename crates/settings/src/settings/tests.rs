@@ -160,7 +160,7 @@ fn each_preset_has_the_documents_values() {
         let of_epopt = |values: [Value; 2]| algorithm.starts_with("epopt").then_some(values);
         has("rank_by", of_epopt(["raw", "normalized"].map(Value::from)));
         has("update_per_episode", of_epopt([false, architecture == rc].map(Value::from)));
-        // The authors' code has this penalty but does not apply it.
+        // The code of Packer et al. (2018) has this penalty but does not apply it.
         let penalty = if algorithm == "rl2-ppo" { 0.2 } else { 0.0 };
         has("kl_coef", n_epochs.map(|_| [penalty, penalty].map(Value::from)));
     }
@@ -290,7 +290,7 @@ fn what_is_observed_is_written_only_where_it_is_not_the_default() {
     assert!(message.contains("observe is \"everything\", but must be one of \"state\", \"parameters\""), "{message}");
 }
 
-/// Returns the paper's ten pairs of algorithm and architecture.
+/// Returns the ten pairs of algorithm and architecture of Packer et al. (2018).
 fn pairs() -> impl Iterator<Item = (&'static str, Architecture)> {
     let all = Settings::names().into_iter().flat_map(|name| Architecture::ALL.map(|architecture| (name, architecture)));
     all.filter(|(name, architecture)| {
