@@ -197,7 +197,7 @@ impl Ledgers {
         }
     }
 
-    /// Stores a record of draws. In a record, the ends of environments happened before the beginnings.
+    /// Stores a record of draws. The environments in `ends` stopped drawing before those in `begins` began.
     fn take_draws(&mut self, line: LedgerLine, DrawRecord { regions, begins, ends, .. }: DrawRecord) {
         let named = begins.iter().map(|begin| begin.count).chain(ends.iter().map(|end| end.count));
         if named.fold(0, u32::saturating_add) > MAX_ENVS {

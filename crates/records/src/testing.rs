@@ -131,8 +131,8 @@ fn asked(environment: &proto::Environment, set: &TestSet, context: &Context) -> 
     region.boxes().iter().map(in_order).collect()
 }
 
-/// Checks that the parameters that the server reports as requested are those of the test. In version R+E, all must be
-/// from R or all from E.
+/// Checks `requested`, the values that the server reports as requested for an episode. `asked` has the values that the
+/// test permits, see [`asked`]. In version R+E, all values must be from R or all from E.
 fn check_requested(
     environment: &proto::Environment,
     set: &TestSet,

@@ -52,7 +52,7 @@ const MAX_BYTES: usize = 1 << 20;
 /// A record of the steps that the server took, with counters of its sessions. Clones share the same data.
 #[derive(Clone)]
 pub struct StepLog {
-    /// The numbers in the requests to step, in the order in which the server took them.
+    /// The number in each step request, in the order in which the server took the steps.
     done: Arc<Mutex<Vec<u64>>>,
     numbers: LeaseCounters,
     limiter: PeerLimiter,
@@ -67,7 +67,7 @@ impl Default for StepLog {
 }
 
 impl StepLog {
-    /// Returns the numbers in all requests to step, in the order in which the server took them.
+    /// Returns the number in each step request, in the order in which the server took the steps.
     pub fn done(&self) -> Vec<u64> {
         self.done.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }

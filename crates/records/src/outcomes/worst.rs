@@ -55,7 +55,7 @@ pub fn worst_contexts(outcomes: &Outcomes) -> Option<f64> {
     if parts.len() < MIN_PARTS {
         return None;
     }
-    // Ranks the regions by the half `chooses`, and measures success in the other half.
+    // Ranks the regions by half number `chooses`, and measures success in the other half.
     let mut one_way = |chooses: usize| {
         parts.sort_by(|a, b| a.rate(chooses).total_cmp(&b.rate(chooses)));
         judged(&parts, chooses)
@@ -64,8 +64,9 @@ pub fn worst_contexts(outcomes: &Outcomes) -> Option<f64> {
     Some(50.0 * (one_way(0) + one_way(1)))
 }
 
-/// Returns the success rate, 0 … 1, in the worst tenth of `parts`: regions sorted by their success rate in the half
-/// `chooses` of their episodes. The returned rate is measured in the other half.
+/// Returns the success rate, 0 … 1, in the worst tenth of the regions `parts`. Half number `chooses` of the episodes, 0
+/// or 1, determines which regions are worst; the returned rate is measured in the other half. `parts` must be sorted by
+/// the success rate in half number `chooses`.
 fn judged(parts: &[ContextGroup], chooses: usize) -> f64 {
     let judges = 1 - chooses;
     let mut wanted = SHARE * parts.iter().map(|part| part.episodes[chooses]).sum::<f64>();

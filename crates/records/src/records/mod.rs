@@ -58,8 +58,8 @@ pub struct RecordsMetadata {
     /// The success criterion in the published code of Packer et al. (2018). `None` if the server did not report it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub code_success: Option<Criterion>,
-    /// The name of the quantity in [`EpisodeRecord::also_achieved`]. `None` if the paper's criterion and its code's
-    /// criterion compare the same quantity.
+    /// The name of the quantity in [`EpisodeRecord::also_achieved`]. `None` if the criteria of the paper and of its
+    /// code compare the same quantity.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub also: Option<String>,
     /// The tests, in the order in which they were recorded.
