@@ -205,6 +205,43 @@ def test_snapshots_of_a_batch_move_between_slots(server: str) -> None:
     assert len(envs.snapshot()) == 3
 
 
+def long_snapshots() -> dict[str, list[tuple[float, float]]]:
+    """Give CartPole twelve distributions of 64 intervals each, so that a snapshot takes some 12 kB."""
+    ranges = {"force": (5, 10), "length": (0.3, 0.7), "mass": (0.1, 0.2), "push_interval": (10, 90)}
+    ranges |= {f"changed_{name}": ranges[name] for name in ("force", "length", "mass")}
+    rates = ("action_hold", "change_probability", "push", "sensor_dropout", "sensor_noise")
+    ranges |= dict.fromkeys(rates, (0.0, 0.1))
+    ends = {name: np.linspace(low, high, 128).reshape(64, 2) for name, (low, high) in ranges.items()}
+    return {name: [(low, high) for low, high in pairs.tolist()] for name, pairs in ends.items()}
+
+
+@pytest.mark.parametrize(
+    ("name", "num_envs", "parameters", "limit"),
+    [("Hopper", 8500, None, 4 << 20), ("CartPole", 5600, long_snapshots(), 64 << 20)],
+    ids=["grpcs_default_limit", "the_limit_of_a_request"],
+)
+def test_long_snapshots_are_followed_by_the_same_bytes(
+    name: str, num_envs: int, parameters: Any, limit: int, server: str
+) -> None:
+    envs = make_vec(name, num_envs=num_envs, parameters=parameters, server=server)
+    envs.reset(seed=3)
+    actions = np.zeros((num_envs, *envs.single_action_space.shape), dtype=envs.single_action_space.dtype)
+    observations = envs.step(actions)[0]
+    saved = envs.snapshot()
+    assert sum(map(len, saved)) > limit
+    expected = envs.step(actions)[0].tobytes()
+    assert envs.restore(saved).tobytes() == observations.tobytes()
+    assert envs.snapshot() == saved
+    assert envs.step(actions)[0].tobytes() == expected
+    odd = np.arange(num_envs) % 2 == 1
+    assert envs.restore(saved[1::2], odd)[odd].tobytes() == observations[odd].tobytes()
+    assert envs.snapshot(odd) == saved[1::2]
+    assert envs.snapshot(~odd) != saved[::2]
+    with pytest.raises(perturb.InvalidArgumentError):
+        envs.restore(saved[:-1])
+    envs.close()
+
+
 def test_observations_stay_as_they_are(server: str) -> None:
     for copy in (False, True):
         envs = make_vec(num_envs=4, copy=copy, server=server)

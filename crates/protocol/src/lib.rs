@@ -31,6 +31,7 @@ mod private_server;
 mod process_limit;
 pub mod region;
 mod reply;
+mod snapshot_parts;
 mod stream;
 mod version;
 
@@ -44,6 +45,7 @@ pub use escape::{escape_environment, escape_lines};
 pub use private_server::PrivateServer;
 pub use process_limit::spawn_failure;
 pub use reply::{Malformed, check_observations, check_step};
+pub use snapshot_parts::snapshot_parts;
 pub use stream::{Stream, TypedRequest};
 pub use version::{UnknownVersion, Version};
 

@@ -87,14 +87,13 @@ impl PrivateServer {
                 ),
             )?;
         let path = directory.path().join("server.sock");
+        let refused = |reason: &str, other: &str| {
+            let reason = format!("{reason} ({}); set TMPDIR to a folder with {other}, such as /tmp", path.display());
+            ClientError::Start { program: program.clone(), reason }
+        };
+        let text = path.to_str().ok_or_else(|| refused("the path of the socket is not UTF-8", "another path"))?;
         let address: Address =
-            format!("unix:{}", path.display()).parse().map_err(|AddressError { reason, .. }| ClientError::Start {
-                program: program.clone(),
-                reason: format!(
-                    "{reason} ({}); set TMPDIR to a folder with a shorter path, such as /tmp",
-                    path.display()
-                ),
-            })?;
+            format!("unix:{text}").parse().map_err(|AddressError { reason, .. }| refused(&reason, "a shorter path"))?;
 
         let process = spawn(&program, &address, workers, tasks, stopped)?;
         Ok(Self { program, process, address, workers, tasks: tasks.to_vec(), directory })

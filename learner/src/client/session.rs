@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use bytes::Bytes;
-use perturb_protocol::{Address, ClientError, Distribution, TypedRequest};
+use perturb_protocol::{Address, ClientError, Distribution, TypedRequest, snapshot_parts};
 use tokio::runtime::Handle;
 
 use super::options::{ActorLocation, OpenOptions};
@@ -11,10 +11,6 @@ use super::reply::StepReply;
 use super::servers::Servers;
 use super::shard::ServerShard;
 use crate::proto::{self, AutoresetMode};
-
-/// Maximum number of snapshots in a restore request. This many snapshots of HalfCheetah are some 600 kB, far below a
-/// server's limit.
-const SNAPSHOTS_PER_RESTORE: usize = 1024;
 
 /// Maximum number of unanswered requests to one server: each request is sent after the previous one was answered.
 const MAX_IN_FLIGHT: u32 = 1;
@@ -180,24 +176,28 @@ impl<'a> Session<'a> {
     }
 
     /// Returns an opaque snapshot of each environment in `slots`, in order. Does not change the environments. All
-    /// servers work at the same time.
+    /// servers work at the same time. A server sends long snapshots in several replies.
     ///
     /// # Errors
     /// Connection failures.
     pub fn snapshot(&mut self, slots: Range<usize>) -> Result<Vec<Bytes>, ClientError> {
-        let mut snapshots = Vec::with_capacity(slots.len());
-        self.exchange(
-            |part| part.mask(&slots).map(|mask| proto::Snapshot { mask }),
-            |part, saved| {
-                let expected = part.overlap(&slots).len();
-                if saved.snapshots.len() != expected {
-                    let got = format!("{} snapshots", saved.snapshots.len());
-                    return Err(part.stream.mismatch::<proto::Snapshot>(got, expected.to_string()));
-                }
-                snapshots.extend(saved.snapshots);
-                Ok(())
-            },
-        )?;
+        let mut snapshots = vec![Bytes::new(); slots.len()];
+        let rounds = self.parts.iter().map(|part| part.snapshot_parts(&slots).len()).max().unwrap_or(0);
+        for round in 0..rounds {
+            let asked = |part: &ServerShard| part.snapshot_parts(&slots).get(round).cloned();
+            self.exchange(
+                |part| asked(part).and_then(|own| part.mask(&own)).map(|mask| proto::Snapshot { mask }),
+                |part, saved| {
+                    let own = asked(part).unwrap_or_default();
+                    if saved.snapshots.len() != own.len() {
+                        let got = format!("{} snapshots", saved.snapshots.len());
+                        return Err(part.stream.mismatch::<proto::Snapshot>(got, own.len().to_string()));
+                    }
+                    snapshots[own.start - slots.start..][..own.len()].clone_from_slice(&saved.snapshots);
+                    Ok(())
+                },
+            )?;
+        }
         Ok(snapshots)
     }
 
@@ -216,9 +216,14 @@ impl<'a> Session<'a> {
         let mut observations = vec![0.0; slots.len() * *size];
         servers.wait_for(async {
             for part in parts.iter_mut() {
-                for chunk in chunks(part.overlap(&slots)) {
-                    let Some(mask) = part.mask(&chunk) else { continue };
-                    let places = chunk.start - slots.start..chunk.end - slots.start;
+                let own = part.overlap(&slots);
+                if own.is_empty() {
+                    continue;
+                }
+                let first = own.start - slots.start;
+                for cut in snapshot_parts(snapshots[first..][..own.len()].iter().map(Bytes::len)) {
+                    let Some(mask) = part.mask(&(own.start + cut.start..own.start + cut.end)) else { continue };
+                    let places = first + cut.start..first + cut.end;
                     let request = proto::Restore { mask, snapshots: snapshots[places.clone()].to_vec() };
                     let done = part.stream.ask(request).await?;
                     let out = &mut observations[places.start * *size..places.end * *size];
@@ -313,12 +318,6 @@ fn split(num_envs: usize, parts: usize) -> Vec<Range<usize>> {
     (0..parts).map(|part| part * num_envs / parts..(part + 1) * num_envs / parts).collect()
 }
 
-/// Divides `slots` into ranges of at most [`SNAPSHOTS_PER_RESTORE`] slots.
-fn chunks(slots: Range<usize>) -> impl Iterator<Item = Range<usize>> {
-    let end = slots.end;
-    slots.step_by(SNAPSHOTS_PER_RESTORE).map(move |first| first..end.min(first + SNAPSHOTS_PER_RESTORE))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -331,16 +330,6 @@ mod tests {
             assert_eq!(all, (0..num_envs).collect::<Vec<_>>());
             let lengths = ranges.iter().map(ExactSizeIterator::len);
             assert!(lengths.clone().max().unwrap() - lengths.min().unwrap() <= 1);
-        }
-    }
-
-    #[test]
-    fn requests_to_restore_cover_a_part_in_order() {
-        const MAX: usize = SNAPSHOTS_PER_RESTORE;
-        for slots in [0..1, 5..MAX, 7..7 + MAX, 1..3 * MAX] {
-            let all: Vec<usize> = chunks(slots.clone()).flatten().collect();
-            assert_eq!(all, slots.clone().collect::<Vec<_>>());
-            assert!(chunks(slots).all(|chunk| (1..=MAX).contains(&chunk.len())));
         }
     }
 }

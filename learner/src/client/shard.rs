@@ -3,7 +3,9 @@
 use std::ops::Range;
 
 use bytes::{Bytes, BytesMut};
-use perturb_protocol::{Address, ClientError, Connection, EndedEpisode, Stream, TypedRequest, check_step};
+use perturb_protocol::{
+    Address, ClientError, Connection, EndedEpisode, Stream, TypedRequest, check_step, snapshot_parts,
+};
 
 use super::options::{OpenOptions, open_request};
 use super::reply::StepReply;
@@ -15,6 +17,8 @@ pub(super) struct ServerShard {
     pub(super) stream: Stream,
     /// The server's slots in the whole batch.
     pub(super) range: Range<usize>,
+    /// An upper bound of the length of one snapshot, bytes; 0 from older servers.
+    snapshot_bytes: usize,
     /// Buffer for encoded actions. Its memory is reused after a request has been sent.
     pub(super) actions: BytesMut,
     /// Whether the last request to this server still needs its reply.
@@ -40,7 +44,8 @@ impl ServerShard {
         let asked = open.observe_parameters;
         let (stream, opened) = Stream::open(connection, open).await?;
         check_observed(connection.address(), asked, &opened)?;
-        Ok((Self { stream, range, actions: BytesMut::new(), asked: false }, opened))
+        let snapshot_bytes = opened.max_snapshot_reply_bytes as usize / range.len().max(1);
+        Ok((Self { stream, range, snapshot_bytes, actions: BytesMut::new(), asked: false }, opened))
     }
 
     /// Returns the part of `slots` that is on this server.
@@ -53,6 +58,13 @@ impl ServerShard {
     pub(super) fn mask(&self, slots: &Range<usize>) -> Option<Bytes> {
         let own = self.overlap(slots);
         (!own.is_empty()).then(|| self.range.clone().map(|slot| u8::from(own.contains(&slot))).collect())
+    }
+
+    /// Divides the part of `slots` that is on this server into ranges whose snapshots fit in one reply each.
+    pub(super) fn snapshot_parts(&self, slots: &Range<usize>) -> Vec<Range<usize>> {
+        let own = self.overlap(slots);
+        let cuts = snapshot_parts(own.clone().map(|_| self.snapshot_bytes));
+        cuts.into_iter().map(|cut| own.start + cut.start..own.start + cut.end).collect()
     }
 
     /// Decodes this server's reply `stepped` into the parts of `reply` for its slots. `size` is O, the length of an

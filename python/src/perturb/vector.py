@@ -304,7 +304,8 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
 
         Returns the observations [N, O]. Restored environments have the observations at which they were saved, and the
         others have their last ones. The same actions then give the same bytes as after the snapshot. If one snapshot
-        cannot be restored, no environment changes.
+        cannot be restored, no environment changes. Snapshots of more than 32 MiB are restored in parts: if one part is
+        refused, those before it stay restored.
         """
         selected = None
         if mask is not None:

@@ -145,6 +145,7 @@ impl Session {
         A: TypedRequest + Send + 'static,
         A::Reply: Send,
     {
+        let busy = BusyGuard(self);
         let OpenSession { transport, runtime, labels, .. } = &mut *open;
         let labels = Arc::clone(labels);
         // Two separate futures, because a common one would have the size of the larger and would have to be moved.
@@ -163,21 +164,19 @@ impl Session {
         };
         match come {
             Ok(Ok(reply)) => {
+                std::mem::forget(busy);
                 self.put_back(py, open);
                 Ok((labels, reply))
             }
             Ok(Err(RequestFailure::Refused(error))) => {
+                std::mem::forget(busy);
                 self.put_back(py, open);
                 Err(error)
             }
-            Ok(Err(RequestFailure::Ended(error))) => {
-                self.end();
-                Err(error)
-            }
+            Ok(Err(RequestFailure::Ended(error))) => Err(error),
             Err(broken) => {
                 // The late reply would be taken for the reply to the next request.
                 open.close(py);
-                self.end();
                 Err(explain(broken))
             }
         }
@@ -210,11 +209,11 @@ impl OpenSession {
     }
 }
 
-/// A guard that ends the session when the guard is dropped. Once the session is open, the caller passes the guard to
-/// [`std::mem::forget`].
-pub(super) struct OpeningGuard<'a>(pub(super) &'a Session);
+/// A guard that ends a busy session when the guard is dropped, also by a panic, so that no session stays busy for ever.
+/// If the session continues, the caller passes the guard to [`std::mem::forget`].
+pub(super) struct BusyGuard<'a>(pub(super) &'a Session);
 
-impl Drop for OpeningGuard<'_> {
+impl Drop for BusyGuard<'_> {
     fn drop(&mut self) {
         self.0.end();
     }

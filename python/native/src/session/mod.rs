@@ -9,16 +9,17 @@ mod exchange;
 mod opened;
 mod transport;
 
+use std::ops::Range;
 use std::pin::pin;
 use std::str::FromStr;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use numpy::{PyArray1, PyArray2, PyArray3};
 use perturb_protocol::proto;
-use perturb_protocol::{Address, ClientError, Timeouts, check_observations, check_step, connect};
+use perturb_protocol::{Address, ClientError, Timeouts, check_observations, check_step, connect, snapshot_parts};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 
@@ -28,7 +29,7 @@ use crate::failure::{self, INVALID, MALFORMED, RequestFailure, UNREACHABLE, UNUS
 use crate::infos::{Events, InfoKeys};
 use crate::requests::{self, Actions, IntervalsByName};
 use crate::session_runtime::{CloseSignal, SessionRuntime};
-use exchange::{FORKS, OpenSession, OpeningGuard, SessionState, duration, explain, unpoisoned};
+use exchange::{BusyGuard, FORKS, OpenSession, SessionState, duration, explain, unpoisoned};
 use transport::SessionServer;
 
 pub use exchange::note_fork;
@@ -65,6 +66,8 @@ pub struct Session {
     closing: Arc<CloseSignal>,
     state: Mutex<SessionState>,
     last: Mutex<LastStep>,
+    /// An upper bound of the length of one snapshot, bytes; 0 from older servers.
+    snapshot_bytes: AtomicUsize,
 }
 
 /// The state of a batch after the last reply. It is a copy, because Python may change the arrays that it got.
@@ -112,6 +115,7 @@ impl Session {
             closing: Arc::default(),
             state: Mutex::new(SessionState::New),
             last: Mutex::default(),
+            snapshot_bytes: AtomicUsize::new(0),
         })
     }
 
@@ -196,7 +200,7 @@ impl Session {
                 _ => return Err(failure(UNUSABLE, 0, "the session was opened before")),
             }
         }
-        let unopened = OpeningGuard(self);
+        let unopened = BusyGuard(self);
         let runtime = SessionRuntime::new().map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
         let opening = pin!(self.server.clone().open(request));
         let come = runtime.wait(py, opening, self.deadline(), &self.closing).map_err(explain)?;
@@ -208,6 +212,7 @@ impl Session {
         let served = opened.environment.unwrap_or_default();
         let labels = Arc::new(InfoKeys::new(py, &served, n));
         let events = Events::begun(&labels, opened.started)?;
+        self.snapshot_bytes.store(opened.max_snapshot_reply_bytes as usize / n.max(1), Ordering::Relaxed);
         *unpoisoned(&self.last) = LastStep { observations: opened.observations.clone(), ..LastStep::default() };
         std::mem::forget(unopened);
         self.put_back(py, Box::new(OpenSession { transport, runtime, labels, under_way: 0 }));
@@ -262,6 +267,7 @@ impl Session {
     fn send(&self, py: Python<'_>, actions: &Bound<'_, PyAny>, encode: &Bound<'_, PyAny>) -> PyResult<()> {
         let request = proto::Step { actions: self.actions.encode(actions, encode)? };
         let mut open = self.take(MAX_STEPS_UNDER_WAY - 1)?;
+        let busy = BusyGuard(self);
         let OpenSession { transport, runtime, under_way, .. } = &mut *open;
         let is_embedded = transport.is_embedded();
         let sent = {
@@ -277,17 +283,12 @@ impl Session {
                 if !is_embedded {
                     py.detach(|| runtime.poll_io());
                 }
+                std::mem::forget(busy);
                 self.put_back(py, open);
                 Ok(())
             }
-            Ok(Err(failed)) => {
-                self.end();
-                Err(failed.into_error())
-            }
-            Err(broken) => {
-                self.end();
-                Err(explain(broken))
-            }
+            Ok(Err(failed)) => Err(failed.into_error()),
+            Err(broken) => Err(explain(broken)),
         }
     }
 
@@ -322,36 +323,53 @@ impl Session {
         let open = self.take(0)?;
         let (labels, done) = self.ask(py, open, request)?;
         check_observations(&done.observations, selected, self.observation_size).map_err(|error| malformed(&error))?;
-        let observations = self.merged(py, mask, &done.observations)?;
+        self.merge(mask, &done.observations);
+        let observations = self.last_observations(py)?;
         Ok((observations, Events::begun(&labels, done.started)?))
     }
 
-    /// Saves the environments that the mask selects, one snapshot each.
+    /// Saves the environments that the mask selects, one snapshot each. Long snapshots come in several replies.
     fn snapshot<'py>(&self, py: Python<'py>, mask: &[u8]) -> PyResult<Vec<Bound<'py, PyBytes>>> {
-        let open = self.take(0)?;
-        let (_, saved) = self.ask(py, open, proto::Snapshot { mask: Bytes::copy_from_slice(mask) })?;
-        let (got, expected) = (saved.snapshots.len(), self.selected(mask));
-        if got != expected {
-            return Err(failure(MALFORMED, 0, format!("the server sent {got} snapshots; expected {expected}")));
+        let length = self.snapshot_bytes.load(Ordering::Relaxed);
+        let selected = self.selected(mask);
+        let mut snapshots = Vec::with_capacity(selected);
+        for part in snapshot_parts((0..selected).map(|_| length)) {
+            let expected = part.len();
+            let open = self.take(0)?;
+            let (_, saved) = self.ask(py, open, proto::Snapshot { mask: self.part_mask(mask, &part, selected) })?;
+            let got = saved.snapshots.len();
+            if got != expected {
+                return Err(failure(MALFORMED, 0, format!("the server sent {got} snapshots; expected {expected}")));
+            }
+            snapshots.extend(saved.snapshots.iter().map(|snapshot| PyBytes::new(py, snapshot)));
         }
-        Ok(saved.snapshots.iter().map(|snapshot| PyBytes::new(py, snapshot)).collect())
+        Ok(snapshots)
     }
 
     /// Restores snapshots into the environments that the mask selects. Returns observations `[N, O]`. Other
-    /// environments have their last observations.
+    /// environments have their last observations. Snapshots that are too long for one request are sent in several. If
+    /// one of these is refused, those before it were restored.
     fn restore<'py>(
         &self,
         py: Python<'py>,
         mask: &[u8],
         snapshots: Vec<Vec<u8>>,
     ) -> PyResult<Bound<'py, PyArray2<f32>>> {
-        let snapshots = snapshots.into_iter().map(Bytes::from).collect();
-        let open = self.take(0)?;
-        let (_, restored) = self.ask(py, open, proto::Restore { mask: Bytes::copy_from_slice(mask), snapshots })?;
-        // Only the length is checked. Observations may not be finite, because the physics of a snapshot may have
-        // diverged.
-        arrays::numbers(&restored.observations, &[self.selected(mask), self.observation_size])?;
-        self.merged(py, mask, &restored.observations)
+        let snapshots: Vec<Bytes> = snapshots.into_iter().map(Bytes::from).collect();
+        let parts = snapshot_parts(snapshots.iter().map(Bytes::len));
+        // The server refuses a wrong number of snapshots.
+        let parts = if snapshots.len() == self.selected(mask) { parts } else { vec![0..snapshots.len()] };
+        for part in parts {
+            let mask = self.part_mask(mask, &part, snapshots.len());
+            let open = self.take(0)?;
+            let request = proto::Restore { mask: mask.clone(), snapshots: snapshots[part].to_vec() };
+            let (_, restored) = self.ask(py, open, request)?;
+            // Only the length is checked. Observations may not be finite, because the physics of a snapshot may have
+            // diverged.
+            arrays::numbers(&restored.observations, &[self.selected(&mask), self.observation_size])?;
+            self.merge(&mask, &restored.observations);
+        }
+        self.last_observations(py)
     }
 
     /// Draws the environment in a slot. Returns a picture, uint8 `[height, width, 3]`.
@@ -403,8 +421,8 @@ impl Session {
 
 impl Session {
     /// Replaces the stored observations of the environments that the mask selects by `rows` `[M, O]`. An empty mask
-    /// selects all. Returns the observations `[N, O]` of all environments. The caller has checked the length of `rows`.
-    fn merged<'py>(&self, py: Python<'py>, mask: &[u8], rows: &Bytes) -> PyResult<Bound<'py, PyArray2<f32>>> {
+    /// selects all. The caller has checked the length of `rows`.
+    fn merge(&self, mask: &[u8], rows: &Bytes) {
         let mut last = unpoisoned(&self.last);
         let width = 4 * self.observation_size;
         if mask.is_empty() || width == 0 {
@@ -419,7 +437,25 @@ impl Session {
             let (terminated, truncated) = (left(&last.terminated), left(&last.truncated));
             *last = LastStep { observations: merged.into(), terminated, truncated };
         }
+    }
+
+    /// Returns the last observations `[N, O]` of all environments.
+    fn last_observations<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f32>>> {
+        let last = unpoisoned(&self.last);
         arrays::rows(py, &last.observations, self.actions.num_envs, self.observation_size)
+    }
+
+    /// Returns the mask of a part of the n environments that `mask` selects, which the part counts from 0.
+    fn part_mask(&self, mask: &[u8], part: &Range<usize>, n: usize) -> Bytes {
+        if part.len() == n {
+            return Bytes::copy_from_slice(mask);
+        }
+        let mut place = 0..;
+        let mut is_in_part = |slot| {
+            let is_selected = mask.is_empty() || mask.get(slot).is_some_and(|&selected| selected != 0);
+            is_selected && place.next().is_some_and(|place| part.contains(&place))
+        };
+        (0..self.actions.num_envs).map(|slot| u8::from(is_in_part(slot))).collect()
     }
 
     /// Checks the reply to a step, and stores its observations and flags as the last ones.
