@@ -4,10 +4,10 @@ use super::{
     Neighbour,
     client::{Connection, LIST, SESSION, framed},
 };
-use crate::common::server::{Server, Session, open, until, within};
+use crate::common::server::{Server, Session, open, parameters, until, within};
 use bytes::Bytes;
 use perturb::proto::{
-    Act, AutoresetMode, Open, Render, SessionRequest, session_request::Request, session_response::Response,
+    Act, AutoresetMode, Open, Render, SessionRequest, Snapshot, session_request::Request, session_response::Response,
 };
 use prost::Message;
 use std::time::{Duration, Instant};
@@ -121,6 +121,31 @@ async fn session_without_room_is_refused_and_open_ones_step_on() {
     drop(first);
     until("there is room", async || matches!(second.answer(open("CartPole", 2_000, 1)).await, Response::Opened(_)))
         .await;
+}
+
+#[tokio::test]
+async fn receipts_of_many_parameters_are_budgeted() {
+    let server = Server::start(&["--max-memory", "9000000"]);
+    let parameters = parameters(&[("action_hold", &[(0.0, 0.0)])]);
+    let mut session = Session::connect(server.tcp()).await;
+    let (code, message) = session.refused(Open { parameters, ..open("CartPole", 2_000, 1) }).await;
+    assert_eq!(code, Code::ResourceExhausted, "thirteen disturbances: {message}");
+    session.ask(open("CartPole", 2_000, 1)).await;
+}
+
+#[tokio::test]
+async fn long_snapshots_are_budgeted_before_they_are_taken() {
+    let server = Server::start(&["--max-memory", "20000000"]);
+    let intervals: Vec<_> = (0..64).map(|i| (f64::from(i) / 128.0, (f64::from(i) + 0.5) / 128.0)).collect();
+    let names = ["action_hold", "push", "sensor_noise", "sensor_dropout", "change_probability"];
+    let parameters = parameters(&names.map(|name| (name, intervals.as_slice())));
+    let (mut session, opened) =
+        Session::open(server.tcp(), Open { parameters, receipts: false, ..open("CartPole", 3_000, 1) }).await;
+    assert!(opened.max_snapshot_reply_bytes > 15_000_000);
+    let (code, message) = session.refused(Snapshot::default()).await;
+    assert_eq!(code, Code::ResourceExhausted, "{message}");
+    let mask: Vec<u8> = (0..3_000).map(|slot| u8::from(slot < 1_000)).collect();
+    assert_eq!(session.snapshot(&mask).await.len(), 1_000);
 }
 
 #[tokio::test]

@@ -52,6 +52,8 @@ pub struct Session {
     env_quota: Option<QuotaGuard>,
     draws: DrawAuditor,
     budget: Budget,
+    /// An upper bound of the length of one snapshot, bytes, until a distribution gets more intervals.
+    snapshot_bytes: usize,
     /// The memory reserved for the requests and replies of steps.
     step_memory: Option<MemoryReservation>,
     /// The memory reserved for the current policy.
@@ -62,7 +64,17 @@ impl Session {
     /// Makes a session that is not open yet. It reserves memory for its replies in `budget`.
     pub fn new(context: Arc<ServerContext>, bearer: Option<Bearer>, budget: Budget) -> Self {
         let draws = DrawAuditor::new(bearer.clone(), context.ledger.clone());
-        Self { context, batch: None, bearer, env_quota: None, draws, budget, step_memory: None, policy_memory: None }
+        Self {
+            context,
+            batch: None,
+            bearer,
+            env_quota: None,
+            draws,
+            budget,
+            snapshot_bytes: 0,
+            step_memory: None,
+            policy_memory: None,
+        }
     }
 
     async fn open(&mut self, request: proto::Open) -> Result<SessionReply, Error> {
@@ -113,7 +125,8 @@ impl Session {
         let max_step_reply_bytes = environment
             .as_ref()
             .map_or(0, |environment| sizes::max_step_reply_bytes(batch.settings(), environment, envs) as u64);
-        let max_snapshot_reply_bytes = sizes::max_snapshot_reply_bytes(envs, batch.max_snapshot_bytes()) as u64;
+        self.snapshot_bytes = batch.max_snapshot_bytes();
+        let max_snapshot_reply_bytes = sizes::max_snapshot_reply_bytes(envs, self.snapshot_bytes) as u64;
         let opened = proto::Opened {
             environment,
             observations,
@@ -151,7 +164,8 @@ impl Session {
     async fn snapshot(&mut self, request: proto::Snapshot) -> Result<SessionReply, Error> {
         let batch = self.opened("snapshot")?;
         let slots = convert::mask("snapshot.mask", batch.size(), &request.mask)?;
-        let mut reservation = self.budget.reserve(sizes::snapshots(slots.len()))?;
+        let bytes = sizes::max_snapshot_reply_bytes(slots.len(), self.snapshot_bytes);
+        let mut reservation = self.budget.reserve(bytes)?;
         let batch = self.opened("snapshot")?;
         let snapshots = batch.snapshot(slots).await?;
         reservation.resize(sizes::snapshot_bytes(&snapshots));

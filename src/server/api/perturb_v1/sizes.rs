@@ -15,14 +15,19 @@ const REQUEST_OVERHEAD_BYTES: usize = 1 << 20;
 const MAX_VARINT_FIELD_BYTES: usize = 11;
 /// The estimated memory that an ended episode takes, as a value and encoded in the reply together, bytes.
 const EPISODE_END_BYTES: usize = 300;
-/// The estimated memory of a receipt, bytes.
-const RECEIPT_BYTES: usize = 500;
-/// The estimated length of an environment's snapshot, bytes.
-const SNAPSHOT_BYTES: usize = 2 << 10;
+/// The estimated memory of an ended or started episode with a receipt, without the receipt's numbers, bytes.
+const RECEIPT_OVERHEAD_BYTES: usize = 400;
 /// An upper bound of the total length of a reply's tags, lengths and non-repeated fields, bytes.
 const FRAMING_BYTES: usize = 256;
 /// The number of integers in a row of `Stepped.receipt_episodes`.
 const RECEIPT_INDICES: usize = 5;
+
+/// Returns the estimated memory of an ended or started episode with its receipt, bytes. Each number is there as a value
+/// and encoded in the reply.
+fn receipt_bytes(settings: &BatchSettings) -> usize {
+    let numbers = settings.spec.parameters.len() + settings.spec.applied.len();
+    RECEIPT_OVERHEAD_BYTES + 2 * size_of::<f64>() * numbers
+}
 
 /// Returns A, the number of entries of an action.
 fn action_width(settings: &BatchSettings) -> usize {
@@ -53,14 +58,9 @@ pub fn step_request(settings: &BatchSettings, envs: usize) -> usize {
 /// computed, one waiting, one being sent). Thanks to it, no step is refused because of other sessions.
 pub fn session(settings: &BatchSettings, envs: usize) -> usize {
     let numbers = 2 * settings.observation_size() + 1 + settings.spec.reward_terms.len();
-    let ends = if settings.receipts { 2 * RECEIPT_BYTES } else { EPISODE_END_BYTES };
+    let ends = if settings.receipts { 2 * receipt_bytes(settings) } else { EPISODE_END_BYTES };
     let reply = envs.saturating_mul(4 * numbers + 2 + ends);
     step_request(settings, envs).saturating_mul(2).saturating_add(reply.saturating_mul(3))
-}
-
-/// Returns the estimated length of the snapshots of `envs` environments, bytes.
-pub fn snapshots(envs: usize) -> usize {
-    envs.saturating_mul(SNAPSHOT_BYTES)
 }
 
 /// Returns the memory that these snapshots take, bytes.
@@ -87,7 +87,7 @@ pub fn max_rollout_bytes(request: &RolloutRequest, batch: &Batch) -> usize {
     let settings = batch.settings();
     // Actions count twice: as sampled, and as inputs of the policy. The 10 stands for flags, values and the like.
     let numbers = settings.observation_size() + 2 * action_width(settings) + 10;
-    let step = batch.size().saturating_mul(4 * numbers + RECEIPT_BYTES);
+    let step = batch.size().saturating_mul(4 * numbers + receipt_bytes(settings));
     step.saturating_mul(request.max_steps).min(MAX_ROLLOUT_BYTES.saturating_add(step))
 }
 
