@@ -116,8 +116,8 @@ pub(super) struct FolderEnvironment {
     push: Option<[f64; 3]>,
     /// Whether the physics have diverged since the last reset.
     diverged: bool,
-    /// Whether the model could not be compiled with the lengths that the last parameters give. Then the previous edit
-    /// stays, and each episode ends as diverged in its first step.
+    /// Whether the model could not be compiled with the lengths that the last parameters give. Then all parameters have
+    /// their defaults, whatever they were before, and each episode ends as diverged in its first step.
     is_impossible: bool,
 }
 
@@ -127,10 +127,9 @@ impl FolderEnvironment {
     /// # Errors
     /// [`Error::Model`] if there is not enough memory for a simulation.
     pub(super) fn new(task: &'static Task) -> Result<Self, Error> {
-        let defaults: Vec<f64> = task.spec.parameters.iter().map(|parameter| parameter.default).collect();
         let edit = task
             .template
-            .edit(&task.parameters, &defaults)
+            .edit(&task.parameters, &defaults(task))
             .map_err(|error| Error::Model { environment: task.spec.name, reason: error.to_string() })?;
         let mut environment = Self {
             task,
@@ -297,6 +296,10 @@ impl FolderEnvironment {
     }
 }
 
+fn defaults(task: &Task) -> Vec<f64> {
+    task.spec.parameters.iter().map(|parameter| parameter.default).collect()
+}
+
 fn is_finite(numbers: &[f64]) -> bool {
     numbers.iter().all(|value| value.is_finite())
 }
@@ -308,15 +311,14 @@ impl Environment for FolderEnvironment {
 
     fn set_parameters(&mut self, values: &[f64]) {
         let task = self.task;
-        let edit = || task.template.edit(&task.parameters, values);
-        // A fatal error needs a second attempt, with a new simulation.
-        match edit().or_else(|_| edit()) {
-            Err(SimulationError::Compile { .. }) => self.is_impossible = true,
-            edited => {
-                self.edit = edited.expect(NO_MEMORY);
-                self.is_impossible = false;
-            }
-        }
+        let edit = |values: &[f64]| {
+            let edit = || task.template.edit(&task.parameters, values);
+            edit().or_else(|_| edit()) // a fatal error needs a second attempt, with a new simulation
+        };
+        let edited = edit(values);
+        self.is_impossible = matches!(edited, Err(SimulationError::Compile { .. }));
+        let edited = if self.is_impossible { edit(&defaults(task)) } else { edited };
+        self.edit = edited.expect(NO_MEMORY);
     }
 
     fn applied(&self, out: &mut [f64]) {

@@ -268,13 +268,16 @@ fn environments_of_other_lengths_take_turns_unseen() {
 #[test]
 fn an_impossible_model_is_divergence_and_told_by_the_receipt() {
     let mut environment = cart("ImpossibleCart");
-    environment.set_parameters(&[1.0, 0.7, 0.04, 0.0]);
-    // Each value alone is possible. Together they give the pole less than MuJoCo's minimum inertia.
-    environment.set_parameters(&[1.0, 0.000_1, 0.000_1, 0.0]);
-    environment.reset(&mut Stream::new(4, 0, Purpose::InitialState, 0));
-    assert!(environment.scene().is_none());
-    assert!(environment.step(Action::Continuous(&[0.0]), &mut [0.0; 2]).diverged);
-    assert!((applied(environment.as_ref())[1] - 0.7).abs() < 1e-14, "the model before");
+    let defaults = applied(environment.as_ref());
+    for before in [0.7, 0.3] {
+        environment.set_parameters(&[1.0, before, 0.04, 0.0]);
+        // Each value alone is possible. Together they give the pole less than MuJoCo's minimum inertia.
+        environment.set_parameters(&[1.5, 0.000_1, 0.000_1, 0.0]);
+        environment.reset(&mut Stream::new(4, 0, Purpose::InitialState, 0));
+        assert!(environment.scene().is_none());
+        assert!(environment.step(Action::Continuous(&[0.0]), &mut [0.0; 2]).diverged);
+        assert_eq!(applied(environment.as_ref()), defaults, "after a pole of {before} m");
+    }
     environment.set_parameters(&[1.0, 0.8, 0.04, 0.0]);
     environment.reset(&mut Stream::new(4, 0, Purpose::InitialState, 0));
     assert!(!environment.step(Action::Continuous(&[0.0]), &mut [0.0; 2]).diverged);
