@@ -15,14 +15,14 @@ use perturb::{
     },
     tasks,
 };
-use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+use rustix::process::{Resource, Rlimit, Signal, getrlimit, setrlimit};
 use std::{
     error::Error,
     io::{self, Read, Write},
     process::ExitCode,
 };
 use tokio::{
-    signal::unix::{Signal, SignalKind, signal},
+    signal::unix::{SignalKind, signal},
     sync::oneshot,
 };
 #[cfg(not(feature = "otel"))]
@@ -316,7 +316,7 @@ fn grpc_target(listeners: &[Listener]) -> Option<String> {
 }
 
 /// Reloads the token and TLS files at each SIGHUP. SIGHUP does not end the server.
-async fn reload_on_hangup(mut hangups: Signal, reloader: Reloader) {
+async fn reload_on_hangup(mut hangups: tokio::signal::unix::Signal, reloader: Reloader) {
     while hangups.recv().await.is_some() {
         if !reloader.reload() {
             tracing::info!("SIGHUP came, and there is no file of tokens or TLS to read again");
@@ -348,8 +348,14 @@ fn health(config: &Config) -> Result<(), Failure> {
 
 /// Resolves at SIGTERM or SIGINT, or, if `exit_with_stdin`, when standard input closes. A second signal exits
 /// immediately.
+///
+/// SIGUSR1, SIGUSR2 and SIGXCPU, by which batch systems and the kernel warn, resolve it too, and do not count as a
+/// second signal. If `exit_with_stdin`, they are ignored: the program that started the server may get them too, and
+/// then needs the server to save its work.
 fn shutdown(exit_with_stdin: bool) -> io::Result<impl Future<Output = ()>> {
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
+    let (mut user_1, mut user_2) = (signal(SignalKind::user_defined1())?, signal(SignalKind::user_defined2())?);
+    let mut processor_time = signal(SignalKind::from_raw(Signal::XCPU.as_raw()))?;
     let (closed, stdin) = oneshot::channel::<()>();
     if exit_with_stdin {
         std::thread::Builder::new()
@@ -367,6 +373,9 @@ fn shutdown(exit_with_stdin: bool) -> io::Result<impl Future<Output = ()>> {
         tokio::select! {
             _ = terminate.recv() => {}
             _ = interrupt.recv() => {}
+            _ = user_1.recv(), if !exit_with_stdin => {}
+            _ = user_2.recv(), if !exit_with_stdin => {}
+            _ = processor_time.recv(), if !exit_with_stdin => {}
             _ = stdin => {}
         }
         tokio::spawn(async move {

@@ -66,7 +66,9 @@ async fn max_envs(server: &Server) -> u32 {
 
 #[rstest]
 #[tokio::test]
-async fn signal_lets_running_sessions_go_on_and_refuses_new_ones(#[values("TERM", "INT")] signal: &str) {
+async fn signal_lets_running_sessions_go_on_and_refuses_new_ones(
+    #[values("TERM", "INT", "USR1", "USR2", "XCPU")] signal: &str,
+) {
     let mut server = Server::start(&["--grace-seconds", "100000"]);
     let e = environment(server.tcp(), "CartPole").await;
     let actor = Actor::new(&e, 4);
@@ -95,6 +97,9 @@ async fn signal_lets_running_sessions_go_on_and_refuses_new_ones(#[values("TERM"
     let status = not_opened.end().await;
     assert_eq!(status.code(), Code::Unavailable, "nothing is opened any more: {status:?}");
 
+    if !["TERM", "INT"].contains(&signal) {
+        server.signal(signal); // the kernel and batch systems repeat warnings
+    }
     replies.extend(session.play(actor, 200, 400).await);
     assert!(replies == reference, "the running session goes on as if nothing had happened");
     assert!(server.child.try_wait().unwrap().is_none(), "the server waits for its session");
@@ -225,6 +230,10 @@ async fn private_server_ends_with_its_input_and_heeds_only_flags() {
     let (_session, _) = Session::open(server.tcp(), open("CartPole", 20_000, 1)).await;
     let second = Session::start(&mut server::client(server.tcp()).await).await.err().expect("flags beat --private");
     assert_eq!(second.code(), Code::ResourceExhausted, "{second:?}");
+    for signal in ["USR1", "USR2", "XCPU", "HUP"] {
+        server.signal(signal);
+        assert_eq!(health(server.tcp(), SERVICE).await.unwrap(), ServingStatus::Serving, "after {signal}");
+    }
     let closed = Instant::now();
     server.stdin = None;
     assert_eq!(server.ended().await.code(), Some(0));
