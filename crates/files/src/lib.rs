@@ -9,15 +9,13 @@ use rustix::io::Errno;
 use serde::Serialize;
 use tempfile::NamedTempFile;
 
+use perturb_system::support::{Operation, unless_unsupported};
 use perturb_text::quoted;
-
-use self::support::{Operation, unless_unsupported};
 
 pub mod checksum;
 pub mod interrupt;
 mod lock;
 mod plain;
-mod support;
 
 pub use self::lock::{Lock, is_locked};
 pub use self::plain::{Stamp, leads_out, read_plain, read_plain_text};
@@ -221,6 +219,7 @@ pub fn require_writable(path: &Path) -> Result<()> {
             return refuse(ErrorKind::IsADirectory, "it is a folder; give the name of a file".into());
         }
         Ok(metadata) if !metadata.is_file() => return Ok(()), // for example a pipe or a terminal
+        Err(error) if error.kind() == ErrorKind::InvalidFilename => return Err(io("write", path)(error)), // too long
         _ => {}
     }
     if !folder.is_dir() {
@@ -305,7 +304,13 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = |name: &str| directory.path().join(name);
         fs::write(path("file"), "x").unwrap();
-        for (name, words) in [("", "it is a folder"), ("no/file", "mkdir -p "), ("file/file", "is no folder")] {
+        let long = "a".repeat(256);
+        for (name, words) in [
+            ("", "it is a folder"),
+            ("no/file", "mkdir -p "),
+            ("file/file", "is no folder"),
+            (&long, "File name too long"),
+        ] {
             let error = require_writable(&path(name)).unwrap_err().to_string();
             assert!(error.starts_with("cannot write ") && error.contains(words), "{name}: {error}");
         }

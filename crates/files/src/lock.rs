@@ -6,8 +6,8 @@ use std::path::Path;
 use std::time::Duration;
 
 use perturb_system::plain::nonblocking_flag;
+use perturb_system::support::is_taken;
 
-use super::support::{Operation, unless_unsupported};
 use super::{Result, io};
 
 /// The name of the file that is locked in place of its folder, because NFS on Linux cannot lock a folder.
@@ -43,13 +43,13 @@ impl Lock {
         options.create(true).truncate(false).read(true).write(true).custom_flags(nonblocking_flag());
         let file = options.open(&path).map_err(io("open", &path))?;
         for _ in 0..MAX_LOCK_TRIES {
-            let exclusive = supported(file.try_lock(), &path).map_err(io("lock", &path))?;
+            let exclusive = is_taken(file.try_lock(), &path).map_err(io("lock", &path))?;
             if exclusive != Some(false) {
                 return Ok(Some(Self(file)));
             }
             // A lock that is held is exclusive, while a test uses a shared lock. So if a shared lock is possible,
             // another process only tests.
-            match supported(file.try_lock_shared(), &path).map_err(io("lock", &path))? {
+            match is_taken(file.try_lock_shared(), &path).map_err(io("lock", &path))? {
                 Some(true) => file.unlock().map_err(io("unlock", &path))?,
                 _ => return Ok(None),
             }
@@ -71,28 +71,9 @@ pub fn is_locked(folder: &Path) -> bool {
     file.is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
 }
 
-/// Converts the result of a locking attempt: whether the lock was taken, or `None` if the file system does not support
-/// locks.
-fn supported(taken: std::result::Result<(), TryLockError>, path: &Path) -> std::io::Result<Option<bool>> {
-    let taken = match taken {
-        Ok(()) => Ok(true),
-        Err(TryLockError::WouldBlock) => Ok(false),
-        Err(TryLockError::Error(source)) => Err(source),
-    };
-    unless_unsupported(Operation::Lock, taken, path)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_file_system_without_locks_gives_the_lock() {
-        let refused = Err(TryLockError::Error(std::io::Error::from_raw_os_error(37)));
-        assert_eq!(supported(refused, Path::new("lock")).unwrap(), None);
-        let broken = Err(TryLockError::Error(std::io::Error::from_raw_os_error(5)));
-        assert!(supported(broken, Path::new("lock")).is_err());
-    }
 
     #[test]
     fn lock_ends_with_its_value_despite_inherited_files() {

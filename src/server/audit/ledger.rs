@@ -4,7 +4,10 @@
 use super::Error;
 use crate::server::error::InvalidValue;
 use perturb_protocol::ledger::{Chain, LedgerEvent, MAX_LINE_BYTES, read};
-use perturb_system::explain_no_thread;
+use perturb_system::{
+    explain_no_thread,
+    support::{Operation, is_taken, unless_unsupported},
+};
 use std::{
     fs::{File, OpenOptions},
     io::{self, Write},
@@ -66,7 +69,9 @@ impl Ledger {
         if !file.metadata()?.is_file() {
             return Err(io::Error::other("that is no file, and a ledger is read again when the server begins"));
         }
-        file.try_lock().map_err(|_| io::Error::other("another server writes it"))?;
+        if is_taken(file.try_lock(), path)? == Some(false) {
+            return Err(io::Error::other("another server writes it"));
+        }
         let existing = read(path, |_, _| {}).map_err(io::Error::other)?;
         if existing.chain.lines() == 0 && existing.unfinished > 0 {
             return Err(io::Error::other("that is no ledger, and not empty: give another name"));
@@ -84,7 +89,8 @@ impl Ledger {
         let start = LedgerEvent::Began { version, commit, unfinished: existing.unfinished };
         writer.write([&start]).map_err(io::Error::other)?;
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        File::open(folder)?.sync_all()?; // puts the directory entry of a new file on the disk
+        // Puts the directory entry of a new file on the disk.
+        unless_unsupported(Operation::Sync, File::open(folder)?.sync_all(), folder)?;
         let (lines, received) = channel();
         let status = Arc::clone(&writer.status);
         std::thread::Builder::new()
@@ -254,7 +260,9 @@ impl LedgerWriter {
             self.file.set_len(self.bytes).map_err(|error| error.to_string())?;
             self.is_torn = false;
         }
-        if let Err(error) = self.file.write_all(lines.as_bytes()).and_then(|()| self.file.sync_data()) {
+        let written = self.file.write_all(lines.as_bytes());
+        let synced = written.and_then(|()| unless_unsupported(Operation::Sync, self.file.sync_data(), &self.path));
+        if let Err(error) = synced {
             // Cuts off the incomplete line that a failed write may leave.
             self.is_torn = self.file.set_len(self.bytes).is_err();
             return Err(error.to_string());

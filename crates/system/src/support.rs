@@ -1,6 +1,7 @@
 //! Operations that some file systems do not support. A missing operation is skipped, and its consequence is logged
 //! once.
 
+use std::fs::TryLockError;
 use std::io::{Error, Result};
 use std::path::Path;
 use std::sync::atomic::{AtomicU8, Ordering};
@@ -12,7 +13,7 @@ static REPORTED: AtomicU8 = AtomicU8::new(0);
 
 /// An operation that a file system may not support.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Operation {
+pub enum Operation {
     /// An advisory lock. Lustre without `-o flock`, NFS without a lock daemon and some FUSE systems do not support it.
     Lock,
     /// Flushing a file, or the names in a folder, to the disk.
@@ -38,10 +39,10 @@ impl Operation {
     fn consequence(self) -> &'static str {
         match self {
             Self::Lock => {
-                "it cannot lock files: nothing protects a run from a second process that trains in the same folder; \
-                 start each run once"
+                "it cannot lock files: nothing protects a run or a ledger from a second process that writes it; start \
+                 each once"
             }
-            Self::Sync => "it cannot write files through to the disk: a power failure may lose the newest checkpoint",
+            Self::Sync => "it cannot write files through to the disk: a power failure may lose what was written last",
             Self::Rename => {
                 "it cannot replace a file in one step: another program may read a half-written file, and a power \
                  failure may leave one"
@@ -50,11 +51,25 @@ impl Operation {
     }
 }
 
+/// Converts the result of a locking attempt: whether the lock was taken, or `None` if the file system does not support
+/// locks.
+///
+/// # Errors
+/// The operating system's.
+pub fn is_taken(lock: std::result::Result<(), TryLockError>, path: &Path) -> Result<Option<bool>> {
+    let taken = match lock {
+        Ok(()) => Ok(true),
+        Err(TryLockError::WouldBlock) => Ok(false),
+        Err(TryLockError::Error(source)) => Err(source),
+    };
+    unless_unsupported(Operation::Lock, taken, path)
+}
+
 /// Replaces the error of a file system that does not support `operation` by `None`, and logs the consequence once.
 ///
 /// # Errors
 /// All other errors.
-pub(crate) fn unless_unsupported<T>(operation: Operation, result: Result<T>, path: &Path) -> Result<Option<T>> {
+pub fn unless_unsupported<T>(operation: Operation, result: Result<T>, path: &Path) -> Result<Option<T>> {
     match result {
         Err(error) if operation.is_missing(&error) => {
             let bit = 1 << operation as u8;
@@ -72,6 +87,15 @@ mod tests {
     use rstest::rstest;
 
     use super::*;
+
+    #[test]
+    fn a_file_system_without_locks_is_told_from_a_taken_lock() {
+        let refused = |code| Err(TryLockError::Error(Error::from_raw_os_error(code)));
+        assert_eq!(is_taken(refused(37), Path::new("lock")).unwrap(), None);
+        assert!(is_taken(refused(5), Path::new("lock")).is_err());
+        let taken = [Ok(()), Err(TryLockError::WouldBlock)].map(|lock| is_taken(lock, Path::new("lock")).unwrap());
+        assert_eq!(taken, [Some(true), Some(false)]);
+    }
 
     #[rstest]
     #[case::enosys(38, [true, true, true])]
